@@ -1,0 +1,1 @@
+"""The simulated world: growth, dilution, sensors, plants and environments; NumPy only, batch axis first."""

@@ -1,0 +1,54 @@
+"""Everything that can go wrong with a reactor, as one tree; catch `ReactorError` widely or a leaf narrowly.
+
+Every message names the thing, its value with unit, the allowed range and the remedy.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "DeviceRestarted",
+    "DeviceStateError",
+    "IdentityError",
+    "LinkError",
+    "ProtocolError",
+    "ReactorError",
+    "RecordingError",
+    "SafetyTrip",
+    "SensorError",
+]
+
+
+class ReactorError(Exception):
+    """Base of all errors of this package."""
+
+
+class LinkError(ReactorError):
+    """The device did not answer: refused, reset, timed out, cable pulled. Whether it acted is unknown."""
+
+
+class ProtocolError(ReactorError):
+    """The device answered something that is not its protocol: malformed JSON, wrong status, bad frame."""
+
+
+class DeviceStateError(ReactorError):
+    """The device answered well, but is not in the state it must be in: pump still on, mode active, absent."""
+
+
+class IdentityError(DeviceStateError):
+    """A reactor answered with another identity than the one pinned at the start."""
+
+
+class DeviceRestarted(DeviceStateError):
+    """The device lost its memory (worker restart, power cut): blank, targets and records are gone."""
+
+
+class SensorError(ReactorError):
+    """A reading that no culture can cause: frozen, impossible, broken spectrometer."""
+
+
+class SafetyTrip(ReactorError):
+    """The interlock ended the run; the message names reason, action taken and remedy."""
+
+
+class RecordingError(ReactorError):
+    """A recording cannot be read or written."""
