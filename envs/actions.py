@@ -17,9 +17,7 @@ def pump_rates(n: int = 17, maximum: float = MAX_PUMP_RATE) -> NDArray[np.float6
     Raises: ValueError if n < 2 or `maximum` is not positive.
     """
     if n < 2:
-        raise ValueError(
-            f"number of pump rates = {n}: allowed >= 2 (the pump must be able to stop and to run)"
-        )
+        raise ValueError(f"number of pump rates = {n}: allowed >= 2 (the pump must be able to stop and to run)")
     if not maximum > 0.0:
         raise ValueError(f"maximum pump rate = {maximum} mL/s: allowed > 0")
     return np.linspace(0.0, maximum, n)

@@ -1,0 +1,213 @@
+"""The frame of every entry point: command line -> Hydra -> checked dataclass -> run folder.
+
+Hydra composes plain YAML; the dataclass of the entry point is the schema. Whatever does not fit it (unknown key,
+wrong type, value out of range, misspelt option) ends as one line on standard error, before a run folder exists.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+__all__ = ["UserError", "compose", "load", "normalise", "run", "write_json"]
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+OmegaConf.register_new_resolver("pid", os.getpid)  # makes run folders of processes started in one second differ
+
+
+class UserError(Exception):
+    """Something the user can mend; the message is one line and is all that is shown."""
+
+
+def groups() -> dict[str, list[str]]:
+    """Config groups and their options, read from the package `conf`: {"env": ["sim", ...], ...}."""
+    found: dict[str, list[str]] = {}
+    root = Path(str(resources.files("conf")))
+    for path in sorted(root.rglob("*.yaml")):
+        group = path.parent.relative_to(root).as_posix()
+        if group != ".":
+            found.setdefault(group, []).append(path.stem)
+    return found
+
+
+def normalise(argv: Sequence[str]) -> list[str]:
+    """Make `+group=option` mean `group=option` for the known groups, and let `resume=RUN` write into RUN.
+
+    Hydra takes only one of the two forms, depending on whether the group has a default; here both work.
+    Raises: UserError for an option that does not exist, naming those that do.
+    """
+    known = groups()
+    out: list[str] = []
+    for arg in argv:
+        match = re.match(r"^\+?([\w/]+)=(.*)$", arg)
+        if match and match[1] in known:
+            arg = f"{match[1]}={match[2]}"
+            for option in match[2].split(","):
+                if re.fullmatch(r"[\w./-]+", option) and option != "null" and option not in known[match[1]]:
+                    raise UserError(f"{match[1]}={option}: no such option; allowed: {', '.join(known[match[1]])}")
+        out.append(arg)
+    resumed = [a.removeprefix("resume=") for a in out if a.startswith("resume=") and a != "resume=null"]
+    if resumed:
+        if not (Path(resumed[-1]) / "config.yaml").is_file():
+            raise UserError(f"resume={resumed[-1]}: no run folder (it holds no config.yaml); give the folder of a run")
+        out += [f"hydra.run.dir={resumed[-1]}", "hydra.output_subdir=null"]
+    return out
+
+
+def _one_line(error: Exception) -> str:
+    """The first useful lines of a Hydra or OmegaConf message as one."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    kept = [s for s in lines if s and not s.startswith(("object_type", "reference_type", "Config search path"))]
+    return " ".join(kept[:6])
+
+
+def _unlock(node: DictConfig) -> None:
+    """Frozen dataclasses become read-only nodes; the schema must take the composed values first."""
+    OmegaConf.set_readonly(node, False)
+    for key in node:
+        if not OmegaConf.is_missing(node, key) and isinstance(node[key], DictConfig):
+            _unlock(node[key])
+
+
+def _unknown(cfg: Any, schema: Any, prefix: str = "") -> str | None:
+    """The message for the first key of `cfg` that the dataclass does not have, with the keys it has."""
+    if not (isinstance(cfg, DictConfig) and is_dataclass(schema)):
+        return None
+    allowed = [f.name for f in fields(schema)]
+    for key in cfg:
+        if str(key) not in allowed:
+            return (
+                f"{prefix}{key}: no such key; allowed under '{prefix.rstrip('.') or 'the top'}': {', '.join(allowed)}"
+            )
+        value = None if OmegaConf.is_missing(cfg, key) or cfg._is_none() else cfg.get(key)
+        message = _unknown(value, getattr(schema, key, None), f"{prefix}{key}.")
+        if message:
+            return message
+    return None
+
+
+def load(cfg: DictConfig, schema: T) -> T:
+    """Turn a composed config into the checked dataclass.
+
+    Args:
+      cfg: composed values, no interpolation left unresolved.
+      schema: an instance with the defaults; a nested dataclass checks its ranges in `__post_init__`.
+    Raises: UserError naming key, value and what is allowed.
+    """
+    message = _unknown(cfg, schema)
+    if message:
+        raise UserError(message)
+    try:
+        node = OmegaConf.structured(schema)
+        _unlock(node)
+        loaded: T = OmegaConf.to_object(OmegaConf.merge(node, cfg))  # type: ignore[assignment]
+    except (OmegaConfBaseException, ValueError) as error:
+        raise UserError(_one_line(error)) from None
+    return loaded
+
+
+def compose(name: str, overrides: Sequence[str]) -> DictConfig:
+    """Compose `conf/<name>.yaml` with command-line overrides, as the entry point would.
+
+    Raises: UserError with Hydra's message on one line.
+    """
+    try:
+        GlobalHydra.instance().clear()
+        with hydra.initialize_config_module("conf", version_base="1.3"):
+            plain = [a for a in normalise(overrides) if not a.startswith("hydra.")]
+            return hydra.compose(name, overrides=plain)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(_one_line(error)) from None
+
+
+def _needs_check(argv: Sequence[str]) -> bool:
+    """A sweep or a Hydra flag (--help, --cfg job, -m) is Hydra's to read; a plain run is checked beforehand."""
+    return not any(a.startswith("-") for a in argv)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON atomically: nobody ever reads half a file. Non-finite numbers become null."""
+
+    def clean(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {str(k): clean(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [clean(v) for v in value]
+        if hasattr(value, "tolist"):
+            return clean(value.tolist())
+        if isinstance(value, float) and not (value == value and abs(value) != float("inf")):
+            return None
+        return value
+
+    temporary = path.with_suffix(path.suffix + ".part")
+    with open(temporary, "w", encoding="utf-8") as f:
+        json.dump(clean(content), f, indent=2)
+        f.write("\n")
+        f.flush()
+        os.fsync(f.fileno())
+    os.replace(temporary, path)
+
+
+def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
+    """Run an entry point; its resolved config is in `config.yaml` of its run folder before `body` starts.
+
+    Args:
+      name: of `conf/<name>.yaml` and of the job.
+      schema: default instance of the entry point's config dataclass; a field `resume` makes it resumable.
+      body: called with the checked config and the run folder; a float it returns is the sweep's objective.
+    Exits: 0, or 1 after one line on standard error; 130 on Ctrl-C.
+    """
+
+    def task(cfg: DictConfig) -> float | None:
+        try:
+            folder = Path(HydraConfig.get().runtime.output_dir)
+            if cfg.get("resume"):
+                stored = OmegaConf.load(folder / "config.yaml")
+                assert isinstance(stored, DictConfig)
+                config = load(OmegaConf.merge(stored, {"resume": cfg.resume}), schema)  # type: ignore[arg-type]
+            else:
+                config = load(cfg, schema)
+                OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+            return body(config, folder)
+        except UserError as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise  # the launcher finishes the other jobs first
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(1)
+
+    try:
+        sys.argv[1:] = normalise(sys.argv[1:])
+        if _needs_check(sys.argv[1:]):
+            load(compose(name, sys.argv[1:]), schema)
+            resumed = [a for a in sys.argv[1:] if a.startswith("resume=") and a != "resume=null"]
+            others = [a for a in sys.argv[1:] if not a.startswith(("resume=", "hydra."))]
+            if resumed and others:
+                raise UserError(
+                    f"{others[0]}: a resumed run takes every value from {resumed[-1][7:]}/config.yaml; drop it"
+                )
+        GlobalHydra.instance().clear()
+        hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)(task)()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("stopped by Ctrl-C", file=sys.stderr)
+        sys.exit(130)
