@@ -7,14 +7,14 @@ electronics (power, motors, faults) are here, because the device sees counts, no
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from envs.plant import Plant
 
-__all__ = ["Bench", "BenchConfig", "Dose", "VialFaults"]
+__all__ = ["Bench", "BenchConfig", "Dose", "VialFaults", "density"]
 
 FEED, WASTE = "Pump1", "Pump2"
 LINEAR, QUADRATIC = 1.833, 0.226  # OD = LINEAR R + QUADRATIC R^2, R = log10(zero / raw) (chibio.md section 4)
@@ -75,18 +75,20 @@ class VialFaults:
     """What is broken at one reactor; may be set at any time.
 
     unplugged: cable out. od_frozen: the spectrometer repeats its last count. od_offset: OD added to every reading.
-    od_jump: OD added to the next measurement only. spectrometer: "" sound, "dead" raw = 1, "dark" raw = 0.
-    spectrometer_glitch: probability that a single reading fails (raw = 1). stuck_open: pumps that run whatever they are
-    told. heater_runaway: heater at full power whatever it is told. stirrer_dead: does not turn.
+    od_jump: OD added to the next measurement only. spectrometer_dead: raw = 1. spectrometer_dark: raw = 0.
+    spectrometer_glitch: probability that a single reading fails (raw = 1). feed_stuck_open, waste_stuck_open,
+    heater_runaway: at full power whatever they are told. stirrer_dead: does not turn.
     """
 
     unplugged: bool = False
     od_frozen: bool = False
     od_offset: float = 0.0
     od_jump: float = 0.0
-    spectrometer: str = ""
+    spectrometer_dead: bool = False
+    spectrometer_dark: bool = False
     spectrometer_glitch: float = 0.0
-    stuck_open: set[str] = field(default_factory=set)
+    feed_stuck_open: bool = False
+    waste_stuck_open: bool = False
     heater_runaway: bool = False
     stirrer_dead: bool = False
 
@@ -122,58 +124,61 @@ class Bench:
         self._stirred_at = start
         self._motors = dict.fromkeys(self.on_s, 0)
         self._since: dict[str, tuple[float, float]] = {}
-        self._feed_s = self._waste_s = 0.0
         self._lit, self._laser_since = 0.0, np.nan
-        self._common, self._measured_at, self._last_raw = 0.0, -np.inf, 0
+        self._common, self._jump, self._measured_at, self._last_raw = 0.0, 0.0, -np.inf, 0
 
     # -- motors, heater, stirrer, laser ----------------------------------------------------------------------------
 
     def motor(self, pump: str) -> int:
         """What the motor really does: 1, -1 or 0."""
-        if not self.powered:
+        if not self.powered or self.faults.unplugged:
             return 0
-        return 1 if pump in self.faults.stuck_open else self._motors[pump]
+        stuck = {FEED: self.faults.feed_stuck_open, WASTE: self.faults.waste_stuck_open}
+        return 1 if stuck.get(pump) else self._motors[pump]
 
     def drive(self, pump: str, direction: int, at: float) -> None:
         """Write the pump's two registers: 1 forward, -1 backward, 0 off."""
-        before = self.motor(pump)
+        before = self._running(at)
         self._motors[pump] = direction
-        self._switched(pump, before, at)
+        self._book(before, at)
 
     def set_power(self, on: bool, at: float) -> None:
-        """Watchdog latch: without it every output is off."""
-        before = {pump: self.motor(pump) for pump in self._motors}
-        self.sync(at)
+        """The watchdog's latch: without power every output is off, and stays off until it is written again."""
+        before = self._running(at)
         self.powered = on
         if not on:
             self._motors = dict.fromkeys(self._motors, 0)
             self.heat = 0.0
             self.set_stirrer(0.0, at)
             self.set_laser(False, at)
+        self._book(before, at)
+
+    def set_fault(self, name: str, value: bool | float, at: float) -> None:
+        """Switch one field of `faults`; a stirrer that dies stops at once."""
+        before = self._running(at)
+        setattr(self.faults, name, value)
+        if self.faults.stirrer_dead:
+            self.set_stirrer(0.0, at)
+        self._book(before, at)
+
+    def _running(self, at: float) -> dict[str, int]:
+        """Bring the plant up to date before the motors change; what they did until now."""
+        self.sync(at)
+        return {pump: self.motor(pump) for pump in self._motors}
+
+    def _book(self, before: dict[str, int], at: float) -> None:
+        """Close and open dose records for the motors that changed from `before`."""
+        media = float(self.plant.media_ml[0])
         for pump, direction in before.items():
-            self._switched(pump, direction, at)
-
-    def set_stuck_open(self, pump: str, stuck: bool, at: float) -> None:
-        """Fault: the pump runs forward at full power whatever it is told."""
-        before = self.motor(pump)
-        (self.faults.stuck_open.add if stuck else self.faults.stuck_open.discard)(pump)
-        self._switched(pump, before, at)
-
-    def _switched(self, pump: str, before: int, at: float) -> None:
-        """Account for a motor that changed from `before` to what it does now."""
-        now = self.motor(pump)
-        if now == before:
-            return
-        self._settle_dose(pump, at)
-        if before == 0 and not self._since:
-            self.sync(at)  # a pulse starts at the start of a plant interval
-        if now != 0:
-            self._since[pump] = (at, float(self.plant.media_ml[0]))
-        else:
-            start, media = self._since.pop(pump)
-            self.sync(at)
-            delivered = float(self.plant.media_ml[0]) - media if pump == FEED else 0.0
-            self.doses.append(Dose(pump, start, at - start, before, delivered))
+            now = self.motor(pump)
+            if now == direction:
+                continue
+            if direction != 0:
+                start, had = self._since.pop(pump)
+                delivered = media - had if pump == FEED else 0.0
+                self.doses.append(Dose(pump, start, at - start, direction, delivered))
+            if now != 0:
+                self._since[pump] = (at, media)
 
     def set_heat(self, duty: float, at: float) -> None:
         """Heater power, 0 to 1."""
@@ -199,16 +204,13 @@ class Bench:
 
     # -- the culture -----------------------------------------------------------------------------------------------
 
-    def _settle_dose(self, pump: str, at: float) -> None:
-        """Book the on-time up to `at` of every running motor into the plant interval in progress."""
-
     def sync(self, at: float) -> None:
         """Bring the plant up to device time `at`."""
         while at - self._at > 1e-9:
             self._step(min(at - self._at, LONGEST_STEP_S))
 
     def _step(self, seconds: float) -> None:
-        feed, waste = (self.motor(pump) * seconds for pump in (FEED, WASTE))
+        feed, waste = (np.array([self.motor(pump) * seconds]) for pump in (FEED, WASTE))
         for pump in self._motors:
             self.on_s[pump] += abs(self.motor(pump)) * seconds
         thermal, plant = self.plant.config.thermal, self.plant
@@ -220,3 +222,47 @@ class Bench:
         plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes)
         self._at += seconds
         self.peak_ml = max(self.peak_ml, float(plant.volume_ml[0]))
+
+    # -- sensors ---------------------------------------------------------------------------------------------------
+
+    def temperature(self, which: str, at: float) -> float:
+        """Reading of a thermometer, degC: IR (culture, 0.02 degC steps), Internal or External (air, 1/16 degC)."""
+        self.sync(at)
+        if which == "IR":
+            value = float(self.plant.read_temperature()[0]) + self._rng.normal(0.0, 0.05)
+            return round(value / 0.02) * 0.02
+        warmed = 0.15 * (float(self.plant.temperature[0]) - self.config.air_c) if which == "Internal" else 0.0
+        return round((self.config.air_c + warmed + self._rng.normal(0.0, 0.05)) * 16.0) / 16.0
+
+    def counts(self, at: float, lit_fraction: float) -> int:
+        """One spectrometer reading of the laser, 16-bit counts.
+
+        raw = blank 10^-R with LINEAR R + QUADRATIC R^2 = what a noise-free sensor would show; stirred or half-lit
+        readings are lower. Args: at: device s; lit_fraction: share of the exposure with the laser on, 0 to 1.
+        """
+        self.sync(at)
+        f, c, rng = self.faults, self.config, self._rng
+        if at - self._measured_at > 10.0:  # a new measurement: what its readings share is drawn again
+            self._common, self._jump = rng.normal(0.0, c.common_fraction), f.od_jump
+            f.od_jump = 0.0
+            if rng.random() < c.outlier_rate:
+                self._jump += (0.04 + rng.exponential(0.05)) * (1.0 if rng.random() < 0.54 else -1.0)
+        self._measured_at = at
+        if f.spectrometer_dark:
+            return 0
+        if f.spectrometer_dead or rng.random() < f.spectrometer_glitch:
+            return 1
+        if f.od_frozen and self._last_raw > 0:
+            return self._last_raw
+        light = self.blank * 10.0 ** -density(float(self.plant.apparent_od[0]) + f.od_offset + self._jump)
+        if self.stir > 0.0 or at < self.settled_at:
+            light *= max(c.stir_factor * (1.0 + rng.normal(0.0, c.stir_noise)), 0.01)
+        light *= 1.0 + self._common + rng.normal(0.0, c.noise_fraction)
+        self._last_raw = int(np.clip(round(DARK_COUNTS + light * lit_fraction), 0, FULL_SCALE))
+        return self._last_raw
+
+
+def density(od: float) -> float:
+    """R of LINEAR R + QUADRATIC R^2 = OD; negative for a vial clearer than the blank, bounded where no root exists."""
+    half = LINEAR / (2.0 * QUADRATIC)
+    return float(np.sqrt(max(od / QUADRATIC + half * half, 0.0))) - half
