@@ -87,17 +87,15 @@ def _unlock(node: DictConfig) -> None:
             _unlock(node[key])
 
 
-def _unknown(cfg: Any, schema: Any, prefix: str = "") -> str | None:
-    """The message for the first key of `cfg` that the dataclass does not have, with the keys it has."""
-    if not (isinstance(cfg, DictConfig) and is_dataclass(schema)):
+def _unknown(values: Any, schema: Any, prefix: str = "") -> str | None:
+    """The message for the first key of a plain dict that the dataclass does not have, with the keys it has."""
+    if not (isinstance(values, dict) and is_dataclass(schema)):
         return None
     allowed = [f.name for f in fields(schema)]
-    for key in cfg:
-        if str(key) not in allowed:
-            return (
-                f"{prefix}{key}: no such key; allowed under '{prefix.rstrip('.') or 'the top'}': {', '.join(allowed)}"
-            )
-        value = None if OmegaConf.is_missing(cfg, key) or cfg._is_none() else cfg.get(key)
+    for key, value in values.items():
+        if key not in allowed:
+            where = f"under {prefix.rstrip('.')}" if prefix else "here"
+            return f"{prefix}{key}: no such key; allowed {where}: {', '.join(allowed)}"
         message = _unknown(value, getattr(schema, key, None), f"{prefix}{key}.")
         if message:
             return message
@@ -112,7 +110,7 @@ def load(cfg: DictConfig, schema: T) -> T:
       schema: an instance with the defaults; a nested dataclass checks its ranges in `__post_init__`.
     Raises: UserError naming key, value and what is allowed.
     """
-    message = _unknown(cfg, schema)
+    message = _unknown(OmegaConf.to_container(cfg, resolve=False), schema)
     if message:
         raise UserError(message)
     try:
