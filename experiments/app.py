@@ -12,7 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,7 +25,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-__all__ = ["UserError", "compose", "load", "normalise", "run", "write_json"]
+__all__ = ["UserError", "compose", "load", "normalise", "run", "save_config", "write_json"]
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -141,6 +141,11 @@ def _needs_check(argv: Sequence[str]) -> bool:
     return not any(a.startswith("-") for a in argv)
 
 
+def save_config(config: Any, folder: Path) -> None:
+    """Write the checked config as `config.yaml`: what `resume=` and `--config-name` read back."""
+    OmegaConf.save(OmegaConf.create(asdict(config)), folder / "config.yaml")
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON atomically: nobody ever reads half a file. Non-finite numbers become null."""
 
@@ -176,14 +181,14 @@ def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
 
     def task(cfg: DictConfig) -> float | None:
         try:
-            folder = Path(HydraConfig.get().runtime.output_dir)
+            folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
             if cfg.get("resume"):
                 stored = OmegaConf.load(folder / "config.yaml")
                 assert isinstance(stored, DictConfig)
                 config = load(OmegaConf.merge(stored, {"resume": cfg.resume}), schema)  # type: ignore[arg-type]
             else:
                 config = load(cfg, schema)
-                OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+                save_config(config, folder)
             return body(config, folder)
         except UserError as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
