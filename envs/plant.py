@@ -347,13 +347,16 @@ class Plant:
         mixed = t.medium_c + (self.temperature - t.medium_c) * kept
         cooled = t.ambient_c + (mixed - t.ambient_c) * np.exp(-minutes / t.cooling_min)
         heated = np.minimum(self.temperature_target, cooled + t.heating_c_per_min * minutes)
-        self._midway = 0.5 * (self.temperature + np.maximum(cooled, heated))
         self.temperature = np.maximum(cooled, heated)
+        # The interval's mean: a vial that is warm again early spends only a share of it on the way.
+        rise = self.temperature - mixed
+        share = np.where(rise > 0.0, np.minimum(rise / (t.heating_c_per_min * minutes), 1.0), 1.0)
+        self._mean_temperature = self.temperature - 0.5 * rise * share
 
     def _grow(self, minutes: float, dilution: Array) -> None:
         """Integrate x, s, w over an interval in which temperature and dilution rate are constant."""
         g = self.config.growth
-        response = self._phi(self._midway)
+        response = self._phi(self._mean_temperature)
         follow = 1.0 if g.adaptation_min == 0.0 else -np.expm1(-minutes / g.adaptation_min)
         self._adapted = self._adapted + (response - self._adapted) * follow
         drift = np.exp(self._log_drift) * max(1.0 + g.ramp_per_h * self.minutes / 60.0, 0.0)
@@ -362,7 +365,7 @@ class Plant:
 
         def derivative(y: Array) -> Array:
             x, s, w = y
-            rate = self._law.specific_rate(s, self._midway) * relative
+            rate = self._law.specific_rate(s, self._mean_temperature) * relative
             exchange = g.wall_attach_per_min * x - g.wall_detach_per_min * w
             return np.stack(
                 [
