@@ -12,18 +12,54 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.plant import Plant
+from envs.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig, ThermalConfig, VesselConfig
 
-__all__ = ["Bench", "BenchConfig", "Dose", "VialFaults", "density"]
+__all__ = ["PLANTS", "Bench", "BenchConfig", "Dose", "VialFaults", "density"]
 
 FEED, WASTE = "Pump1", "Pump2"
 LINEAR, QUADRATIC = 1.833, 0.226  # OD = LINEAR R + QUADRATIC R^2, R = log10(zero / raw) (chibio.md section 4)
 FULL_SCALE = 65535
 DARK_COUNTS = 3.0  # what the spectrometer counts without light
 LONGEST_STEP_S = 60.0
+SENSOR_STEP_S = 2.0
 STIR_SETTLE_S = 2.0  # readings sooner after the stirrer stopped are still disturbed
 STIR_STOPPED_S = 90.0  # a stirrer off for longer than any still phase has failed: cells settle
 DOSES_KEPT = 50_000
+
+
+def healthy_plant() -> PlantConfig:
+    """A sound reactor: pulses with their dead time, growth that follows temperature, all vials alike."""
+    return PlantConfig(
+        growth=GrowthConfig(mu=0.025, temperature_law="arrhenius", adaptation_min=2.0),
+        pump=PumpConfig(dosing="pulse", pulse_cv=0.05, dead_time_s=0.05, min_pulse_s=0.1),
+        thermal=ThermalConfig(ripple_c=0.1),
+    )
+
+
+def bench_plant() -> PlantConfig:
+    """As public logs show them: every vial has its own growth, pump, tube height and optics (biology.md section 9)."""
+    return PlantConfig(
+        growth=GrowthConfig(
+            mu=0.025, mu_cv=0.07, drift_sd_per_h=0.02, temperature_law="arrhenius", adaptation_min=2.0, yield_od=5.0
+        ),
+        pump=PumpConfig(
+            dosing="pulse",
+            gain_ml_s=1.11,
+            gain_cv=0.15,
+            pulse_cv=0.1,
+            dead_time_s=0.05,
+            min_pulse_s=0.1,
+            timing_error_s=0.02,
+            prime_low=0.3,
+            prime_high=0.7,
+        ),
+        sensor=SensorConfig(gain_cv=0.07, curvature=-0.1, blank_error=0.01, drift_per_h=0.002),
+        vessel=VesselConfig(volume_sd_ml=0.5, evaporation_ml_day=1.0),
+        thermal=ThermalConfig(ripple_c=0.15),
+    )
+
+
+PLANTS = {"bench": bench_plant, "healthy": healthy_plant}
 
 
 @dataclass(frozen=True)
@@ -138,9 +174,10 @@ class Bench:
 
     def drive(self, pump: str, direction: int, at: float) -> None:
         """Write the pump's two registers: 1 forward, -1 backward, 0 off."""
-        before = self._running(at)
-        self._motors[pump] = direction
-        self._book(before, at)
+        if direction != self._motors[pump]:
+            before = self._running(at)
+            self._motors[pump] = direction
+            self._book(before, at)
 
     def set_power(self, on: bool, at: float) -> None:
         """The watchdog's latch: without power every output is off, and stays off until it is written again."""
@@ -182,8 +219,9 @@ class Bench:
 
     def set_heat(self, duty: float, at: float) -> None:
         """Heater power, 0 to 1."""
-        self.sync(at)
-        self.heat = duty
+        if duty != self.heat:
+            self.sync(at)
+            self.heat = duty
 
     def set_stirrer(self, power: float, at: float) -> None:
         """Stirrer power, 0 to 1."""
@@ -209,6 +247,11 @@ class Bench:
         while at - self._at > 1e-9:
             self._step(min(at - self._at, LONGEST_STEP_S))
 
+    def _nearly_sync(self, at: float) -> None:
+        """`sync` for a sensor: while no pump runs, a culture does not change within two seconds."""
+        if self._since or at - self._at > SENSOR_STEP_S:
+            self.sync(at)
+
     def _step(self, seconds: float) -> None:
         feed, waste = (np.array([self.motor(pump) * seconds]) for pump in (FEED, WASTE))
         for pump in self._motors:
@@ -227,7 +270,7 @@ class Bench:
 
     def temperature(self, which: str, at: float) -> float:
         """Reading of a thermometer, degC: IR (culture, 0.02 degC steps), Internal or External (air, 1/16 degC)."""
-        self.sync(at)
+        self._nearly_sync(at)
         if which == "IR":
             value = float(self.plant.read_temperature()[0]) + self._rng.normal(0.0, 0.05)
             return round(value / 0.02) * 0.02
@@ -240,7 +283,7 @@ class Bench:
         raw = blank 10^-R with LINEAR R + QUADRATIC R^2 = what a noise-free sensor would show; stirred or half-lit
         readings are lower. Args: at: device s; lit_fraction: share of the exposure with the laser on, 0 to 1.
         """
-        self.sync(at)
+        self._nearly_sync(at)
         f, c, rng = self.faults, self.config, self._rng
         if at - self._measured_at > 10.0:  # a new measurement: what its readings share is drawn again
             self._common, self._jump = rng.normal(0.0, c.common_fraction), f.od_jump

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from envs.plant import Plant, PlantConfig, PumpConfig
+from envs.plant import Plant, PlantConfig
 from hardware.clock import Clock
 from hardware.emulator_app import AppError, BusStuck, ProcessDied, ReactorApp, Steps
-from hardware.emulator_bench import Bench, BenchConfig, VialFaults
+from hardware.emulator_bench import Bench, BenchConfig, VialFaults, healthy_plant
 from hardware.emulator_faults import LinkFaults
 from hardware.emulator_routes import HTML, Answer, answer_request
 from hardware.emulator_state import ALL_REACTORS
@@ -29,6 +29,7 @@ from hardware.emulator_state import ALL_REACTORS
 __all__ = ["ChiBioDevice", "DeviceOptions", "Exchange"]
 
 EPOCH = 1_767_225_600.0  # the board's clock at device second 0: 2026-01-01 00:00:00
+REQUEST = "request"  # owner of the events of the request being served
 POWER_LATCH_S = 1.0  # the watchdog cuts power about a second after the software stopped
 ERROR_PAGE = b"<!doctype html>\n<title>500 Internal Server Error</title>\n<h1>Internal Server Error</h1>\n"
 
@@ -45,7 +46,7 @@ class DeviceOptions:
     boot_s: float = 8.0
     request_s: float = 0.005
     bench: BenchConfig = field(default_factory=BenchConfig)
-    plant: PlantConfig = field(default_factory=lambda: PlantConfig(pump=PumpConfig(dosing="pulse")))
+    plant: PlantConfig = field(default_factory=healthy_plant)
 
     def __post_init__(self) -> None:
         for key, low, high in (("worker_timeout_s", 1.0, 3600.0), ("boot_s", 0.0, 600.0), ("request_s", 0.0, 5.0)):
@@ -95,6 +96,7 @@ class ChiBioDevice:
       rng: noise of everything, one stream per reactor.
       options: see `DeviceOptions`.
       od: initial optical density, one for all or one per reactor; temperature: of the vials, degC.
+      blanked: start with the zeros an operator has set with clear medium; False = 65000, as after power-on.
     Raises: ValueError for an unknown or repeated position or a wrong number of ODs.
     """
 
@@ -106,6 +108,7 @@ class ChiBioDevice:
         options: DeviceOptions | None = None,
         od: float | Sequence[float] = 0.3,
         temperature: float = 24.0,
+        blanked: bool = False,
     ) -> None:
         if not reactors or len(set(reactors)) != len(reactors) or not set(reactors) <= set(ALL_REACTORS):
             raise ValueError(f"reactors = {','.join(reactors)}: allowed a list of different names from M0 to M7")
@@ -117,7 +120,7 @@ class ChiBioDevice:
         self._now = clock.now()
         self._events: list[_Event] = []
         self._order = self._life = 0
-        self._wall_offset = 0.0
+        self._wall_offset = self._deadline = 0.0
         self.alive, self._ready = True, True
         self._queue: deque[Exchange] = deque()
         self._serving: Exchange | None = None
@@ -132,6 +135,8 @@ class ChiBioDevice:
             plant.reset(start_od, temperature)
             self.benches[name] = Bench(plant, self.options.bench, bench_stream, self._now)
         self._power_on_software()
+        for name, bench in self.benches.items() if blanked else ():
+            self.apps[name].data["OD0"]["target"] = round(bench.blank)
 
     # -- the computer (protocol Board) -----------------------------------------------------------------------------
 
@@ -185,8 +190,10 @@ class ChiBioDevice:
     def _resume(self, event: _Event) -> None:
         try:
             pause = next(event.steps)
-        except (StopIteration, BusStuck):
+        except StopIteration:
             return
+        except BusStuck:
+            pause = math.inf
         except ProcessDied as problem:
             self._note(f"{event.owner}: {problem}")
             self._exit()
@@ -194,7 +201,11 @@ class ChiBioDevice:
         except (AppError, ArithmeticError, LookupError, TypeError, ValueError) as problem:
             self._note(f"{event.owner}: {type(problem).__name__}: {problem}")  # the thread ends, silently as there
             return
-        self._schedule(pause, event.steps, event.life, event.owner)
+        if event.owner == REQUEST and self._now + pause > self._deadline:
+            pause = self._deadline - self._now
+            event.steps = self._watch()
+        if pause < math.inf:
+            self._schedule(pause, event.steps, event.life, event.owner)
         if self.faults.bus_stuck_when_pumping and any(b.motor("Pump1") for b in self.benches.values()):
             self.faults.bus_stuck, self.faults.bus_stuck_when_pumping = True, False
 
@@ -316,13 +327,12 @@ class ChiBioDevice:
         """One worker, one request at a time."""
         if self._ready and self._serving is None and self._queue:
             self._serving = self._queue.popleft()
-            self._schedule(0.0, self._serve(self._serving), self._life, "request")
-            limit = self.options.worker_timeout_s
-            self._schedule(limit, self._watch(self._serving), self._life, "request watch")
+            self._deadline = self._now + self.options.worker_timeout_s
+            self._schedule(0.0, self._serve(self._serving), self._life, REQUEST)
 
-    def _watch(self, exchange: Exchange) -> Steps:
-        if exchange is self._serving:
-            self.kill_worker()
+    def _watch(self) -> Steps:
+        """What a request that outlives the worker's time-out comes to."""
+        self.kill_worker()
         yield from ()
 
     def _serve(self, exchange: Exchange) -> Steps:
