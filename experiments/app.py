@@ -12,7 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,7 +25,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-__all__ = ["UserError", "compose", "load", "normalise", "run", "write_json"]
+__all__ = ["UserError", "compose", "load", "normalise", "run", "save_config", "write_json"]
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -87,17 +87,15 @@ def _unlock(node: DictConfig) -> None:
             _unlock(node[key])
 
 
-def _unknown(cfg: Any, schema: Any, prefix: str = "") -> str | None:
-    """The message for the first key of `cfg` that the dataclass does not have, with the keys it has."""
-    if not (isinstance(cfg, DictConfig) and is_dataclass(schema)):
+def _unknown(values: Any, schema: Any, prefix: str = "") -> str | None:
+    """The message for the first key of a plain dict that the dataclass does not have, with the keys it has."""
+    if not (isinstance(values, dict) and is_dataclass(schema)):
         return None
     allowed = [f.name for f in fields(schema)]
-    for key in cfg:
-        if str(key) not in allowed:
-            return (
-                f"{prefix}{key}: no such key; allowed under '{prefix.rstrip('.') or 'the top'}': {', '.join(allowed)}"
-            )
-        value = None if OmegaConf.is_missing(cfg, key) or cfg._is_none() else cfg.get(key)
+    for key, value in values.items():
+        if key not in allowed:
+            where = f"under {prefix.rstrip('.')}" if prefix else "here"
+            return f"{prefix}{key}: no such key; allowed {where}: {', '.join(allowed)}"
         message = _unknown(value, getattr(schema, key, None), f"{prefix}{key}.")
         if message:
             return message
@@ -112,7 +110,7 @@ def load(cfg: DictConfig, schema: T) -> T:
       schema: an instance with the defaults; a nested dataclass checks its ranges in `__post_init__`.
     Raises: UserError naming key, value and what is allowed.
     """
-    message = _unknown(cfg, schema)
+    message = _unknown(OmegaConf.to_container(cfg, resolve=False), schema)
     if message:
         raise UserError(message)
     try:
@@ -141,6 +139,11 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
 def _needs_check(argv: Sequence[str]) -> bool:
     """A sweep or a Hydra flag (--help, --cfg job, -m) is Hydra's to read; a plain run is checked beforehand."""
     return not any(a.startswith("-") for a in argv)
+
+
+def save_config(config: Any, folder: Path) -> None:
+    """Write the checked config as `config.yaml`: what `resume=` and `--config-name` read back."""
+    OmegaConf.save(OmegaConf.create(asdict(config)), folder / "config.yaml")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -178,14 +181,14 @@ def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
 
     def task(cfg: DictConfig) -> float | None:
         try:
-            folder = Path(HydraConfig.get().runtime.output_dir)
+            folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
             if cfg.get("resume"):
                 stored = OmegaConf.load(folder / "config.yaml")
                 assert isinstance(stored, DictConfig)
                 config = load(OmegaConf.merge(stored, {"resume": cfg.resume}), schema)  # type: ignore[arg-type]
             else:
                 config = load(cfg, schema)
-                OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+                save_config(config, folder)
             return body(config, folder)
         except UserError as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:

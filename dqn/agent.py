@@ -1,0 +1,174 @@
+"""The agent: epsilon-greedy action choice and one DQN update, for S independent seeds at once; one is S = 1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from dqn.config import DQNConfig
+from dqn.network import QNetwork, initial_weights
+from dqn.replay import Replay, Transition
+from dqn.schedules import decayed, linear
+from dqn.streams import UniformStream
+from dqn.targets import blend, double_q_target, loss_gradient, q_target
+
+__all__ = ["STREAMS", "DQNAgent", "Relabel"]
+
+STREAMS = ("init", "explore", "replay", "relabel")
+"""Names of the random streams an agent needs, each independent of the others."""
+
+Relabel = Callable[[Transition, torch.Tensor], Transition]
+"""Replaces the goal of a minibatch: (transitions (S, B), uniform numbers (S, B, 2)) -> transitions (S, B)."""
+
+
+class DQNAgent:
+    """Deep Q-learning (Mnih 2015) of S agents that share nothing but the machine.
+
+    One update (`learn`): draw a minibatch, form y = r + gamma max_a Q_target(s', a), take one Adam step on
+    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates blend the target network.
+
+    Args:
+      config: hyper-parameters.
+      observations: O, numbers per observation. actions: A.
+      streams: for each name in STREAMS one SeedSequence per agent.
+      relabel: goal replacement, used on a share `config.relabel` of each minibatch.
+      device: "cpu" or "cuda".
+    """
+
+    def __init__(
+        self,
+        config: DQNConfig,
+        observations: int,
+        actions: int,
+        streams: Mapping[str, Sequence[np.random.SeedSequence]],
+        relabel: Relabel | None = None,
+        device: str = "cpu",
+    ) -> None:
+        self.config = config
+        self.device = torch.device(device)
+        self.n_agents = len(streams["init"])
+        self.n_actions = actions
+        matrix = offset = None
+        if config.input_matrix:
+            offset = torch.tensor(config.input_offset, dtype=torch.float32, device=self.device)
+            matrix = torch.tensor(config.input_matrix, dtype=torch.float32, device=self.device).view(len(offset), -1)
+        features = observations if offset is None else len(offset)
+        self.sizes = (features, *config.hidden, actions)
+        flat = np.stack([initial_weights(self.sizes, seed) for seed in streams["init"]])
+        weights = torch.from_numpy(flat).to(self.device)
+        self.online = QNetwork(weights, self.sizes, matrix, offset)
+        self.target = QNetwork(weights.clone(), self.sizes, matrix, offset)
+        self.greedy = QNetwork(weights.clone(), self.sizes, matrix, offset) if config.average else self.online
+        parameter = torch.nn.Parameter(weights)
+        parameter.grad = self.online.grad
+        self._adam = torch.optim.Adam([parameter], lr=config.learning_rate, fused=True)
+        self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
+        self._explore = UniformStream(streams["explore"], 2, self.device)
+        self._draws = UniformStream(streams["replay"], config.batch_size, self.device)
+        self._relabelled = round(config.relabel * config.batch_size)
+        self._goals = UniformStream(streams["relabel"], max(1, 2 * self._relabelled), self.device)
+        self._relabel = relabel
+        if self._relabelled and relabel is None:
+            raise ValueError(f"agent.relabel = {config.relabel}: this task has no goal to replace; set it to 0")
+        self.steps = 0  # environment steps taken
+        self.updates = 0
+        self.loss = torch.zeros(self.n_agents, device=self.device)  # of the last update
+        self.q_range = torch.zeros(self.n_agents, 2, device=self.device)  # min and max Q in its minibatch
+
+    @property
+    def epsilon(self) -> float:
+        """Exploration rate now."""
+        c = self.config
+        return linear(c.epsilon_start, c.epsilon_end, c.epsilon_steps, self.steps)
+
+    @property
+    def learning_rate(self) -> float:
+        """Adam's rate now."""
+        c = self.config
+        return decayed(c.learning_rate, c.learning_rate_decay, c.total_updates, self.updates)
+
+    @torch.no_grad()
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """Epsilon-greedy actions for one observation per agent, (S, O) -> (S,) int64."""
+        u = self._explore.next()
+        best = self.online(observation.unsqueeze(1))[:, 0].argmax(-1)
+        return torch.where(u[:, 0] < self.epsilon, (u[:, 1] * self.n_actions).long(), best)
+
+    @torch.no_grad()
+    def observe(self, step: Transition) -> None:
+        """Remember one step of every agent and do the updates that are due."""
+        self.replay.add(step._replace(r_t=step.r_t * self.config.reward_scale))
+        self.steps += 1
+        if self.steps > self.config.learn_start:
+            for _ in range(self.config.updates_per_step):
+                self.learn()
+
+    def _minibatch(self) -> Transition:
+        """B transitions per agent, the first ones with another goal."""
+        batch = self.replay.sample(self._draws.next())
+        n = self._relabelled
+        if n:
+            assert self._relabel is not None
+            numbers = self._goals.next().view(self.n_agents, n, 2)
+            changed = self._relabel(Transition(*(field[:, :n] for field in batch)), numbers)
+            changed = changed._replace(r_t=changed.r_t * self.config.reward_scale)
+            batch = Transition(*(torch.cat([a, b[:, n:]], dim=1) for a, b in zip(changed, batch, strict=True)))
+        return batch
+
+    @torch.no_grad()
+    def learn(self) -> None:
+        """One update of every agent."""
+        c = self.config
+        batch = self._minibatch()
+        q_t = self.target(batch.s_t)
+        if c.double:
+            target = double_q_target(batch.r_t, batch.continues, c.gamma, q_t, self.online(batch.s_t))
+        else:
+            target = q_target(batch.r_t, batch.continues, c.gamma, q_t)
+        q_tm1, inputs = self.online.forward(batch.s_tm1)
+        self.loss, gradient = loss_gradient(q_tm1, batch.a_tm1, target, c.huber)
+        self.online.backward(inputs, gradient)
+        self._adam.param_groups[0]["lr"] = self.learning_rate
+        self._adam.step()
+        self.updates += 1
+        if self.updates % c.target_period == 0:
+            blend(self.target.flat, self.online.flat, c.target_blend)
+            self.q_range = torch.stack([q_tm1.amin((1, 2)), q_tm1.amax((1, 2))], dim=1)
+        if c.average:
+            blend(self.greedy.flat, self.online.flat, 1.0 - c.average)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The complete learning state: loading it into a new agent of the same config continues to the bit."""
+        return {
+            "online": self.online.flat.cpu(),
+            "target": self.target.flat.cpu(),
+            "greedy": self.greedy.flat.cpu(),
+            "adam": self._adam.state_dict(),
+            "replay": self.replay.state_dict(),
+            "explore": self._explore.state_dict(),
+            "draws": self._draws.state_dict(),
+            "goals": self._goals.state_dict(),
+            "steps": self.steps,
+            "updates": self.updates,
+            "loss": self.loss.cpu(),
+            "q_range": self.q_range.cpu(),
+        }
+
+    @torch.no_grad()
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue as saved. Raises: RuntimeError from torch where shapes differ."""
+        self.online.flat.copy_(state["online"])
+        self.target.flat.copy_(state["target"])
+        self.greedy.flat.copy_(state["greedy"])
+        self._adam.load_state_dict(state["adam"])
+        self.replay.load_state_dict(state["replay"])
+        self._explore.load_state_dict(state["explore"])
+        self._draws.load_state_dict(state["draws"])
+        self._goals.load_state_dict(state["goals"])
+        self.steps = state["steps"]
+        self.updates = state["updates"]
+        self.loss = state["loss"].to(self.device)
+        self.q_range = state["q_range"].to(self.device)

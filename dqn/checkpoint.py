@@ -1,0 +1,60 @@
+"""Complete training states on disk: written atomically, read without executing anything."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+
+__all__ = ["CheckpointError", "load", "save"]
+
+FORMAT = 1
+
+
+class CheckpointError(Exception):
+    """A checkpoint cannot be used; the message says which and why."""
+
+
+def save(path: Path, state: dict[str, Any]) -> None:
+    """Write tensors and plain Python values so that `path` is always a whole checkpoint, also after kill -9.
+
+    Raises: OSError where the disk refuses; the previous checkpoint stays.
+    """
+    temporary = path.with_suffix(path.suffix + ".part")
+    with open(temporary, "wb") as f:
+        torch.save({"format": FORMAT, "state": state}, f)
+        f.flush()
+        os.fsync(f.fileno())
+    os.replace(temporary, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read a checkpoint; only tensors and plain values are accepted.
+
+    Raises: CheckpointError naming the file and the remedy.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"{path}: no such checkpoint; the run ended before its first one, start it anew"
+        ) from None
+    except Exception as error:  # torch raises whatever its unpickler meets
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(
+            f"{path}: not a readable checkpoint ({reason}); use one written by this project"
+        ) from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{path}: checkpoint format {content.get('format') if isinstance(content, dict) else '?'}: "
+            f"allowed {FORMAT}; train anew with this version"
+        )
+    state: dict[str, Any] = content["state"]
+    return state

@@ -1,0 +1,38 @@
+"""From the weights of one torch agent to `dqn.policy.Policy`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dqn.network import QNetwork
+from dqn.policy import FORMAT, OBSERVATION, Policy
+
+__all__ = ["export"]
+
+
+def export(
+    network: QNetwork, agent: int, flat: torch.Tensor, pump_rates: NDArray[np.float64], metadata: dict[str, Any]
+) -> Policy:
+    """The greedy policy of one agent.
+
+    Args:
+      network: gives layer sizes and input map.
+      agent: index into `flat`.
+      flat: weights of all agents, shape (S, P); not necessarily the network's own (the best ones, say).
+      pump_rates: the action grid, mL/s, shape (A,).
+      metadata: control_min, model, config_hash and whatever else a bench should check or show.
+    """
+    own = QNetwork(flat[agent : agent + 1].detach().cpu().clone(), network.sizes)
+    matrix, offset = network.input_map()
+    return Policy(
+        weights=tuple(weight[0].numpy().copy() for weight, _ in own.layers),
+        biases=tuple(bias[0, 0].numpy().copy() for _, bias in own.layers),
+        input_matrix=matrix,
+        input_offset=offset,
+        pump_rates=np.asarray(pump_rates, dtype=np.float64),
+        metadata={"format": FORMAT, "observation": list(OBSERVATION), **metadata},
+    )

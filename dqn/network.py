@@ -1,0 +1,106 @@
+"""S independent Q-networks evaluated together: multilayer perceptrons whose weights carry a leading agent axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+
+__all__ = ["QNetwork", "initial_weights"]
+
+Layer = tuple[torch.Tensor, torch.Tensor]
+
+
+def initial_weights(sizes: Sequence[int], seed: np.random.SeedSequence) -> np.ndarray:
+    """Weights of one network, flat: W and b of each layer uniform in +-1/sqrt(inputs) (the default of torch.nn.Linear).
+
+    Args:
+      sizes: units of input, hidden and output layers.
+      seed: the agent's own stream.
+    Returns: float32, shape (P,).
+    """
+    rng = np.random.default_rng(seed)
+    parts = []
+    for inputs, outputs in pairwise(sizes):
+        bound = 1.0 / np.sqrt(inputs)
+        parts += [rng.uniform(-bound, bound, inputs * outputs), rng.uniform(-bound, bound, outputs)]
+    return np.concatenate(parts).astype(np.float32)
+
+
+class QNetwork:
+    """Q(observation, .) = W3 relu(W2 relu(W1 f + b1) + b2) + b3 with f = M observation + c, for S agents at once.
+
+    M and c are constants of the input, stored and exported with the weights. All weights of all agents live in one
+    tensor `flat`, shape (S, P), whose slices are the layers; an optimiser, a copy or a running mean is then one
+    operation. Gradients are written out by hand: two matrix products a layer, no graph.
+
+    Args:
+      flat: weights, shape (S, P), laid out as by `initial_weights`.
+      sizes: units of feature, hidden and output layers.
+      matrix: M, shape (features, observations); None means that the features are the observation.
+      offset: c, shape (features,).
+    """
+
+    def __init__(
+        self,
+        flat: torch.Tensor,
+        sizes: Sequence[int],
+        matrix: torch.Tensor | None = None,
+        offset: torch.Tensor | None = None,
+    ) -> None:
+        self.flat = flat
+        self.sizes = tuple(sizes)
+        self.layers = self._views(flat)
+        self.grad = torch.zeros_like(flat)
+        self._grads = self._views(self.grad)
+        self._matrix = torch.eye(self.sizes[0], device=flat.device) if matrix is None else matrix
+        self._offset = torch.zeros(self.sizes[0], device=flat.device) if offset is None else offset
+
+    def _views(self, flat: torch.Tensor) -> list[Layer]:
+        """(W, b) of each layer as views: W (S, in, out), b (S, 1, out)."""
+        views = []
+        start = 0
+        for i, o in pairwise(self.sizes):
+            middle, end = start + i * o, start + i * o + o
+            views.append((flat[:, start:middle].view(-1, i, o), flat[:, middle:end].view(-1, 1, o)))
+            start = end
+        return views
+
+    def with_weights(self, flat: torch.Tensor) -> QNetwork:
+        """The same network with other weights, shape (S', P)."""
+        return QNetwork(flat, self.sizes, self._matrix, self._offset)
+
+    def features(self, observation: torch.Tensor) -> torch.Tensor:
+        """f = M observation + c; observation (S, B, observations) -> (S, B, features)."""
+        return torch.matmul(observation, self._matrix.T).add_(self._offset)
+
+    def input_map(self) -> tuple[np.ndarray, np.ndarray]:
+        """M (F, O) and c (F,) as NumPy arrays."""
+        return self._matrix.cpu().numpy().copy(), self._offset.cpu().numpy().copy()
+
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Q values, shape (S, B, A), and the inputs of each layer, for `backward`."""
+        h = self.features(observation)
+        inputs = []
+        for weight, bias in self.layers[:-1]:
+            inputs.append(h)
+            h = torch.baddbmm(bias, h, weight).relu_()
+        inputs.append(h)
+        weight, bias = self.layers[-1]
+        return torch.baddbmm(bias, h, weight), inputs
+
+    def __call__(self, observation: torch.Tensor) -> torch.Tensor:
+        """Q values only; observation (S, B, observations) -> (S, B, A)."""
+        return self.forward(observation)[0]
+
+    def backward(self, inputs: list[torch.Tensor], grad_q: torch.Tensor) -> None:
+        """Fill `grad` with the gradient of a loss whose derivative by Q is `grad_q`, shape (S, B, A)."""
+        delta = grad_q
+        for k in range(len(self.layers) - 1, -1, -1):
+            grad_weight, grad_bias = self._grads[k]
+            torch.bmm(inputs[k].transpose(1, 2), delta, out=grad_weight)
+            torch.sum(delta, 1, keepdim=True, out=grad_bias)
+            if k > 0:
+                delta = torch.bmm(delta, self.layers[k][0].transpose(1, 2)).mul_(inputs[k] > 0)

@@ -1,0 +1,52 @@
+"""TD targets and losses as pure functions; S agents, B transitions, A actions."""
+
+from __future__ import annotations
+
+import torch
+
+__all__ = ["blend", "double_q_target", "loss_gradient", "q_target"]
+
+
+def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor) -> torch.Tensor:
+    """y = r + gamma c max_a Q_target(s', a) (Mnih 2015).
+
+    Args:
+      r_t, continues: shape (S, B); q_t: target network at s', shape (S, B, A).
+    Returns: shape (S, B).
+    """
+    return r_t + gamma * continues * q_t.amax(-1)
+
+
+def double_q_target(
+    r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor, q_t_online: torch.Tensor
+) -> torch.Tensor:
+    """y = r + gamma c Q_target(s', argmax_a Q_online(s', a)) (van Hasselt 2016); arguments as `q_target`."""
+    best = q_t_online.argmax(-1, keepdim=True)
+    return r_t + gamma * continues * q_t.gather(-1, best).squeeze(-1)
+
+
+def loss_gradient(
+    q_tm1: torch.Tensor, a_tm1: torch.Tensor, target: torch.Tensor, huber: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Loss of each agent and its gradient by all Q values.
+
+    L = mean_B l(d), d = Q(s, a) - y, with l(d) = d^2 / 2, or beyond |d| = huber its tangent (Huber 1964).
+
+    Args:
+      q_tm1: (S, B, A); a_tm1: (S, B) int64; target: y (S, B); huber: 0 means squared error.
+    Returns: loss (S,), dL/dQ (S, B, A).
+    """
+    action = a_tm1.unsqueeze(-1)
+    d = q_tm1.gather(-1, action).squeeze(-1) - target
+    slope = d if huber == 0.0 else d.clamp(-huber, huber)
+    loss = (slope * (d - 0.5 * slope)).mean(-1)
+    gradient = torch.zeros_like(q_tm1).scatter_(-1, action, slope.unsqueeze(-1) / d.shape[-1])
+    return loss, gradient
+
+
+def blend(target: torch.Tensor, online: torch.Tensor, share: float) -> None:
+    """target <- (1 - share) target + share online, in place; share 1 copies."""
+    if share == 1.0:
+        target.copy_(online)
+    else:
+        target.lerp_(online, share)

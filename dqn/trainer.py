@@ -1,0 +1,140 @@
+"""The loop of agent and environment as a generator; counting, logging, evaluating and stopping belong to the caller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dqn.agent import DQNAgent
+from dqn.replay import Transition
+
+__all__ = ["TrainRecord", "Trainer", "TrainingEnv"]
+
+Step = tuple[
+    NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
+]  # observations, rewards, terminated, truncated, infos
+
+
+class TrainingEnv(Protocol):
+    """A vector environment with one copy per agent, SAME_STEP autoreset, whose state can be saved."""
+
+    def reset(self) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start episodes in all copies."""
+        ...
+
+    def step(self, actions: NDArray[np.intp]) -> Step:
+        """One step in all copies; infos["final_obs"] holds last observations where an episode ended."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Complete state."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
+        """Restore it; returns the current observations."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrainRecord:
+    """What happened in one interval of training; arrays have one entry per agent, shape (S,).
+
+    episode_return: undiscounted reward of the last episode that ended in the interval, nan where none did.
+    loss, q_min, q_max: of the last update (q range: at the last target blend).
+    """
+
+    step: int
+    updates: int
+    epsilon: float
+    learning_rate: float
+    episode_return: NDArray[np.float64]
+    loss: NDArray[np.float64]
+    q_min: NDArray[np.float64]
+    q_max: NDArray[np.float64]
+
+
+class Trainer:
+    """Lets S agents act in S copies of the environment and learn.
+
+    Args:
+      env: one copy per agent.
+      agent: the S agents.
+      interval: steps between records.
+    """
+
+    def __init__(self, env: TrainingEnv, agent: DQNAgent, interval: int) -> None:
+        self.env = env
+        self.agent = agent
+        self.interval = interval
+        self._return = np.zeros(agent.n_agents)
+        self._finished = np.full(agent.n_agents, np.nan)
+        self._observation: NDArray[np.float32] | None = None
+
+    def run(self) -> Iterator[TrainRecord]:
+        """Train until the config's total_steps, yielding a record every `interval` steps and at the end."""
+        if self._observation is None:
+            self._observation, _ = self.env.reset()
+        total = self.agent.config.total_steps
+        while self.agent.steps < total:
+            self._step()
+            if self.agent.steps % self.interval == 0 or self.agent.steps == total:
+                yield self._record()
+                self._finished[:] = np.nan
+
+    def _step(self) -> None:
+        """One environment step of every agent, and its updates."""
+        assert self._observation is not None
+        agent = self.agent
+        before = torch.from_numpy(self._observation).to(agent.device)
+        action = agent.act(before)
+        self._observation, reward, terminated, truncated, infos = self.env.step(action.cpu().numpy())
+        done = terminated | truncated
+        # the state that was really reached: at an episode's end the environment already shows the next episode
+        reached = np.where(done[:, None], infos["final_obs"], self._observation) if done.any() else self._observation
+        step = Transition(
+            s_tm1=before.unsqueeze(1),
+            a_tm1=action.unsqueeze(1),
+            r_t=torch.from_numpy(reward.astype(np.float32)).to(agent.device).unsqueeze(1),
+            s_t=torch.from_numpy(reached).to(agent.device).unsqueeze(1),
+            continues=torch.from_numpy(~terminated).to(agent.device, torch.float32).unsqueeze(1),
+        )
+        agent.observe(step)
+        self._return += reward
+        if done.any():
+            self._finished[done] = self._return[done]
+            self._return[done] = 0.0
+
+    def _record(self) -> TrainRecord:
+        agent = self.agent
+        q_range = agent.q_range.cpu().numpy().astype(np.float64)
+        return TrainRecord(
+            step=agent.steps,
+            updates=agent.updates,
+            epsilon=agent.epsilon,
+            learning_rate=agent.learning_rate,
+            episode_return=self._finished.copy(),
+            loss=agent.loss.cpu().numpy().astype(np.float64),
+            q_min=q_range[:, 0],
+            q_max=q_range[:, 1],
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Complete state of agents, environment and loop."""
+        return {
+            "agent": self.agent.state_dict(),
+            "env": self.env.state_dict(),
+            "return": self._return.tolist(),
+            "finished": self._finished.tolist(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue as saved."""
+        self.agent.load_state_dict(state["agent"])
+        self._observation = self.env.load_state_dict(state["env"])
+        self._return[:] = state["return"]
+        self._finished[:] = state["finished"]

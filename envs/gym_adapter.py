@@ -1,0 +1,61 @@
+"""The single-environment view of the vector environment, for libraries that expect `gymnasium.Env`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.task import EnvConfig
+from envs.vector_env import BioreactorVectorEnv, action_space, observation_space
+
+__all__ = ["BioreactorEnv", "register"]
+
+ENV_ID = "Bioreactor-v0"
+
+
+class BioreactorEnv(gymnasium.Env[Any, Any]):
+    """`BioreactorVectorEnv` with N = 1 and no autoreset; observation, action and reward are specified there.
+
+    Version history: v0, the task of the paper.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
+
+    def __init__(self, config: EnvConfig | None = None, **overrides: Any) -> None:
+        self._batch = BioreactorVectorEnv(1, config, **overrides)
+        self.config = self._batch.config
+        self.observation_space = observation_space()
+        self.action_space = action_space(self.config)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; with a seed the same one every time."""
+        super().reset(seed=seed)
+        observation, _ = self._batch.reset(seed=seed)
+        return observation[0], {}
+
+    def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """One control period; `truncated` after `episode_steps`, after which `reset` must follow.
+
+        Raises: ValueError for an action outside the grid.
+        """
+        if not self.action_space.contains(action):
+            raise ValueError(f"action {action!r}: allowed 0 to {self.config.n_actions - 1} (index of a pump rate)")
+        observation, reward, _, truncated, infos = self._batch.step(np.asarray([action]))
+        if truncated[0]:
+            observation = infos["final_obs"]
+        return observation[0], float(reward[0]), False, bool(truncated[0]), {}
+
+
+def register() -> None:
+    """Make `gymnasium.make("Bioreactor-v0")` and `gymnasium.make_vec(...)` work; called on import of `envs`."""
+    if ENV_ID not in gymnasium.registry:
+        gymnasium.register(
+            id=ENV_ID,
+            entry_point="envs.gym_adapter:BioreactorEnv",
+            vector_entry_point="envs.vector_env:BioreactorVectorEnv",
+        )

@@ -1,0 +1,212 @@
+"""N training episodes side by side as one `gymnasium.vector.VectorEnv`, without a Python loop over copies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from envs.rewards import tracking_reward
+from envs.task import EnvConfig, step_factors
+
+__all__ = ["BioreactorVectorEnv", "EpisodeStreams", "action_space", "observation_space"]
+
+Array = NDArray[np.float64]
+EPISODES_PER_BLOCK = 64
+
+
+def observation_space() -> spaces.Box:
+    """[x, setpoint], OD without unit, shape (2,), float32, each >= 0; x is capped where no sensor reads further."""
+    return spaces.Box(low=0.0, high=np.array([MAX_OD, 2.0], dtype=np.float32), shape=(2,), dtype=np.float32)
+
+
+def action_space(config: EnvConfig) -> spaces.Discrete:
+    """Index into the pump rates, 0 (pump off) to n_actions - 1 (maximum rate)."""
+    return spaces.Discrete(config.n_actions)
+
+
+MAX_OD = 1000.0  # keeps a runaway copy finite: 100 steps at mu = 0.1/min from OD 4 reach 1e5, no culture does
+
+
+class EpisodeStreams:
+    """Two uniform numbers per episode and copy (start OD, setpoint), each copy from a generator of its own.
+
+    Copy i draws the same numbers whatever N is. Numbers are drawn in blocks, so that a reset of thousands of copies
+    costs no Python loop; the state is that of the generators before their block, and how far into it each copy is.
+    """
+
+    def __init__(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
+        self._generators = [np.random.default_rng(seed) for seed in seeds]
+        self._states: list[Any] = [None] * len(seeds)
+        self._block = np.empty((len(seeds), EPISODES_PER_BLOCK, 2))
+        self._position = np.zeros(len(seeds), dtype=np.intp)
+        self._refill(np.arange(len(seeds)))
+
+    def _refill(self, copies: NDArray[np.intp]) -> None:
+        for i in copies:
+            self._states[i] = self._generators[i].bit_generator.state
+            self._generators[i].random(out=self._block[i])
+        self._position[copies] = 0
+
+    def take(self, copies: NDArray[np.intp]) -> Array:
+        """Two numbers in [0, 1) for each of `copies`, shape (len(copies), 2)."""
+        used_up = copies[self._position[copies] == EPISODES_PER_BLOCK]
+        if used_up.size:
+            self._refill(used_up)
+        numbers = self._block[copies, self._position[copies]]
+        self._position[copies] += 1
+        return numbers
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue; plain numbers and lists."""
+        return {"generators": list(self._states), "position": self._position.tolist()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue as saved."""
+        for generator, stored in zip(self._generators, state["generators"], strict=True):
+            generator.bit_generator.state = stored
+        self._refill(np.arange(len(self._generators)))
+        self._position[:] = state["position"]
+
+
+class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
+    """A culture held at a setpoint by choosing a pump rate every control period (paper, sections 2 and 3).
+
+    Dynamics: x' = (mu - u/tau) x, integrated with `substeps` steps of `integrator` per control period.
+
+    | observation | meaning                       | range      | unit |
+    |-------------|-------------------------------|------------|------|
+    | 0           | optical density x             | [0, 1000]  | -    |
+    | 1           | setpoint of this episode      | (0, 2]     | -    |
+
+    Action: index a of the pump rate u = a / (n_actions - 1) * max_pump_rate, mL/s.
+    Reward: -(x - setpoint)^2 of the x reached; in the last step times `final_reward_weight`.
+    Start: x uniform in `start_od`, setpoint drawn from `setpoints`, both from the copy's own stream.
+    End: never terminated; truncated after `episode_steps` steps (bootstrapping continues).
+    Autoreset: SAME_STEP; the last observation of an ended episode is in infos["final_obs"].
+
+    Args:
+      num_envs: N >= 1.
+      config: the task.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
+
+    def __init__(self, num_envs: int = 1, config: EnvConfig | None = None, **overrides: Any) -> None:
+        self.config = EnvConfig(**overrides) if config is None else config
+        self.num_envs = num_envs
+        self.render_mode = None
+        self.single_observation_space = observation_space()
+        self.single_action_space = action_space(self.config)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._factors = step_factors(self.config)
+        self._setpoints = np.asarray(self.config.setpoints)
+        self._od = np.ones(num_envs)
+        self._setpoint = np.ones(num_envs)
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._streams: EpisodeStreams | None = None
+
+    @property
+    def od(self) -> Array:
+        """True x in full precision, shape (N,); a view to read."""
+        return self._od
+
+    @property
+    def setpoint(self) -> Array:
+        """Setpoint of the running episode, shape (N,); a view to read."""
+        return self._setpoint
+
+    def seed_streams(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
+        """Give every copy its stream; `reset(seed=...)` does this with seed, seed + 1, ..."""
+        self._streams = EpisodeStreams(seeds)
+
+    def _start(self, copies: NDArray[np.intp]) -> None:
+        """Begin a new episode in `copies`."""
+        assert self._streams is not None
+        numbers = self._streams.take(copies)
+        low, high = self.config.start_od
+        self._od[copies] = low + (high - low) * numbers[:, 0]
+        self._setpoint[copies] = self._setpoints[(numbers[:, 1] * self._setpoints.size).astype(np.intp)]
+        self._steps[copies] = 0
+
+    def _observe(self) -> NDArray[np.float32]:
+        observation = np.empty((self.num_envs, 2), dtype=np.float32)
+        observation[:, 0] = self._od
+        observation[:, 1] = self._setpoint
+        return observation
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start new episodes.
+
+        Args:
+          seed: an integer (copy i gets seed + i), one integer or None per copy, or None to go on with the streams.
+          options: {"reset_mask": bool array (N,)} restarts only some copies.
+        Returns: observations (N, 2), {}.
+        Raises: ValueError if the mask has another shape.
+        """
+        if isinstance(seed, int):
+            seed = [seed + i for i in range(self.num_envs)]
+        if seed is not None:
+            self.seed_streams([np.random.SeedSequence(s) for s in seed])
+        elif self._streams is None:
+            self.seed_streams(np.random.SeedSequence().spawn(self.num_envs))
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=np.bool_))
+        if np.shape(mask) != (self.num_envs,):
+            raise ValueError(f"reset_mask has shape {np.shape(mask)}: allowed ({self.num_envs},)")
+        self._start(np.flatnonzero(mask))
+        return self._observe(), {}
+
+    def step(
+        self, actions: NDArray[np.intp]
+    ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """One control period in every copy.
+
+        Args:
+          actions: indices of pump rates, shape (N,), integers.
+        Returns: observations (N, 2), rewards (N,), terminated (N,) all False, truncated (N,), infos; where an episode
+          ended infos["final_obs"] (N, 2) holds its last observation and infos["_final_obs"] (N,) says where.
+        Raises: RuntimeError before the first reset; IndexError for an action outside the grid.
+        """
+        if self._streams is None:
+            raise RuntimeError("step before reset: call reset(seed=...) first")
+        np.multiply(self._od, self._factors[actions], out=self._od)
+        np.minimum(self._od, MAX_OD, out=self._od)
+        reward = tracking_reward(self._od, self._setpoint)
+        self._steps += 1
+        truncated = self._steps >= self.config.episode_steps
+        infos: dict[str, Any] = {}
+        if truncated.any():
+            reward[truncated] *= self.config.final_reward_weight
+            infos["final_obs"] = self._observe()
+            infos["_final_obs"] = truncated.copy()
+            infos["final_info"] = {}
+            infos["_final_info"] = truncated.copy()
+            self._start(np.flatnonzero(truncated))
+        return self._observe(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, infos
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue to the bit; plain numbers and lists."""
+        assert self._streams is not None, "reset before state_dict"
+        return {
+            "od": self._od.tolist(),
+            "setpoint": self._setpoint.tolist(),
+            "steps": self._steps.tolist(),
+            "streams": self._streams.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
+        """Continue as saved; returns the current observations (N, 2)."""
+        assert self._streams is not None, "seed_streams before load_state_dict"
+        self._od[:] = state["od"]
+        self._setpoint[:] = state["setpoint"]
+        self._steps[:] = state["steps"]
+        self._streams.load_state_dict(state["streams"])
+        return self._observe()
