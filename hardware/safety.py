@@ -72,6 +72,8 @@ class Interlock:
         self._suspects = np.zeros(n)
         self._mu = np.full(n, c.mu_max)  # slow estimate of the growth rate
         self._excess, self._deficit = np.zeros(n), np.zeros(n)  # cumulated unexplained rise and fall of ln OD
+        self._futile = np.zeros(n)  # cumulated rise of ln OD at full feed
+        self._over = np.zeros((n, 3))  # samples in a row for which each of the three was over its limit
         self._hold_until_s = np.full(n, -math.inf)
         self._hold_kind = np.full(n, -1.0)  # index into REMEDIES
         self._latched = np.zeros(n)
@@ -188,7 +190,8 @@ class Interlock:
         """Cumulated sums of what ln OD did beyond the best and the worst explanation (one-sided CUSUM).
 
         With d = dosed / volume and x the change of ln OD in dt minutes, a sound pump gives x <= mu dt - gain_min d,
-        and no culture gives x < -gain_max d - death dt. mu is a slow estimate (60 min) plus 0.01 1/min.
+        and no culture gives x < -gain_max d - death dt. mu is a slow estimate (60 min) plus 0.01 1/min. At full feed
+        (0.8 of the largest rate and more) x must be below -0.004 dt, or the culture outgrows the pump.
         """
         c = self.config
         usual = usual & (od > 0.05) & (self._od > 0.05)
@@ -201,17 +204,25 @@ class Interlock:
         self._excess = np.where(usual, np.maximum(self._excess + rise, 0.0), self._excess)
         fall = -x - c.gain_max * d - c.death * dt
         self._deficit = np.where(usual, np.maximum(self._deficit + fall, 0.0), self._deficit)
+        full = d / dt >= 0.8 * c.max_rate * 60.0 / c.volume_ml
+        futile = np.where(full, np.maximum(self._futile + x + 0.004 * dt, 0.0), 0.0)
+        self._futile = np.where(usual, futile, self._futile)
         weight = np.where(usual, 1.0 - np.exp(-dt / 60.0), 0.0)
         self._mu = self._mu + weight * (np.clip((x + d) / dt, 0.0, c.mu_max) - self._mu)
         noise = np.hypot(c.noise_od, c.noise_fraction * od) / np.maximum(od, 0.05)
         limit = c.drift + 6.0 * np.where(usual, noise, 0.0)
-        rising, falling = usual & (self._excess > limit), usual & (self._deficit > limit)
-        excess, deficit = self._excess, self._deficit
-        self._trip("no_dilution", rising, lambda i: f"the pump ran, ln OD is {excess[i]:.2f} above what it must be")
-        self._trip("falls", falling, lambda i: f"ln OD is {deficit[i]:.2f} below what growth and doses explain")
+        sums = np.stack([self._excess, self._deficit, self._futile], axis=1)
+        over = np.where(sums > limit[:, None], self._over + 1, 0)  # an outlier is over it once only
+        self._over = np.where(usual[:, None], over, self._over)
+        rising, falling, futile_now = (self._over >= c.persistence).T & usual
+        helpless = futile_now & ~rising
+        self._trip("no_dilution", rising, lambda i: f"the pump ran, ln OD is {sums[i, 0]:.2f} above what it must be")
+        self._trip("falls", falling, lambda i: f"ln OD is {sums[i, 1]:.2f} below what growth and doses explain")
+        self._trip("cannot_hold", helpless, lambda i: f"at full feed OD {od[i]:.3f} does not fall")
         self._cool("no_dilution", rising, now)
         self._cool("falls", falling, now)
-        self._excess, self._deficit = np.where(rising, 0.0, excess), np.where(falling, 0.0, deficit)
+        self._excess, self._deficit = np.where(rising, 0.0, sums[:, 0]), np.where(falling, 0.0, sums[:, 1])
+        self._futile = np.where(helpless | rising, 0.0, self._futile)
 
     def _cool(self, kind: str, mask: Mask, now: float) -> None:
         """No dose for a while after `kind`, unless it is only reported."""
