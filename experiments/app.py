@@ -72,8 +72,14 @@ def normalise(argv: Sequence[str]) -> list[str]:
     return out
 
 
+TYPES = {"Float": "a number", "Integer": "a whole number", "bool": "true or false"}
+
+
 def _one_line(error: Exception) -> str:
-    """The first useful lines of a Hydra or OmegaConf message as one."""
+    """A Hydra or OmegaConf message as one line; a wrong type as `key = value: allowed ...`."""
+    wrong = re.match(r"Value '(.*)' (?:of type '\w+' could not be converted to|is not a valid) (\w+)", str(error))
+    if wrong and isinstance(error, OmegaConfBaseException):
+        return f"{error.full_key} = {wrong[1]}: allowed {TYPES.get(wrong[2], wrong[2])}"
     lines = [line.strip() for line in str(error).splitlines()]
     kept = [s for s in lines if s and not s.startswith(("object_type", "reference_type", "Config search path"))]
     return " ".join(kept[:6])
@@ -131,8 +137,10 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
         GlobalHydra.instance().clear()
         with hydra.initialize_config_module("conf", version_base="1.3"):
             plain = [a for a in normalise(overrides) if not a.startswith("hydra.")]
-            return hydra.compose(name, overrides=plain)
-    except (HydraException, OmegaConfBaseException) as error:
+            known = groups()  # any other key is forced in, so that an unknown one is named by the schema, not by Hydra
+            forced = [a if a.split("=")[0] in known else re.sub(r"^\+*(?=\w)", "++", a) for a in plain]
+            return hydra.compose(name, overrides=forced)
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra's own checks of a group's name
         raise UserError(_one_line(error)) from None
 
 

@@ -77,8 +77,8 @@ class PopulationWriter:
 
     def figure(self, tag: str, figure: Figure, step: int) -> None:
         """Show a figure under TensorBoard's images."""
-        figure.canvas.draw()  # type: ignore[no-untyped-call]
-        pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+        figure.canvas.draw()
+        pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
         self.summary.add_image(tag, pixels, step, dataformats="HWC")
 
     def hyper_parameters(self, values: Mapping[str, float | str | bool], metrics: Mapping[str, float]) -> None:
