@@ -177,12 +177,13 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     os.replace(temporary, path)
 
 
-def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
+def run(name: str, schema: Callable[[DictConfig], T], body: Callable[[T, Path], float | None]) -> None:
     """Run an entry point; its resolved config is in `config.yaml` of its run folder before `body` starts.
 
     Args:
       name: of `conf/<name>.yaml` and of the job.
-      schema: default instance of the entry point's config dataclass; a field `resume` makes it resumable.
+      schema: gives the default instance of the config dataclass that fits a composed config (a backend has fields of
+        its own); a field `resume` makes the entry point resumable.
       body: called with the checked config and the run folder; a float it returns is the sweep's objective.
     Exits: 0, or 1 after one line on standard error; 130 on Ctrl-C.
     """
@@ -193,9 +194,10 @@ def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
             if cfg.get("resume"):
                 stored = OmegaConf.load(folder / "config.yaml")
                 assert isinstance(stored, DictConfig)
-                config = load(OmegaConf.merge(stored, {"resume": cfg.resume}), schema)  # type: ignore[arg-type]
+                stored.resume = cfg.resume
+                config = load(stored, schema(stored))
             else:
-                config = load(cfg, schema)
+                config = load(cfg, schema(cfg))
                 save_config(config, folder)
             return body(config, folder)
         except UserError as error:
@@ -207,7 +209,8 @@ def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
     try:
         sys.argv[1:] = normalise(sys.argv[1:])
         if _needs_check(sys.argv[1:]):
-            load(compose(name, sys.argv[1:]), schema)
+            composed = compose(name, sys.argv[1:])
+            load(composed, schema(composed))
             resumed = [a for a in sys.argv[1:] if a.startswith("resume=") and a != "resume=null"]
             others = [a for a in sys.argv[1:] if not a.startswith(("resume=", "hydra."))]
             if resumed and others:
@@ -216,7 +219,7 @@ def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
                 )
         GlobalHydra.instance().clear()
         hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)(task)()
-    except UserError as error:
+    except (UserError, ValueError) as error:  # a ValueError is the schema's own word on a value
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
