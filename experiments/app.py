@@ -138,7 +138,7 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
         with hydra.initialize_config_module("conf", version_base="1.3"):
             plain = [a for a in normalise(overrides) if not a.startswith("hydra.")]
             known = groups()  # any other key is forced in, so that an unknown one is named by the schema, not by Hydra
-            forced = [a if a.split("=")[0] in known else re.sub(r"^\+*(?=\w)", "++", a) for a in plain]
+            forced = [a if re.split("[@=]", a)[0] in known else re.sub(r"^\+*(?=\w)", "++", a) for a in plain]
             return hydra.compose(name, overrides=forced)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra's own checks of a group's name
         raise UserError(_one_line(error)) from None

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dqn.config import DQNConfig
+from envs.plant import PlantConfig
 from envs.setpoints import Schedule
 from envs.task import EnvConfig
 from hardware.simulated import SimulatedConfig
@@ -51,6 +52,7 @@ class DeployConfig:
     """`python -m experiments.deploy`."""
 
     backend: Any = field(default_factory=SimulatedConfig)  # one of BACKENDS
+    plant: PlantConfig = field(default_factory=PlantConfig)  # of a simulated backend
     scenario: Schedule = field(default_factory=Schedule)
     policy: str = "latest"  # a policy.npz, a run folder, or `latest`
     env_file: str | None = None  # a calibrated.yaml; its model becomes the simulated plant's

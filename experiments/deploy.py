@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from dqn.policy import Policy
+    from envs.plant import PlantConfig
     from envs.setpoints import Schedule
     from experiments.loop import Step
 
@@ -67,18 +68,17 @@ def load_policy(name: str, control_min: float) -> Policy:
     return policy
 
 
-def plant_of(config: DeployConfig) -> SimulatedConfig:
-    """The simulated backend, its plant carrying the calibrated model if one is given."""
-    backend: SimulatedConfig = config.backend
+def plant_of(config: DeployConfig) -> PlantConfig:
+    """The simulated plant, carrying the calibrated model if one is given."""
+    plant = config.plant
     if config.env_file is None:
-        return backend
+        return plant
     from experiments.train import read_env_file
 
     model = read_env_file(config.env_file)
-    plant = backend.plant
     gain = plant.vessel.volume_ml / (60.0 * model.tau)  # tau = V / (60 g)
     growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
-    return replace(backend, plant=replace(plant, growth=growth, pump=pump))
+    return replace(plant, growth=growth, pump=pump)
 
 
 class Record:
@@ -218,9 +218,9 @@ def deploy(config: DeployConfig, folder: Path) -> None:
     from hardware.errors import ReactorError
     from hardware.simulated import SimulatedReactors
 
-    backend = plant_of(config)
+    backend: SimulatedConfig = config.backend
     policy = load_policy(config.policy, backend.control_min)
-    plant = Plant(backend.plant, len(backend.reactors), np.random.default_rng(backend.seed))
+    plant = Plant(plant_of(config), len(backend.reactors), np.random.default_rng(backend.seed))
     reactors = SimulatedReactors(plant, backend)
     loop = ClosedLoop(reactors, LearnedController(policy), RateLimit(float(policy.pump_rates[-1])), config.scenario)
     record = Record(folder, reactors.names, config.fsync)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from envs.plant import Plant, PlantConfig
+from envs.plant import Plant
 from hardware.clock import Clock, VirtualClock
 from hardware.reactor import Command, Measurement, Receipt
 
@@ -22,7 +22,6 @@ class SimulatedConfig:
     control_min: float = 1.0  # min between samples
     pump_ml_s: float = 1.0  # believed flow of the feed pump at full power, mL/s
     seed: int = 0  # of what the plant draws
-    plant: PlantConfig = field(default_factory=PlantConfig)
 
     def __post_init__(self) -> None:
         """Check every range once, where the value enters."""
