@@ -67,7 +67,8 @@ def body(config: CalibrateConfig, folder: Path) -> float | None:
     Returns: PMSE in % of a calibration. Raises: app.UserError.
     """
     if config.generate:
-        return _generate(config, folder)
+        _generate(config, folder)
+        return None
     if config.coverage:
         return _coverage(config, folder)
     return _calibrate(config, folder)
@@ -194,7 +195,7 @@ def environment_yaml(result: Calibration, source: str) -> str:
     mu, tau = result.fit.mu, result.tau
     first, end = result.window_rows
     head = [
-        "# Training model x' = (mu - u/tau) x, equation (5) of the paper, fitted to a recording by experiments.calibrate.",
+        "# Training model x' = (mu - u/tau) x, equation (5) of the paper, fitted to a recording by calibrate.",
         f"# Recording {source}, rows {first}:{end}, {result.fit.n_used} readings, PMSE {result.fit.pmse_pct:.3g} %.",
         f"# 95 % intervals: mu {mu.low:.6g} to {mu.high:.6g} 1/min, tau {tau.low:.6g} to {tau.high:.6g}.",
         *(f"# Warning: {w}." for w in result.warnings),
@@ -212,19 +213,19 @@ def _events(folder: Path, result: Calibration, figures: dict[str, Figure]) -> No
     """Scalars and figures for TensorBoard; imported here because it costs seconds that a refusal need not wait for."""
     from torch.utils.tensorboard import SummaryWriter
 
-    with SummaryWriter(str(folder)) as writer:  # type: ignore[no-untyped-call]
+    with SummaryWriter(str(folder)) as writer:
         for tag, value in (
             ("calibration/mu_per_min", result.fit.mu.value),
             ("calibration/tau", result.tau.value),
             ("calibration/pmse_pct", result.fit.pmse_pct),
         ):
-            writer.add_scalar(tag, value, 0)  # type: ignore[no-untyped-call]
+            writer.add_scalar(tag, value, 0)
         for i, segment in enumerate(result.segments):
             for name, parameter in (("mu_per_min", segment.mu), ("tau", segment.tau)):
                 if parameter is not None:
-                    writer.add_scalar(f"drift/{name}", parameter.value, i)  # type: ignore[no-untyped-call]
+                    writer.add_scalar(f"drift/{name}", parameter.value, i)
         for key, figure in figures.items():
-            writer.add_image(f"calibration/{key}", pixels(figure), 0, dataformats="HWC")  # type: ignore[no-untyped-call]
+            writer.add_image(f"calibration/{key}", pixels(figure), 0, dataformats="HWC")
 
 
 def report(result: Calibration, recording: Recording, content: dict[str, Any]) -> str:
@@ -233,8 +234,10 @@ def report(result: Calibration, recording: Recording, content: dict[str, Any]) -
     first, end = result.window_rows
     lines = [
         "",
-        f"  mu          {mu.value:.5f} 1/min   95 % {mu.low:.5f} to {mu.high:.5f}   (doubling {content['doubling_min']:.1f} min)",
-        f"  tau         {tau.value:.4f}          95 % {tau.low:.4f} to {tau.high:.4f}   (at 0.02 mL/s: {0.02 / tau.value:.4f} 1/min)",
+        f"  mu          {mu.value:.5f} 1/min   95 % {mu.low:.5f} to {mu.high:.5f}   "
+        f"(doubling time {content['doubling_min']:.1f} min)",
+        f"  tau         {tau.value:.4f}          95 % {tau.low:.4f} to {tau.high:.4f}   "
+        f"(dilution {0.02 / tau.value:.4f} 1/min at 0.02 mL/s)",
         f"  PMSE        {result.fit.pmse_pct:.3g} %   (100 sum e^2 / sum OD^2; rms error {result.fit.rms:.4f} OD)",
         f"  window      rows {first}:{end} - {result.window_reason}",
     ]
@@ -248,7 +251,8 @@ def report(result: Calibration, recording: Recording, content: dict[str, Any]) -
         if drift is not None:
             sure = "" if drift.significant else ", within its uncertainty"
             lines.append(
-                f"  drift       {name} {drift.first:.3g} to {drift.last:.3g} along the recording ({drift.change_pct:+.0f} %{sure})"
+                f"  drift       {name} {drift.first:.3g} to {drift.last:.3g} along the recording "
+                f"({drift.change_pct:+.0f} %{sure})"
             )
     lines += [f"  rejected    rows {row_spans(r.rows)} ({len(r.rows)}): {r.reason}" for r in result.rejections]
     lines += [f"  note        {note}" for note in recording.notes]

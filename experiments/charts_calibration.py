@@ -6,6 +6,7 @@ Each function returns a matplotlib Figure; nothing touches pyplot's global state
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -23,7 +24,7 @@ __all__ = ["coverage_figure", "drift_figure", "fit_figure", "pixels", "save"]
 Array = NDArray[np.float64]
 
 DATA, MODEL, UNUSED, BAD, PUMP = "#3b4b5c", "#d1495b", "#a9b4bf", "#e08e0b", "#2a7f9e"
-STYLE = {
+STYLE: Any = {
     "font.size": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -42,8 +43,8 @@ def save(figure: Figure, path: Path) -> None:
 def pixels(figure: Figure) -> NDArray[np.uint8]:
     """The figure as an RGB image, shape (height, width, 3), for TensorBoard."""
     canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    image: NDArray[np.uint8] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    canvas.draw()  # type: ignore[no-untyped-call]
+    image: NDArray[np.uint8] = np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
     return image
 
 
