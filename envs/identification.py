@@ -290,15 +290,16 @@ def _turned_over(series: Series, inverse: tuple[float, float, float]) -> Paramet
 def _interval(value: float, influence: Array, n_parameters: int) -> tuple[float, float, float]:
     """Value and 95 % interval from the influence of each reading, shape (m,), in the order of time.
 
-    Half width t_{0.975, nu} sqrt(V), V = `_sum_variance`. Few readings at a high OD carry most of the information and
-    correlated ones repeat each other, so V is itself uncertain: nu = 3 (sum z^2)^2 / sum z^4 * sum z^2 / V - p, at
-    least 4, the effective number of readings (Satterthwaite's; the 3 is the kurtosis of normal errors).
+    Half width t_{0.975, nu} sqrt(V), V = `_sum_variance`, but never below sum z^2: readings that repel one another are
+    an accident of a short record. Few readings at a high OD carry most of the information and correlated ones repeat
+    each other, so V is itself uncertain: nu = 1.5 (sum z^2)^2 / sum z^4 * sum z^2 / V - p, at least 4, after
+    Satterthwaite's effective number of readings, 3 (sum z^2)^2 / sum z^4 for normal errors, halved because their
+    correlation is estimated from the same readings. docs/calibration.md measures the coverage.
     """
-    m = len(influence)
     squares = influence**2
     independent = max(float(squares.sum()), 1e-300)
-    variance = max(_sum_variance(influence), 0.25 * independent)
-    effective = min(m, 3.0 * independent**2 / max(float((squares**2).sum()), 1e-300)) * min(1.0, independent / variance)
+    variance = max(_sum_variance(influence), independent)
+    effective = 1.5 * independent**2 / max(float((squares**2).sum()), 1e-300) * independent / variance
     half = float(stdtrit(max(effective - n_parameters, 4.0), 0.5 + CONFIDENCE / 2) * np.sqrt(variance))
     return float(value), float(value) - half, float(value) + half
 
