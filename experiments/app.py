@@ -177,16 +177,24 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     os.replace(temporary, path)
 
 
-def run(name: str, schema: Callable[[DictConfig], T], body: Callable[[T, Path], float | None]) -> None:
+def run(
+    name: str,
+    schema: T,
+    body: Callable[[T, Path], float | None],
+    choose: Callable[[DictConfig], T] | None = None,
+) -> None:
     """Run an entry point; its resolved config is in `config.yaml` of its run folder before `body` starts.
 
     Args:
       name: of `conf/<name>.yaml` and of the job.
-      schema: gives the default instance of the config dataclass that fits a composed config (a backend has fields of
-        its own); a field `resume` makes the entry point resumable.
+      schema: default instance of the entry point's config dataclass; a field `resume` makes it resumable.
+      choose: gives the schema that fits a composed config, where it depends on one (a backend has fields of its own).
       body: called with the checked config and the run folder; a float it returns is the sweep's objective.
     Exits: 0, or 1 after one line on standard error; 130 on Ctrl-C.
     """
+
+    def fitting(cfg: DictConfig) -> T:
+        return schema if choose is None else choose(cfg)
 
     def task(cfg: DictConfig) -> float | None:
         try:
@@ -195,9 +203,9 @@ def run(name: str, schema: Callable[[DictConfig], T], body: Callable[[T, Path], 
                 stored = OmegaConf.load(folder / "config.yaml")
                 assert isinstance(stored, DictConfig)
                 stored.resume = cfg.resume
-                config = load(stored, schema(stored))
+                config = load(stored, fitting(stored))
             else:
-                config = load(cfg, schema(cfg))
+                config = load(cfg, fitting(cfg))
                 save_config(config, folder)
             return body(config, folder)
         except UserError as error:
@@ -210,7 +218,7 @@ def run(name: str, schema: Callable[[DictConfig], T], body: Callable[[T, Path], 
         sys.argv[1:] = normalise(sys.argv[1:])
         if _needs_check(sys.argv[1:]):
             composed = compose(name, sys.argv[1:])
-            load(composed, schema(composed))
+            load(composed, fitting(composed))
             resumed = [a for a in sys.argv[1:] if a.startswith("resume=") and a != "resume=null"]
             others = [a for a in sys.argv[1:] if not a.startswith(("resume=", "hydra."))]
             if resumed and others:

@@ -254,7 +254,7 @@ def _schema(cfg: DictConfig) -> DeployConfig:
 
 def main() -> None:
     """Entry point."""
-    app.run("deploy", _schema, deploy)
+    app.run("deploy", DeployConfig(), deploy, choose=_schema)
 
 
 if __name__ == "__main__":

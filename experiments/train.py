@@ -189,7 +189,7 @@ def train(config: TrainConfig, folder: Path) -> float:
 
 def main() -> None:
     """Entry point."""
-    app.run("train", lambda _: TrainConfig(), train)
+    app.run("train", TrainConfig(), train)
 
 
 if __name__ == "__main__":
