@@ -219,8 +219,8 @@ def deploy(config: DeployConfig, folder: Path) -> None:
     from hardware.simulated import SimulatedReactors
 
     backend: SimulatedConfig = config.backend
-    policy = load_policy(config.policy, backend.control_min)
     plant = Plant(plant_of(config), len(backend.reactors), np.random.default_rng(backend.seed))
+    policy = load_policy(config.policy, backend.control_min)
     reactors = SimulatedReactors(plant, backend)
     loop = ClosedLoop(reactors, LearnedController(policy), RateLimit(float(policy.pump_rates[-1])), config.scenario)
     record = Record(folder, reactors.names, config.fsync)
