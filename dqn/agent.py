@@ -13,7 +13,7 @@ from dqn.network import QNetwork, initial_weights
 from dqn.replay import Replay, Transition
 from dqn.schedules import decayed, linear
 from dqn.streams import UniformStream
-from dqn.targets import blend, double_q_target, loss_gradient, q_target
+from dqn.targets import advantage_target, blend, double_q_target, loss_gradient, q_target
 
 __all__ = ["STREAMS", "DQNAgent", "Relabel"]
 
@@ -51,8 +51,8 @@ class DQNAgent:
         self.device = torch.device(device)
         self.n_agents = len(streams["init"])
         self.n_actions = actions
-        matrix = torch.tensor(config.input_matrix, device=self.device) if config.input_matrix else None
-        offset = torch.tensor(config.input_offset, device=self.device)
+        matrix = torch.tensor(config.input_matrix, dtype=torch.float32, device=self.device) if config.input_matrix else None
+        offset = torch.tensor(config.input_offset, dtype=torch.float32, device=self.device)
         features = observations if matrix is None else matrix.shape[0]
         self.sizes = (features, *config.hidden, actions)
         flat = np.stack([initial_weights(self.sizes, seed) for seed in streams["init"]])
@@ -62,7 +62,8 @@ class DQNAgent:
         self.greedy = QNetwork(weights.clone(), self.sizes, matrix, offset) if config.average else self.online
         parameter = torch.nn.Parameter(weights)
         parameter.grad = self.online.grad
-        self._adam = torch.optim.Adam([parameter], lr=config.learning_rate, fused=True)
+        betas = (0.9, config.adam_beta2)
+        self._adam = torch.optim.Adam([parameter], config.learning_rate, betas, config.adam_eps, fused=True)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
         self._explore = UniformStream(streams["explore"], 2, self.device)
         self._draws = UniformStream(streams["replay"], config.batch_size, self.device)
@@ -126,6 +127,8 @@ class DQNAgent:
             target = double_q_target(batch.r_t, batch.continues, c.gamma, q_t, self.online(batch.s_t))
         else:
             target = q_target(batch.r_t, batch.continues, c.gamma, q_t)
+        if c.action_gap:
+            target = advantage_target(target, c.action_gap, self.target(batch.s_tm1), batch.a_tm1)
         q_tm1, inputs = self.online.forward(batch.s_tm1)
         self.loss, gradient = loss_gradient(q_tm1, batch.a_tm1, target, c.huber)
         self.online.backward(inputs, gradient)
