@@ -51,9 +51,11 @@ class DQNAgent:
         self.device = torch.device(device)
         self.n_agents = len(streams["init"])
         self.n_actions = actions
-        matrix = torch.tensor(config.input_matrix, dtype=torch.float32, device=self.device) if config.input_matrix else None
-        offset = torch.tensor(config.input_offset, dtype=torch.float32, device=self.device)
-        features = observations if matrix is None else matrix.shape[0]
+        matrix = offset = None
+        if config.input_matrix:
+            offset = torch.tensor(config.input_offset, dtype=torch.float32, device=self.device)
+            matrix = torch.tensor(config.input_matrix, dtype=torch.float32, device=self.device).view(len(offset), -1)
+        features = observations if offset is None else len(offset)
         self.sizes = (features, *config.hidden, actions)
         flat = np.stack([initial_weights(self.sizes, seed) for seed in streams["init"]])
         weights = torch.from_numpy(flat).to(self.device)

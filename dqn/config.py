@@ -37,8 +37,8 @@ class DQNConfig:
     reward_scale: float = 1.0  # rewards are multiplied by this inside the agent
     relabel: float = 0.0  # share of each minibatch whose goal is replaced by a random one (hindsight)
     average: float = 0.0  # decay of the running mean of weights that acts greedily; 0 means the weights themselves
-    input_matrix: tuple[tuple[float, ...], ...] = ()  # features = matrix @ observation + offset; () means identity
-    input_offset: tuple[float, ...] = ()
+    input_matrix: tuple[float, ...] = ()  # features = M observation + c, M row by row; () means identity
+    input_offset: tuple[float, ...] = ()  # c, one number per feature
 
     def __post_init__(self) -> None:
         """Check every range once, where the value enters."""
@@ -68,10 +68,12 @@ class DQNConfig:
         for key, value, ok, allowed in checks:
             if not ok:
                 raise ValueError(f"agent.{key} = {value}: allowed {allowed}")
-        if len(self.input_matrix) != len(self.input_offset):
+        if bool(self.input_matrix) != bool(self.input_offset) or (
+            self.input_offset and len(self.input_matrix) % len(self.input_offset)
+        ):
             raise ValueError(
-                f"agent.input_offset has {len(self.input_offset)} values: allowed as many as rows of "
-                f"agent.input_matrix, {len(self.input_matrix)}"
+                f"agent.input_matrix has {len(self.input_matrix)} values and agent.input_offset "
+                f"{len(self.input_offset)}: allowed one row of the matrix per value of the offset, or neither"
             )
 
     @property

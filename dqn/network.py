@@ -55,9 +55,8 @@ class QNetwork:
         self.layers = self._views(flat)
         self.grad = torch.zeros_like(flat)
         self._grads = self._views(self.grad)
-        self._matrix = torch.eye(self.sizes[0]) if matrix is None else matrix
-        self._offset = torch.zeros(self.sizes[0]) if matrix is None or offset is None else offset
-        self._identity = matrix is None
+        self._matrix = torch.eye(self.sizes[0], device=flat.device) if matrix is None else matrix
+        self._offset = torch.zeros(self.sizes[0], device=flat.device) if offset is None else offset
 
     def _views(self, flat: torch.Tensor) -> list[Layer]:
         """(W, b) of each layer as views: W (S, in, out), b (S, 1, out)."""
@@ -69,9 +68,13 @@ class QNetwork:
             start = end
         return views
 
+    def with_weights(self, flat: torch.Tensor) -> QNetwork:
+        """The same network with other weights, shape (S', P)."""
+        return QNetwork(flat, self.sizes, self._matrix, self._offset)
+
     def features(self, observation: torch.Tensor) -> torch.Tensor:
         """f = M observation + c; observation (S, B, observations) -> (S, B, features)."""
-        return observation if self._identity else observation @ self._matrix.T + self._offset
+        return torch.matmul(observation, self._matrix.T).add_(self._offset)
 
     def input_map(self) -> tuple[np.ndarray, np.ndarray]:
         """M (F, O) and c (F,) as NumPy arrays."""

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, TypeVar
 
 __all__ = ["tracking_reward"]
 
+T = TypeVar("T", bound=Any)
 
-def tracking_reward(od: NDArray[np.float64], setpoint: NDArray[np.float64]) -> NDArray[np.float64]:
+
+def tracking_reward(od: T, setpoint: T) -> T:
     """r = -(x - setpoint)^2 (paper, equation 4), of the OD reached by the step.
 
     Args:
-      od: x, shape (N,) or any; setpoint: same shape or broadcastable.
+      od: x, shape (N,) or any; a NumPy array or a tensor. setpoint: same type, same or broadcastable shape.
     Returns: shape of the broadcast. Raises: nothing.
     """
-    error = od - setpoint
-    return -error * error
+    error: T = od - setpoint
+    reward: T = -error * error
+    return reward

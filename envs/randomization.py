@@ -1,0 +1,78 @@
+"""Where a plant's randomness comes from: one stream per vial, drawn on a schedule no controller can bend."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Tape", "check_ranges", "spread", "streams", "uniform"]
+
+Array = NDArray[np.float64]
+Streams = Sequence[np.random.Generator]
+
+
+def check_ranges(owner: object, name: str, ranges: Mapping[str, tuple[float, float, str]]) -> None:
+    """Check numbers of a config dataclass against {key: (lowest, highest, unit)}.
+
+    Raises: ValueError naming the key, its value with unit, and the allowed range; nan is never allowed.
+    """
+    for key, (low, high, unit) in ranges.items():
+        value = getattr(owner, key)
+        if not low <= value <= high:
+            raise ValueError(f"{name}.{key} = {value} {unit}".rstrip() + f": allowed {low:g} to {high:g}; change it")
+
+
+def streams(rng: np.random.Generator | Streams, n: int) -> list[np.random.Generator]:
+    """One generator per vial, shape n; stream i of a spawned set is the same whatever n is.
+
+    Raises: ValueError if a sequence of another length than n is given.
+    """
+    if isinstance(rng, np.random.Generator):
+        return rng.spawn(n)
+    if len(rng) != n:
+        raise ValueError(f"number of random streams = {len(rng)}: allowed {n}, one per vial; pass one generator each")
+    return list(rng)
+
+
+def spread(rngs: Streams, mean: float, cv: float) -> Array:
+    """mean (1 + cv z) with z standard normal cut at three sigma, one draw per stream, shape (N,)."""
+    z = np.clip([rng.standard_normal() for rng in rngs], -3.0, 3.0)
+    return np.asarray(mean * (1.0 + cv * z), dtype=np.float64)
+
+
+def uniform(rngs: Streams, low: float, high: float) -> Array:
+    """Uniform on [low, high), one draw per stream, shape (N,)."""
+    return np.asarray([low + (high - low) * rng.random() for rng in rngs], dtype=np.float64)
+
+
+class Tape:
+    """Rows of ready random numbers, one row per event, the same event for all vials at once.
+
+    Every row has the same number of draws whether or not they are used, so what a controller does never shifts what
+    is drawn later: two controllers with equal seeds meet equal noise (paired comparison), and vial i meets the noise
+    of stream i whatever N is.
+
+    Args:
+      rngs: one stream per vial.
+      normals, uniforms: draws per row and vial.
+    """
+
+    BLOCK = 128  # rows drawn at once: one call per stream and block instead of one per row
+
+    def __init__(self, rngs: Streams, normals: int, uniforms: int) -> None:
+        self._rngs, self._sizes = rngs, (normals, uniforms)
+        self._row = self.BLOCK
+        self._normal = np.empty((len(rngs), self.BLOCK, normals))
+        self._uniform = np.empty((len(rngs), self.BLOCK, uniforms))
+
+    def next(self) -> tuple[Array, Array]:
+        """The next row: (standard normals, uniforms on [0, 1)), shapes (normals, N) and (uniforms, N)."""
+        if self._row == self.BLOCK:
+            for i, rng in enumerate(self._rngs):
+                self._normal[i] = rng.standard_normal((self.BLOCK, self._sizes[0]))
+                self._uniform[i] = rng.random((self.BLOCK, self._sizes[1]))
+            self._row = 0
+        row, self._row = self._row, self._row + 1
+        return self._normal[:, row].T, self._uniform[:, row].T

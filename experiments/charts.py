@@ -1,0 +1,165 @@
+"""Figures from arrays. Each function returns a matplotlib Figure; `save` writes it as SVG and PNG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+__all__ = ["COLOURS", "culture", "learning", "new_figure", "policy_map", "save", "trajectories"]
+
+Array = NDArray[np.float64]
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f", "#000000")
+"""Okabe and Ito's palette: distinguishable with any colour vision."""
+
+matplotlib.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "turbidostat-dqn"})
+
+
+def new_figure(
+    width: float, height: float, rows: int = 1, columns: int = 1, **kwargs: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure and its axes, row by row, in the house's look."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False, **kwargs)
+    axes = list(grid.ravel())
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.grid(True, color="#e6e6e6", linewidth=0.6)
+        ax.set_axisbelow(True)
+    return figure, axes
+
+
+def save(figure: Figure, folder: Path, name: str) -> Path:
+    """Write folder/name.svg and folder/name.png; returns the path of the PNG."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+    figure.savefig(folder / f"{name}.png", dpi=150)
+    return folder / f"{name}.png"
+
+
+def _population(ax: Axes, x: Array, curves: Array, colour: str, label: str) -> None:
+    """One line for one agent; median, quartiles and range for several. curves: (K, S)."""
+    if curves.shape[1] == 1:
+        ax.plot(x, curves[:, 0], color=colour, linewidth=1.2, label=label)
+        return
+    low, q1, middle, q3, high = np.nanpercentile(curves, [0, 25, 50, 75, 100], axis=1)
+    n = curves.shape[1]
+    ax.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0, label=f"range of {n} seeds")
+    ax.fill_between(x, q1, q3, color=colour, alpha=0.35, linewidth=0, label="middle half")
+    ax.plot(x, middle, color=colour, linewidth=1.4, label=f"{label}, median")
+
+
+def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_step: Array) -> Figure:
+    """Reward per episode (the paper's Fig. 2b) and regret of the greedy policy during training.
+
+    Args:
+      episode_return: (episodes, S). eval_step: (K,). regret_pct: on the selection grid, (K, S).
+      best_step: step of the kept policy, (S,).
+    """
+    figure, (left, right) = new_figure(9.0, 3.4, 1, 2)
+    episodes = np.arange(1, episode_return.shape[0] + 1)
+    _population(left, episodes, -episode_return, COLOURS[0], "exploring agent")
+    left.set(xlabel="episode", ylabel="cost of the episode, sum of (x − setpoint)²", yscale="log")
+    left.set_title("Cost per training episode (minus the reward)", fontsize=10)
+    left.legend(frameon=False, fontsize=8)
+    _population(right, eval_step, np.maximum(regret_pct, 1e-2), COLOURS[1], "greedy policy")
+    if best_step.size == 1:
+        right.axvline(best_step[0], color=COLOURS[2], linewidth=1, linestyle="--", label="policy kept")
+    right.set(xlabel="environment step", ylabel="regret against the optimum, %", yscale="log")
+    right.set_title("Greedy policy on the selection grid", fontsize=10)
+    right.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def policy_map(od: Array, setpoint: Array, learned: Array, optimal: Array) -> Figure:
+    """Pump rate over OD and setpoint, learned beside optimal.
+
+    Args: od (X,), setpoint (Y,), learned and optimal (Y, X) in mL/s.
+    """
+    figure, axes = new_figure(9.0, 3.6, 1, 2, sharey=True)
+    for ax, rate, title in zip(
+        axes, (learned, optimal), ("learned policy", "optimum (dynamic programming)"), strict=True
+    ):
+        mesh = ax.pcolormesh(od, setpoint, rate * 1000.0, cmap="viridis", vmin=0.0, vmax=20.0, rasterized=True)
+        ax.plot([setpoint[0], setpoint[-1]], [setpoint[0], setpoint[-1]], color="white", linewidth=1, linestyle="--")
+        ax.set(xlabel="OD x")
+        ax.set_title(title, fontsize=10)
+        ax.grid(False)
+    axes[0].set_ylabel("setpoint, OD")
+    figure.colorbar(mesh, ax=axes, label="pump rate, µL/s")
+    return figure
+
+
+def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates: Array, best_rates: Array) -> Figure:
+    """Noise-free closed loops of the learned policy and the optimum from the same starts, a column per setpoint.
+
+    Args:
+      minutes: (K + 1,). od, best: OD including the start, (K + 1, G). setpoint: (G,).
+      rates, best_rates: pump rates in mL/s, (K, G).
+    """
+    goals = np.unique(setpoint)
+    figure, axes = new_figure(3.4 * goals.size, 4.6, 2, goals.size, sharex=True, sharey="row", height_ratios=[2, 1])
+    for column, goal in enumerate(goals):
+        top, bottom = axes[column], axes[goals.size + column]
+        top.axhline(goal, color="black", linewidth=0.8, linestyle="--", label="setpoint")
+        for k, g in enumerate(np.flatnonzero(setpoint == goal)):
+            top.plot(minutes, od[:, g], color=COLOURS[k], linewidth=1.5, label=f"learned, from {od[0, g]:g}")
+            top.plot(
+                minutes, best[:, g], color="black", linewidth=1.0, linestyle=":", label="optimum" if k == 0 else None
+            )
+            bottom.step(minutes[:-1], rates[:, g] * 1000.0, where="post", color=COLOURS[k], linewidth=1.0)
+            bottom.step(
+                minutes[:-1], best_rates[:, g] * 1000.0, where="post", color="black", linewidth=0.8, linestyle=":"
+            )
+        top.set_title(f"setpoint {goal:g}", fontsize=10)
+        bottom.set(xlabel="time, min", ylim=(-0.5, 21.0))
+    axes[0].legend(frameon=False, fontsize=8)
+    axes[0].set_ylabel("OD")
+    axes[goals.size].set_ylabel("pump rate, µL/s")
+    return figure
+
+
+def culture(
+    minutes: Array,
+    od: Array,
+    setpoint: Array,
+    rate: Array,
+    names: Sequence[str],
+    temperature: Array | None = None,
+    title: str = "",
+) -> Figure:
+    """A recorded closed loop: OD over setpoint, above pump rate (and temperature).
+
+    Args:
+      minutes, od, setpoint, rate, temperature: (K, N), nan where a reactor has no sample. names: N labels.
+    """
+    rows = 2 if temperature is None else 3
+    ratios = [2.2, 1.0] if temperature is None else [2.2, 1.0, 0.8]
+    figure, axes = new_figure(8.0, 4.6 + 0.9 * (rows - 2), rows, 1, sharex=True, height_ratios=ratios)
+    for n, name in enumerate(names):
+        colour = COLOURS[n % len(COLOURS)]
+        axes[0].plot(minutes[:, n], od[:, n], color=colour, linewidth=1.2, label=name)
+        axes[0].step(
+            minutes[:, n], setpoint[:, n], where="post", color="black" if n == 0 else colour, linewidth=0.9,
+            linestyle="--", label="setpoint" if n == 0 else None,
+        )  # fmt: skip
+        axes[1].step(minutes[:, n], rate[:, n] * 1000.0, where="post", color=colour, linewidth=1.0)
+        if temperature is not None:
+            axes[2].plot(minutes[:, n], temperature[:, n], color=colour, linewidth=1.0)
+    axes[0].set_ylabel("OD")
+    axes[0].set_title(title, fontsize=10)
+    axes[0].legend(frameon=False, fontsize=8, ncols=3)
+    axes[1].set(ylabel="pump rate, µL/s", ylim=(-0.5, 21.0))
+    if temperature is not None:
+        axes[2].set_ylabel("temperature, °C")
+    axes[-1].set_xlabel("time, min")
+    return figure

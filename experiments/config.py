@@ -1,0 +1,64 @@
+"""What each entry point can be told: the typed schema behind conf/*.yaml. Light to import: no torch, no matplotlib."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from dqn.config import DQNConfig
+from envs.setpoints import Schedule
+from envs.task import EnvConfig
+from hardware.simulated import SimulatedConfig
+
+__all__ = ["DeployConfig", "TrainConfig", "deploy_schema"]
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """`python -m experiments.train`. Raises: ValueError naming key, value and allowed range."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    agent: DQNConfig = field(default_factory=DQNConfig)
+    env_file: str | None = None  # a calibrated.yaml; replaces `env`
+    seed: int = 0  # of the first agent
+    n_agents: int = 1  # agents with seeds seed, seed + 1, ... trained in one process
+    device: str = "cpu"  # cpu | cuda
+    threads: int = 0  # CPU threads of torch; 0: one for a few agents, all for many
+    eval_every: int = 500  # steps between evaluations of the greedy policy
+    checkpoint_every: int = 1000  # steps between checkpoints
+    resume: str | None = None  # a run folder to continue
+
+    def __post_init__(self) -> None:
+        """Check every range once, where the value enters."""
+        checks = (
+            ("seed", self.seed, self.seed >= 0, "at least 0"),
+            ("n_agents", self.n_agents, 1 <= self.n_agents <= 100_000, "1 to 100000"),
+            ("device", self.device, self.device in ("cpu", "cuda"), "cpu or cuda"),
+            ("threads", self.threads, self.threads >= 0, "at least 0 (0 = automatic)"),
+            ("eval_every", self.eval_every, self.eval_every >= 1, "at least 1 step"),
+            ("checkpoint_every", self.checkpoint_every, self.checkpoint_every >= 1, "at least 1 step"),
+        )
+        for key, value, ok, allowed in checks:
+            if not ok:
+                raise ValueError(f"{key} = {value}: allowed {allowed}")
+
+
+BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig}
+
+
+@dataclass(frozen=True)
+class DeployConfig:
+    """`python -m experiments.deploy`."""
+
+    backend: Any = field(default_factory=SimulatedConfig)  # one of BACKENDS
+    scenario: Schedule = field(default_factory=Schedule)
+    policy: str = "latest"  # a policy.npz, a run folder, or `latest`
+    env_file: str | None = None  # a calibrated.yaml; its model becomes the simulated plant's
+    fsync: bool = True  # every row on the disk before the next command
+
+
+def deploy_schema(kind: str) -> DeployConfig:
+    """The schema for the backend of this kind. Raises: ValueError naming the kinds there are."""
+    if kind not in BACKENDS:
+        raise ValueError(f"backend.kind = {kind}: allowed {', '.join(BACKENDS)}")
+    return DeployConfig(backend=BACKENDS[kind]())

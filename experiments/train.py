@@ -1,0 +1,196 @@
+"""Learn a pump policy on the calibrated growth model: `python -m experiments.train`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig, OmegaConf
+
+from envs.task import EnvConfig
+from experiments import app
+from experiments.config import TrainConfig
+
+if TYPE_CHECKING:
+    from experiments.evaluation import Score
+    from experiments.session import Session
+
+log = logging.getLogger(__name__)
+
+MANY_AGENTS = 12  # from here on the matrix products are large enough to share between cores
+
+
+def read_env_file(path: str) -> EnvConfig:
+    """The model a calibration wrote. Raises: UserError naming the file and what is wrong with it."""
+    remedy = "give the calibrated.yaml of a calibration run"
+    try:
+        content = OmegaConf.load(path)
+    except OSError as error:
+        raise app.UserError(f"env_file={path}: {error.strerror}; {remedy}") from None
+    except Exception as error:  # whatever PyYAML's parser meets, and text that is no UTF-8
+        raise app.UserError(f"env_file={path}: not YAML ({str(error).splitlines()[0]}); {remedy}") from None
+    if not isinstance(content, DictConfig):
+        raise app.UserError(f"env_file={path}: holds no key: value pairs; {remedy}")
+    try:
+        return app.load(content, EnvConfig())
+    except app.UserError as error:
+        raise app.UserError(f"env_file={path}: {error}") from None
+
+
+def _fingerprint(config: TrainConfig) -> str:
+    """Short hash of everything that shapes the policy."""
+    relevant = {"env": asdict(config.env), "agent": asdict(config.agent)}
+    return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _export(session: Session, score: Score) -> Path:
+    """Every agent's best policy under policies/, the best agent's as policy.npz."""
+    from dqn import policy
+    from dqn.export import export
+
+    c, best = session.config, session.best
+    folder = session.folder / "policies"
+    folder.mkdir(exist_ok=True)
+    for i, seed in enumerate(session.seeds):
+        metadata = {
+            "seed": seed,
+            "control_min": c.env.control_min,
+            "model": asdict(c.env),
+            "agent": asdict(c.agent),
+            "config_hash": _fingerprint(c),
+            "trained_steps": int(best.step[i]),
+            "regret_pct": float(score.regret_pct[i]),
+            "steady_abs_error": float(score.steady_abs_error[i]),
+        }
+        exported = export(session.trainer.agent.online, i, best.weights, c.env.pump_rates(), metadata)
+        policy.save(folder / f"seed{seed:04d}.npz", exported)
+        if i == int(best.regret.argmin()):
+            policy.save(session.folder / "policy.npz", exported)
+    return session.folder / "policy.npz"
+
+
+def _figures(session: Session, policy_path: Path) -> None:
+    """Learning curves, policy map and example trajectories, as files and in TensorBoard."""
+    import numpy as np
+
+    from dqn import policy
+    from envs.optimum import solve
+    from experiments import charts
+    from experiments.evaluation import rollout
+
+    env, gamma, best = session.config.env, session.config.agent.gamma, session.best
+    rates, factors = env.pump_rates(), session.selection.factors
+    learned = policy.load(policy_path)
+    history = np.array([[step, *regret] for step, regret, _ in best.history])
+    figures = {
+        "learning": charts.learning(np.array(session.returns), history[:, 0], history[:, 1:], best.step.astype(float))
+    }
+
+    od, setpoint = np.linspace(0.05, 1.25, 241), np.linspace(min(env.setpoints), max(env.setpoints), 33)
+    optimum = solve(env, gamma, setpoints=np.append(setpoint, env.setpoints), grid=3001)
+    x, s = (a.ravel() for a in np.meshgrid(od, setpoint))
+    learned_map = learned.rate(np.stack([x, s], axis=1)).reshape(setpoint.size, od.size)
+    best_map = rates[optimum.act(x, s)].reshape(setpoint.size, od.size)
+    figures["policy_map"] = charts.policy_map(od, setpoint, learned_map, best_map)
+
+    goals = np.asarray(env.setpoints)[[0, len(env.setpoints) // 2, -1]]
+    starts, targets = np.repeat(env.start_od, goals.size)[None], np.tile(goals, 2)[None]
+    ours = rollout(
+        lambda a, b: learned.act(np.stack([a[0], b[0]], axis=1))[None], factors, starts, targets, env.episode_steps
+    )
+    theirs = rollout(lambda a, b: optimum.act(a[0], b[0])[None], factors, starts, targets, env.episode_steps)
+    figures["trajectories"] = charts.trajectories(
+        np.arange(env.episode_steps + 1, dtype=np.float64) * env.control_min,
+        np.concatenate([starts, ours.od[:, 0]]),
+        np.concatenate([starts, theirs.od[:, 0]]),
+        targets[0],
+        rates[ours.action[:, 0]],
+        rates[theirs.action[:, 0]],
+    )
+    for name, figure in figures.items():
+        charts.save(figure, session.folder / "figures", name)
+        session.writer.events.figure(f"figures/{name}", figure, session.trainer.agent.steps)
+
+
+def _finish(session: Session) -> None:
+    """Score on the reported grid, export, draw, write summary.json."""
+    import numpy as np
+
+    from experiments import build
+    from experiments.evaluation import Evaluation, report_grid
+
+    c, agent, best = session.config, session.trainer.agent, session.best
+    report = Evaluation(c.env, c.agent.gamma, report_grid(c.env))
+    kept = report(build.act_with(agent.online, best.weights), agent.n_agents)
+    last = report(build.act_with(agent.online, agent.greedy.flat), agent.n_agents)
+    path = _export(session, kept)
+    _figures(session, path)
+    summary = {
+        "seeds": list(session.seeds),
+        "env_steps": agent.steps,
+        "updates": agent.updates,
+        "train_seconds": round(session.seconds, 3),
+        "regret_pct": kept.regret_pct,
+        "steady_abs_error": kept.steady_abs_error,
+        "regret_pct_last": last.regret_pct,
+        "steady_abs_error_last": last.steady_abs_error,
+        "kept_step": best.step,
+        "optimum_cost": report.optimum_cost,
+        "optimum_steady_abs_error": report.optimum_steady,
+        "policy": str(path),
+        "policy_seed": session.seeds[int(best.regret.argmin())],
+        "config_hash": _fingerprint(c),
+    }
+    app.write_json(session.folder / "summary.json", summary)
+    numbers = {
+        k: v for k, v in {**asdict(c.agent), "mu": c.env.mu, "tau": c.env.tau}.items() if isinstance(v, int | float)
+    }
+    session.writer.events.hyper_parameters(numbers, ["eval/regret_pct", "eval/steady_abs_error"])
+    log.info(
+        "%d agent(s), %d steps and %d updates each in %.1f s: regret %.2f %% (worst %.2f %%), steady error %.4f OD",
+        agent.n_agents, agent.steps, agent.updates, session.seconds, np.median(kept.regret_pct),
+        kept.regret_pct.max(), np.median(kept.steady_abs_error),
+    )  # fmt: skip
+    log.info("policy %s; figures %s; tensorboard --logdir %s", path, session.folder / "figures", session.folder)
+
+
+def train(config: TrainConfig, folder: Path) -> float:
+    """Train, export and report; returns the median regret, the objective of a sweep."""
+    if config.env_file is not None:
+        config = replace(config, env=read_env_file(config.env_file), env_file=None)
+        app.save_config(config, folder)
+
+    import torch
+
+    from dqn.checkpoint import CheckpointError
+    from experiments.session import Session
+
+    if config.device == "cuda" and not torch.cuda.is_available():
+        raise app.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
+    threads = config.threads or (1 if config.n_agents < MANY_AGENTS else torch.get_num_threads())
+    torch.set_num_threads(threads)
+    try:
+        session = Session(config, folder, resume=config.resume is not None)
+    except CheckpointError as error:
+        raise app.UserError(f"resume={config.resume}: {error}") from None
+    try:
+        session.run()
+        _finish(session)
+    finally:
+        session.writer.close()
+    import numpy as np
+
+    return float(np.median(session.best.regret))
+
+
+def main() -> None:
+    """Entry point."""
+    app.run("train", lambda _: TrainConfig(), train)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,332 @@
+"""The plant against formulas: training model, mass balances, pump, temperature, faults, and its random streams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from envs.growth import Culture, Exponential
+from envs.integrators import euler
+from envs.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig, ThermalConfig, VesselConfig
+from experiments import app
+
+Array = NDArray[np.float64]
+
+PRESETS = sorted(p.stem for p in (Path(str(resources.files("conf"))) / "plant").glob("*.yaml"))
+PULSE = PumpConfig(dosing="pulse")
+
+
+def preset(name: str) -> PlantConfig:
+    return app.load(app.compose(f"plant/{name}", []).plant, PlantConfig())
+
+
+def plant(config: PlantConfig, n: int = 1, seed: int = 0) -> Plant:
+    return Plant(config, n, np.random.default_rng(seed))
+
+
+def test_nominal_is_the_training_model() -> None:
+    n, rng = 32, np.random.default_rng(5)
+    od = rng.uniform(0.1, 1.1, n)
+    p = plant(preset("nominal"), n)
+    p.reset(od)
+    model = Culture(Exponential(0.03), 1.0 / 3.0)
+    state = np.stack([od, np.ones(n)], axis=1)
+    for _ in range(100):
+        u = rng.choice(np.linspace(0.0, 0.02, 17), n)
+        p.advance(1.0, 60.0 * u)
+        state = euler(lambda y, u=u: model.derivative(y, u, np.full(n, 37.0)), state, 1.0, 10)  # type: ignore[misc]
+        np.testing.assert_allclose(p.od, state[:, 0], rtol=1e-13)
+    np.testing.assert_array_equal(p.read_od(), p.od)
+    np.testing.assert_array_equal(p.volume_ml, 20.0)
+
+
+def test_nominal_preset_equals_the_defaults() -> None:
+    assert preset("nominal") == PlantConfig()
+
+
+def test_a_pulse_dilutes_exactly_and_growth_follows_it() -> None:
+    p = plant(PlantConfig(pump=PULSE, integrator="rk4"))
+    p.advance(1.0, np.array([1.2]))
+    assert p.od[0] == pytest.approx(0.5 * np.exp(-1.2 / 20.0 + 0.03), rel=1e-9)
+
+
+def test_without_waste_the_dose_stays_in_the_vial() -> None:
+    p = plant(PlantConfig(pump=PULSE, growth=GrowthConfig(mu=0.0)))
+    p.advance(1.0, np.array([2.0]), np.array([0.0]))
+    assert p.od[0] == pytest.approx(0.5 * 20.0 / 22.0)
+    assert p.volume_ml[0] == pytest.approx(22.0)
+    p.advance(1.0, np.array([0.0]), np.array([1.5]))  # the waste pump takes culture: OD unchanged
+    assert p.volume_ml[0] == pytest.approx(20.5)
+    p.advance(1.0, np.array([0.0]), np.array([60.0]))  # and never below its tube
+    assert p.volume_ml[0] == pytest.approx(20.0)
+    assert p.od[0] == pytest.approx(0.5 * 20.0 / 22.0)
+
+
+def test_blocked_waste_overflows_after_the_minutes_the_rim_allows() -> None:
+    p = plant(PlantConfig(pump=PULSE), 2)
+    p.waste_gain_factor[1] = 0.0
+    first = 0
+    for minute in range(1, 13):
+        p.advance(1.0, np.array([1.2, 1.2]))
+        if p.overflowed[1] and not first:
+            first = minute
+    assert first == 9  # 10 mL of room at 1.2 mL per minute
+    np.testing.assert_array_equal(p.overflowed, [False, True])
+    assert p.volume_ml[1] == 30.0
+
+
+def test_substrate_is_conserved_in_a_batch_and_exhausted_at_the_yield() -> None:
+    config = PlantConfig(growth=GrowthConfig(yield_od=3.0, k_s=0.2))
+    p = plant(config)
+    p.reset(0.1)
+    total = p.od + 3.0 * p.substrate
+    for _ in range(600):
+        p.advance(1.0, np.zeros(1))
+        assert p.substrate[0] >= 0.0
+    np.testing.assert_allclose(p.od + 3.0 * p.substrate, total, rtol=1e-12)
+    assert p.od[0] == pytest.approx(3.0, rel=1e-3)
+
+
+def test_chemostat_settles_where_monod_says() -> None:
+    g = GrowthConfig(mu=0.03, yield_od=3.0, k_s=0.2)
+    p = plant(PlantConfig(growth=g))
+    for _ in range(2000):
+        p.advance(1.0, np.array([0.4]))
+    dilution = 0.4 / 20.0
+    s = dilution * g.k_s / (g.mu * (1.0 + g.k_s) - dilution)  # mu_max = mu (1 + k_s)
+    assert p.substrate[0] == pytest.approx(s, rel=1e-6)
+    assert p.od[0] == pytest.approx(3.0 * (1.0 - s), rel=1e-6)
+
+
+def test_cooling_is_passive_and_heating_fast() -> None:
+    p = plant(PlantConfig())
+    minutes = 0
+    while p.temperature[0] > 30.0:
+        p.advance(1.0, np.zeros(1), temperature_target=30.0)
+        minutes += 1
+    assert minutes == int(np.ceil(39.0 * np.log(13.0 / 6.0)))  # 31; measured reactors took 29 and 33
+    p.advance(30.0, np.zeros(1), temperature_target=float("nan"))
+    assert p.temperature[0] == 30.0  # nan leaves the target
+    p.advance(5.0, np.zeros(1), temperature_target=37.0)
+    assert p.temperature[0] == 37.0
+    p.advance(600.0, np.zeros(1), temperature_target=0.0)
+    assert p.temperature[0] == pytest.approx(24.0, abs=1e-3)
+
+
+def test_fresh_medium_cools_the_vial() -> None:
+    p = plant(PlantConfig(pump=PULSE, thermal=ThermalConfig(medium_c=20.0, heating_c_per_min=0.1)))
+    p.advance(1e-6, np.array([1.2]))
+    assert 37.0 - p.temperature[0] == pytest.approx(17.0 * (1.0 - np.exp(-0.06)), rel=1e-3)  # about 1 degC
+
+
+@pytest.mark.parametrize(
+    ("name", "ratio"), [("cold_switch_10", 0.9), ("cold_switch_25", 0.75), ("cold_switch_40", 0.6)]
+)
+def test_cold_switch_presets_slow_growth_as_named(name: str, ratio: float) -> None:
+    p = plant(preset(name))
+
+    def rate() -> float:
+        before = p.od.copy()
+        p.advance(1.0, np.zeros(1))
+        return float(np.log(p.od / before)[0])
+
+    warm = rate()
+    p.advance(60.0, np.zeros(1), temperature_target=30.0)
+    p.reset(0.5, temperature=30.0)
+    assert rate() / warm == pytest.approx(ratio, abs=0.005)
+
+
+def test_growth_follows_temperature_with_its_time_constant() -> None:
+    g = GrowthConfig(temperature_law="cardinal", adaptation_min=10.0)
+    p = plant(PlantConfig(growth=g, thermal=ThermalConfig(heating_c_per_min=10.0)))
+    p.reset(0.5, temperature=30.0)
+    cold = p._adapted.copy()
+    p.advance(1.0, np.zeros(1), temperature_target=37.0)
+    for _ in range(10):
+        p.advance(1.0, np.zeros(1))
+    share = (p._adapted - cold) / (1.0 - cold)
+    assert share[0] == pytest.approx(1.0 - np.exp(-1.05), abs=0.02)  # the first minute counts half: it was on the way
+
+
+def test_wall_biomass_saturates_and_lifts_the_reading() -> None:
+    config = preset("long_run")
+    quiet = replace(config, sensor=SensorConfig(wall_gain=config.sensor.wall_gain))
+    p = plant(quiet, 4)
+    for _ in range(48 * 60):
+        p.advance(1.0, np.where(p.od > 0.5, 1.2, 0.0))
+    capacity = config.growth.wall_capacity_od
+    assert np.all(p.wall > 0.5 * capacity)
+    assert np.all(p.wall < 1.05 * capacity)
+    np.testing.assert_allclose(p.apparent_od - p.od, config.sensor.wall_gain * p.wall)
+
+
+def test_evaporation_concentrates() -> None:
+    p = plant(PlantConfig(growth=GrowthConfig(mu=0.0), vessel=VesselConfig(evaporation_ml_day=2.0)))
+    p.advance(720.0, np.zeros(1))
+    assert p.volume_ml[0] == pytest.approx(19.0)
+    assert p.od[0] == pytest.approx(0.5 * 20.0 / 19.0)
+
+
+def dose(config: PumpConfig, on_s: float, prepare: Callable[[Plant], None] = lambda p: None) -> float:
+    p = plant(PlantConfig(pump=config))
+    prepare(p)
+    p.advance(1.0, np.array([on_s]))
+    return float(p.media_ml[0])
+
+
+def test_pump_delivers_gain_times_on_time_less_dead_time() -> None:
+    worn = replace(PULSE, gain_ml_s=0.7, dead_time_s=0.05, min_pulse_s=0.1)
+    assert dose(worn, 1.05) == pytest.approx(0.7)
+    assert dose(worn, 0.079) == 0.0  # the first of the 17 levels is dead
+    assert dose(worn, 0.158) == pytest.approx(0.7 * 0.108)
+    assert dose(replace(worn, gain_drift_per_h=-0.1), 1.05) == pytest.approx(0.7)
+
+
+def test_fault_switches_of_the_pump() -> None:
+    for factor in (0.0, 0.5, 1.5):
+        assert dose(PULSE, 1.0, lambda p, f=factor: p.pump_gain_factor.fill(f)) == pytest.approx(factor)  # type: ignore[misc]
+    assert dose(PULSE, 1.0, lambda p: p.back_leak_ml.fill(0.2)) == pytest.approx(0.8)
+    assert dose(PULSE, 1.0, lambda p: p.media_left_ml.fill(0.3)) == pytest.approx(0.3)
+    p = plant(PlantConfig(pump=PULSE))
+    p.advance(1.0, np.array([-2.0]))  # backwards: culture leaves, nothing is diluted
+    assert p.volume_ml[0] == pytest.approx(18.0)
+    assert p.od[0] > 0.5
+
+
+def test_priming_loses_part_of_the_first_pulse_after_a_rest() -> None:
+    p = plant(PlantConfig(pump=replace(PULSE, prime_low=0.3, prime_high=0.7)), 200)
+    p.advance(11.0, np.zeros(200))
+    p.advance(1.0, np.ones(200))
+    first = p.media_ml.copy()
+    p.advance(1.0, np.ones(200))
+    np.testing.assert_allclose(p.media_ml - first, 1.0)
+    assert first.min() >= 0.3
+    assert first.max() <= 0.7
+    assert first.mean() == pytest.approx(0.5, abs=0.03)
+
+
+def test_pulse_spread_and_its_memory() -> None:
+    p = plant(PlantConfig(pump=replace(PULSE, pulse_cv=0.1, pulse_ar=0.5)), 400)
+    doses = []
+    for _ in range(60):
+        before = p.media_ml
+        p.advance(1.0, np.ones(400))
+        doses.append(p.media_ml - before)
+    d = np.array(doses)[5:] - 1.0
+    assert d.std() == pytest.approx(0.1, rel=0.03)
+    assert np.mean(d[1:] * d[:-1]) / d.var() == pytest.approx(0.5, abs=0.02)
+
+
+def test_small_irregular_steps_give_the_same_plant() -> None:
+    config = preset("bench")
+    whole, cut = plant(config, 3), plant(config, 3)
+    steps = np.array([0.004, 0.009, 0.006, 0.002, 0.03, 0.2, 0.749])  # min; the pump runs through the first four
+    for _ in range(20):
+        whole.advance(1.0, np.full(3, 60.0 * steps[:4].sum()), np.full(3, 10.0))
+        for k, h in enumerate(steps):
+            cut.advance(float(h), np.full(3, 60.0 * h if k < 4 else 0.0), np.full(3, 2.5 if k < 4 else 0.0))
+    np.testing.assert_allclose(cut.media_ml, whole.media_ml, rtol=1e-9)
+    np.testing.assert_allclose(cut.volume_ml, whole.volume_ml, rtol=1e-6)
+    np.testing.assert_allclose(cut.od, whole.od, rtol=2e-3)
+    np.testing.assert_allclose(cut.read_od(), whole.read_od(), rtol=3e-3)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_vial_i_is_the_same_whatever_n_is(name: str) -> None:
+    config = preset(name)
+    many = plant(config, 8, seed=3)
+    one = Plant(config, 1, [np.random.default_rng(3).spawn(8)[5]])
+    for minute in range(40):
+        on = 0.3 + 0.5 * (minute % 3)
+        many.advance(1.0, on)
+        one.advance(1.0, on)
+        assert many.read_od()[5] == pytest.approx(one.read_od()[0], rel=1e-12)
+    for key, value in many.draws.items():
+        assert value[5] == one.draws[key][0], key
+
+
+def test_noise_does_not_depend_on_what_the_pump_is_told() -> None:
+    config = PlantConfig(
+        growth=GrowthConfig(drift_sd_per_h=0.1),
+        pump=replace(PULSE, pulse_cv=0.2, pulse_ar=0.5, timing_error_s=0.1),
+        sensor=SensorConfig(noise_floor=0.01, lag1=0.1, outlier_rate=0.05, bubble_rate=0.05),
+    )
+    a, b = plant(config, 6), plant(config, 6)
+    for minute in range(200):
+        a.advance(1.0, 0.5)
+        b.advance(1.0, 1.0 if minute % 7 == 0 else 0.0)
+        np.testing.assert_allclose(a.read_od() - a.apparent_od, b.read_od() - b.apparent_od, atol=1e-12)
+    before = a.media_ml, b.media_ml
+    a.advance(1.0, 0.7)
+    b.advance(1.0, 0.7)
+    np.testing.assert_allclose(a.media_ml - before[0], b.media_ml - before[1], rtol=1e-9)
+    x = a.od.copy(), b.od.copy()
+    a.advance(1.0, 0.0)
+    b.advance(1.0, 0.0)
+    np.testing.assert_allclose(a.od / x[0], b.od / x[1], rtol=1e-12)  # growth drifted alike
+
+
+def test_draws_have_the_configured_spread_and_seeds_differ() -> None:
+    config = preset("bench")
+    p = plant(config, 2000)
+    assert p.draws["mu"].mean() == pytest.approx(0.025, rel=0.01)
+    assert p.draws["mu"].std() / 0.025 == pytest.approx(0.07, rel=0.08)
+    assert p.draws["pump_gain_ml_s"].std() / 1.11 == pytest.approx(0.15, rel=0.08)
+    tau = p.draws["volume_ml"] / 60.0 / p.draws["pump_gain_ml_s"]
+    assert np.quantile(tau, 0.025) > 0.21
+    assert np.quantile(tau, 0.975) < 0.46
+    assert np.abs(np.quantile(p.draws["sensor_noise_factor"], [0.1, 0.9]) - [0.5, 2.2]).max() < 0.15
+    assert not np.array_equal(p.draws["mu"], plant(config, 2000, seed=1).draws["mu"])
+
+
+def test_growth_faults_and_stirrer() -> None:
+    p = plant(PlantConfig(), 3)
+    p.mu_factor[1] = 0.6
+    p.stir_factor[2] = 0.0
+    p.advance(5.0, 0.0)
+    rate = np.log(p.od / 0.5) / 5.0
+    np.testing.assert_allclose(rate / rate[0], [1.0, 0.6, 0.5], rtol=5e-3)
+    assert 0.05 < 1.0 - p.apparent_od[2] / p.od[2] < 0.10
+
+
+def test_reset_starts_a_new_culture_in_the_same_reactor() -> None:
+    p = plant(preset("bench"), 4)
+    mu = p.draws["mu"].copy()
+    p.advance(30.0, 1.0)
+    p.reset(0.8, temperature=30.0)
+    np.testing.assert_array_equal(p.od, 0.8)
+    np.testing.assert_array_equal(p.temperature, 30.0)
+    np.testing.assert_array_equal(p.media_ml, 0.0)
+    np.testing.assert_array_equal(p.draws["mu"], mu)
+    assert p.minutes == 0.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GrowthConfig(mu=-0.01), r"plant.growth.mu = -0.01 1/min: allowed 0 to 0.1"),
+        (lambda: GrowthConfig(mu=float("nan")), r"plant.growth.mu = nan"),
+        (lambda: GrowthConfig(temperature_law="linear"), r"temperature_law = linear: allowed none"),
+        (lambda: PumpConfig(dosing="drip"), r"plant.pump.dosing = drip: allowed continuous, pulse"),
+        (lambda: PumpConfig(dead_time_s=0.05), r"set dosing=pulse"),
+        (lambda: PumpConfig(dosing="pulse", prime_low=0.9, prime_high=0.5), r"prime_low = 0.9"),
+        (lambda: SensorConfig(outlier_rate=1.5), r"plant.sensor.outlier_rate = 1.5"),
+        (lambda: VesselConfig(capacity_ml=20.0), r"plant.vessel.capacity_ml = 20.0 mL: allowed 24.5"),
+        (lambda: ThermalConfig(cooling_min=0.0), r"plant.thermal.cooling_min = 0.0 min"),
+        (lambda: PlantConfig(integrator="heun"), r"plant.integrator = heun: allowed euler, rk4"),
+        (lambda: Plant(PlantConfig(), 0, np.random.default_rng(0)), r"number of vials = 0"),
+        (lambda: Plant(PlantConfig(), 2, [np.random.default_rng(0)]), r"random streams = 1: allowed 2"),
+        (lambda: plant(PlantConfig()).reset(-0.1), r"start OD"),
+        (lambda: plant(PlantConfig()).advance(0.0, np.zeros(1)), r"interval = 0.0 min"),
+        (lambda: plant(PlantConfig()).advance(1.0, np.array([np.nan])), r"pump on-time"),
+    ],
+)
+def test_what_is_out_of_range_is_named(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
