@@ -66,6 +66,7 @@ class Station:
         self._acted: tuple[float, int] | None = None  # newest one a dose was decided for
         self._offsets: deque[float] = deque(maxlen=10)  # arrival here minus the device's own time of recent samples
         self._late_s = 0.0  # how much later than possible the newest sample was seen
+        self._looked = False  # the last look found nothing new, so the next sample will be seen when it appears
         self._carry_ml, self._doses = 0.0, 0
         self._stuck = ""  # why the pumps could not be verified off
 
@@ -221,6 +222,7 @@ class Station:
         if is_new and (fault is None or fault.kind in ("mode", "pump")):
             self._take(state, now)
             return True
+        self._looked = not is_new
         return False
 
     def _diagnose(self, state: DeviceState, age_s: float) -> Fault | None:
@@ -255,10 +257,12 @@ class Station:
     def _take(self, state: DeviceState, now: float) -> None:
         """Make a new sample the newest one, note it down, and look after heater and stirrer."""
         self._sample = (state.sample_s, state.cycles)
-        self.arrived_s, self.time_s, self.next_poll = now, now - self.zero, now + CYCLE_S - 2.5
+        self.arrived_s, self.time_s = now, now - self.zero
+        self.next_poll = now + CYCLE_S - (2.5 if self._looked else 20.0)
+        self._looked = False
         self.od, self.temperature, self.raw = state.sample_od, state.sample_temperature, state.raw
         offset = now - state.sample_s
-        if self._offsets and not -1.0 < offset - min(self._offsets) < 65.0:
+        if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:
             self.tell(f"the board's clock moved by {min(self._offsets) - offset:.0f} s against this computer's")
             self._offsets.clear()
         self._offsets.append(offset)
