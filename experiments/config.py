@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from dqn.config import DQNConfig
+from envs.plant import PlantConfig
+from envs.setpoints import Schedule
 from envs.task import EnvConfig
+from hardware.simulated import SimulatedConfig
 
-__all__ = ["TrainConfig"]
+__all__ = ["DeployConfig", "TrainConfig", "deploy_schema"]
 
 
 @dataclass(frozen=True)
@@ -38,3 +42,25 @@ class TrainConfig:
         for key, value, ok, allowed in checks:
             if not ok:
                 raise ValueError(f"{key} = {value}: allowed {allowed}")
+
+
+BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig}
+
+
+@dataclass(frozen=True)
+class DeployConfig:
+    """`python -m experiments.deploy`."""
+
+    backend: Any = field(default_factory=SimulatedConfig)  # one of BACKENDS
+    plant: PlantConfig = field(default_factory=PlantConfig)  # of a simulated backend
+    scenario: Schedule = field(default_factory=Schedule)
+    policy: str = "latest"  # a policy.npz, a run folder, or `latest`
+    env_file: str | None = None  # a calibrated.yaml; its model becomes the simulated plant's
+    fsync: bool = True  # every row on the disk before the next command
+
+
+def deploy_schema(kind: str) -> DeployConfig:
+    """The schema for the backend of this kind. Raises: ValueError naming the kinds there are."""
+    if kind not in BACKENDS:
+        raise ValueError(f"backend.kind = {kind}: allowed {', '.join(BACKENDS)}")
+    return DeployConfig(backend=BACKENDS[kind]())

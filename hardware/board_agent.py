@@ -33,10 +33,12 @@ the one it waits for (ID 0 counts as the answer to the request in flight).
 
 Repeating a request is safe: a request equal to the previous one (same ID, METHOD, PATH) is answered from memory and
 not carried out again. So a PC that got no reply, a damaged one or ID 0 sends the very same line again; it takes a new
-ID for every new request and starts a session with HELLO and an ID drawn at random, which also clears that memory.
+ID for every new request and starts a session with HELLO and an ID drawn at random. HELLO and a trip of the dead-man
+switch clear that memory.
 
 HELLO, PING and BYE answer {"agent": "board_agent", "protocol": 1, "version": "1.0", "deadman_s": 120.0, "silent_s":
-0.0, "armed": true, "trips": 0, "last_trip": "", "url": "http://192.168.7.2:5000"}.
+0.0, "armed": true, "trips": 0, "last_trip": "", "url": "http://192.168.7.2:5000"}; silent_s is the silence before
+this request.
 
 GET /getSysdata/ is reduced to the fields that a client needs (under 1 KB): the same JSON with fewer keys; `record`
 lists hold their last value only, and "_records" {"time": n, "OD": n, "ThermometerIR": n} holds their lengths, which
@@ -46,6 +48,548 @@ Dead man
 --------
 Every valid request is a heartbeat. After `--deadman` seconds without one, Pump1 to Pump4 of every present reactor are
 switched off, read back, and the pass is repeated until it is verified or a heartbeat comes. A reactor whose on-board
-regulation is on (OD.ON = 1) has been handed over deliberately and is left alone. It is armed from the start on;
-BYE disarms it (a client that has left everything in order) until the next request that is not BYE.
+regulation is on (OD.ON = 1) has been handed over deliberately and is left alone. Because the device answers 204 even
+if its bus is dead, each pass ends with MeasureTemp/IR: if the bus hangs, that request makes the server restart itself
+with everything off (chibio.md section 9), otherwise it does nothing. It is armed from the start on; BYE disarms it
+(a client that has left everything in order) until the next request that is not BYE. On SIGTERM a live session's pumps
+are switched off before the agent ends.
+
+Beside an HTTP link
+-------------------
+`--http ADDRESS:PORT` listens there and carries every HTTP request to the device unchanged, so a client that uses this
+address instead of the device's has the same switch without further ado. Its own routes: GET /_agent/status (the JSON
+of HELLO; no heartbeat), POST /_agent/heartbeat (204) for a client that talks to the device directly, and
+POST /_agent/bye (204). 502 means that the device refused the connection, 504 that no complete answer came.
 """
+
+from __future__ import annotations
+
+import argparse
+import errno
+import fcntl
+import http.client
+import http.server
+import json
+import logging
+import os
+import select
+import signal
+import sys
+import termios
+import threading
+import time
+import tty
+import urllib.parse
+import zlib
+
+VERSION = "1.0"
+PROTOCOL = 1
+MAX_LINE = 512
+MAX_BODY = 262144
+REFUSED, NO_ANSWER, TOO_LONG, UNREADABLE = 10, 11, 12, 20
+DEVICE_METHODS = ("GET", "POST", "RAW")
+AGENT_METHODS = ("HELLO", "PING", "BYE")
+PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")
+PROBE_TIMEOUT_S = 40.0  # longer than the 30 s after which the device's server kills a hung worker
+RETRY_S = 5.0  # between passes of the dead-man switch that could not be verified
+WRITE_TIMEOUT_S = 5.0
+BACKOFF_S = (0.2, 5.0)  # first and longest pause before the line is opened again
+
+log = logging.getLogger("board_agent")
+
+
+# -- frames --------------------------------------------------------------------------------------------------------
+
+
+def encode_request(number: int, method: str, path: str) -> bytes:
+    """A request line, as the PC sends it."""
+    head = f">{number} {method} {path}".encode("ascii")
+    return head + b" %08x\n" % zlib.crc32(head)
+
+
+def decode_request(line: bytes) -> tuple[int, str, str] | None:
+    """(ID, METHOD, PATH) of a line without its newline; None if it is not a valid request. Never raises."""
+    start = line.rfind(b">")
+    parts = line[start:].split(b" ") if start >= 0 and len(line) - start < MAX_LINE else []
+    if len(parts) != 4 or parts[3] != b"%08x" % zlib.crc32(b" ".join(parts[:3])):
+        return None
+    number, method, path = parts[0][1:], parts[1].decode("latin-1"), parts[2]
+    if not number.isdigit() or number.startswith(b"0") or len(number) > 10 or int(number) > 0xFFFFFFFF:
+        return None
+    if method not in DEVICE_METHODS + AGENT_METHODS or (method in AGENT_METHODS and path != b"/"):
+        return None
+    if not path.startswith(b"/") or any(not 33 <= byte <= 126 for byte in path):
+        return None
+    return int(number), method, path.decode("ascii")
+
+
+def encode_reply(number: int, status: int, body: bytes) -> bytes:
+    """Header line, body and closing newline."""
+    head = b"<%d %d %d" % (number, status, len(body))
+    return head + b" %08x\n" % zlib.crc32(head + body) + body + b"\n"
+
+
+KEPT = {
+    "UIDevice": None,
+    "presentDevices": None,
+    "DeviceID": None,
+    "Version": ("value",),
+    "Experiment": ("ON", "cycles", "startTime"),
+    "time": ("record",),
+    "OD": ("ON", "current", "target", "Measuring", "record"),
+    "OD0": ("raw", "target"),
+    "Pump1": ("ON", "target"),
+    "Pump2": ("ON", "target"),
+    "Pump3": ("ON", "target"),
+    "Pump4": ("ON", "target"),
+    "Stir": ("ON", "target"),
+    "Heat": ("ON", "target"),
+    "Thermostat": ("ON", "target"),
+    "ThermometerIR": ("current", "record"),
+    "ThermometerExternal": ("current",),
+    "Volume": ("target",),
+    "Zigzag": ("ON",),
+    "Custom": ("ON",),
+    "Chemostat": ("ON",),
+    "Light": ("ON",),
+    "FP1": ("ON",),
+    "FP2": ("ON",),
+    "FP3": ("ON",),
+    "Terminal": ("text",),
+}  # None = the whole field
+
+
+def reduce_sysdata(body: bytes) -> bytes:
+    """The answer to GET /getSysdata/ with the fields a client needs; unchanged if it is not what is expected."""
+    try:
+        data = json.loads(body.decode("utf-8"))
+        small = {}
+        for name, keys in KEPT.items():
+            if name in data:
+                entry = data[name]
+                small[name] = entry if keys is None else {key: entry[key] for key in keys if key in entry}
+        lengths = {}
+        for name in ("time", "OD", "ThermometerIR"):
+            lengths[name] = len(small[name]["record"])
+            small[name]["record"] = small[name]["record"][-1:]
+        small["_records"] = lengths
+        if "Terminal" in small and "text" in small["Terminal"]:
+            text = small["Terminal"]["text"]
+            small["Terminal"]["text"] = text[:160] if isinstance(text, str) else text[:2]
+        return json.dumps(small, separators=(",", ":")).encode("utf-8")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return body
+
+
+# -- the device ----------------------------------------------------------------------------------------------------
+
+
+class Unanswered(Exception):
+    """The device gave no answer; `status` says how far the request got."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class Device:
+    """The device's HTTP server.
+
+    Args: url: e.g. http://192.168.7.2:5000; timeout_s: longest wait for an answer.
+    Raises: ValueError for an address that is not http://HOST[:PORT].
+    """
+
+    def __init__(self, url: str, timeout_s: float) -> None:
+        parts = urllib.parse.urlsplit(url)
+        if parts.scheme != "http" or not parts.hostname or parts.path not in ("", "/"):
+            raise ValueError(f"url = {url}: allowed http://HOST:PORT, e.g. http://192.168.7.2:5000")
+        self.url, self.timeout_s = url, timeout_s
+        self._host, self._port = parts.hostname, parts.port or 80
+
+    def request(self, method: str, path: str, timeout_s: float | None = None) -> tuple[int, bytes, str]:
+        """(status, body, content type). Raises: Unanswered."""
+        connection = http.client.HTTPConnection(self._host, self._port, timeout=timeout_s or self.timeout_s)
+        try:
+            try:
+                connection.connect()
+            except OSError as problem:
+                raise Unanswered(REFUSED, f"{self.url}: {problem}") from problem
+            try:
+                headers = {"X-Requested-With": "XMLHttpRequest", "Content-Length": "0", "Connection": "close"}
+                connection.request(method, path, headers=headers)
+                response = connection.getresponse()
+                body = response.read(MAX_BODY + 1)
+                left = response.length
+            except (OSError, http.client.HTTPException) as problem:
+                raise Unanswered(NO_ANSWER, f"{method} {path}: {type(problem).__name__} {problem}") from problem
+        finally:
+            connection.close()
+        if len(body) > MAX_BODY:
+            raise Unanswered(TOO_LONG, f"{method} {path}: more than {MAX_BODY} bytes")
+        if left:
+            raise Unanswered(NO_ANSWER, f"{method} {path}: {left} bytes missing at the end")
+        return response.status, body, response.getheader("Content-Type") or "text/plain"
+
+
+# -- the switch ----------------------------------------------------------------------------------------------------
+
+
+class Agent:
+    """Carries requests to the device and turns the pumps off when they stop coming.
+
+    Args: device; deadman_s: allowed silence; probe: end a pass with a request that unmasks a dead bus.
+    `lock` is held for every request and for the whole of one reactor's pass.
+    """
+
+    def __init__(self, device: Device, deadman_s: float, probe: bool = True) -> None:
+        self.device, self.deadman_s, self.probe = device, deadman_s, probe
+        self.lock = threading.RLock()
+        self.armed, self.session, self.trips, self.last_trip = True, False, 0, ""
+        self.silent_s = 0.0  # silence before the latest request
+        self._beat = time.monotonic()
+        self._beats = 0
+        self._settled = False  # this silence has been dealt with
+        self._memory: tuple[tuple[int, str, str], bytes] | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def start(self) -> None:
+        """Start watching."""
+        self._thread.start()
+
+    def beat(self, arm: bool = True) -> None:
+        """A sign of life; arm False ends the watch until the next one."""
+        now = time.monotonic()
+        self.silent_s, self._beat = now - self._beat, now
+        self._beats += 1
+        self.armed = self.session = arm
+        self._settled = False
+
+    def status(self) -> bytes:
+        """The JSON of HELLO, PING and BYE."""
+        return json.dumps(
+            {
+                "agent": "board_agent",
+                "protocol": PROTOCOL,
+                "version": VERSION,
+                "deadman_s": self.deadman_s,
+                "silent_s": round(self.silent_s, 3),
+                "armed": self.armed,
+                "trips": self.trips,
+                "last_trip": self.last_trip,
+                "url": self.device.url,
+            }
+        ).encode("ascii")
+
+    def answer_line(self, line: bytes) -> bytes:
+        """The reply frame for one received line; b"" for a line that is no frame."""
+        if b">" not in line:
+            return b""
+        request = decode_request(line)
+        if request is None:
+            return encode_reply(0, UNREADABLE, b"unreadable request, not carried out")
+        number, method, path = request
+        if method == "HELLO":
+            self._memory = None
+        self.beat(arm=method != "BYE")
+        if self._memory is not None and self._memory[0] == request:
+            return self._memory[1]
+        if method in AGENT_METHODS:
+            reply = encode_reply(number, 200, self.status())
+        else:
+            reply = encode_reply(number, *self._carry(method, path))
+        self._memory = request, reply
+        return reply
+
+    def _carry(self, method: str, path: str) -> tuple[int, bytes]:
+        try:
+            with self.lock:
+                status, body, _ = self.device.request("GET" if method == "RAW" else method, path)
+        except Unanswered as problem:
+            return problem.status, str(problem).encode("ascii", "replace")[:200]
+        if method == "GET" and path == "/getSysdata/" and status == 200:
+            body = reduce_sysdata(body)
+        return status, body
+
+    def _watch(self) -> None:
+        while not self._stop.wait(min(0.5, self.deadman_s / 10.0)):
+            if self.armed and not self._settled and time.monotonic() - self._beat > self.deadman_s:
+                self._trip()
+
+    def _trip(self) -> None:
+        """No client: passes until everything is verified off or somebody is back."""
+        beats = self._beats
+        self.trips += 1
+        self.last_trip = time.strftime("%Y-%m-%dT%H:%M:%S")
+        self._memory = None
+        log.warning("no valid request for %.0f s: switching all pumps off", self.deadman_s)
+        while not self._stop.is_set():
+            problems = self.sweep(beats)
+            if self._beats != beats:
+                log.warning("a client is back, dead-man pass ended")
+                return
+            if not problems:
+                log.warning("pumps verified off")
+                self._settled = True
+                return
+            log.error("not verified: %s; next try in %.0f s", "; ".join(problems), RETRY_S)
+            self._stop.wait(RETRY_S)
+
+    def sweep(self, beats: int) -> list[str]:
+        """One pass over all present reactors; what could not be verified. Ends early when `beats` is outdated."""
+        problems = []
+        try:
+            with self.lock:
+                present = self._state()["presentDevices"]
+            for name in sorted(present):
+                if present[name] == 1 and self._beats == beats:
+                    with self.lock:
+                        problems += self._switch_off(name)
+        except (Unanswered, ValueError, KeyError, TypeError, AttributeError) as problem:
+            problems.append(f"{type(problem).__name__}: {problem}")
+        return problems
+
+    def _state(self) -> dict:  # type: ignore[type-arg]
+        """The selected reactor's state. Raises: Unanswered, ValueError for an answer that is not JSON."""
+        status, body, _ = self.device.request("GET", "/getSysdata/")
+        if status != 200:
+            raise ValueError(f"getSysdata answered {status}")
+        return dict(json.loads(body.decode("utf-8")))
+
+    def _switch_off(self, name: str) -> list[str]:
+        self.device.request("POST", "/changeDevice/" + name)
+        state = self._state()
+        if state["UIDevice"] != name or state["presentDevices"][name] != 1:
+            return [name + " cannot be selected"]
+        if state["OD"]["ON"] == 1:
+            log.warning("%s regulates on its own (OD.ON = 1): left alone", name)
+            return []
+        for pump in PUMPS:
+            status, _, _ = self.device.request("POST", f"/SetOutputOn/{pump}/0/{name}")
+            if status != 204:
+                return [f"{pump} of {name}: status {status}"]
+        state = self._state()
+        running = [pump for pump in PUMPS if state[pump]["ON"] != 0]
+        if state["UIDevice"] != name or running:
+            return [f"{name}: still on: " + (", ".join(running) or "unknown, another reactor was selected")]
+        if self.probe:
+            self.device.request("POST", "/MeasureTemp/IR/" + name, PROBE_TIMEOUT_S)
+        return []
+
+    def stop(self) -> None:
+        """End the watch; a live session's pumps are switched off first."""
+        self._stop.set()
+        if self.session and not self._settled:
+            problems = self.sweep(self._beats)
+            log.warning("agent ends: pumps %s", "; ".join(problems) if problems else "verified off")
+
+
+# -- serial line ---------------------------------------------------------------------------------------------------
+
+
+class SerialPort:
+    """Owns a tty in raw mode and answers the requests that arrive on it; a line that hangs up is opened again.
+
+    Args: path: e.g. /dev/ttyGS0; baud: rate, without meaning on USB; agent.
+    Raises: ValueError for a rate the system does not know.
+    """
+
+    def __init__(self, path: str, baud: int, agent: Agent) -> None:
+        if not hasattr(termios, f"B{baud}"):
+            raise ValueError(f"baud = {baud}: allowed the usual rates, e.g. 115200")
+        self._path, self._agent = path, agent
+        self._speed = getattr(termios, f"B{baud}")
+        self._stop = threading.Event()
+
+    def stop(self) -> None:
+        """End `run` within a second."""
+        self._stop.set()
+
+    def run(self) -> None:
+        """Serve until `stop`."""
+        pause = BACKOFF_S[0]
+        while not self._stop.is_set():
+            try:
+                descriptor = self._open()
+            except (OSError, termios.error) as problem:
+                log.warning("%s: %s; next try in %.1f s", self._path, problem, pause)
+                self._stop.wait(pause)
+                pause = min(2.0 * pause, BACKOFF_S[1])
+                continue
+            log.info("%s open", self._path)
+            began = time.monotonic()
+            try:
+                self._serve(descriptor)
+            except (OSError, termios.error) as problem:
+                log.warning("%s: line lost (%s)", self._path, problem)
+            finally:
+                os.close(descriptor)
+            pause = BACKOFF_S[0] if time.monotonic() - began > BACKOFF_S[1] else min(2.0 * pause, BACKOFF_S[1])
+            self._stop.wait(pause)
+
+    def _open(self) -> int:
+        descriptor = os.open(self._path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        try:
+            fcntl.ioctl(descriptor, termios.TIOCEXCL)
+            tty.setraw(descriptor)
+            mode = termios.tcgetattr(descriptor)
+            mode[2] |= termios.CLOCAL | termios.CREAD
+            mode[4] = mode[5] = self._speed
+            termios.tcsetattr(descriptor, termios.TCSANOW, mode)
+            termios.tcflush(descriptor, termios.TCIOFLUSH)
+        except (OSError, termios.error):
+            os.close(descriptor)
+            raise
+        return descriptor
+
+    def _serve(self, descriptor: int) -> None:
+        """Lines in, replies out. Raises: OSError when the line is gone."""
+        waiting = b""
+        while not self._stop.is_set():
+            if not select.select([descriptor], [], [], 0.5)[0]:
+                continue
+            try:
+                chunk = os.read(descriptor, 4096)
+            except BlockingIOError:
+                continue
+            if not chunk:
+                raise OSError(errno.EIO, "hung up")
+            *lines, waiting = (waiting + chunk).split(b"\n")
+            waiting = waiting[-2 * MAX_LINE :]  # garbage without end is not kept; its newline makes one bad line
+            for line in lines:
+                reply = self._agent.answer_line(line)
+                if reply:
+                    self._write(descriptor, reply)
+
+    def _write(self, descriptor: int, data: bytes) -> None:
+        """Send, or give up when nobody reads: a full line must not stop the agent."""
+        deadline = time.monotonic() + WRITE_TIMEOUT_S + len(data) / 2000.0
+        while data:
+            left = deadline - time.monotonic()
+            if left <= 0.0 or not select.select([], [descriptor], [], left)[1]:
+                termios.tcflush(descriptor, termios.TCOFLUSH)
+                log.warning("%s: nobody reads, reply dropped", self._path)
+                return
+            try:
+                data = data[os.write(descriptor, data) :]
+            except BlockingIOError:
+                continue
+
+
+# -- HTTP ----------------------------------------------------------------------------------------------------------
+
+
+class Proxy(http.server.ThreadingHTTPServer):
+    """The agent beside an HTTP link; see the module's docstring."""
+
+    daemon_threads = True
+
+    def __init__(self, address: tuple[str, int], agent: Agent) -> None:
+        self.agent = agent
+        super().__init__(address, ProxyHandler)
+
+
+class ProxyHandler(http.server.BaseHTTPRequestHandler):
+    """One request of the client."""
+
+    protocol_version = "HTTP/1.1"
+    timeout = 30
+    server: Proxy
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Silent: thousands of requests a day."""
+
+    def do_GET(self) -> None:
+        """Any method of the device; the agent's own routes."""
+        agent = self.server.agent
+        length = self.headers.get("Content-Length", "0")
+        self.rfile.read(min(int(length), MAX_BODY) if length.isdigit() else 0)
+        if self.path == "/_agent/status" and self.command == "GET":
+            self._send(200, agent.status(), "application/json")
+        elif self.path in ("/_agent/heartbeat", "/_agent/bye") and self.command == "POST":
+            agent.beat(arm=self.path.endswith("heartbeat"))
+            self._send(204, b"", "text/plain")
+        elif self.path.startswith("/_agent"):
+            self._send(404, b"allowed: GET status, POST heartbeat, POST bye\n", "text/plain")
+        else:
+            agent.beat()
+            try:
+                with agent.lock:
+                    answer = agent.device.request(self.command, self.path)
+            except Unanswered as problem:
+                status = 504 if problem.status == NO_ANSWER else 502
+                answer = (status, f"{problem}\n".encode("ascii", "replace"), "text/plain")
+            self._send(*answer)
+
+    do_POST = do_GET
+
+    def _send(self, status: int, body: bytes, kind: str) -> None:
+        self.close_connection = True
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        if status != 204:
+            self.send_header("Content-Length", str(len(body)))
+        self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(body)
+
+
+# -- program -------------------------------------------------------------------------------------------------------
+
+
+def parser() -> argparse.ArgumentParser:
+    """Arguments of the program."""
+    p = argparse.ArgumentParser(description="Carries requests to the Chi.Bio server; turns pumps off in silence.")
+    p.add_argument("--tty", help="serial line to serve, e.g. /dev/ttyGS0")
+    p.add_argument("--baud", type=int, default=115200, help="line rate (default %(default)s)")
+    p.add_argument("--http", metavar="ADDRESS:PORT", help="listen here for HTTP requests, e.g. 192.168.7.2:5001")
+    p.add_argument("--url", default="http://192.168.7.2:5000", help="the device's server (default %(default)s)")
+    p.add_argument("--deadman", type=float, default=120.0, help="allowed silence, s (default %(default)s)")
+    p.add_argument("--http-timeout", type=float, default=18.0, help="wait for the device, s (default %(default)s)")
+    p.add_argument("--no-probe", action="store_true", help="do not unmask a dead bus with MeasureTemp")
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run until SIGTERM or SIGINT; exit status."""
+    arguments = parser().parse_args(argv)
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    proxy = None
+    try:
+        if not arguments.tty and not arguments.http:
+            raise ValueError("neither --tty nor --http is given: allowed one or both")
+        for key, value in (("deadman", arguments.deadman), ("http-timeout", arguments.http_timeout)):
+            if not 0.0 < value <= 86400.0:
+                raise ValueError(f"{key} = {value:g} s: allowed more than 0, up to 86400")
+        agent = Agent(Device(arguments.url, arguments.http_timeout), arguments.deadman, not arguments.no_probe)
+        port = SerialPort(arguments.tty, arguments.baud, agent) if arguments.tty else None
+        if arguments.http:
+            host, _, number = arguments.http.rpartition(":")
+            if not number.isdigit():
+                raise ValueError(f"http = {arguments.http}: allowed ADDRESS:PORT, e.g. 192.168.7.2:5001")
+            proxy = Proxy((host, int(number)), agent)
+    except (ValueError, OSError, OverflowError) as problem:
+        print(f"board_agent: {problem}", file=sys.stderr)
+        return 2
+    stop = threading.Event()
+    for name in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(name, lambda *_: stop.set())
+    agent.start()
+    if port is not None:
+        threading.Thread(target=port.run, daemon=True).start()
+    if proxy is not None:
+        threading.Thread(target=proxy.serve_forever, daemon=True).start()
+    where = [arguments.tty] if arguments.tty else []
+    where += [f"http://{arguments.http.rpartition(':')[0]}:{proxy.server_address[1]}"] if proxy else []
+    log.info("board_agent %s ready on %s, dead-man %.6g s", VERSION, " and ".join(where), agent.deadman_s)
+    stop.wait()
+    if port is not None:
+        port.stop()
+    if proxy is not None:
+        proxy.shutdown()
+    agent.stop()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

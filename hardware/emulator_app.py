@@ -256,13 +256,11 @@ class ReactorApp:
         meter["current"] = value if value <= 100.0 else meter["current"]
 
     def expose(self, seconds: float) -> Generator[float, None, int]:
-        """Laser on, one reading, laser off; counts. Another thread that switches the laser off spoils it."""
+        """Laser on, one reading, laser off; counts. Another thread that measures at the same time spoils it."""
         yield from self.set_on("LASER650", 1)
-        bench, start = self._hardware(), self.board.now()
-        lit = bench.lit_s(start)
+        self._hardware().begin_exposure(self.board.now())
         yield seconds
-        bench, end = self._hardware(), self.board.now()
-        raw = bench.counts(end, (bench.lit_s(end) - lit) / (end - start))
+        raw = self._hardware().counts(self.board.now(), seconds)
         yield from self.set_on("LASER650", 0)
         self.data["AS7341"]["current"]["ADC0"] = raw
         return raw

@@ -160,7 +160,7 @@ class Bench:
         self._stirred_at = start
         self._motors = dict.fromkeys(self.on_s, 0)
         self._since: dict[str, tuple[float, float]] = {}
-        self._lit, self._laser_since = 0.0, np.nan
+        self._lit, self._lit_before, self._laser_since = 0.0, 0.0, np.nan
         self._common, self._jump, self._measured_at, self._last_raw = 0.0, 0.0, -np.inf, 0
 
     # -- motors, heater, stirrer, laser ----------------------------------------------------------------------------
@@ -231,12 +231,16 @@ class Bench:
         self.stir = power if self.powered and not self.faults.stirrer_dead else 0.0
 
     def set_laser(self, on: bool, at: float) -> None:
-        """Laser on or off; readings see the share of their exposure during which it was on."""
+        """Laser on or off."""
         if not np.isnan(self._laser_since):
             self._lit += at - self._laser_since
         self._laser_since = at if on else np.nan
 
-    def lit_s(self, at: float) -> float:
+    def begin_exposure(self, at: float) -> None:
+        """The spectrometer starts integrating, and forgets what another thread had begun to integrate."""
+        self._lit_before = self._lit_s(at)
+
+    def _lit_s(self, at: float) -> float:
         """Total time the laser has been on."""
         return self._lit + (0.0 if np.isnan(self._laser_since) else at - self._laser_since)
 
@@ -277,11 +281,11 @@ class Bench:
         warmed = 0.15 * (float(self.plant.temperature[0]) - self.config.air_c) if which == "Internal" else 0.0
         return round((self.config.air_c + warmed + self._rng.normal(0.0, 0.05)) * 16.0) / 16.0
 
-    def counts(self, at: float, lit_fraction: float) -> int:
+    def counts(self, at: float, exposure_s: float) -> int:
         """One spectrometer reading of the laser, 16-bit counts.
 
         raw = blank 10^-R with LINEAR R + QUADRATIC R^2 = what a noise-free sensor would show; stirred or half-lit
-        readings are lower. Args: at: device s; lit_fraction: share of the exposure with the laser on, 0 to 1.
+        readings are lower. Args: at: device s; exposure_s: how long it should have been lit since `begin_exposure`.
         """
         self._nearly_sync(at)
         f, c, rng = self.faults, self.config, self._rng
@@ -301,7 +305,11 @@ class Bench:
         if self.stir > 0.0 or at < self.settled_at:
             light *= max(c.stir_factor * (1.0 + rng.normal(0.0, c.stir_noise)), 0.01)
         light *= 1.0 + self._common + rng.normal(0.0, c.noise_fraction)
-        self._last_raw = int(np.clip(round(DARK_COUNTS + light * lit_fraction), 0, FULL_SCALE))
+        self._last_raw = int(
+            np.clip(
+                round(DARK_COUNTS + light * min((self._lit_s(at) - self._lit_before) / exposure_s, 1.0)), 0, FULL_SCALE
+            )
+        )
         return self._last_raw
 
 

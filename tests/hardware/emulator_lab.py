@@ -1,0 +1,71 @@
+"""An emulated device without noise, and the few calls every test of it makes."""
+
+import json
+from typing import Any
+
+import numpy as np
+
+from envs.plant import GrowthConfig, PlantConfig, PumpConfig
+from hardware.clock import VirtualClock
+from hardware.emulator_bench import BenchConfig
+from hardware.emulator_device import ChiBioDevice, DeviceOptions
+
+BLANK = 14000.0
+BIAS_S = 0.1  # every pump run is longer than asked by this
+
+
+def quiet(mu: float = 0.0, **bench: float) -> DeviceOptions:
+    """No noise, known blank, constant pump bias, a culture that grows with mu (1/min)."""
+    fixed = {
+        "blank_low": BLANK,
+        "blank_high": BLANK,
+        "noise_fraction": 0.0,
+        "common_fraction": 0.0,
+        "outlier_rate": 0.0,
+        "stir_noise": 0.0,
+        "on_time_bias_low_s": BIAS_S,
+        "on_time_bias_high_s": BIAS_S,
+    } | bench
+    plant = PlantConfig(growth=GrowthConfig(mu=mu), pump=PumpConfig(dosing="pulse"))
+    return DeviceOptions(bench=BenchConfig(**fixed), plant=plant)
+
+
+class Lab:
+    """A device on a virtual clock and a client that asks it."""
+
+    def __init__(self, reactors: tuple[str, ...] = ("M0", "M1"), mu: float = 0.0, seed: int = 0, **kwargs: Any) -> None:
+        options = kwargs.pop("options", None) or quiet(mu)
+        self.clock = VirtualClock()
+        self.device = ChiBioDevice(reactors, self.clock, np.random.default_rng(seed), options, **kwargs)
+
+    def post(self, path: str) -> int:
+        """Status of a POST."""
+        return self.device.handle("POST", path)[0]
+
+    def state(self, reactor: str = "M0") -> dict[str, Any]:
+        """sysData of a reactor, as a client gets it."""
+        assert self.post(f"/changeDevice/{reactor}") == 204
+        status, body = self.device.handle("GET", "/getSysdata/")
+        assert status == 200
+        data: dict[str, Any] = json.loads(body)
+        assert data["UIDevice"] == reactor
+        return data
+
+    def peek(self, reactor: str = "M0") -> dict[str, Any]:
+        """sysData without asking for it: takes no device time."""
+        self.device.run_until(self.clock.now())
+        return self.device.apps[reactor].data
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass."""
+        self.clock.sleep(seconds)
+        self.device.run_until(self.clock.now())
+
+    def wait_until(self, at: float) -> None:
+        """Let time pass up to device second `at`."""
+        self.wait(at - self.clock.now())
+
+    def doses(self, reactor: str = "M0", pump: str = "Pump1") -> list[tuple[float, float]]:
+        """(start, length) of what the pump's motor did, s."""
+        self.device.run_until(self.clock.now())
+        return [(d.start_s, d.seconds) for d in self.device.benches[reactor].doses if d.pump == pump]

@@ -1,0 +1,284 @@
+"""The experiment cycle: timing, records, start, stop and their races (chibio.md section 3)."""
+
+import numpy as np
+import pytest
+
+from hardware.emulator_faults import inject
+from hardware.emulator_state import append_records, fresh_sysdata, thin_records
+from tests.hardware.emulator_lab import Lab, quiet
+
+
+def cycle_start(lab: Lab, cycles: int) -> float:
+    """Run until cycle number `cycles` has begun; its start, device s, to 10 ms."""
+    while lab.peek()["Experiment"]["cycles"] < cycles:
+        lab.wait(0.01)
+    return lab.clock.now()
+
+
+def test_start_turns_everything_off_and_the_thermostat_on() -> None:
+    lab = Lab()
+    for pump in range(1, 5):
+        lab.post(f"/SetOutputTarget/Pump{pump}/M0/-0.1")
+        lab.post(f"/SetOutputOn/Pump{pump}/1/M0")
+    lab.post("/SetOutputOn/Stir/1/M0")
+    lab.post("/Direction/Pump1/M0")
+    before = lab.clock.now()
+    lab.post("/Experiment/1/M0")
+    assert lab.clock.now() - before == pytest.approx(0.07, abs=0.03)
+    state = lab.state()
+    assert [state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4)] == [0, 0, 0, 0]
+    assert state["Pump1"]["direction"] == 1.0
+    assert (state["Stir"]["ON"], state["Thermostat"]["ON"], state["Thermostat"]["target"]) == (0, 1, 37.0)
+    assert (state["Experiment"]["ON"], state["OD"]["ON"]) == (1, 0)
+    assert state["Experiment"]["startTime"] == "2026-01-01 00:00:02"
+    assert state["Experiment"]["startTimeRaw"] == "Thu, 01 Jan 2026 00:00:02 GMT"
+    lab.wait(0.2)
+    truth = lab.device.truth("M0")
+    assert set(truth["motors"].values()) == {0}
+
+
+def test_timetable_of_one_cycle() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    zero = cycle_start(lab, 2)
+    seen: dict[str, float] = {}
+    was = {"Measuring": 0, "Stir": 0, "records": 1}
+    assert lab.peek()["Stir"]["ON"] == 0  # stirrer off at 0
+    while lab.clock.now() < zero + 59.0:
+        data = lab.peek()
+        now = {"Measuring": data["OD"]["Measuring"], "Stir": data["Stir"]["ON"], "records": len(data["OD"]["record"])}
+        for key, value in now.items():
+            if value != was[key]:
+                seen[f"{key} {value}"] = lab.clock.now() - zero
+        was = now
+        lab.wait(0.01)
+    assert seen["Measuring 1"] == pytest.approx(5.0, abs=0.05)
+    assert seen["Measuring 0"] == pytest.approx(10.0, abs=0.15)  # 4 (0.97 + 0.25), then temperatures
+    assert seen["Stir 1"] == pytest.approx(10.5, abs=0.15)
+    assert seen["records 2"] == pytest.approx(13.0, abs=0.5)
+    assert set(seen) == {"Measuring 1", "Measuring 0", "Stir 1", "records 2"}
+
+
+def test_period_is_60_07_s_and_time_record_is_the_start_of_the_cycle() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait(150 * 60.07 + 20.0)
+    times = np.array(lab.state()["time"]["record"])
+    periods = np.diff(times)
+    assert np.median(periods) == pytest.approx(60.07, abs=0.02)
+    assert periods.min() >= 60.03 - 0.01
+    assert periods.max() <= 60.17
+    assert times[0] < 0.2
+    assert np.all(times == np.round(times, 2))
+
+
+def test_od_current_shows_single_readings_while_measuring_then_the_mean_of_their_ods() -> None:
+    lab = Lab(options=quiet(noise_fraction=0.05), blanked=True)
+    lab.post("/Experiment/1/M0")
+    lab.wait_until(5.0)
+    singles: list[float] = []
+    while lab.clock.now() < 12.0:
+        lab.wait(0.05)
+        data = lab.peek()
+        if data["OD"]["Measuring"] == 1 and data["OD"]["current"] not in singles:
+            singles.append(data["OD"]["current"])
+    data = lab.peek()
+    readings = singles[1:] if singles[0] == 0.0 else singles  # 0 from power-on, until the first reading
+    assert len(set(readings[:4])) == 4
+    mean = sum(readings[:4]) / 4
+    assert data["OD"]["current"] == pytest.approx(mean, abs=1e-12)
+    raw_od = 1.833 * np.log10(14000.0 / data["OD0"]["raw"]) + 0.226 * np.log10(14000.0 / data["OD0"]["raw"]) ** 2
+    assert raw_od == pytest.approx(readings[3], abs=1e-9)  # OD0.raw stays the last raw
+    assert raw_od != pytest.approx(mean, abs=1e-6)
+
+
+def test_waste_pump_lengthens_the_still_phase_and_beyond_60_s_the_cycle() -> None:
+    lab = Lab()
+    lab.post("/SetOutputTarget/Pump2/M0/0.5")
+    lab.post("/Experiment/1/M0")
+    lab.post("/SetOutputOn/Pump2/1/M0")
+    zero = cycle_start(lab, 2)
+    while lab.peek()["Stir"]["ON"] == 0:
+        lab.wait(0.05)
+    assert lab.clock.now() - zero == pytest.approx(10.0 + 63 * 0.5 + 0.5, abs=0.2)
+    lab.post("/SetOutputTarget/Pump2/M0/0.9")
+    third = cycle_start(lab, 4)
+    assert cycle_start(lab, 5) - third == pytest.approx(69.8, abs=0.5)  # run of the real software: 69.8 s
+    assert "too short" in lab.state()["Terminal"]["text"]
+
+
+def test_pumps_3_and_4_do_not_lengthen_anything() -> None:
+    lab = Lab()
+    lab.post("/SetOutputTarget/Pump3/M0/0.9")
+    lab.post("/Experiment/1/M0")
+    lab.post("/SetOutputOn/Pump3/1/M0")
+    second = cycle_start(lab, 2)
+    assert cycle_start(lab, 3) - second == pytest.approx(60.07, abs=0.1)
+
+
+def test_records_grow_to_200_then_201_become_109() -> None:
+    data = fresh_sysdata("1", "M0")
+    for k in range(200):
+        append_records(data, 60.0 * k)
+        thin_records(data)
+    assert len(data["time"]["record"]) == 200
+    append_records(data, 60.0 * 200)
+    thin_records(data)
+    times = data["time"]["record"]
+    assert len(times) == 109
+    assert times[-11:] == [60.0 * k for k in range(190, 201)]  # the newest stay as they are
+    assert times[0] == 0.0
+    assert set(np.diff(times[:90])) <= {60.0, 120.0, 180.0}
+    assert {len(data[k]["record"]) for k in ("OD", "Pump1", "Pump2", "ThermometerIR", "Thermostat", "GrowthRate")} == {
+        109
+    }
+    assert len(data["OD"]["targetrecord"]) == len(data["FP1"]["Emit2Record"]) == 109
+    assert data["Heat"]["record"] == []
+
+
+def test_371_cycles_leave_186_records() -> None:
+    """Length seen in a run of the real software while cycle 371 was under way."""
+    data = fresh_sysdata("1", "M0")
+    for k in range(370):
+        append_records(data, 60.07 * k)
+        thin_records(data)
+    assert len(data["time"]["record"]) == 186
+
+
+def test_terminal_is_emptied_every_tenth_cycle_newest_line_first() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait(8 * 60.07 + 5.0)
+    text = lab.state()["Terminal"]["text"]
+    assert text.startswith("2026-01-01 00:08:00  - Cycle 9 Started</br>")
+    assert "Experiment Started" in text
+    lab.wait(15.0)
+    text = lab.state()["Terminal"]["text"]
+    assert text.endswith("  - Terminal Cleared</br>")
+    assert "Cycle 9 Started" not in text
+
+
+def test_start_time_raw_is_0_for_an_instant_in_cycles_1_11_21() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    hits = set()
+    while lab.clock.now() < 12 * 60.07:
+        lab.wait(0.05)
+        if lab.peek()["Experiment"]["startTimeRaw"] == 0:
+            hits.add(lab.peek()["Experiment"]["cycles"])
+    assert hits == {1, 11}
+    assert isinstance(lab.peek()["Experiment"]["startTimeRaw"], str)
+
+
+def test_second_start_stops() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait(30.0)
+    lab.post("/Experiment/1/M0")
+    state = lab.state()
+    assert (state["Experiment"]["ON"], state["Thermostat"]["ON"], state["Stir"]["ON"]) == (0, 0, 0)
+
+
+def test_stop_switches_pumps_1_and_2_off_at_once_3_and_4_later() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait(20.0)
+    for pump in (1, 2, 3, 4):
+        lab.post(f"/SetOutputTarget/Pump{pump}/M0/0.3")
+        lab.post(f"/SetOutputOn/Pump{pump}/1/M0")
+    lab.post("/Experiment/0/M0")
+    state = lab.state()
+    assert [state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4)] == [0, 0, 1, 1]
+    assert state["OD"]["ON"] == 0
+    assert "Stopped" not in state["Terminal"]["text"]
+    lab.wait_until(61.0)  # the thread slept out its cycle
+    state = lab.state()
+    assert [state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4)] == [0, 0, 0, 0]
+    assert "Experiment Stopped" in state["Terminal"]["text"].split("</br>")[0]
+
+
+def test_the_end_of_a_stopped_cycle_switches_off_what_was_started_meanwhile() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait(20.0)
+    lab.post("/Experiment/0/M0")
+    lab.post("/SetOutputOn/Stir/1/M0")
+    lab.post("/SetOutputOn/Thermostat/1/M0")
+    lab.wait_until(58.0)
+    assert (lab.state()["Stir"]["ON"], lab.state()["Thermostat"]["ON"]) == (1, 1)
+    lab.wait_until(62.0)
+    assert (lab.state()["Stir"]["ON"], lab.state()["Thermostat"]["ON"]) == (0, 0)
+
+
+def test_stop_in_the_first_five_seconds_takes_the_cycle_back() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    zero = cycle_start(lab, 3)
+    lab.post("/Experiment/0/M0")
+    lab.wait_until(zero + 6.0)
+    state = lab.state()
+    assert state["Experiment"]["cycles"] == 2
+    assert len(state["OD"]["record"]) == 2
+
+
+def test_restart_within_the_old_cycle_loses_the_thermostat_and_may_be_repaired() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait(30.0)
+    lab.post("/Experiment/0/M0")
+    lab.wait(5.0)
+    lab.post("/Experiment/1/M0")
+    lab.wait(20.0)
+    state = lab.state()
+    assert (state["Experiment"]["ON"], state["Thermostat"]["ON"], state["Stir"]["ON"]) == (1, 1, 1)
+    lab.wait_until(125.0)
+    state = lab.state()
+    assert (state["Experiment"]["ON"], state["Thermostat"]["ON"]) == (1, 0)  # silently without heating
+    assert state["Experiment"]["cycles"] >= 3  # the new chain runs on
+    lab.post("/SetOutputOn/Thermostat/1/M0")
+    lab.wait(200.0)
+    assert lab.state()["Thermostat"]["ON"] == 1
+
+
+def test_restart_after_the_old_cycle_has_ended_is_clean() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait(30.0)
+    lab.post("/Experiment/0/M0")
+    lab.wait(70.0)
+    first = lab.state()["Experiment"]["startTime"]
+    lab.post("/Experiment/1/M0")
+    lab.wait(95.0)
+    state = lab.state()
+    assert (state["Thermostat"]["ON"], state["Stir"]["ON"]) == (1, 1)
+    assert state["Experiment"]["startTime"] == first  # cycles > 0: the old start stays, records continue
+    assert np.all(np.diff(state["time"]["record"]) > 0)
+
+
+def test_a_dead_cycle_thread_leaves_a_plausible_picture() -> None:
+    lab = Lab(mu=0.03, blanked=True)
+    lab.post("/Experiment/1/M0")
+    lab.wait(100.0)
+    inject(lab.device, "cycle_dead", "M0")
+    before = lab.state()
+    lab.wait(600.0)
+    after = lab.state()
+    assert after["Experiment"]["ON"] == 1
+    assert after["Experiment"]["cycles"] == before["Experiment"]["cycles"]
+    assert after["OD"]["current"] == before["OD"]["current"]
+    assert lab.device.truth("M0")["od"] > 1.2 * before["OD"]["current"]
+    lab.post("/Experiment/0/M0")
+    lab.wait(70.0)
+    lab.post("/Experiment/1/M0")  # recovery used in the field
+    lab.wait(20.0)
+    assert lab.state()["time"]["record"][-1] > 700.0
+
+
+def test_two_reactors_cycle_independently() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait(25.0)
+    lab.post("/Experiment/1/M1")
+    lab.wait(300.0)
+    assert lab.state("M0")["Experiment"]["cycles"] == 6
+    assert lab.state("M1")["Experiment"]["cycles"] == 5

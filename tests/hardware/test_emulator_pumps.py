@@ -1,0 +1,236 @@
+"""Pump periods, thread replacement, doses, volume (chibio.md section 5.1 and 5.2) with independently computed times."""
+
+import numpy as np
+import pytest
+
+from hardware.emulator_faults import inject
+from tests.hardware.emulator_lab import BIAS_S, Lab
+
+
+def set_pump(lab: Lab, pump: str, target: float, on: bool = True, reactor: str = "M0") -> None:
+    lab.post(f"/SetOutputTarget/{pump}/{reactor}/{target}")
+    if on:
+        lab.post(f"/SetOutputOn/{pump}/1/{reactor}")
+
+
+def test_a_pump_left_on_doses_63_s_times_target_every_63_s_for_ever() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", 0.02)
+    lab.wait(630.0 + 5.0)
+    starts, lengths = zip(*lab.doses(), strict=True)
+    assert len(starts) == 11
+    assert starts[0] < 0.15  # the dose comes first, the pause after
+    np.testing.assert_allclose(np.diff(starts), 63.0, atol=0.1)
+    np.testing.assert_allclose(lengths, 63 * 0.02 + BIAS_S, atol=1e-6)
+
+
+def test_single_shot_dose_is_one_dose() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", 0.05)
+    lab.wait(63 * 0.05 + 0.5)
+    lab.post("/SetOutputOn/Pump1/0/M0")
+    lab.wait(300.0)
+    assert [length for _, length in lab.doses()] == pytest.approx([3.15 + BIAS_S])
+    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(3.15 + BIAS_S)  # 1 mL/s, perfect head
+
+
+def test_off_ends_a_dose_in_progress() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", 0.5)
+    lab.wait(2.0)
+    lab.post("/SetOutputOn/Pump1/0/M0")
+    lab.wait(200.0)
+    assert [length for _, length in lab.doses()] == pytest.approx([2.0], abs=0.1)
+
+
+def test_rewriting_the_target_while_on_doses_at_once_and_restarts_the_period() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", 0.02)
+    lab.wait_until(30.0)
+    set_pump(lab, "Pump1", 0.05, on=False)
+    lab.wait_until(120.0)
+    starts = [start for start, _ in lab.doses()]
+    lengths = [length for _, length in lab.doses()]
+    assert starts == pytest.approx([0.05, 30.05, 93.05], abs=0.1)
+    assert lengths == pytest.approx([1.26 + BIAS_S, 3.15 + BIAS_S, 3.15 + BIAS_S])
+
+
+def test_writing_every_60_07_s_gives_1_049_times_the_nominal_flow() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", 0.02)
+    for k in range(1, 200):
+        lab.wait_until(60.07 * k)
+        set_pump(lab, "Pump1", 0.02, on=False)
+    lab.wait_until(60.07 * 200)
+    per_second = (lab.device.truth("M0")["on_s"]["Pump1"] - 200 * BIAS_S) / (200 * 60.07)
+    assert per_second / 0.02 == pytest.approx(63 / 60.07, rel=2e-3)
+
+
+def test_writing_later_than_63_s_gives_two_doses() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", 0.05)
+    lab.wait_until(67.0)
+    set_pump(lab, "Pump1", 0.05, on=False)
+    lab.wait_until(75.0)
+    assert sum(length for _, length in lab.doses()) == pytest.approx(3 * (3.15 + BIAS_S))
+
+
+@pytest.mark.parametrize("target", [1.0, -1.0])
+def test_full_duty_is_continuous(target: float) -> None:
+    lab = Lab()
+    set_pump(lab, "Pump3", target)
+    lab.wait(400.0)
+    assert lab.device.benches["M0"].motor("Pump3") == int(target)
+    assert lab.doses(pump="Pump3") == []  # never switched off between periods
+    lab.post("/SetOutputOn/Pump3/0/M0")
+    lab.wait(1.0)
+    [(start, length)] = lab.doses(pump="Pump3")
+    assert length == pytest.approx(400.0, abs=0.3)
+
+
+def test_target_0_refuses_to_go_on_and_stays_off_when_a_target_comes() -> None:
+    lab = Lab()
+    lab.post("/SetOutputOn/Pump1/1/M0")
+    assert lab.state()["Pump1"]["ON"] == 0
+    set_pump(lab, "Pump1", 0.1)
+    assert lab.state()["Pump1"]["ON"] == 1
+    lab.wait(10.0)
+    lab.post("/SetOutputTarget/Pump1/M0/0")
+    assert lab.state()["Pump1"]["ON"] == 0
+    lab.post("/SetOutputTarget/Pump1/M0/0.1")
+    assert lab.state()["Pump1"]["ON"] == 0
+    lab.wait(100.0)
+    assert len(lab.doses()) == 1
+
+
+def test_nan_target_moves_nothing() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", float("nan"))
+    lab.wait(200.0)
+    assert lab.doses() == []
+    assert lab.device.benches["M0"].motor("Pump1") == 0
+
+
+def test_negative_target_runs_backwards_and_draws_culture_out() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", -0.05)
+    lab.wait(10.0)
+    assert [d.direction for d in lab.device.benches["M0"].doses] == [-1]
+    truth = lab.device.truth("M0")
+    assert truth["feed_ml"] == 0.0
+    assert truth["volume_ml"] == pytest.approx(20.0 - 3.15 - BIAS_S)
+
+
+def test_direction_before_the_thread_reads_it_reverses_the_dose() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", 0.05)
+    lab.post("/Direction/Pump1/M0")
+    lab.wait(10.0)
+    assert [d.direction for d in lab.device.benches["M0"].doses] == [-1]
+
+
+def test_set_output_on_returns_before_the_motor_turns() -> None:
+    lab = Lab()
+    lab.post("/SetOutputTarget/Pump1/M0/0.1")
+    before = lab.clock.now()
+    lab.post("/SetOutputOn/Pump1/1/M0")
+    assert lab.clock.now() - before < 0.02
+    assert lab.device.benches["M0"].motor("Pump1") == 0
+    lab.wait(0.1)
+    assert lab.device.benches["M0"].motor("Pump1") == 1
+
+
+def test_record_shows_a_pump_only_if_it_is_on_when_the_cycle_records() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait_until(20.0)
+    set_pump(lab, "Pump1", 0.02)  # single shot, over long before the next record
+    lab.wait_until(23.0)
+    lab.post("/SetOutputOn/Pump1/0/M0")
+    lab.wait_until(80.0)
+    set_pump(lab, "Pump1", 0.02)  # left on
+    lab.wait_until(140.0)
+    assert lab.state()["Pump1"]["record"] == [0.0, 0.0, 0.02]
+
+
+def test_volume_balance_waste_level_and_overflow() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", 0.02)
+    lab.wait(5.0)
+    lab.post("/SetOutputOn/Pump1/0/M0")
+    truth = lab.device.truth("M0")
+    assert truth["volume_ml"] == pytest.approx(20.0 + 1.26 + BIAS_S)
+    set_pump(lab, "Pump2", 0.15)
+    lab.wait(15.0)
+    assert lab.device.truth("M0")["volume_ml"] == pytest.approx(20.0)  # down to the waste tube, not below
+    lab.post("/SetOutputOn/Pump2/0/M0")
+    inject(lab.device, "waste_gain_factor", "M0", 0.0)
+    set_pump(lab, "Pump2", 1.0)
+    set_pump(lab, "Pump1", 0.5)
+    lab.wait(9.0)
+    assert not lab.device.truth("M0")["overflowed"]
+    lab.wait(3.0)
+    truth = lab.device.truth("M0")
+    assert truth["overflowed"]
+    assert truth["peak_ml"] == pytest.approx(30.0)
+
+
+def test_feed_dilutes_by_what_it_adds() -> None:
+    lab = Lab(od=0.8)
+    set_pump(lab, "Pump2", 1.0)
+    set_pump(lab, "Pump1", 2.0 / 63.0)
+    lab.wait(20.0)
+    assert lab.device.truth("M0")["od"] == pytest.approx(0.8 * np.exp(-(2.0 + BIAS_S) / 20.0), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fault", "value", "delivered"),
+    [("pump_gain_factor", 0.0, 0.0), ("pump_gain_factor", 0.3, 0.3), ("media_left_ml", 0.5, 0.5)],
+)
+def test_pump_faults_change_what_arrives_not_what_the_device_says(fault: str, value: float, delivered: float) -> None:
+    lab = Lab()
+    inject(lab.device, fault, "M0", value)
+    set_pump(lab, "Pump1", (1.0 - BIAS_S) / 63.0)
+    lab.wait(5.0)
+    assert lab.state()["Pump1"]["ON"] == 1
+    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(delivered)
+
+
+def test_back_leak_takes_from_every_pulse() -> None:
+    lab = Lab()
+    inject(lab.device, "back_leak_ml", "M0", 0.2)
+    set_pump(lab, "Pump1", (1.0 - BIAS_S) / 63.0)
+    lab.wait(70.0)
+    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(2 * 0.8)
+
+
+def test_stuck_open_pump_runs_although_the_device_says_off() -> None:
+    lab = Lab()
+    inject(lab.device, "feed_stuck_open", "M0")
+    lab.wait(10.0)
+    lab.post("/SetOutputOn/Pump1/0/M0")
+    assert lab.state()["Pump1"]["ON"] == 0
+    inject(lab.device, "feed_stuck_open", "M0", 0)
+    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(10.0, abs=0.1)
+    lab.wait(100.0)
+    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(10.0, abs=0.1)
+
+
+def test_dose_log_agrees_with_on_time_and_volume() -> None:
+    lab = Lab(("M0", "M1", "M2"), seed=3)
+    rng = np.random.default_rng(1)
+    for _ in range(300):
+        m = rng.choice(["M0", "M1", "M2"])
+        set_pump(lab, "Pump1", float(rng.uniform(0.0, 0.1)), on=bool(rng.random() < 0.7), reactor=m)
+        if rng.random() < 0.4:
+            lab.post(f"/SetOutputOn/Pump1/{rng.integers(0, 2)}/{m}")
+        lab.wait(float(rng.exponential(8.0)))
+    for m in lab.device.reactors:
+        lab.post(f"/SetOutputOn/Pump1/0/{m}")
+    lab.wait(1.0)
+    for m in lab.device.reactors:
+        truth = lab.device.truth(m)
+        doses = [d for d in lab.device.benches[m].doses if d.pump == "Pump1"]
+        assert sum(d.seconds for d in doses) == pytest.approx(truth["on_s"]["Pump1"])
+        assert sum(d.feed_ml for d in doses) == pytest.approx(truth["feed_ml"])
+        assert truth["feed_ml"] == pytest.approx(truth["on_s"]["Pump1"])

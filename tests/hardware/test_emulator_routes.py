@@ -1,0 +1,253 @@
+"""Routes, status codes, clamps, toggles and selection, statement by statement of chibio.md section 2."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hardware.clock import VirtualClock
+from hardware.emulator_device import ChiBioDevice
+from hardware.emulator_faults import inject
+from tests.hardware.emulator_lab import BLANK, Lab
+
+SAMPLE = Path(__file__).parents[2].parent / "shared" / "samples" / "chibio_sysdata.json"
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", "/", 200),
+        ("GET", "/getSysdata/", 200),
+        ("GET", "/getSysdata", 308),
+        ("POST", "/getSysdata/", 405),
+        ("GET", "/changeDevice/M0", 405),
+        ("POST", "/changeDevice/M0", 204),
+        ("POST", "/changeDevice/M0/", 404),
+        ("POST", "/changeDevice/M9", 500),
+        ("POST", "/changeDevice/0", 500),
+        ("POST", "/changeDevice/M5", 204),
+        ("POST", "/scanDevices/all", 204),
+        ("POST", "/scanDevices/M5", 204),
+        ("POST", "/SetOutputTarget/Pump1/M0/0.02", 204),
+        ("POST", "/SetOutputTarget/Pump1/0/0.02", 204),
+        ("POST", "/SetOutputTarget/Pump1/0.02/M0", 500),
+        ("POST", "/SetOutputTarget/Pump1/M0/abc", 500),
+        ("POST", "/SetOutputTarget/Pump1/M8/0.02", 500),
+        ("POST", "/SetOutputTarget/Pump1/m0/0.02", 500),
+        ("POST", "/SetOutputTarget/Pump9/M0/0.02", 500),
+        ("POST", "/SetOutputTarget/Chemostat/M0/0.02", 500),
+        ("POST", "/SetOutputTarget/GrowthRate/M0/1", 500),
+        ("POST", "/SetOutputTarget/Zigzag/M0/1", 500),
+        ("POST", "/SetOutputTarget/OD0/M0/14000", 500),
+        ("POST", "/SetOutputTarget/Pump1/M0", 404),
+        ("POST", "/SetOutputTarget/Pump1/M0/1/2", 404),
+        ("POST", "/SetOutputOn/Pump1/0/M0", 204),
+        ("POST", "/SetOutputOn/Pump1/0.5/M0", 500),
+        ("POST", "/SetOutputOn/Zigzag/1/M0", 204),
+        ("POST", "/Direction/Pump1/M0", 204),
+        ("POST", "/MeasureOD/M0", 204),
+        ("POST", "/CalibrateOD/OD0/M0/14000/0", 204),
+        ("POST", "/CalibrateOD/OD/M0/14000/0", 204),
+        ("POST", "/CalibrateOD/Blank/M0/14000/0", 500),
+        ("POST", "/MeasureTemp/IR/M0", 204),
+        ("POST", "/MeasureTemp/Culture/M0", 500),
+        ("POST", "/MeasureFP/M0", 204),
+        ("POST", "/GetSpectrum/x4/M0", 204),
+        ("POST", "/GetSpectrum/four/M0", 500),
+        ("POST", "/Experiment/0/M0", 204),
+        ("POST", "/ExperimentReset", 204),
+        ("POST", "/ClearTerminal/M0", 204),
+        ("POST", "/SetFPMeasurement/FP1/LEDB/CLEAR/nm510/nm550/x10", 204),
+        ("POST", "/SetCustom/C1/0", 204),
+        ("POST", "/SetLightActuation/LEDD", 204),
+        ("POST", "/CharacteriseDevice/M0/C1", 204),
+        ("POST", "/NoSuchRoute", 404),
+        ("PUT", "/getSysdata/", 405),
+    ],
+)
+def test_status_codes(method: str, path: str, status: int) -> None:
+    lab = Lab()
+    got, body = lab.device.handle(method, path)
+    assert got == status
+    assert lab.device.alive
+    assert body == b"" if status == 204 else body
+    if status == 500:
+        assert b"html" in body  # no JSON errors exist
+        assert lab.state()["UIDevice"] == "M0"  # and the software survives
+
+
+def test_the_state_has_every_field_of_a_recorded_answer_with_its_type_and_sorted_keys() -> None:
+    if not SAMPLE.exists():
+        pytest.skip(f"no recorded answer at {SAMPLE}")
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait(9 * 60.07 + 20.0)
+    lab.post("/changeDevice/M0")
+    body = lab.device.handle("GET", "/getSysdata/")[1]
+    recorded, mine = json.loads(SAMPLE.read_text()), json.loads(body)
+
+    def compare(want: dict, got: dict, where: str) -> None:  # type: ignore[type-arg]
+        assert sorted(want) == sorted(got), where
+        for key, value in want.items():
+            if isinstance(value, dict):
+                compare(value, got[key], f"{where}.{key}")
+            elif isinstance(value, (int, float)):
+                assert isinstance(got[key], (int, float)), f"{where}.{key}"
+            else:
+                assert type(got[key]) is type(value), f"{where}.{key}"
+
+    compare(recorded, mine, "sysData")
+    assert list(mine) == sorted(mine)
+    assert len(mine["OD"]["record"]) == len(mine["time"]["record"]) == 10
+
+
+def test_targets_are_clamped_nan_passes_and_comes_out_as_a_bare_token() -> None:
+    lab = Lab()
+    for value, kept in (("5", 1.0), ("-5", -1.0), ("-0.2", -0.2), ("inf", 1.0), ("-inf", -1.0)):
+        assert lab.post(f"/SetOutputTarget/Pump1/M0/{value}") == 204
+        assert lab.state()["Pump1"]["target"] == kept
+    lab.post("/SetOutputTarget/Thermostat/M0/80")
+    assert lab.state()["Thermostat"]["target"] == 50.0
+    assert lab.post("/SetOutputTarget/Pump3/M0/nan") == 204
+    body = lab.device.handle("GET", "/getSysdata/")[1]
+    assert b":NaN" in body
+    assert math.isnan(json.loads(body)["Pump3"]["target"])
+
+
+def test_od0_is_stored_and_then_answers_500() -> None:
+    lab = Lab()
+    assert lab.post("/SetOutputTarget/OD0/M0/12345") == 500
+    assert lab.state()["OD0"]["target"] == 12345.0
+
+
+def test_force_is_on_off_and_anything_else_toggles() -> None:
+    lab = Lab()
+    lab.post("/SetOutputTarget/Pump1/M0/0.1")
+    for force, on in (("1", 1), ("1", 1), ("0", 0), ("0", 0), ("2", 1), ("7", 0), ("-1", 1)):
+        lab.post(f"/SetOutputOn/Pump1/{force}/M0")
+        assert lab.state()["Pump1"]["ON"] == on
+
+
+def test_experiment_flag_set_through_set_output_starts_no_thread() -> None:
+    lab = Lab()
+    assert lab.post("/SetOutputOn/Experiment/1/M0") == 204
+    lab.wait(200.0)
+    state = lab.state()
+    assert (state["Experiment"]["ON"], state["Experiment"]["cycles"]) == (1, 0)
+
+
+def test_only_the_selected_reactor_is_served_and_an_absent_one_is_ignored() -> None:
+    lab = Lab()
+    lab.post("/SetOutputTarget/Stir/M1/0.7")
+    assert lab.state("M1")["Stir"]["target"] == 0.7
+    assert lab.post("/changeDevice/M6") == 204
+    data = json.loads(lab.device.handle("GET", "/getSysdata/")[1])
+    assert data["UIDevice"] == "M1"
+    assert data["presentDevices"] == {"M0": 1, "M1": 1} | {f"M{k}": 0 for k in range(2, 8)}
+    lab.post("/SetOutputTarget/Stir/0/0.6")  # 0 = the one selected
+    assert lab.state("M1")["Stir"]["target"] == 0.6
+    assert lab.state("M0")["Stir"]["target"] == 0.5
+
+
+def test_identities_differ_and_an_absent_position_has_none() -> None:
+    lab = Lab()
+    first, second = lab.state("M0")["DeviceID"], lab.state("M1")["DeviceID"]
+    assert first.isdigit()
+    assert second.isdigit()
+    assert first != second
+    assert lab.device.apps["M4"].data["DeviceID"] == ""
+
+
+def test_after_power_on_nothing_runs_and_the_zero_is_65000() -> None:
+    state = Lab().state()
+    assert state["OD0"]["target"] == 65000.0
+    assert state["Experiment"]["startTime"] == " Waiting "
+    assert state["Experiment"]["cycles"] == 0
+    assert state["Thermostat"]["target"] == 37.0
+    assert [state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4)] == [0, 0, 0, 0]
+
+
+def test_blanked_start_has_the_zero_an_operator_would_have_set() -> None:
+    assert Lab(blanked=True).state()["OD0"]["target"] == BLANK
+
+
+@pytest.mark.parametrize(
+    ("path", "seconds"),
+    [
+        ("/MeasureOD/M0", 0.97),
+        ("/GetSpectrum/x1/M0", 1.9),
+        ("/SetOutputOn/Pump1/0/M0", 0.0),
+        ("/SetOutputTarget/Stir/M0/0.5", 0.0),  # off: nothing is switched
+    ],
+)
+def test_blocking_times(path: str, seconds: float) -> None:
+    lab = Lab()
+    before = lab.clock.now()
+    lab.post(path)
+    assert lab.clock.now() - before == pytest.approx(seconds, abs=0.02)
+
+
+@pytest.mark.parametrize(("target", "seconds"), [(0.4, 1.5), (0.5, 2.25), (0.8, 2.25), (0.9, 3.0)])
+def test_stirrer_blocks_by_its_target_and_again_when_the_target_is_rewritten(target: float, seconds: float) -> None:
+    lab = Lab()
+    lab.post(f"/SetOutputTarget/Stir/M0/{target}")
+    for path in ("/SetOutputOn/Stir/1/M0", f"/SetOutputTarget/Stir/M0/{target}"):
+        before = lab.clock.now()
+        lab.post(path)
+        assert lab.clock.now() - before == pytest.approx(seconds, abs=0.02)
+    assert lab.device.benches["M0"].stir == target
+
+
+def test_switching_regulation_either_way_turns_both_pumps_off() -> None:
+    lab = Lab()
+    for force in ("1", "0"):
+        for pump in ("Pump1", "Pump2"):
+            lab.post(f"/SetOutputTarget/{pump}/M0/0.1")
+            lab.post(f"/SetOutputOn/{pump}/1/M0")
+        lab.post(f"/SetOutputOn/OD/{force}/M0")
+        state = lab.state()
+        assert (state["OD"]["ON"], state["Pump1"]["ON"], state["Pump2"]["ON"]) == (int(force), 0, 0)
+
+
+def test_direction_negates_the_target_and_under_regulation_the_direction_too() -> None:
+    lab = Lab()
+    lab.post("/SetOutputTarget/Pump1/M0/0.1")
+    lab.post("/Direction/Pump1/M0")
+    assert (lab.state()["Pump1"]["target"], lab.state()["Pump1"]["direction"]) == (-0.1, 1.0)
+    lab.post("/SetOutputOn/OD/1/M0")
+    lab.post("/Direction/Pump1/M0")
+    assert (lab.state()["Pump1"]["target"], lab.state()["Pump1"]["direction"]) == (0.1, -1.0)
+
+
+def test_reset_wipes_the_selected_reactor_only() -> None:
+    lab = Lab()
+    for m in ("M0", "M1"):
+        lab.post(f"/CalibrateOD/OD0/{m}/14000/0")
+        lab.post(f"/SetOutputTarget/Stir/{m}/0.7")
+    lab.post("/changeDevice/M1")
+    before = lab.clock.now()
+    assert lab.post("/ExperimentReset") == 204
+    assert 1.0 <= lab.clock.now() - before <= 2.0
+    assert (lab.state("M1")["OD0"]["target"], lab.state("M1")["Stir"]["target"]) == (65000.0, 0.5)
+    assert (lab.state("M0")["OD0"]["target"], lab.state("M0")["Stir"]["target"]) == (14000.0, 0.7)
+
+
+def test_forks() -> None:
+    lab = Lab()
+    inject(lab.device, "require_requested_with")
+    assert lab.device.handle("POST", "/changeDevice/M0")[0] == 403
+    assert lab.device.handle("GET", "/getSysdata/")[0] == 200
+    assert lab.device.handle("POST", "/changeDevice/M0", {"x-requested-with": "XMLHttpRequest"})[0] == 204
+    inject(lab.device, "terminal_as_list")
+    inject(lab.device, "extra_fields")
+    data = json.loads(lab.device.handle("GET", "/getSysdata/")[1])
+    assert isinstance(data["Terminal"]["text"], list)
+    assert "Pump5" in data
+
+
+@pytest.mark.parametrize("reactors", [(), ("M8",), ("M0", "M0"), ("m0",)])
+def test_impossible_reactor_lists_are_refused(reactors: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match="M0 to M7"):
+        ChiBioDevice(reactors, VirtualClock(), np.random.default_rng(0))
