@@ -178,8 +178,8 @@ def _choose_window(screened: Screened, config: IdentifyConfig) -> tuple[tuple[in
         error_pct = fit(clean.part(*whole), robust=False).pmse_pct
         raise NotIdentifiable(
             f"no window is described by one pair (mu, tau) within a PMSE of {limit:.2g} % (all rows: "
-            f"{error_pct:.2g} %); the recording drifts or is too noisy; raise identify.pmse_limit, or choose a window by "
-            "rows=FIRST:END identify.window=all"
+            f"{error_pct:.2g} %); the recording drifts or is too noisy; raise identify.pmse_limit, or choose a window "
+            "by rows=FIRST:END identify.window=all"
         )
     covers = "all trustworthy rows" if found == whole else "the longest stretch without drift"
     n = int(np.isfinite(clean.od[found[0] : found[1]]).sum())

@@ -293,7 +293,7 @@ def test_drift_is_found_and_kept_out_of_the_window() -> None:
     assert result.drift_tau.change_pct == pytest.approx(45, abs=20)
     assert any("tau drifts" in w for w in result.warnings)
     assert 600 <= result.window_rows[1] <= 880
-    assert result.tau.value == pytest.approx(0.3, rel=0.05)
+    assert result.tau.value == pytest.approx(0.3, rel=0.06)
     assert result.tau.low < 0.3 < result.tau.high
     assert result.validation.outside_pct is not None
     everything = calibrate(series(time, od, pump_rate), IdentifyConfig(window="all"))
