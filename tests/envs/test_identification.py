@@ -296,9 +296,18 @@ def test_drift_is_found_and_kept_out_of_the_window() -> None:
     assert result.tau.value == pytest.approx(0.3, rel=0.06)
     assert result.tau.low < 0.3 < result.tau.high
     assert result.validation.outside_pct is not None
-    everything = calibrate(series(time, od, pump_rate), IdentifyConfig(window="all"))
-    assert everything.window == (0, 1200)
-    assert any("exceeds" in w for w in everything.warnings)
+    with pytest.raises(NotIdentifiable, match="a culture that drifts"):
+        calibrate(series(time, od, pump_rate), IdentifyConfig(window="all"))
+
+
+def test_all_rows_on_request_with_a_warning() -> None:
+    """The second half grows 5 % faster: more than the limit forgives, not enough to be refused."""
+    s = simulated(noise=0.005)
+    faster = s.od * np.exp(0.0015 * np.maximum(s.time - 180, 0.0))
+    config = IdentifyConfig(window="all", pmse_limit=0.01)
+    result = calibrate(series(s.time, faster, s.pump_rate), config)
+    assert result.window == (0, 361)
+    assert any("exceeds" in w for w in result.warnings)
 
 
 def test_constant_culture_shows_no_drift() -> None:
