@@ -33,6 +33,7 @@ class DQNConfig:
     target_blend: float = 1.0  # share of the online network in a blend; 1 copies
     double: bool = False  # double-Q targets (van Hasselt 2016)
     action_gap: float = 0.0  # alpha of advantage learning: action gaps are learned 1 / (1 - alpha) times as wide
+    action_smoothness: float = 0.0  # exponent by which rough differences between actions are learned later; 0: off
     huber: float = 0.0  # TD errors beyond this are clipped in the gradient; 0 means squared error
     reward_scale: float = 1.0  # rewards are multiplied by this inside the agent
     relabel: float = 0.0  # share of each minibatch whose goal is replaced by a random one (hindsight)
@@ -60,6 +61,7 @@ class DQNConfig:
             ("target_period", self.target_period, self.target_period >= 1, "at least 1 update"),
             ("target_blend", self.target_blend, 0.0 < self.target_blend <= 1.0, "0 < blend <= 1"),
             ("action_gap", self.action_gap, 0.0 <= self.action_gap < 1.0, "0 <= alpha < 1"),
+            ("action_smoothness", self.action_smoothness, self.action_smoothness >= 0.0, "at least 0 (0 = off)"),
             ("huber", self.huber, self.huber >= 0.0, "at least 0 (0 = squared error)"),
             ("reward_scale", self.reward_scale, self.reward_scale > 0.0, "greater than 0"),
             ("relabel", self.relabel, 0.0 <= self.relabel <= 1.0, "0 to 1"),
