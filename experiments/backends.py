@@ -25,6 +25,7 @@ from hardware.transport import open_transport
 __all__ = ["continue_loop", "opened", "plant_of"]
 
 log = logging.getLogger(__name__)
+logging.getLogger("httpx").setLevel(logging.WARNING)  # it tells of every request; the journal does that better
 
 
 def plant_of(config: DeployConfig) -> PlantConfig:
