@@ -9,9 +9,10 @@ from dqn.config import DQNConfig
 from envs.plant import PlantConfig
 from envs.setpoints import Schedule
 from envs.task import EnvConfig
+from experiments.controllers.learned import LearnedConfig
 from hardware.simulated import SimulatedConfig
 
-__all__ = ["DeployConfig", "TrainConfig", "deploy_schema"]
+__all__ = ["DeployConfig", "TrainConfig", "controller_config", "deploy_schema"]
 
 
 @dataclass(frozen=True)
@@ -54,13 +55,32 @@ class DeployConfig:
     backend: Any = field(default_factory=SimulatedConfig)  # one of BACKENDS
     plant: PlantConfig = field(default_factory=PlantConfig)  # of a simulated backend
     scenario: Schedule = field(default_factory=Schedule)
-    policy: str = "latest"  # a policy.npz, a run folder, or `latest`
+    controller: Any = field(default_factory=LearnedConfig)  # one of `controller_config`
+    policy: str = "latest"  # of controller=dqn: a policy.npz, a run folder, or `latest`
     env_file: str | None = None  # a calibrated.yaml; its model becomes the simulated plant's
     fsync: bool = True  # every row on the disk before the next command
 
 
-def deploy_schema(kind: str) -> DeployConfig:
-    """The schema for the backend of this kind. Raises: ValueError naming the kinds there are."""
+def controller_config(kind: str) -> Any:
+    """The default config of the controller of this kind. Raises: ValueError naming the kinds there are."""
+    from experiments.controllers.baselines import HoldConfig, ThresholdConfig
+    from experiments.controllers.inverse import InverseConfig
+    from experiments.controllers.mpc import MpcConfig
+    from experiments.controllers.oracle import OracleConfig
+    from experiments.controllers.pi import ChiBioPIConfig, TunedPIConfig
+
+    kinds = (
+        LearnedConfig(), ChiBioPIConfig(), TunedPIConfig(), MpcConfig(), InverseConfig(), ThresholdConfig(),
+        HoldConfig(), OracleConfig(),
+    )  # fmt: skip
+    known = {config.kind: config for config in kinds}
+    if kind not in known:
+        raise ValueError(f"controller.kind = {kind}: allowed {', '.join(known)}")
+    return known[kind]
+
+
+def deploy_schema(kind: str, controller: str = "dqn") -> DeployConfig:
+    """The schema for the backend and controller of these kinds. Raises: ValueError naming the kinds there are."""
     if kind not in BACKENDS:
         raise ValueError(f"backend.kind = {kind}: allowed {', '.join(BACKENDS)}")
-    return DeployConfig(backend=BACKENDS[kind]())
+    return DeployConfig(backend=BACKENDS[kind](), controller=controller_config(controller))

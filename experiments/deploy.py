@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from dqn.policy import Policy
     from envs.plant import PlantConfig
     from envs.setpoints import Schedule
+    from envs.task import EnvConfig
     from experiments.loop import Step
 
     Array = NDArray[np.float64]
@@ -79,6 +80,18 @@ def plant_of(config: DeployConfig) -> PlantConfig:
     gain = plant.vessel.volume_ml / (60.0 * model.tau)  # tau = V / (60 g)
     growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
     return replace(plant, growth=growth, pump=pump)
+
+
+def model_of(config: DeployConfig) -> EnvConfig:
+    """The growth model that model-based controllers are given: the calibrated one, else the nominal one."""
+    from envs.task import EnvConfig
+
+    model = EnvConfig()
+    if config.env_file is not None:
+        from experiments.train import read_env_file
+
+        model = read_env_file(config.env_file)
+    return replace(model, control_min=config.backend.control_min)
 
 
 class Record:
@@ -213,16 +226,20 @@ def deploy(config: DeployConfig, folder: Path) -> None:
     from tqdm.contrib.logging import logging_redirect_tqdm
 
     from envs.plant import Plant
-    from experiments.controllers.learned import LearnedController
+    from experiments import build
     from experiments.loop import ClosedLoop, RateLimit
     from hardware.errors import ReactorError
     from hardware.simulated import SimulatedReactors
 
     backend: SimulatedConfig = config.backend
     plant = Plant(plant_of(config), len(backend.reactors), np.random.default_rng(backend.seed))
-    policy = load_policy(config.policy, backend.control_min)
+    kind = config.controller.kind
+    policy = load_policy(config.policy, backend.control_min) if kind == "dqn" else None
+    model = model_of(config)
+    controller = build.controller(config.controller, model, policy, plant, backend.pump_ml_s)
+    limit = model.max_pump_rate if policy is None else float(policy.pump_rates[-1])
     reactors = SimulatedReactors(plant, backend)
-    loop = ClosedLoop(reactors, LearnedController(policy), RateLimit(float(policy.pump_rates[-1])), config.scenario)
+    loop = ClosedLoop(reactors, controller, RateLimit(limit), config.scenario)
     record = Record(folder, reactors.names, config.fsync)
     outcome = "failed"
     try:
@@ -244,12 +261,12 @@ def deploy(config: DeployConfig, folder: Path) -> None:
     finally:
         reactors.stop()
         if record.steps:
-            _finish(record, config.scenario, folder, outcome, f"{backend.kind}, {Path(config.policy).name} policy")
+            _finish(record, config.scenario, folder, outcome, f"{backend.kind}, controller {kind}")
         record.close()
 
 
 def _schema(cfg: DictConfig) -> DeployConfig:
-    return deploy_schema(str(cfg.backend.kind))
+    return deploy_schema(str(cfg.backend.kind), str(cfg.controller.kind))
 
 
 def main() -> None:
