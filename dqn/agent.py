@@ -13,7 +13,7 @@ from dqn.network import QNetwork, initial_weights
 from dqn.replay import Replay, Transition
 from dqn.schedules import decayed, linear
 from dqn.streams import UniformStream
-from dqn.targets import blend, double_q_target, loss_gradient, q_target
+from dqn.targets import advantage_target, blend, double_q_target, loss_gradient, q_target
 
 __all__ = ["STREAMS", "DQNAgent", "Relabel"]
 
@@ -64,7 +64,8 @@ class DQNAgent:
         self.greedy = QNetwork(weights.clone(), self.sizes, matrix, offset) if config.average else self.online
         parameter = torch.nn.Parameter(weights)
         parameter.grad = self.online.grad
-        self._adam = torch.optim.Adam([parameter], lr=config.learning_rate, fused=True)
+        betas = (0.9, config.adam_beta2)
+        self._adam = torch.optim.Adam([parameter], config.learning_rate, betas, config.adam_eps, fused=True)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
         self._explore = UniformStream(streams["explore"], 2, self.device)
         self._draws = UniformStream(streams["replay"], config.batch_size, self.device)
@@ -128,6 +129,8 @@ class DQNAgent:
             target = double_q_target(batch.r_t, batch.continues, c.gamma, q_t, self.online(batch.s_t))
         else:
             target = q_target(batch.r_t, batch.continues, c.gamma, q_t)
+        if c.action_gap:
+            target = advantage_target(target, c.action_gap, self.target(batch.s_tm1), batch.a_tm1)
         q_tm1, inputs = self.online.forward(batch.s_tm1)
         self.loss, gradient = loss_gradient(q_tm1, batch.a_tm1, target, c.huber)
         self.online.backward(inputs, gradient)

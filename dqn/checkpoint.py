@@ -47,7 +47,7 @@ def load(path: Path) -> dict[str, Any]:
             f"{path}: no such checkpoint; the run ended before its first one, start it anew"
         ) from None
     except Exception as error:  # torch raises whatever its unpickler meets
-        reason = str(error).splitlines()[0]
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise CheckpointError(
             f"{path}: not a readable checkpoint ({reason}); use one written by this project"
         ) from None

@@ -19,6 +19,8 @@ class DQNConfig:
     gamma: float = 0.99  # discount per step
     learning_rate: float = 1e-3  # Adam's, at the start
     learning_rate_decay: float = 0.0  # fraction of all updates, at the end, over which the rate falls to zero
+    adam_beta2: float = 0.999  # decay of Adam's mean of squared gradients
+    adam_eps: float = 1e-8  # added to its root
     total_steps: int = 10_000  # length of training
     epsilon_start: float = 1.0  # exploration rate at step 0
     epsilon_end: float = 0.05  # and from step epsilon_steps on
@@ -30,6 +32,7 @@ class DQNConfig:
     target_period: int = 500  # updates between blends of the target network
     target_blend: float = 1.0  # share of the online network in a blend; 1 copies
     double: bool = False  # double-Q targets (van Hasselt 2016)
+    action_gap: float = 0.0  # alpha of advantage learning: action gaps are learned 1 / (1 - alpha) times as wide
     huber: float = 0.0  # TD errors beyond this are clipped in the gradient; 0 means squared error
     reward_scale: float = 1.0  # rewards are multiplied by this inside the agent
     relabel: float = 0.0  # share of each minibatch whose goal is replaced by a random one (hindsight)
@@ -44,6 +47,8 @@ class DQNConfig:
             ("gamma", self.gamma, 0.0 <= self.gamma < 1.0, "0 <= gamma < 1"),
             ("learning_rate", self.learning_rate, 0.0 < self.learning_rate <= 1.0, "0 < rate <= 1"),
             ("learning_rate_decay", self.learning_rate_decay, 0.0 <= self.learning_rate_decay <= 1.0, "0 to 1"),
+            ("adam_beta2", self.adam_beta2, 0.0 <= self.adam_beta2 < 1.0, "0 <= beta2 < 1"),
+            ("adam_eps", self.adam_eps, self.adam_eps > 0.0, "greater than 0"),
             ("total_steps", self.total_steps, self.total_steps >= 1, "at least 1"),
             ("epsilon_start", self.epsilon_start, 0.0 <= self.epsilon_start <= 1.0, "0 to 1"),
             ("epsilon_end", self.epsilon_end, 0.0 <= self.epsilon_end <= 1.0, "0 to 1"),
@@ -54,6 +59,7 @@ class DQNConfig:
             ("updates_per_step", self.updates_per_step, self.updates_per_step >= 1, "at least 1"),
             ("target_period", self.target_period, self.target_period >= 1, "at least 1 update"),
             ("target_blend", self.target_blend, 0.0 < self.target_blend <= 1.0, "0 < blend <= 1"),
+            ("action_gap", self.action_gap, 0.0 <= self.action_gap < 1.0, "0 <= alpha < 1"),
             ("huber", self.huber, self.huber >= 0.0, "at least 0 (0 = squared error)"),
             ("reward_scale", self.reward_scale, self.reward_scale > 0.0, "greater than 0"),
             ("relabel", self.relabel, 0.0 <= self.relabel <= 1.0, "0 to 1"),

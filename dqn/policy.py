@@ -81,12 +81,13 @@ def load(path: Path) -> Policy:
     """
     remedy = "give the policy.npz of a training run"
     try:
-        with np.load(path, allow_pickle=False) as content:
+        with open(path, "rb") as f, np.load(f, allow_pickle=False) as content:
             arrays = {name: content[name] for name in content.files}
     except FileNotFoundError:
         raise PolicyError(f"policy {path}: no such file; {remedy}") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise PolicyError(f"policy {path}: not a policy file ({str(error).splitlines()[0]}); {remedy}") from None
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise PolicyError(f"policy {path}: not a policy file ({reason}); {remedy}") from None
     try:
         metadata = json.loads(str(arrays["metadata"]))
         if metadata.get("format") != FORMAT:

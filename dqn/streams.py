@@ -17,7 +17,8 @@ class UniformStream:
     """Uniform numbers in [0, 1), `width` per agent and call, each agent from a generator of its own.
 
     Each generator fills a block of CALLS_PER_BLOCK calls at a time, so that the cost per call does not grow with a
-    Python loop over agents. The state is that of the generators before their block, and the place in it.
+    Python loop over agents. The state is that of the generators before their block and the place in it, or, once the
+    block is used up, that of the generators now.
 
     Args:
       seeds: one per agent, S.
@@ -49,7 +50,9 @@ class UniformStream:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue; plain numbers."""
-        return {"generators": self._states, "position": self._position}
+        used_up = self._position == CALLS_PER_BLOCK
+        states = [g.bit_generator.state for g in self._generators] if used_up else self._states
+        return {"generators": states, "position": self._position}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue as saved."""

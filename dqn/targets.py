@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["blend", "double_q_target", "loss_gradient", "q_target"]
+__all__ = ["advantage_target", "blend", "double_q_target", "loss_gradient", "q_target"]
 
 
 def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor) -> torch.Tensor:
@@ -23,6 +23,19 @@ def double_q_target(
     """y = r + gamma c Q_target(s', argmax_a Q_online(s', a)) (van Hasselt 2016); arguments as `q_target`."""
     best = q_t_online.argmax(-1, keepdim=True)
     return r_t + gamma * continues * q_t.gather(-1, best).squeeze(-1)
+
+
+def advantage_target(target: torch.Tensor, alpha: float, q_tm1: torch.Tensor, a_tm1: torch.Tensor) -> torch.Tensor:
+    """y - alpha (max_a Q_target(s, a) - Q_target(s, a_tm1)): advantage learning (Baird 1999; Bellemare 2016, eq. 10).
+
+    The fixed point has the same greedy policy and the same maximum V; its gaps V - Q(s, a) are 1 / (1 - alpha) times
+    those of Q-learning, so that an error of the network confuses fewer actions.
+
+    Args:
+      target: y, (S, B); q_tm1: target network at s, (S, B, A); a_tm1: (S, B) int64.
+    Returns: shape (S, B).
+    """
+    return target - alpha * (q_tm1.amax(-1) - q_tm1.gather(-1, a_tm1.unsqueeze(-1)).squeeze(-1))
 
 
 def loss_gradient(

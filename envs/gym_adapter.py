@@ -29,14 +29,17 @@ class BioreactorEnv(gymnasium.Env[Any, Any]):
         self.config = self._batch.config
         self.observation_space = observation_space()
         self.action_space = action_space(self.config)
+        self._next: NDArray[np.float32] | None = None  # start of the episode the batch has already begun
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start an episode; with a seed the same one every time."""
         super().reset(seed=seed)
-        observation, _ = self._batch.reset(seed=seed)
-        return observation[0], {}
+        if seed is not None or self._next is None:
+            self._next = self._batch.reset(seed=seed)[0][0]
+        observation, self._next = self._next, None
+        return observation, {}
 
     def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """One control period; `truncated` after `episode_steps`, after which `reset` must follow.
@@ -47,7 +50,7 @@ class BioreactorEnv(gymnasium.Env[Any, Any]):
             raise ValueError(f"action {action!r}: allowed 0 to {self.config.n_actions - 1} (index of a pump rate)")
         observation, reward, _, truncated, infos = self._batch.step(np.asarray([action]))
         if truncated[0]:
-            observation = infos["final_obs"]
+            self._next, observation = observation[0], infos["final_obs"]
         return observation[0], float(reward[0]), False, bool(truncated[0]), {}
 
 

@@ -72,8 +72,14 @@ def normalise(argv: Sequence[str]) -> list[str]:
     return out
 
 
+TYPES = {"Float": "a number", "Integer": "a whole number", "bool": "true or false"}
+
+
 def _one_line(error: Exception) -> str:
-    """The first useful lines of a Hydra or OmegaConf message as one."""
+    """A Hydra or OmegaConf message as one line; a wrong type as `key = value: allowed ...`."""
+    wrong = re.match(r"Value '(.*)' (?:of type '\w+' could not be converted to|is not a valid) (\w+)", str(error))
+    if wrong and isinstance(error, OmegaConfBaseException):
+        return f"{error.full_key} = {wrong[1]}: allowed {TYPES.get(wrong[2], wrong[2])}"
     lines = [line.strip() for line in str(error).splitlines()]
     kept = [s for s in lines if s and not s.startswith(("object_type", "reference_type", "Config search path"))]
     return " ".join(kept[:6])
@@ -131,8 +137,10 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
         GlobalHydra.instance().clear()
         with hydra.initialize_config_module("conf", version_base="1.3"):
             plain = [a for a in normalise(overrides) if not a.startswith("hydra.")]
-            return hydra.compose(name, overrides=plain)
-    except (HydraException, OmegaConfBaseException) as error:
+            known = groups()  # any other key is forced in, so that an unknown one is named by the schema, not by Hydra
+            forced = [a if re.split("[@=]", a)[0] in known else re.sub(r"^\+*(?=\w)", "++", a) for a in plain]
+            return hydra.compose(name, overrides=forced)
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra's own checks of a group's name
         raise UserError(_one_line(error)) from None
 
 
@@ -169,15 +177,24 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     os.replace(temporary, path)
 
 
-def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
+def run(
+    name: str,
+    schema: T,
+    body: Callable[[T, Path], float | None],
+    choose: Callable[[DictConfig], T] | None = None,
+) -> None:
     """Run an entry point; its resolved config is in `config.yaml` of its run folder before `body` starts.
 
     Args:
       name: of `conf/<name>.yaml` and of the job.
       schema: default instance of the entry point's config dataclass; a field `resume` makes it resumable.
+      choose: gives the schema that fits a composed config, where it depends on one (a backend has fields of its own).
       body: called with the checked config and the run folder; a float it returns is the sweep's objective.
     Exits: 0, or 1 after one line on standard error; 130 on Ctrl-C.
     """
+
+    def fitting(cfg: DictConfig) -> T:
+        return schema if choose is None else choose(cfg)
 
     def task(cfg: DictConfig) -> float | None:
         try:
@@ -185,9 +202,10 @@ def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
             if cfg.get("resume"):
                 stored = OmegaConf.load(folder / "config.yaml")
                 assert isinstance(stored, DictConfig)
-                config = load(OmegaConf.merge(stored, {"resume": cfg.resume}), schema)  # type: ignore[arg-type]
+                stored.resume = cfg.resume
+                config = load(stored, fitting(stored))
             else:
-                config = load(cfg, schema)
+                config = load(cfg, fitting(cfg))
                 save_config(config, folder)
             return body(config, folder)
         except UserError as error:
@@ -199,7 +217,8 @@ def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
     try:
         sys.argv[1:] = normalise(sys.argv[1:])
         if _needs_check(sys.argv[1:]):
-            load(compose(name, sys.argv[1:]), schema)
+            composed = compose(name, sys.argv[1:])
+            load(composed, fitting(composed))
             resumed = [a for a in sys.argv[1:] if a.startswith("resume=") and a != "resume=null"]
             others = [a for a in sys.argv[1:] if not a.startswith(("resume=", "hydra."))]
             if resumed and others:
@@ -208,7 +227,7 @@ def run(name: str, schema: T, body: Callable[[T, Path], float | None]) -> None:
                 )
         GlobalHydra.instance().clear()
         hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)(task)()
-    except UserError as error:
+    except (UserError, ValueError) as error:  # a ValueError is the schema's own word on a value
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:

@@ -100,24 +100,31 @@ def policy_map(od: Array, setpoint: Array, learned: Array, optimal: Array) -> Fi
 
 
 def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates: Array, best_rates: Array) -> Figure:
-    """Noise-free closed loops of the learned policy and the optimum from the same starts.
+    """Noise-free closed loops of the learned policy and the optimum from the same starts, a column per setpoint.
 
     Args:
       minutes: (K + 1,). od, best: OD including the start, (K + 1, G). setpoint: (G,).
       rates, best_rates: pump rates in mL/s, (K, G).
     """
-    figure, (top, bottom) = new_figure(7.5, 5.0, 2, 1, sharex=True, height_ratios=[2, 1])
-    for g in range(setpoint.size):
-        colour = COLOURS[g % len(COLOURS)]
-        top.plot(minutes, od[:, g], color=colour, linewidth=1.6, label=f"setpoint {setpoint[g]:g}")
-        top.plot(minutes, best[:, g], color=colour, linewidth=1.0, linestyle=":")
-        top.axhline(setpoint[g], color=colour, linewidth=0.6, linestyle="--")
-        bottom.step(minutes[:-1], rates[:, g] * 1000.0, where="post", color=colour, linewidth=1.2)
-        bottom.step(minutes[:-1], best_rates[:, g] * 1000.0, where="post", color=colour, linewidth=0.8, linestyle=":")
-    top.plot([], [], color="black", linestyle=":", linewidth=1.0, label="optimum")
-    top.set(ylabel="OD")
-    top.legend(frameon=False, fontsize=8, ncols=2)
-    bottom.set(xlabel="time, min", ylabel="pump rate, µL/s", ylim=(-0.5, 21.0))
+    goals = np.unique(setpoint)
+    figure, axes = new_figure(3.4 * goals.size, 4.6, 2, goals.size, sharex=True, sharey="row", height_ratios=[2, 1])
+    for column, goal in enumerate(goals):
+        top, bottom = axes[column], axes[goals.size + column]
+        top.axhline(goal, color="black", linewidth=0.8, linestyle="--", label="setpoint")
+        for k, g in enumerate(np.flatnonzero(setpoint == goal)):
+            top.plot(minutes, od[:, g], color=COLOURS[k], linewidth=1.5, label=f"learned, from {od[0, g]:g}")
+            top.plot(
+                minutes, best[:, g], color="black", linewidth=1.0, linestyle=":", label="optimum" if k == 0 else None
+            )
+            bottom.step(minutes[:-1], rates[:, g] * 1000.0, where="post", color=COLOURS[k], linewidth=1.0)
+            bottom.step(
+                minutes[:-1], best_rates[:, g] * 1000.0, where="post", color="black", linewidth=0.8, linestyle=":"
+            )
+        top.set_title(f"setpoint {goal:g}", fontsize=10)
+        bottom.set(xlabel="time, min", ylim=(-0.5, 21.0))
+    axes[0].legend(frameon=False, fontsize=8)
+    axes[0].set_ylabel("OD")
+    axes[goals.size].set_ylabel("pump rate, µL/s")
     return figure
 
 

@@ -113,7 +113,7 @@ def _figures(session: Session, policy_path: Path) -> None:
     )
     for name, figure in figures.items():
         charts.save(figure, session.folder / "figures", name)
-        session.writer.figure(f"figures/{name}", figure, session.trainer.agent.steps)
+        session.writer.events.figure(f"figures/{name}", figure, session.trainer.agent.steps)
 
 
 def _finish(session: Session) -> None:
@@ -149,8 +149,7 @@ def _finish(session: Session) -> None:
     numbers = {
         k: v for k, v in {**asdict(c.agent), "mu": c.env.mu, "tau": c.env.tau}.items() if isinstance(v, int | float)
     }
-    metrics = {"eval/regret_pct": float(np.median(kept.regret_pct))}
-    session.writer.hyper_parameters(numbers, metrics)
+    session.writer.events.hyper_parameters(numbers, ["eval/regret_pct", "eval/steady_abs_error"])
     log.info(
         "%d agent(s), %d steps and %d updates each in %.1f s: regret %.2f %% (worst %.2f %%), steady error %.4f OD",
         agent.n_agents, agent.steps, agent.updates, session.seconds, np.median(kept.regret_pct),

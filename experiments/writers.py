@@ -1,23 +1,74 @@
-"""Where records of a training go: TensorBoard events and a CSV that survives a crash."""
+"""Where the numbers of a run go for looking at: TensorBoard events, and a CSV of the same scalars.
+
+TensorBoard's own event writer is used, so that a bench without torch can show a run live.
+"""
 
 from __future__ import annotations
 
 import csv
+import io
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import hparams
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.plugins.hparams import summary_v2
+from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["PopulationWriter", "interquartile_mean"]
+__all__ = ["Events", "PopulationWriter", "interquartile_mean"]
 
 MOST_CURVES = 64  # a population larger than this gets its statistics only
+
+
+class Events:
+    """TensorBoard events of one run.
+
+    Args:
+      folder: where the event file goes.
+      first_step: on resume, events of an earlier life at this step and later are hidden.
+    """
+
+    def __init__(self, folder: Path, first_step: int = 0) -> None:
+        self._writer = EventFileWriter(str(folder))
+        if first_step:
+            self._writer.add_event(
+                Event(step=first_step, wall_time=time.time(), session_log=SessionLog(status=SessionLog.START))
+            )
+
+    def _add(self, summary: Summary, step: int) -> None:
+        self._writer.add_event(Event(step=step, wall_time=time.time(), summary=summary))
+
+    def scalar(self, tag: str, value: float, step: int) -> None:
+        """One point of a curve."""
+        self._add(Summary(value=[Summary.Value(tag=tag, simple_value=value)]), step)
+
+    def figure(self, tag: str, figure: Figure, step: int) -> None:
+        """A picture under TensorBoard's images."""
+        png = io.BytesIO()
+        figure.savefig(png, format="png", dpi=110)
+        image = Summary.Image(encoded_image_string=png.getvalue(), colorspace=3, height=1, width=1)
+        self._add(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
+
+    def hyper_parameters(self, values: Mapping[str, float | str | bool], metrics: Sequence[str]) -> None:
+        """A row of TensorBoard's HPARAMS table; the metrics are the last values of these scalar tags."""
+        keys = [summary_v2.HParam(name) for name in values]
+        self._add(summary_v2.hparams_config_pb(keys, [summary_v2.Metric(tag) for tag in metrics]), 0)
+        self._add(summary_v2.hparams_pb(dict(values)), 0)
+
+    def flush(self) -> None:
+        """Make everything so far visible to a reader."""
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Flush and close. Idempotent."""
+        self._writer.close()
 
 
 def interquartile_mean(values: NDArray[np.float64]) -> float:
@@ -31,17 +82,17 @@ class PopulationWriter:
     """Scalars of S agents: each agent's curve as a run of its own, and the population's statistics.
 
     One agent: tags stand in the run folder itself. Several: `agents/seedNNNN/` hold the single curves, and the run
-    folder has tag/iqm, tag/min and tag/max over seeds. Every row is also appended to progress.csv.
+    folder has tag/iqm, tag/min and tag/max over seeds. Every value is also a row of progress.csv.
 
     Args:
-      folder: run folder. seeds: of the agents. first_step: on resume, later events of an earlier life are dropped.
+      folder: run folder. seeds: of the agents. first_step: step of the checkpoint a run is resumed from, or 0.
     """
 
     def __init__(self, folder: Path, seeds: Sequence[int], first_step: int = 0) -> None:
-        purge = first_step + 1 if first_step else None
-        self.summary = SummaryWriter(str(folder), purge_step=purge)
+        purge = first_step + 1 if first_step else 0
+        self.events = Events(folder, purge)
         singles = seeds if 1 < len(seeds) <= MOST_CURVES else []
-        self._agents = [SummaryWriter(str(folder / "agents" / f"seed{seed:04d}"), purge_step=purge) for seed in singles]
+        self._agents = [Events(folder / "agents" / f"seed{seed:04d}", purge) for seed in singles]
         self._seeds = list(seeds)
         self._path = folder / "progress.csv"
         kept = self._rows_until(first_step) if first_step else []
@@ -65,35 +116,24 @@ class PopulationWriter:
             if not np.isfinite(each).any():
                 continue
             if each.size == 1:
-                self.summary.add_scalar(tag, each[0], step)
+                self.events.scalar(tag, float(each[0]), step)
             else:
-                self.summary.add_scalar(f"{tag}/iqm", interquartile_mean(each), step)
-                self.summary.add_scalar(f"{tag}/min", np.nanmin(each), step)
-                self.summary.add_scalar(f"{tag}/max", np.nanmax(each), step)
-                for writer, v in zip(self._agents, each, strict=False):
-                    writer.add_scalar(tag, v, step)
+                self.events.scalar(f"{tag}/iqm", interquartile_mean(each), step)
+                self.events.scalar(f"{tag}/min", float(np.nanmin(each)), step)
+                self.events.scalar(f"{tag}/max", float(np.nanmax(each)), step)
+                for events, v in zip(self._agents, each, strict=False):
+                    events.scalar(tag, float(v), step)
             names: Sequence[int | str] = self._seeds if each.size == len(self._seeds) else ["all"]
             self._csv.writerows([step, name, tag, repr(float(v))] for name, v in zip(names, each, strict=True))
-
-    def figure(self, tag: str, figure: Figure, step: int) -> None:
-        """Show a figure under TensorBoard's images."""
-        figure.canvas.draw()  # type: ignore[no-untyped-call]
-        pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
-        self.summary.add_image(tag, pixels, step, dataformats="HWC")
-
-    def hyper_parameters(self, values: Mapping[str, float | str | bool], metrics: Mapping[str, float]) -> None:
-        """A row of TensorBoard's HPARAMS table, in this run and not in a sub-run."""
-        for event in hparams(dict(values), dict(metrics)):  # type: ignore[no-untyped-call]
-            self.summary._get_file_writer().add_summary(event)  # type: ignore[no-untyped-call]
 
     def flush(self) -> None:
         """Make everything so far visible to a reader."""
         self._file.flush()
-        for writer in (self.summary, *self._agents):
-            writer.flush()
+        for events in (self.events, *self._agents):
+            events.flush()
 
     def close(self) -> None:
         """Flush and close. Idempotent."""
         self._file.close()
-        for writer in (self.summary, *self._agents):
-            writer.close()
+        for events in (self.events, *self._agents):
+            events.close()

@@ -12,10 +12,41 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Command", "Measurement", "Reactor", "Receipt"]
+__all__ = ["Command", "Fault", "Measurement", "Reactor", "Receipt", "Vitals"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something wrong with one reactor that it or its link reports: which kind, what was seen, what helps.
+
+    kind: link (no or no readable answer), selection (another client keeps choosing reactors), identity, absent,
+      restarted (the device lost its memory), stopped (its experiment was ended), stalled (it answers, its experiment
+      does not go on), mode (something else acts on its pumps), blank (its zero was changed), pump (not verified off).
+    """
+
+    kind: str
+    detail: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.kind}: {self.detail}; {self.remedy}"
+
+
+@dataclass(frozen=True)
+class Vitals:
+    """What a device tells of itself beside the sample.
+
+    age_s: time since the newest sample arrived, by this computer's monotonic clock, shape (N,).
+    raw: spectrometer counts of the newest sample, shape (N,); nan where unknown.
+    faults: what is wrong with each reactor, or None; N entries.
+    """
+
+    age_s: Array
+    raw: Array
+    faults: tuple[Fault | None, ...]
 
 
 @dataclass(frozen=True)
@@ -26,12 +57,14 @@ class Measurement:
     od: optical density, shape (N,); nan where there is none.
     temperature: culture temperature, degC, shape (N,); nan where there is none.
     fresh: True where this sample was not delivered before, shape (N,).
+    vitals: state of the device; None for a backend that cannot fail.
     """
 
     time_s: Array
     od: Array
     temperature: Array
     fresh: Mask
+    vitals: Vitals | None = None
 
 
 @dataclass(frozen=True)
@@ -50,10 +83,17 @@ class Command:
 
 @dataclass(frozen=True)
 class Receipt:
-    """What was done: volume of fresh medium asked of the pump for this command, mL, shape (N,); 0 outside `rows`."""
+    """What was done.
+
+    volume_ml: fresh medium asked of the pumps for this command, mL, shape (N,); 0 outside `rows`. It is what the
+      pump was really told: less than the command where a limit cut it or a small dose was put off to the next.
+    notes: what differs from the command, one line each.
+    waste_ml: what the waste pump was told to be able to remove, mL, shape (N,); None where waste is not modelled.
+    """
 
     volume_ml: Array
     notes: tuple[str, ...] = field(default=())
+    waste_ml: Array | None = None
 
 
 class Reactor(Protocol):
@@ -65,14 +105,31 @@ class Reactor(Protocol):
         ...
 
     def measure(self) -> Measurement:
-        """Wait for a new sample of at least one reactor.
+        """Wait for a new sample of at least one reactor, or, when none comes in time, return with none fresh.
 
-        Raises: LinkError, ProtocolError, DeviceStateError.
+        Trouble with single reactors is told in `vitals`, so that the others go on.
+        Raises: ReactorError for what no waiting can mend.
         """
         ...
 
     def actuate(self, command: Command) -> Receipt:
         """Carry out a command. Raises: as `measure`."""
+        ...
+
+    def elapsed(self) -> float:
+        """Run time, s, on a monotonic clock; what `Measurement.time_s` is counted on."""
+        ...
+
+    def pumps_off(self, rows: Mask) -> list[str]:
+        """All pumps of `rows` off, verified; returns what failed, one line per reactor, its name first."""
+        ...
+
+    def heat_off(self, rows: Mask) -> list[str]:
+        """Heating of `rows` off for the rest of the run; returns what failed, as `pumps_off`."""
+        ...
+
+    def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
+        """Hand `rows` over to the device's own regulation at `setpoint` (OD, (N,)); returns what failed."""
         ...
 
     def stop(self) -> None:

@@ -1,0 +1,278 @@
+"""Which readings of a recording can be trusted: outliers, frozen or broken sensors, gaps. NumPy only, no model fitted.
+
+Judgement rests on the detrended log OD r = ln y - mu t + C/tau, C the pumped volume (the integral of u), with a robust
+pilot estimate of mu and 1/tau from short differences: whatever culture and pump do, r moves slowly, so that a jump in
+r is the sensor's (or a hand's) doing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+__all__ = ["Rejection", "Screened", "Series", "noise_sd", "pumped_volume", "row_spans", "screen"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+OD_FLOOR = 1e-3  # below it a logarithm says nothing
+OUTLIER_SD = 6.0
+OUTLIER_SHARE = 0.05  # a deviation below 5 % of the OD cannot move a fit and is left to the robust loss
+OUTLIER_WINDOW = 11  # rows; finds bursts of up to five bad readings (bubbles last 1 to 5, biology.md section 4)
+NOISE_WINDOW = 61
+JUMP_LOG = 0.35  # a factor of 1.4 between the medians of five readings before and after
+JUMP_SHARE = 0.1  # of the recording's 95th OD percentile; smaller steps carry no weight in a least-squares fit of OD
+JUMP_ROWS = 5
+SHORT_ROWS = 10  # between two jumps; what is shorter is a burst, not a regime
+FROZEN_ROWS = 10
+NOISY_FACTOR = 6.0
+GAP_MIN = 5.0  # and five times the usual spacing: what the pump did meanwhile is unknown
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """A recording as the fit wants it.
+
+    time: min, strictly increasing, shape (n,).
+    od: OD, nan where there is no reading, shape (n,).
+    pump_rate: mL/s, >= 0, held from each row to the next, shape (n,).
+    row: number by which rows are reported, increasing, shape (n,).
+    Raises: ValueError when shapes or values disagree with that.
+    """
+
+    time: Array
+    od: Array
+    pump_rate: Array
+    row: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        shapes = {self.time.shape, self.od.shape, self.pump_rate.shape, self.row.shape}
+        if len(shapes) != 1 or self.time.ndim != 1:
+            raise ValueError(f"series: shapes {sorted(shapes)}: allowed is one shape (n,) for all four arrays")
+        if not (np.diff(self.time) > 0).all() or not np.isfinite(self.time).all():
+            raise ValueError("series: times must be finite and strictly increasing, in min")
+        if not (self.pump_rate >= 0.0).all():
+            raise ValueError("series: pump rates must be >= 0 mL/s")
+
+    def part(self, first: int, end: int) -> Series:
+        """Positions [first, end), as a series."""
+        s = slice(first, end)
+        return Series(self.time[s], self.od[s], self.pump_rate[s], self.row[s])
+
+    def rejecting(self, bad: Mask) -> Series:
+        """The same with the readings of `bad`, shape (n,), taken out (nan); time and pump stay."""
+        return Series(self.time, np.where(bad, np.nan, self.od), self.pump_rate, self.row)
+
+
+@dataclass(frozen=True, eq=False)
+class Rejection:
+    """Readings taken out for one reason; rows are row numbers."""
+
+    reason: str
+    rows: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """A series without its faulty readings, its trustworthy stretches, and what was rejected.
+
+    stretches: positions [first, end) between jumps and gaps that may be fitted, in order.
+    """
+
+    series: Series
+    stretches: tuple[tuple[int, int], ...]
+    rejections: tuple[Rejection, ...]
+
+
+def pumped_volume(time: Array, pump_rate: Array) -> Array:
+    """C_i = sum_{j<i} u_j (t_{j+1} - t_j), in mL/s min; C/tau is the accumulated dilution. Shape (..., n), C_0 = 0."""
+    steps = pump_rate[..., :-1] * np.diff(time, axis=-1)
+    start = np.zeros((*steps.shape[:-1], 1))
+    return np.concatenate([start, np.cumsum(steps, axis=-1)], axis=-1)
+
+
+def row_spans(rows: NDArray[np.int64]) -> str:
+    """Row numbers as text: '3, 7-9'."""
+    if not len(rows):
+        return "none"
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    spans = [f"{p[0]}" if len(p) == 1 else f"{p[0]}-{p[-1]}" for p in parts]
+    return ", ".join(spans[:6]) + (f" and {len(spans) - 6} more" if len(spans) > 6 else "")
+
+
+def _slow_log_od(series: Series) -> Array:
+    """r of the module's docstring, shape (n,), nan where there is no reading."""
+    volume = pumped_volume(series.time, series.pump_rate)
+    log_od = np.log(np.maximum(series.od, OD_FLOOR))
+    lag = 5
+    if len(log_od) <= 2 * lag:
+        return log_od
+    rise = log_od[lag:] - log_od[:-lag]
+    columns = np.stack([series.time[lag:] - series.time[:-lag], -(volume[lag:] - volume[:-lag])], axis=1)
+    level = np.minimum(series.od[lag:], series.od[:-lag])
+    ok = np.isfinite(rise)
+    rise, columns, level = rise[ok], columns[ok], np.maximum(level[ok], OD_FLOOR)
+    weight = level.copy()  # sd of ln y is sd(y) / y
+    pilot = np.zeros(2)
+    for _ in range(8):  # reweighted least squares: a few jumps must not bend the pilot
+        pilot = np.linalg.lstsq(columns * weight[:, None], rise * weight, rcond=1e-10)[0]
+        error = (rise - columns @ pilot) * level
+        scale = max(1.4826 * float(np.median(np.abs(error))), 1e-9)
+        weight = level * np.minimum(1.0, 2.0 * scale / np.maximum(np.abs(error), 1e-300))
+    slow: Array = log_od - pilot[0] * series.time + pilot[1] * volume
+    return slow
+
+
+def _running(values: Array, width: int) -> Array:
+    """Running median over `width` (odd) neighbours ignoring nan, shape (n,); nan only where all are."""
+    half = width // 2
+    padded = np.concatenate([np.full(half, np.nan), values, np.full(half, np.nan)])
+    windows = np.sort(sliding_window_view(padded, width), axis=1)  # nan last
+    count = np.isfinite(windows).sum(axis=1)
+    rows = np.arange(len(values))
+    median: Array = 0.5 * (windows[rows, np.maximum(count - 1, 0) // 2] + windows[rows, count // 2])
+    return median
+
+
+def _deviation(series: Series, slow: Array) -> tuple[Array, Array]:
+    """Deviation of each reading from its neighbourhood, and the OD expected there; both OD, shape (n,)."""
+    trend = np.log(np.maximum(series.od, OD_FLOOR)) - slow
+    expected = np.exp(_running(slow, OUTLIER_WINDOW) + trend)
+    return series.od - expected, expected
+
+
+def noise_sd(series: Series) -> float:
+    """Robust sd of a reading about its neighbourhood (11 rows), OD; what no model of the culture can explain."""
+    deviation, _ = _deviation(series, _slow_log_od(series))
+    return float(1.4826 * np.nanmedian(np.abs(deviation)))
+
+
+def screen(series: Series) -> Screened:
+    """Find frozen, outlying and noisy readings, gaps, and jumps that no culture can make.
+
+    A jump parts the recording into regimes; the one with most readings is kept, the others are rejected whole, and so
+    is the last reading before a jump upwards, since one reading averages over several seconds. A gap only parts it.
+
+    Returns: see `Screened`. Raises: ValueError if no reading is left.
+    """
+    readings = np.isfinite(series.od)
+    reasons: list[str] = []
+    label = np.full(len(series.od), -1)
+
+    def reject(bad: Mask, reason: str) -> Series:
+        label[bad & readings] = len(reasons)  # the latest judgement is the widest and stands
+        reasons.append(reason)
+        return series.rejecting(label >= 0)
+
+    series = reject(_frozen(series.od), f"sensor frozen: the same OD {FROZEN_ROWS} times or more in a row")
+    slow = _slow_log_od(series)
+    deviation, expected = _deviation(series, slow)
+    local = 1.4826 * _running(np.abs(deviation), NOISE_WINDOW)
+    overall = float(np.nanmedian(local)) if readings.any() else 0.0
+    limit = np.maximum(OUTLIER_SD * np.maximum(local, 0.3 * overall), OUTLIER_SHARE * expected)
+    series = reject(np.abs(deviation) > limit, f"outlier: more than {OUTLIER_SD:g} sd from its neighbours")
+    noisy = local > np.maximum(NOISY_FACTOR * overall, 2 * OUTLIER_SHARE * expected)
+    series = reject(noisy, f"sensor noisy: scatter over {NOISY_FACTOR:g} times that of the recording")
+    if not np.isfinite(series.od).any():
+        raise ValueError("no trustworthy reading is left: the sensor was frozen or erratic throughout")
+    gaps = _gaps(series.time)
+    slow = np.where(np.isfinite(series.od), slow, np.nan)
+    jumps = [j for j in _jumps(series, slow) if j not in gaps]
+    for first, end, reason in list(_foreign_regimes(series, slow, jumps)):
+        bad = np.zeros(len(series.od), dtype=np.bool_)
+        bad[first:end] = True
+        series = reject(bad, reason)
+    usable = np.flatnonzero(np.isfinite(series.od))
+    first, end = int(usable[0]), int(usable[-1]) + 1
+    edges = [first, *(g for g in gaps if first < g < end), end]
+    stretches = tuple((a, b) for a, b in pairwise(edges) if np.isfinite(series.od[a:b]).any())
+    found = tuple(Rejection(r, series.row[label == k]) for k, r in enumerate(reasons) if (label == k).any())
+    return Screened(series, stretches, found)
+
+
+def _frozen(od: Array) -> Mask:
+    """True for the repeats (not the first) in a stretch of equal readings of at least FROZEN_ROWS."""
+    same = np.concatenate([[False], od[1:] == od[:-1]])
+    frozen = np.zeros(len(od), dtype=np.bool_)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        if b - a + 1 >= FROZEN_ROWS:
+            frozen[a:b] = True
+    return frozen
+
+
+def _gaps(time: Array) -> list[int]:
+    """Positions before which the recording pauses."""
+    step = np.diff(time)
+    if not len(step):
+        return []
+    return [int(i) + 1 for i in np.flatnonzero(step > max(GAP_MIN, 5.0 * float(np.median(step))))]
+
+
+def _jumps(series: Series, slow: Array) -> list[int]:
+    """Positions of the first reading after a persistent jump."""
+    valid = np.flatnonzero(np.isfinite(series.od))
+    if len(valid) < 2 * JUMP_ROWS:
+        return []
+    r, y = slow[valid], series.od[valid]
+    median_r = np.median(sliding_window_view(r, JUMP_ROWS), axis=1)
+    median_y = np.median(sliding_window_view(y, JUMP_ROWS), axis=1)
+    step = median_r[JUMP_ROWS:] - median_r[:-JUMP_ROWS]
+    level = np.minimum(median_y[JUMP_ROWS:], median_y[:-JUMP_ROWS])
+    size = np.maximum(level, OD_FLOOR) * np.expm1(np.abs(step))  # the jump in OD, free of growth and dilution
+    smallest = max(JUMP_SHARE * float(np.percentile(y, 95)), OUTLIER_SD * noise_sd(series))
+    big = (np.abs(step) > JUMP_LOG) & (size > smallest)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], big.astype(np.int8), [0]])))
+    found = []
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        first, end = a + JUMP_ROWS - 2, min(b + JUMP_ROWS + 1, len(r))
+        within = np.arange(max(first, 1), end)
+        found.append(int(valid[within[np.argmax(np.abs(r[within] - r[within - 1]))]]))
+    return sorted(set(found))
+
+
+def _foreign_regimes(series: Series, slow: Array, jumps: list[int]) -> Iterator[tuple[int, int, str]]:
+    """(first, end, reason) of every regime but the one with most readings; short bursts are bridged."""
+    regimes = [[(a, b)] for a, b in zip([0, *jumps], [*jumps, len(series.od)], strict=True)]
+    readings = [int(np.isfinite(series.od[r[0][0] : r[0][1]]).sum()) for r in regimes]
+    bursts: list[tuple[int, int]] = []
+    for k in range(len(regimes) - 2, 0, -1):
+        before, (a, b), after = regimes[k - 1][-1], regimes[k][0], regimes[k + 1][0]
+        if readings[k] < SHORT_ROWS and abs(_level(slow, before, last=True) - _level(slow, after)) < JUMP_LOG:
+            bursts.append((a, b))
+            regimes[k - 1 : k + 2] = [regimes[k - 1] + regimes[k + 1]]
+            readings[k - 1 : k + 2] = [readings[k - 1] + readings[k + 1]]
+    for a, b in bursts:
+        yield a, b, "burst: jumps away from the trend and comes back"
+    kept = int(np.argmax(readings))
+    for k, regime in enumerate(regimes):
+        if k == kept:
+            continue
+        first, end = regime[0][0], regime[-1][1]
+        at = first if k > kept else end
+        guard = 1 if k > kept and at > 0 else 0
+        yield first - guard, end, _jump_reason(series, at, k > kept)
+
+
+def _level(slow: Array, regime: tuple[int, int], last: bool = False) -> float:
+    part = slow[regime[0] : regime[1]]
+    part = part[np.isfinite(part)]
+    return float(np.median(part[-JUMP_ROWS:] if last else part[:JUMP_ROWS]))
+
+
+def _jump_reason(series: Series, at: int, later: bool) -> str:
+    before = np.flatnonzero(np.isfinite(series.od[:at]))[-1]
+    after = at + np.flatnonzero(np.isfinite(series.od[at:]))[0]
+    what = (
+        f"OD goes from {series.od[before]:.3g} to {series.od[after]:.3g} between rows {series.row[before]} and "
+        f"{series.row[after]} ({series.time[after] - series.time[before]:.1f} min), which no culture does, and does "
+        "not come back"
+    )
+    rose = series.od[after] > series.od[before]
+    side = "from there on" if later else "up to there"
+    return f"sensor broken or moved {side}: {what}" if rose == later else f"another regime {side}: {what}"

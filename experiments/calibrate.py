@@ -1,0 +1,322 @@
+"""Entry point: a recording in, one trustworthy pair (mu, tau) out, as an environment file for `train`.
+
+Also the generator of the paper's open-loop protocol (generate=true) and the coverage study (coverage=N).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from envs.calibration import Calibration, Drift, IdentifyConfig, calibrate
+from envs.identification import Parameter
+from envs.open_loop import OpenLoop, open_loop
+from envs.screening import Series, row_spans
+from experiments import app
+from experiments.charts_calibration import coverage_figure, drift_figure, fit_figure, pixels, save
+from hardware.errors import RecordingError
+from hardware.recording import Recorder, Recording, read_recording
+
+__all__ = ["CalibrateConfig", "body", "environment_yaml", "main", "summary"]
+
+COLUMNS = ("time_min", "od", "pump_rate_ml_s")
+PMSE_FORMULA = "100 * sum (od - model)^2 / sum od^2 over the fitted readings, model run freely from one fitted start"
+
+
+@dataclass(frozen=True)
+class CalibrateConfig:
+    """Keys of conf/calibrate.yaml; see the comments there."""
+
+    data: str | None = None
+    rows: str | None = None
+    run: int | None = None
+    reactor: str | None = None
+    pump_ml_s: float = 1.0
+    name: str = "calibrated"
+    identify: IdentifyConfig = field(default_factory=IdentifyConfig)
+    generate: bool = False
+    out: str | None = None
+    coverage: int = 0
+    protocol: OpenLoop = field(default_factory=OpenLoop)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.coverage <= 10000:
+            raise ValueError(f"coverage = {self.coverage}: allowed 0 (no study) to 10000 recordings")
+        if not re.fullmatch(r"[\w-]+", self.name):
+            raise ValueError(f"name = {self.name}: allowed letters, digits, _ and - (it names a file)")
+        if not 0.0 < self.pump_ml_s <= 10.0:
+            raise ValueError(f"pump_ml_s = {self.pump_ml_s}: allowed > 0 to 10 mL/s")
+        if self.rows is not None and not re.fullmatch(r"\d*:\d*", self.rows):
+            raise ValueError(f"rows = {self.rows}: allowed FIRST:END, e.g. 0:700 (data rows from 0, END excluded)")
+
+
+def main() -> None:
+    """Command line."""
+    app.run("calibrate", CalibrateConfig(), body)
+
+
+def body(config: CalibrateConfig, folder: Path) -> float | None:
+    """Calibrate, generate a recording, or study the coverage, as the config says.
+
+    Returns: PMSE in % of a calibration. Raises: app.UserError.
+    """
+    if config.generate:
+        _generate(config, folder)
+        return None
+    if config.coverage:
+        return _coverage(config, folder)
+    return _calibrate(config, folder)
+
+
+def _calibrate(config: CalibrateConfig, folder: Path) -> float:
+    source = config.data or str(resources.files("experiments") / "data" / "open_loop.csv")
+    print(f"reading {config.data or 'the shipped recording'}", flush=True)
+    try:
+        recording = read_recording(source, pump_ml_s=config.pump_ml_s, run=config.run, reactor=config.reactor)
+    except RecordingError as error:
+        raise app.UserError(str(error)) from None
+    raw = _series(recording, config.rows, source)
+    hours = (raw.time[-1] - raw.time[0]) / 60
+    print(f"{recording.source}: rows {raw.row[0]}-{raw.row[-1]}, {hours:.1f} h; fitting", flush=True)
+    try:
+        result = calibrate(raw, config.identify)
+    except ValueError as error:
+        raise app.UserError(f"{source}: {error}") from None
+    name = Path(source).name
+    figures = {
+        "fit": fit_figure(raw, result, f"{name}: measured and free-running model"),
+        "drift": drift_figure(result, f"{name}: segments of about {config.identify.segment_min:g} min, fitted alone"),
+    }
+    for key, figure in figures.items():
+        save(figure, folder / f"{key}.png")
+    environment = folder / f"{config.name}.yaml"
+    environment.write_text(environment_yaml(result, name), encoding="utf-8")
+    content = summary(result, recording, raw)
+    app.write_json(folder / "summary.json", {**content, "data": source, "env_file": str(environment)})
+    _events(folder, result, figures)
+    print(report(result, recording, content))
+    print(f"\n  files       {environment}\n              {folder}/{{summary.json, fit.png, drift.png}}")
+    return result.fit.pmse_pct
+
+
+def _series(recording: Recording, rows: str | None, source: str) -> Series:
+    """The asked-for rows of a recording. Raises: app.UserError if there are fewer than ten."""
+    first, end = 0, int(recording.row[-1]) + 1
+    if rows is not None:
+        low, high = rows.split(":")
+        first, end = int(low or 0), int(high or end)
+    keep = (recording.row >= first) & (recording.row < end)
+    if np.isfinite(recording.od[keep]).sum() < 10:
+        raise app.UserError(
+            f"rows = {rows}: {int(keep.sum())} rows of {source} lie there; the recording has rows "
+            f"{recording.row[0]}:{recording.row[-1] + 1}; at least 10 readings are needed"
+        )
+    return Series(recording.time_min[keep], recording.od[keep], recording.pump_rate[keep], recording.row[keep])
+
+
+def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str, Any]:
+    """What summary.json holds; rows are [first, end), counted from 0; n_rejected counts readings within `rows`."""
+    row = result.screened.series.row
+    v = result.validation
+    return {
+        "mu": _interval(result.fit.mu),
+        "tau": _interval(result.tau),
+        "pmse_pct": result.fit.pmse_pct,
+        "pmse_formula": PMSE_FORMULA,
+        "rows_used": list(result.window_rows),
+        "n_used": result.fit.n_used,
+        "n_rejected": len(raw.od) - int(np.isfinite(result.screened.series.od).sum()),
+        "warnings": list(result.warnings),
+        "notes": list(recording.notes),
+        "rejected": [
+            {
+                "rows": row_spans(r.rows),
+                "first": int(r.rows[0]),
+                "last": int(r.rows[-1]),
+                "n": len(r.rows),
+                "reason": r.reason,
+            }
+            for r in result.rejections
+        ],
+        "window": result.window_reason,
+        "rows": [int(raw.row[0]), int(raw.row[-1]) + 1],
+        "source": recording.source,
+        "rms_od": result.fit.rms,
+        "residual_autocorrelation": result.fit.autocorrelation,
+        "start_od": float(result.fit.start_od[0]),
+        "doubling_min": float(np.log(2.0) / result.fit.mu.value),
+        "validation": {
+            "holdout_pmse_pct": v.holdout_pct,
+            "holdout_n": v.holdout_n,
+            "outside_pmse_pct": v.outside_pct,
+            "outside_n": v.outside_n,
+        },
+        "drift": {"mu": _drift(result.drift_mu), "tau": _drift(result.drift_tau)},
+        "segments": [
+            {
+                "rows": [int(row[s.first]), int(row[s.end - 1]) + 1],
+                "middle_min": s.middle_min,
+                "mu": None if s.mu is None else _interval(s.mu),
+                "tau": None if s.tau is None else _interval(s.tau),
+                "pmse_pct": s.pmse_pct,
+            }
+            for s in result.segments
+        ],
+    }
+
+
+def _interval(p: Parameter) -> dict[str, Any]:
+    return {"value": p.value, "ci95": [p.low, p.high]}
+
+
+def _drift(d: Drift | None) -> dict[str, Any] | None:
+    if d is None:
+        return None
+    return {
+        "first": d.first,
+        "last": d.last,
+        "change_pct": d.change_pct,
+        "per_hour": _interval(d.slope_per_h),
+        "significant": d.significant,
+        "segments": d.segments,
+    }
+
+
+def environment_yaml(result: Calibration, source: str) -> str:
+    """conf/env/sim.yaml with the fitted mu and tau and where they come from in place of its opening comment."""
+    text = (resources.files("conf") / "env" / "sim.yaml").read_text(encoding="utf-8")
+    body = re.sub(r"\A(?:#.*\n|\s*\n)+", "", text)
+    mu, tau = result.fit.mu, result.tau
+    first, end = result.window_rows
+    head = [
+        "# Training model x' = (mu - u/tau) x, equation (5) of the paper, fitted to a recording by calibrate.",
+        f"# Recording {source}, rows {first}:{end}, {result.fit.n_used} readings, PMSE {result.fit.pmse_pct:.3g} %.",
+        f"# 95 % intervals: mu {mu.low:.6g} to {mu.high:.6g} 1/min, tau {tau.low:.6g} to {tau.high:.6g}.",
+        *(f"# Warning: {w}." for w in result.warnings),
+    ]
+    for key, value, comment in (
+        ("mu", mu.value, "specific growth rate, 1/min"),
+        ("tau", tau.value, "u/tau is the dilution rate in 1/min for a pump rate u in mL/s"),
+    ):
+        body, n = re.subn(rf"^{key}:.*$", f"{key}: {value!r} # {comment}", body, flags=re.MULTILINE)
+        assert n == 1, f"conf/env/sim.yaml holds {n} lines for {key}"
+    return "\n".join(head) + "\n" + body
+
+
+def _events(folder: Path, result: Calibration, figures: dict[str, Figure]) -> None:
+    """Scalars and figures for TensorBoard; imported here because it costs seconds that a refusal need not wait for."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    with SummaryWriter(str(folder)) as writer:
+        for tag, value in (
+            ("calibration/mu_per_min", result.fit.mu.value),
+            ("calibration/tau", result.tau.value),
+            ("calibration/pmse_pct", result.fit.pmse_pct),
+        ):
+            writer.add_scalar(tag, value, 0)
+        for i, segment in enumerate(result.segments):
+            for name, parameter in (("mu_per_min", segment.mu), ("tau", segment.tau)):
+                if parameter is not None:
+                    writer.add_scalar(f"drift/{name}", parameter.value, i)
+        for key, figure in figures.items():
+            writer.add_image(f"calibration/{key}", pixels(figure), 0, dataformats="HWC")
+
+
+def report(result: Calibration, recording: Recording, content: dict[str, Any]) -> str:
+    """The result for a human, a dozen lines."""
+    mu, tau, v = result.fit.mu, result.tau, result.validation
+    first, end = result.window_rows
+    lines = [
+        "",
+        f"  mu          {mu.value:.5f} 1/min   95 % {mu.low:.5f} to {mu.high:.5f}   "
+        f"(doubling time {content['doubling_min']:.1f} min)",
+        f"  tau         {tau.value:.4f}          95 % {tau.low:.4f} to {tau.high:.4f}   "
+        f"(dilution {0.02 / tau.value:.4f} 1/min at 0.02 mL/s)",
+        f"  PMSE        {result.fit.pmse_pct:.3g} %   (100 sum e^2 / sum OD^2; rms error {result.fit.rms:.4f} OD)",
+        f"  window      rows {first}:{end} - {result.window_reason}",
+    ]
+    if v.holdout_pct is not None:
+        lines.append(f"  held out    PMSE {v.holdout_pct:.3g} % over the window's last 30 %, fitted to the first 70 %")
+    if v.outside_pct is not None:
+        lines.append(
+            f"              PMSE {v.outside_pct:.3g} % on {v.outside_n} readings outside the window, started afresh"
+        )
+    for name, drift in (("mu", result.drift_mu), ("tau", result.drift_tau)):
+        if drift is not None:
+            sure = "" if drift.significant else ", within its uncertainty"
+            lines.append(
+                f"  drift       {name} {drift.first:.3g} to {drift.last:.3g} along the recording "
+                f"({drift.change_pct:+.0f} %{sure})"
+            )
+    lines += [f"  rejected    rows {row_spans(r.rows)} ({len(r.rows)}): {r.reason}" for r in result.rejections]
+    lines += [f"  note        {note}" for note in recording.notes]
+    lines += [f"  warning     {warning}" for warning in result.warnings]
+    return "\n".join(lines)
+
+
+def _generate(config: CalibrateConfig, folder: Path) -> None:
+    protocol = config.protocol
+    path = Path(config.out) if config.out else folder / "open_loop.csv"
+    if path.exists():
+        raise app.UserError(f"out={path}: exists; remove it or choose another file")
+    time, od, pump_rate = open_loop(protocol, np.random.default_rng(protocol.seed))
+    try:
+        with Recorder(path, COLUMNS, fsync=False) as recorder:
+            for t, y, u in zip(time, od[0], pump_rate[0], strict=True):
+                recorder.write({"time_min": round(float(t), 4), "od": round(float(y), 5), "pump_rate_ml_s": float(u)})
+    except RecordingError as error:
+        raise app.UserError(str(error)) from None
+    app.write_json(
+        folder / "summary.json", {"file": str(path), "rows": len(time), "mu": protocol.mu, "tau": protocol.tau}
+    )
+    print(f"{len(time)} rows of the open-loop protocol (mu {protocol.mu:g}, tau {protocol.tau:g}) in {path}")
+
+
+def _coverage(config: CalibrateConfig, folder: Path) -> float:
+    """Share of simulated recordings whose 95 % intervals hold the truth; returns the smaller of the two, in %."""
+    protocol, n = config.protocol, config.coverage
+    print(f"simulating {n} recordings of {protocol.hours:g} h with {100 * protocol.noise:g} % noise", flush=True)
+    time, od, pump_rate = open_loop(protocol, np.random.default_rng(protocol.seed), n)
+    rows = np.arange(len(time))
+    found = []
+    for i in range(n):
+        try:
+            found.append(calibrate(Series(time, od[i], pump_rate[i], rows), config.identify))
+        except ValueError as error:
+            raise app.UserError(f"simulated recording {i}: {error}") from None
+    mu = np.array([(c.fit.mu.value, c.fit.mu.low, c.fit.mu.high) for c in found])
+    tau = np.array([(c.tau.value, c.tau.low, c.tau.high) for c in found])
+    truth = (protocol.mu, protocol.tau)
+    shares = [_share(values, true) for values, true in zip((mu, tau), truth, strict=True)]
+    title = f"{n} simulated recordings of {protocol.hours:g} h, {100 * protocol.noise:g} % noise (seed {protocol.seed})"
+    save(coverage_figure(mu, tau, truth, title), folder / "coverage.png")
+    app.write_json(
+        folder / "summary.json",
+        {
+            "recordings": n,
+            "coverage_pct": {"mu": shares[0], "tau": shares[1]},
+            "noise": protocol.noise,
+            "relative_half_width_pct": {"mu": _half_width(mu), "tau": _half_width(tau)},
+        },
+    )
+    print(f"95 % intervals hold the truth: mu {shares[0]:.1f} %, tau {shares[1]:.1f} % of {n}")
+    print(f"figure and summary in {folder}")
+    return min(shares)
+
+
+def _share(values: np.ndarray[Any, np.dtype[np.float64]], truth: float) -> float:
+    return 100.0 * float(np.mean((values[:, 1] <= truth) & (truth <= values[:, 2])))
+
+
+def _half_width(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+    return 50.0 * float(np.median((values[:, 2] - values[:, 1]) / values[:, 0]))
+
+
+if __name__ == "__main__":
+    main()

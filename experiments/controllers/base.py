@@ -1,0 +1,52 @@
+"""What a controller is: N reactors in, N pump rates out, once per sample. Structural; nothing has to inherit."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Array", "Controller", "Explains", "Mask", "usable"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class Controller(Protocol):
+    """Decides one pump rate per reactor and sample.
+
+    The same controller serves one reactor on the bench and 64 replicates in simulation. Reactors are independent:
+    row i of a batch does exactly what the controller would do for that reactor alone.
+    """
+
+    def reset(self, n: int) -> None:
+        """Forget everything; from here on there are n reactors, at the start of a run."""
+        ...
+
+    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
+        """Pump rates for the coming control period, mL/s, shape (N,).
+
+        Args:
+          od: newest reading, shape (N,); nan where there is none.
+          setpoint: OD to hold, shape (N,), > 0.
+          minute: when the reading was taken, min since the run began, shape (N,).
+          rows: True where the reading is new, shape (N,). Only these rows' internal state advances; what is returned
+            elsewhere is ignored.
+        Raises: nothing for readings of any value.
+        """
+        ...
+
+
+@runtime_checkable
+class Explains(Protocol):
+    """A controller that can say how it came to its last decision."""
+
+    def explain(self) -> dict[str, Array]:
+        """Name -> value of the last decision, each with leading axis N."""
+        ...
+
+
+def usable(od: Array, rows: Mask) -> Mask:
+    """Rows with a new reading that is a number."""
+    return np.asarray(rows & np.isfinite(od))

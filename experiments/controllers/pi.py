@@ -1,0 +1,146 @@
+"""PI control of OD: the Chi.Bio's on-board law as it is, and one that is tuned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from envs.actions import MAX_PUMP_RATE
+from envs.task import EnvConfig
+from experiments.controllers.base import Array, Mask, usable
+
+__all__ = ["ChiBioPI", "ChiBioPIConfig", "TunedPI", "TunedPIConfig"]
+
+ASSUMED_FLOW_ML_S = 4.0  # what the device's law takes a pump to deliver; real ones give about 1 (field.md section d)
+LOWEST_OD = 1e-6  # the device puts this for a setpoint of 0 or less
+
+
+@dataclass(frozen=True)
+class ChiBioPIConfig:
+    """volume_ml: what the device is told the vial holds, it scales the gain; max_pump_rate: its clamp, mL/s."""
+
+    volume_ml: float = 20.0
+    max_pump_rate: float = MAX_PUMP_RATE
+
+    def __post_init__(self) -> None:
+        if not 5.0 <= self.volume_ml <= 50.0:
+            raise ValueError(f"controller.volume_ml = {self.volume_ml} mL: allowed 5 to 50")
+        if not 0.0 < self.max_pump_rate <= 0.05:
+            raise ValueError(f"controller.max_pump_rate = {self.max_pump_rate} mL/s: allowed 0 < rate <= 0.05")
+
+
+class ChiBioPI:
+    """The Chi.Bio's `RegulateOD`, number for number (chibio.md section 6).
+
+    With x the reading, x' the one before, r the setpoint, e = x - r and dt the minutes between the last two recorded
+    times (which are those of the two cycles before this one, because a cycle is recorded after its decision):
+
+      P  = ln(x/r) / dt / (240/V) for x > 0, else 0; times 0.7 if |x - x'| < 0.1, unless I2 is reset
+      I1 = 0 if e < 0.01; else I1 + 0.1 e if |x - x'| < 0.05 and e > 0.025; else I1
+           (for a gasket that makes the pump deliver too little)
+      I2 = 0 if |e| > 0.1 and |x - x'| < 0.05; else I2 + 0.01 e if |x - x'| < 0.1; else I2
+      u  = clip(P + I1 + I2, 0, 0.02); 0 if x - x' > 0.04 (noise guard); 0 in the first two cycles
+    """
+
+    def __init__(self, config: ChiBioPIConfig) -> None:
+        self.config = config
+        self.reset(1)
+
+    def reset(self, n: int) -> None:
+        """See `Controller.reset`."""
+        self._cycles = np.zeros(n, dtype=np.int64)
+        self._before = np.zeros(n)
+        self._times = np.zeros((2, n))  # of the last two recorded cycles, older first
+        self._p, self._i1, self._i2, self._rate = (np.zeros(n) for _ in range(4))
+
+    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
+        """See `Controller.act`."""
+        now = usable(od, rows)
+        self._cycles = self._cycles + now
+        regulating = now & (self._cycles >= 3)
+        x, r = np.where(now, od, 1.0), np.where(setpoint > 0.0, setpoint, LOWEST_OD)
+        error, change = x - r, np.abs(x - self._before)
+        interval = self._times[1] - self._times[0]
+        interval = np.where(interval > 0.0, interval, 1.0)  # before two records exist; u is 0 then
+        gain = self.config.volume_ml / (60.0 * ASSUMED_FLOW_ML_S) / interval
+        p = np.where(x > 0.0, np.log(np.maximum(x, LOWEST_OD) / r) * gain, 0.0)
+        i1 = self._i1 + np.where((change < 0.05) & (error > 0.025), 0.1 * error, 0.0)
+        i1 = np.where(error < 0.01, 0.0, i1)
+        cleared = (np.abs(error) > 0.1) & (change < 0.05)
+        steady = ~cleared & (change < 0.1)
+        i2 = np.where(cleared, 0.0, self._i2 + np.where(steady, 0.01 * error, 0.0))
+        p = np.where(steady, 0.7 * p, p)
+        rate = np.where(x - self._before > 0.04, 0.0, np.clip(p + i1 + i2, 0.0, self.config.max_pump_rate))
+        self._p, self._i1, self._i2 = (
+            np.where(regulating, new, old) for new, old in ((p, self._p), (i1, self._i1), (i2, self._i2))
+        )
+        self._rate = np.where(regulating, rate, np.where(now, 0.0, self._rate))
+        self._before = np.where(now, od, self._before)
+        self._times = np.where(now, np.stack([self._times[1], minute]), self._times)
+        return self._rate.copy()
+
+    def explain(self) -> dict[str, Array]:
+        """The three parts of the last decision, mL/s."""
+        return {"p": self._p.copy(), "i1": self._i1.copy(), "i2": self._i2.copy()}
+
+
+@dataclass(frozen=True)
+class TunedPIConfig:
+    """delay_min: time until a decision shows, min; closed_loop_min: wanted time constant, min.
+
+    feed_forward: start the integrator at mu of the model instead of 0.
+    """
+
+    delay_min: float = 1.0
+    closed_loop_min: float = 1.0
+    feed_forward: bool = True
+
+    def __post_init__(self) -> None:
+        for key, value in (("delay_min", self.delay_min), ("closed_loop_min", self.closed_loop_min)):
+            if not 0.5 <= value <= 60.0:
+                raise ValueError(f"controller.{key} = {value} min: allowed 0.5 to 60")
+
+
+class TunedPI:
+    """PI on the logarithm of OD, tuned by a rule, with anti-windup.
+
+    In z = ln(x/r) the plant is an integrator, z' = mu - u/tau, with mu as a step disturbance; so
+
+      u = tau (K z + I),   I <- I + K dt z / T,   K = 1 / (t_c + delay),   T = 4 (t_c + delay)
+
+    which is the SIMC rule for an integrating process with dead time (Skogestad 2003, J. Process Control 13:291). With
+    its tight setting t_c = delay = one control period, the sampled closed loop has the double pole 0.75. Anti-windup:
+    I stands still while u is at a bound and z would push it further.
+
+    Args:
+      config: the rule's two times; model: mu, tau, control period and the largest pump rate.
+    """
+
+    def __init__(self, config: TunedPIConfig, model: EnvConfig) -> None:
+        self.config, self.model = config, model
+        self.gain = 1.0 / (config.closed_loop_min + config.delay_min)  # 1/min
+        self.integral_gain = self.gain * model.control_min / (4.0 * (config.closed_loop_min + config.delay_min))
+        self.reset(1)
+
+    def reset(self, n: int) -> None:
+        """See `Controller.reset`."""
+        self._integral = np.full(n, self.model.mu if self.config.feed_forward else 0.0)
+        self._p, self._rate = np.zeros(n), np.zeros(n)
+
+    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
+        """See `Controller.act`."""
+        now = usable(od, rows)
+        z = np.log(np.maximum(np.where(now, od, 1.0), LOWEST_OD) / np.maximum(setpoint, LOWEST_OD))
+        p = self.gain * z
+        wanted = self.model.tau * (p + self._integral)
+        rate = np.clip(wanted, 0.0, self.model.max_pump_rate)
+        pushing = ((wanted > rate) & (z > 0.0)) | ((wanted < rate) & (z < 0.0))
+        integral = self._integral + np.where(pushing, 0.0, self.integral_gain * z)
+        self._integral = np.where(now, integral, self._integral)
+        self._p, self._rate = np.where(now, p, self._p), np.where(now, rate, self._rate)
+        return self._rate.copy()
+
+    def explain(self) -> dict[str, Array]:
+        """The two parts of the next decision as dilution rates, 1/min."""
+        return {"p": self._p.copy(), "i": self._integral.copy()}

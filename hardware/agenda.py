@@ -1,0 +1,49 @@
+"""What has to happen at its time: a queue of small tasks on a clock, run by one thread."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Iterator
+
+from hardware.clock import Clock
+
+__all__ = ["Agenda", "Task"]
+
+Task = Iterator[float]
+"""A generator that does its work in steps; what it yields is the pause in seconds until its next step."""
+
+
+class Agenda:
+    """Tasks ordered by the time of their next step; steps due at one time run in the order they were added.
+
+    A task that raises is removed and its error is handed to the caller of `run_due`; the others stay.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._queue: list[tuple[float, int, Task]] = []
+        self._order = itertools.count()
+
+    def add(self, task: Task, delay_s: float = 0.0) -> None:
+        """Run the first step of `task` in `delay_s` seconds."""
+        heapq.heappush(self._queue, (self._clock.now() + delay_s, next(self._order), task))
+
+    def run_due(self) -> None:
+        """Run every step that is due. Raises: what a step raises; call again for the rest."""
+        while self._queue and self._queue[0][0] <= self._clock.now():
+            _, _, task = heapq.heappop(self._queue)
+            pause = next(task, None)
+            if pause is not None:
+                self.add(task, pause)
+
+    def next_due(self) -> float:
+        """Clock time of the next step, inf if there is none."""
+        return self._queue[0][0] if self._queue else float("inf")
+
+    def clear(self) -> None:
+        """Forget all tasks."""
+        for _, _, task in self._queue:
+            if hasattr(task, "close"):
+                task.close()
+        self._queue.clear()

@@ -1,0 +1,133 @@
+"""Append-only journal of a run: JSON lines, each on disk before the call returns, a torn last line cut on reopening."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from hardware.errors import RecordingError
+
+__all__ = ["Journal", "read_journal"]
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, non-finite numbers as None: what strict JSON can hold."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _complete(data: bytes) -> int:
+    """Length of `data` up to the end of its last whole row: a line that ends and that is a JSON object."""
+    end = data.rfind(b"\n") + 1
+    while end > 0:
+        start = data.rfind(b"\n", 0, end - 1) + 1
+        try:
+            if isinstance(json.loads(data[start:end]), dict):
+                return end
+        except ValueError:
+            pass
+        end = start  # a power cut can leave a whole line of zeros, too
+    return 0
+
+
+class Journal:
+    """One row per event: {"n": number, "wall": s since 1970, "mono": s, "kind": ..., fields...}.
+
+    Rows are written with one write call and one fsync, so a row that `append` returned from survives a kill at once,
+    a power cut, and a full disk. Kinds and fields belong to whoever writes them.
+
+    Args:
+      path: file, created if missing; its folder must exist.
+      wall: clock of the day, s since 1970; only ever for the record and for the position of a resumed run.
+      fsync: False leaves the flushing to the operating system: survives a kill, not a power cut (simulated runs).
+    Attributes: cut, bytes of a torn last line that were removed on opening; rows, what was there before.
+    Raises: RecordingError if the file cannot be opened, read or written; the message says what to do.
+    """
+
+    def __init__(self, path: Path, wall: Callable[[], float] = time.time, fsync: bool = True) -> None:
+        self.path = path
+        self._wall = wall
+        self._fsync = fsync
+        try:
+            old = path.read_bytes() if path.exists() else b""
+            kept = _complete(old)
+            self.cut = len(old) - kept
+            self._file: int | None = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+            if self.cut:
+                os.ftruncate(self._file, kept)
+            os.fsync(self._file)
+            folder = os.open(path.parent, os.O_RDONLY)  # the name of a new file must be on disk, too
+            os.fsync(folder)
+            os.close(folder)
+        except OSError as error:
+            raise RecordingError(f"journal {path}: {error.strerror or error}; check folder, rights and disk") from error
+        self.rows = list(_parse(old[:kept], path))
+        self._n = int(self.rows[-1].get("n", len(self.rows) - 1)) + 1 if self.rows else 0
+        self._size = kept
+
+    def append(self, kind: str, fields: Mapping[str, Any]) -> None:
+        """Write one row. Raises: RecordingError if it is not wholly on disk; nothing half-written stays."""
+        if self._file is None:
+            raise RecordingError(f"journal {self.path}: written to after it was closed")
+        row = {"n": self._n, "wall": round(self._wall(), 3), "mono": round(time.monotonic(), 3), "kind": kind}
+        line = json.dumps(_plain({**row, **fields}), separators=(",", ":"), allow_nan=False).encode() + b"\n"
+        try:
+            written = os.write(self._file, line)
+            if written != len(line):
+                os.ftruncate(self._file, self._size)
+                raise OSError(28, "No space left on device")
+            if self._fsync:
+                os.fsync(self._file)
+        except OSError as error:
+            raise RecordingError(
+                f"journal {self.path}: {error.strerror or error}; free disk space, then resume the run"
+            ) from error
+        self._n += 1
+        self._size += written
+
+    @property
+    def next_row(self) -> int:
+        """Number the next row will have."""
+        return self._n
+
+    def close(self) -> None:
+        """Release the file. Idempotent."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+
+def _parse(data: bytes, path: Path) -> Iterator[dict[str, Any]]:
+    for number, line in enumerate(data.splitlines(), 1):
+        try:
+            row = json.loads(line)
+        except ValueError as error:
+            raise RecordingError(f"journal {path}, line {number}: {error}; the file was changed by hand") from error
+        if not isinstance(row, dict):
+            raise RecordingError(f"journal {path}, line {number}: not a row; the file was changed by hand")
+        yield row
+
+
+def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:
+    """All whole rows, oldest first, and how many bytes of a torn last line follow them; the file stays untouched.
+
+    Raises: RecordingError if the file is missing or damaged elsewhere than at its end.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"journal {path}: {error.strerror or error}; give the folder of a run") from error
+    kept = _complete(data)
+    return list(_parse(data[:kept], path)), len(data) - kept

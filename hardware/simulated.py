@@ -1,0 +1,110 @@
+"""Reactors in this process: N vials of `envs.Plant`, sampled and dosed once per control period, in virtual time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from envs.plant import Plant
+from hardware.clock import Clock, VirtualClock
+from hardware.reactor import Array, Command, Mask, Measurement, Receipt
+
+__all__ = ["SimulatedConfig", "SimulatedReactors"]
+
+
+@dataclass(frozen=True)
+class SimulatedConfig:
+    """`backend=sim`. Raises: ValueError naming key, value and allowed range."""
+
+    kind: str = "sim"
+    reactors: tuple[str, ...] = ("M0",)  # one simulated vial each
+    control_min: float = 1.0  # min between samples
+    pump_ml_s: float = 1.0  # believed flow of the feed pump at full power, mL/s
+    seed: int = 0  # of what the plant draws
+
+    def __post_init__(self) -> None:
+        """Check every range once, where the value enters."""
+        checks = (
+            ("reactors", self.reactors, len(set(self.reactors)) == len(self.reactors) >= 1, "one or more unique names"),
+            ("control_min", self.control_min, 0.0 < self.control_min <= 60.0, "0 < control_min <= 60 min"),
+            ("pump_ml_s", self.pump_ml_s, 0.0 < self.pump_ml_s <= 10.0, "0 < flow <= 10 mL/s"),
+            ("seed", self.seed, self.seed >= 0, "at least 0"),
+        )
+        for key, value, ok, allowed in checks:
+            if not ok:
+                raise ValueError(f"backend.{key} = {value}: allowed {allowed}")
+
+
+class SimulatedReactors:
+    """`Reactor` in front of a plant: a cycle is sample, decide, dose, grow for the rest of the control period.
+
+    Args:
+      plant: N vials, reset to the state the run starts from.
+      config: names, period and what the pump is believed to deliver.
+      clock: virtual, or a scaled one to watch a run.
+    """
+
+    def __init__(self, plant: Plant, config: SimulatedConfig, clock: Clock | None = None) -> None:
+        if plant.n != len(config.reactors):
+            raise ValueError(f"plant has {plant.n} vials: allowed {len(config.reactors)}, one per reactor")
+        self.plant = plant
+        self.config = config
+        self._clock = clock or VirtualClock()
+        self._started = self._clock.now()
+        self._sampled = False
+        self._feed_s = np.zeros(plant.n)
+        self._target = np.full(plant.n, np.nan)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """As configured."""
+        return self.config.reactors
+
+    def measure(self) -> Measurement:
+        """Let the control period pass (with the dose of the last command) and read every sensor. Raises: nothing."""
+        if self._sampled:
+            self.plant.advance(self.config.control_min, self._feed_s, temperature_target=self._target)
+            self._clock.sleep(60.0 * self.config.control_min)
+            self._feed_s = np.zeros(self.plant.n)
+        self._sampled = True
+        return Measurement(
+            time_s=np.full(self.plant.n, self.elapsed()),
+            od=self.plant.read_od(),
+            temperature=self.plant.read_temperature(),
+            fresh=np.ones(self.plant.n, dtype=np.bool_),
+        )
+
+    def actuate(self, command: Command) -> Receipt:
+        """Dose once within the coming control period. Raises: nothing."""
+        volume = np.where(command.rows, command.pump_rate, 0.0) * 60.0 * self.config.control_min
+        self._feed_s = volume / self.config.pump_ml_s
+        self._target = np.where(command.rows, command.temperature, np.nan)
+        return Receipt(volume_ml=volume)
+
+    def elapsed(self) -> float:
+        """Run time on the clock, s."""
+        return self._clock.now() - self._started
+
+    def pumps_off(self, rows: Mask) -> list[str]:
+        """No dose is pending for `rows` any more. Nothing can fail."""
+        self._feed_s = np.where(rows, 0.0, self._feed_s)
+        return []
+
+    def heat_off(self, rows: Mask) -> list[str]:
+        """The heater of `rows` is off until a temperature is commanded. Nothing can fail."""
+        self._target = np.where(rows, 0.0, self._target)
+        return []
+
+    def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
+        """There is no device that could regulate by itself."""
+        self.pumps_off(rows)
+        return [
+            f"{name}: no on-board regulation in simulation, pumps off"
+            for name, r in zip(self.names, rows, strict=True)
+            if r
+        ]
+
+    def stop(self) -> None:
+        """No dose is pending any more."""
+        self._feed_s = np.zeros(self.plant.n)

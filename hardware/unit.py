@@ -1,0 +1,156 @@
+"""One reactor position: every request to it, verified. No schedule, no policy, no safety rules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from hardware.clock import Clock
+from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
+from hardware.transport import Transport
+from hardware.wire import PUMPS, DeviceState, check_command, parse_state
+
+__all__ = ["Log", "Unit", "no_log"]
+
+Log = Callable[[str, Mapping[str, Any]], None]
+"""Takes a kind and its fields, for instance `Journal.append`."""
+
+
+def no_log(kind: str, fields: Mapping[str, Any]) -> None:
+    """Keeps nothing."""
+
+
+class Unit:
+    """The verified conversation with one reactor.
+
+    The device shows one selected reactor to everybody, so a read is changeDevice and GET as a pair, believed only if
+    the answer names this reactor and its pinned identity (chibio.md section 12.2). A command is sent only if the last
+    verified read saw this reactor present: one request to an absent one ends the whole server (section 0.3).
+
+    Args:
+      name: position, M0 to M7.
+      reactors: all positions this client owns.
+      transport, clock: how requests travel, how time passes.
+      log: told of every command and its answer.
+    """
+
+    def __init__(self, name: str, reactors: Sequence[str], transport: Transport, clock: Clock, log: Log) -> None:
+        self.name = name
+        self.device_id = ""  # pinned at the first read
+        self.state: DeviceState | None = None  # the last verified one
+        self.took_s = 0.0  # how long the last verified read took
+        self._reactors = tuple(reactors)
+        self._transport = transport
+        self._clock = clock
+        self._log = log
+
+    def read(self, tries: int = 3) -> DeviceState:
+        """The reactor's state, certainly its own.
+
+        Raises: LinkError, ProtocolError; DeviceStateError if it is absent or another client keeps selecting reactors;
+          IdentityError if another unit answers at this position than before.
+        """
+        selected = ""
+        for _ in range(tries):
+            start = self._clock.now()
+            self._post(f"/changeDevice/{self.name}", quiet=True)
+            reply = self._transport.get("/getSysdata/")
+            if reply.status != 200:
+                raise ProtocolError(f"GET /getSysdata/: status {reply.status}, expected 200")
+            state = parse_state(reply.body)
+            selected = state.selected
+            if self.name not in state.present:
+                self.state = None  # nothing is sent to it from now on
+                raise DeviceStateError(f"{self.name} is absent (present: {', '.join(state.present) or 'none'})")
+            if selected == self.name:
+                break
+        else:
+            raise DeviceStateError(
+                f"{self.name} cannot be read: the device shows {selected}; another client keeps selecting reactors"
+            )
+        if not state.device_id or (self.device_id and state.device_id != self.device_id):
+            self.state = None
+            raise IdentityError(
+                f"{self.name} answers with identity {state.device_id or 'none'}, pinned is {self.device_id or 'none'}"
+            )
+        self.device_id = state.device_id
+        self.state, self.took_s = state, self._since(start)
+        return state
+
+    def post(self, path: str) -> None:
+        """Send one command of `wire.check_command`.
+
+        Raises: LinkError (it may have been carried out), ProtocolError for a status other than 204, DeviceStateError
+          if the command is not allowed or the reactor was not present at the last verified read.
+        """
+        if self.state is None or self.name not in self.state.present:
+            raise DeviceStateError(f"refused to send POST {path}: {self.name} was not seen present")
+        self._post(path)
+
+    def _post(self, path: str, quiet: bool = False) -> None:
+        check_command(path, self._reactors)
+        start = self._clock.now()
+        answer: int | str = ""
+        try:
+            reply = self._transport.post(path)
+            answer = reply.status
+        except ReactorError as error:
+            answer = str(error)
+            raise
+        finally:
+            if not quiet or answer != 204:
+                self._log(
+                    "command", {"reactor": self.name, "path": path, "answer": answer, "took_s": self._since(start)}
+                )
+        if reply.status != 204:
+            hint = "; the server wants X-Requested-With" if reply.status == 403 else ""
+            raise ProtocolError(f"POST {path}: status {reply.status}, expected 204{hint}")
+
+    def _since(self, start: float) -> float:
+        return round(self._clock.now() - start, 3)
+
+    def target(self, item: str, value: float) -> None:
+        """Set the target of `item`. Raises: as `post`."""
+        self.post(f"/SetOutputTarget/{item}/{self.name}/{value:.6f}")
+
+    def switch(self, item: str, on: bool) -> None:
+        """Switch `item`; never a toggle. Raises: as `post`."""
+        self.post(f"/SetOutputOn/{item}/{int(on)}/{self.name}")
+
+    def pumps_off(self, tries: int = 3) -> None:
+        """All four pumps off, read back. Every pump is tried even if another one fails.
+
+        Raises: LinkError, ProtocolError, DeviceStateError if it could not be verified.
+        """
+        error: ReactorError | None = None
+        for attempt in range(tries):
+            if attempt:
+                self._clock.sleep(1.0)
+            error = None
+            if self.state is None:
+                self.read()  # presence first
+            for pump in PUMPS:
+                try:
+                    self.switch(pump, False)
+                except (LinkError, ProtocolError) as failed:
+                    error = failed
+            if error is not None:
+                continue
+            try:
+                on = [p for p, is_on in zip(PUMPS, self.read().pumps_on, strict=True) if is_on]
+            except (LinkError, ProtocolError) as failed:
+                error = failed
+                continue
+            if not on:
+                return
+            error = DeviceStateError(f"{self.name}: {', '.join(on)} still on after the off command")
+        assert error is not None
+        raise error
+
+    def probe(self) -> None:
+        """Touch the bus with a blocking call: quick if all is well, and if the bus hangs the server kills itself.
+
+        It ends with everything off, which is the remote kill switch of a pump stuck on (chibio.md section 9).
+        Raises: LinkError if the bus hangs.
+        """
+        self.post(f"/MeasureTemp/IR/{self.name}")

@@ -1,0 +1,186 @@
+"""The agent as a whole: an easy problem, populations, resuming, and one update recomputed with torch's own parts."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dqn.agent import DQNAgent
+from dqn.config import DQNConfig
+from dqn.replay import Transition
+from dqn.trainer import Trainer
+from tests.dqn.problems import IdentityEnv, streams
+
+SMALL = DQNConfig(
+    hidden=(16, 16),
+    gamma=0.5,
+    learning_rate=3e-3,
+    total_steps=600,
+    epsilon_steps=300,
+    learn_start=32,
+    batch_size=16,
+    target_period=25,
+    replay_size=500,
+)
+EVERYTHING: dict[str, Any] = {
+    "double": True,
+    "action_gap": 0.5,
+    "huber": 0.5,
+    "average": 0.9,
+    "learning_rate_decay": 0.5,
+    "updates_per_step": 2,
+    "relabel": 0.5,
+    "target_blend": 0.5,
+}
+
+
+def _flip(batch: Transition, uniform: torch.Tensor) -> Transition:
+    """A goal replacement of no meaning that uses its random numbers."""
+    return batch._replace(r_t=batch.r_t + uniform[..., 0].to(torch.float32))
+
+
+def _trainer(config: DQNConfig, seeds: range) -> Trainer:
+    agent = DQNAgent(config, 3, 3, streams(seeds), _flip)
+    return Trainer(IdentityEnv(seeds), agent, interval=50)
+
+
+def _train(trainer: Trainer, records: int | None = None) -> Trainer:
+    for k, _ in enumerate(trainer.run()):
+        if records is not None and k + 1 == records:
+            break
+    return trainer
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"double": True, "action_gap": 0.5, "huber": 0.5, "average": 0.9}], ids=["plain", "all"]
+)
+def test_solves_the_identity_problem(changes: dict[str, Any]) -> None:
+    """Every one of 8 agents picks the paying action for every symbol, and Q is 1 / (1 - gamma) there."""
+    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 1500, "epsilon_end": 0.3, **changes})
+    trainer = _train(_trainer(config, range(8)))
+    q = trainer.agent.greedy(torch.eye(3).expand(8, 3, 3))
+    assert torch.equal(q.argmax(-1), torch.arange(3).expand(8, 3))
+    torch.testing.assert_close(q.amax(-1), torch.full((8, 3), 2.0), rtol=0.1, atol=0.1)
+
+
+@pytest.mark.parametrize("changes", [{}, EVERYTHING], ids=["plain", "everything"])
+def test_agent_of_a_population_is_the_agent_alone(changes: dict[str, Any]) -> None:
+    """Same episodes, actions and minibatches; weights equal up to rounding over the first updates."""
+    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 60, "epsilon_start": 0.5, **changes})
+    population = _train(_trainer(config, range(4, 12))).agent
+    for i in (0, 3, 7):
+        alone = _train(_trainer(config, range(4 + i, 5 + i))).agent
+        assert torch.equal(population.replay.state_dict()["rows"][i], alone.replay.state_dict()["rows"][0])
+        for one, other in ((population.online, alone.online), (population.target, alone.target)):
+            torch.testing.assert_close(one.flat[i], other.flat[0], rtol=1e-4, atol=1e-6)
+    assert not torch.allclose(population.online.flat[0], population.online.flat[1])
+
+
+@pytest.mark.parametrize("changes", [{}, EVERYTHING], ids=["plain", "everything"])
+@pytest.mark.parametrize("stop", [1, 5])
+def test_a_resumed_run_is_the_uninterrupted_one(changes: dict[str, Any], stop: int) -> None:
+    config = DQNConfig(**{**SMALL.__dict__, **changes})
+    whole = _trainer(config, range(3))
+    returns = [record.episode_return for record in whole.run()]
+    stopped = _train(_trainer(config, range(3)), records=stop)
+    state = copy.deepcopy(stopped.state_dict())
+    resumed = _trainer(config, range(3))
+    resumed.load_state_dict(state)
+    rest = [record.episode_return for record in resumed.run()]
+    for one, other in zip(
+        (whole.agent.online, whole.agent.target, whole.agent.greedy),
+        (resumed.agent.online, resumed.agent.target, resumed.agent.greedy),
+        strict=True,
+    ):
+        assert torch.equal(one.flat, other.flat)
+    np.testing.assert_array_equal(np.array(returns[stop:]), np.array(rest))
+
+
+def test_one_update_agrees_with_torch() -> None:
+    """Minibatch, double target, squared error and Adam, recomputed with autograd from the same draws."""
+    config = DQNConfig(**{**SMALL.__dict__, "learn_start": 40, "total_steps": 41, "double": True, "gamma": 0.9})
+    trainer = _trainer(config, range(2))
+    before = trainer.agent.online.flat.clone()
+    _train(trainer)
+    agent = trainer.agent
+    assert agent.updates == 1
+    for i in range(2):
+        parameters = before[i].double().clone().requires_grad_()
+
+        def q(observation: torch.Tensor, flat: torch.Tensor = parameters) -> torch.Tensor:
+            h, start = observation.double(), 0
+            for k, (inputs, outputs) in enumerate(((3, 16), (16, 16), (16, 3))):
+                weight = flat[start : start + inputs * outputs].view(inputs, outputs)
+                start += inputs * outputs
+                h = h @ weight + flat[start : start + outputs]
+                start += outputs
+                h = torch.relu(h) if k < 2 else h
+            return h
+
+        draws = np.random.default_rng(streams(range(i, i + 1))["replay"][0]).random(config.batch_size)
+        rows = agent.replay.state_dict()["rows"][i][(draws * 41).astype(int)]
+        s_tm1, s_t, action, reward = rows[:, :3], rows[:, 3:6], rows[:, 6].long(), rows[:, 7].double()
+        with torch.no_grad():
+            # before the first blend the target network is the online one
+            target = reward + 0.9 * q(s_t).gather(1, q(s_t).argmax(1, keepdim=True))[:, 0]
+        adam = torch.optim.Adam([parameters], lr=config.learning_rate)
+        (0.5 * (q(s_tm1).gather(1, action[:, None])[:, 0] - target) ** 2).mean().backward()
+        adam.step()
+        torch.testing.assert_close(agent.online.flat[i].double(), parameters.detach(), rtol=1e-4, atol=1e-6)
+
+
+def test_truncation_bootstraps_and_termination_does_not() -> None:
+    """All rewards 1 and one observation: Q grows towards 1 / (1 - gamma) only where episodes are truncated."""
+    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 10_000, "gamma": 0.9, "target_period": 10})
+    values = []
+    for continues in (1.0, 0.0):
+        agent = DQNAgent(config, 1, 2, streams(range(1)))
+        one = torch.ones(1, 1, 1)
+        for k in range(500):
+            action = torch.tensor([[k % 2]])
+            agent.observe(Transition(one, action, torch.ones(1, 1), one, torch.full((1, 1), continues)))
+        values.append(agent.online(one)[0, 0])
+    torch.testing.assert_close(values[0], torch.full((2,), 10.0), rtol=0.05, atol=0.0)
+    torch.testing.assert_close(values[1], torch.full((2,), 1.0), rtol=0.05, atol=0.0)
+
+
+def test_exploration_follows_epsilon() -> None:
+    """At epsilon 0.5 with 4 actions the greedy one comes up in 0.5 + 0.5 / 4 of the steps."""
+    config = DQNConfig(**{**SMALL.__dict__, "epsilon_start": 0.5, "epsilon_end": 0.5})
+    agent = DQNAgent(config, 3, 4, streams(range(64)))
+    observation = torch.eye(3)[torch.arange(64) % 3]
+    greedy = agent.online(observation.unsqueeze(1))[:, 0].argmax(-1)
+    share = torch.stack([agent.act(observation) == greedy for _ in range(400)]).double().mean()
+    assert float(share) == pytest.approx(0.625, abs=0.01)
+
+
+def test_relabelling_without_a_goal_is_refused() -> None:
+    config = DQNConfig(**{**SMALL.__dict__, "relabel": 0.5})
+    with pytest.raises(ValueError, match=r"agent\.relabel = 0\.5"):
+        DQNAgent(config, 3, 3, streams(range(1)))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("hidden", ()),
+        ("gamma", 1.0),
+        ("learning_rate", 0.0),
+        ("adam_eps", 0.0),
+        ("adam_beta2", 1.0),
+        ("epsilon_end", 1.5),
+        ("batch_size", 0),
+        ("target_blend", 0.0),
+        ("action_gap", 1.0),
+        ("relabel", -0.1),
+        ("average", 1.0),
+        ("input_offset", (1.0,)),
+    ],
+)
+def test_values_out_of_range_are_named(key: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=rf"agent\.{key} "):
+        DQNConfig(**{key: value})

@@ -1,0 +1,89 @@
+"""Checkpoints: whole on disk, exact in content, and never executed."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+
+from dqn import checkpoint
+from dqn.agent import DQNAgent
+from dqn.config import DQNConfig
+from dqn.trainer import Trainer
+from tests.dqn.problems import IdentityEnv, streams
+
+CONFIG = DQNConfig(
+    hidden=(8, 8), total_steps=200, learn_start=20, batch_size=8, target_period=10, average=0.9, learning_rate_decay=0.5
+)
+
+
+def _trainer() -> Trainer:
+    return Trainer(IdentityEnv(range(2)), DQNAgent(CONFIG, 3, 3, streams(range(2))), interval=30)
+
+
+def test_resume_through_a_file_is_exact(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.pt"
+    whole = _trainer()
+    for record in whole.run():
+        if record.step == 90:
+            checkpoint.save(path, whole.state_dict())
+    resumed = _trainer()
+    resumed.load_state_dict(checkpoint.load(path))
+    assert resumed.agent.steps == 90
+    for _ in resumed.run():
+        pass
+    one, other = whole.agent.state_dict(), resumed.agent.state_dict()
+    for name in ("online", "target", "greedy"):
+        assert torch.equal(one[name], other[name])
+    assert torch.equal(one["replay"]["rows"], other["replay"]["rows"])
+    assert one["explore"] == other["explore"]
+
+
+def test_a_failed_write_leaves_the_previous_checkpoint(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.pt"
+    checkpoint.save(path, {"step": 1})
+    with pytest.raises((pickle.PicklingError, AttributeError, TypeError)):
+        checkpoint.save(path, {"step": 2, "unpicklable": lambda: None})
+    assert checkpoint.load(path) == {"step": 1}
+
+
+class _Malicious:
+    """Runs a command when unpickled by an unrestricted reader."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, (f"touch {self.marker}",)
+
+
+def test_code_in_a_checkpoint_is_refused_and_not_run(tmp_path: Path) -> None:
+    marker, path = tmp_path / "ran", tmp_path / "checkpoint.pt"
+    torch.save({"format": checkpoint.FORMAT, "state": _Malicious(marker)}, path)
+    with pytest.raises(checkpoint.CheckpointError, match=r"checkpoint\.pt: not a readable checkpoint"):
+        checkpoint.load(path)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense", b"PK\x03\x04 torn"], ids=["empty", "text", "torn"])
+def test_unreadable_files_are_named(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(content)
+    with pytest.raises(checkpoint.CheckpointError, match=r"checkpoint\.pt: not a readable checkpoint"):
+        checkpoint.load(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(checkpoint.CheckpointError, match="no such checkpoint"):
+        checkpoint.load(tmp_path / "checkpoint.pt")
+
+
+@pytest.mark.parametrize("content", [{"format": 99, "state": {}}, [1, 2]])
+def test_another_format_is_refused(tmp_path: Path, content: object) -> None:
+    path = tmp_path / "checkpoint.pt"
+    torch.save(content, path)
+    with pytest.raises(checkpoint.CheckpointError, match="format"):
+        checkpoint.load(path)

@@ -1,0 +1,93 @@
+"""The hand-written network against torch's own layers and autograd."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dqn.network import QNetwork, initial_weights
+
+SIZES = (3, 7, 5, 4)
+AGENTS, BATCH = 3, 6
+
+
+def _flat(sizes: tuple[int, ...] = SIZES) -> torch.Tensor:
+    return torch.from_numpy(np.stack([initial_weights(sizes, np.random.SeedSequence(i)) for i in range(AGENTS)]))
+
+
+def _twin(network: QNetwork, agent: int) -> torch.nn.Sequential:
+    """The same network out of torch's modules, in double precision."""
+    modules: list[torch.nn.Module] = []
+    for weight, bias in network.layers:
+        linear = torch.nn.Linear(weight.shape[1], weight.shape[2], dtype=torch.float64)
+        with torch.no_grad():
+            linear.weight.copy_(weight[agent].T)
+            linear.bias.copy_(bias[agent, 0])
+        modules += [linear, torch.nn.ReLU()]
+    return torch.nn.Sequential(*modules[:-1])
+
+
+def test_forward_and_backward_agree_with_autograd() -> None:
+    network = QNetwork(_flat(), SIZES)
+    generator = torch.Generator().manual_seed(0)
+    observation = torch.randn(AGENTS, BATCH, SIZES[0], generator=generator)
+    slope = torch.randn(AGENTS, BATCH, SIZES[-1], generator=generator)
+    q, inputs = network.forward(observation)
+    network.backward(inputs, slope)
+    for i in range(AGENTS):
+        twin = _twin(network, i)
+        expected = twin(observation[i].double())
+        torch.testing.assert_close(q[i].double(), expected, rtol=1e-5, atol=1e-6)
+        (expected * slope[i]).sum().backward()
+        linears = [m for m in twin if isinstance(m, torch.nn.Linear)]
+        gradient = torch.cat([torch.cat([m.weight.grad.T.reshape(-1), m.bias.grad]) for m in linears])
+        torch.testing.assert_close(network.grad[i].double(), gradient, rtol=1e-4, atol=1e-5)
+
+
+def test_backward_overwrites_an_earlier_gradient() -> None:
+    network = QNetwork(_flat(), SIZES)
+    observation = torch.ones(AGENTS, BATCH, SIZES[0])
+    _, inputs = network.forward(observation)
+    slope = torch.ones(AGENTS, BATCH, SIZES[-1])
+    network.backward(inputs, slope)
+    first = network.grad.clone()
+    network.backward(inputs, slope)
+    torch.testing.assert_close(network.grad, first, rtol=0.0, atol=0.0)
+
+
+def test_agents_do_not_see_one_another() -> None:
+    flat = _flat()
+    network = QNetwork(flat, SIZES)
+    observation = torch.ones(AGENTS, BATCH, SIZES[0])
+    before = network(observation).clone()
+    flat[1] += 1.0
+    after = network(observation)
+    assert torch.equal(before[[0, 2]], after[[0, 2]])
+    assert not torch.equal(before[1], after[1])
+
+
+def test_input_map_is_applied_and_reported() -> None:
+    matrix, offset = torch.tensor([[3.0, -3.0], [0.0, 2.0], [1.0, 0.5]]), torch.tensor([0.0, -1.2, 0.25])
+    sizes = (3, 4, 2)
+    network = QNetwork(_flat(sizes), sizes, matrix, offset)
+    observation = torch.rand(AGENTS, BATCH, 2)
+    plain = QNetwork(_flat(sizes), sizes)
+    torch.testing.assert_close(network(observation), plain(observation @ matrix.T + offset))
+    stored = network.input_map()
+    np.testing.assert_array_equal(stored[0], matrix.numpy())
+    np.testing.assert_array_equal(stored[1], offset.numpy())
+
+
+def test_initial_weights_follow_torch_linear() -> None:
+    """Uniform in +-1/sqrt(inputs), layer by layer; another seed gives other numbers."""
+    sizes = (4, 400, 100)
+    flat = initial_weights(sizes, np.random.SeedSequence(5))
+    assert flat.dtype == np.float32
+    assert flat.size == 4 * 400 + 400 + 400 * 100 + 100
+    first, second = flat[:2000], flat[2000:]
+    for part, bound in ((first, 0.5), (second, 0.05)):
+        assert np.abs(part).max() <= bound
+        assert np.std(part) == pytest.approx(bound / np.sqrt(3.0), rel=0.05)
+        assert abs(np.mean(part)) < 0.05 * bound
+    assert not np.array_equal(flat, initial_weights(sizes, np.random.SeedSequence(6)))

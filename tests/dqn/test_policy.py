@@ -1,0 +1,135 @@
+"""The exported policy against the torch network it came from, and files that are none."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dqn import policy
+from dqn.export import export
+from dqn.network import QNetwork, initial_weights
+
+SIZES = (3, 64, 64, 17)
+RATES = np.linspace(0.0, 0.02, 17)
+MATRIX = torch.tensor([[3.0, -3.0], [0.0, 3.0], [1.0, 1.0]])
+OFFSET = torch.tensor([0.0, -1.8, 0.5])
+
+
+def _network() -> QNetwork:
+    flat = np.stack([initial_weights(SIZES, np.random.SeedSequence(i)) for i in range(3)])
+    return QNetwork(torch.from_numpy(flat), SIZES, MATRIX, OFFSET)
+
+
+def _policy(agent: int = 1) -> policy.Policy:
+    network = _network()
+    return export(network, agent, network.flat, RATES, {"control_min": 1.0, "model": {"mu": 0.03, "tau": 1 / 3}})
+
+
+def _observations() -> np.ndarray:
+    od, setpoint = np.meshgrid(np.linspace(0.01, 1.5, 40), np.linspace(0.2, 1.0, 9))
+    return np.stack([od.ravel(), setpoint.ravel()], axis=1)
+
+
+@pytest.mark.parametrize("agent", [0, 2])
+def test_numpy_policy_agrees_with_torch(tmp_path: Path, agent: int) -> None:
+    policy.save(tmp_path / "policy.npz", _policy(agent))
+    read = policy.load(tmp_path / "policy.npz")
+    observation = _observations()
+    expected = _network()(torch.from_numpy(observation.astype(np.float32)).expand(3, -1, -1))[agent].numpy()
+    np.testing.assert_allclose(read.q_values(observation), expected, rtol=1e-5, atol=1e-6)
+    action = expected.argmax(1)
+    assert len(set(action.tolist())) > 1
+    np.testing.assert_array_equal(read.act(observation), action)
+    np.testing.assert_array_equal(read.rate(observation), RATES[action])
+
+
+def test_metadata_returns(tmp_path: Path) -> None:
+    policy.save(tmp_path / "policy.npz", _policy())
+    metadata = policy.load(tmp_path / "policy.npz").metadata
+    assert metadata["format"] == policy.FORMAT
+    assert metadata["observation"] == ["od", "setpoint"]
+    assert metadata["model"] == {"mu": 0.03, "tau": 1 / 3}
+
+
+def test_export_does_not_share_memory_with_the_agent() -> None:
+    network = _network()
+    exported = export(network, 0, network.flat, RATES, {})
+    before = exported.q_values(_observations()).copy()
+    network.flat += 1.0
+    np.testing.assert_array_equal(exported.q_values(_observations()), before)
+
+
+def test_reading_needs_no_torch(tmp_path: Path) -> None:
+    policy.save(tmp_path / "policy.npz", _policy())
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from pathlib import Path\n"
+        "from dqn import policy\n"
+        f"print(policy.load(Path({str(tmp_path / 'policy.npz')!r})).rate(__import__('numpy').array([[0.9, 0.3]]))[0])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert float(done.stdout) == _policy().rate(np.array([[0.9, 0.3]]))[0]
+
+
+def _change(path: Path, **changes: Any) -> None:
+    """Rewrite a policy file with some arrays replaced, or removed where None."""
+    with np.load(path) as content:
+        arrays = {name: content[name] for name in content.files}
+    for name, value in changes.items():
+        if value is None:
+            del arrays[name]
+        else:
+            arrays[name] = value
+    np.savez(path, **arrays)
+
+
+def _metadata(**changes: Any) -> np.ndarray:
+    return np.array(json.dumps({"format": policy.FORMAT, "observation": ["od", "setpoint"], **changes}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"w1": None}, "incomplete or of mismatched shapes"),
+        ({"b0": np.zeros(5, np.float32)}, "incomplete or of mismatched shapes"),
+        ({"metadata": np.array("not json")}, "incomplete or of mismatched shapes"),
+        ({"metadata": _metadata(format=2)}, "format 2: allowed 1"),
+        ({"metadata": _metadata(observation=["od"])}, "observation"),
+        ({"pump_rates": np.zeros(16)}, "17 Q values, 16 pump rates"),
+        ({"b2": np.full(17, np.nan, np.float32)}, "not finite"),
+    ],
+)
+def test_bad_contents_are_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    path = tmp_path / "policy.npz"
+    policy.save(path, _policy())
+    _change(path, **changes)
+    with pytest.raises(policy.PolicyError, match=message):
+        policy.load(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"text, not numbers", b"PK\x03\x04"], ids=["empty", "text", "torn"])
+def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "policy.npz"
+    path.write_bytes(content)
+    with pytest.raises(policy.PolicyError, match=r"policy\.npz: not a policy file"):
+        policy.load(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(policy.PolicyError, match="no such file"):
+        policy.load(tmp_path / "policy.npz")
+
+
+def test_pickled_objects_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "policy.npz"
+    policy.save(path, _policy())
+    _change(path, w0=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(policy.PolicyError, match="not a policy file"):
+        policy.load(path)

@@ -1,0 +1,105 @@
+"""The ring against a plain list."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dqn.replay import Replay, Transition
+
+AGENTS, OBSERVATIONS = 3, 2
+CPU = torch.device("cpu")
+
+
+def _step(rng: np.random.Generator) -> Transition:
+    def numbers(*shape: int) -> torch.Tensor:
+        return torch.from_numpy(rng.standard_normal(shape).astype(np.float32))
+
+    return Transition(
+        s_tm1=numbers(AGENTS, 1, OBSERVATIONS),
+        a_tm1=torch.from_numpy(rng.integers(0, 17, (AGENTS, 1))),
+        r_t=numbers(AGENTS, 1),
+        s_t=numbers(AGENTS, 1, OBSERVATIONS),
+        continues=torch.from_numpy((rng.random((AGENTS, 1)) < 0.5).astype(np.float32)),
+    )
+
+
+@settings(deadline=None, max_examples=25)
+@given(capacity=st.integers(1, 9), added=st.integers(1, 30), seed=st.integers(0, 2**31))
+def test_holds_the_last_ones_like_a_list(capacity: int, added: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    replay = Replay(AGENTS, capacity, OBSERVATIONS, CPU)
+    naive: list[Transition] = []
+    for k in range(added):
+        step = _step(rng)
+        replay.add(step)
+        if len(naive) < capacity:
+            naive.append(step)
+        else:
+            naive[k % capacity] = step
+    assert replay.size == len(naive)
+    uniform = torch.from_numpy(rng.random((AGENTS, 16)))
+    batch = replay.sample(uniform)
+    for i in range(AGENTS):
+        for j in range(16):
+            expected = naive[int(uniform[i, j] * len(naive))]
+            for drawn, stored in zip(batch, expected, strict=True):
+                assert torch.equal(drawn[i, j], stored[i, 0])
+
+
+def test_types_of_a_minibatch() -> None:
+    replay = Replay(AGENTS, 4, OBSERVATIONS, CPU)
+    replay.add(_step(np.random.default_rng(0)))
+    batch = replay.sample(torch.zeros(AGENTS, 5, dtype=torch.float64))
+    assert batch.a_tm1.dtype == torch.int64
+    assert [tuple(field.shape) for field in batch] == [(3, 5, 2), (3, 5), (3, 5), (3, 5, 2), (3, 5)]
+
+
+def test_the_largest_number_below_one_stays_inside() -> None:
+    replay = Replay(AGENTS, 7, OBSERVATIONS, CPU)
+    for _ in range(7):
+        replay.add(_step(np.random.default_rng(1)))
+    replay.sample(torch.full((AGENTS, 1), np.nextafter(1.0, 0.0), dtype=torch.float64))
+
+
+def test_uniform_frequencies() -> None:
+    """Every row is drawn equally often: chi-square over 10 rows, 20 000 draws."""
+    rng = np.random.default_rng(2)
+    replay = Replay(1, 10, OBSERVATIONS, CPU)
+    for k in range(10):
+        one = Transition(*(field[:1] for field in _step(rng)))
+        replay.add(one._replace(r_t=torch.tensor([[float(k)]])))
+    rows = replay.sample(torch.from_numpy(rng.random((1, 20_000)))).r_t.long()
+    count = torch.bincount(rows[0], minlength=10).numpy()
+    assert ((count - 2000.0) ** 2 / 2000.0).sum() < 27.9  # 99.9 % quantile with 9 degrees of freedom
+
+
+def test_minibatch_is_a_copy() -> None:
+    replay = Replay(AGENTS, 4, OBSERVATIONS, CPU)
+    replay.add(_step(np.random.default_rng(3)))
+    zero = torch.zeros(AGENTS, 1, dtype=torch.float64)
+    replay.sample(zero).s_t.add_(100.0)
+    assert replay.sample(zero).s_t.abs().max() < 50.0
+
+
+def test_empty_memory_is_refused() -> None:
+    with pytest.raises(ValueError, match="replay memory is empty"):
+        Replay(AGENTS, 4, OBSERVATIONS, CPU).sample(torch.zeros(AGENTS, 1))
+
+
+@pytest.mark.parametrize("added", [3, 11])
+def test_state_continues(added: int) -> None:
+    rng = np.random.default_rng(4)
+    one, other = (Replay(AGENTS, 5, OBSERVATIONS, CPU) for _ in range(2))
+    for _ in range(added):
+        one.add(_step(rng))
+    other.load_state_dict(one.state_dict())
+    step = _step(rng)
+    one.add(step)
+    other.add(step)
+    uniform = torch.from_numpy(rng.random((AGENTS, 8)))
+    for a, b in zip(one.sample(uniform), other.sample(uniform), strict=True):
+        assert torch.equal(a, b)

@@ -1,0 +1,99 @@
+"""Targets by hand on a chain of two states, losses against autograd."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from dqn.targets import advantage_target, blend, double_q_target, loss_gradient, q_target
+
+GAMMA = 0.9
+# Chain: in state 0 action 0 stays (reward 0), action 1 moves to state 1 (reward 1); state 1 is left by either action,
+# back to state 0, with reward 2 for action 0 and 0 for action 1.
+MOVES = [[0, 1], [0, 0]]
+REWARDS = [[0.0, 1.0], [2.0, 0.0]]
+
+
+def _all_transitions() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """State, action, reward, next state of all four pairs, each of shape (1, 4)."""
+    pairs = [(s, a) for s in (0, 1) for a in (0, 1)]
+    state = torch.tensor([[s for s, _ in pairs]])
+    action = torch.tensor([[a for _, a in pairs]])
+    reward = torch.tensor([[REWARDS[s][a] for s, a in pairs]])
+    after = torch.tensor([[MOVES[s][a] for s, a in pairs]])
+    return state, action, reward, after
+
+
+def _exact() -> torch.Tensor:
+    """Q* of the chain, shape (2, 2): V0 = 1 + g V1, V1 = 2 + g V0 (moving on always pays)."""
+    v0 = (1.0 + 2.0 * GAMMA) / (1.0 - GAMMA**2)
+    v1 = 2.0 + GAMMA * v0
+    return torch.tensor([[GAMMA * v0, v0], [v1, GAMMA * v0]])
+
+
+def test_one_target_by_hand() -> None:
+    q_t = torch.tensor([[[1.0, 5.0], [4.0, 3.0], [4.0, 3.0]]])
+    reward, continues = torch.tensor([[1.0, 2.0, 2.0]]), torch.tensor([[1.0, 1.0, 0.0]])
+    # 1 + 0.9 * 5, 2 + 0.9 * 4, and 2 alone where the episode terminated
+    torch.testing.assert_close(q_target(reward, continues, GAMMA, q_t), torch.tensor([[5.5, 5.6, 2.0]]))
+    online = torch.tensor([[[9.0, 1.0], [0.0, 1.0], [0.0, 1.0]]])
+    # the online network picks action 0, 1, 1; the target network says 1, 3, 3
+    expected = torch.tensor([[1.9, 4.7, 2.0]])
+    torch.testing.assert_close(double_q_target(reward, continues, GAMMA, q_t, online), expected)
+
+
+def test_q_iteration_reaches_the_exact_values() -> None:
+    _, _, reward, after = _all_transitions()
+    q = torch.zeros(2, 2)
+    for _ in range(200):
+        q = q_target(reward, torch.ones(1, 4), GAMMA, q[after]).view(2, 2)
+    torch.testing.assert_close(q, _exact(), rtol=1e-5, atol=1e-5)
+    double = double_q_target(reward, torch.ones(1, 4), GAMMA, q[after], q[after]).view(2, 2)
+    torch.testing.assert_close(double, q, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 0.9])
+def test_advantage_learning_widens_gaps_and_keeps_values(alpha: float) -> None:
+    """Its fixed point: the same V, the same greedy actions, gaps 1 / (1 - alpha) times as wide."""
+    state, action, reward, after = _all_transitions()
+    q = torch.zeros(2, 2)
+    for _ in range(600):
+        target = q_target(reward, torch.ones(1, 4), GAMMA, q[after])
+        q = advantage_target(target, alpha, q[state], action).view(2, 2)
+    exact = _exact()
+    value = exact.amax(1, keepdim=True)
+    torch.testing.assert_close(q, value - (value - exact) / (1.0 - alpha), rtol=1e-4, atol=1e-4)
+
+
+def test_no_advantage_no_change() -> None:
+    state, action, reward, _ = _all_transitions()
+    assert torch.equal(advantage_target(reward, 0.0, _exact()[state], action), reward)
+
+
+@pytest.mark.parametrize("huber", [0.0, 0.3])
+def test_loss_and_gradient_agree_with_autograd(huber: float) -> None:
+    generator = torch.Generator().manual_seed(1)
+    q = torch.randn(3, 8, 5, generator=generator, dtype=torch.float64, requires_grad=True)
+    action = torch.randint(0, 5, (3, 8), generator=generator)
+    target = torch.randn(3, 8, generator=generator, dtype=torch.float64)
+    loss, gradient = loss_gradient(q.detach(), action, target, huber)
+    chosen = q.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+    if huber:
+        each = torch.nn.functional.huber_loss(chosen, target, reduction="none", delta=huber)
+    else:
+        each = 0.5 * (chosen - target) ** 2
+    expected = each.mean(-1)
+    torch.testing.assert_close(loss, expected.detach())
+    expected.sum().backward()
+    assert q.grad is not None
+    torch.testing.assert_close(gradient, q.grad)
+
+
+def test_blend() -> None:
+    target, online = torch.zeros(2, 3), torch.ones(2, 3)
+    blend(target, online, 0.25)
+    torch.testing.assert_close(target, torch.full((2, 3), 0.25))
+    blend(target, online, 1.0)
+    assert torch.equal(target, online)
+    online += 1.0
+    assert torch.equal(target, torch.ones(2, 3))

@@ -1,0 +1,131 @@
+"""What every controller owes the loop: independence of rows, indifference to bad readings, and a place in conf/."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from envs.task import EnvConfig
+from experiments import app
+from experiments.controllers.base import Controller, Explains
+from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
+from experiments.controllers.inverse import Inverse, InverseConfig
+from experiments.controllers.mpc import Mpc, MpcConfig
+from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
+from experiments.controllers.pso import SwarmConfig
+
+MODEL = EnvConfig()
+QUICK = SwarmConfig(particles=6, iterations=8)
+MAKERS: dict[str, Callable[[], Controller]] = {
+    "pi": lambda: ChiBioPI(ChiBioPIConfig()),
+    "pi_tuned": lambda: TunedPI(TunedPIConfig(), MODEL),
+    "inverse": lambda: Inverse(InverseConfig(), MODEL),
+    "mpc": lambda: Mpc(MpcConfig(swarm=QUICK), MODEL),
+    "threshold": lambda: Threshold(ThresholdConfig(hysteresis=0.02)),
+    "hold": lambda: Hold(HoldConfig(), MODEL),
+}
+CONFIGS = {
+    "pi": ChiBioPIConfig(),
+    "pi_tuned": TunedPIConfig(),
+    "inverse": InverseConfig(),
+    "mpc": MpcConfig(),
+    "threshold": ThresholdConfig(),
+    "hold": HoldConfig(),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_batch_of_64_is_64_singles(name: str) -> None:
+    """Also when only some rows are fresh: a single controller sees just its own fresh readings."""
+    n, steps = 64, 12
+    rng = np.random.default_rng(7)
+    od = np.clip(0.5 + np.cumsum(0.02 * rng.standard_normal((steps, n)), axis=0), 0.05, 2.0)
+    setpoint = rng.choice([0.4, 0.5, 0.6], (steps, n))
+    fresh = rng.random((steps, n)) < 0.8
+    batch = MAKERS[name]()
+    batch.reset(n)
+    together = np.array([batch.act(od[k], setpoint[k], np.full(n, float(k)), fresh[k]) for k in range(steps)])
+    assert together.shape == (steps, n)
+    for i in range(n):
+        single = MAKERS[name]()
+        size, row = (i + 1, i) if name == "mpc" else (1, 0)  # row i of a swarm has random stream i
+        single.reset(size)
+        for k in np.flatnonzero(fresh[:, i]):
+            x, r, t = np.full((3, size), np.nan)
+            x[row], r[row], t[row] = od[k, i], setpoint[k, i], float(k)
+            rate = single.act(x, r, t, np.arange(x.size) == row)[row]
+            assert rate == pytest.approx(together[k, i], rel=1e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_readings_of_any_value_give_a_rate_in_range(name: str) -> None:
+    odd = np.array([np.nan, np.inf, -np.inf, 0.0, -0.3, 1e-9, 14.0, 1e6, 0.5, 0.7])
+    controller = MAKERS[name]()
+    controller.reset(odd.size)
+    setpoint = np.full(odd.size, 0.5)
+    for k in range(8):
+        rate = controller.act(np.roll(odd, k), setpoint, np.full(odd.size, float(k)), np.ones(odd.size, dtype=bool))
+        assert np.all(np.isfinite(rate))
+        assert np.all((rate >= 0.0) & (rate <= 0.02 + 1e-15))
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_reset_forgets(name: str) -> None:
+    rng = np.random.default_rng(2)
+    od = 0.5 + 0.05 * rng.standard_normal((10, 3))
+    controller = MAKERS[name]()
+
+    def run() -> list[list[float]]:
+        controller.reset(3)
+        everything = np.ones(3, dtype=bool)
+        return [controller.act(x, np.full(3, 0.5), np.full(3, float(k)), everything).tolist() for k, x in enumerate(od)]
+
+    assert run() == run()
+
+
+@pytest.mark.parametrize("name", ["pi", "pi_tuned", "inverse", "mpc"])
+def test_explanations_have_one_row_per_reactor(name: str) -> None:
+    controller = MAKERS[name]()
+    controller.reset(5)
+    controller.act(np.full(5, 0.52), np.full(5, 0.5), np.zeros(5), np.ones(5, dtype=bool))
+    assert isinstance(controller, Explains)
+    for key, value in controller.explain().items():
+        assert value.shape[0] == 5, key
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_the_conf_file_holds_the_defaults(name: str) -> None:
+    default = CONFIGS[name]
+    assert app.load(app.compose(f"controller/{name}", []).controller, default) == default
+    assert set(app.compose(f"controller/{name}", []).controller) == set(asdict(default))
+
+
+def test_threshold_and_hold_by_hand() -> None:
+    threshold = Threshold(ThresholdConfig(rate=0.015, hysteresis=0.02))
+    threshold.reset(1)
+    path = [0.49, 0.51, 0.49, 0.481, 0.48, 0.49, 0.501]
+    rates = [threshold.act(np.array([x]), np.array([0.5]), np.zeros(1), np.ones(1, dtype=bool))[0] for x in path]
+    np.testing.assert_allclose(rates, [0.0, 0.015, 0.015, 0.015, 0.0, 0.0, 0.015])
+    hold = Hold(HoldConfig(), MODEL)
+    hold.reset(2)
+    u = hold.act(np.array([0.1, 2.0]), np.full(2, 0.5), np.zeros(2), np.ones(2, dtype=bool))
+    np.testing.assert_allclose(u, 0.01)  # mu tau
+    with pytest.raises(ValueError, match=r"controller.rate = 1.0 mL/s"):
+        HoldConfig(rate=1.0)
+    with pytest.raises(ValueError, match=r"controller.hysteresis = -0.1 OD"):
+        ThresholdConfig(hysteresis=-0.1)
+
+
+@pytest.mark.parametrize("name", ["pi", "pi_tuned", "inverse"])
+def test_ninety_minutes_of_64_replicates_in_well_under_a_second(name: str) -> None:
+    controller = MAKERS[name]()
+    controller.reset(64)
+    od = 0.5 + 0.01 * np.random.default_rng(0).standard_normal((90, 64))
+    start = time.process_time()
+    for k, x in enumerate(od):
+        controller.act(x, np.full(64, 0.5), np.full(64, float(k)), np.ones(64, dtype=bool))
+    assert time.process_time() - start < 0.5

@@ -1,0 +1,176 @@
+"""The MPC: model, cost, swarm against exhaustive and gradient references, and the loop against the optimum."""
+
+from __future__ import annotations
+
+import time
+from itertools import product
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from envs.optimum import solve
+from envs.task import EnvConfig, step_factors
+from experiments.controllers.mpc import Mpc, MpcConfig, Problem
+from experiments.controllers.pso import SwarmConfig, minimise
+
+Array = NDArray[np.float64]
+MODEL = EnvConfig()
+
+
+def states(n: int, seed: int = 0) -> tuple[Array, Array]:
+    """Random start ODs and setpoints; half of the starts are within 10 % of the setpoint."""
+    rng = np.random.default_rng(seed)
+    setpoint = rng.choice(np.asarray(MODEL.setpoints), n)
+    od = np.where(rng.random(n) < 0.5, setpoint * rng.uniform(0.9, 1.1, n), rng.uniform(0.1, 1.1, n))
+    return od, setpoint
+
+
+def cost_of(problem: Problem, v: Array) -> Array:
+    return problem.cost(v[:, None])[:, 0]
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+def test_closed_form_of_the_step_is_the_models(integrator: str) -> None:
+    model = EnvConfig(mu=0.021, tau=0.27, integrator=integrator, substeps=7)
+    v = np.linspace(-0.2, 1.2, 31)
+    factors, slope = Problem(np.ones(1), np.ones(1), model, 100.0).factors(v)
+    np.testing.assert_allclose(factors, step_factors(model, v * model.max_pump_rate), rtol=1e-13)
+    h = 1e-6
+    above, below = (step_factors(model, (v + s) * model.max_pump_rate) for s in (h, -h))
+    np.testing.assert_allclose(slope, (above - below) / (2 * h), rtol=1e-6)
+
+
+def test_cost_by_hand() -> None:
+    """Two steps with the pump off, then one outside the range."""
+    problem = Problem(np.array([0.4]), np.array([0.5]), MODEL, 100.0)
+    f = 1.003**10
+    assert problem.cost(np.zeros((1, 1, 2)))[0, 0] == pytest.approx((0.4 * f - 0.5) ** 2 + (0.4 * f * f - 0.5) ** 2)
+    outside = problem.cost(np.array([[[0.0, 1.001]], [[-0.001, 1.001]]])[:1])[0, 0]
+    assert 100.0 < outside < 101.0
+    assert problem.cost(np.array([[[-0.001, 1.001]]]))[0, 0] > 200.0
+
+
+def test_gradient_of_the_cost_is_exact() -> None:
+    problem = Problem(np.array([0.7]), np.array([0.5]), MODEL, 100.0)
+    v = np.array([0.3, 0.9, 0.1, 0.6, 0.5])
+    gradient = problem.value_and_gradient(v)[1]
+    for k in range(5):
+        step = 1e-6 * np.eye(5)[k]
+        difference = (problem.value_and_gradient(v + step)[0] - problem.value_and_gradient(v - step)[0]) / 2e-6
+        assert gradient[k] == pytest.approx(difference, rel=1e-5, abs=1e-10)
+
+
+def test_no_grid_point_beats_the_solvers() -> None:
+    """All 11^5 sequences of 11 pump rates, from 30 random states."""
+    od, setpoint = states(30, seed=1)
+    grid = np.array(list(product(np.linspace(0.0, 1.0, 11), repeat=5)))
+    problem = Problem(od, setpoint, MODEL, 100.0)
+    best = np.array(
+        [Problem(od[i : i + 1], setpoint[i : i + 1], MODEL, 100.0).cost(grid[None]).min() for i in range(30)]
+    )
+    start = np.full((30, 5), 0.5)
+    gradient = cost_of(problem, problem.by_gradient(start))
+    swarm = cost_of(problem, problem.by_swarm(start, np.random.default_rng(0).spawn(30), SwarmConfig()))
+    assert np.all(gradient <= best + 1e-12)
+    assert np.all(swarm <= best * 1.01 + 1e-6)
+    # where the optimum is at the bounds the grid contains it
+    saturated = np.abs(np.log(od / setpoint)) > 0.2
+    assert saturated.sum() > 5
+    np.testing.assert_allclose(gradient[saturated], best[saturated], rtol=1e-9)
+
+
+def test_swarm_finds_the_optimum_from_a_cold_start() -> None:
+    """Success: cost within 1 % of the gradient solver's, or within (0.0005 OD)^2 summed; in 400 of 400 states."""
+    od, setpoint = states(400)
+    rng = np.random.default_rng(3)
+    problem = Problem(od, setpoint, MODEL, 100.0)
+    reference = cost_of(problem, problem.by_gradient(np.full((400, 5), 0.5)))
+    moves = problem.by_swarm(rng.uniform(0.0, 1.0, (400, 5)), rng.spawn(400), SwarmConfig())
+    assert np.all((moves >= 0.0) & (moves <= 1.0))
+    gap = cost_of(problem, moves) - reference
+    assert gap.min() > -1e-9  # and never below it: the problem has one minimum
+    assert np.mean(gap <= 0.01 * reference + 1.25e-6) >= 0.995
+
+
+def test_swarm_minimises_what_it_is_given() -> None:
+    """A shifted ill-conditioned bowl outside the start box, and independence of the swarms from one another."""
+    centre = np.array([[1.5, -0.5, 0.2], [0.1, 0.9, 2.0]])
+    weight = np.array([1.0, 10.0, 100.0])
+    swarm = SwarmConfig(particles=30, iterations=300)
+
+    def bowl(x: Array) -> Array:
+        return np.asarray((weight * (x - centre[: x.shape[0], None]) ** 2).sum(-1))
+
+    best, cost = minimise(bowl, 0.0, 1.0, np.zeros((2, 3)), np.random.default_rng(0).spawn(2), swarm)
+    np.testing.assert_allclose(best, centre, atol=1e-6)
+    np.testing.assert_allclose(cost, bowl(best[:, None])[:, 0])
+    alone, _ = minimise(bowl, 0.0, 1.0, np.zeros((1, 3)), np.random.default_rng(0).spawn(2)[:1], swarm)
+    np.testing.assert_array_equal(alone[0], best[0])
+
+
+@pytest.mark.parametrize("solver", ["pso", "gradient"])
+def test_closed_loop_on_the_model_costs_what_the_optimum_costs(solver: str) -> None:
+    """Sum over 100 steps of (x - r)^2 after each step, against the dynamic-programming policy with its 17 rates."""
+    n = 24
+    od, setpoint = states(n, seed=4)
+    mpc, optimum = Mpc(MpcConfig(solver=solver), MODEL), solve(MODEL, grid=3001)
+    mpc.reset(n)
+    ours, best = od.copy(), od.copy()
+    j_ours, j_best = np.zeros(n), np.zeros(n)
+    for k in range(100):
+        u = mpc.act(ours, setpoint, np.full(n, float(k)), np.ones(n, dtype=bool))
+        ours = ours * step_factors(MODEL, u)
+        best = best * optimum.factors[optimum.act(best, setpoint)]
+        j_ours += (ours - setpoint) ** 2
+        j_best += (best - setpoint) ** 2
+    assert j_ours.mean() == pytest.approx(j_best.mean(), rel=0.02)
+    assert np.abs(ours - setpoint).max() < 1e-3
+
+
+def test_decisions_repeat_and_seeds_matter() -> None:
+    od, setpoint = states(4)
+
+    def decide(seed: int) -> Array:
+        mpc = Mpc(MpcConfig(seed=seed, swarm=SwarmConfig(particles=5, iterations=5)), MODEL)
+        mpc.reset(4)
+        return mpc.act(od, setpoint, np.zeros(4), np.ones(4, dtype=bool))
+
+    np.testing.assert_array_equal(decide(0), decide(0))
+    assert not np.array_equal(decide(0), decide(1))
+
+
+def test_the_plan_is_explained() -> None:
+    mpc = Mpc(MpcConfig(), MODEL)
+    mpc.reset(2)
+    rate = mpc.act(np.array([0.6, 0.4]), np.array([0.5, 0.5]), np.zeros(2), np.ones(2, dtype=bool))
+    plan = mpc.explain()
+    np.testing.assert_array_equal(plan["planned_rate"][:, 0], rate)
+    np.testing.assert_allclose(plan["predicted_od"][:, 0], np.array([0.6, 0.4]) * step_factors(MODEL, rate))
+
+
+def test_ninety_minutes_of_64_replicates_in_seconds() -> None:
+    mpc = Mpc(MpcConfig(), MODEL)
+    mpc.reset(64)
+    od, setpoint = states(64)
+    start = time.process_time()
+    for k in range(9):  # a tenth of a run
+        od = od * step_factors(MODEL, mpc.act(od, setpoint, np.full(64, float(k)), np.ones(64, dtype=bool)))
+    assert time.process_time() - start < 2.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: MpcConfig(horizon=0), "controller.horizon = 0"),
+        (lambda: MpcConfig(penalty=0.0), "controller.penalty = 0.0"),
+        (lambda: MpcConfig(solver="newton"), "controller.solver = newton: allowed pso, gradient"),
+        (lambda: SwarmConfig(particles=1), "controller.swarm.particles = 1"),
+        (lambda: SwarmConfig(inertia=1.0), "controller.swarm.inertia = 1.0"),
+        (lambda: SwarmConfig(attraction=2.0), "attraction = 2.0: allowed 0 < attraction < 1.67"),
+    ],
+)
+def test_ranges(make: object, message: str) -> None:
+    assert callable(make)
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -1,0 +1,132 @@
+"""The PI laws against their difference equations, computed by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from envs.task import EnvConfig
+from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
+
+Array = NDArray[np.float64]
+
+
+def play(
+    controller: ChiBioPI | TunedPI, ods: list[float], setpoint: float, minutes: list[float] | None = None
+) -> Array:
+    """Pump rates for a sequence of readings of one reactor."""
+    controller.reset(1)
+    times = minutes or [float(k) for k in range(len(ods))]
+    rates = [
+        controller.act(np.array([x]), np.array([setpoint]), np.array([t]), np.array([True]))[0]
+        for x, t in zip(ods, times, strict=True)
+    ]
+    return np.array(rates)
+
+
+def test_the_devices_law_by_hand() -> None:
+    ods = [0.55, 0.56, 0.57, 0.53, 0.505, 0.56, 0.62, 0.63, 0.48]
+    by_hand = [
+        0.0,  # cycle 1
+        0.0,  # cycle 2
+        # e .07, |dy| .01: P = .7 ln(1.14)/12 = .0076433, I1 = .007, I2 = .0007
+        0.0076433 + 0.007 + 0.0007,
+        # e .03, |dy| .04: P = .7 ln(1.06)/12 = .0033990, I1 = .007 + .003, I2 = .0007 + .0003
+        0.0033990 + 0.010 + 0.0010,
+        # e .005 < .01: I1 = 0; I2 = .0010 + .00005; P = .7 ln(1.01)/12 = .0005804
+        0.0005804 + 0.00105,
+        0.0,  # rose by .055: noise guard. I2 = .00105 + .0006
+        0.0,  # rose by .06: noise guard. |e| = .12 but |dy| > .05, so I2 grows to .00285 and is not cleared
+        0.02,  # e .13, |dy| .01: I2 cleared, P = ln(1.26)/12 = .01926 not reduced, I1 = .013: clamped
+        0.0,  # e -.02: I1 = 0; |dy| .15: I2 kept; P < 0
+    ]
+    np.testing.assert_allclose(play(ChiBioPI(ChiBioPIConfig()), ods, 0.5), by_hand, atol=1e-7)
+
+
+def test_the_devices_integrators_after_that_sequence() -> None:
+    pi = ChiBioPI(ChiBioPIConfig())
+    play(pi, [0.55, 0.56, 0.57, 0.53], 0.5)
+    parts = pi.explain()
+    assert parts["i1"][0] == pytest.approx(0.010)
+    assert parts["i2"][0] == pytest.approx(0.0010)
+    play(pi, [0.55, 0.56, 0.57, 0.53, 0.505, 0.56, 0.62], 0.5)
+    assert pi.explain()["i2"][0] == pytest.approx(0.00285)
+
+
+def test_a_dead_zone_keeps_the_gasket_integrator() -> None:
+    """Between 0.01 and 0.025 the first integrator neither grows nor is cleared."""
+    pi = ChiBioPI(ChiBioPIConfig())
+    play(pi, [0.55, 0.55, 0.55, 0.52], 0.5)
+    assert pi.explain()["i1"][0] == pytest.approx(0.005)
+
+
+def test_the_interval_is_that_of_the_last_two_records() -> None:
+    """The decision of a cycle is made before the cycle is recorded, so a long gap shows one cycle later."""
+    pi = ChiBioPI(ChiBioPIConfig())
+    play(pi, [0.52, 0.52, 0.52, 0.52], 0.5, [0.0, 1.0, 3.0, 4.0])
+    assert pi.explain()["p"][0] == pytest.approx(0.7 * np.log(1.04) / 2.0 / 12.0)
+    play(pi, [0.52, 0.52, 0.52], 0.5, [0.0, 1.0, 3.0])
+    assert pi.explain()["p"][0] == pytest.approx(0.7 * np.log(1.04) / 12.0)
+
+
+def test_gain_scales_with_volume_and_odd_readings_do_not_pump() -> None:
+    pi = ChiBioPI(ChiBioPIConfig(volume_ml=10.0))
+    play(pi, [0.52, 0.52, 0.52], 0.5)
+    assert pi.explain()["p"][0] == pytest.approx(0.7 * np.log(1.04) / 24.0)
+    assert play(pi, [0.0, 0.0, 0.0, -0.1], 0.5)[-1] == 0.0
+    assert play(pi, [0.5, 0.5, 0.5], 0.0)[-1] == 0.02  # setpoint 0: the device pumps at its clamp
+
+
+def test_tuned_pi_by_hand() -> None:
+    """tau (K z + I) with K = 1/2, integral gain 1/16 and I starting at mu."""
+    model = EnvConfig(mu=0.03, tau=1.0 / 3.0)
+    z1, z2 = np.log(0.51 / 0.5), np.log(0.505 / 0.5)
+    expected = [(0.03 + z1 / 2) / 3, (0.03 + z1 / 16 + z2 / 2) / 3]
+    np.testing.assert_allclose(play(TunedPI(TunedPIConfig(), model), [0.51, 0.505], 0.5), expected)
+
+
+def test_tuned_pi_has_the_poles_it_claims() -> None:
+    """Closed around z <- z + mu - u/tau with another mu, z obeys z'' - 1.5 z' + 0.5625 z = 0: double pole 0.75."""
+    model = EnvConfig(mu=0.03, tau=1.0 / 3.0)
+    pi = TunedPI(TunedPIConfig(), model)
+    pi.reset(1)
+    z, path = 0.01, []
+    for k in range(25):
+        u = pi.act(np.array([0.5 * np.exp(z)]), np.array([0.5]), np.array([float(k)]), np.array([True]))[0]
+        assert 0.0 < u < 0.02
+        path.append(z)
+        z += 0.025 - u / model.tau
+    p = np.array(path)
+    np.testing.assert_allclose(p[2:] - 1.5 * p[1:-1] + 0.5625 * p[:-2], 0.0, atol=1e-14)
+    assert abs(p[-1]) < 1e-3
+
+
+def test_tuned_pi_does_not_wind_up() -> None:
+    """Climbing from 0.4 to 0.8 keeps the pump at 0 for 20 min; the integrator stands still meanwhile."""
+    model = EnvConfig()
+    pi = TunedPI(TunedPIConfig(), model)
+    pi.reset(1)
+    x, highest = 0.4, 0.0
+    for k in range(60):
+        u = pi.act(np.array([x]), np.array([0.8]), np.array([float(k)]), np.array([True]))[0]
+        if u == 0.0:
+            assert pi.explain()["i"][0] == model.mu
+        x *= np.exp(model.mu - u / model.tau)
+        highest = max(highest, x)
+    assert highest < 0.8 * 1.01
+    assert x == pytest.approx(0.8, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ChiBioPIConfig(volume_ml=0.0), "controller.volume_ml = 0.0 mL: allowed 5 to 50"),
+        (lambda: ChiBioPIConfig(max_pump_rate=1.0), "controller.max_pump_rate = 1.0 mL/s"),
+        (lambda: TunedPIConfig(delay_min=0.0), "controller.delay_min = 0.0 min: allowed 0.5 to 60"),
+    ],
+)
+def test_ranges(make: object, message: str) -> None:
+    assert callable(make)
+    with pytest.raises(ValueError, match=message):
+        make()

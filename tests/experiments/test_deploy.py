@@ -1,0 +1,175 @@
+"""Deploying as a user does: a policy file, a scenario, a simulated reactor, and what is left in the run folder."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dqn import policy
+from envs.plant import Plant, PlantConfig, SensorConfig
+from envs.setpoints import Schedule
+from envs.task import EnvConfig, step_factors
+from experiments.controllers.learned import LearnedController
+from experiments.loop import ClosedLoop
+from hardware.recording import read_recording
+from hardware.safety import Interlock
+from hardware.simulated import SimulatedConfig, SimulatedReactors
+
+ROOT = Path(__file__).parents[2]
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+
+
+def run(*overrides: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "experiments.deploy", *overrides]
+    return subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, timeout=120, cwd=cwd)
+
+
+def inverse_policy(control_min: float = 1.0) -> policy.Policy:
+    """A hand-made network that pumps u = 0.01 + 0.1 (x - setpoint), the steady rate of the nominal model plus feedback.
+
+    One ReLU layer: Q_a = -|u_a - u| as -relu(u_a - u) - relu(u - u_a), which is largest at the nearest rate.
+    """
+    rates = EnvConfig().pump_rates()
+    n = rates.size
+    w0 = np.zeros((2, 2 * n), dtype=np.float32)
+    w0[:, :n], w0[:, n:] = np.array([[-0.1], [0.1]]), np.array([[0.1], [-0.1]])
+    b0 = np.concatenate([rates - 0.01, 0.01 - rates]).astype(np.float32)
+    w1 = -np.concatenate([np.eye(n), np.eye(n)]).astype(np.float32)
+    metadata = {"format": 1, "observation": ["od", "setpoint"], "control_min": control_min, "regret_pct": 1.0}
+    return policy.Policy(
+        (w0, w1), (b0, np.zeros(n, np.float32)), np.eye(2, dtype=np.float32), np.zeros(2, np.float32), rates, metadata
+    )
+
+
+@pytest.fixture(scope="module")
+def policy_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("policy") / "policy.npz"
+    policy.save(path, inverse_policy())
+    return path
+
+
+@pytest.fixture(scope="module")
+def deployed(policy_file, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("deploy") / "run"
+    done = run(f"policy={policy_file}", f"hydra.run.dir={folder}", "backend.reactors=[M0,M1]")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_summary_has_its_keys_and_holds_the_setpoints(deployed):
+    summary = json.loads((deployed / "summary.json").read_text())
+    assert summary["outcome"] == "completed"
+    assert summary["minutes"] >= 90
+    assert [w["setpoint"] for w in summary["windows"]] == [0.8, 0.65, 0.5] * 2
+    for window in summary["windows"]:
+        for key in ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error"):
+            assert np.isfinite(window[key])
+        assert window["steady_abs_error"] < 0.03
+        assert window["ise_mean"] == pytest.approx(window["ise"] / 30)
+    assert summary["volume_ml"] == pytest.approx(sum(r["volume_ml"] for r in summary["reactors"].values()))
+
+
+def test_recording_tells_the_whole_run(deployed):
+    with open(deployed / "recordings" / "M1.csv", newline="") as f:
+        rows = list(csv.DictReader(f))
+    minutes = np.array([float(r["time_min"]) for r in rows])
+    np.testing.assert_allclose(np.diff(minutes), 1.0)
+    assert rows[0]["phase"] == "-1"
+    assert {r["setpoint"] for r in rows} == {"0.8", "0.65", "0.5"}
+    for row in rows:
+        assert float(row["volume_ml"]) == pytest.approx(60 * float(row["pump_rate_ml_s"]))
+    summary = json.loads((deployed / "summary.json").read_text())
+    assert sum(float(r["volume_ml"]) for r in rows) == pytest.approx(summary["reactors"]["M1"]["volume_ml"])
+
+
+def test_recording_can_be_calibrated_on(deployed):
+    recording = read_recording(deployed / "recordings" / "M0.csv")
+    assert recording.od.size > 90
+    assert recording.pump_rate.max() <= 0.02
+
+
+def test_same_seed_same_recording_and_another_seed_another(policy_file, tmp_path):
+    texts = []
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        assert run(f"policy={policy_file}", f"backend.seed={seed}", f"hydra.run.dir={tmp_path / name}").returncode == 0
+        texts.append((tmp_path / name / "recordings" / "M0.csv").read_text())
+    assert texts[0] == texts[1] != texts[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["policy=nowhere.npz"], "nowhere.npz: no such file"),
+        (["policy=latest"], "train one first"),
+        (["scenario.setpoints=[5,5,5]"], "scenario.setpoints = [5.0, 5.0, 5.0]: allowed each 0 < OD <= 1.5"),
+        (["backend=simm"], "backend=simm: no such option"),
+        (["env_file=nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_bad_input_ends_in_one_line(arguments, message, tmp_path):
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == 1
+    assert message in done.stderr
+    assert len([line for line in done.stderr.strip().splitlines() if not line[:2].isdigit()]) == 1
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 torn"])
+def test_a_file_that_is_no_policy_ends_in_one_line(content, tmp_path):
+    path = tmp_path / "policy.npz"
+    path.write_bytes(content)
+    done = run(f"policy={path}", f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.returncode == 1
+    assert "not a policy file" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_another_control_period_is_refused_with_both_values(tmp_path):
+    policy.save(tmp_path / "policy.npz", inverse_policy(control_min=2.0))
+    done = run(f"policy={tmp_path / 'policy.npz'}", f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.returncode == 1
+    assert "2.0 min" in done.stderr
+    assert "1.0 min" in done.stderr
+
+
+def test_the_perfect_plant_is_the_training_model():
+    """Closed loop on the `nominal` plant against x <- f(u) x, step for step."""
+    reactors = SimulatedReactors(Plant(PlantConfig(start_od=0.9), 1, np.random.default_rng(0)), SimulatedConfig())
+    learned = LearnedController(inverse_policy())
+    loop = ClosedLoop(reactors, learned, Interlock(1), Schedule((0.5,), (40.0,), (37.0,)))
+    od = 0.9
+    for step in loop.run():
+        assert step.od[0] == pytest.approx(od, rel=1e-12)
+        od *= step_factors(EnvConfig(), step.rate)[0]
+    assert loop.done.all()
+
+
+def test_recovery_is_undiluted_and_each_reactor_has_its_own_clock():
+    reactors = SimulatedReactors(
+        Plant(PlantConfig(), 2, np.random.default_rng(0)), SimulatedConfig(reactors=("A", "B"))
+    )
+    reactors.plant.reset(od=np.array([0.4, 0.79]))
+    schedule = Schedule((0.8,), (10.0,), (37.0,), recovery_od=0.8)
+    steps = list(ClosedLoop(reactors, LearnedController(inverse_policy()), Interlock(2), schedule).run())
+    recovering = np.array([s.phase for s in steps]) < 0
+    assert np.array([s.rate for s in steps])[recovering].max() == 0.0
+    assert recovering[:, 0].sum() == np.ceil(np.log(2.0) / np.log1p(0.003) / 10)
+    assert recovering[:, 1].sum() == 1
+    rows = np.array([s.rows for s in steps])
+    assert rows[:, 1].sum() == 1 + 11  # recovery, then minutes 0 to 10; nothing is done once the schedule is over
+
+
+def test_a_reading_that_is_no_number_is_answered_with_no_dose():
+    sensor = SensorConfig()
+    plant = Plant(replace(PlantConfig(start_od=0.9), sensor=sensor), 1, np.random.default_rng(0))
+    plant.sensor_offset = np.array([np.nan])
+    reactors = SimulatedReactors(plant, SimulatedConfig())
+    loop = ClosedLoop(reactors, LearnedController(inverse_policy()), Interlock(1), Schedule((0.5,), (5.0,), (37.0,)))
+    loop.began[:] = 0.0
+    assert all(step.rate[0] == 0.0 for step in loop.run())

@@ -1,0 +1,219 @@
+"""Training as a user runs it: real processes, real files, real kills."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from dqn import checkpoint, policy
+from envs.task import EnvConfig
+from experiments import build
+from experiments.config import TrainConfig
+from experiments.evaluation import Evaluation, report_grid, selection_grid
+from experiments.session import Session
+
+SHORT = [
+    "agent.total_steps=1000",
+    "agent.learn_start=100",
+    "agent.epsilon_steps=500",
+    "eval_every=200",
+    "checkpoint_every=200",
+]
+ROOT = Path(__file__).parents[2]
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+
+
+def command(entry: str, *overrides: str) -> list[str]:
+    return [sys.executable, "-m", f"experiments.{entry}", *overrides]
+
+
+def run(entry: str, *overrides: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(entry, *overrides), capture_output=True, text=True, env=ENVIRONMENT, timeout=120, cwd=cwd
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """One uninterrupted short training with two agents."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    done = run("train", *SHORT, "n_agents=2", "seed=4", f"hydra.run.dir={folder}")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_summary_has_its_keys(whole):
+    summary = json.loads((whole / "summary.json").read_text())
+    assert summary["seeds"] == [4, 5]
+    assert summary["env_steps"] == 1000
+    assert summary["updates"] == 900
+    for key in ("regret_pct", "steady_abs_error", "regret_pct_last"):
+        assert len(summary[key]) == 2
+    assert summary["train_seconds"] > 0
+    assert Path(summary["policy"]).is_file()
+
+
+def test_every_file_is_there(whole):
+    names = {p.relative_to(whole).as_posix() for p in whole.rglob("*")}
+    for name in (
+        "config.yaml",
+        "progress.csv",
+        "checkpoint.pt",
+        "policy.npz",
+        "policies/seed0004.npz",
+        "policies/seed0005.npz",
+    ):
+        assert name in names
+    for figure in ("learning", "policy_map", "trajectories"):
+        assert f"figures/{figure}.svg" in names
+        assert f"figures/{figure}.png" in names
+
+
+def test_tensorboard_reads_grouped_scalars_and_figures(whole):
+    events = EventAccumulator(str(whole)).Reload()
+    tags = set(events.Tags()["scalars"])
+    for tag in ("train/return", "train/loss", "q/min", "q/max", "eval/regret_pct", "eval/steady_abs_error"):
+        assert {f"{tag}/iqm", f"{tag}/min", f"{tag}/max"} <= tags
+    assert {"train/epsilon", "train/learning_rate", "speed/steps_per_s"} <= tags
+    assert {"figures/learning", "figures/policy_map", "figures/trajectories"} <= set(events.Tags()["images"])
+    single = EventAccumulator(str(whole / "agents" / "seed0005")).Reload()
+    assert [e.step for e in single.Scalars("train/return")] == list(range(100, 1001, 100))
+
+
+def test_the_summary_can_be_recomputed_from_the_exported_policy(whole):
+    summary = json.loads((whole / "summary.json").read_text())
+    config = EnvConfig()
+    report = Evaluation(config, 0.99, report_grid(config))
+    for i, seed in enumerate(summary["seeds"]):
+        learned = policy.load(whole / "policies" / f"seed{seed:04d}.npz")
+        score = report(lambda od, s, learned=learned: learned.act(np.stack([od[0], s[0]], axis=1))[None])
+        assert score.regret_pct[0] == pytest.approx(summary["regret_pct"][i], rel=1e-3)
+
+
+def test_selection_and_report_share_no_start():
+    config = EnvConfig()
+    kept = {(round(a, 9), round(b, 9)) for a, b in zip(*selection_grid(config), strict=True)}
+    told = {(round(a, 9), round(b, 9)) for a, b in zip(*report_grid(config), strict=True)}
+    assert len(told) == 41 * 9
+    assert not kept & told
+
+
+def test_killed_at_a_random_moment_and_resumed_gives_the_same_weights(whole, tmp_path):
+    rng = np.random.default_rng(int(time.time()))
+    folder = tmp_path / "killed"
+    process = subprocess.Popen(
+        command("train", *SHORT, "n_agents=2", "seed=4", f"hydra.run.dir={folder}"),
+        env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    while not (folder / "checkpoint.pt").is_file():
+        assert process.poll() is None
+        time.sleep(0.005)
+    time.sleep(float(rng.uniform(0.0, 0.6)))
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = run("train", f"resume={folder}")
+    assert done.returncode == 0, done.stderr
+    a, b = checkpoint.load(whole / "checkpoint.pt"), checkpoint.load(folder / "checkpoint.pt")
+    for key in ("online", "target", "greedy"):
+        assert torch.equal(a["trainer"]["agent"][key], b["trainer"]["agent"][key])
+    assert torch.equal(a["trainer"]["agent"]["replay"]["rows"], b["trainer"]["agent"]["replay"]["rows"])
+    assert torch.equal(a["best"]["weights"], b["best"]["weights"])
+    assert a["returns"] == b["returns"]
+    first = [line for line in (whole / "progress.csv").read_text().splitlines() if ",speed/" not in line]
+    second = [line for line in (folder / "progress.csv").read_text().splitlines() if ",speed/" not in line]
+    assert first == second
+
+
+def test_agent_of_a_population_is_the_same_seed_alone(tmp_path):
+    """Same episodes, exploration and minibatches; same weights up to rounding over the first updates."""
+    config = TrainConfig().agent
+    many = build.trainer(EnvConfig(), config, range(10, 18))
+    alone = build.trainer(EnvConfig(), config, [13])
+    for trainer in (many, alone):
+        trainer._observation, _ = trainer.env.reset()
+        for _ in range(config.learn_start + 5):
+            trainer._step()
+    ours, theirs = many.agent.replay.state_dict()["rows"][3], alone.agent.replay.state_dict()["rows"][0]
+    assert torch.equal(ours[:500], theirs[:500])
+    np.testing.assert_allclose(many.agent.online.flat[3], alone.agent.online.flat[0], atol=2e-5)
+    assert not torch.allclose(many.agent.online.flat[2], many.agent.online.flat[3])
+
+
+def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path):
+    from dataclasses import replace
+
+    c = TrainConfig()
+    c = replace(c, agent=replace(c.agent, total_steps=600, learn_start=100), eval_every=100, checkpoint_every=100)
+    (tmp_path / "a").mkdir()
+    first = Session(c, tmp_path / "a")
+    first.run()
+    first.writer.close()
+    half = replace(c, agent=replace(c.agent, total_steps=300))
+    (tmp_path / "b").mkdir()
+    second = Session(half, tmp_path / "b")
+    second.run()
+    second.writer.close()
+    third = Session(c, tmp_path / "b", resume=True)
+    assert third.trainer.agent.steps == 300
+    third.run()
+    third.writer.close()
+    assert torch.equal(first.trainer.agent.online.flat, third.trainer.agent.online.flat)
+    assert first.best.history == third.best.history
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["env.mu=abc"], "env.mu = abc: allowed a number"),
+        (["resume=nowhere"], "resume=nowhere: no run folder"),
+        (["+env=simm"], "env=simm: no such option; allowed: sim"),
+    ],
+)
+def test_bad_input_ends_in_one_line(arguments, message, tmp_path):
+    done = run("train", *arguments, cwd=tmp_path)
+    assert done.returncode == 1
+    assert message in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("content", [None, "mu: 0.02\ntau: zero\n", "- 1\n", "mu: [", "nu: 0.02\n", "mu: 7\n"])
+def test_a_bad_env_file_ends_in_one_line(content, tmp_path):
+    path = tmp_path / "model.yaml"
+    if content is not None:
+        path.write_text(content)
+    done = run("train", f"env_file={path}", f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.returncode == 1
+    assert "model.yaml" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_sweep_gives_each_run_its_folder(tmp_path):
+    done = run(
+        "train",
+        "-m",
+        "seed=range(0,2)",
+        *SHORT,
+        "agent.total_steps=200",
+        f"hydra.sweep.dir={tmp_path}",
+        "+experiment=smoke",
+    )
+    assert done.returncode == 0, done.stderr
+    seeds = [json.loads((tmp_path / str(k) / "summary.json").read_text())["seeds"] for k in range(2)]
+    assert seeds == [[0], [1]]
+
+
+@pytest.mark.parametrize("flags", [["--help"], ["--cfg", "job"], ["--cfg", "job", "+env=sim", "+experiment=smoke"]])
+def test_help_and_config_printing(flags):
+    done = run("train", *flags)
+    assert done.returncode == 0
+    assert "mu: 0.03" in done.stdout or "env: sim" in done.stdout
+    assert "Traceback" not in done.stderr
