@@ -203,7 +203,6 @@ def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConf
 def deploy(config: DeployConfig, folder: Path) -> None:
     """One closed loop over the scenario."""
     from experiments import backends
-    from experiments.controllers.learned import LearnedController
     from experiments.loop import ClosedLoop
     from experiments.record import Record
     from hardware.errors import ReactorError
@@ -216,20 +215,23 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         raise app.UserError(str(error)) from None
     if config.resume is not None and backend.kind == "sim":
         raise app.UserError(f"resume={config.resume}: a simulated run takes a second; run it again")
-    if config.preflight_only:
-        backends.preflight(config)
-        return
-    plant = backends.plant_of(config) if backend.kind == "sim" else config.plant
-    policy = load_policy(config.policy, backend.control_min, config.safety.max_rate)
+    plant, model = backends.plant_of(config), backends.model_of(config)
+    policy = None
+    if config.controller.kind == "dqn":
+        policy = load_policy(config.policy, backend.control_min, config.safety.max_rate)
     record = None
     try:
+        if config.preflight_only:
+            backends.run_preflight(config, folder)
+            return
         with terminated_as_interrupt():
             record = Record(folder, backend.reactors, config.fsync)
             for repair in record.repairs:
                 log.warning("%s", repair)
             with backends.opened(config, plant, record) as reactors:
+                controller = backends.controller_of(config, model, policy, reactors)
                 interlock = Interlock(len(backend.reactors), config.safety)
-                loop = ClosedLoop(reactors, LearnedController(policy), interlock, schedules, record.decided)
+                loop = ClosedLoop(reactors, controller, interlock, schedules, record.decided)
                 if config.resume is not None:
                     backends.continue_loop(loop, record)
                 outcome = _run(loop, record, reactors, config)
@@ -244,7 +246,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
 
 
 def _schema(cfg: DictConfig) -> DeployConfig:
-    return deploy_schema(str(cfg.backend.kind))
+    return deploy_schema(str(cfg.backend.kind), str(cfg.controller.kind))
 
 
 def main() -> None:

@@ -421,6 +421,11 @@ class Station:
         self._target_c = target_c
         self._log("temperature", {"reactor": self.name, "temperature": target_c})
 
+    def set_blank(self, raw: float) -> None:
+        """Make `raw` counts read as OD 0, here and on the device. Raises: ReactorError, also outside 3000 to 60000."""
+        self.unit.post(f"/CalibrateOD/OD0/{self.name}/{raw:.6f}/0")
+        self._blank = raw
+
     def heat_off(self) -> None:
         """Thermostat and heater off, and not switched on again. Raises: ReactorError."""
         self._heat = False
