@@ -165,6 +165,11 @@ class ChiBioDevice:
         if self.faults.bus_stuck:
             raise BusStuck(name)
 
+    def write_row(self, name: str) -> None:
+        """One line of a data file, written under the bus lock. Raises: BusStuck, also for a full disk."""
+        self.faults.bus_stuck = self.faults.bus_stuck or self.faults.disk_full
+        self.bus(name)
+
     def spawn(self, steps: Steps, owner: str) -> None:
         """Start a thread of the software; it runs at the present device time, after what is already due."""
         self._schedule(0.0, steps, self._life, owner)
@@ -264,6 +269,13 @@ class ChiBioDevice:
         """Fault: the software ends itself, as after too many bus failures."""
         self._note("crashed on demand")
         self._exit()
+
+    def cut_power(self) -> None:
+        """Fault: the whole board loses power; its clock starts again where it had started before."""
+        self.crash()
+        self._wall_offset = -self._now
+        for bench in self.benches.values():
+            bench.set_power(False, self._now)
 
     def restart(self) -> None:
         """Somebody starts the software again by hand: defaults, nothing running."""

@@ -56,6 +56,9 @@ def preflight(
         unit = Unit(name, config.reactors, transport, clock, no_log)
         try:
             state = unit.read()
+            if not state.running:
+                unit.probe()  # a device that never ran an experiment shows no temperature yet
+                state = unit.read()
         except ReactorError as error:
             checks.append(
                 Check(f"{name} present", False, str(error), "plug it in with the server stopped, or leave it out")

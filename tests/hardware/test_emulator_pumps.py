@@ -84,7 +84,7 @@ def test_full_duty_is_continuous(target: float) -> None:
     assert lab.doses(pump="Pump3") == []  # never switched off between periods
     lab.post("/SetOutputOn/Pump3/0/M0")
     lab.wait(1.0)
-    [(start, length)] = lab.doses(pump="Pump3")
+    [(_, length)] = lab.doses(pump="Pump3")
     assert length == pytest.approx(400.0, abs=0.3)
 
 
