@@ -238,7 +238,8 @@ def _validate(screened: Screened, window: tuple[int, int], fitted: Fit, horizon:
             part = clean.part(a, b)
             model = trajectory(part.time, part.pump_rate, early.mu.value, early.tau.value, float(early.start_od[0]))
             late = clean.od[cut:b]
-            holdout, holdout_n = pmse(late, model[cut - a :]), int(np.isfinite(late).sum())
+            holdout_n = int((late > 0.0).sum())
+            holdout = pmse(late, model[cut - a :]) if holdout_n else None
     except NotIdentifiable:
         pass  # the early part alone says too little; the report then has no such number
     od, model = _predictions_outside(screened, window, fitted, horizon)

@@ -359,9 +359,7 @@ class Plant:
         response = self._phi(self._mean_temperature)
         follow = 1.0 if g.adaptation_min == 0.0 else -np.expm1(-minutes / g.adaptation_min)
         self._adapted = self._adapted + (response - self._adapted) * follow
-        drift = np.exp(self._log_drift) * max(1.0 + g.ramp_per_h * self.minutes / 60.0, 0.0)
-        stirred = UNSTIRRED_GROWTH + (1.0 - UNSTIRRED_GROWTH) * self.stir_factor
-        relative = self._adapted * drift * stirred * self.mu_factor
+        relative = self._relative_growth()
 
         def derivative(y: Array) -> Array:
             x, s, w = y
@@ -378,6 +376,30 @@ class Plant:
         substeps = max(1, int(np.ceil(minutes / self.config.substep_min - 1e-9)))
         state = self._integrate(derivative, np.stack([self.od, self.substrate, self.wall]), minutes, substeps)
         self.od, self.substrate, self.wall = np.maximum(state, 0.0)
+
+    def _relative_growth(self) -> Array:
+        """What temperature, drift, stirring and `mu_factor` now make of the growth law's rate, shape (N,)."""
+        drift = np.exp(self._log_drift) * max(1.0 + self.config.growth.ramp_per_h * self.minutes / 60.0, 0.0)
+        stirred = UNSTIRRED_GROWTH + (1.0 - UNSTIRRED_GROWTH) * self.stir_factor
+        return np.asarray(self._adapted * drift * stirred * self.mu_factor)
+
+    def expected_od(self, minutes: float, feed_s: Array) -> Array:
+        """Suspended biomass after an interval without surprises, OD, (A, N); changes nothing.
+
+        x grows at the rate of this moment (substrate, temperature, drift and stirring as they are) and is diluted by
+        the mean dose of a primed pump. What is drawn during the interval, priming and the wall are left out.
+
+        Args:
+          minutes: length of the interval, min, at most 1.
+          feed_s: on-times of the feed pump to compare, s, shape (A, N).
+        """
+        rate = self._law.specific_rate(self.substrate, self.temperature) * self._relative_growth()
+        dose = self.feed.expected(feed_s, self.minutes) / self.volume_ml
+        steps = max(1, int(np.ceil(minutes / self.config.substep_min - 1e-9)))
+        continuous = self.config.pump.dosing == "continuous"
+        change = (rate * minutes - (dose if continuous else 0.0)) / steps
+        grown = (1.0 + change) ** steps if self.config.integrator == "euler" else np.exp(steps * change)
+        return np.asarray(self.od * grown * (1.0 if continuous else np.exp(-dose)))
 
     def read_od(self) -> Array:
         """One averaged reading of every sensor, with all that is configured or switched on, OD, shape (N,)."""

@@ -123,6 +123,17 @@ class FeedPump:
         moves = (on_s > 0.0) & (on_s >= c.min_pulse_s)
         return np.where(moves, np.maximum(on_s + self._timing - c.dead_time_s, 0.0), 0.0)
 
+    def expected(self, on_s: Array, clock_min: float) -> Array:
+        """Mean dose of one pulse of `on_s` s by a primed head, mL; on_s and the result end in (N,). Changes nothing.
+
+        Args: as `deliver`.
+        """
+        c = self.config
+        moves = (on_s > 0.0) & (on_s >= c.min_pulse_s)
+        moving = np.where(moves, np.maximum(on_s + 0.5 * c.timing_error_s - c.dead_time_s, 0.0), 0.0)
+        flow = self.draws["pump_gain_ml_s"] * self.gain_factor * (1.0 + c.gain_drift_per_h * clock_min / 60.0)
+        return np.asarray(np.clip(flow * moving - self.back_leak_ml, 0.0, self.media_left_ml))
+
     def deliver(self, on_s: Array, minutes: float, clock_min: float) -> Array:
         """Run forward for `on_s` s at the start of an interval; volume of fresh medium delivered, mL, shape (N,).
 

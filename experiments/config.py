@@ -9,11 +9,12 @@ from dqn.config import DQNConfig
 from envs.plant import PlantConfig
 from envs.setpoints import Schedule
 from envs.task import EnvConfig
-from hardware.chibio_config import ChiBioConfig
+from experiments.controllers.learned import LearnedConfig
+from hardware.chibio_config import ChiBioConfig, EmulatorConfig
 from hardware.safety_config import SafetyConfig
 from hardware.simulated import SimulatedConfig
 
-__all__ = ["DeployConfig", "TrainConfig", "deploy_schema"]
+__all__ = ["BACKENDS", "DeployConfig", "TrainConfig", "controller_config", "deploy_schema"]
 
 
 @dataclass(frozen=True)
@@ -46,15 +47,7 @@ class TrainConfig:
                 raise ValueError(f"{key} = {value}: allowed {allowed}")
 
 
-@dataclass(frozen=True)
-class ChiBioBackend(ChiBioConfig):
-    """`backend=chibio`: a real Chi.Bio, or an emulator that already runs, at `url`."""
-
-    kind: str = "chibio"
-    control_min: float = 1.0  # min, the device's own cycle
-
-
-BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig, "chibio": ChiBioBackend}
+BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig, "chibio": ChiBioConfig, "emulator": EmulatorConfig}
 
 
 @dataclass(frozen=True)
@@ -66,7 +59,8 @@ class DeployConfig:
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     scenario: Schedule = field(default_factory=Schedule)
     each: dict[str, Any] = field(default_factory=dict)  # reactor -> what differs from `scenario`, and its `role`
-    policy: str = "latest"  # a policy.npz, a run folder, or `latest`
+    controller: Any = field(default_factory=LearnedConfig)  # one of `controller_config`
+    policy: str = "latest"  # of controller=dqn: a policy.npz, a run folder, or `latest`
     env_file: str | None = None  # a calibrated.yaml; its model becomes the simulated plant's
     fsync: bool = True  # every row on the disk before the next command
     preflight_only: bool = False  # check the device and stop
@@ -95,8 +89,26 @@ class DeployConfig:
         return str(self.each.get(reactor, {}).get("role", "replicate"))
 
 
-def deploy_schema(kind: str) -> DeployConfig:
-    """The schema for the backend of this kind. Raises: ValueError naming the kinds there are."""
+def controller_config(kind: str) -> Any:
+    """The default config of the controller of this kind. Raises: ValueError naming the kinds there are."""
+    from experiments.controllers.baselines import HoldConfig, ThresholdConfig
+    from experiments.controllers.inverse import InverseConfig
+    from experiments.controllers.mpc import MpcConfig
+    from experiments.controllers.oracle import OracleConfig
+    from experiments.controllers.pi import ChiBioPIConfig, TunedPIConfig
+
+    kinds = (
+        LearnedConfig(), ChiBioPIConfig(), TunedPIConfig(), MpcConfig(), InverseConfig(), ThresholdConfig(),
+        HoldConfig(), OracleConfig(),
+    )  # fmt: skip
+    known = {config.kind: config for config in kinds}
+    if kind not in known:
+        raise ValueError(f"controller.kind = {kind}: allowed {', '.join(known)}")
+    return known[kind]
+
+
+def deploy_schema(kind: str, controller: str = "dqn") -> DeployConfig:
+    """The schema for the backend and controller of these kinds. Raises: ValueError naming the kinds there are."""
     if kind not in BACKENDS:
         raise ValueError(f"backend.kind = {kind}: allowed {', '.join(BACKENDS)}")
-    return DeployConfig(backend=BACKENDS[kind]())
+    return DeployConfig(backend=BACKENDS[kind](), controller=controller_config(controller))

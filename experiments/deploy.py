@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -154,6 +155,7 @@ class Announcer:
         self._names = loop.reactors.names
         self._phase = [-2] * len(self._names)
         self._reason: list[str | None] = [None] * len(self._names)
+        self._told: set[str] = set()
 
     def __call__(self, step: Step) -> None:
         """Log what is new in this step."""
@@ -167,7 +169,10 @@ class Announcer:
                 self._reason[n] = kinds
                 log.warning("%s: %s", name, step.reasons[n] or "interlock: all well again")
         for note in step.notes:
-            log.info("%s", note)
+            kind = re.sub(r"[\d.]+", "#", note)
+            if kind not in self._told:  # the journal has every one of them
+                self._told.add(kind)
+                log.info("%s (noted once here, every time in the journal)", note)
 
 
 def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConfig) -> str:
@@ -203,7 +208,6 @@ def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConf
 def deploy(config: DeployConfig, folder: Path) -> None:
     """One closed loop over the scenario."""
     from experiments import backends
-    from experiments.controllers.learned import LearnedController
     from experiments.loop import ClosedLoop
     from experiments.record import Record
     from hardware.errors import ReactorError
@@ -216,20 +220,23 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         raise app.UserError(str(error)) from None
     if config.resume is not None and backend.kind == "sim":
         raise app.UserError(f"resume={config.resume}: a simulated run takes a second; run it again")
-    if config.preflight_only:
-        backends.preflight(config)
-        return
-    plant = backends.plant_of(config) if backend.kind == "sim" else config.plant
-    policy = load_policy(config.policy, backend.control_min, config.safety.max_rate)
+    plant, model = backends.plant_of(config), backends.model_of(config)
+    policy = None
+    if config.controller.kind == "dqn":
+        policy = load_policy(config.policy, backend.control_min, config.safety.max_rate)
     record = None
     try:
+        if config.preflight_only:
+            backends.run_preflight(config, folder)
+            return
         with terminated_as_interrupt():
             record = Record(folder, backend.reactors, config.fsync)
             for repair in record.repairs:
                 log.warning("%s", repair)
             with backends.opened(config, plant, record) as reactors:
+                controller = backends.controller_of(config, model, policy, reactors)
                 interlock = Interlock(len(backend.reactors), config.safety)
-                loop = ClosedLoop(reactors, LearnedController(policy), interlock, schedules, record.decided)
+                loop = ClosedLoop(reactors, controller, interlock, schedules, record.decided)
                 if config.resume is not None:
                     backends.continue_loop(loop, record)
                 outcome = _run(loop, record, reactors, config)
@@ -244,7 +251,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
 
 
 def _schema(cfg: DictConfig) -> DeployConfig:
-    return deploy_schema(str(cfg.backend.kind))
+    return deploy_schema(str(cfg.backend.kind), str(cfg.controller.kind))
 
 
 def main() -> None:

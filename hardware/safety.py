@@ -62,7 +62,7 @@ class Interlock:
         self.fed_ml = np.zeros(n)
         self._hour = np.zeros((n, 60))  # feed per minute of the hour
         self._minute = np.full(n, -1.0)  # minute of the newest entry of _hour
-        self._last_dose_s, self._last_dose_ml = np.full(n, -math.inf), np.zeros(n)
+        self._dose_s, self._dose_ml = np.full((n, 4), -math.inf), np.zeros((n, 4))  # the newest four doses
         self._fresh_s = np.full(n, math.nan)  # `now` of the newest sample
         self._seen = np.full(n, math.nan)  # its reading, believed or not
         self._repeats = np.zeros(n)
@@ -74,6 +74,7 @@ class Interlock:
         self._excess, self._deficit = np.zeros(n), np.zeros(n)  # cumulated unexplained rise and fall of ln OD
         self._futile = np.zeros(n)  # cumulated rise of ln OD at full feed
         self._over = np.zeros((n, 3))  # samples in a row for which each of the three was over its limit
+        self._owed_ml = np.zeros(n)  # allowed but not dosed since the last dose
         self._hold_until_s = np.full(n, -math.inf)
         self._hold_kind = np.full(n, -1.0)  # index into REMEDIES
         self._latched = np.zeros(n)
@@ -267,8 +268,10 @@ class Interlock:
         wanted = np.where(fresh & ~unusable, rate, 0.0)
         allowed = np.minimum(wanted, c.max_rate)
         self._trip("limit", wanted > c.max_rate * (1.0 + 1e-9), lambda i: f"{wanted[i]:g} mL/s cut to {c.max_rate:g}")
+        undosed = fresh & (self._owed_ml > 2.0 * c.max_rate * c.period_s)
+        self._trip("undosed", undosed, lambda i: f"{self._owed_ml[i]:.2f} mL were allowed, nothing was dosed")
         self._roll(now)
-        recent = np.where(now - self._last_dose_s < 0.9 * c.period_s, self._last_dose_ml, 0.0)
+        recent = np.where(now - self._dose_s < 60.0, self._dose_ml, 0.0).sum(axis=1)
         left = {
             "budget": np.minimum.reduce(
                 [c.ml_per_minute - recent, c.ml_per_hour - self._hour.sum(axis=1), c.ml_per_run - self.fed_ml]
@@ -313,6 +316,7 @@ class Interlock:
             reasons.append(" | ".join(texts) or None)
         kinds = tuple(tuple(kind for kind, _, _ in found) for found in self._found)
         rate = np.where(response == Response.PASS, allowed, 0.0)
+        self._owed_ml = self._owed_ml + rate * c.period_s
         sane = np.clip(np.where(np.isfinite(setpoint), setpoint, 0.5), 0.05, c.max_setpoint)
         sane = np.where((setpoint > 0.0) & (setpoint <= c.max_setpoint), sane, 0.5)
         return Verdict(rate, response, reasons, kinds, self._heat_off > 0.0, sane)
@@ -332,8 +336,9 @@ class Interlock:
         self.fed_ml = self.fed_ml + feed
         self._since_ml = self._since_ml + feed
         dosed = feed > 0.0
-        self._last_dose_s = np.where(dosed, now, self._last_dose_s)
-        self._last_dose_ml = np.where(dosed, feed, self._last_dose_ml)
+        for mine, new in ((self._dose_s, np.full(self.n, now)), (self._dose_ml, feed)):
+            mine[dosed] = np.column_stack([mine[dosed, 1:], new[dosed]])
+        self._owed_ml = np.where(dosed, 0.0, self._owed_ml)
         waste = np.full(self.n, math.inf) if receipt.waste_ml is None else np.asarray(receipt.waste_ml)
         level = np.maximum(self.volume_ml + feed - waste, self.config.volume_ml)
         self.volume_ml = np.where(waste > 0.0, level, self.volume_ml + feed)
@@ -356,6 +361,6 @@ class Interlock:
             new = np.array(state[key], dtype=np.float64)
             if new.shape != old.shape:
                 raise ValueError(f"saved interlock is for {len(state[key])} reactors, this run has {self.n}")
-            if key in ("_last_dose_s", "_hold_until_s"):
+            if key in ("_dose_s", "_hold_until_s"):
                 new = np.where(np.isnan(new), -math.inf, new)
             setattr(self, key, new)

@@ -47,6 +47,7 @@ REMEDIES = {
     "budget": "check for a leak or wash-out; raise the budget in conf/safety if the flow is right",
     "bottle": "fill the bottle and start a new run with its content",
     "overflow": "check waste pump and tube",
+    "undosed": "look at the run's notes for why doses are not given: link too slow, device not as set",
     "impossible": "check cable, vial and blank",
     "spectrometer": "check the spectrometer's cable; restart the device if it persists",
     "frozen": "look at the device's terminal: its measuring thread may be dead",
@@ -61,7 +62,7 @@ REMEDIES = {
     "thermometer": "check that the vial is seated; heating stays off in this run",
     "device": "see the text",
 }
-MAY_BE_REPORTED = ("limit", "no_dilution", "cannot_hold", "thermometer", "hot", "jump", "stale")
+MAY_BE_REPORTED = ("limit", "undosed", "no_dilution", "cannot_hold", "thermometer", "hot", "jump", "stale")
 SENSOR_REASONS = ("impossible", "spectrometer", "frozen", "jump", "no_dilution", "falls", "stale", "lost", "silent")
 
 
@@ -80,6 +81,7 @@ class Responses:
     budget: str = "hold"
     bottle: str = "hold"
     overflow: str = "pumps_off"
+    undosed: str = "report"
     impossible: str = "hold"
     spectrometer: str = "pumps_off"
     frozen: str = "hold"
@@ -113,15 +115,7 @@ class Responses:
                     f"safety.responses.{f.name} = regulate: not allowed, the device would pump by the reading that is "
                     "not to be believed; use hold, pumps_off or stop"
                 )
-            if word == "report" and f.name not in (
-                "limit",
-                "no_dilution",
-                "cannot_hold",
-                "thermometer",
-                "hot",
-                "jump",
-                "stale",
-            ):
+            if word == "report" and f.name not in MAY_BE_REPORTED:
                 raise ValueError(f"safety.responses.{f.name} = report: at least hold is needed for this reason")
 
 
@@ -149,7 +143,7 @@ class SafetyConfig:
 
     max_rate: float = 0.02
     period_s: float = 60.0
-    ml_per_minute: float = 2.0
+    ml_per_minute: float = 3.0
     ml_per_hour: float = 75.0
     ml_per_run: float = 10000.0
     bottle_ml: float = 2000.0

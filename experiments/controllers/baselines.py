@@ -17,6 +17,7 @@ __all__ = ["Hold", "HoldConfig", "Threshold", "ThresholdConfig"]
 class ThresholdConfig:
     """rate: mL/s while OD is above the setpoint; hysteresis: OD below the setpoint at which it stops again."""
 
+    kind: str = "threshold"
     rate: float = MAX_PUMP_RATE
     hysteresis: float = 0.0
 
@@ -50,6 +51,7 @@ class Threshold:
 class HoldConfig:
     """rate: constant pump rate, mL/s; None means mu tau of the model, which holds any OD if the model is true."""
 
+    kind: str = "hold"
     rate: float | None = None
 
     def __post_init__(self) -> None:

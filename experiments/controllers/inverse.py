@@ -27,6 +27,7 @@ class InverseConfig:
     gate_sigma: readings further than this from the prediction are outliers, unless gate_max of them come in a row.
     """
 
+    kind: str = "inverse"
     noise_floor: float = 0.005
     noise_relative: float = 0.003
     mu_sd: float = 0.008

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from dqn.policy import Policy
 from experiments.controllers.base import Array, Mask
 
-__all__ = ["LearnedController"]
+__all__ = ["LearnedConfig", "LearnedController"]
+
+
+@dataclass(frozen=True)
+class LearnedConfig:
+    """Everything about a policy is in its file."""
+
+    kind: str = "dqn"
 
 
 class LearnedController:

@@ -26,6 +26,7 @@ class MpcConfig:
     seed: of the swarms.
     """
 
+    kind: str = "mpc"
     horizon: int = 5
     penalty: float = 100.0
     solver: str = "pso"

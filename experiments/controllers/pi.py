@@ -20,6 +20,7 @@ LOWEST_OD = 1e-6  # the device puts this for a setpoint of 0 or less
 class ChiBioPIConfig:
     """volume_ml: what the device is told the vial holds, it scales the gain; max_pump_rate: its clamp, mL/s."""
 
+    kind: str = "pi"
     volume_ml: float = 20.0
     max_pump_rate: float = MAX_PUMP_RATE
 
@@ -92,6 +93,7 @@ class TunedPIConfig:
     feed_forward: start the integrator at mu of the model instead of 0.
     """
 
+    kind: str = "pi_tuned"
     delay_min: float = 1.0
     closed_loop_min: float = 1.0
     feed_forward: bool = True

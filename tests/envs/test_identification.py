@@ -234,6 +234,51 @@ def test_burst_that_comes_back_is_bridged() -> None:
     assert result.window == (0, 361)
 
 
+@pytest.mark.parametrize("level", [0.0, 0.4])
+def test_dead_sensor_is_refused(level: float) -> None:
+    s = simulated()
+    with pytest.raises(ValueError, match="trustworthy readings above zero are left"):
+        calibrate(series(s.time, np.full(361, level), s.pump_rate))
+
+
+def test_any_mutilated_recording_ends_in_a_result_or_in_a_reason() -> None:
+    """Random cuts, holes, jumps, frozen and wild stretches; warnings are errors here, so NumPy may not even mutter."""
+    time, od, pump_rate = open_loop(OpenLoop(), np.random.default_rng(0), 20)
+    outcomes = set()
+    for k in range(200):
+        rng = np.random.default_rng(k)
+        n = int(rng.integers(1, 362))
+        t, y, u = time[:n].copy(), od[k % 20, :n].copy(), pump_rate[k % 20, :n].copy()
+        for operation in rng.integers(0, 8, rng.integers(0, 4)):
+            at = int(rng.integers(0, n))
+            part = slice(at, at + int(rng.integers(1, n + 1)))
+            if operation == 0:
+                y[part] = np.nan
+            elif operation == 1:
+                y[part] *= rng.choice([0.0, -0.02, 3.0, 0.1])
+            elif operation == 2:
+                u[part] = rng.choice([0.0, 0.02, 1.0])
+            elif operation == 3:
+                u[:] = rng.choice([0.0, 0.01])
+            elif operation == 4:
+                y[part] = y[at]
+            elif operation == 5:
+                y[part] = rng.uniform(-0.05, 9.0, len(y[part]))
+            elif operation == 6:
+                t[at:] += rng.choice([10.0, 1000.0])
+            else:
+                y[rng.random(n) < 0.3] = np.nan
+        try:
+            result = calibrate(series(t, y, u))
+        except ValueError:
+            outcomes.add("refused")
+        else:
+            assert result.fit.mu.low < result.fit.mu.value < result.fit.mu.high
+            assert 0.0 < result.tau.low < result.tau.value < result.tau.high
+            outcomes.add("fitted")
+    assert outcomes == {"refused", "fitted"}
+
+
 def test_frozen_sensor() -> None:
     s = simulated()
     od = s.od.copy()

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -182,6 +183,41 @@ def test_stuck_bus_lies_with_204_and_the_temperature_probe_is_the_kill_switch() 
     assert c.link.post("/MeasureTemp/IR/M0").status == 204
 
 
+def test_a_full_disk_stalls_the_cycles_of_all_reactors_while_the_server_answers() -> None:
+    c = Client()
+    for m in ("M0", "M1"):
+        c.link.post(f"/Experiment/1/{m}")
+    c.lab.wait_until(100.0)
+    inject(c.device, "disk_full")
+    c.lab.wait_until(600.0)
+    assert [c.state(m)["Experiment"]["cycles"] for m in ("M0", "M1")] == [3, 3]
+    assert c.state()["Experiment"]["ON"] == 1
+
+
+def test_a_reactor_marked_absent_by_a_glitch_is_killed_by_its_own_threads() -> None:
+    c = Client()
+    c.link.post("/Experiment/1/M1")
+    c.lab.wait(20.0)
+    inject(c.device, "marked_absent", "M1")
+    assert c.state("M0")["presentDevices"]["M1"] == 0
+    c.lab.wait(60.0)
+    assert not c.device.alive
+
+
+def test_after_a_power_cut_the_clock_starts_again_and_everything_is_off() -> None:
+    c = Client()
+    c.link.post("/SetOutputTarget/Pump3/M0/1")
+    c.link.post("/SetOutputOn/Pump3/1/M0")
+    c.lab.wait(1000.0)
+    inject(c.device, "power_cut")
+    assert set(c.device.truth("M0")["motors"].values()) == {0}
+    c.lab.wait(600.0)
+    inject(c.device, "restart")
+    c.link.post("/Experiment/1/M0")
+    assert wiped(c.state("M1"))
+    assert c.state("M0")["Experiment"]["startTime"].startswith("2026-01-01 00:10")
+
+
 def test_worker_wipe_while_pumping_stops_the_pumps() -> None:
     c = Client(blanked=True)
     for m in ("M0", "M1"):
@@ -336,3 +372,11 @@ def test_every_fault_can_be_injected_into_a_running_device(name: str) -> None:
 def test_timeout_must_be_positive() -> None:
     with pytest.raises(ValueError, match="timeout_s = 0"):
         EmulatorTransport(Lab().device, 0.0)
+
+
+def test_every_fault_is_documented() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="utf-8")
+    for name, (_, values, effect) in FAULTS.items():
+        assert f"| `{name}` |" in text
+        assert values in text
+        assert effect in text

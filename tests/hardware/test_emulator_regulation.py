@@ -104,7 +104,7 @@ def test_volume_0_ends_the_cycle_thread() -> None:
     lab.post("/SetOutputTarget/Volume/M0/0")
     regulate(lab, 0.5)
     lab.wait(600.0)
-    assert lab.state()["Experiment"]["cycles"] == 3
+    assert lab.state()["Experiment"]["cycles"] == 1
 
 
 def test_od_on_without_experiment_does_nothing() -> None:

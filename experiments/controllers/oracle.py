@@ -1,0 +1,91 @@
+"""The yardstick: dynamic programming on the very plant that is being controlled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from envs.optimum import OptimalPolicy, solve
+from envs.plant import Plant
+from envs.task import EnvConfig
+from experiments.controllers.base import Array, Mask
+
+__all__ = ["Oracle", "OracleConfig"]
+
+SECONDS = 60.0  # per min
+SPAN = (0.05, 4.0)  # OD over setpoint that the value function covers
+GRID = 3001
+DRAWN = ("mu", "volume_ml", "pump_gain_ml_s")
+
+
+@dataclass(frozen=True)
+class OracleConfig:
+    """levels: pump rates it chooses from, equally spaced over the pump's range; gamma: discount per control period.
+
+    129 levels hold the learned policy's 17 and are fine enough that a continuous rate gains nothing measurable.
+    """
+
+    kind: str = "oracle"
+    levels: int = 129
+    gamma: float = 0.99
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.levels <= 1001:
+            raise ValueError(f"controller.levels = {self.levels}: allowed 2 to 1001 pump rates")
+        if not 0.0 <= self.gamma < 1.0:
+            raise ValueError(f"controller.gamma = {self.gamma}: allowed 0 <= gamma < 1")
+
+
+@cache
+def _value(mu: float, tau: float, control_min: float, max_rate: float, levels: int, gamma: float) -> OptimalPolicy:
+    """The optimum of setpoint 1 for one vial; the model is linear in x, so V_s(x) = s^2 V_1(x/s) for any setpoint s."""
+    model = EnvConfig(mu, tau, control_min=control_min, n_actions=levels, max_pump_rate=max_rate, start_od=SPAN)
+    return solve(model, gamma, np.array([1.0]), GRID)
+
+
+class Oracle:
+    """u = argmin_u (y(u) - r)^2 + gamma r^2 V(y(u)/r), with y(u) the reading that a noise-free sensor will show next.
+
+    It knows, of each vial: the growth rate at this moment (drawn mu, substrate, temperature, drift), flow, dead time
+    and shortest pulse of its pump head, the volume, and what the sensor would show without noise, which it uses in
+    place of the reading. V is that of the vial's drawn mu and tau = volume/(60 flow). It does not know what is drawn
+    later: the spread of the coming dose, the next reading's noise, the drift within the coming minute; nor priming and
+    the wall. So it is the bound on `nominal`, and elsewhere what full knowledge of the present is worth.
+
+    Args:
+      config: action grid and discount; plant: the vials it controls, in the order of the rows; model: control period
+      and largest pump rate; flow_ml_s: flow that the backend believes in when it turns a rate into an on-time.
+    """
+
+    def __init__(self, config: OracleConfig, plant: Plant, model: EnvConfig, flow_ml_s: float = 1.0) -> None:
+        self.config, self.plant, self.model = config, plant, model
+        self.rates = np.linspace(0.0, model.max_pump_rate, config.levels)
+        self._on_s = (self.rates * SECONDS * model.control_min / flow_ml_s)[:, None]
+        mu, volume, gain = (plant.draws[key] for key in DRAWN)
+        tau = volume / (SECONDS * gain)
+        fixed = (model.control_min, model.max_pump_rate, config.levels, config.gamma)
+        solved = [_value(float(m), float(t), *fixed) for m, t in zip(mu, tau, strict=True)]
+        self._log_ratio = solved[0].log_od
+        self._values = np.stack([s.value[0] for s in solved])
+
+    def reset(self, n: int) -> None:
+        """It has no memory. Raises: ValueError unless n is the plant's number of vials."""
+        if n != self.plant.n:
+            raise ValueError(f"oracle of a plant with {self.plant.n} vials: allowed {self.plant.n} reactors, not {n}")
+
+    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
+        """See `Controller.act`; the reading itself is not looked at."""
+        plant = self.plant
+        after = plant.expected_od(self.model.control_min, self._on_s + np.zeros(plant.n))
+        seen = plant.sensor.apparent(after, plant.wall, plant.minutes)
+        ratio = np.log(np.maximum(seen, 1e-6) / setpoint)
+        spacing = self._log_ratio[1] - self._log_ratio[0]
+        place = np.clip((ratio - self._log_ratio[0]) / spacing, 0.0, self._log_ratio.size - 1.000001)
+        left = place.astype(np.intp)
+        vial = np.arange(plant.n)
+        low, high = self._values[vial, left], self._values[vial, left + 1]
+        ahead = low + (place - left) * (high - low)
+        cost = (seen - setpoint) ** 2 + self.config.gamma * setpoint**2 * ahead
+        return np.asarray(self.rates[np.argmin(cost, axis=0)])
