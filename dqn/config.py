@@ -37,6 +37,8 @@ class DQNConfig:
     huber: float = 0.0  # TD errors beyond this are clipped in the gradient; 0 means squared error
     reward_scale: float = 1.0  # rewards are multiplied by this inside the agent
     relabel: float = 0.0  # share of each minibatch whose goal is replaced by a random one (hindsight)
+    relabel_near: float = 0.0  # share of those whose new goal is drawn close to the state reached
+    relabel_width: tuple[float, float] = (1e-3, 0.8)  # how close: range of the distance, log-uniform
     average: float = 0.0  # decay of the running mean of weights that acts greedily; 0 means the weights themselves
     input_matrix: tuple[float, ...] = ()  # features = M observation + c, M row by row; () means identity
     input_offset: tuple[float, ...] = ()  # c, one number per feature
@@ -65,6 +67,13 @@ class DQNConfig:
             ("huber", self.huber, self.huber >= 0.0, "at least 0 (0 = squared error)"),
             ("reward_scale", self.reward_scale, self.reward_scale > 0.0, "greater than 0"),
             ("relabel", self.relabel, 0.0 <= self.relabel <= 1.0, "0 to 1"),
+            ("relabel_near", self.relabel_near, 0.0 <= self.relabel_near <= 1.0, "0 to 1"),
+            (
+                "relabel_width",
+                self.relabel_width,
+                len(self.relabel_width) == 2 and 0.0 < self.relabel_width[0] <= self.relabel_width[1],
+                "[low, high] with 0 < low <= high",
+            ),
             ("average", self.average, 0.0 <= self.average < 1.0, "0 <= decay < 1"),
         )
         for key, value, ok, allowed in checks:
