@@ -99,6 +99,10 @@ class QNetwork:
         """M (F, O) and c (F,) as NumPy arrays."""
         return self._matrix.cpu().numpy().copy(), self._offset.cpu().numpy().copy()
 
+    def output_map(self) -> np.ndarray:
+        """C (A, A) as a NumPy array."""
+        return np.eye(self.sizes[-1], dtype=np.float32) if self._basis is None else self._basis.cpu().numpy().copy()
+
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Q values, shape (S, B, A), and the inputs of each layer, for `backward`."""
         h = self.features(observation)
