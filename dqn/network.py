@@ -127,4 +127,5 @@ class QNetwork:
             torch.bmm(inputs[k].transpose(1, 2), delta, out=grad_weight)
             torch.sum(delta, 1, keepdim=True, out=grad_bias)
             if k > 0:
-                delta = torch.bmm(delta, self.layers[k][0].transpose(1, 2)).mul_(inputs[k] > 0)
+                back = torch.bmm(delta, self.layers[k][0].transpose(1, 2))
+                delta = torch.ops.aten.threshold_backward(back, inputs[k], 0.0)  # relu's derivative, in one pass
