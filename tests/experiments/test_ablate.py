@@ -53,6 +53,7 @@ def test_a_study_leaves_table_summary_and_figure_and_resumes(tmp_path: Path) -> 
     regret = [float(r["regret_pct"]) for r in rows if r["ablation"] == "mine"]
     assert summary["ablations"]["mine"]["regret_pct"]["worst"] == pytest.approx(max(regret))
     assert summary["ablations"]["mine"]["regret_pct"]["median"] == pytest.approx(float(np.median(regret)))
+    assert len((folder / "table.md").read_text().splitlines()) == 4
     assert (folder / "figures" / "ablation.png").stat().st_size > 5000
 
     kept = [line for line in (folder / "ablation.csv").read_text().splitlines() if not line.startswith("mine")]
