@@ -1,8 +1,8 @@
 """What each choice of an agent is worth: trains variants of one agent over the same seeds and compares them.
 
 `python -m experiments.ablate` trains every entry of `ablations` in conf/ablate.yaml: the agent of the command line with
-some of its values replaced. The run folder gets ablation.csv (a row per variant and seed), summary.json, table.md and a figure,
-and one sub-folder per variant with its TensorBoard curves. A stopped run goes on with `resume=RUN`.
+some of its values replaced. The run folder gets ablation.csv (a row per variant and seed), summary.json, table.md, a
+figure, and one sub-folder per variant with its TensorBoard curves. A stopped run goes on with `resume=RUN`.
 """
 
 from __future__ import annotations
