@@ -152,13 +152,11 @@ class DQNAgent:
         self._adam.param_groups[0]["lr"] = self.learning_rate
         self._adam.step()
         self.updates += 1
+        if self.updates % c.target_period == 0:
+            blend(self.target.flat, self.online.flat, c.target_blend)
+            self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
         if c.average:
             blend(self.greedy.flat, self.online.flat, 1.0 - c.average)
-        if self.updates % c.target_period == 0:
-            blend(
-                self.target.flat, self.greedy.flat, c.target_blend
-            )  # the mean, where there is one: less noise to learn
-            self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
 
     def state_dict(self) -> dict[str, Any]:
         """The complete learning state: loading it into a new agent of the same config continues to the bit."""
