@@ -53,12 +53,15 @@ class Transport(Protocol):
         """POST without a body. Raises: LinkError when no answer came; the device may have acted all the same."""
         ...
 
-    def close(self) -> None:
-        """Release the line; on a serial line also disarm the dead-man switch. Idempotent.
+    def disarm(self) -> None:
+        """Tell a dead-man switch on the way, if there is one, that all pumps were left verified off.
 
-        Call it only when the pumps were verified off: otherwise let the process end with the line open, so that
-        the dead-man switch acts.
+        The next request arms it again. Raises: nothing; an armed switch is the safe side.
         """
+        ...
+
+    def close(self) -> None:
+        """Release the line. Idempotent."""
         ...
 
 
@@ -136,6 +139,9 @@ class HttpTransport:
         """POST `path` without a body. Raises: LinkError (the device may have acted), ProtocolError."""
         return self._request("POST", path)
 
+    def disarm(self) -> None:
+        """Nothing: no switch on this way."""
+
     def close(self) -> None:
         """Close the client. Idempotent."""
         self._client.close()
@@ -205,12 +211,14 @@ class SerialTransport:
         """POST `path`. Raises: LinkError (the device may have acted), ProtocolError."""
         return self._request("POST", path)
 
+    def disarm(self) -> None:
+        """BYE to the agent, whose switch then rests until the next request."""
+        if self._line is not None:
+            with contextlib.suppress(LinkError, ProtocolError):
+                self._exchange("BYE", "/")
+
     def close(self) -> None:
-        """Tell the agent that all is in order, so that its dead-man switch rests, and release the port. Idempotent."""
-        if self._line is None:
-            return
-        with contextlib.suppress(LinkError, ProtocolError):  # an armed dead-man switch is the safe side
-            self._exchange("BYE", "/")
+        """Release the port; the agent's switch stays as it is. Idempotent."""
         self._drop()
 
     def _open(self) -> None:
