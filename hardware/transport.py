@@ -159,8 +159,8 @@ class HttpTransport:
                         raise LinkError(f"{method} {path}: the answer was not complete after {self._read_s:.1f} s")
                 return Reply(answer.status_code, bytes(body), answer.headers.get("date", ""))
         except (httpx.RemoteProtocolError, httpx.DecodingError) as error:
-            if "without sending" in str(error):  # closed before a byte of answer: a dying server, not a strange one
-                raise LinkError(f"{method} {path}: {self.url} closed the connection without an answer") from error
+            if "without sending" in str(error):  # closed before the answer was whole: a dying server, not a strange one
+                raise LinkError(f"{method} {path}: {self.url} closed the connection without a whole answer") from error
             raise ProtocolError(f"{method} {path}: not an HTTP answer ({error})") from error
         except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
             reason = str(error) or type(error).__name__
