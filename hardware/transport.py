@@ -190,7 +190,7 @@ class SerialTransport:
         port: str,
         speed: float = 1.0,
         config: TransportConfig | None = None,
-        attempts: int = 3,
+        attempts: int = 5,
         rng: random.Random | None = None,
     ) -> None:
         self.port = port
@@ -307,7 +307,8 @@ class SerialTransport:
         while (line := self._until_newline(deadline)) is not None:
             match = _HEADER.match(line[line.rfind(b"<") :]) if b"<" in line else None
             if match is None:
-                damaged += b"<" in line
+                if b"<" in line:  # perhaps our reply, damaged: asking again is safe and quicker than waiting
+                    return None, damaged + 1
                 continue
             number, status, length, crc = int(match[1]), int(match[2]), int(match[3]), int(match[4], 16)
             body = self._read(length, deadline) if length <= MAX_BODY else None
