@@ -266,14 +266,14 @@ def test_three_reactors_over_http_at_speed_60() -> None:
         reactors = ChiBioReactors(transport, clock, config, log=lambda k, f: rows.append({"kind": k, **f}))
         reactors.begin()
         samples = np.zeros(3)
-        while reactors.elapsed() < 480.0:
+        while reactors.elapsed() < 300.0:
             m = reactors.measure()
             rate = np.clip((0.025 + 0.5 * np.log(m.od / 0.5)) / 3.0, 0.0, 0.02)
             reactors.actuate(Command(m.fresh, np.where(m.fresh, rate, 0.0), np.full(3, 37.0)))
             samples += m.fresh
         reactors.stop()
         transport.close()
-    assert np.all(samples >= 7)
+    assert np.all(samples >= 4)
     acted = [(r["reactor"], *r["sample"]) for r in rows if r["kind"] == "intent"]  # type: ignore[misc]
     assert len(set(acted)) == len(acted)
     assert not [r for r in rows if r["kind"] == "fault"]
