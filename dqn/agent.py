@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from dqn.config import DQNConfig
-from dqn.network import QNetwork, initial_weights
+from dqn.network import QNetwork, action_basis, initial_weights
 from dqn.replay import Replay, Transition
 from dqn.schedules import decayed, linear
 from dqn.streams import UniformStream
@@ -59,9 +59,10 @@ class DQNAgent:
         self.sizes = (features, *config.hidden, actions)
         flat = np.stack([initial_weights(self.sizes, seed) for seed in streams["init"]])
         weights = torch.from_numpy(flat).to(self.device)
-        self.online = QNetwork(weights, self.sizes, matrix, offset)
-        self.target = QNetwork(weights.clone(), self.sizes, matrix, offset)
-        self.greedy = QNetwork(weights.clone(), self.sizes, matrix, offset) if config.average else self.online
+        basis = action_basis(actions, config.action_smoothness).to(self.device) if config.action_smoothness else None
+        self.online = QNetwork(weights, self.sizes, matrix, offset, basis)
+        self.target = self.online.with_weights(weights.clone())
+        self.greedy = self.online.with_weights(weights.clone()) if config.average else self.online
         parameter = torch.nn.Parameter(weights)
         parameter.grad = self.online.grad
         betas = (0.9, config.adam_beta2)
