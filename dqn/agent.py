@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from dqn.config import DQNConfig
 from dqn.network import QNetwork, action_basis, initial_weights
-from dqn.replay import Replay, Transition
+from dqn.replay import Array, Replay, Transition
 from dqn.schedules import decayed, linear
 from dqn.streams import UniformStream
 from dqn.targets import advantage_target, blend, double_q_target, loss_gradient, q_target
@@ -68,7 +69,7 @@ class DQNAgent:
         betas = (0.9, config.adam_beta2)
         self._adam = torch.optim.Adam([parameter], config.learning_rate, betas, config.adam_eps, fused=True)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
-        self._explore = UniformStream(streams["explore"], 2, self.device)
+        self._explore = UniformStream(streams["explore"], 2, torch.device("cpu"))
         self._draws = UniformStream(streams["replay"], config.batch_size, self.device)
         self._relabelled = round(config.relabel * config.batch_size)
         self._goals = UniformStream(streams["relabel"], max(1, 2 * self._relabelled), self.device)
@@ -93,16 +94,20 @@ class DQNAgent:
         return decayed(c.learning_rate, c.learning_rate_decay, c.total_updates, self.updates)
 
     @torch.no_grad()
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Epsilon-greedy actions for one observation per agent, (S, O) -> (S,) int64."""
-        u = self._explore.next()
-        best = self.online(observation.unsqueeze(1))[:, 0].argmax(-1)
-        return torch.where(u[:, 0] < self.epsilon, (u[:, 1] * self.n_actions).long(), best)
+    def act(self, observation: Array) -> NDArray[np.int64]:
+        """Epsilon-greedy actions for one observation per agent, (S, O) -> (S,)."""
+        u = self._explore.next().numpy()
+        action = (u[:, 1] * self.n_actions).astype(np.int64)
+        greedy = u[:, 0] >= self.epsilon
+        if greedy.any():
+            seen = torch.from_numpy(observation).to(self.device).unsqueeze(1)
+            best = self.online(seen).argmax(-1).view(-1).cpu().numpy()
+            action = np.where(greedy, best, action)
+        return action
 
-    @torch.no_grad()
-    def observe(self, step: Transition) -> None:
-        """Remember one step of every agent and do the updates that are due."""
-        self.replay.add(step._replace(r_t=step.r_t * self.config.reward_scale))
+    def observe(self, s_tm1: Array, a_tm1: Array, r_t: Array, s_t: Array, continues: Array) -> None:
+        """Remember one step of every agent (arguments as `Replay.add`) and do the updates that are due."""
+        self.replay.add(s_tm1, a_tm1, r_t * self.config.reward_scale, s_t, continues)
         self.steps += 1
         if self.steps > self.config.learn_start:
             for _ in range(self.config.updates_per_step):
