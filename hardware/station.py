@@ -25,6 +25,7 @@ __all__ = ["Station"]
 
 CYCLE_S = 60.07  # median of 3275 real cycles (chibio.md section 3)
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
+FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 OWN_WILL = ("Zigzag", "Custom", "Chemostat")  # modes that act on the pumps
 
 
@@ -119,17 +120,19 @@ class Station:
                 yield OLD_CYCLE_S
             self._prepare()
             state = self.unit.read()
-            if state.running and math.isfinite(state.sample_s):
-                self._sample = (state.sample_s, state.cycles)  # it may be a minute old: wait for the next one
+            if math.isfinite(state.sample_s):
+                self._sample = (state.sample_s, state.cycles)  # of unknown age: wait for the next one
+            self._offsets.clear()
             if not state.running:
                 self._start()
+                if state.cycles == 0:  # then the device's own time begins now, and so does the first cycle
+                    self._offsets.append(self._clock.now() + FIRST_SAMPLE_S)
                 if not self._heat:  # a start switches the thermostat on
                     self.heat_off()
             if math.isfinite(self.handed_over):
                 self.regulate(self.handed_over)
             self._start_time = self.unit.read().start_time
             self.arrived_s = self.next_poll = self._clock.now()
-            self._offsets.clear()
             identity = {"reactor": self.name, "device_id": self.unit.device_id, "blank": self._blank}
             self._log("device", {**identity, "temperature": self._target_c, "start_time": self._start_time})
         finally:
@@ -263,7 +266,7 @@ class Station:
         self.next_poll = now + CYCLE_S - (2.5 if self._looked else 20.0)
         self._looked = False
         reading = {"od": self.od, "temperature": self.temperature, "raw": self.raw, "blank": state.blank}
-        timing = {"late_s": round(self._late_s, 3), "read_s": self.unit.took_s}
+        timing = {"late_s": self._late_s, "read_s": self.unit.took_s}
         self._log("sample", {"reactor": self.name, "sample": self._sample, **reading, **timing})
         if self._late_s > 30.0 or self.dosing:
             return  # the stirrer may be off for the next measurement already
@@ -287,9 +290,9 @@ class Station:
         if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:
             self.tell(f"the board's clock moved by {min(self._offsets) - offset:.0f} s against this computer's")
             self._offsets.clear()
-        if self._looked or not self._offsets or offset < min(self._offsets):
+        if self._looked or (self._offsets and offset < min(self._offsets)):
             self._offsets.append(offset)
-        self._late_s = offset - min(self._offsets)
+        self._late_s = offset - min(self._offsets) if self._offsets else math.inf  # already there at the first look
 
     def _report(self, fault: Fault | None) -> bool:
         """Set or clear the fault; False, because a fault brings no sample."""
@@ -332,6 +335,8 @@ class Station:
         if self.dosing:
             return "the previous dose has not ended"
         past = self._clock.now() - self.arrived_s + self._late_s
+        if math.isinf(past):
+            return "its sample is of unknown age, the next one is waited for"
         if past + waste_s > self.config.window_s:
             return f"{past:.0f} s after its sample appeared it would not end before the next measurement"
         return ""
