@@ -103,6 +103,10 @@ class QNetwork:
         """M (F, O) and c (F,) as NumPy arrays."""
         return self._matrix.cpu().numpy().copy(), self._offset.cpu().numpy().copy()
 
+    def output_map(self) -> np.ndarray:
+        """C (A, A) as a NumPy array."""
+        return np.eye(self.sizes[-1], dtype=np.float32) if self._basis is None else self._basis.cpu().numpy().copy()
+
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Q values, shape (S, B, A), and the inputs of each layer, for `backward`."""
         h = self.features(observation)
@@ -127,4 +131,5 @@ class QNetwork:
             torch.bmm(inputs[k].transpose(1, 2), delta, out=grad_weight)
             torch.sum(delta, 1, keepdim=True, out=grad_bias)
             if k > 0:
-                delta = torch.bmm(delta, self.layers[k][0].transpose(1, 2)).mul_(inputs[k] > 0)
+                back = torch.bmm(delta, self.layers[k][0].transpose(1, 2))
+                delta = torch.ops.aten.threshold_backward(back, inputs[k], 0.0)  # relu's derivative, in one pass
