@@ -1,4 +1,4 @@
-"""Controllers side by side on simulated reactors, `python -m experiments.benchmark`: the paper's experiments and more."""
+"""Controllers side by side on simulated reactors: the paper's experiments and more, `python -m experiments.benchmark`."""
 
 from __future__ import annotations
 
@@ -184,8 +184,8 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any], 
             for plant in study.plants:
                 shown = [by_cell[c, plant, scenario] for c in study.controllers][:4]
                 caption = (
-                    f"Plant {plant}, {config.replicates} replicates. Line: mean of the measured OD and of the pump rate; "
-                    "band: one standard deviation over replicates; dashed: setpoint."
+                    f"Plant {plant}, {config.replicates} replicates. Line: mean of the measured OD and of the pump "
+                    "rate; band: one standard deviation over replicates; dashed: setpoint."
                 )
                 key = name if name in CAPTIONS else f"{name}_{scenario}_{plant}"
                 figures.add(key, charts.bands(shown), CAPTIONS.get(name, f"{name}: {scenario} on {plant}"), caption)
@@ -194,8 +194,8 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any], 
             "table2",
             charts.published_and_ours(table_2_rows(summary["rows"], config)),
             "The paper's Table 2 beside this run",
-            f"Hollow: published, real reactors, n = 3. Filled: this run, n = {config.replicates}; bar: 95 % interval of "
-            "the mean. Left is better.",
+            f"Hollow: published, real reactors, n = 3. Filled: this run, n = {config.replicates}; bar: 95 % interval "
+            "of the mean. Left is better.",
         )
     for scenario in dict.fromkeys(s for study in config.studies.values() for s in study.scenarios):
         totals = [e for e in summary["totals"] if e["scenario"] == scenario]
@@ -206,7 +206,8 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any], 
             charts.plants(totals),
             f"Every plant, {scenario}",
             f"ISE and ITAE of the measured OD, summed over the windows; mean and 95 % interval, n = "
-            f"{config.replicates}. Red: what the sensor's noise alone would score on a culture exactly on the setpoint.",
+            f"{config.replicates}. Red: what the sensor's noise alone would score on a culture exactly on the "
+            "setpoint. `hold` is off the scale and left out.",
         )
         against = [e for e in summary["paired_totals"] if e["scenario"] == scenario and e["against"] == "dqn"]
         if against:
@@ -263,7 +264,7 @@ def _store(trials: list[Trial], folder: Path) -> None:
         for t in trials
         for key in ("od", "clean", "rate", "temperature")
     }
-    np.savez_compressed(folder / "trajectories.npz", **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(folder / "trajectories.npz", **arrays)
 
 
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:

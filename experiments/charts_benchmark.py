@@ -128,14 +128,17 @@ def _log_axis(ax: Axes) -> None:
 
 
 def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
-    """ISE and ITAE summed over the windows, a line per plant: mean and 95 % interval of every controller.
+    """ISE and ITAE summed over the windows, a line per plant: mean and 95 % interval of every controller but `hold`.
 
     Args: entries: of `comparison.totals`, all of one scenario.
     """
     names = _plants(entries)
+    entries = [e for e in entries if e["controller"] != "hold"]
     controllers = list(dict.fromkeys(str(e["controller"]) for e in entries))
     figure, axes = new_figure(10.4, 1.6 + 0.62 * len(names), 1, 2, sharey=True)
     for metric, ax in zip(("ise", "itae"), axes, strict=True):
+        seen = np.array([e[key] for e in entries for key in (f"floor_{metric}", f"{metric}_mean")])
+        ax.set_xlim(0.6 * seen[seen > 0.0].min(), 1.8 * seen.max())
         for y in range(len(names)):
             if y % 2 == 0:
                 ax.axhspan(y - 0.5, y + 0.5, color="#f3f5f7", zorder=0)
@@ -145,7 +148,7 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
             offset = 0.72 * ((controllers.index(e["controller"]) + 0.5) / len(controllers) - 0.5)
             low, high = e[f"{metric}_ci95"]
             if np.isfinite(low):
-                ax.plot([max(low, 1e-6), high], [y + offset] * 2, color=colour, linewidth=1.3)
+                ax.plot([max(low, 1e-12), high], [y + offset] * 2, color=colour, linewidth=1.3)
             ax.plot(e[f"{metric}_mean"], y + offset, marker, color=colour, markersize=5)
             floor = e[f"floor_{metric}"]
             if e["controller"] in ("oracle", controllers[0]) and floor > 0.0:

@@ -155,9 +155,7 @@ def _pair(one: Trial, other: Trial, metric: str, window: str, difference: Array,
 
 def _partners(trials: Sequence[Trial], against: str) -> list[tuple[Trial, Trial]]:
     of = {(t.plant, t.scenario): t for t in trials if t.controller == against}
-    return [
-        (t, of[t.plant, t.scenario]) for t in trials if t.controller != against and (t.plant, t.scenario) in of
-    ]
+    return [(t, of[t.plant, t.scenario]) for t in trials if t.controller != against and (t.plant, t.scenario) in of]
 
 
 def pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:

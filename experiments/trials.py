@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +38,7 @@ def windows(schedule: Schedule) -> list[Window]:
     edges = schedule.edges
     by_setpoint = [f"{s:g}" for s in schedule.setpoints]
     by_temperature = [f"{t:g}" for t in schedule.temperatures]
-    by_hours = [f"{a / 60:g}-{b / 60:g} h" for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    by_hours = [f"{a / 60:g}-{b / 60:g} h" for a, b in pairwise(edges)]
     names = next((n for n in (by_setpoint, by_temperature) if len(set(n)) == len(n)), by_hours)
     return [
         Window(name, s, float(a), float(b))
@@ -74,7 +76,7 @@ class Trial:
 
     def score_floor(self, window: Window) -> WindowMetrics:
         """Metrics of the sensor's error alone: what a culture that is exactly on the setpoint would be scored."""
-        return self._score(window.setpoint + self.od - self.clean, window)
+        return self._score(self.od - self.clean, replace(window, setpoint=0.0))
 
     def _score(self, od: Array, window: Window) -> WindowMetrics:
         minute = np.broadcast_to(self.minute, od.shape)
@@ -114,9 +116,8 @@ def run_trial(
     backend = SimulatedConfig(reactors=tuple(f"M{i}" for i in range(replicates)), control_min=model.control_min)
     loop = ClosedLoop(SimulatedReactors(plant, backend), make(plant), RateLimit(model.max_pump_rate), schedule)
     minute = np.arange(0.0, schedule.total_min + 1e-6, model.control_min)
-    stored = {
-        key: np.full((replicates, minute.size), np.nan) for key in ("od", "clean", "rate", "temperature", "media_ml")
-    }
+    fields = ("od", "clean", "rate", "temperature", "media_ml")
+    stored: dict[str, Any] = {key: np.full((replicates, minute.size), np.nan) for key in fields}
     for step in loop.run():
         row = np.flatnonzero(step.rows & (step.phase >= 0))
         column = np.rint(step.elapsed[row] / model.control_min).astype(np.intp)
