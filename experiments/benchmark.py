@@ -1,4 +1,4 @@
-"""Controllers side by side on simulated reactors: the paper's experiments and more, `python -m experiments.benchmark`."""
+"""Controllers side by side on simulated reactors, `python -m experiments.benchmark`: the paper and beyond it."""
 
 from __future__ import annotations
 
@@ -183,9 +183,11 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any], 
         for scenario in study.scenarios:
             for plant in study.plants:
                 shown = [by_cell[c, plant, scenario] for c in study.controllers][:4]
+                long = config.scenarios[scenario].total_min > charts.LONG_MIN
+                what = "noise-free OD and pump rate in blocks of 10 min" if long else "measured OD and pump rate"
                 caption = (
-                    f"Plant {plant}, {config.replicates} replicates. Line: mean of the measured OD and of the pump "
-                    "rate; band: one standard deviation over replicates; dashed: setpoint."
+                    f"Plant {plant}, {config.replicates} replicates. Line: mean of {what}; band: one standard deviation "
+                    "over replicates; dashed: setpoint."
                 )
                 key = name if name in CAPTIONS else f"{name}_{scenario}_{plant}"
                 figures.add(key, charts.bands(shown), CAPTIONS.get(name, f"{name}: {scenario} on {plant}"), caption)

@@ -16,9 +16,12 @@ from experiments.charts import COLOURS, new_figure
 from experiments.published import TABLE_2
 from experiments.trials import Trial
 
-__all__ = ["bands", "differences", "plants", "published_and_ours"]
+__all__ = ["LONG_MIN", "bands", "differences", "plants", "published_and_ours"]
 
 Array = NDArray[np.float64]
+
+LONG_MIN = 360.0  # a schedule longer than this is drawn in blocks
+BLOCK = 10  # samples
 
 STYLE = {
     "dqn": (COLOURS[0], "o"),
@@ -46,8 +49,21 @@ def _band(ax: Axes, minute: Array, values: Array, colour: str) -> None:
     ax.plot(minute, mean, color=colour, linewidth=1.3)
 
 
+def _curves(trial: Trial) -> tuple[Array, Array, Array, Array]:
+    """Time, OD (N, K), pump rate and temperature as they are drawn: as they are, or in blocks and without noise."""
+    last = trial.minute.size - 1
+    if trial.schedule.total_min <= LONG_MIN:
+        return trial.minute[:last], trial.od[:, :last], trial.rate[:, :last], trial.temperature[:, :last]
+
+    def blocks(values: Array) -> Array:
+        whole = last // BLOCK * BLOCK
+        return np.asarray(values[..., :whole].reshape(*values.shape[:-1], -1, BLOCK).mean(axis=-1))
+
+    return blocks(trial.minute), blocks(trial.clean), blocks(trial.rate), blocks(trial.temperature)
+
+
 def bands(trials: Sequence[Trial]) -> Figure:
-    """Measured OD over pump rate (over temperature), a column per controller: mean over replicates, band = one sd."""
+    """OD over pump rate (over temperature), a column per controller: mean over replicates, band = one sd."""
     first = trials[0]
     switched = len(set(first.schedule.temperatures)) > 1
     rows, ratios = (3, [2.2, 1.1, 0.9]) if switched else (2, [2.2, 1.1])
@@ -61,11 +77,12 @@ def bands(trials: Sequence[Trial]) -> Figure:
         edges = trial.schedule.edges
         goals = np.append(trial.schedule.setpoints, trial.schedule.setpoints[-1])
         top.step(edges, goals, where="post", color="black", linewidth=1.0, linestyle="--")
-        _band(top, trial.minute, trial.od, colour)
-        _band(middle, trial.minute[:-1], 1000.0 * trial.rate[:, :-1], colour)
+        minute, od, rate, temperature = _curves(trial)
+        _band(top, minute, od, colour)
+        _band(middle, minute, 1000.0 * rate, colour)
         if switched:
             bottom = axes[2 * len(trials) + column]
-            _band(bottom, trial.minute, trial.temperature, colour)
+            _band(bottom, minute, temperature, colour)
             for ax in (top, middle, bottom):
                 ax.axvline(edges[1], color="#888888", linewidth=0.8, linestyle=":")
         top.set_title(f"{trial.controller}, n = {trial.od.shape[0]}", fontsize=10)
@@ -135,6 +152,7 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
     names = _plants(entries)
     entries = [e for e in entries if e["controller"] != "hold"]
     controllers = list(dict.fromkeys(str(e["controller"]) for e in entries))
+    witness = "oracle" if "oracle" in controllers else controllers[0]  # whose run tells the floor; all nearly agree
     figure, axes = new_figure(10.4, 1.6 + 0.62 * len(names), 1, 2, sharey=True)
     for metric, ax in zip(("ise", "itae"), axes, strict=True):
         seen = np.array([e[key] for e in entries for key in (f"floor_{metric}", f"{metric}_mean")])
@@ -151,7 +169,7 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
                 ax.plot([max(low, 1e-12), high], [y + offset] * 2, color=colour, linewidth=1.3)
             ax.plot(e[f"{metric}_mean"], y + offset, marker, color=colour, markersize=5)
             floor = e[f"floor_{metric}"]
-            if e["controller"] in ("oracle", controllers[0]) and floor > 0.0:
+            if e["controller"] == witness and floor > 0.0:
                 ax.plot([floor, floor], [y - 0.42, y + 0.42], color="#b00020", linewidth=1.4, zorder=1)
         _log_axis(ax)
         unit = {"ise": "ISE, OD² min", "itae": "ITAE, OD min²"}[metric]

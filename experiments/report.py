@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import app, tables
-from experiments.tables import Table, number
+from experiments.tables import Table, number, typeset
 
 __all__ = ["Page", "ReportConfig", "inline_svg", "main", "write"]
 
@@ -33,7 +33,7 @@ STYLE = """
 body { margin: 0; color: var(--ink); background: #fff; font: 16px/1.55 "Helvetica Neue", Helvetica, Arial, sans-serif; }
 header { background: var(--accent); color: #fff; padding: 2.2rem 0 1.8rem; }
 header p { margin: .3rem 0 0; opacity: .88; }
-main, header > div { max-width: 68rem; margin: 0 auto; padding: 0 1.5rem; }
+main, header > div { max-width: 76rem; margin: 0 auto; padding: 0 1.5rem; }
 h1 { font-size: 1.9rem; margin: 0; font-weight: 600; }
 h2 { font-size: 1.35rem; margin: 2.6rem 0 .8rem; padding-bottom: .3rem; border-bottom: 2px solid var(--line); }
 h3 { font-size: 1.08rem; margin: 1.8rem 0 .4rem; }
@@ -45,8 +45,8 @@ figure svg, figure img { max-width: 100%; height: auto; display: block; }
 .scroll { overflow-x: auto; }
 .note, .caption { color: var(--soft); font-size: .9rem; margin: .45rem 0 0; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .32rem .7rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
-thead th { border-bottom: 2px solid var(--ink); vertical-align: bottom; background: var(--wash); }
+th, td { padding: .32rem .6rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
+thead th { border-bottom: 2px solid var(--ink); vertical-align: bottom; white-space: normal; background: var(--wash); }
 th:first-child { text-align: left; font-weight: 500; }
 td.best { font-weight: 700; color: #08634a; background: #e7f5ef; }
 table.keys td { text-align: left; white-space: normal; overflow-wrap: anywhere; }
@@ -85,7 +85,7 @@ class Page:
 
     def text(self, text: str) -> None:
         """Append a paragraph of plain text."""
-        self.add(f"<p>{html.escape(text)}</p>")
+        self.add(f"<p>{typeset(text)}</p>")
 
     def table(self, table: Table, folded: str = "") -> None:
         """Append a table, behind a heading to click on if `folded` gives one."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from experiments.published import TABLE_2, Published
 from experiments.report import Page, provenance
-from experiments.tables import Best, Cell, Table, number, plus_minus
+from experiments.tables import Best, Cell, Table, number, plus_minus, typeset
 
 __all__ = ["losses", "page", "table_2"]
 
@@ -111,23 +111,17 @@ def cell_by_cell(rows: Sequence[Row]) -> Table:
         cells: list[Cell] = [f"{name_of(p.scenario, p.window)}, {p.controller}"]
         for metric in METRICS:
             published, ours = getattr(p, metric), row[f"{metric}_mean"]
-            cells += [
-                number(published, 4),
-                number(ours),
-                "here" if ours < published else "published",
-                number(published / 30.0),
-                number(ours / 30.0),
-            ]
+            cells += [f"{number(published, 4)} ({number(published / 30.0)})", f"{number(ours)} ({number(ours / 30.0)})"]
+            cells.append("here" if ours < published else "published")
         body.append(tuple(cells))
-    each = (" published", " here", ", lower", "/30 published", "/30 here")
-    columns = ("cell", *(f"{m.upper()}{what}" for m in METRICS for what in each))
+    columns = ("cell", *(f"{m.upper()}{what}" for m in METRICS for what in (", published", ", here", ", lower")))
     return Table(
         "table2_cells",
-        "Table 2 cell by cell, in both conventions",
+        "Table 2 cell by cell: T = 1 min, and in brackets T = window",
         columns,
         tuple(body),
-        "/30: T = window, the integrals divided by 30 min. A lower value here means that a simulated culture is held "
-        "closer than the published one, not that the controller is better: plant, pump and start are not the paper's.",
+        "T = window: the integrals divided by 30 min. A lower value here means that a simulated culture is held closer "
+        "than the published one, not that the controller is better: plant, pump and start are not the paper's.",
     )
 
 
@@ -174,7 +168,7 @@ def published_losses() -> list[str]:
 
 def _matrix(
     name: str, title: str, entries: Sequence[Row], value: Callable[[Row], float | None], text: Callable[[Row], str],
-    note: str, floor: str | None = None, lowest: bool = True,
+    note: str, floor: str | None = None, lowest: bool = True, scale: float = 1.0,
 ) -> Table:  # fmt: skip
     """Plants down, controllers across; the lowest of a row is marked, the oracle out of competition."""
     controllers = list(dict.fromkeys(str(e["controller"]) for e in entries))
@@ -183,11 +177,12 @@ def _matrix(
         at = {c: _find(entries, controller=c, plant=plant) for c in controllers}
         values = {c: value(r) for c, r in at.items() if r is not None and c != "oracle"}
         known = {c: v for c, v in values.items() if v is not None}
-        best = _lowest(known) if lowest and len(known) > 1 else ""
-        cells: list[Cell] = [plant, *(_mark("–" if r is None else text(r), c == best) for c, r in at.items())]
+        least = min(known.values()) if lowest and len(known) > 1 else None
+        best = {c for c, v in known.items() if least is not None and v <= least * (1.0 + 1e-9)}
+        cells: list[Cell] = [plant, *(_mark("–" if r is None else text(r), c in best) for c, r in at.items())]
         if floor is not None:
-            first = next(r for r in at.values() if r is not None)
-            cells.append(number(first[floor]))
+            told = at.get("oracle") or next(r for r in at.values() if r is not None)
+            cells.append(number(scale * told[floor]))
         body.append(tuple(cells))
     columns = ("plant", *controllers, *(("sensor-noise floor",) if floor else ()))
     return Table(name, title, columns, tuple(body), note)
@@ -209,18 +204,19 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
     pairs = [e for e in summary["paired_totals"] if e["scenario"] == scenario]
     n = totals[0]["n"]
     out.add(f"<h3>{html.escape(scenario)}</h3>")
-    for metric in METRICS:
+    for metric, scale, unit in (("ise", 1000.0, "10⁻³ OD² min"), ("itae", 1.0, "OD min²")):
+
+        def text(r: Row, m: str = metric, k: float = scale) -> str:
+            return plus_minus(k * r[f"{m}_mean"], None if r[f"{m}_sd"] is None else k * r[f"{m}_sd"])
+
         out.table(
             _matrix(
-                f"{scenario}_{metric}",
-                f"{metric.upper()} of the measured OD ({UNITS[metric]}, T = 1 min), sum over the windows",
-                totals,
-                lambda r, m=metric: r[f"{m}_mean"],  # type: ignore[misc]
-                lambda r, m=metric: plus_minus(r[f"{m}_mean"], r[f"{m}_sd"]),  # type: ignore[misc]
+                f"{scenario}_{metric}", f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
+                totals, lambda r, m=metric: r[f"{m}_mean"], text,  # type: ignore[misc]
                 f"Mean ± standard deviation, n = {n}. Marked: lowest; the oracle is out of competition.",
-                f"floor_{metric}",
+                f"floor_{metric}", scale=scale,
             )
-        )
+        )  # fmt: skip
     for against, heading in (
         ("oracle", "Distance from the oracle"),
         ("dqn", "Paired difference to the learned policy"),
@@ -290,7 +286,7 @@ def _paper_section(out: Page, summary: Row) -> None:
         out.table(table_2(rows, metric))
     lost, cells = losses(rows, summary["paired"]), 2 * len(_windows(rows))
     cells_lost = len({(s.split(":")[0]) for s in lost})
-    items = "".join(f"<li>{html.escape(s)}</li>" for s in lost)
+    items = "".join(f"<li>{typeset(s)}</li>" for s in lost)
     known = any(r["controller"] == "dqn" for r in rows)
     verdict = f"Of {cells} cells here, the learned policy (dqn) loses {cells_lost}:" if lost else (
         f"The learned policy (dqn) is lowest in all {cells} cells here." if known else "No learned policy was run."

@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import html
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Best", "Cell", "Table", "number", "plus_minus", "write"]
+__all__ = ["Best", "Cell", "Table", "number", "plus_minus", "typeset", "write"]
 
 
 @dataclass(frozen=True)
@@ -29,14 +30,19 @@ def number(value: float | None, digits: int = 3) -> str:
     if value == 0.0:
         return "0"
     text = f"{value:.{digits}g}"
-    return f"{value:.0f}" if "e+" in text else text
+    return f"{value:.0f}" if "e+" in text else text.replace("e-0", "e-")
 
 
 def plus_minus(mean: float | None, sd: float | None, digits: int = 3) -> str:
-    """mean ± sd, the deviation to two digits; the mean alone where there is no deviation."""
-    if mean is None or sd is None or sd != sd:
+    """mean ± sd, the deviation to two digits; the mean alone where there is none, or none beyond rounding."""
+    if mean is None or sd is None or not sd > 1e-9 * abs(mean):
         return number(mean, digits)
     return f"{number(mean, digits)} ± {number(sd, 2)}"
+
+
+def typeset(text: str) -> str:
+    """Escaped for HTML, with true minus signs before numbers."""
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", html.escape(text))
 
 
 @dataclass(frozen=True)
@@ -71,9 +77,8 @@ class Table:
     @staticmethod
     def _html_cell(cell: Cell, column: int) -> str:
         tag = "th" if column == 0 else "td"
-        if isinstance(cell, Best):
-            return f'<{tag} class="best">{html.escape(cell.text)}</{tag}>'
-        return f"<{tag}>{html.escape(cell)}</{tag}>"
+        text = typeset(cell.text if isinstance(cell, Best) else cell)
+        return f'<{tag} class="best">{text}</{tag}>' if isinstance(cell, Best) else f"<{tag}>{text}</{tag}>"
 
     def csv(self) -> str:
         """Comma-separated values with the headings as first line."""
@@ -101,7 +106,7 @@ class Table:
 
 
 TEX = {"\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}",
-       "±": r"$\pm$", "–": "--", "−": "$-$", "µ": r"$\mu$", "°": r"$^\circ$", "²": "$^2$", "~": r"\textasciitilde{}",
+       "±": r"$\pm$", "–": "--", "−": "$-$", "µ": r"$\mu$", "°": r"$^\circ$", "²": "$^2$", "⁻": "$^-$", "³": "$^3$", "~": r"\textasciitilde{}",
        "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$"}  # fmt: skip
 
 
