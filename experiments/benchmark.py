@@ -186,8 +186,8 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any], 
                 long = config.scenarios[scenario].total_min > charts.LONG_MIN
                 what = "noise-free OD and pump rate in blocks of 10 min" if long else "measured OD and pump rate"
                 caption = (
-                    f"Plant {plant}, {config.replicates} replicates. Line: mean of {what}; band: one standard deviation "
-                    "over replicates; dashed: setpoint."
+                    f"Plant {plant}, {config.replicates} replicates. Line: mean of {what}; band: one standard "
+                    "deviation over replicates; dashed: setpoint."
                 )
                 key = name if name in CAPTIONS else f"{name}_{scenario}_{plant}"
                 figures.add(key, charts.bands(shown), CAPTIONS.get(name, f"{name}: {scenario} on {plant}"), caption)

@@ -211,7 +211,8 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
 
         out.table(
             _matrix(
-                f"{scenario}_{metric}", f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
+                f"{scenario}_{metric}",
+                f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
                 totals, lambda r, m=metric: r[f"{m}_mean"], text,  # type: ignore[misc]
                 f"Mean ± standard deviation, n = {n}. Marked: lowest; the oracle is out of competition.",
                 f"floor_{metric}", scale=scale,
