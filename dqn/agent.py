@@ -14,12 +14,14 @@ from dqn.network import QNetwork, action_basis, initial_weights
 from dqn.replay import Array, Replay, Transition
 from dqn.schedules import decayed, linear
 from dqn.streams import UniformStream
-from dqn.targets import advantage_target, blend, double_q_target, loss_gradient, q_target
+from dqn.targets import advantage_target, blend, double_q_target, huber_loss, loss_gradient, q_target
 
 __all__ = ["STREAMS", "DQNAgent", "Relabel"]
 
 STREAMS = ("init", "explore", "replay", "relabel")
 """Names of the random streams an agent needs, each independent of the others."""
+
+DIAGNOSED = 100  # updates from one look at loss and range of Q to the next
 
 Relabel = Callable[[Transition, torch.Tensor], Transition]
 """Replaces the goal of a minibatch: (transitions (S, B), uniform numbers (S, B, 2)) -> transitions (S, B)."""
@@ -78,7 +80,7 @@ class DQNAgent:
             raise ValueError(f"agent.relabel = {config.relabel}: this task has no goal to replace; set it to 0")
         self.steps = 0  # environment steps taken
         self.updates = 0
-        self.loss = torch.zeros(self.n_agents, device=self.device)  # of the last update
+        self.loss = torch.zeros(self.n_agents, device=self.device)  # of the last diagnosed update
         self.q_range = torch.zeros(self.n_agents, 2, device=self.device)  # min and max Q in its minibatch
 
     @property
@@ -138,13 +140,15 @@ class DQNAgent:
         if c.action_gap:
             target = advantage_target(target, c.action_gap, self.target(batch.s_tm1), batch.a_tm1)
         q_tm1, inputs = self.online.forward(batch.s_tm1)
-        self.loss, gradient = loss_gradient(q_tm1, batch.a_tm1, target, c.huber)
+        td_error, gradient = loss_gradient(q_tm1, batch.a_tm1, target, c.huber)
         self.online.backward(inputs, gradient)
         self._adam.param_groups[0]["lr"] = self.learning_rate
         self._adam.step()
         self.updates += 1
         if self.updates % c.target_period == 0:
             blend(self.target.flat, self.online.flat, c.target_blend)
+        if self.updates % DIAGNOSED == 0:
+            self.loss = huber_loss(td_error, c.huber)
             self.q_range = torch.stack([q_tm1.amin((1, 2)), q_tm1.amax((1, 2))], dim=1)
         if c.average:
             blend(self.greedy.flat, self.online.flat, 1.0 - c.average)

@@ -43,7 +43,7 @@ class TrainRecord:
     """What happened in one interval of training; arrays have one entry per agent, shape (S,).
 
     episode_return: undiscounted reward of the last episode that ended in the interval, nan where none did.
-    loss, q_min, q_max: of the last update (q range: at the last target blend).
+    loss, q_min, q_max: of the last update they were looked at, at most 100 updates ago.
     """
 
     step: int
