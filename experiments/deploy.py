@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -154,6 +155,7 @@ class Announcer:
         self._names = loop.reactors.names
         self._phase = [-2] * len(self._names)
         self._reason: list[str | None] = [None] * len(self._names)
+        self._told: set[str] = set()
 
     def __call__(self, step: Step) -> None:
         """Log what is new in this step."""
@@ -167,7 +169,10 @@ class Announcer:
                 self._reason[n] = kinds
                 log.warning("%s: %s", name, step.reasons[n] or "interlock: all well again")
         for note in step.notes:
-            log.info("%s", note)
+            kind = re.sub(r"[\d.]+", "#", note)
+            if kind not in self._told:  # the journal has every one of them
+                self._told.add(kind)
+                log.info("%s (noted once here, every time in the journal)", note)
 
 
 def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConfig) -> str:
