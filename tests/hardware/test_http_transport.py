@@ -30,7 +30,7 @@ from hardware.unit import Unit, no_log
 from tests.hardware.driver_lab import Bed
 from tests.hardware.script import answer, state
 
-FUZZ_CASES = int(os.environ.get("FUZZ_CASES", "200"))
+FUZZ_CASES = int(os.environ.get("FUZZ_CASES", "100"))
 QUICK = TransportConfig(connect_s=0.4, read_s=0.4, floor_s=0.1)
 OK = b"HTTP/1.1 204 NO CONTENT\r\nDate: Mon, 05 Jan 2026 10:00:00 GMT\r\nConnection: close\r\n\r\n"
 
