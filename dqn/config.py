@@ -33,9 +33,12 @@ class DQNConfig:
     target_blend: float = 1.0  # share of the online network in a blend; 1 copies
     double: bool = False  # double-Q targets (van Hasselt 2016)
     action_gap: float = 0.0  # alpha of advantage learning: action gaps are learned 1 / (1 - alpha) times as wide
+    action_smoothness: float = 0.0  # exponent by which rough differences between actions are learned later; 0: off
     huber: float = 0.0  # TD errors beyond this are clipped in the gradient; 0 means squared error
     reward_scale: float = 1.0  # rewards are multiplied by this inside the agent
     relabel: float = 0.0  # share of each minibatch whose goal is replaced by a random one (hindsight)
+    relabel_near: float = 0.0  # share of those whose new goal is drawn close to the state reached
+    relabel_width: tuple[float, float] = (1e-3, 0.8)  # how close: range of the distance, log-uniform
     average: float = 0.0  # decay of the running mean of weights that acts greedily; 0 means the weights themselves
     input_matrix: tuple[float, ...] = ()  # features = M observation + c, M row by row; () means identity
     input_offset: tuple[float, ...] = ()  # c, one number per feature
@@ -60,9 +63,17 @@ class DQNConfig:
             ("target_period", self.target_period, self.target_period >= 1, "at least 1 update"),
             ("target_blend", self.target_blend, 0.0 < self.target_blend <= 1.0, "0 < blend <= 1"),
             ("action_gap", self.action_gap, 0.0 <= self.action_gap < 1.0, "0 <= alpha < 1"),
+            ("action_smoothness", self.action_smoothness, self.action_smoothness >= 0.0, "at least 0 (0 = off)"),
             ("huber", self.huber, self.huber >= 0.0, "at least 0 (0 = squared error)"),
             ("reward_scale", self.reward_scale, self.reward_scale > 0.0, "greater than 0"),
             ("relabel", self.relabel, 0.0 <= self.relabel <= 1.0, "0 to 1"),
+            ("relabel_near", self.relabel_near, 0.0 <= self.relabel_near <= 1.0, "0 to 1"),
+            (
+                "relabel_width",
+                self.relabel_width,
+                len(self.relabel_width) == 2 and 0.0 < self.relabel_width[0] <= self.relabel_width[1],
+                "[low, high] with 0 < low <= high",
+            ),
             ("average", self.average, 0.0 <= self.average < 1.0, "0 <= decay < 1"),
         )
         for key, value, ok, allowed in checks:

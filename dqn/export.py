@@ -17,7 +17,7 @@ __all__ = ["export"]
 def export(
     network: QNetwork, agent: int, flat: torch.Tensor, pump_rates: NDArray[np.float64], metadata: dict[str, Any]
 ) -> Policy:
-    """The greedy policy of one agent.
+    """The greedy policy of one agent; a basis of the outputs is multiplied into the last layer.
 
     Args:
       network: gives layer sizes and input map.
@@ -27,10 +27,13 @@ def export(
       metadata: control_min, model, config_hash and whatever else a bench should check or show.
     """
     own = QNetwork(flat[agent : agent + 1].detach().cpu().clone(), network.sizes)
+    weights = [weight[0].numpy().copy() for weight, _ in own.layers]
+    biases = [bias[0, 0].numpy().copy() for _, bias in own.layers]
+    weights[-1], biases[-1] = weights[-1] @ network.output_map(), biases[-1] @ network.output_map()
     matrix, offset = network.input_map()
     return Policy(
-        weights=tuple(weight[0].numpy().copy() for weight, _ in own.layers),
-        biases=tuple(bias[0, 0].numpy().copy() for _, bias in own.layers),
+        weights=tuple(weights),
+        biases=tuple(biases),
         input_matrix=matrix,
         input_offset=offset,
         pump_rates=np.asarray(pump_rates, dtype=np.float64),

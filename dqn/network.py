@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-__all__ = ["QNetwork", "initial_weights"]
+__all__ = ["QNetwork", "action_basis", "initial_weights"]
 
 Layer = tuple[torch.Tensor, torch.Tensor]
 
@@ -29,6 +29,22 @@ def initial_weights(sizes: Sequence[int], seed: np.random.SeedSequence) -> np.nd
     return np.concatenate(parts).astype(np.float32)
 
 
+def action_basis(actions: int, smoothness: float) -> torch.Tensor:
+    """C with Q = z C: row k is cos(pi k (a + 1/2) / A) / (1 + k)^smoothness, a fixed basis of functions of the action.
+
+    C is invertible, so the network can represent the same Q values with it as without. It changes the direction in
+    which gradient steps go: one sample then moves Q of similar actions alike, and the rougher a difference between
+    actions is, the more slowly it is learned.
+
+    Args:
+      actions: A. smoothness: >= 0.
+    Returns: shape (A, A), float32.
+    """
+    k, a = np.arange(actions)[:, None], np.arange(actions)[None, :]
+    basis = np.cos(np.pi * k * (a + 0.5) / actions) / (1.0 + k) ** smoothness
+    return torch.from_numpy(basis.astype(np.float32))
+
+
 class QNetwork:
     """Q(observation, .) = W3 relu(W2 relu(W1 f + b1) + b2) + b3 with f = M observation + c, for S agents at once.
 
@@ -41,6 +57,7 @@ class QNetwork:
       sizes: units of feature, hidden and output layers.
       matrix: M, shape (features, observations); None means that the features are the observation.
       offset: c, shape (features,).
+      basis: C of `action_basis`, by which the outputs are multiplied; None means that they are the Q values.
     """
 
     def __init__(
@@ -49,6 +66,7 @@ class QNetwork:
         sizes: Sequence[int],
         matrix: torch.Tensor | None = None,
         offset: torch.Tensor | None = None,
+        basis: torch.Tensor | None = None,
     ) -> None:
         self.flat = flat
         self.sizes = tuple(sizes)
@@ -57,6 +75,8 @@ class QNetwork:
         self._grads = self._views(self.grad)
         self._matrix = torch.eye(self.sizes[0], device=flat.device) if matrix is None else matrix
         self._offset = torch.zeros(self.sizes[0], device=flat.device) if offset is None else offset
+        self._mapped = matrix is not None
+        self._basis = basis
 
     def _views(self, flat: torch.Tensor) -> list[Layer]:
         """(W, b) of each layer as views: W (S, in, out), b (S, 1, out)."""
@@ -70,15 +90,22 @@ class QNetwork:
 
     def with_weights(self, flat: torch.Tensor) -> QNetwork:
         """The same network with other weights, shape (S', P)."""
-        return QNetwork(flat, self.sizes, self._matrix, self._offset)
+        matrix, offset = (self._matrix, self._offset) if self._mapped else (None, None)
+        return QNetwork(flat, self.sizes, matrix, offset, self._basis)
 
     def features(self, observation: torch.Tensor) -> torch.Tensor:
         """f = M observation + c; observation (S, B, observations) -> (S, B, features)."""
-        return torch.matmul(observation, self._matrix.T).add_(self._offset)
+        if self._mapped:
+            return torch.matmul(observation, self._matrix.T).add_(self._offset)
+        return observation
 
     def input_map(self) -> tuple[np.ndarray, np.ndarray]:
         """M (F, O) and c (F,) as NumPy arrays."""
         return self._matrix.cpu().numpy().copy(), self._offset.cpu().numpy().copy()
+
+    def output_map(self) -> np.ndarray:
+        """C (A, A) as a NumPy array."""
+        return np.eye(self.sizes[-1], dtype=np.float32) if self._basis is None else self._basis.cpu().numpy().copy()
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Q values, shape (S, B, A), and the inputs of each layer, for `backward`."""
@@ -89,7 +116,8 @@ class QNetwork:
             h = torch.baddbmm(bias, h, weight).relu_()
         inputs.append(h)
         weight, bias = self.layers[-1]
-        return torch.baddbmm(bias, h, weight), inputs
+        z = torch.baddbmm(bias, h, weight)
+        return z if self._basis is None else torch.matmul(z, self._basis), inputs
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
         """Q values only; observation (S, B, observations) -> (S, B, A)."""
@@ -97,10 +125,11 @@ class QNetwork:
 
     def backward(self, inputs: list[torch.Tensor], grad_q: torch.Tensor) -> None:
         """Fill `grad` with the gradient of a loss whose derivative by Q is `grad_q`, shape (S, B, A)."""
-        delta = grad_q
+        delta = grad_q if self._basis is None else torch.matmul(grad_q, self._basis.T)
         for k in range(len(self.layers) - 1, -1, -1):
             grad_weight, grad_bias = self._grads[k]
             torch.bmm(inputs[k].transpose(1, 2), delta, out=grad_weight)
             torch.sum(delta, 1, keepdim=True, out=grad_bias)
             if k > 0:
-                delta = torch.bmm(delta, self.layers[k][0].transpose(1, 2)).mul_(inputs[k] > 0)
+                back = torch.bmm(delta, self.layers[k][0].transpose(1, 2))
+                delta = torch.ops.aten.threshold_backward(back, inputs[k], 0.0)  # relu's derivative, in one pass

@@ -21,6 +21,9 @@ __all__ = ["Calibration", "Drift", "IdentifyConfig", "Segment", "Validation", "c
 Array = NDArray[np.float64]
 
 FLOOR_FACTOR = 3.0  # a window may miss by three times what the sensor's noise alone does
+WORST_FLOOR = 10.0  # %; a sensor noisier than that excuses nothing
+NOTABLE_DRIFT_PCT = 10.0
+SUSPICION = 0.65  # of a 95 % half width: the 80 % interval
 MOST_EDGES = 60  # window borders are tried at this many places at most
 PLAUSIBLE_MU = (0.001, 0.06)  # 1/min, doubling in 11 h to 12 min
 PLAUSIBLE_TAU = (0.05, 2.0)
@@ -30,7 +33,8 @@ PLAUSIBLE_TAU = (0.05, 2.0)
 class IdentifyConfig:
     """How the window is chosen and what is reported.
 
-    window: "auto" takes the longest stretch whose free-running fit stays below the limit; "all" takes all rows.
+    window: "auto" takes the longest stretch whose free-running fit stays below the limit and whose segments do not
+      drift; "all" takes all rows.
     pmse_limit: of a window, %; raised to three times the PMSE of the sensor's noise where that is larger.
     segment_min: length of the segments of the drift report, min.
     horizon_min: over which the pair is tested outside its window, each time from a fresh start, min.
@@ -165,66 +169,61 @@ def _choose_window(screened: Screened, config: IdentifyConfig) -> tuple[tuple[in
     clean = screened.series
     whole = max(screened.stretches, key=lambda s: np.isfinite(clean.od[s[0] : s[1]]).sum())
     floor = 100.0 * noise_sd(clean) ** 2 / float(np.nanmean(clean.od**2))
-    limit = max(config.pmse_limit, FLOOR_FACTOR * floor)
+    limit = max(config.pmse_limit, min(FLOOR_FACTOR * floor, WORST_FLOOR))
     if config.window == "all":
         return whole, "all trustworthy rows, as asked (identify.window=all)", limit
-    refusal: NotIdentifiable | None = None
-    found: list[tuple[int, float, int, int]] = []
-    for first, end in sorted(screened.stretches, key=lambda s: s[0] - s[1]):
-        try:
-            check_excitation(clean.part(first, end))
-        except NotIdentifiable as error:
-            refusal = refusal or error
-            continue
-        found += _good_windows(clean, first, end, limit)
-    if found:
-        n, error_pct, first, end = max(found)
-        del error_pct
-        covers = "all trustworthy rows" if (first, end) == whole else "the longest stretch"
-        return (
-            (first, end),
-            f"{covers}: one free-running trajectory describes its {n} readings within {limit:.2g} %",
-            limit,
+    found = _longest_window(screened, limit, config.segment_min)
+    if found is None:
+        check_excitation(clean.part(*whole))  # the likeliest reasons first, each in its own words
+        error_pct = fit(clean.part(*whole), robust=False).pmse_pct
+        raise NotIdentifiable(
+            f"no window is described by one pair (mu, tau) within a PMSE of {limit:.2g} % (all rows: "
+            f"{error_pct:.2g} %); the recording drifts or is too noisy; raise identify.pmse_limit, or choose a window "
+            "by rows=FIRST:END identify.window=all"
         )
-    if refusal is not None and not any(_excited(clean, s) for s in screened.stretches):
-        raise refusal
-    raise NotIdentifiable(
-        f"no window is described by one pair (mu, tau) within a PMSE of {limit:.2g} %; the recording drifts or is too "
-        "noisy; raise identify.pmse_limit, or take a window by hand with rows=FIRST:END identify.window=all"
-    )
+    covers = "all trustworthy rows" if found == whole else "the longest stretch without drift"
+    n = int(np.isfinite(clean.od[found[0] : found[1]]).sum())
+    return found, f"{covers}: one free-running trajectory describes its {n} readings within {limit:.2g} %", limit
 
 
-def _excited(clean: Series, stretch: tuple[int, int]) -> bool:
-    try:
-        check_excitation(clean.part(*stretch))
-    except NotIdentifiable:
-        return False
-    return True
-
-
-def _good_windows(clean: Series, first: int, end: int, limit: float) -> list[tuple[int, float, int, int]]:
-    """(readings, -PMSE, first, end) of the longest acceptable window from each start that can still win."""
-    step = max(20, -(-(end - first) // MOST_EDGES))
-    edges = [*range(first, end - step // 2, step), end]
+def _longest_window(screened: Screened, limit: float, segment_min: float) -> tuple[int, int] | None:
+    """The window with most readings whose free-running fit stays below the limit and which does not drift inside."""
+    clean = screened.series
     count = np.concatenate([[0], np.cumsum(np.isfinite(clean.od))])
-    found: list[tuple[int, float, int, int]] = []
-    best = 0
-    for i, a in enumerate(edges[:-1]):
-        for b in reversed(edges[i + 1 :]):
-            n = int(count[b] - count[a])
-            if n <= best:
-                break
-            part = clean.part(a, b)
-            try:
-                check_excitation(part)
-                candidate = fit(part, robust=False)
-            except NotIdentifiable:
-                continue
-            if candidate.pmse_pct <= limit:
-                best = n
-                found.append((n, -candidate.pmse_pct, a, b))
-                break
-    return found
+    best: tuple[int, int] | None = None
+    most = 0
+    for first, end in screened.stretches:
+        step = max(20, -(-(end - first) // MOST_EDGES))
+        edges = [*range(first, end - step // 2, step), end]
+        for i, a in enumerate(edges[:-1]):
+            for b in reversed(edges[i + 1 :]):
+                if count[b] - count[a] <= most:
+                    break
+                part = clean.part(a, b)
+                try:
+                    check_excitation(part)
+                    good = fit(part, robust=False).pmse_pct <= limit
+                except NotIdentifiable:
+                    continue
+                if good and not _drifts(part, segment_min):
+                    best, most = (a, b), int(count[b] - count[a])
+                    break
+    return best
+
+
+def _drifts(part: Series, segment_min: float) -> bool:
+    """True when mu or tau of the segments within `part` move by 10 % or more, beyond their 80 % interval.
+
+    Less certainty than for a warning: a window that may drift is not to be trusted.
+    """
+    segments = _segments(Screened(part, ((0, len(part.od)),), ()), segment_min)
+    lines = (_drift(segments, [s.mu for s in segments]), _drift(segments, [s.tau for s in segments]))
+    return any(
+        d is not None
+        and abs(d.change_pct) >= NOTABLE_DRIFT_PCT
+        and abs(d.slope_per_h.value) > SUSPICION * d.slope_per_h.half_width
+        for d in lines
+    )
 
 
 def _validate(screened: Screened, window: tuple[int, int], fitted: Fit, horizon: float) -> Validation:
@@ -239,7 +238,8 @@ def _validate(screened: Screened, window: tuple[int, int], fitted: Fit, horizon:
             part = clean.part(a, b)
             model = trajectory(part.time, part.pump_rate, early.mu.value, early.tau.value, float(early.start_od[0]))
             late = clean.od[cut:b]
-            holdout, holdout_n = pmse(late, model[cut - a :]), int(np.isfinite(late).sum())
+            holdout_n = int((late > 0.0).sum())
+            holdout = pmse(late, model[cut - a :]) if holdout_n else None
     except NotIdentifiable:
         pass  # the early part alone says too little; the report then has no such number
     od, model = _predictions_outside(screened, window, fitted, horizon)
@@ -326,7 +326,7 @@ def _warnings(result: Calibration, limit: float) -> list[str]:
     found = []
     fitted, v = result.fit, result.validation
     for name, drift in (("mu", result.drift_mu), ("tau", result.drift_tau)):
-        if drift is not None and drift.significant and abs(drift.change_pct) >= 10.0:
+        if drift is not None and drift.significant and abs(drift.change_pct) >= NOTABLE_DRIFT_PCT:
             found.append(
                 f"{name} drifts along the recording: {drift.first:.3g} to {drift.last:.3g} "
                 f"({drift.change_pct:+.0f} % over {drift.segments} segments); the returned value belongs to the window"

@@ -282,7 +282,8 @@ def _turned_over(series: Series, inverse: tuple[float, float, float]) -> Paramet
     if low <= 0.0 or (high - low) / 2 > WIDEST_TAU * value:
         raise NotIdentifiable(
             f"rows {series.row[0]}-{series.row[-1]}: 1/tau = {value:.3g} with the 95 % interval {low:.3g} to "
-            f"{high:.3g}; allowed within +-{100 * WIDEST_TAU:.0f} %: these rows do not determine tau; use more dilution"
+            f"{high:.3g}; allowed within +-{100 * WIDEST_TAU:.0f} %: they do not determine tau: too little "
+            "dilution, too much noise, or a culture that drifts; choose other rows"
         )
     return Parameter(1.0 / value, 1.0 / high, 1.0 / low)
 

@@ -30,6 +30,7 @@ JUMP_SHARE = 0.1  # of the recording's 95th OD percentile; smaller steps carry n
 JUMP_ROWS = 5
 SHORT_ROWS = 10  # between two jumps; what is shorter is a burst, not a regime
 FROZEN_ROWS = 10
+MIN_LEFT = 10
 NOISY_FACTOR = 6.0
 GAP_MIN = 5.0  # and five times the usual spacing: what the pump did meanwhile is unknown
 
@@ -158,7 +159,7 @@ def screen(series: Series) -> Screened:
     A jump parts the recording into regimes; the one with most readings is kept, the others are rejected whole, and so
     is the last reading before a jump upwards, since one reading averages over several seconds. A gap only parts it.
 
-    Returns: see `Screened`. Raises: ValueError if no reading is left.
+    Returns: see `Screened`. Raises: ValueError if fewer than ten readings are left.
     """
     readings = np.isfinite(series.od)
     reasons: list[str] = []
@@ -170,16 +171,16 @@ def screen(series: Series) -> Screened:
         return series.rejecting(label >= 0)
 
     series = reject(_frozen(series.od), f"sensor frozen: the same OD {FROZEN_ROWS} times or more in a row")
+    _check_left(series)
     slow = _slow_log_od(series)
     deviation, expected = _deviation(series, slow)
     local = 1.4826 * _running(np.abs(deviation), NOISE_WINDOW)
-    overall = float(np.nanmedian(local)) if readings.any() else 0.0
+    overall = float(np.nanmedian(local))
     limit = np.maximum(OUTLIER_SD * np.maximum(local, 0.3 * overall), OUTLIER_SHARE * expected)
     series = reject(np.abs(deviation) > limit, f"outlier: more than {OUTLIER_SD:g} sd from its neighbours")
     noisy = local > np.maximum(NOISY_FACTOR * overall, 2 * OUTLIER_SHARE * expected)
     series = reject(noisy, f"sensor noisy: scatter over {NOISY_FACTOR:g} times that of the recording")
-    if not np.isfinite(series.od).any():
-        raise ValueError("no trustworthy reading is left: the sensor was frozen or erratic throughout")
+    _check_left(series)
     gaps = _gaps(series.time)
     slow = np.where(np.isfinite(series.od), slow, np.nan)
     jumps = [j for j in _jumps(series, slow) if j not in gaps]
@@ -193,6 +194,15 @@ def screen(series: Series) -> Screened:
     stretches = tuple((a, b) for a, b in pairwise(edges) if np.isfinite(series.od[a:b]).any())
     found = tuple(Rejection(r, series.row[label == k]) for k, r in enumerate(reasons) if (label == k).any())
     return Screened(series, stretches, found)
+
+
+def _check_left(series: Series) -> None:
+    left = int((series.od > 0.0).sum())
+    if left < MIN_LEFT:
+        raise ValueError(
+            f"{left} trustworthy readings above zero are left, at least {MIN_LEFT} are needed: the sensor was frozen, "
+            "dark or erratic throughout"
+        )
 
 
 def _frozen(od: Array) -> Mask:
@@ -241,12 +251,14 @@ def _foreign_regimes(series: Series, slow: Array, jumps: list[int]) -> Iterator[
     regimes = [[(a, b)] for a, b in zip([0, *jumps], [*jumps, len(series.od)], strict=True)]
     readings = [int(np.isfinite(series.od[r[0][0] : r[0][1]]).sum()) for r in regimes]
     bursts: list[tuple[int, int]] = []
-    for k in range(len(regimes) - 2, 0, -1):
+    k = len(regimes) - 2
+    while k > 0:
         before, (a, b), after = regimes[k - 1][-1], regimes[k][0], regimes[k + 1][0]
         if readings[k] < SHORT_ROWS and abs(_level(slow, before, last=True) - _level(slow, after)) < JUMP_LOG:
             bursts.append((a, b))
             regimes[k - 1 : k + 2] = [regimes[k - 1] + regimes[k + 1]]
             readings[k - 1 : k + 2] = [readings[k - 1] + readings[k + 1]]
+        k = min(k - 1, len(regimes) - 2)
     for a, b in bursts:
         yield a, b, "burst: jumps away from the trend and comes back"
     kept = int(np.argmax(readings))

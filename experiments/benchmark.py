@@ -103,7 +103,7 @@ def learned(config: BenchmarkConfig, wanted: set[str], figures: Figures) -> tupl
     found: dict[str, Policy] = {}
     told: dict[str, Any] = {}
     if config.policy is not None and "dqn" in wanted:
-        found["dqn"] = load_policy(config.policy, config.env.control_min)
+        found["dqn"] = load_policy(config.policy, config.env.control_min, config.env.max_pump_rate)
         told["dqn"] = {"policy": config.policy, "regret_pct": found["dqn"].metadata.get("regret_pct")}
     for name in sorted(wanted - set(found)):
         if name not in config.agents:

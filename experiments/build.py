@@ -7,42 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from envs.rewards import tracking_reward
 from envs.task import EnvConfig
 from experiments import seeding
 
 if TYPE_CHECKING:
     import torch
 
-    from dqn.agent import Relabel
     from dqn.config import DQNConfig
     from dqn.network import QNetwork
     from dqn.policy import Policy
-    from dqn.replay import Transition
     from dqn.trainer import Trainer
     from envs.plant import Plant
     from experiments.controllers.base import Controller
     from experiments.evaluation import Act
 
-__all__ = ["act_with", "controller", "goal_relabel", "trainer"]
-
-
-def goal_relabel(config: EnvConfig, device: str) -> Relabel:
-    """Replace the setpoint of a transition: (x, u, x') does not depend on it, so the transition stays true.
-
-    The new setpoint is one of the task's, uniformly; the reward is that of the new setpoint.
-    """
-    import torch
-
-    goals = torch.tensor(config.setpoints, dtype=torch.float32, device=device)
-
-    def relabel(batch: Transition, uniform: torch.Tensor) -> Transition:
-        goal = goals[(uniform[..., 0] * goals.numel()).long()]
-        before = torch.stack([batch.s_tm1[..., 0], goal], dim=-1)
-        after = torch.stack([batch.s_t[..., 0], goal], dim=-1)
-        return batch._replace(s_tm1=before, s_t=after, r_t=tracking_reward(batch.s_t[..., 0], goal))
-
-    return relabel
+__all__ = ["act_with", "controller", "trainer"]
 
 
 def trainer(env: EnvConfig, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu") -> Trainer:
@@ -50,11 +29,12 @@ def trainer(env: EnvConfig, agent: DQNConfig, seeds: Sequence[int], device: str 
     from dqn.agent import STREAMS, DQNAgent
     from dqn.trainer import Trainer
     from envs.vector_env import BioreactorVectorEnv
+    from experiments.hindsight import goal_relabel
 
     streams = seeding.streams(seeds, (*STREAMS, "env"))
     copies = BioreactorVectorEnv(len(seeds), env)
     copies.seed_streams(streams["env"])
-    learner = DQNAgent(agent, 2, env.n_actions, streams, goal_relabel(env, device), device)
+    learner = DQNAgent(agent, 2, env.n_actions, streams, goal_relabel(env, agent, device), device)
     return Trainer(copies, learner, interval=env.episode_steps)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from dqn.config import DQNConfig
@@ -10,9 +10,11 @@ from envs.plant import PlantConfig
 from envs.setpoints import Schedule
 from envs.task import EnvConfig
 from experiments.controllers.learned import LearnedConfig
+from hardware.chibio_config import ChiBioConfig, EmulatorConfig
+from hardware.safety_config import SafetyConfig
 from hardware.simulated import SimulatedConfig
 
-__all__ = ["DeployConfig", "TrainConfig", "controller_config", "deploy_schema"]
+__all__ = ["BACKENDS", "DeployConfig", "TrainConfig", "controller_config", "deploy_schema"]
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class TrainConfig:
                 raise ValueError(f"{key} = {value}: allowed {allowed}")
 
 
-BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig}
+BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig, "chibio": ChiBioConfig, "emulator": EmulatorConfig}
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,37 @@ class DeployConfig:
 
     backend: Any = field(default_factory=SimulatedConfig)  # one of BACKENDS
     plant: PlantConfig = field(default_factory=PlantConfig)  # of a simulated backend
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
     scenario: Schedule = field(default_factory=Schedule)
+    each: dict[str, Any] = field(default_factory=dict)  # reactor -> what differs from `scenario`, and its `role`
     controller: Any = field(default_factory=LearnedConfig)  # one of `controller_config`
     policy: str = "latest"  # of controller=dqn: a policy.npz, a run folder, or `latest`
     env_file: str | None = None  # a calibrated.yaml; its model becomes the simulated plant's
     fsync: bool = True  # every row on the disk before the next command
+    preflight_only: bool = False  # check the device and stop
+    resume: str | None = None  # a run folder to continue
+
+    def schedules(self) -> list[Schedule]:
+        """One schedule per reactor. Raises: ValueError naming reactor, key and what is allowed."""
+        unknown = [name for name in self.each if name not in self.backend.reactors]
+        if unknown:
+            raise ValueError(f"each.{unknown[0]}: no such reactor; allowed {', '.join(self.backend.reactors)}")
+        schedules = []
+        for name in self.backend.reactors:
+            own = {k: v for k, v in dict(self.each.get(name, {})).items() if k != "role"}
+            wrong = set(own) - {f.name for f in fields(Schedule)}
+            if wrong:
+                allowed = ", ".join([f.name for f in fields(Schedule)] + ["role"])
+                raise ValueError(f"each.{name}.{sorted(wrong)[0]}: no such key; allowed {allowed}")
+            try:
+                schedules.append(replace(self.scenario, **own))
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"each.{name}: {error}") from None
+        return schedules
+
+    def role(self, reactor: str) -> str:
+        """What a reactor is for, in words of the user."""
+        return str(self.each.get(reactor, {}).get("role", "replicate"))
 
 
 def controller_config(kind: str) -> Any:

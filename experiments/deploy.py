@@ -1,39 +1,32 @@
-"""Run a learned policy in closed loop and record it: `python -m experiments.deploy`."""
+"""Run a controller in closed loop and record everything: `python -m experiments.deploy`."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import replace
+import re
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
 from experiments import app
 from experiments.config import DeployConfig, deploy_schema
-from hardware.simulated import SimulatedConfig
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from dqn.policy import Policy
-    from envs.plant import PlantConfig
     from envs.setpoints import Schedule
-    from envs.task import EnvConfig
-    from experiments.loop import Step
-
-    Array = NDArray[np.float64]
+    from experiments.loop import ClosedLoop, Step
+    from experiments.record import Record
+    from hardware.reactor import Reactor
 
 log = logging.getLogger(__name__)
 
 POOR_REGRET_PCT = 25.0
-
-COLUMNS = (
-    "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
-    "temperature_degc", "guard",
-)  # fmt: skip
+METRICS = ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error")
 
 
 def find_policy(name: str, root: Path = Path("runs/train")) -> Path:
@@ -47,8 +40,8 @@ def find_policy(name: str, root: Path = Path("runs/train")) -> Path:
     return path / "policy.npz" if path.is_dir() else path
 
 
-def load_policy(name: str, control_min: float) -> Policy:
-    """The policy, checked against the backend. Raises: UserError naming both values of a mismatch."""
+def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
+    """The policy, checked against backend and safety. Raises: UserError naming both values of a mismatch."""
     from dqn import policy as policies
 
     path = find_policy(name)
@@ -57,10 +50,15 @@ def load_policy(name: str, control_min: float) -> Policy:
     except policies.PolicyError as error:
         raise app.UserError(str(error)) from None
     trained = float(policy.metadata.get("control_min", float("nan")))
-    if abs(trained - control_min) > 1e-9:
+    if not abs(trained - control_min) <= 1e-9:
         raise app.UserError(
             f"policy {path} was trained for a control period of {trained} min, the backend has {control_min} min; "
-            f"set backend.control_min={trained} or train with env.control_min={control_min}"
+            f"train with env.control_min={control_min}"
+        )
+    if policy.pump_rates.max() > max_rate + 1e-12:
+        raise app.UserError(
+            f"policy {path} pumps up to {policy.pump_rates.max()} mL/s, the interlock allows {max_rate} mL/s; "
+            "train with a smaller env.max_pump_rate or raise safety.max_rate"
         )
     regret = float(policy.metadata.get("regret_pct", float("nan")))
     log.info("policy %s: regret %.2f %% against the optimum of its model", path, regret)
@@ -69,200 +67,187 @@ def load_policy(name: str, control_min: float) -> Policy:
     return policy
 
 
-def plant_of(config: DeployConfig) -> PlantConfig:
-    """The simulated plant, carrying the calibrated model if one is given."""
-    plant = config.plant
-    if config.env_file is None:
-        return plant
-    from experiments.train import read_env_file
-
-    model = read_env_file(config.env_file)
-    gain = plant.vessel.volume_ml / (60.0 * model.tau)  # tau = V / (60 g)
-    growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
-    return replace(plant, growth=growth, pump=pump)
-
-
-def model_of(config: DeployConfig) -> EnvConfig:
-    """The growth model that model-based controllers are given: the calibrated one, else the nominal one."""
-    from envs.task import EnvConfig
-
-    model = EnvConfig()
-    if config.env_file is not None:
-        from experiments.train import read_env_file
-
-        model = read_env_file(config.env_file)
-    return replace(model, control_min=config.backend.control_min)
-
-
-class Record:
-    """What a run leaves behind: one CSV per reactor, TensorBoard events, and the arrays for figure and metrics.
-
-    Args:
-      folder: run folder. names: of the reactors. fsync: each row on the disk before `add` returns.
-    """
-
-    def __init__(self, folder: Path, names: Sequence[str], fsync: bool) -> None:
-        from experiments.writers import Events
-        from hardware.recording import Recorder
-
-        (folder / "recordings").mkdir(exist_ok=True)
-        self.names = tuple(names)
-        self._recorders = [Recorder(folder / "recordings" / f"{name}.csv", COLUMNS, fsync) for name in names]
-        self.events = Events(folder)
-        self.steps: list[Step] = []
-
-    def add(self, step: Step) -> None:
-        """One row per reactor that has a new sample."""
-        self.steps.append(step)
-        for n in step.rows.nonzero()[0]:
-            row: dict[str, float | int | str | bool | None] = {
-                "time_min": round(float(step.minute[n]), 4),
-                "elapsed_min": round(float(step.elapsed[n]), 4),
-                "phase": int(step.phase[n]),
-                "od": float(step.od[n]),
-                "setpoint": float(step.setpoint[n]),
-                "pump_rate_ml_s": float(step.rate[n]),
-                "proposed_ml_s": float(step.proposed[n]),
-                "volume_ml": float(step.volume_ml[n]),
-                "temperature_degc": round(float(step.temperature[n]), 3),
-                "guard": step.reasons[n] or "",
-            }
-            self._recorders[n].write(row)
-            minute = round(float(step.minute[n]))
-            curves = {"od": step.od, "setpoint": step.setpoint, "pump_rate_ml_s": step.rate}
-            for tag, value in {**curves, "temperature_degc": step.temperature, **step.explanation}.items():
-                self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
-
-    def series(self, field: str) -> Array:
-        """A field of all steps, nan where a reactor had no new sample, shape (N, K)."""
-        import numpy as np
-
-        values = np.array([np.where(step.rows, getattr(step, field), np.nan) for step in self.steps], dtype=np.float64)
-        return values.T
-
-    def close(self) -> None:
-        """Close all files. Idempotent."""
-        for recorder in self._recorders:
-            recorder.close()
-        self.events.close()
-
-
-def windows_of(record: Record, schedule: Schedule) -> list[dict[str, Any]]:
+def windows_of(record: Record, schedules: list[Schedule]) -> list[dict[str, Any]]:
     """Metrics of every phase and reactor, as in summary.json."""
     from experiments.metrics import window_metrics
 
-    elapsed, od = record.series("elapsed"), record.series("od")
+    elapsed, od = record.series("elapsed_min"), record.series("od")
     rows = []
-    for phase, setpoint in enumerate(schedule.setpoints):
-        start, end = float(schedule.edges[phase]), float(schedule.edges[phase + 1])
-        m = window_metrics(elapsed, od, setpoint, start, end)
-        for n, name in enumerate(record.names):
-            rows.append(
-                {
-                    "reactor": name,
-                    "phase": phase,
-                    "setpoint": setpoint,
-                    "temperature": schedule.temperatures[phase],
-                    **{
-                        key: float(getattr(m, key)[n])
-                        for key in ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error")
-                    },
-                }
-            )
+    for n, (name, schedule) in enumerate(zip(record.names, schedules, strict=True)):
+        for phase, setpoint in enumerate(schedule.setpoints):
+            start, end = float(schedule.edges[phase]), float(schedule.edges[phase + 1])
+            m = window_metrics(elapsed[n : n + 1], od[n : n + 1], setpoint, start, end)
+            window = {"reactor": name, "phase": phase, "setpoint": setpoint, "start_min": start, "end_min": end}
+            window["temperature"] = schedule.temperatures[phase]
+            rows.append({**window, **{key: float(getattr(m, key)[0]) for key in METRICS}})
     return rows
 
 
-def _finish(record: Record, schedule: Schedule, folder: Path, outcome: str, title: str) -> None:
+def _line(w: dict[str, Any]) -> str:
+    formats = ("8.4f", "8.2f", "8.5f", "8.3f", "8.1f", "8.4f")
+    cells = [f"{w[k]:{f}}" if w[k] == w[k] else f"{'–':>8}" for k, f in zip(METRICS, formats, strict=True)]
+    return f"{w['reactor']:8} {w['setpoint']:8.2f} " + " ".join(cells)
+
+
+def _finish(record: Record, config: DeployConfig, outcome: str) -> None:
     """Figure and summary.json, whatever the outcome."""
     import numpy as np
 
     from experiments import charts
 
-    volume = np.nansum(record.series("volume_ml"), axis=1)
-    minute = record.series("minute")
-    windows = windows_of(record, schedule)
-    switched = len(set(schedule.temperatures)) > 1
-    figure = charts.culture(
-        minute.T,
-        record.series("od").T,
-        np.where(record.series("phase") >= 0, record.series("setpoint"), np.nan).T,
-        record.series("rate").T,
-        record.names,
-        record.series("temperature").T if switched else None,
-        title,
-    )
+    schedules, folder = config.schedules(), record.folder
+    volume, minute = np.nansum(record.series("volume_ml"), axis=1), record.series("time_min")
+    setpoint = np.where(record.series("phase") >= 0, record.series("setpoint"), np.nan)
+    switched = any(len(set(s.temperatures)) > 1 for s in schedules)
+    temperature = record.series("temperature_degc").T if switched else None
+    series = (minute.T, record.series("od").T, setpoint.T, record.series("pump_rate_ml_s").T)
+    figure = charts.culture(*series, record.names, temperature, f"{config.backend.kind}: {outcome}")
     path = charts.save(figure, folder / "figures", "closed_loop")
-    record.events.figure("figures/closed_loop", figure, len(record.steps))
+    record.events.figure("figures/closed_loop", figure, minute.shape[1])
+    windows = windows_of(record, schedules)
+    reactors = {
+        name: {
+            "role": config.role(name),
+            "volume_ml": float(v),
+            "rows": len(rows),
+            "interlock": sum(bool(row["interlock"]) for row in rows),
+        }
+        for name, v, rows in zip(record.names, volume, record.rows, strict=True)
+    }
     summary = {
         "outcome": outcome,
-        "minutes": float(np.nanmax(minute)) if minute.size else 0.0,
+        "minutes": float(np.nanmax(minute)) if np.isfinite(minute).any() else 0.0,
         "windows": windows,
         "volume_ml": float(volume.sum()),
-        "reactors": {name: {"volume_ml": float(v)} for name, v in zip(record.names, volume, strict=True)},
+        "reactors": reactors,
+        "repairs": record.repairs,
         "figure": str(path),
     }
     app.write_json(folder / "summary.json", summary)
     log.info("%s after %.0f min, %.1f mL of fresh medium", outcome, summary["minutes"], summary["volume_ml"])
-    header = (
-        f"{'reactor':8} {'setpoint':>8} {'ISE':>8} {'ITAE':>8} {'ISE/T':>8} {'ITAE/T':>8} {'settled':>8} {'steady':>8}"
+    heads = ("reactor", "setpoint", "ISE", "ITAE", "ISE/T", "ITAE/T", "settled", "steady")
+    header = f"{heads[0]:8} " + " ".join(f"{h:>8}" for h in heads[1:])
+    lines = "\n".join(_line(w) for w in windows)
+    log.info(
+        "ISE, ITAE with T = 1 min; /T with T = window; settled: min until |e| stays within 5 %%\n%s\n%s", header, lines
     )
-    log.info("windows (ISE, ITAE: T = 1 min; /T: T = window; settled: min until |e| stays within 5 %%)\n%s\n%s",
-             header, "\n".join(_line(w) for w in windows))  # fmt: skip
     log.info("recordings %s; figure %s; tensorboard --logdir %s", folder / "recordings", path, folder)
 
 
-def _line(w: dict[str, Any]) -> str:
-    numbers = [w["ise"], w["itae"], w["ise_mean"], w["itae_mean"], w["settling_min"], w["steady_abs_error"]]
-    formats = ("8.4f", "8.2f", "8.5f", "8.3f", "8.1f", "8.4f")
-    return f"{w['reactor']:8} {w['setpoint']:8.2f} " + " ".join(
-        f"{n:{f}}" if n == n else f"{'never':>8}" for n, f in zip(numbers, formats, strict=True)
-    )
+@contextmanager
+def terminated_as_interrupt() -> Iterator[None]:
+    """SIGTERM (a service manager, a shutting-down PC) ends the run like Ctrl-C: pumps off, files closed."""
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
-def deploy(config: DeployConfig, folder: Path) -> None:
-    """One closed loop over the scenario."""
-    import numpy as np
+class Announcer:
+    """Tells what changes, once: phases, words of the interlock, notes of the reactors."""
+
+    def __init__(self, loop: ClosedLoop) -> None:
+        self._names = loop.reactors.names
+        self._phase = [-2] * len(self._names)
+        self._reason: list[str | None] = [None] * len(self._names)
+        self._told: set[str] = set()
+
+    def __call__(self, step: Step) -> None:
+        """Log what is new in this step."""
+        for n, name in enumerate(self._names):
+            if step.rows[n] and int(step.phase[n]) != self._phase[n]:
+                self._phase[n] = int(step.phase[n])
+                what = "recovery" if self._phase[n] < 0 else f"setpoint {step.setpoint[n]:g}"
+                log.info("%s: %s from minute %.0f, OD %.3f", name, what, step.minute[n], step.od[n])
+            kinds = (step.reasons[n] or "").split(":")[0]
+            if kinds != (self._reason[n] or ""):
+                self._reason[n] = kinds
+                log.warning("%s: %s", name, step.reasons[n] or "interlock: all well again")
+        for note in step.notes:
+            kind = re.sub(r"[\d.]+", "#", note)
+            if kind not in self._told:  # the journal has every one of them
+                self._told.add(kind)
+                log.info("%s (noted once here, every time in the journal)", note)
+
+
+def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConfig) -> str:
+    """The loop until its end or trouble; returns the outcome. Pumps are verified off, whatever happens."""
     from tqdm import tqdm
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    from envs.plant import Plant
-    from experiments import build
-    from experiments.loop import ClosedLoop, RateLimit
     from hardware.errors import ReactorError
-    from hardware.simulated import SimulatedReactors
 
-    backend: SimulatedConfig = config.backend
-    plant = Plant(plant_of(config), len(backend.reactors), np.random.default_rng(backend.seed))
-    kind = config.controller.kind
-    policy = load_policy(config.policy, backend.control_min) if kind == "dqn" else None
-    model = model_of(config)
-    controller = build.controller(config.controller, model, policy, plant, backend.pump_ml_s)
-    limit = model.max_pump_rate if policy is None else float(policy.pump_rates[-1])
-    reactors = SimulatedReactors(plant, backend)
-    loop = ClosedLoop(reactors, controller, RateLimit(limit), config.scenario)
-    record = Record(folder, reactors.names, config.fsync)
-    outcome = "failed"
+    announce = Announcer(loop)
+    outcome = "failed: see the log"
     try:
-        with logging_redirect_tqdm(), tqdm(disable=None, unit="min") as bar:
-            phase = np.full(len(reactors.names), -2)
+        with logging_redirect_tqdm(), tqdm(disable=None, unit="sample") as bar:
             for step in loop.run():
-                record.add(step)
-                bar.update()
-                for n in np.flatnonzero(step.rows & (step.phase != phase)):
-                    what = "recovery" if step.phase[n] < 0 else f"setpoint {step.setpoint[n]:g}"
-                    log.info("%s: %s from minute %.0f, OD %.3f", reactors.names[n], what, step.minute[n], step.od[n])
-                phase = np.where(step.rows, step.phase, phase)
-        outcome = "completed"
+                record.done(step, loop.state_dict())
+                announce(step)
+                bar.update(int(step.rows.sum()))
+        given_up = [name for name, s in zip(reactors.names, loop.stopped, strict=True) if s]
+        outcome = f"stopped by the interlock: {', '.join(given_up)}" if given_up else "completed"
     except KeyboardInterrupt:
         outcome = "stopped by the operator"
     except ReactorError as error:
         outcome = f"failed: {error}"
+    finally:
+        try:
+            reactors.stop()
+            log.info("pumps verified off")
+        except ReactorError as error:
+            outcome = f"failed: {error}"
+    return outcome
+
+
+def deploy(config: DeployConfig, folder: Path) -> None:
+    """One closed loop over the scenario."""
+    from experiments import backends
+    from experiments.loop import ClosedLoop
+    from experiments.record import Record
+    from hardware.errors import ReactorError
+    from hardware.safety import Interlock
+
+    backend = config.backend
+    try:
+        schedules = config.schedules()
+    except ValueError as error:
+        raise app.UserError(str(error)) from None
+    if config.resume is not None and backend.kind == "sim":
+        raise app.UserError(f"resume={config.resume}: a simulated run takes a second; run it again")
+    plant, model = backends.plant_of(config), backends.model_of(config)
+    policy = None
+    if config.controller.kind == "dqn":
+        policy = load_policy(config.policy, backend.control_min, config.safety.max_rate)
+    record = None
+    try:
+        if config.preflight_only:
+            backends.run_preflight(config, folder)
+            return
+        with terminated_as_interrupt():
+            record = Record(folder, backend.reactors, config.fsync)
+            for repair in record.repairs:
+                log.warning("%s", repair)
+            with backends.opened(config, plant, record) as reactors:
+                controller = backends.controller_of(config, model, policy, reactors)
+                interlock = Interlock(len(backend.reactors), config.safety)
+                loop = ClosedLoop(reactors, controller, interlock, schedules, record.decided)
+                if config.resume is not None:
+                    backends.continue_loop(loop, record)
+                outcome = _run(loop, record, reactors, config)
+            _finish(record, config, outcome)
+    except ReactorError as error:
         raise app.UserError(str(error)) from None
     finally:
-        reactors.stop()
-        if record.steps:
-            _finish(record, config.scenario, folder, outcome, f"{backend.kind}, controller {kind}")
-        record.close()
+        if record is not None:
+            record.close()
+    if outcome.startswith("failed"):
+        raise app.UserError(outcome)
 
 
 def _schema(cfg: DictConfig) -> DeployConfig:

@@ -1,79 +1,38 @@
-"""The closed loop, the same for simulation, emulator and bench: measure, decide, guard, actuate, record.
+"""The closed loop, the same for simulation, emulator and bench: measure, decide, guard, actuate.
 
 It is a generator of what happened; clocks and wires are the reactors', files and screens are the caller's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.setpoints import Schedule
 from experiments.controllers.base import Array, Controller, Explains, Mask
-from hardware.reactor import Command, Measurement, Reactor, Receipt
+from hardware.reactor import Command, Reactor
+from hardware.safety import Interlock, Verdict
+from hardware.safety_config import Response
 
-__all__ = ["ClosedLoop", "Guard", "RateLimit", "Step", "Verdict"]
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What the guard allows.
-
-    rate: mL/s, shape (N,). reasons: why it differs from what was proposed, or None; N entries.
-    """
-
-    rate: Array
-    reasons: tuple[str | None, ...]
-
-
-class Guard(Protocol):
-    """Stands between every controller and every pump."""
-
-    def check(self, measurement: Measurement, setpoint: Array, proposed: Array) -> Verdict:
-        """The allowed pump rates. Raises: SafetyTrip where the run must end."""
-        ...
-
-    def confirm(self, receipt: Receipt) -> None:
-        """Account for what was really dosed."""
-        ...
-
-
-class RateLimit:
-    """The smallest guard: rates within [0, maximum], nothing on a reading that is no number.
-
-    Args: maximum: mL/s.
-    """
-
-    def __init__(self, maximum: float) -> None:
-        self.maximum = maximum
-
-    def check(self, measurement: Measurement, setpoint: Array, proposed: Array) -> Verdict:
-        """Clamp, and say so. Raises: nothing."""
-        rate = np.where(np.isfinite(measurement.od) & np.isfinite(proposed), np.clip(proposed, 0.0, self.maximum), 0.0)
-        changed = rate != proposed
-        reasons = tuple(
-            f"pump rate {p:.4f} mL/s limited to {r:.4f}" if c else None
-            for p, r, c in zip(proposed, rate, changed, strict=True)
-        )
-        return Verdict(rate, reasons)
-
-    def confirm(self, receipt: Receipt) -> None:
-        """Nothing to account for."""
+__all__ = ["ClosedLoop", "Step"]
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One pass through the loop; arrays (N,), to be read where `rows` is True.
+    """One pass through the loop; arrays (N,).
 
-    minute: when the OD was measured, since the run began. elapsed: since the schedule began, nan in recovery.
-    phase: of the schedule, -1 in recovery. proposed and rate: before and after the guard, mL/s.
-    volume_ml: asked of the pump. reasons: of the guard. explanation: of the controller. done: schedule over.
+    rows: reactors with a new sample, for which the rest is to be read. now_s: run time, s.
+    minute: when the OD was measured, min since the run began. elapsed: since the schedule began, nan in recovery.
+    phase: of the schedule, -1 in recovery. proposed, rate: before and after the interlock, mL/s.
+    volume_ml: asked of the pump; known only after the dose was begun. reasons: of the interlock, for all reactors.
+    response: of the interlock. notes: of the reactors. explanation: of the controller. done: schedule over.
     """
 
+    now_s: float
     rows: Mask
     minute: Array
     elapsed: Array
@@ -84,65 +43,130 @@ class Step:
     proposed: Array
     rate: Array
     volume_ml: Array
-    reasons: tuple[str | None, ...]
+    reasons: Sequence[str | None]
+    response: NDArray[np.int64]
+    notes: Sequence[str]
     explanation: dict[str, Array]
     done: Mask
 
 
-@dataclass
 class ClosedLoop:
-    """Controller x guard x reactors over a schedule, for N reactors that may be sampled at different moments.
+    """Controller x interlock x reactors over one schedule per reactor; reactors may be sampled at different moments.
 
-    Each reactor first recovers (grows undiluted until `schedule.recovery_od`), then runs the schedule on its own time.
+    Each reactor first recovers (grows undiluted until `recovery_od`), then runs its schedule on its own time.
+
+    Args:
+      reactors: N reactors. controller: decides. interlock: of N reactors.
+      schedules: one per reactor, or one for all.
+      before_dose: called with the step as decided, before anything is dosed (volume_ml still nan): the journal.
+    Raises: ValueError for another number of schedules than of reactors.
     """
 
-    reactors: Reactor
-    controller: Controller
-    guard: Guard
-    schedule: Schedule
-    began: Array = field(init=False)  # minute at which each reactor's schedule began; nan while it recovers
-    done: Mask = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Start everywhere in recovery."""
-        n = len(self.reactors.names)
-        self.began = np.full(n, np.nan)
+    def __init__(
+        self,
+        reactors: Reactor,
+        controller: Controller,
+        interlock: Interlock,
+        schedules: Sequence[Schedule] | Schedule,
+        before_dose: Callable[[Step], None] | None = None,
+    ) -> None:
+        n = len(reactors.names)
+        self.reactors, self.controller, self.interlock = reactors, controller, interlock
+        self.schedules = [schedules] * n if isinstance(schedules, Schedule) else list(schedules)
+        if len(self.schedules) != n:
+            raise ValueError(f"{len(self.schedules)} schedules: allowed one for each of the {n} reactors")
+        self._before_dose = before_dose
+        self._recovery_od = np.array([s.recovery_od for s in self.schedules])
+        self._recovery_limit = np.array([s.recovery_limit_min for s in self.schedules])
+        self._total = np.array([s.total_min for s in self.schedules])
+        self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
         self.done = np.zeros(n, dtype=np.bool_)
-        self.controller.reset(n)
+        self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
+        self._handed_over = np.zeros(n, dtype=np.bool_)
+        controller.reset(n)
 
     def run(self) -> Iterator[Step]:
-        """Go on until every reactor's schedule is over. Raises: ReactorError."""
-        while not self.done.all():
+        """Go on until every reactor's schedule is over or was stopped. Raises: ReactorError."""
+        while not (self.done | self.stopped).all():
             yield self.step()
 
+    def _asked(self, elapsed: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """Phase, setpoint and temperature of each reactor, each (N,)."""
+        first = self.schedules[0]
+        if all(s is first for s in self.schedules):
+            return (first.phase(elapsed), *first.at(elapsed))
+        phase = np.array([int(s.phase(elapsed[i : i + 1])[0]) for i, s in enumerate(self.schedules)])
+        pairs = [s.at(elapsed[i : i + 1]) for i, s in enumerate(self.schedules)]
+        return phase, np.array([p[0][0] for p in pairs]), np.array([p[1][0] for p in pairs])
+
     def step(self) -> Step:
-        """One measurement of at least one reactor, and the commands that follow from it."""
+        """Wait for a sample of at least one reactor (or for trouble), and act on it."""
         m = self.reactors.measure()
-        rows = m.fresh & ~self.done
+        now = self.reactors.elapsed()
+        rows = m.fresh & ~self.done & ~self.stopped
         minute = m.time_s / 60.0
-        recovered = (m.od >= self.schedule.recovery_od) | (minute >= self.schedule.recovery_limit_min)
+        recovered = (m.od >= self._recovery_od) | (minute >= self._recovery_limit)
         self.began = np.where(rows & np.isnan(self.began) & recovered, minute, self.began)
         elapsed = minute - self.began
-        phase = self.schedule.phase(elapsed)
-        setpoint, temperature = self.schedule.at(elapsed)
-        self.done = self.done | (rows & (elapsed >= self.schedule.total_min - 1e-6))
+        phase, setpoint, temperature = self._asked(elapsed)
+        self.done = self.done | (rows & (elapsed >= self._total - 1e-6))
 
         decided = self.controller.act(m.od, setpoint, minute, rows & (phase >= 0))
         proposed = np.where((phase >= 0) & ~self.done, decided, 0.0)
-        verdict = self.guard.check(m, setpoint, proposed)
-        receipt = self.reactors.actuate(Command(rows, verdict.rate, temperature))
-        self.guard.confirm(receipt)
+        verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
         explanation = self.controller.explain() if isinstance(self.controller, Explains) else {}
-        return Step(
-            rows, minute, elapsed, phase, m.od, m.temperature, setpoint, proposed, verdict.rate, receipt.volume_ml,
-            verdict.reasons, explanation, self.done.copy(),
-        )  # fmt: skip
+
+        def told(volume_ml: Array, notes: Sequence[str]) -> Step:
+            return Step(
+                now, rows, minute, elapsed, phase, m.od, m.temperature, setpoint, proposed, verdict.rate, volume_ml,
+                verdict.reasons, verdict.response, notes, explanation, self.done.copy(),
+            )  # fmt: skip
+
+        if self._before_dose is not None:
+            self._before_dose(told(np.full(len(self.done), np.nan), ()))
+        failures = self._respond(verdict)
+        heat = np.where(verdict.heat_off, np.nan, temperature)
+        receipt = self.reactors.actuate(Command(rows, verdict.rate, heat))
+        self.interlock.confirm(receipt, now)
+        return told(receipt.volume_ml, (*failures, *receipt.notes))
+
+    def _respond(self, verdict: Verdict) -> list[str]:
+        """Carry out what the interlock demands beyond not dosing; returns what failed (it is tried again next time)."""
+        failed: list[str] = []
+        off = verdict.response == Response.PUMPS_OFF
+        stop = (verdict.response == Response.STOP) & ~self.stopped
+        if (off | stop).any():
+            failed += self.reactors.pumps_off(off | stop)
+            self.stopped = self.stopped | (stop & ~self._named(failed))
+        regulate = (verdict.response == Response.REGULATE) & ~self._handed_over
+        if regulate.any():
+            trouble = self.reactors.regulate(regulate, verdict.setpoint)
+            self._handed_over = self._handed_over | (regulate & ~self._named(trouble))
+            failed += trouble
+        if verdict.heat_off.any():
+            failed += self.reactors.heat_off(verdict.heat_off)
+        return failed
+
+    def _named(self, failures: Sequence[str]) -> Mask:
+        """Reactors that a list of failures speaks of."""
+        return np.array([any(line.startswith(f"{name}:") for line in failures) for name in self.reactors.names])
 
     def state_dict(self) -> dict[str, Any]:
-        """Where each reactor's schedule stands; plain numbers."""
-        return {"began": self.began.tolist(), "done": self.done.tolist()}
+        """Where each reactor's schedule and the interlock stand; plain numbers and lists."""
+        return {
+            "began": self.began.tolist(),
+            "done": self.done.tolist(),
+            "stopped": self.stopped.tolist(),
+            "handed_over": self._handed_over.tolist(),
+            "interlock": self.interlock.state(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue as saved."""
-        self.began[:] = state["began"]
-        self.done[:] = state["done"]
+        """Continue as saved; None stands for nan. Raises: ValueError for another number of reactors."""
+        if len(state["began"]) != len(self.done):
+            raise ValueError(f"saved loop is for {len(state['began'])} reactors, this run has {len(self.done)}")
+        self.began = np.array(state["began"], dtype=np.float64)
+        self.done = np.array(state["done"], dtype=np.bool_)
+        self.stopped = np.array(state["stopped"], dtype=np.bool_)
+        self._handed_over = np.array(state["handed_over"], dtype=np.bool_)
+        self.interlock.restore(state["interlock"])

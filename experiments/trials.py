@@ -14,8 +14,10 @@ from envs.plant import Plant, PlantConfig
 from envs.setpoints import Schedule
 from envs.task import EnvConfig
 from experiments.controllers.base import Controller
-from experiments.loop import ClosedLoop, RateLimit
+from experiments.loop import ClosedLoop
 from experiments.metrics import WindowMetrics, window_metrics
+from hardware.safety import Interlock
+from hardware.safety_config import SafetyConfig
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 
 __all__ = ["Trial", "Window", "run_trial", "windows"]
@@ -110,11 +112,14 @@ def run_trial(
 
     Args:
       names: of controller, plant and scenario. make: builds the controller for a plant.
-      model: control period and largest pump rate; the guard's limit.
+      model: control period and largest pump rate; the interlock's limit.
     """
     plant = Plant(plant_config, replicates, np.random.default_rng(seed))
     backend = SimulatedConfig(reactors=tuple(f"M{i}" for i in range(replicates)), control_min=model.control_min)
-    loop = ClosedLoop(SimulatedReactors(plant, backend), make(plant), RateLimit(model.max_pump_rate), schedule)
+    # a sensor without noise repeats itself exactly at a steady state, which on a bench means that it is dead
+    patience = SafetyConfig().frozen_samples if plant_config.sensor.noise_floor > 0.0 else 60
+    safety = SafetyConfig(max_rate=model.max_pump_rate, frozen_samples=patience)
+    loop = ClosedLoop(SimulatedReactors(plant, backend), make(plant), Interlock(replicates, safety), schedule)
     minute = np.arange(0.0, schedule.total_min + 1e-6, model.control_min)
     fields = ("od", "clean", "rate", "temperature", "media_ml")
     stored: dict[str, Any] = {key: np.full((replicates, minute.size), np.nan) for key in fields}

@@ -42,7 +42,7 @@ this request.
 
 GET /getSysdata/ is reduced to the fields that a client needs (under 1 KB): the same JSON with fewer keys; `record`
 lists hold their last value only, and "_records" {"time": n, "OD": n, "ThermometerIR": n} holds their lengths, which
-differ for an instant while the device appends; "Terminal.text" is cut to its newest 160 characters. RAW gives it whole.
+differ for an instant while the device appends; "Terminal.text" is cut to its newest 80 characters. RAW gives it whole.
 
 Dead man
 --------
@@ -91,8 +91,8 @@ DEVICE_METHODS = ("GET", "POST", "RAW")
 AGENT_METHODS = ("HELLO", "PING", "BYE")
 PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")
 PROBE_TIMEOUT_S = 40.0  # longer than the 30 s after which the device's server kills a hung worker
-RETRY_S = 5.0  # between passes of the dead-man switch that could not be verified
-WRITE_TIMEOUT_S = 5.0
+RETRY_S = (2.0, 60.0)  # first and longest pause between passes of the dead-man switch that were not verified
+WRITE_TIMEOUT_S = 5.0  # without a byte leaving
 BACKOFF_S = (0.2, 5.0)  # first and longest pause before the line is opened again
 
 log = logging.getLogger("board_agent")
@@ -146,7 +146,6 @@ KEPT = {
     "Heat": ("ON", "target"),
     "Thermostat": ("ON", "target"),
     "ThermometerIR": ("current", "record"),
-    "ThermometerExternal": ("current",),
     "Volume": ("target",),
     "Zigzag": ("ON",),
     "Custom": ("ON",),
@@ -175,7 +174,7 @@ def reduce_sysdata(body: bytes) -> bytes:
         small["_records"] = lengths
         if "Terminal" in small and "text" in small["Terminal"]:
             text = small["Terminal"]["text"]
-            small["Terminal"]["text"] = text[:160] if isinstance(text, str) else text[:2]
+            small["Terminal"]["text"] = text[:80] if isinstance(text, str) else text[:2]
         return json.dumps(small, separators=(",", ":")).encode("utf-8")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return body
@@ -323,6 +322,7 @@ class Agent:
         self.last_trip = time.strftime("%Y-%m-%dT%H:%M:%S")
         self._memory = None
         log.warning("no valid request for %.0f s: switching all pumps off", self.deadman_s)
+        pause = RETRY_S[0]
         while not self._stop.is_set():
             problems = self.sweep(beats)
             if self._beats != beats:
@@ -332,8 +332,9 @@ class Agent:
                 log.warning("pumps verified off")
                 self._settled = True
                 return
-            log.error("not verified: %s; next try in %.0f s", "; ".join(problems), RETRY_S)
-            self._stop.wait(RETRY_S)
+            log.error("not verified: %s; next try in %.0f s", "; ".join(problems), pause)
+            self._stop.wait(pause)
+            pause = min(2.0 * pause, RETRY_S[1])
 
     def sweep(self, beats: int) -> list[str]:
         """One pass over all present reactors; what could not be verified. Ends early when `beats` is outdated."""
@@ -463,10 +464,8 @@ class SerialPort:
 
     def _write(self, descriptor: int, data: bytes) -> None:
         """Send, or give up when nobody reads: a full line must not stop the agent."""
-        deadline = time.monotonic() + WRITE_TIMEOUT_S + len(data) / 2000.0
         while data:
-            left = deadline - time.monotonic()
-            if left <= 0.0 or not select.select([], [descriptor], [], left)[1]:
+            if not select.select([], [descriptor], [], WRITE_TIMEOUT_S)[1]:
                 termios.tcflush(descriptor, termios.TCOFLUSH)
                 log.warning("%s: nobody reads, reply dropped", self._path)
                 return
@@ -565,7 +564,7 @@ def main(argv: list[str] | None = None) -> int:
         port = SerialPort(arguments.tty, arguments.baud, agent) if arguments.tty else None
         if arguments.http:
             host, _, number = arguments.http.rpartition(":")
-            if not number.isdigit():
+            if not host or not number.isdigit():
                 raise ValueError(f"http = {arguments.http}: allowed ADDRESS:PORT, e.g. 192.168.7.2:5001")
             proxy = Proxy((host, int(number)), agent)
     except (ValueError, OSError, OverflowError) as problem:

@@ -55,6 +55,7 @@ class ChiBioReactors:
         if len(rigs) != len(config.reactors):
             raise ValueError(f"calibrations for {len(rigs)} reactors, reactors = {list(config.reactors)}")
         self.config = config
+        self._transport = transport
         self._clock = clock
         self._log = log
         self._log_error: Exception | None = None
@@ -219,6 +220,7 @@ class ChiBioReactors:
         if pending:
             reasons = "; ".join(f"{s.name}: {errors[s.name]}" for s in pending)
             raise DeviceStateError(f"pumps not verified off: {reasons}. Switch the pump boards off by hand now")
+        self._transport.disarm()
 
     @staticmethod
     def _silence(station: Station, errors: dict[str, ReactorError]) -> bool:

@@ -8,13 +8,14 @@ from hardware.pumps import DosingConfig
 from hardware.transport import TransportConfig
 from hardware.wire import POSITIONS
 
-__all__ = ["ChiBioConfig"]
+__all__ = ["ChiBioConfig", "EmulatorConfig"]
 
 
 @dataclass(frozen=True)
 class ChiBioConfig:
     """How to reach a Chi.Bio, which reactors to run and how.
 
+    kind: which backend these values are for.
     url, speed: the device's address; device seconds per real second (1 on the bench, more for a fast emulator).
     reactors: positions to run, M0 to M7.
     transport: the link.
@@ -33,9 +34,10 @@ class ChiBioConfig:
     Raises: ValueError naming key, value and allowed range.
     """
 
+    kind: str = "chibio"
     url: str = "http://192.168.7.2:5000"
     speed: float = 1.0
-    reactors: list[str] = field(default_factory=lambda: ["M0"])
+    reactors: tuple[str, ...] = ("M0",)
     transport: TransportConfig = field(default_factory=TransportConfig)
     calibration: str = "calibration"
     temperature: float = 37.0
@@ -69,5 +71,35 @@ class ChiBioConfig:
         for key, (low, high) in ranges.items():
             if not low <= getattr(self, key) <= high:
                 raise ValueError(f"backend.{key} = {getattr(self, key)}: allowed {low:g} to {high:g}")
+        if abs(self.dosing.period_s - 60.0) > 1e-9:
+            raise ValueError(
+                f"backend.dosing.period_s = {self.dosing.period_s}: allowed 60 (the device measures so often)"
+            )
         if self.lost_s <= self.stale_s:
             raise ValueError(f"backend.lost_s = {self.lost_s} s: allowed more than stale_s = {self.stale_s} s")
+
+    @property
+    def control_min(self) -> float:
+        """Control period, min; a policy must have been trained for the same one."""
+        return self.dosing.period_s / 60.0
+
+
+@dataclass(frozen=True)
+class EmulatorConfig(ChiBioConfig):
+    """`backend=emulator`: the same driver against an emulator that the run starts by itself; `url` is then ignored.
+
+    od, plant, seed: of the emulated cultures, see `python -m hardware.emulator --help`.
+    """
+
+    kind: str = "emulator"
+    speed: float = 60.0
+    od: float = 0.3
+    plant: str = "healthy"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.plant not in ("healthy", "bench"):
+            raise ValueError(f"backend.plant = {self.plant}: allowed healthy, bench")
+        if not 0.0 <= self.od <= 4.0 or self.seed < 0:
+            raise ValueError(f"backend.od = {self.od}, seed = {self.seed}: allowed 0 to 4, and at least 0")

@@ -256,7 +256,10 @@ def parser() -> argparse.ArgumentParser:
 
 def build(arguments: argparse.Namespace) -> ChiBioDevice:
     """The device the arguments describe. Raises: ValueError."""
-    ods = [float(x) for x in arguments.od.split(",")]
+    try:
+        ods = [float(x) for x in arguments.od.split(",")]
+    except ValueError:
+        raise ValueError(f"od = {arguments.od}: allowed a number, or one per reactor, e.g. 0.3,0.4") from None
     return ChiBioDevice(
         tuple(arguments.reactors.split(",")),
         RealClock(arguments.speed),
@@ -275,11 +278,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     if control is None:
         control = arguments.port + 1 if arguments.port else 0
     try:
+        for key, port in (("port", arguments.port), ("control-port", control)):
+            if not 0 <= port <= 65535:
+                raise ValueError(f"{key} = {port}: allowed 0 to 65535; choose another")
         server = EmulatorServer(build(arguments), arguments.host, arguments.port, control)
-    except (OSError, OverflowError, ValueError) as problem:
-        reason = getattr(problem, "strerror", None) or str(problem)
-        where = f"{arguments.host}:{arguments.port}: " if isinstance(problem, (OSError, OverflowError)) else ""
-        print(f"emulator: {where}{reason}; choose another or end what uses it" if where else f"emulator: {reason}")
+    except OSError as problem:
+        where = f"{arguments.host}:{arguments.port}"
+        print(f"emulator: {where}: {problem.strerror or problem}; choose another or end what uses it")
+        return 2
+    except ValueError as problem:
+        print(f"emulator: {problem}")
         return 2
 
     def end(number: int, frame: FrameType | None) -> None:

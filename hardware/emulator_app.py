@@ -22,6 +22,7 @@ from hardware.emulator_state import (
     fresh_sysdata,
     thin_records,
 )
+from hardware.emulator_turbidostat import AppError, feed_duty, zigzag
 
 __all__ = ["AppError", "Board", "BusStuck", "ProcessDied", "ReactorApp", "Steps"]
 
@@ -37,10 +38,6 @@ PUMP_START_S = 0.05  # thread start and first writes
 CYCLE_EXTRA_S = 0.05  # what a cycle's bookkeeping adds to its 60 s
 FILE_DUMP_S = 0.2  # writing the whole state; startTimeRaw reads 0 meanwhile
 FEED_CAP = 0.02  # the on-board regulator's own limit
-
-
-class AppError(Exception):
-    """An exception inside the device's software: a route answers 500, a thread ends."""
 
 
 class BusStuck(Exception):
@@ -76,6 +73,10 @@ class Board(Protocol):
 
     def bus(self, name: str) -> None:
         """One access to a chip of a reactor. Raises: BusStuck, ProcessDied."""
+        ...
+
+    def write_row(self, name: str) -> None:
+        """One line of a data file, under the bus lock. Raises: BusStuck."""
         ...
 
     def uniform(self, low: float, high: float) -> float:
@@ -396,7 +397,7 @@ class ReactorApp:
             clear_terminal(data, self.board.stamp())
         append_records(data, started)
         thin_records(data)
-        self.board.bus(self.name)  # the row is written under the bus lock
+        self.board.write_row(self.name)
         if experiment["cycles"] % 10 == 1:
             raw, experiment["startTimeRaw"] = experiment["startTimeRaw"], 0
             yield FILE_DUMP_S
@@ -406,10 +407,12 @@ class ReactorApp:
         """`RegulateOD`: the on-board turbidostat (chibio.md section 6)."""
         data, od, cycles = self.data, self.data["OD"], self.data["Experiment"]["cycles"]
         restore = od["target"]
-        zigzag = data["Zigzag"]["ON"] == 1
-        if zigzag:
-            self._zigzag()
-        feed = 0.0 if cycles < 3 or len(data["time"]["record"]) < 2 else self._law()
+        if data["Volume"]["target"] == 0:
+            raise AppError("division by a volume of 0")
+        swinging = data["Zigzag"]["ON"] == 1
+        if swinging:
+            zigzag(data)
+        feed = 0.0 if cycles < 3 or len(data["time"]["record"]) < 2 else feed_duty(data)
         feed = min(max(feed, 0.0), FEED_CAP)
         if data["Chemostat"]["ON"] == 1:
             feed = float(data["Chemostat"]["p1"])
@@ -421,47 +424,5 @@ class ReactorApp:
             data["Pump1"]["target"] = data["Pump2"]["target"] = 0.0
         yield from self.set_on("Pump1", 1)
         yield from self.set_on("Pump2", 1)
-        if zigzag:
+        if swinging:
             od["target"] = restore
-
-    def _law(self) -> float:
-        """Feed duty before clipping: proportional to ln(x / r) per minute, two integrators, noise guard."""
-        od, times = self.data["OD"], self.data["time"]["record"]
-        now, before = od["current"], od["record"][-1]
-        target = od["target"] if od["target"] > 0 else 1e-6
-        minutes = (times[-1] - times[-2]) / 60.0
-        volume = self.data["Volume"]["target"]
-        if volume == 0:
-            raise AppError("division by a volume of 0")
-        growth = math.log(now / target) / minutes if now > 0 and minutes != 0 else 0.0
-        feed = growth / (240.0 / volume)
-        error, change = now - target, now - before
-        if error < 0.01:
-            od["Integral"] = 0
-        elif abs(change) < 0.05 and error > 0.025:
-            od["Integral"] += 0.1 * error
-        if abs(error) > 0.1 and abs(change) < 0.05:
-            od["Integral2"] = 0
-        elif abs(change) < 0.1:
-            od["Integral2"] += 0.01 * error
-            feed *= 0.7
-        return 0.0 if change > 0.04 else float(feed + od["Integral"] + od["Integral2"])
-
-    def _zigzag(self) -> None:
-        """`Zigzag`: swing the set-point about its centre and estimate growth while nothing is pumped."""
-        data, zigzag = self.data, self.data["Zigzag"]
-        centre, now, zig = data["OD"]["target"], data["OD"]["current"], zigzag["Zig"]
-        cycles = data["Experiment"]["cycles"]
-        last = data["OD"]["record"][-1] if data["OD"]["record"] else now
-        if now < centre - zig and last < centre:
-            if zigzag["target"] != 5.0:
-                zigzag["SwitchPoint"] = cycles
-            zigzag["target"] = 5.0
-        elif now > centre + zig and last > centre + zig:
-            zigzag["target"], zigzag["SwitchPoint"] = centre - 1.5 * zig, cycles
-        data["OD"]["target"] = zigzag["target"]
-        if cycles > 6 and cycles - zigzag["SwitchPoint"] > 5:
-            if not (now > 0 and last > 0):
-                raise AppError("logarithm of an OD of 0 or less")
-            growth = 60.0 * math.log(now / last)
-            data["GrowthRate"]["current"] = 0.95 * data["GrowthRate"]["current"] + 0.05 * growth

@@ -24,7 +24,7 @@ LONGEST_STEP_S = 60.0
 SENSOR_STEP_S = 2.0
 STIR_SETTLE_S = 2.0  # readings sooner after the stirrer stopped are still disturbed
 STIR_STOPPED_S = 90.0  # a stirrer off for longer than any still phase has failed: cells settle
-DOSES_KEPT = 50_000
+DOSES_KEPT = 5_000  # per reactor; a day of single-shot dosing is 2880
 
 
 def healthy_plant() -> PlantConfig:

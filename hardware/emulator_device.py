@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from email.utils import format_datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -78,13 +78,12 @@ class Exchange:
         return self.answer is not None or self.fate != ""
 
 
-@dataclass(order=True)
-class _Event:
+class _Event(NamedTuple):
     at: float
-    order: int
-    steps: Steps = field(compare=False)
-    life: int = field(compare=False)  # process it belongs to; -1 = hardware, survives the software
-    owner: str = field(compare=False)
+    order: int  # of equal times the earlier scheduled comes first; unique, so nothing further is compared
+    steps: Steps
+    life: int  # process it belongs to; -1 = hardware, survives the software
+    owner: str
 
 
 class ChiBioDevice:
@@ -165,6 +164,11 @@ class ChiBioDevice:
         if self.faults.bus_stuck:
             raise BusStuck(name)
 
+    def write_row(self, name: str) -> None:
+        """One line of a data file, written under the bus lock. Raises: BusStuck, also for a full disk."""
+        self.faults.bus_stuck = self.faults.bus_stuck or self.faults.disk_full
+        self.bus(name)
+
     def spawn(self, steps: Steps, owner: str) -> None:
         """Start a thread of the software; it runs at the present device time, after what is already due."""
         self._schedule(0.0, steps, self._life, owner)
@@ -202,9 +206,8 @@ class ChiBioDevice:
             self._note(f"{event.owner}: {type(problem).__name__}: {problem}")  # the thread ends, silently as there
             return
         if event.owner == REQUEST and self._now + pause > self._deadline:
-            pause = self._deadline - self._now
-            event.steps = self._watch()
-        if pause < math.inf:
+            self._schedule(self._deadline - self._now, self._watch(), event.life, event.owner)
+        elif pause < math.inf:
             self._schedule(pause, event.steps, event.life, event.owner)
         if self.faults.bus_stuck_when_pumping and any(b.motor("Pump1") for b in self.benches.values()):
             self.faults.bus_stuck, self.faults.bus_stuck_when_pumping = True, False
@@ -264,6 +267,13 @@ class ChiBioDevice:
         """Fault: the software ends itself, as after too many bus failures."""
         self._note("crashed on demand")
         self._exit()
+
+    def cut_power(self) -> None:
+        """Fault: the whole board loses power; its clock starts again where it had started before."""
+        self.crash()
+        self._wall_offset = -self._now
+        for bench in self.benches.values():
+            bench.set_power(False, self._now)
 
     def restart(self) -> None:
         """Somebody starts the software again by hand: defaults, nothing running."""

@@ -19,7 +19,7 @@ class LinkFaults:
     the server (half-open connection). lost_reply: acted on, then silence. reset_before, reset_after: connection reset
     without or after acting. malformed, truncated: getSysdata answers broken JSON, or half its bytes under the full
     length. lying: POST routes answer 204 and do nothing. bus_stuck: the bus lock is never released.
-    bus_stuck_when_pumping: it gets stuck as soon as a feed pump runs.
+    bus_stuck_when_pumping: it gets stuck as soon as a feed pump runs. disk_full: when a cycle writes its row.
     foreign_selects: probability that somebody else's page selects another reactor before a request.
     require_requested_with, terminal_as_list, extra_fields: variants seen in forks (chibio.md section 11).
     """
@@ -35,6 +35,7 @@ class LinkFaults:
     lying: int = 0
     bus_stuck: bool = False
     bus_stuck_when_pumping: bool = False
+    disk_full: bool = False
     foreign_selects: float = 0.0
     require_requested_with: bool = False
     terminal_as_list: bool = False
@@ -53,9 +54,15 @@ class LinkFaults:
 FAULTS: dict[str, tuple[str, str, str]] = {
     "worker_wipe": ("act", "any", "the web worker is killed and replaced: state wiped, everything off"),
     "crash": ("act", "any", "the software ends itself (code 4): connections refused, power cut after 1 s"),
+    "power_cut": ("act", "any", "the whole board loses power; its clock, without a battery, starts again in 2026"),
     "restart": ("act", "any", "somebody starts the crashed software again, with defaults"),
     "clock_step": ("act", "seconds", "the board's clock is set forward, or back if negative"),
     "cycle_dead": ("act", "any", "the experiment thread of the reactor ends; Experiment.ON stays 1"),
+    "marked_absent": (
+        "act",
+        "any",
+        "one failed thermometer poll: present = 0, so the reactor's own threads end it all",
+    ),
     "slow_s": ("board", "seconds >= 0", "network delay of every request"),
     "hang_s": ("board", "seconds >= 0", "the next request takes so long; above 30 s the worker is killed"),
     "lost_request": ("board", "count", "half-open connection: the server never sees the request"),
@@ -67,6 +74,7 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "lying": ("board", "count", "POST routes answer 204 and do nothing"),
     "bus_stuck": ("board", "0 or 1", "the bus lock is never released: pumps stay as they are, 204 lies"),
     "bus_stuck_when_pumping": ("board", "0 or 1", "bus_stuck, as soon as a feed pump runs"),
+    "disk_full": ("board", "0 or 1", "the next cycle cannot write its row and keeps the bus lock: as bus_stuck"),
     "foreign_selects": ("board", "probability", "before a request, somebody's page selects another reactor"),
     "require_requested_with": ("board", "0 or 1", "fork: 403 for a POST without X-Requested-With"),
     "terminal_as_list": ("board", "0 or 1", "fork: Terminal.text is a list of lines"),
@@ -125,6 +133,11 @@ def _act(device: ChiBioDevice, name: str, names: tuple[str, ...], value: float) 
         device.kill_worker()
     elif name == "crash":
         device.crash()
+    elif name == "power_cut":
+        device.cut_power()
+    elif name == "marked_absent":
+        for m in names:
+            device.apps[m].data["present"] = 0
     elif name == "restart":
         device.restart()
     elif name == "clock_step":

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import unquote
 
 from hardware.emulator_app import ReactorApp, Steps
 from hardware.emulator_state import ALL_REACTORS, add_terminal, clear_terminal
@@ -188,9 +190,14 @@ def find_route(method: str, path: str) -> tuple[Route | None, list[str], int]:
 
 def answer_request(device: ChiBioDevice, exchange: Exchange) -> Generator[float, None, Answer]:
     """Run one request to its answer. Raises: whatever the device's software raises on the way."""
-    found, arguments, code = find_route(exchange.method, exchange.path.split("?", 1)[0])
+    path = unquote(exchange.path.split("?", 1)[0])
+    merged = re.sub("/+", "/", path)
+    found, arguments, code = find_route(exchange.method, merged)
+    if path != merged and found is not None:
+        found, code = None, 308
     if found is None:
-        location = {"Location": exchange.path + "/"} if code == 308 else {}
+        slash = "" if merged != path else "/"
+        location = {"Location": merged + slash} if code == 308 else {}
         return code, f"<!doctype html>\n<title>{code}</title>\n".encode(), HTML | location
     headers = {key.lower() for key in exchange.headers}
     if device.faults.require_requested_with and found.method == "POST" and "x-requested-with" not in headers:

@@ -97,6 +97,11 @@ class Journal:
         self._n += 1
         self._size += written
 
+    @property
+    def next_row(self) -> int:
+        """Number the next row will have."""
+        return self._n
+
     def close(self) -> None:
         """Release the file. Idempotent."""
         if self._file is not None:

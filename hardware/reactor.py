@@ -116,6 +116,22 @@ class Reactor(Protocol):
         """Carry out a command. Raises: as `measure`."""
         ...
 
+    def elapsed(self) -> float:
+        """Run time, s, on a monotonic clock; what `Measurement.time_s` is counted on."""
+        ...
+
+    def pumps_off(self, rows: Mask) -> list[str]:
+        """All pumps of `rows` off, verified; returns what failed, one line per reactor, its name first."""
+        ...
+
+    def heat_off(self, rows: Mask) -> list[str]:
+        """Heating of `rows` off for the rest of the run; returns what failed, as `pumps_off`."""
+        ...
+
+    def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
+        """Hand `rows` over to the device's own regulation at `setpoint` (OD, (N,)); returns what failed."""
+        ...
+
     def stop(self) -> None:
         """All pumps off, verified. Idempotent. Raises: ReactorError if they could not be verified off."""
         ...

@@ -62,7 +62,7 @@ class Interlock:
         self.fed_ml = np.zeros(n)
         self._hour = np.zeros((n, 60))  # feed per minute of the hour
         self._minute = np.full(n, -1.0)  # minute of the newest entry of _hour
-        self._last_dose_s, self._last_dose_ml = np.full(n, -math.inf), np.zeros(n)
+        self._dose_s, self._dose_ml = np.full((n, 4), -math.inf), np.zeros((n, 4))  # the newest four doses
         self._fresh_s = np.full(n, math.nan)  # `now` of the newest sample
         self._seen = np.full(n, math.nan)  # its reading, believed or not
         self._repeats = np.zeros(n)
@@ -72,6 +72,9 @@ class Interlock:
         self._suspects = np.zeros(n)
         self._mu = np.full(n, c.mu_max)  # slow estimate of the growth rate
         self._excess, self._deficit = np.zeros(n), np.zeros(n)  # cumulated unexplained rise and fall of ln OD
+        self._futile = np.zeros(n)  # cumulated rise of ln OD at full feed
+        self._over = np.zeros((n, 3))  # samples in a row for which each of the three was over its limit
+        self._owed_ml = np.zeros(n)  # allowed but not dosed since the last dose
         self._hold_until_s = np.full(n, -math.inf)
         self._hold_kind = np.full(n, -1.0)  # index into REMEDIES
         self._latched = np.zeros(n)
@@ -188,7 +191,8 @@ class Interlock:
         """Cumulated sums of what ln OD did beyond the best and the worst explanation (one-sided CUSUM).
 
         With d = dosed / volume and x the change of ln OD in dt minutes, a sound pump gives x <= mu dt - gain_min d,
-        and no culture gives x < -gain_max d - death dt. mu is a slow estimate (60 min) plus 0.01 1/min.
+        and no culture gives x < -gain_max d - death dt. mu is a slow estimate (60 min) plus 0.01 1/min. At full feed
+        (0.8 of the largest rate and more) x must be below -0.004 dt, or the culture outgrows the pump.
         """
         c = self.config
         usual = usual & (od > 0.05) & (self._od > 0.05)
@@ -201,17 +205,25 @@ class Interlock:
         self._excess = np.where(usual, np.maximum(self._excess + rise, 0.0), self._excess)
         fall = -x - c.gain_max * d - c.death * dt
         self._deficit = np.where(usual, np.maximum(self._deficit + fall, 0.0), self._deficit)
+        full = d / dt >= 0.8 * c.max_rate * 60.0 / c.volume_ml
+        futile = np.where(full, np.maximum(self._futile + x + 0.004 * dt, 0.0), 0.0)
+        self._futile = np.where(usual, futile, self._futile)
         weight = np.where(usual, 1.0 - np.exp(-dt / 60.0), 0.0)
         self._mu = self._mu + weight * (np.clip((x + d) / dt, 0.0, c.mu_max) - self._mu)
         noise = np.hypot(c.noise_od, c.noise_fraction * od) / np.maximum(od, 0.05)
         limit = c.drift + 6.0 * np.where(usual, noise, 0.0)
-        rising, falling = usual & (self._excess > limit), usual & (self._deficit > limit)
-        excess, deficit = self._excess, self._deficit
-        self._trip("no_dilution", rising, lambda i: f"the pump ran, ln OD is {excess[i]:.2f} above what it must be")
-        self._trip("falls", falling, lambda i: f"ln OD is {deficit[i]:.2f} below what growth and doses explain")
+        sums = np.stack([self._excess, self._deficit, self._futile], axis=1)
+        over = np.where(sums > limit[:, None], self._over + 1, 0)  # an outlier is over it once only
+        self._over = np.where(usual[:, None], over, self._over)
+        rising, falling, futile_now = (self._over >= c.persistence).T & usual
+        helpless = futile_now & ~rising
+        self._trip("no_dilution", rising, lambda i: f"the pump ran, ln OD is {sums[i, 0]:.2f} above what it must be")
+        self._trip("falls", falling, lambda i: f"ln OD is {sums[i, 1]:.2f} below what growth and doses explain")
+        self._trip("cannot_hold", helpless, lambda i: f"at full feed OD {od[i]:.3f} does not fall")
         self._cool("no_dilution", rising, now)
         self._cool("falls", falling, now)
-        self._excess, self._deficit = np.where(rising, 0.0, excess), np.where(falling, 0.0, deficit)
+        self._excess, self._deficit = np.where(rising, 0.0, sums[:, 0]), np.where(falling, 0.0, sums[:, 1])
+        self._futile = np.where(helpless | rising, 0.0, self._futile)
 
     def _cool(self, kind: str, mask: Mask, now: float) -> None:
         """No dose for a while after `kind`, unless it is only reported."""
@@ -256,8 +268,10 @@ class Interlock:
         wanted = np.where(fresh & ~unusable, rate, 0.0)
         allowed = np.minimum(wanted, c.max_rate)
         self._trip("limit", wanted > c.max_rate * (1.0 + 1e-9), lambda i: f"{wanted[i]:g} mL/s cut to {c.max_rate:g}")
+        undosed = fresh & (self._owed_ml > 2.0 * c.max_rate * c.period_s)
+        self._trip("undosed", undosed, lambda i: f"{self._owed_ml[i]:.2f} mL were allowed, nothing was dosed")
         self._roll(now)
-        recent = np.where(now - self._last_dose_s < 0.9 * c.period_s, self._last_dose_ml, 0.0)
+        recent = np.where(now - self._dose_s < 60.0, self._dose_ml, 0.0).sum(axis=1)
         left = {
             "budget": np.minimum.reduce(
                 [c.ml_per_minute - recent, c.ml_per_hour - self._hour.sum(axis=1), c.ml_per_run - self.fed_ml]
@@ -302,6 +316,7 @@ class Interlock:
             reasons.append(" | ".join(texts) or None)
         kinds = tuple(tuple(kind for kind, _, _ in found) for found in self._found)
         rate = np.where(response == Response.PASS, allowed, 0.0)
+        self._owed_ml = self._owed_ml + rate * c.period_s
         sane = np.clip(np.where(np.isfinite(setpoint), setpoint, 0.5), 0.05, c.max_setpoint)
         sane = np.where((setpoint > 0.0) & (setpoint <= c.max_setpoint), sane, 0.5)
         return Verdict(rate, response, reasons, kinds, self._heat_off > 0.0, sane)
@@ -321,8 +336,9 @@ class Interlock:
         self.fed_ml = self.fed_ml + feed
         self._since_ml = self._since_ml + feed
         dosed = feed > 0.0
-        self._last_dose_s = np.where(dosed, now, self._last_dose_s)
-        self._last_dose_ml = np.where(dosed, feed, self._last_dose_ml)
+        for mine, new in ((self._dose_s, np.full(self.n, now)), (self._dose_ml, feed)):
+            mine[dosed] = np.column_stack([mine[dosed, 1:], new[dosed]])
+        self._owed_ml = np.where(dosed, 0.0, self._owed_ml)
         waste = np.full(self.n, math.inf) if receipt.waste_ml is None else np.asarray(receipt.waste_ml)
         level = np.maximum(self.volume_ml + feed - waste, self.config.volume_ml)
         self.volume_ml = np.where(waste > 0.0, level, self.volume_ml + feed)
@@ -345,6 +361,6 @@ class Interlock:
             new = np.array(state[key], dtype=np.float64)
             if new.shape != old.shape:
                 raise ValueError(f"saved interlock is for {len(state[key])} reactors, this run has {self.n}")
-            if key in ("_last_dose_s", "_hold_until_s"):
+            if key in ("_dose_s", "_hold_until_s"):
                 new = np.where(np.isnan(new), -math.inf, new)
             setattr(self, key, new)

@@ -47,11 +47,13 @@ REMEDIES = {
     "budget": "check for a leak or wash-out; raise the budget in conf/safety if the flow is right",
     "bottle": "fill the bottle and start a new run with its content",
     "overflow": "check waste pump and tube",
+    "undosed": "look at the run's notes for why doses are not given: link too slow, device not as set",
     "impossible": "check cable, vial and blank",
     "spectrometer": "check the spectrometer's cable; restart the device if it persists",
     "frozen": "look at the device's terminal: its measuring thread may be dead",
     "jump": "check for bubbles, foam and a moved vial",
     "no_dilution": "check feed tube, bottle and gasket; clean the vial's wall",
+    "cannot_hold": "the culture outgrows the pump, or the pump has become weak: weigh its doses, check gasket and tube",
     "falls": "check for a pump that runs on, a leak, a stopped stirrer",
     "stale": "check link and device",
     "lost": "check link and device; pumps are swept off as soon as it answers",
@@ -60,6 +62,7 @@ REMEDIES = {
     "thermometer": "check that the vial is seated; heating stays off in this run",
     "device": "see the text",
 }
+MAY_BE_REPORTED = ("limit", "undosed", "no_dilution", "cannot_hold", "thermometer", "hot", "jump", "stale")
 SENSOR_REASONS = ("impossible", "spectrometer", "frozen", "jump", "no_dilution", "falls", "stale", "lost", "silent")
 
 
@@ -78,11 +81,13 @@ class Responses:
     budget: str = "hold"
     bottle: str = "hold"
     overflow: str = "pumps_off"
+    undosed: str = "report"
     impossible: str = "hold"
     spectrometer: str = "pumps_off"
     frozen: str = "hold"
     jump: str = "hold"
     no_dilution: str = "hold"
+    cannot_hold: str = "report"
     falls: str = "pumps_off"
     stale: str = "hold"
     lost: str = "pumps_off"
@@ -110,7 +115,7 @@ class Responses:
                     f"safety.responses.{f.name} = regulate: not allowed, the device would pump by the reading that is "
                     "not to be believed; use hold, pumps_off or stop"
                 )
-            if word == "report" and f.name not in ("limit", "no_dilution", "thermometer", "hot", "jump", "stale"):
+            if word == "report" and f.name not in MAY_BE_REPORTED:
                 raise ValueError(f"safety.responses.{f.name} = report: at least hold is needed for this reason")
 
 
@@ -127,8 +132,8 @@ class SafetyConfig:
       fastest decline without a dose. jump, jump_fraction: a step of more than max(jump, jump_fraction * OD) beyond
       what growth and dose explain is no culture. accept_up, accept_down: consistent readings after which a step is
       believed (bubbles last up to 5 readings).
-    drift: unexplained change of ln OD that trips no_dilution or falls; noise_od, noise_fraction: sensor noise, of
-      which six standard deviations are added to it.
+    drift: unexplained change of ln OD that trips no_dilution or falls once it has lasted for `persistence` samples;
+      noise_od, noise_fraction: sensor noise, of which six standard deviations are added to it.
     cooldown: no dose for so long after no_dilution, falls. stale_s, lost_s: age of the newest sample, s; silent: age
       at which a reactor is given up.
     hot_excess: allowed above the thermostat target, degC; max_temperature: absolute limit, degC; cooling: a vial
@@ -138,7 +143,7 @@ class SafetyConfig:
 
     max_rate: float = 0.02
     period_s: float = 60.0
-    ml_per_minute: float = 2.0
+    ml_per_minute: float = 3.0
     ml_per_hour: float = 75.0
     ml_per_run: float = 10000.0
     bottle_ml: float = 2000.0
@@ -159,6 +164,7 @@ class SafetyConfig:
     accept_up: int = 6
     accept_down: int = 3
     drift: float = 0.05
+    persistence: int = 3
     noise_od: float = 0.005
     noise_fraction: float = 0.005
     cooldown: float = 5.0
@@ -186,6 +192,7 @@ class SafetyConfig:
             "accept_up": (2, 60),
             "accept_down": (2, 60),
             "drift": (0.01, 1.0),
+            "persistence": (1, 30),
             "stale_s": (self.period_s * 1.1, 3600.0),
             "lost_s": (self.stale_s, 7200.0),
             "max_temperature": (20.0, 45.0),

@@ -8,7 +8,7 @@ import numpy as np
 
 from envs.plant import Plant
 from hardware.clock import Clock, VirtualClock
-from hardware.reactor import Command, Measurement, Receipt
+from hardware.reactor import Array, Command, Mask, Measurement, Receipt
 
 __all__ = ["SimulatedConfig", "SimulatedReactors"]
 
@@ -69,7 +69,7 @@ class SimulatedReactors:
             self._feed_s = np.zeros(self.plant.n)
         self._sampled = True
         return Measurement(
-            time_s=np.full(self.plant.n, self._clock.now() - self._started),
+            time_s=np.full(self.plant.n, self.elapsed()),
             od=self.plant.read_od(),
             temperature=self.plant.read_temperature(),
             fresh=np.ones(self.plant.n, dtype=np.bool_),
@@ -81,6 +81,29 @@ class SimulatedReactors:
         self._feed_s = volume / self.config.pump_ml_s
         self._target = np.where(command.rows, command.temperature, np.nan)
         return Receipt(volume_ml=volume)
+
+    def elapsed(self) -> float:
+        """Run time on the clock, s."""
+        return self._clock.now() - self._started
+
+    def pumps_off(self, rows: Mask) -> list[str]:
+        """No dose is pending for `rows` any more. Nothing can fail."""
+        self._feed_s = np.where(rows, 0.0, self._feed_s)
+        return []
+
+    def heat_off(self, rows: Mask) -> list[str]:
+        """The heater of `rows` is off until a temperature is commanded. Nothing can fail."""
+        self._target = np.where(rows, 0.0, self._target)
+        return []
+
+    def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
+        """There is no device that could regulate by itself."""
+        self.pumps_off(rows)
+        return [
+            f"{name}: no on-board regulation in simulation, pumps off"
+            for name, r in zip(self.names, rows, strict=True)
+            if r
+        ]
 
     def stop(self) -> None:
         """No dose is pending any more."""

@@ -25,6 +25,7 @@ __all__ = ["Station"]
 
 CYCLE_S = 60.07  # median of 3275 real cycles (chibio.md section 3)
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
+FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 OWN_WILL = ("Zigzag", "Custom", "Chemostat")  # modes that act on the pumps
 
 
@@ -64,7 +65,7 @@ class Station:
         self._start_time = ""
         self._sample: tuple[float, int] | None = None  # newest one delivered
         self._acted: tuple[float, int] | None = None  # newest one a dose was decided for
-        self._offsets: deque[float] = deque(maxlen=10)  # arrival here minus the device's own time of recent samples
+        self._offsets: deque[float] = deque(maxlen=3)  # arrival minus the device's own time, samples seen at once
         self._late_s = 0.0  # how much later than possible the newest sample was seen
         self._looked = False  # the last look found nothing new, so the next sample will be seen when it appears
         self._carry_ml, self._doses = 0.0, 0
@@ -119,17 +120,19 @@ class Station:
                 yield OLD_CYCLE_S
             self._prepare()
             state = self.unit.read()
-            if state.running and math.isfinite(state.sample_s):
-                self._sample = (state.sample_s, state.cycles)  # it may be a minute old: wait for the next one
+            if math.isfinite(state.sample_s):
+                self._sample = (state.sample_s, state.cycles)  # of unknown age: wait for the next one
+            self._offsets.clear()
             if not state.running:
                 self._start()
+                if state.cycles == 0:  # then the device's own time begins now, and so does the first cycle
+                    self._offsets.append(self._clock.now() + FIRST_SAMPLE_S)
                 if not self._heat:  # a start switches the thermostat on
                     self.heat_off()
             if math.isfinite(self.handed_over):
                 self.regulate(self.handed_over)
             self._start_time = self.unit.read().start_time
             self.arrived_s = self.next_poll = self._clock.now()
-            self._offsets.clear()
             identity = {"reactor": self.name, "device_id": self.unit.device_id, "blank": self._blank}
             self._log("device", {**identity, "temperature": self._target_c, "start_time": self._start_time})
         finally:
@@ -175,7 +178,6 @@ class Station:
         try:
             self.unit.pumps_off()
             if kind == "stalled":
-                self.unit.probe()
                 self.unit.post(f"/Experiment/0/{self.name}")
                 yield OLD_CYCLE_S
             else:
@@ -207,8 +209,9 @@ class Station:
         """What a verified state means; True if it brings a new sample."""
         now = self._clock.now()
         self.next_poll = now + self.config.poll_s
+        # cycles counts cycles begun: a sample that was seen late may carry the number of the next one already
         is_new = math.isfinite(state.sample_s) and (
-            self._sample is None or (state.sample_s != self._sample[0] and state.cycles > self._sample[1])
+            self._sample is None or (state.sample_s != self._sample[0] and state.cycles >= self._sample[1])
         )
         age = 0.0 if is_new else now - self.arrived_s
         fault = self._diagnose(state, age)
@@ -258,17 +261,12 @@ class Station:
         """Make a new sample the newest one, note it down, and look after heater and stirrer."""
         self._sample = (state.sample_s, state.cycles)
         self.arrived_s, self.time_s = now, now - self.zero
+        self.od, self.temperature, self.raw = state.sample_od, state.sample_temperature, state.raw
+        self._time_arrival(now - state.sample_s)
         self.next_poll = now + CYCLE_S - (2.5 if self._looked else 20.0)
         self._looked = False
-        self.od, self.temperature, self.raw = state.sample_od, state.sample_temperature, state.raw
-        offset = now - state.sample_s
-        if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:
-            self.tell(f"the board's clock moved by {min(self._offsets) - offset:.0f} s against this computer's")
-            self._offsets.clear()
-        self._offsets.append(offset)
-        self._late_s = offset - min(self._offsets)
         reading = {"od": self.od, "temperature": self.temperature, "raw": self.raw, "blank": state.blank}
-        timing = {"late_s": round(self._late_s, 3), "read_s": self.unit.took_s}
+        timing = {"late_s": self._late_s, "read_s": self.unit.took_s}
         self._log("sample", {"reactor": self.name, "sample": self._sample, **reading, **timing})
         if self._late_s > 30.0 or self.dosing:
             return  # the stirrer may be off for the next measurement already
@@ -282,6 +280,19 @@ class Station:
                     self.tell(f"{item} was off and was switched on again")
                 except ReactorError as error:
                     self.tell(f"{item} is off and could not be switched on: {error}")
+
+    def _time_arrival(self, offset: float) -> None:
+        """How much later than possible this sample was seen: its offset against the smallest of recent ones.
+
+        Only samples that were waited for are a measure, so after three of them a step of the board's clock, which
+        looks the same, is forgotten.
+        """
+        if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:
+            self.tell(f"the board's clock moved by {min(self._offsets) - offset:.0f} s against this computer's")
+            self._offsets.clear()
+        if self._looked or (self._offsets and offset < min(self._offsets)):
+            self._offsets.append(offset)
+        self._late_s = offset - min(self._offsets) if self._offsets else math.inf  # already there at the first look
 
     def _report(self, fault: Fault | None) -> bool:
         """Set or clear the fault; False, because a fault brings no sample."""
@@ -324,6 +335,8 @@ class Station:
         if self.dosing:
             return "the previous dose has not ended"
         past = self._clock.now() - self.arrived_s + self._late_s
+        if math.isinf(past):
+            return "its sample is of unknown age, the next one is waited for"
         if past + waste_s > self.config.window_s:
             return f"{past:.0f} s after its sample appeared it would not end before the next measurement"
         return ""
@@ -420,6 +433,11 @@ class Station:
             return
         self._target_c = target_c
         self._log("temperature", {"reactor": self.name, "temperature": target_c})
+
+    def set_blank(self, raw: float) -> None:
+        """Make `raw` counts read as OD 0, here and on the device. Raises: ReactorError, also outside 3000 to 60000."""
+        self.unit.post(f"/CalibrateOD/OD0/{self.name}/{raw:.6f}/0")
+        self._blank = raw
 
     def heat_off(self) -> None:
         """Thermostat and heater off, and not switched on again. Raises: ReactorError."""

@@ -12,6 +12,9 @@ from hardware.wire import PUMPS, DeviceState, check_command, parse_state
 
 __all__ = ["Log", "Unit", "no_log"]
 
+SETTLE_S = 0.3
+"""A pump command is answered before its thread has written to the bus (chibio.md section 5.1)."""
+
 Log = Callable[[str, Mapping[str, Any]], None]
 """Takes a kind and its fields, for instance `Journal.append`."""
 
@@ -118,7 +121,11 @@ class Unit:
         self.post(f"/SetOutputOn/{item}/{int(on)}/{self.name}")
 
     def pumps_off(self, tries: int = 3) -> None:
-        """All four pumps off, read back. Every pump is tried even if another one fails.
+        """All four pumps off, verified. Every pump is tried even if another one fails.
+
+        Read-back alone proves nothing, for the flags are intent: with the bus hung they say off while the motor runs.
+        So a blocking call touches the bus in between. It is quick if all is well; on a hung bus it outlasts the
+        server's worker, whose end switches everything off: the remote kill switch (chibio.md section 9).
 
         Raises: LinkError, ProtocolError, DeviceStateError if it could not be verified.
         """
@@ -136,7 +143,9 @@ class Unit:
                     error = failed
             if error is not None:
                 continue
+            self._clock.sleep(SETTLE_S)
             try:
+                self.probe()
                 on = [p for p, is_on in zip(PUMPS, self.read().pumps_on, strict=True) if is_on]
             except (LinkError, ProtocolError) as failed:
                 error = failed
@@ -148,9 +157,5 @@ class Unit:
         raise error
 
     def probe(self) -> None:
-        """Touch the bus with a blocking call: quick if all is well, and if the bus hangs the server kills itself.
-
-        It ends with everything off, which is the remote kill switch of a pump stuck on (chibio.md section 9).
-        Raises: LinkError if the bus hangs.
-        """
+        """Touch the bus with a blocking call. Raises: LinkError if it hangs."""
         self.post(f"/MeasureTemp/IR/{self.name}")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dqn.network import QNetwork, initial_weights
+from dqn.network import QNetwork, action_basis, initial_weights
 
 SIZES = (3, 7, 5, 4)
 AGENTS, BATCH = 3, 6
@@ -28,8 +28,10 @@ def _twin(network: QNetwork, agent: int) -> torch.nn.Sequential:
     return torch.nn.Sequential(*modules[:-1])
 
 
-def test_forward_and_backward_agree_with_autograd() -> None:
-    network = QNetwork(_flat(), SIZES)
+@pytest.mark.parametrize("smoothness", [None, 0.0, 2.0])
+def test_forward_and_backward_agree_with_autograd(smoothness: float | None) -> None:
+    basis = None if smoothness is None else action_basis(SIZES[-1], smoothness)
+    network = QNetwork(_flat(), SIZES, basis=basis)
     generator = torch.Generator().manual_seed(0)
     observation = torch.randn(AGENTS, BATCH, SIZES[0], generator=generator)
     slope = torch.randn(AGENTS, BATCH, SIZES[-1], generator=generator)
@@ -38,6 +40,7 @@ def test_forward_and_backward_agree_with_autograd() -> None:
     for i in range(AGENTS):
         twin = _twin(network, i)
         expected = twin(observation[i].double())
+        expected = expected if basis is None else expected @ basis.double()
         torch.testing.assert_close(q[i].double(), expected, rtol=1e-5, atol=1e-6)
         (expected * slope[i]).sum().backward()
         linears = [m for m in twin if isinstance(m, torch.nn.Linear)]
@@ -91,3 +94,15 @@ def test_initial_weights_follow_torch_linear() -> None:
         assert np.std(part) == pytest.approx(bound / np.sqrt(3.0), rel=0.05)
         assert abs(np.mean(part)) < 0.05 * bound
     assert not np.array_equal(flat, initial_weights(sizes, np.random.SeedSequence(6)))
+
+
+def test_action_basis_spans_everything_and_prefers_smooth_differences() -> None:
+    plain = action_basis(17, 0.0).double()
+    gram = plain @ plain.T
+    torch.testing.assert_close(gram, torch.diag(torch.diag(gram)), rtol=0.0, atol=1e-5)  # orthogonal rows
+    basis = action_basis(17, 2.0).double()
+    assert int(torch.linalg.matrix_rank(basis)) == 17
+    torch.testing.assert_close(basis[0], torch.ones(17, dtype=torch.float64))
+    moved = basis.T @ basis  # what a gradient step on one Q value does to all of them
+    assert bool((moved[8, 8] >= moved[8]).all())
+    assert float(moved[8, 7]) > float(moved[8, 3])

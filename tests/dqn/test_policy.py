@@ -14,7 +14,7 @@ import torch
 
 from dqn import policy
 from dqn.export import export
-from dqn.network import QNetwork, initial_weights
+from dqn.network import QNetwork, action_basis, initial_weights
 
 SIZES = (3, 64, 64, 17)
 RATES = np.linspace(0.0, 0.02, 17)
@@ -22,13 +22,14 @@ MATRIX = torch.tensor([[3.0, -3.0], [0.0, 3.0], [1.0, 1.0]])
 OFFSET = torch.tensor([0.0, -1.8, 0.5])
 
 
-def _network() -> QNetwork:
+def _network(smoothness: float = 0.0) -> QNetwork:
     flat = np.stack([initial_weights(SIZES, np.random.SeedSequence(i)) for i in range(3)])
-    return QNetwork(torch.from_numpy(flat), SIZES, MATRIX, OFFSET)
+    basis = action_basis(SIZES[-1], smoothness) if smoothness else None
+    return QNetwork(torch.from_numpy(flat), SIZES, MATRIX, OFFSET, basis)
 
 
-def _policy(agent: int = 1) -> policy.Policy:
-    network = _network()
+def _policy(agent: int = 1, smoothness: float = 0.0) -> policy.Policy:
+    network = _network(smoothness)
     return export(network, agent, network.flat, RATES, {"control_min": 1.0, "model": {"mu": 0.03, "tau": 1 / 3}})
 
 
@@ -37,12 +38,12 @@ def _observations() -> np.ndarray:
     return np.stack([od.ravel(), setpoint.ravel()], axis=1)
 
 
-@pytest.mark.parametrize("agent", [0, 2])
-def test_numpy_policy_agrees_with_torch(tmp_path: Path, agent: int) -> None:
-    policy.save(tmp_path / "policy.npz", _policy(agent))
+@pytest.mark.parametrize(("agent", "smoothness"), [(0, 0.0), (2, 0.0), (0, 0.5)])
+def test_numpy_policy_agrees_with_torch(tmp_path: Path, agent: int, smoothness: float) -> None:
+    policy.save(tmp_path / "policy.npz", _policy(agent, smoothness))
     read = policy.load(tmp_path / "policy.npz")
     observation = _observations()
-    expected = _network()(torch.from_numpy(observation.astype(np.float32)).expand(3, -1, -1))[agent].numpy()
+    expected = _network(smoothness)(torch.from_numpy(observation.astype(np.float32)).expand(3, -1, -1))[agent].numpy()
     np.testing.assert_allclose(read.q_values(observation), expected, rtol=1e-5, atol=1e-6)
     action = expected.argmax(1)
     assert len(set(action.tolist())) > 1

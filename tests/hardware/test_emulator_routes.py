@@ -63,6 +63,10 @@ SAMPLE = Path(__file__).parents[2].parent / "shared" / "samples" / "chibio_sysda
         ("POST", "/SetCustom/C1/0", 204),
         ("POST", "/SetLightActuation/LEDD", 204),
         ("POST", "/CharacteriseDevice/M0/C1", 204),
+        ("POST", "/SetOutputTarget/Pump1/M0/0%2e02", 204),
+        ("POST", "//changeDevice//M0", 308),
+        ("POST", "//changeDevice//M0//x", 404),
+        ("GET", "/getSysdata/?t=1", 200),
         ("POST", "/NoSuchRoute", 404),
         ("PUT", "/getSysdata/", 405),
     ],
@@ -251,3 +255,40 @@ def test_forks() -> None:
 def test_impossible_reactor_lists_are_refused(reactors: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match="M0 to M7"):
         ChiBioDevice(reactors, VirtualClock(), np.random.default_rng(0))
+
+
+def test_same_seed_same_readings_another_seed_others() -> None:
+    def records(seed: int, reactors: tuple[str, ...]) -> list[float]:
+        device = ChiBioDevice(reactors, VirtualClock(), np.random.default_rng(seed), blanked=True)
+        device.handle("POST", "/Experiment/1/M0")
+        device.run_until(600.0)
+        return list(device.apps["M0"].data["OD"]["record"])
+
+    assert records(1, ("M0",)) == records(1, ("M0",))
+    assert records(1, ("M0",)) != records(2, ("M0",))
+
+
+def test_thousands_of_random_requests_leave_a_device_that_answers() -> None:
+    rng = np.random.default_rng(5)
+    verbs = {"SetOutputTarget": 3, "SetOutputOn": 3, "Direction": 2, "MeasureOD": 1, "CalibrateOD": 4, "Experiment": 2}
+    verbs |= {"changeDevice": 1, "MeasureTemp": 2, "ClearTerminal": 1, "SetFPMeasurement": 6, "GetSpectrum": 2}
+    verbs |= {"getSysdata": 0, "getSysdata/": 0, "ExperimentReset": 0}
+    arguments = ["Pump1", "Pump2", "Stir", "OD", "OD0", "Thermostat", "Heat", "Zigzag", "Light", "FP1", "LASER650"]
+    arguments += ["M0", "M1", "0", "1", "2", "-1", "0.5", "nan", "inf", "1e400", "", "%00", "x", "IR", "Internal", "é"]
+    lab = Lab(blanked=True, od=0.5)
+    lab.post("/Experiment/1/M0")
+    seen = set()
+    for _ in range(4000):
+        verb = str(rng.choice(list(verbs)))
+        count = verbs[verb] if rng.random() < 0.9 else int(rng.integers(0, 5))
+        path = "/".join(["", verb, *rng.choice(arguments, count)])
+        reads = verb.startswith("get") == (rng.random() < 0.9)
+        status, _ = lab.device.handle("GET" if reads else "POST", path)
+        seen.add(status)
+        lab.wait(float(rng.exponential(2.0)))
+        assert lab.device.alive, lab.device.errors[-1]
+    assert seen == {200, 204, 308, 404, 405, 500}
+    for reactor in ("M0", "M1"):
+        assert 0.0 < lab.device.truth(reactor)["volume_ml"] <= 30.0
+        assert math.isfinite(lab.device.truth(reactor)["od"])
+    assert lab.state()["UIDevice"] == "M0"

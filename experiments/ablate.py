@@ -1,0 +1,236 @@
+"""What each choice of an agent is worth: trains variants of one agent over the same seeds and compares them.
+
+`python -m experiments.ablate` trains every entry of `ablations` in conf/ablate.yaml: the agent of the command line with
+some of its values replaced. The run folder gets ablation.csv (a row per variant and seed), summary.json and a figure,
+and one sub-folder per variant with its TensorBoard curves. A stopped run goes on with `resume=RUN`.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+import re
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dqn.config import DQNConfig
+from envs.task import EnvConfig
+from experiments import app
+from experiments.config import TrainConfig
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["AblateConfig", "Row", "main", "summarise", "variant"]
+
+log = logging.getLogger(__name__)
+
+MEASURES = ("regret_pct", "steady_abs_error", "regret_pct_last", "steady_abs_error_last")
+
+
+@dataclass(frozen=True)
+class AblateConfig:
+    """Keys of conf/ablate.yaml. Raises: ValueError naming key, value and allowed range."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    agent: DQNConfig = field(default_factory=DQNConfig)
+    ablations: dict[str, dict[str, Any]] = field(default_factory=dict)  # name -> values that differ from `agent`
+    only: list[str] = field(default_factory=list)  # names to train; empty means all
+    seed: int = 0
+    n_agents: int = 32
+    device: str = "cpu"
+    threads: int = 0
+    eval_every: int = 500
+    resume: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check every variant before the first one trains."""
+        unknown = [name for name in self.only if name not in self.ablations]
+        if unknown:
+            raise ValueError(f"only = {unknown[0]}: allowed {', '.join(self.ablations)}")
+        for name in self.ablations:
+            if not re.fullmatch(r"[\w.+-]+", name):
+                raise ValueError(f"ablations.{name}: allowed letters, digits, _ . + and - (it names a folder)")
+            self.training(name)
+
+    @property
+    def names(self) -> list[str]:
+        """Variants to train, in order."""
+        return [name for name in self.ablations if not self.only or name in self.only]
+
+    def training(self, name: str) -> TrainConfig:
+        """The training run of one variant."""
+        return TrainConfig(
+            env=self.env,
+            agent=variant(self.agent, name, self.ablations[name]),
+            seed=self.seed,
+            n_agents=self.n_agents,
+            device=self.device,
+            threads=self.threads,
+            eval_every=self.eval_every,
+            checkpoint_every=self.agent.total_steps,
+        )
+
+
+def _frozen(value: Any) -> Any:
+    """Lists from YAML as the tuples a config holds."""
+    return tuple(_frozen(v) for v in value) if isinstance(value, list | tuple) else value
+
+
+def variant(agent: DQNConfig, name: str, values: dict[str, Any]) -> DQNConfig:
+    """`agent` with some values replaced.
+
+    Raises: ValueError naming the variant and the key that does not exist or is out of range.
+    """
+    known = [f.name for f in fields(DQNConfig)]
+    for key in values:
+        if key not in known:
+            raise ValueError(f"ablations.{name}.{key}: no such key; allowed: {', '.join(known)}")
+    try:
+        return replace(agent, **{key: _frozen(value) for key, value in values.items()})
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"ablations.{name}: {error}") from None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One agent of one variant: measures on the reported grid, kept policy and last iterate."""
+
+    ablation: str
+    seed: int
+    regret_pct: float
+    steady_abs_error: float
+    regret_pct_last: float
+    steady_abs_error_last: float
+    train_seconds: float  # of the whole population
+
+
+def _read(path: Path) -> list[Row]:
+    """Rows of an earlier life of this run."""
+    if not path.is_file():
+        return []
+    with open(path, newline="", encoding="utf-8") as f:
+        return [
+            Row(r["ablation"], int(r["seed"]), *(float(r[k]) for k in (*MEASURES, "train_seconds")))
+            for r in csv.DictReader(f)
+        ]
+
+
+def _write(path: Path, rows: list[Row]) -> None:
+    """All rows so far, atomically."""
+    temporary = path.with_suffix(".part")
+    with open(temporary, "w", newline="", encoding="utf-8") as f:
+        writer = csv.writer(f)
+        writer.writerow([k.name for k in fields(Row)])
+        writer.writerows([getattr(row, k.name) for k in fields(Row)] for row in rows)
+    temporary.replace(path)
+
+
+def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
+    """Train one variant and score it on the reported grid."""
+    from experiments import build
+    from experiments.evaluation import Evaluation, report_grid
+    from experiments.session import Session
+
+    folder.mkdir(parents=True, exist_ok=True)
+    session = Session(config, folder)
+    try:
+        session.run()
+    finally:
+        session.writer.close()
+    agent = session.trainer.agent
+    report = Evaluation(config.env, config.agent.gamma, report_grid(config.env))
+    kept = report(build.act_with(agent.online, session.best.weights), agent.n_agents)
+    last = report(build.act_with(agent.online, agent.greedy.flat), agent.n_agents)
+    return [
+        Row(name, seed, *(float(v) for v in measures), session.seconds)
+        for seed, *measures in zip(
+            session.seeds, kept.regret_pct, kept.steady_abs_error, last.regret_pct, last.steady_abs_error, strict=True
+        )
+    ]
+
+
+def summarise(rows: list[Row]) -> dict[str, dict[str, Any]]:
+    """Per variant: median, interquartile mean and worst seed of every measure."""
+    from experiments.writers import interquartile_mean
+
+    out: dict[str, dict[str, Any]] = {}
+    for name in dict.fromkeys(row.ablation for row in rows):
+        own = [row for row in rows if row.ablation == name]
+        entry: dict[str, Any] = {"seeds": len(own), "train_seconds": own[0].train_seconds}
+        for measure in MEASURES:
+            values = np.array([getattr(row, measure) for row in own])
+            entry[measure] = {
+                "median": float(np.median(values)),
+                "iqm": interquartile_mean(values),
+                "worst": float(values.max()),
+            }
+        out[name] = entry
+    return out
+
+
+def figure(rows: list[Row]) -> Figure:
+    """One point per seed: regret and steady error of the kept policy, and regret of the last iterate."""
+    from experiments.charts import COLOURS, new_figure
+
+    names = list(dict.fromkeys(row.ablation for row in rows))[::-1]
+    panels = (
+        ("regret_pct", "regret of the kept policy, %", 0.5),
+        ("regret_pct_last", "regret of the last iterate, %", 2.0),
+        ("steady_abs_error", "steady error of the kept policy, OD", 0.003),
+    )
+    canvas, axes = new_figure(11.0, 1.4 + 0.27 * len(names), 1, len(panels), sharey=True)
+    jitter = np.random.default_rng(0)
+    for ax, (measure, label, limit) in zip(axes, panels, strict=True):
+        for k, name in enumerate(names):
+            values: NDArray[np.float64] = np.array([getattr(row, measure) for row in rows if row.ablation == name])
+            height = k + jitter.uniform(-0.22, 0.22, values.size)
+            ax.plot(np.maximum(values, 1e-4), height, ".", color=COLOURS[0], alpha=0.45, markersize=4)
+            ax.plot([np.median(values)] * 2, [k - 0.34, k + 0.34], color=COLOURS[1], linewidth=2)
+        ax.axvline(limit, color=COLOURS[6], linewidth=1, linestyle="--")
+        ax.set(xscale="log", xlabel=label)
+    axes[0].set_yticks(range(len(names)), names, fontsize=8)
+    return canvas
+
+
+def ablate(config: AblateConfig, folder: Path) -> float:
+    """Train all variants; returns the median regret of the first, the objective of a sweep."""
+    import torch
+
+    from experiments.charts import save
+
+    torch.set_num_threads(config.threads or torch.get_num_threads())
+    path = folder / "ablation.csv"
+    rows = _read(path)
+    done = {row.ablation for row in rows}
+    for k, name in enumerate(config.names):
+        if name in done:
+            continue
+        log.info("variant %d of %d: %s %s", k + 1, len(config.names), name, config.ablations[name])
+        rows += _train(config.training(name), name, folder / name)
+        _write(path, rows)
+        entry = summarise(rows)[name]
+        regret, steady, last = (entry[m] for m in MEASURES[:3])
+        log.info(
+            "%s: regret %.3f %% (worst %.3f), steady error %.4f (worst %.4f), last iterate %.3f %% (worst %.3f), %.0f s",
+            name, regret["median"], regret["worst"], steady["median"], steady["worst"], last["median"], last["worst"],
+            entry["train_seconds"],
+        )  # fmt: skip
+    summary = summarise(rows)
+    app.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
+    save(figure(rows), folder / "figures", "ablation")
+    log.info("table %s, figure %s", path, folder / "figures" / "ablation.png")
+    return float(summary[config.names[0]]["regret_pct"]["median"])
+
+
+def main() -> None:
+    """Entry point."""
+    app.run("ablate", AblateConfig(), ablate)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Measure the blank of clear medium under run conditions and store it: `python -m experiments.blank`."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from datetime import date
+from pathlib import Path
+
+from experiments import app
+from experiments.calibrations import save
+from hardware.bench import measure_blanks
+from hardware.chibio import ChiBioReactors
+from hardware.chibio_config import ChiBioConfig
+from hardware.clock import RealClock
+from hardware.errors import ReactorError
+from hardware.transport import open_transport
+
+__all__ = ["BlankConfig", "blank"]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class BlankConfig:
+    """Values of `conf/blank.yaml`. Raises: ValueError naming key, value and allowed range."""
+
+    backend: ChiBioConfig = field(default_factory=ChiBioConfig)
+    samples: int = 6  # minutes to average, one reading each
+
+    def __post_init__(self) -> None:
+        """Check every range once, where the value enters."""
+        if not 3 <= self.samples <= 60:
+            raise ValueError(f"samples = {self.samples}: allowed 3 to 60 (one a minute)")
+
+
+def blank(config: BlankConfig, folder: Path) -> None:
+    """Stir and heat clear medium, average its counts, set them as blanks, store them. Raises: UserError."""
+    backend = config.backend
+    log.info("clear medium in %s; this takes %d minutes", ", ".join(backend.reactors), config.samples + 1)
+    try:
+        transport = open_transport(backend.transport, backend.url, backend.speed)
+        reactors = ChiBioReactors(transport, RealClock(backend.speed), backend)
+        try:
+            reactors.begin()
+            found = measure_blanks(reactors, config.samples)
+            stored = [s.unit.device_id for s in reactors.stations]
+            reactors.end()
+        except BaseException:
+            reactors.stop()
+            raise
+        transport.close()
+    except ReactorError as error:
+        raise app.UserError(str(error)) from None
+    rows = {}
+    for name, identity, raw, sd in zip(reactors.names, stored, found.raw, found.sd, strict=True):
+        when = {"date": date.today().isoformat(), "device_id": identity}
+        values = {"blank": float(raw), "sd": float(sd), "samples": found.samples, **when}
+        path = save(Path(backend.calibration), name, "blank", values)
+        rows[name] = {**values, "file": str(path)}
+        log.info("%s: blank %.0f +- %.0f counts, stored in %s", name, raw, sd, path)
+    app.write_json(folder / "summary.json", rows)
+
+
+def main() -> None:
+    """Entry point."""
+    app.run("blank", BlankConfig(), blank)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,164 @@
+"""Weigh a pump's doses and store its calibration: `python -m experiments.calibrate_pump`."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+
+from experiments import app
+from experiments.calibrations import save
+from hardware.bench import dose_series
+from hardware.chibio_config import ChiBioConfig
+from hardware.clock import RealClock
+from hardware.errors import ReactorError
+from hardware.pumps import PumpFit, fit_pump
+from hardware.transport import open_transport
+from hardware.unit import Unit, no_log
+from hardware.wire import FEED, PERIOD_S, WASTE
+
+__all__ = ["CalibratePumpConfig", "Series", "calibrate", "read_weighings"]
+
+log = logging.getLogger(__name__)
+
+PUMP_OF = {"feed": FEED, "waste": WASTE}
+LIMITS = {"feed": 0.05, "waste": 0.5}
+
+
+@dataclass(frozen=True)
+class Series:
+    """One weighing: `doses` doses of 63 s * `duty` weighed `grams`."""
+
+    duty: float
+    doses: int
+    grams: float
+
+
+@dataclass(frozen=True)
+class CalibratePumpConfig:
+    """Values of `conf/calibrate_pump.yaml`. Raises: ValueError naming key, value and allowed range."""
+
+    backend: ChiBioConfig = field(default_factory=ChiBioConfig)
+    reactor: str = "M0"
+    pump: str = "feed"
+    duties: tuple[float, ...] = (0.006, 0.01, 0.02, 0.04)
+    doses: int = 20
+    csv: str | None = None  # weighings already made: columns duty, doses, grams
+
+    def __post_init__(self) -> None:
+        """Check every range once, where the value enters."""
+        if self.pump not in PUMP_OF:
+            raise ValueError(f"pump = {self.pump}: allowed feed, waste")
+        if self.reactor not in (f"M{k}" for k in range(8)):
+            raise ValueError(f"reactor = {self.reactor}: allowed M0 to M7")
+        limit = LIMITS[self.pump]
+        if len(set(self.duties)) < 2 or not all(0.003 <= d <= limit for d in self.duties):
+            raise ValueError(f"duties = {list(self.duties)}: allowed at least two different ones from 0.003 to {limit}")
+        if not 3 <= self.doses <= 200:
+            raise ValueError(f"doses = {self.doses}: allowed 3 to 200 per weighing")
+
+
+def read_weighings(path: Path) -> list[Series]:
+    """Weighings from a CSV file with the columns duty, doses, grams. Raises: UserError naming the line."""
+    try:
+        with open(path, newline="", encoding="utf-8") as f:
+            rows = list(csv.DictReader(f))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise app.UserError(f"csv={path}: not readable ({error}); give a file with columns duty,doses,grams") from None
+    found = []
+    for number, row in enumerate(rows, 2):
+        try:
+            series = Series(float(row["duty"]), int(row["doses"]), float(row["grams"]))
+            if not (0.0 < series.duty <= 1.0 and series.doses >= 1 and 0.0 <= series.grams < 10_000.0):
+                raise ValueError("duty 0 to 1, doses at least 1, grams at least 0")
+        except (KeyError, TypeError, ValueError) as error:
+            raise app.UserError(f"csv={path}, line {number}: {error}; columns duty,doses,grams") from None
+        found.append(series)
+    return found
+
+
+def _number(ask: Callable[[str], str], question: str) -> float:
+    while True:
+        answer = ask(question).strip().replace(",", ".")
+        try:
+            value = float(answer)
+            if 0.0 <= value < 10_000.0:
+                return value
+        except ValueError:
+            pass
+        print(f"  {answer!r} is no mass in grams; a number from 0 to 10000, please")
+
+
+def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tuple[list[Series], str]:
+    """Walk the operator through all series; the weighings and the unit's identity.
+
+    Args: ask: puts a question and returns the answer.
+    Raises: ReactorError.
+    """
+    clock = RealClock(config.backend.speed)
+    transport = open_transport(config.backend.transport, config.backend.url, config.backend.speed)
+    unit = Unit(config.reactor, [config.reactor], transport, clock, no_log)
+    found = []
+    identity = unit.read().device_id
+    print(
+        f"{config.reactor} {config.pump} pump, unit {identity}. Put its inlet into water, prime the tube, and let its"
+    )
+    print("outlet drip into a beaker on a balance, the tube not touching the beaker.")
+    for duty in config.duties:
+        ask(f"\n{config.doses} doses of {PERIOD_S * duty:.2f} s: tare the balance, then press Enter ")
+        for given in dose_series(unit, clock, PUMP_OF[config.pump], duty, config.doses):
+            print(f"\r  dose {given} of {config.doses}", end="", flush=True)
+        found.append(Series(duty, config.doses, _number(ask, "\n  grams on the balance: ")))
+    transport.close()
+    return found, identity
+
+
+def report(fit: PumpFit, found: list[Series]) -> str:
+    """What was found, for a person to judge."""
+    c = fit.calibration
+    lines = [f"{'asked s':>8} {'doses':>6} {'mL/dose':>9} {'fitted':>9}"]
+    lines += [
+        f"{PERIOD_S * s.duty:8.3f} {s.doses:6d} {s.grams / s.doses:9.4f} {c.volume(PERIOD_S * s.duty):9.4f}"
+        for s in found
+    ]
+    lines.append(
+        f"flow {c.flow_ml_s:.4f} +- {fit.flow_se:.4f} mL/s, bias {c.bias_s:+.3f} +- {fit.bias_se:.3f} s, "
+        f"spread of a dose {100.0 * c.spread:.1f} %, smallest useful dose {c.min_dose_ml:.3f} mL ({c.min_on_s:.2f} s)"
+    )
+    return "\n".join(lines)
+
+
+def calibrate(config: CalibratePumpConfig, folder: Path) -> None:
+    """Weigh (or read weighings), fit, store. Raises: UserError."""
+    try:
+        if config.csv is not None:
+            found, identity = read_weighings(Path(config.csv)), ""
+        elif sys.stdin.isatty():
+            found, identity = weigh(config)
+        else:
+            raise app.UserError("no terminal to ask for the weights; give csv=FILE with columns duty,doses,grams")
+        on_s, doses, grams = np.array([[PERIOD_S * s.duty, s.doses, s.grams] for s in found]).reshape(-1, 3).T
+        fit = fit_pump(on_s, doses, grams, date.today().isoformat(), identity)
+    except (ReactorError, ValueError) as error:
+        raise app.UserError(str(error)) from None
+    weighings = [{"duty": s.duty, "doses": s.doses, "grams": s.grams} for s in found]
+    uncertainty = {"flow_se": fit.flow_se, "bias_se": fit.bias_se}
+    values = {**fit.calibration.as_dict(), **uncertainty, "weighings": weighings}
+    path = save(Path(config.backend.calibration), config.reactor, config.pump, values)
+    app.write_json(folder / "summary.json", {**values, "file": str(path)})
+    log.info("%s %s pump\n%s\nstored in %s", config.reactor, config.pump, report(fit, found), path)
+
+
+def main() -> None:
+    """Entry point."""
+    app.run("calibrate_pump", CalibratePumpConfig(), calibrate)
+
+
+if __name__ == "__main__":
+    main()

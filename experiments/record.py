@@ -1,0 +1,165 @@
+"""What a closed loop leaves behind: a journal, one CSV per reactor, the loop's state, TensorBoard events.
+
+Order of writing, so that nothing is lost and nothing is done twice: the decision goes into the journal before the
+dose; the dose's intent too (by the driver); after it the row goes into the CSV and the state into state.json. A run
+that is killed in between is completed from the journal when it is resumed.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments import app
+from experiments.loop import Step
+from experiments.writers import Events
+from hardware.errors import RecordingError
+from hardware.journal import Journal
+from hardware.reactor import Receipt
+from hardware.recording import Recorder
+
+__all__ = ["COLUMNS", "Record"]
+
+Array = NDArray[np.float64]
+Row = dict[str, float | int | str | bool | None]
+
+COLUMNS = (
+    "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
+    "temperature_degc", "interlock",
+)  # fmt: skip
+NUMBERS = COLUMNS[:-1]
+
+
+def row_of(step: Step, n: int) -> Row:
+    """The CSV row of reactor n in a step."""
+    return {
+        "time_min": round(float(step.minute[n]), 4),
+        "elapsed_min": round(float(step.elapsed[n]), 4),
+        "phase": int(step.phase[n]),
+        "od": float(step.od[n]),
+        "setpoint": float(step.setpoint[n]),
+        "pump_rate_ml_s": float(step.rate[n]),
+        "proposed_ml_s": float(step.proposed[n]),
+        "volume_ml": float(step.volume_ml[n]),
+        "temperature_degc": round(float(step.temperature[n]), 3),
+        "interlock": step.reasons[n] or "",
+    }
+
+
+class Record:
+    """Journal, recordings, state and events of one run.
+
+    Args:
+      folder: run folder; what an earlier life of the run left there is continued.
+      names: of the reactors.
+      fsync: each row on the disk before the call returns.
+    Attributes: journal (the driver writes into it, too); rows, per reactor, what the CSV holds; repairs, what was
+      mended on opening, one line each.
+    Raises: RecordingError.
+    """
+
+    def __init__(self, folder: Path, names: Sequence[str], fsync: bool) -> None:
+        self.folder, self.names = folder, tuple(names)
+        self._fsync = fsync
+        (folder / "recordings").mkdir(exist_ok=True)
+        self.journal = Journal(folder / "journal.jsonl", fsync=fsync)
+        self.repairs = [f"journal: cut a torn last line of {self.journal.cut} bytes"] if self.journal.cut else []
+        self._recorders = [Recorder(self._csv(name), COLUMNS, fsync) for name in names]
+        self.repairs += [r.repaired for r in self._recorders if r.repaired]
+        self.rows: list[list[Row]] = [self._read(name) for name in names]
+        self._complete()
+        first = max((len(rows) for rows in self.rows), default=0)
+        self.events = Events(folder, first)
+        self._points = first
+
+    def _csv(self, name: str) -> Path:
+        return self.folder / "recordings" / f"{name}.csv"
+
+    def _read(self, name: str) -> list[Row]:
+        """Rows an earlier life wrote."""
+        with open(self._csv(name), newline="", encoding="utf-8") as f:
+            rows: list[Row] = []
+            for raw in csv.DictReader(f):
+                row: Row = {key: float(raw[key]) if raw[key] else math.nan for key in NUMBERS}
+                rows.append({**row, "interlock": raw["interlock"]})
+        return rows
+
+    def _complete(self) -> None:
+        """Append to the CSVs what the journal decided and a kill kept from being written."""
+        for n, name in enumerate(self.names):
+            last = float(self.rows[n][-1]["time_min"] or 0.0) if self.rows[n] else -math.inf
+            mine = [r for r in self.journal.rows if r.get("reactor") == name and r["kind"] in ("decision", "intent")]
+            for k, decision in enumerate(mine):
+                if decision["kind"] != "decision" or decision["row"]["time_min"] <= last:
+                    continue
+                row: Row = {c: math.nan if decision["row"][c] is None else decision["row"][c] for c in COLUMNS}
+                followed = k + 1 < len(mine) and mine[k + 1]["kind"] == "intent"
+                row["volume_ml"] = float(mine[k + 1]["feed_ml"]) if followed else 0.0
+                self._recorders[n].write(row)
+                self.rows[n].append(row)
+                self.repairs.append(f"{name}: the row of minute {row['time_min']} was completed from the journal")
+
+    def decided(self, step: Step) -> None:
+        """Journal every decision of a step before anything is dosed, with how the controller came to it."""
+        for n in range(len(self.names)):
+            if step.rows[n]:
+                why = {key: float(value[n]) for key, value in step.explanation.items()}
+                fields = {"reactor": self.names[n], "row": row_of(step, n), "why": why}
+                self.journal.append("decision", fields)
+            elif step.reasons[n] is not None:
+                self.journal.append("trouble", {"reactor": self.names[n], "interlock": step.reasons[n]})
+
+    def done(self, step: Step, state: Mapping[str, Any]) -> None:
+        """Write a step's rows, the state after it, and its curves."""
+        for n in np.flatnonzero(step.rows):
+            row = row_of(step, int(n))
+            self._recorders[n].write(row)
+            self.rows[n].append(row)
+            minute = self._points = max(self._points, round(float(step.minute[n])))
+            curves = {"od": step.od, "setpoint": step.setpoint, "pump_rate_ml_s": step.rate}
+            for tag, value in {**curves, "temperature_degc": step.temperature, **step.explanation}.items():
+                self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
+        if self._fsync:
+            self.events.flush()
+            self.save(state)
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Replace state.json; it says up to which row of the journal it knows everything."""
+        app.write_json(self.folder / "state.json", {"journal_row": self.journal.next_row, **state})
+
+    def load_state(self) -> tuple[dict[str, Any], list[Receipt]]:
+        """The saved state and the doses begun after it was written. Raises: RecordingError where there is none."""
+        path = self.folder / "state.json"
+        try:
+            state: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise RecordingError(f"{path}: no state to resume from ({error}); start a new run") from None
+        later = []
+        for row in self.journal.rows:
+            if row.get("kind") == "intent" and row["n"] >= state["journal_row"]:
+                volume = np.array([row["feed_ml"] if name == row["reactor"] else 0.0 for name in self.names])
+                waste = np.array([row["waste_ml"] if name == row["reactor"] else 0.0 for name in self.names])
+                later.append(Receipt(volume, (), waste))
+        return state, later
+
+    def series(self, column: str) -> Array:
+        """A column of all recordings, shape (N, K); shorter recordings end in nan."""
+        longest = max((len(rows) for rows in self.rows), default=0)
+        values = np.full((len(self.names), longest), np.nan)
+        for n, rows in enumerate(self.rows):
+            values[n, : len(rows)] = [row[column] for row in rows]
+        return values
+
+    def close(self) -> None:
+        """Close all files. Idempotent."""
+        for recorder in self._recorders:
+            recorder.close()
+        self.journal.close()
+        self.events.close()

@@ -1,0 +1,60 @@
+"""An emulated device of one's own: `python -m hardware.emulator` as a child process on a free port."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from types import TracebackType
+
+from hardware.errors import LinkError
+
+__all__ = ["EmulatorProcess"]
+
+
+class EmulatorProcess:
+    """Starts the emulator and ends it again; use as a context manager.
+
+    Args:
+      arguments: of `python -m hardware.emulator`, without --port.
+    Attributes: url of the device, control of its fault switches.
+    Raises: LinkError with the emulator's own words if it does not start.
+    """
+
+    def __init__(self, arguments: Sequence[str]) -> None:
+        command = [sys.executable, "-m", "hardware.emulator", "--port", "0", *arguments]
+        # a session of its own: Ctrl-C reaches the client first, which then still has a device to switch off
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        ready = re.match(r"emulator ready: (http://\S+) .* control (http://\S+)", line)
+        if ready is None:
+            self.close()
+            raise LinkError(f"the emulator did not start: {line.strip() or 'no output'}")
+        self.url, self.control = ready[1], ready[2]
+
+    @property
+    def pid(self) -> int:
+        """Of the child process."""
+        return self._process.pid
+
+    def close(self) -> None:
+        """End it. Idempotent."""
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(5.0)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def __enter__(self) -> EmulatorProcess:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,156 @@
+"""Before a run: one line per check, passed or with the remedy. Looks, touches nothing but the selected reactor."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
+from pathlib import Path
+
+from hardware.chibio_config import ChiBioConfig
+from hardware.clock import Clock
+from hardware.errors import ReactorError
+from hardware.pumps import Rig
+from hardware.transport import Transport
+from hardware.unit import Unit, no_log
+from hardware.wire import PERIOD_S, UNSET_BLANK, DeviceState
+
+__all__ = ["Check", "preflight"]
+
+FREE_MB = 200.0  # a week of eight reactors writes well under this
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line: what was checked, whether it passed, what was seen, what to do. `required` ones stop a run."""
+
+    name: str
+    ok: bool
+    detail: str
+    remedy: str = ""
+    required: bool = True
+
+    def __str__(self) -> str:
+        mark = "pass" if self.ok else ("FAIL" if self.required else "note")
+        return f"{mark}  {self.name}: {self.detail}" + ("" if self.ok else f" -> {self.remedy}")
+
+
+def preflight(
+    transport: Transport, clock: Clock, config: ChiBioConfig, rigs: list[Rig], folder: Path | None = None
+) -> list[Check]:
+    """Connection, clock, disk, and per reactor presence, identity, blank, modes, sensors and pump calibration.
+
+    Args:
+      transport, clock, config, rigs: as for `ChiBioReactors`.
+      folder: where the run will write; its disk is checked.
+    Raises: nothing about the device; a check that cannot be made has failed.
+    """
+    checks = [_disk(folder)] if folder is not None else []
+    try:
+        checks += [_link(transport, clock), _board_clock(transport, clock, config)]
+    except ReactorError as error:
+        return [*checks, Check("connection", False, str(error), "check cable, address and that the server runs")]
+    for name, rig in zip(config.reactors, rigs, strict=True):
+        unit = Unit(name, config.reactors, transport, clock, no_log)
+        try:
+            state = unit.read()
+            if not state.running:
+                unit.probe()  # a device that never ran an experiment shows no temperature yet
+                state = unit.read()
+        except ReactorError as error:
+            checks.append(
+                Check(f"{name} present", False, str(error), "plug it in with the server stopped, or leave it out")
+            )
+            continue
+        checks.append(
+            Check(f"{name} present", True, f"identity {state.device_id}, software {state.version or 'unnamed'}")
+        )
+        checks += _reactor(name, state, rig)
+    return checks
+
+
+def _disk(folder: Path) -> Check:
+    free = shutil.disk_usage(folder).free / 1e6
+    return Check("disk", free > FREE_MB, f"{free:.0f} MB free", f"free at least {FREE_MB:.0f} MB under {folder}")
+
+
+def _link(transport: Transport, clock: Clock) -> Check:
+    start = clock.now()
+    for _ in range(3):
+        transport.get("/getSysdata/")
+    took = (clock.now() - start) / 3.0
+    return Check("connection", took < 2.0, f"{took:.2f} s per answer", "close web pages; use a faster link")
+
+
+def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Check:
+    """Whether the board's clock runs evenly; what it shows does not matter (chibio.md section 9)."""
+    dates, times = [], []
+    for pause in (5.0, 0.0):
+        reply = transport.get("/getSysdata/")
+        times.append(clock.now())
+        try:
+            dates.append(parsedate_to_datetime(reply.date).timestamp())
+        except ValueError:
+            return Check("board clock", True, "not visible over this link", required=False)
+        clock.sleep(pause)
+    drift = (dates[1] - dates[0]) - (times[1] - times[0]) / config.speed
+    return Check(
+        "board clock", abs(drift) < 2.5, f"{drift:+.1f} s against this computer", "stop clock corrections on the board"
+    )
+
+
+def _reactor(name: str, state: DeviceState, rig: Rig) -> Iterator[Check]:
+    """Checks of one reactor's state."""
+    blank = rig.blank if math.isfinite(rig.blank) else state.blank
+    source = "stored" if math.isfinite(rig.blank) else "of the device"
+    yield Check(
+        f"{name} blank",
+        3000.0 <= blank <= 60000.0 and blank != UNSET_BLANK,
+        f"{blank:.0f} counts ({source})",
+        "measure it with clear medium: python -m experiments.blank",
+    )
+    yield Check(
+        f"{name} modes",
+        not state.modes and not state.regulating,
+        ", ".join([*state.modes, *(["OD regulation"] if state.regulating else [])]) or "none active",
+        "switch them off in the web page (OD regulation is switched off by the run itself)",
+        required=bool(state.modes),
+    )
+    yield Check(
+        f"{name} temperature",
+        10.0 < state.temperature < 45.0,
+        f"{state.temperature:.1f} degC",
+        "check that the vial is seated under the thermometer",
+    )
+    yield Check(
+        f"{name} light sensor",
+        state.cycles == 0 or state.raw >= 5.0,
+        f"raw {state.raw:.0f} after {state.cycles} cycles",
+        "check the spectrometer; restart the device",
+    )
+    same = all(not p.device_id or p.device_id == state.device_id for p in (rig.feed, rig.waste))
+    dates = f"feed {rig.feed.date or 'never weighed'}, waste {rig.waste.date or 'never weighed'}"
+    yield Check(
+        f"{name} pump calibration",
+        rig.calibrated and same,
+        dates + ("" if same else ", on another unit"),
+        f"python -m experiments.calibrate_pump reactor={name}; until then {rig.feed.flow_ml_s:g} mL/s is assumed",
+        required=False,
+    )
+    stronger = 4.0 * rig.waste.flow_ml_s / rig.feed.flow_ml_s
+    yield Check(
+        f"{name} waste over feed",
+        stronger >= 1.5,
+        f"waste moves {stronger:.1f} times the feed in its on-time",
+        "exchange or repair the waste pump",
+    )
+    on = [p for p, is_on in zip(("Pump1", "Pump2", "Pump3", "Pump4"), state.pumps_on, strict=True) if is_on]
+    yield Check(
+        f"{name} pumps",
+        not on,
+        f"{', '.join(on) or 'all'} {'on' if on else 'off'}",
+        f"an earlier client left them on, each repeats its dose every {PERIOD_S:.0f} s; the run switches them off",
+        required=False,
+    )

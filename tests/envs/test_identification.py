@@ -1,0 +1,444 @@
+"""mu and tau from recordings: against brute force, other integrators, simulated truth and independent fits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from envs.calibration import Calibration, IdentifyConfig, calibrate
+from envs.growth import Culture, Exponential
+from envs.identification import NotIdentifiable, _sum_variance, fit, pmse, trajectory
+from envs.integrators import rk4
+from envs.open_loop import OpenLoop, open_loop
+from envs.screening import Series, noise_sd, pumped_volume, screen
+from hardware.recording import read_recording
+from tests.real_recording import DITHER, needs_dither
+
+
+def series(time: np.ndarray, od: np.ndarray, pump_rate: np.ndarray) -> Series:
+    return Series(time, od, pump_rate, np.arange(len(time)))
+
+
+def simulated(seed: int = 1, **changes: object) -> Series:
+    time, od, pump_rate = open_loop(OpenLoop(**changes), np.random.default_rng(seed))  # type: ignore[arg-type]
+    return series(time, od[0], pump_rate[0])
+
+
+def dither(first: int = 0, end: int | None = None) -> Series:
+    r = read_recording(DITHER)
+    return Series(r.time_min, r.od, r.pump_rate, r.row).part(first, len(r.od) if end is None else end)
+
+
+def rejected(result: Calibration) -> dict[str, list[int]]:
+    return {r.reason.split(":")[0]: r.rows.tolist() for r in result.rejections}
+
+
+# ---------------------------------------------------------------- the model
+
+
+def test_trajectory_agrees_with_the_integrated_growth_model() -> None:
+    rng = np.random.default_rng(0)
+    time = np.cumsum(rng.uniform(0.5, 1.5, (3, 40)), axis=1)
+    pump_rate = rng.uniform(0.0, 0.02, (3, 40))
+    mu, tau, start = np.array([0.01, 0.02, 0.03]), np.array([0.25, 0.3, 0.4]), np.array([0.2, 0.5, 0.9])
+    batch = trajectory(time, pump_rate, mu, tau, start)
+    for k in range(3):
+        culture = Culture(Exponential(mu[k]), tau[k])
+        state = np.array([[start[k], 1.0]])
+        for i in range(39):
+            assert batch[k, i] == pytest.approx(state[0, 0], rel=1e-9)
+            u = pump_rate[k, i : i + 1]
+            state = rk4(lambda y, u=u, c=culture: c.derivative(y, u, np.array([37.0])), state, np.diff(time[k])[i], 20)
+        single = trajectory(time[k], pump_rate[k], mu[k], tau[k], start[k])
+        np.testing.assert_array_equal(batch[k], single)
+
+
+def test_pumped_volume_and_pmse_by_hand() -> None:
+    time, rate = np.array([0.0, 1.0, 3.0, 4.0]), np.array([0.01, 0.02, 0.0, 5.0])
+    np.testing.assert_allclose(pumped_volume(time, rate), [0.0, 0.01, 0.05, 0.05])
+    assert pmse(np.array([1.0, 2.0, np.nan]), np.array([1.1, 1.8, 7.0])) == pytest.approx(100 * 0.05 / 5.0)
+
+
+# ---------------------------------------------------------------- the fit
+
+
+@pytest.mark.parametrize(("mu", "tau"), [(0.01, 0.25), (0.02, 1 / 3), (0.03, 0.45)])
+def test_noise_free_recording_gives_its_parameters_back(mu: float, tau: float) -> None:
+    found = fit(simulated(mu=mu, tau=tau, noise=0.0, keep_od=(0.05, 2.0)))
+    assert found.tau is not None
+    assert (found.mu.value, found.tau.value) == pytest.approx((mu, tau), rel=1e-7)
+    assert found.pmse_pct < 1e-9
+
+
+def test_fit_is_the_minimum_that_brute_force_finds() -> None:
+    s = simulated(noise=0.03)
+
+    def cost(p: np.ndarray) -> float:
+        return float(np.sum((trajectory(s.time, s.pump_rate, p[0] / 30, 1 / p[1] / 3, p[2] / 8) - s.od) ** 2))
+
+    brute = minimize(
+        cost, [1.0, 1.0, 1.0], method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-14, "maxiter": 9000}
+    )
+    found = fit(s, robust=False)
+    assert found.tau is not None
+    assert [found.mu.value, found.tau.value, found.start_od[0]] == pytest.approx(
+        [brute.x[0] / 30, 1 / brute.x[1] / 3, brute.x[2] / 8], rel=1e-5
+    )
+
+
+def test_segments_with_their_own_start_survive_level_shifts() -> None:
+    s = simulated(noise=0.005)
+    level = np.repeat([1.0, 1.15, 0.9], [120, 120, 121])
+    shifted = series(s.time, s.od * level, s.pump_rate)
+    found = fit(shifted, starts=(0, 120, 240))
+    assert found.tau is not None
+    assert (found.mu.value, found.tau.value) == pytest.approx((0.028, 0.31), rel=0.02)
+    whole = fit(shifted, robust=False)
+    assert whole.pmse_pct > 20 * found.pmse_pct
+
+
+def test_missing_readings_change_nothing_but_the_precision() -> None:
+    s = simulated(noise=0.0)
+    holes = s.rejecting(np.random.default_rng(3).random(len(s.od)) < 0.5)
+    found = fit(holes)
+    assert found.tau is not None
+    assert (found.mu.value, found.tau.value) == pytest.approx((0.028, 0.31), rel=1e-6)
+    assert found.n_used == np.isfinite(holes.od).sum() < 0.6 * len(s.od)
+
+
+def test_huber_loss_bounds_the_pull_of_one_wrong_reading() -> None:
+    s = simulated(noise=0.01)
+    od = s.od.copy()
+    od[np.argmax(od)] *= 3.0
+    wrong = series(s.time, od, s.pump_rate)
+    off = [abs(fit(wrong, robust=r).mu.value - 0.028) for r in (True, False)]
+    assert off[0] < 0.5 * off[1]
+
+
+# ---------------------------------------------------------------- intervals
+
+
+def test_variance_of_a_correlated_sum_against_its_formula() -> None:
+    """For AR(1) noise Var(sum) -> n sigma^2 (1 + rho)/(1 - rho)."""
+    rng = np.random.default_rng(5)
+    n, rho = 600, 0.7
+    estimates, sums = [], []
+    for _ in range(300):
+        z = np.empty(n)
+        z[0] = rng.standard_normal()
+        for i in range(1, n):
+            z[i] = rho * z[i - 1] + np.sqrt(1 - rho**2) * rng.standard_normal()
+        estimates.append(_sum_variance(z - z.mean()))
+        sums.append(z.sum())
+    exact = n * (1 + rho) / (1 - rho)
+    assert np.mean(estimates) == pytest.approx(exact, rel=0.1)
+    assert np.var(sums) == pytest.approx(exact, rel=0.25)  # the simulation itself is right
+
+
+def coverage(config: OpenLoop, n: int, seed: int) -> tuple[float, float]:
+    time, od, pump_rate = open_loop(config, np.random.default_rng(seed), n)
+    found = [calibrate(series(time, od[i], pump_rate[i])) for i in range(n)]
+    mu = np.mean([c.fit.mu.low <= config.mu <= c.fit.mu.high for c in found])
+    tau = np.mean([c.tau.low <= config.tau <= c.tau.high for c in found])
+    return float(mu), float(tau)
+
+
+def test_intervals_hold_the_truth_at_one_percent_noise() -> None:
+    for share in coverage(OpenLoop(), 200, seed=20):
+        assert 0.90 <= share <= 0.99
+
+
+def test_intervals_allow_for_correlated_noise() -> None:
+    """Ignoring the correlation of 0.8 would cover some 43 %."""
+    for share in coverage(OpenLoop(noise_correlation=0.8), 150, seed=21):
+        assert 0.87 <= share <= 0.99
+
+
+def test_intervals_are_as_wide_as_the_estimates_scatter() -> None:
+    """Half width over the Monte Carlo sd of one experiment: 1.96 for a known variance, more for an estimated one."""
+    config = OpenLoop(noise_correlation=0.3)
+    time, od, pump_rate = open_loop(config, np.random.default_rng(30))
+    truth = trajectory(time, pump_rate[0], config.mu, config.tau, config.start_od)
+    np.testing.assert_allclose(od[0], truth, rtol=0.05)
+    rng, found = np.random.default_rng(31), []
+    for _ in range(200):
+        error = rng.standard_normal(len(time))
+        for i in range(1, len(time)):
+            error[i] = 0.3 * error[i - 1] + np.sqrt(1 - 0.3**2) * error[i]
+        found.append(fit(series(time, truth * (1 + 0.01 * error), pump_rate[0])))
+    for values in ([f.mu for f in found], [f.tau for f in found]):
+        known = [v for v in values if v is not None]
+        ratio = np.mean([v.half_width for v in known]) / np.std([v.value for v in known])
+        assert 1.8 < ratio < 2.7
+
+
+# ---------------------------------------------------------------- identifiability
+
+
+@pytest.mark.parametrize(
+    ("rate", "message"),
+    [
+        (lambda t: 0.0 * t, "pump never runs"),
+        (lambda t: 0.0 * t + 0.01, "pump never stops"),
+        (lambda t: np.where((t > 50) & (t < 52), 0.02, 0.0), "at least 3 of each"),
+    ],
+)
+def test_recording_that_cannot_give_tau_says_so(rate: object, message: str) -> None:
+    time = np.arange(200.0)
+    pump_rate = rate(time)  # type: ignore[operator]
+    od = trajectory(time, pump_rate, 0.012, 1 / 3, 0.05) * (1 + 0.01 * np.random.default_rng(0).standard_normal(200))
+    with pytest.raises(NotIdentifiable, match=message):
+        calibrate(series(time, od, pump_rate))
+
+
+def test_tau_lost_in_noise_is_refused() -> None:
+    rng = np.random.default_rng(2)
+    time = np.arange(60.0)
+    pump_rate = np.where(time % 2 < 1, 0.0, 0.0005)
+    od = trajectory(time, pump_rate, 0.01, 1 / 3, 0.3) * (1 + 0.05 * rng.standard_normal(60))
+    with pytest.raises(NotIdentifiable, match="do not determine tau"):
+        calibrate(series(time, od, pump_rate))
+
+
+def test_growth_alone_gives_mu_without_tau() -> None:
+    time = np.arange(120.0)
+    found = fit(series(time, 0.05 * np.exp(0.02 * time), np.zeros(120)))
+    assert found.tau is None
+    assert found.mu.value == pytest.approx(0.02, rel=1e-7)
+
+
+# ---------------------------------------------------------------- screening
+
+
+def test_clean_recordings_lose_next_to_nothing() -> None:
+    time, od, pump_rate = open_loop(OpenLoop(noise=0.02), np.random.default_rng(9), 60)
+    lost = [np.isnan(screen(series(time, od[i], pump_rate[i])).series.od).sum() for i in range(60)]
+    assert np.mean(lost) < 0.001 * len(time)
+
+
+def test_outliers_are_found_where_they_were_put() -> None:
+    s = simulated()
+    rows = [20, 97, 98, 180, 300]
+    od = s.od.copy()
+    od[rows] *= [1.5, 0.6, 0.7, 2.0, 1.3]
+    assert rejected(calibrate(series(s.time, od, s.pump_rate))) == {"outlier": rows}
+
+
+def test_burst_that_comes_back_is_bridged() -> None:
+    s = simulated()
+    od = s.od.copy()
+    od[150:158] += 0.6
+    result = calibrate(series(s.time, od, s.pump_rate))
+    assert [i for rows in rejected(result).values() for i in rows] == list(range(150, 158))
+    assert result.window == (0, 361)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.4])
+def test_dead_sensor_is_refused(level: float) -> None:
+    s = simulated()
+    with pytest.raises(ValueError, match="trustworthy readings above zero are left"):
+        calibrate(series(s.time, np.full(361, level), s.pump_rate))
+
+
+def test_any_mutilated_recording_ends_in_a_result_or_in_a_reason() -> None:
+    """Random cuts, holes, jumps, frozen and wild stretches; warnings are errors here, so NumPy may not even mutter."""
+    time, od, pump_rate = open_loop(OpenLoop(), np.random.default_rng(0), 20)
+    outcomes = set()
+    for k in range(200):
+        rng = np.random.default_rng(k)
+        n = int(rng.integers(1, 362))
+        t, y, u = time[:n].copy(), od[k % 20, :n].copy(), pump_rate[k % 20, :n].copy()
+        for operation in rng.integers(0, 8, rng.integers(0, 4)):
+            at = int(rng.integers(0, n))
+            part = slice(at, at + int(rng.integers(1, n + 1)))
+            if operation == 0:
+                y[part] = np.nan
+            elif operation == 1:
+                y[part] *= rng.choice([0.0, -0.02, 3.0, 0.1])
+            elif operation == 2:
+                u[part] = rng.choice([0.0, 0.02, 1.0])
+            elif operation == 3:
+                u[:] = rng.choice([0.0, 0.01])
+            elif operation == 4:
+                y[part] = y[at]
+            elif operation == 5:
+                y[part] = rng.uniform(-0.05, 9.0, len(y[part]))
+            elif operation == 6:
+                t[at:] += rng.choice([10.0, 1000.0])
+            else:
+                y[rng.random(n) < 0.3] = np.nan
+        try:
+            result = calibrate(series(t, y, u))
+        except ValueError:
+            outcomes.add("refused")
+        else:
+            assert result.fit.mu.low < result.fit.mu.value < result.fit.mu.high
+            assert 0.0 < result.tau.low < result.tau.value < result.tau.high
+            outcomes.add("fitted")
+    assert outcomes == {"refused", "fitted"}
+
+
+def test_frozen_sensor() -> None:
+    s = simulated()
+    od = s.od.copy()
+    od[200:] = od[200]
+    assert rejected(calibrate(series(s.time, od, s.pump_rate))) == {"sensor frozen": list(range(201, 361))}
+
+
+@pytest.mark.parametrize("factor", [6.0, 0.2])
+def test_persistent_jump_parts_the_recording(factor: float) -> None:
+    s = simulated()
+    od = s.od.copy()
+    od[250:] *= factor
+    result = calibrate(series(s.time, od, s.pump_rate))
+    assert [i for rows in rejected(result).values() for i in rows] == list(range(249, 361))
+    assert result.fit.mu.low <= 0.028 <= result.fit.mu.high
+
+
+def test_sensor_gone_wild() -> None:
+    s = simulated()
+    od = s.od.copy()
+    od[240:] = np.random.default_rng(4).uniform(0.0, 3.0, 121)
+    result = calibrate(series(s.time, od, s.pump_rate))
+    assert result.window_rows[1] <= 245
+    assert result.tau.value == pytest.approx(0.31, rel=0.02)
+    assert "sensor noisy" in rejected(result)
+
+
+def test_pause_parts_the_recording_without_rejecting() -> None:
+    s = simulated(hours=12.0)
+    keep = (s.time < 200) | (s.time > 260)
+    result = calibrate(series(s.time[keep], s.od[keep], s.pump_rate[keep]))
+    assert len(result.screened.stretches) == 2
+    assert not result.rejections
+    assert result.window_rows[0] == 200
+
+
+def test_noise_sd_is_measured_through_growth_and_dilution() -> None:
+    time, od, pump_rate = open_loop(OpenLoop(noise=0.0), np.random.default_rng(3))
+    noisy = od[0] + 0.004 * np.random.default_rng(4).standard_normal(len(time))
+    assert noise_sd(series(time, noisy, pump_rate[0])) == pytest.approx(0.004, rel=0.2)
+
+
+# ---------------------------------------------------------------- window, drift, validation
+
+
+def test_drift_is_found_and_kept_out_of_the_window() -> None:
+    """tau rises by 60 % in the second half; the first half alone is fitted."""
+    rng = np.random.default_rng(8)
+    time = np.arange(1200.0)
+    pump_rate = np.where(time % 60 < 15, 0.015, 0.0)
+    tau = np.interp(time, [0, 600, 1200], [0.3, 0.3, 0.48])
+    rise = 0.012 - pump_rate / tau
+    od = 0.4 * np.exp(np.concatenate([[0.0], np.cumsum(rise[:-1])])) * (1 + 0.01 * rng.standard_normal(1200))
+    result = calibrate(series(time, od, pump_rate))
+    assert result.drift_tau is not None
+    assert result.drift_tau.significant
+    assert result.drift_tau.change_pct == pytest.approx(45, abs=20)
+    assert any("tau drifts" in w for w in result.warnings)
+    assert 600 <= result.window_rows[1] <= 880
+    assert result.tau.value == pytest.approx(0.3, rel=0.06)
+    assert result.tau.low < 0.3 < result.tau.high
+    assert result.validation.outside_pct is not None
+    with pytest.raises(NotIdentifiable, match="a culture that drifts"):
+        calibrate(series(time, od, pump_rate), IdentifyConfig(window="all"))
+
+
+def test_all_rows_on_request_with_a_warning() -> None:
+    """The second half grows 5 % faster: more than the limit forgives, not enough to be refused."""
+    s = simulated(noise=0.005)
+    faster = s.od * np.exp(0.0015 * np.maximum(s.time - 180, 0.0))
+    config = IdentifyConfig(window="all", pmse_limit=0.01)
+    result = calibrate(series(s.time, faster, s.pump_rate), config)
+    assert result.window == (0, 361)
+    assert any("exceeds" in w for w in result.warnings)
+
+
+def test_constant_culture_shows_no_drift() -> None:
+    result = calibrate(simulated(hours=20.0))
+    assert result.drift_mu is not None
+    assert result.drift_tau is not None
+    assert not any("drifts" in w for w in result.warnings)
+    assert result.validation.holdout_pct is not None
+    assert result.validation.holdout_pct < 0.1
+    assert result.validation.outside_pct is None
+
+
+@pytest.mark.parametrize(
+    "changes", [{"window": "best"}, {"pmse_limit": 0.0}, {"segment_min": 5.0}, {"horizon_min": float("nan")}]
+)
+def test_config_names_key_and_value(changes: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=rf"identify\.{next(iter(changes))} = .*allowed"):
+        IdentifyConfig(**changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "changes", [{"mu": 0.2}, {"tau": 2.0}, {"hours": 1.0}, {"noise": -0.1}, {"keep_od": (1.0, 0.5)}]
+)
+def test_protocol_names_key_and_value(changes: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=rf"protocol\.{next(iter(changes))} = .*allowed"):
+        OpenLoop(**changes)  # type: ignore[arg-type]
+
+
+def test_generator_follows_the_protocol() -> None:
+    time, od, pump_rate = open_loop(OpenLoop(noise=0.0), np.random.default_rng(2), 20)
+    assert (pump_rate[:, time < 60] == 0.0).all()
+    for y, u in zip(od, pump_rate, strict=True):
+        below = int(np.argmax((time >= 60) & (y < 0.3)))
+        assert (u[60:below] == 0.02).all()
+        changes = time[below:][1:][np.diff(u[below:]) != 0] - time[below]
+        regular = changes[changes % 30 == 0] if y[below:].min() > 0.08 and y[below:].max() < 1.2 else changes
+        assert len(regular) == len(changes)
+        assert np.isin(np.round(u / 0.00125, 9) % 1, [0.0]).all()
+    assert len({tuple(u) for u in pump_rate}) == 20
+    y, u = od[0], pump_rate[0]
+    np.testing.assert_allclose(trajectory(time, u, 0.028, 0.31, 0.12), y, rtol=1e-8)
+
+
+# ---------------------------------------------------------------- the real recording
+
+
+@needs_dither
+@pytest.mark.parametrize(
+    ("rows", "starts", "mu", "tau", "rms", "error"),
+    [
+        ((0, 700), 0, 0.0102, 0.304, 0.0213, 0.43),
+        ((270, 700), 0, 0.0104, 0.301, 0.0257, 0.45),
+        ((270, 1156), 60, 0.0099, 0.42, 0.035, 0.81),
+    ],
+)
+def test_real_recording_against_independent_fits(
+    rows: tuple[int, int], starts: int, mu: float, tau: float, rms: float, error: float
+) -> None:
+    s = dither(*rows)
+    found = fit(s, starts=tuple(range(0, len(s.od), starts)) if starts else (0,), robust=False)
+    assert found.tau is not None
+    assert found.mu.value == pytest.approx(mu, abs=2e-4)
+    assert found.tau.value == pytest.approx(tau, rel=0.02)
+    assert found.rms == pytest.approx(rms, rel=0.02)
+    assert found.pmse_pct == pytest.approx(error, abs=0.02)
+
+
+@needs_dither
+def test_free_run_through_the_drift_is_refused() -> None:
+    with pytest.raises(NotIdentifiable, match="1/tau = 0.32"):  # tau 3.1, nonsense
+        fit(dither(270, 1156), robust=False)
+
+
+@needs_dither
+def test_whole_real_recording() -> None:
+    result = calibrate(dither())
+    broken = next(r for r in result.rejections if "sensor broken" in r.reason)
+    assert broken.rows.tolist() == list(range(1157, 1209))
+    first, end = result.window_rows
+    assert end <= 780
+    assert 0.0098 <= result.fit.mu.value <= 0.0108
+    assert 0.28 <= result.tau.value <= 0.33
+    assert result.fit.pmse_pct <= 0.6
+    assert result.drift_mu is not None
+    assert result.drift_mu.change_pct == pytest.approx(40, abs=15)
+    assert result.drift_tau is not None
+    assert result.drift_tau.significant
+    assert result.drift_tau.last == pytest.approx(0.42, abs=0.04)
+    assert first < 20

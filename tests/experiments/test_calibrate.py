@@ -1,0 +1,220 @@
+"""`python -m experiments.calibrate` as a user runs it: its files, its numbers, and its refusals."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from envs.calibration import calibrate
+from envs.open_loop import OpenLoop, open_loop
+from envs.screening import Series
+from experiments import app
+from experiments.calibrate import CalibrateConfig, environment_yaml
+from hardware.recording import read_recording
+from tests.real_recording import DITHER, needs_dither
+
+ROOT = Path(__file__).parents[2]
+Cli = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def cli(tmp_path: Path) -> Cli:
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [
+                sys.executable,
+                "-W",
+                "ignore",
+                "-m",
+                "experiments.calibrate",
+                *arguments,
+                f"hydra.run.dir={tmp_path}/run",
+            ],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+
+    return run
+
+
+def tidy(path: Path, od: np.ndarray, time: np.ndarray, pump_rate: np.ndarray) -> str:
+    rows = zip(time.tolist(), od.tolist(), pump_rate.tolist(), strict=True)
+    path.write_text("time_min,od,pump_rate_ml_s\n" + "".join(f"{t!r},{y!r},{u!r}\n" for t, y, u in rows))
+    return f"data={path}"
+
+
+@pytest.fixture(scope="module")
+def recording() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    time, od, pump_rate = open_loop(OpenLoop(hours=4.0), np.random.default_rng(6))
+    return time, od[0], pump_rate[0]
+
+
+def test_shipped_recording_from_the_command_line(cli: Cli, tmp_path: Path) -> None:
+    done = cli()
+    assert done.returncode == 0, done.stderr
+    run = tmp_path / "run"
+    content = json.loads((run / "summary.json").read_text())
+    assert content["mu"]["ci95"][0] <= 0.028 <= content["mu"]["ci95"][1]
+    assert content["tau"]["ci95"][0] <= 0.31 <= content["tau"]["ci95"][1]
+    assert content["rows_used"] == [0, 361]
+    assert (content["n_used"], content["n_rejected"], content["warnings"]) == (361, 0, [])
+    assert content["pmse_pct"] < 0.05
+    for word in ("mu ", "tau ", "PMSE", "window", "held out", "doubling", "calibrated.yaml"):
+        assert word in done.stdout
+    for figure in ("fit.png", "drift.png"):
+        assert (run / figure).read_bytes().startswith(b"\x89PNG")
+    assert list(run.glob("events.out.tfevents.*"))
+    nominal = OmegaConf.load(str(resources.files("conf") / "env" / "sim.yaml"))
+    fitted = OmegaConf.load(run / "calibrated.yaml")
+    assert list(fitted) == list(nominal)
+    assert {k for k in nominal if nominal[k] != fitted[k]} == {"mu", "tau"}
+    assert (fitted.mu, fitted.tau) == (content["mu"]["value"], content["tau"]["value"])
+
+
+def test_shipped_recording_is_what_the_generator_makes(cli: Cli, tmp_path: Path) -> None:
+    assert cli("generate=true", "out=again.csv").returncode == 0
+    shipped = resources.files("experiments") / "data" / "open_loop.csv"
+    assert (tmp_path / "again.csv").read_text() == shipped.read_text()
+    again = cli("generate=true", "out=again.csv")
+    assert again.returncode == 1
+    assert again.stderr == "error: out=again.csv: exists; remove it or choose another file\n"
+
+
+@needs_dither
+@pytest.mark.parametrize("rows", ["0:700", None])
+def test_real_recording_from_the_command_line(cli: Cli, tmp_path: Path, rows: str | None) -> None:
+    done = cli(f"data={DITHER}", *([f"rows={rows}"] if rows else []))
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert 0.0098 <= content["mu"]["value"] <= 0.0108
+    assert 0.28 <= content["tau"]["value"] <= 0.33
+    assert content["pmse_pct"] <= 0.6
+    if rows:
+        assert content["rows_used"] == [0, 700]
+        assert content["n_rejected"] == 0
+    else:
+        assert content["rows_used"][1] <= 780
+        assert any(
+            r["first"] == 1157 and r["last"] == 1208 and "sensor broken" in r["reason"] for r in content["rejected"]
+        )
+        assert content["n_rejected"] >= 52
+        assert any("tau drifts" in w for w in content["warnings"])
+        assert any("mu drifts" in w for w in content["warnings"])
+        assert "sensor broken" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("empty", "is empty"),
+        ("binary", "not a text file"),
+        ("counts", "raw detector counts"),
+        ("backward", "time does not advance"),
+        ("negative", "more negative than noise"),
+        ("never runs", "the pump never runs"),
+        ("never stops", "the pump never stops"),
+        ("absent", "No such file"),
+    ],
+)
+def test_refusals_are_one_line(
+    cli: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray], kind: str, message: str
+) -> None:
+    time, od, pump_rate = recording
+    path = tmp_path / "bad.csv"
+    growing = 0.1 * np.exp(0.005 * time) * (od / od)
+    if kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "binary":
+        path.write_bytes(np.random.default_rng(1).bytes(5000))
+    elif kind != "absent":
+        tidy(
+            path,
+            od={"counts": 13000 * 10**-od, "negative": -od}.get(kind, growing if "never" in kind else od),
+            time=time[::-1] if kind == "backward" else time,
+            pump_rate={"never runs": 0 * time, "never stops": 0 * time + 0.01}.get(kind, pump_rate),
+        )
+    done = cli(f"data={path}")
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    assert str(path) in done.stderr
+
+
+def test_flaws_are_excluded_and_reported(
+    cli: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> None:
+    time, od, pump_rate = (a.copy() for a in recording)
+    od[[30, 31]], od[60], od[90] = np.nan, -0.5, 3.0 * od[90]
+    time[120], time[150] = time[119], time[140] + 0.5
+    done = cli(tidy(tmp_path / "flawed.csv", od, time, pump_rate))
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert content["n_rejected"] == 4
+    assert [(r["rows"], r["n"]) for r in content["rejected"]] == [("90", 1)]
+    notes = " | ".join(content["notes"])
+    for part in ("30-31: OD is not a finite", "row 60: OD below", "120, 150: time does not advance"):
+        assert part in notes
+        assert part in done.stdout
+    assert content["tau"]["value"] == pytest.approx(0.31, rel=0.02)
+
+
+def test_coverage_study_writes_its_figure(cli: Cli, tmp_path: Path) -> None:
+    done = cli("coverage=40")
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert content["recordings"] == 40
+    assert all(80 <= share <= 100 for share in content["coverage_pct"].values())
+    assert (tmp_path / "run" / "coverage.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_help_documents_the_generator(cli: Cli) -> None:
+    done = cli("--help")
+    assert done.returncode == 0
+    for word in ("generate=true", "protocol.noise", "coverage=200", "rows=0:700", "pmse_limit"):
+        assert word in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("rows=abc", "rows = abc: allowed FIRST:END"),
+        ("coverage=-1", "coverage = -1: allowed"),
+        ("name=../x", "name = ../x: allowed"),
+        ("pump_ml_s=0", "pump_ml_s = 0.0: allowed"),
+        ("identify.window=big", "identify.window = big: allowed auto, all"),
+        ("protocol.tau=3", "protocol.tau = 3.0: allowed"),
+        ("+identify.windows=all", "identify.windows: no such key"),
+    ],
+)
+def test_wrong_values_name_key_value_and_range(override: str, message: str) -> None:
+    with pytest.raises(app.UserError, match=message.replace("+", r"\+").replace(".", r"\.")):
+        app.load(app.compose("calibrate", [override]), CalibrateConfig())
+
+
+def test_yaml_and_dataclass_hold_the_same_defaults() -> None:
+    loaded = asdict(app.load(app.compose("calibrate", []), CalibrateConfig()))
+    loaded["protocol"]["keep_od"] = tuple(loaded["protocol"]["keep_od"])  # YAML knows lists only
+    assert loaded == asdict(CalibrateConfig())
+
+
+def test_environment_file_tells_its_origin() -> None:
+    r = read_recording(str(resources.files("experiments") / "data" / "open_loop.csv"))
+    result = calibrate(Series(r.time_min, r.od, r.pump_rate, r.row))
+    head = environment_yaml(result, "open_loop.csv").splitlines()[:3]
+    assert all(line.startswith("#") for line in head)
+    assert "open_loop.csv, rows 0:361, 361 readings" in head[1]

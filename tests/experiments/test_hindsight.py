@@ -1,0 +1,73 @@
+"""Relabelled transitions: still true, goals where they are said to be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dqn.config import DQNConfig
+from dqn.replay import Transition
+from envs.task import EnvConfig
+from experiments.hindsight import goal_relabel
+
+ENV = EnvConfig()
+AGENTS, BATCH = 4, 500
+
+
+def _batch(od: float | None = None) -> Transition:
+    generator = torch.Generator().manual_seed(0)
+    numbers = torch.rand(AGENTS, BATCH, 2, 2, generator=generator)
+    before, after = numbers[..., 0], numbers[..., 1]
+    if od is not None:
+        after[..., 0] = od
+    action = torch.randint(0, 17, (AGENTS, BATCH), generator=generator)
+    return Transition(before, action, torch.full((AGENTS, BATCH), 9.0), after, torch.ones(AGENTS, BATCH))
+
+
+def _relabel(near: float, batch: Transition, width: tuple[float, float] = (1e-3, 0.8)) -> Transition:
+    uniform = torch.rand(AGENTS, BATCH, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return goal_relabel(ENV, DQNConfig(relabel_near=near, relabel_width=width), "cpu")(batch, uniform)
+
+
+@pytest.mark.parametrize("near", [0.0, 0.5, 1.0])
+def test_only_the_goal_and_its_reward_change(near: float) -> None:
+    old, new = _batch(), _relabel(near, _batch())
+    assert torch.equal(old.s_tm1[..., 0], new.s_tm1[..., 0])
+    assert torch.equal(old.s_t[..., 0], new.s_t[..., 0])
+    assert torch.equal(old.a_tm1, new.a_tm1)
+    assert torch.equal(old.continues, new.continues)
+    goal = new.s_t[..., 1]
+    assert torch.equal(goal, new.s_tm1[..., 1])
+    assert float(goal.min()) >= 0.2 - 1e-6
+    assert float(goal.max()) <= 1.0 + 1e-6
+    torch.testing.assert_close(new.r_t, -((new.s_t[..., 0] - goal) ** 2))
+    assert [field.dtype for field in new] == [field.dtype for field in old]
+
+
+def test_far_goals_are_uniform() -> None:
+    goal = _relabel(0.0, _batch()).s_t[..., 1].numpy().ravel()
+    count, _ = np.histogram(goal, bins=8, range=(0.2, 1.0))
+    assert ((count - 250.0) ** 2 / 250.0).sum() < 24.3  # 99.9 % quantile with 7 degrees of freedom
+
+
+def test_near_goals_cover_every_order_of_magnitude_on_both_sides() -> None:
+    new = _relabel(1.0, _batch(od=0.6), width=(1e-3, 0.1))
+    error = (new.s_t[..., 1] - 0.6).numpy().ravel()
+    count, _ = np.histogram(np.log10(np.abs(error)), bins=4, range=(-3.0, -1.0))
+    assert count.sum() >= 0.999 * error.size  # rounding of x' may move the ends
+    assert ((count - 500.0) ** 2 / 500.0).sum() < 16.3  # 99.9 % quantile with 3 degrees of freedom
+    assert np.mean(error > 0) == pytest.approx(0.5, abs=0.05)
+
+
+def test_share_of_near_goals() -> None:
+    new = _relabel(0.3, _batch(od=0.6), width=(1e-3, 1e-2))
+    close = (new.s_t[..., 1] - 0.6).abs() <= 1.001e-2
+    assert bool(close[:, :150].all())
+    assert float(close[:, 150:].double().mean()) < 0.06
+
+
+def test_a_state_outside_all_setpoints_gets_a_far_goal() -> None:
+    goal = _relabel(1.0, _batch(od=5.0)).s_t[..., 1]
+    assert float(goal.max()) <= 1.0
+    assert float(goal.std()) > 0.2

@@ -1,0 +1,545 @@
+"""The board agent: frames, reduction, dead-man switch; on a real pty, before a real server, as a real process.
+
+BOARD_PYTHON=python3.7 runs the agent under the interpreter of the board.
+"""
+
+import ast
+import configparser
+import contextlib
+import json
+import os
+import pty
+import select
+import shlex
+import signal
+import subprocess
+import sys
+import time
+import tty
+import zlib
+from collections.abc import Iterator
+from http.client import HTTPConnection
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hardware import board_agent
+from hardware.board_agent import Agent, Device, decode_request, encode_reply, encode_request, reduce_sysdata
+from tests.hardware.emulator_lab import Lab
+from tests.hardware.test_emulator_server import Process
+
+SOURCE = Path(board_agent.__file__)
+PYTHON = os.environ.get("BOARD_PYTHON", sys.executable)
+PATHS = st.text(st.characters(min_codepoint=33, max_codepoint=126, exclude_characters=">"), max_size=60).map(
+    "/".__add__
+)
+
+
+# -- what runs on the board ------------------------------------------------------------------------------------------
+
+
+def test_python_3_7_suffices() -> None:
+    command = [str(Path(sys.executable).with_name("vermin")), "-t=3.7-", "--no-tips", "--violations", str(SOURCE)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_only_the_standard_library_is_imported() -> None:
+    tree = ast.parse(SOURCE.read_text(), feature_version=(3, 7))
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0
+            names.add(str(node.module).split(".")[0])
+    assert names <= set(sys.stdlib_module_names)
+
+
+def test_the_service_file_starts_it_with_arguments_it_understands() -> None:
+    unit = configparser.ConfigParser(interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment, method-assign]
+    unit.read(SOURCE.with_name("board_agent.service"))
+    command = shlex.split(unit["Service"]["ExecStart"])
+    assert command[1].endswith("board_agent.py")
+    arguments = board_agent.parser().parse_args(command[2:])
+    assert arguments.tty == "/dev/ttyGS0"
+    assert unit["Service"]["Restart"] == "always"
+
+
+# -- frames ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_frame_by_hand() -> None:
+    head = b">17 POST /SetOutputOn/Pump1/0/M0"
+    line = head + b" " + format(zlib.crc32(head), "08x").encode()
+    assert encode_request(17, "POST", "/SetOutputOn/Pump1/0/M0") == line + b"\n"
+    assert decode_request(line) == (17, "POST", "/SetOutputOn/Pump1/0/M0")
+    body = b"abc\n<1 200"
+    head = b"<17 200 10"
+    assert encode_reply(17, 200, body) == head + format(zlib.crc32(head + body), " 08x").encode() + b"\n" + body + b"\n"
+
+
+@given(st.integers(1, 2**32 - 1), st.sampled_from(["GET", "POST", "RAW"]), PATHS, st.binary(max_size=20))
+def test_frames_survive_the_way_and_noise_before_them(number: int, method: str, path: str, noise: bytes) -> None:
+    line = encode_request(number, method, path)[:-1]
+    assert decode_request(line) == (number, method, path)
+    assert decode_request(noise.replace(b"\n", b"") + line) == (number, method, path)
+
+
+@settings(max_examples=3000)
+@given(st.integers(1, 2**32 - 1), PATHS, st.data())
+def test_a_damaged_frame_is_never_taken_for_another(number: int, path: str, data: st.DataObject) -> None:
+    line = bytearray(encode_request(number, "POST", path)[:-1])
+    for _ in range(data.draw(st.integers(1, 3))):
+        line[data.draw(st.integers(0, len(line) - 1))] = data.draw(st.integers(0, 255))
+    assert decode_request(bytes(line)) in (None, (number, "POST", path))
+
+
+@settings(max_examples=3000)
+@given(st.binary(max_size=700))
+def test_garbage_is_never_a_request(line: bytes) -> None:
+    assert decode_request(line) is None
+    assert decode_request(b">" + line) is None
+
+
+@pytest.mark.parametrize(
+    ("number", "method", "path"),
+    [
+        (0, "GET", "/"),
+        (2**32, "GET", "/"),
+        (-1, "GET", "/"),
+        (1, "PUT", "/"),
+        (1, "get", "/"),
+        (1, "GET", "getSysdata"),
+        (1, "GET", "/a b"),
+        (1, "GET", "/a\tb"),
+        (1, "PING", "/getSysdata/"),
+        (1, "GET", "/" + "x" * 600),
+    ],
+)
+def test_well_summed_nonsense_is_refused(number: int, method: str, path: str) -> None:
+    assert decode_request(encode_request(number, method, path)[:-1]) is None
+
+
+class Recorder(Device):
+    """A device that remembers what it was asked."""
+
+    def __init__(self) -> None:
+        super().__init__("http://127.0.0.1:9", 1.0)
+        self.asked: list[tuple[str, str]] = []
+
+    def request(self, method: str, path: str, timeout_s: float | None = None) -> tuple[int, bytes, str]:
+        self.asked.append((method, path))
+        return 204, b"", "text/html"
+
+
+@settings(max_examples=2000, deadline=None)
+@given(st.lists(st.one_of(st.binary(max_size=80), st.just(b">")), max_size=8))
+def test_nothing_is_carried_out_on_garbage(lines: list[bytes]) -> None:
+    device = Recorder()
+    agent = Agent(device, 10.0)
+    for line in lines:
+        reply = agent.answer_line(line)
+        assert reply == b"" or reply.startswith(b"<0 20 ")
+    assert device.asked == []
+    assert agent.session is False  # garbage is no heartbeat
+
+
+def test_a_repeated_request_is_answered_from_memory_until_hello() -> None:
+    device = Recorder()
+    agent = Agent(device, 10.0)
+    line = encode_request(5, "POST", "/SetOutputOn/Pump3/2/M0")[:-1]
+    assert agent.answer_line(line) == agent.answer_line(line) == encode_reply(5, 204, b"")
+    assert len(device.asked) == 1
+    agent.answer_line(encode_request(5, "POST", "/SetOutputOn/Pump4/2/M0")[:-1])  # same ID, another request
+    assert len(device.asked) == 2
+    agent.answer_line(line)
+    assert len(device.asked) == 3
+    agent.answer_line(encode_request(9, "HELLO", "/")[:-1])
+    agent.answer_line(line)
+    assert len(device.asked) == 4
+
+
+# -- reduction -------------------------------------------------------------------------------------------------------
+
+
+def test_reduced_state_is_small_and_says_the_same() -> None:
+    lab = Lab(blanked=True, od=0.4)
+    lab.post("/Experiment/1/M0")
+    lab.wait(230 * 60.07)
+    lab.post("/changeDevice/M0")
+    body = lab.device.handle("GET", "/getSysdata/")[1]
+    full, small_body = json.loads(body), reduce_sysdata(body)
+    small = json.loads(small_body)
+    assert len(body) > 20_000
+    assert len(small_body) < 1024
+    assert small["_records"] == {"time": 138, "OD": 138, "ThermometerIR": 138}
+    for name, entry in small.items():
+        if name in ("_records", "Terminal"):
+            continue
+        if not isinstance(entry, dict):
+            assert entry == full[name]
+            continue
+        for key, value in entry.items():
+            assert value == (full[name][key][-1:] if key == "record" else full[name][key]), f"{name}.{key}"
+    assert full["Terminal"]["text"].startswith(small["Terminal"]["text"])
+
+
+JSON = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.floats(), st.text(max_size=5)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3),
+        st.dictionaries(st.sampled_from([*board_agent.KEPT, "record", "text", "ON", "x"]), inner, max_size=6),
+    ),
+    max_leaves=20,
+)
+
+
+@settings(max_examples=1000)
+@given(st.one_of(st.binary(max_size=200), JSON.map(lambda x: json.dumps(x).encode())))
+def test_reduction_of_anything_else_leaves_it_alone_or_reduces_it(body: bytes) -> None:
+    reduced = reduce_sysdata(body)
+    assert reduced == body or "_records" in json.loads(reduced)
+
+
+# -- the process -----------------------------------------------------------------------------------------------------
+
+
+class Rig:
+    """Emulator, agent and a pty between the agent and this test; `link` is where the agent finds its line."""
+
+    def __init__(self, folder: Path, *arguments: str, tty_line: bool = True, speed: int = 60) -> None:
+        self.emulator = Process("--reactors", "M0,M1", "--speed", str(speed))
+        self.link = folder / "ttyGS0"
+        self.master = -1
+        self.number = 1000
+        line = ["--tty", str(self.link)] if tty_line else []
+        if tty_line:
+            self.plug()
+        command = [PYTHON, str(SOURCE), *line, "--url", f"http://127.0.0.1:{self.emulator.port}", *arguments]
+        self.log = folder / "log"
+        with self.log.open("w") as log:
+            self.agent = subprocess.Popen(command, stderr=log, cwd=folder)
+        self.until(lambda: "ready" in self.log.read_text() and (not tty_line or "open" in self.log.read_text()))
+
+    def plug(self) -> None:
+        """A new line under the same name."""
+        self.master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.link.unlink(missing_ok=True)
+        self.link.symlink_to(os.ttyname(slave))
+        self.slave = slave  # kept: a pty without any open slave reads as hung up
+
+    def unplug(self) -> None:
+        os.close(self.master)
+        os.close(self.slave)
+
+    def send(self, data: bytes) -> None:
+        os.write(self.master, data)
+
+    def receive(self, timeout: float = 5.0) -> tuple[int, int, bytes]:
+        """(ID, status, body) of the next reply frame."""
+        data, deadline = b"", time.monotonic() + timeout
+        while True:
+            head, newline, rest = data.partition(b"\n")
+            if newline:
+                assert head.startswith(b"<"), head
+                number, status, length, crc = head[1:].split(b" ")
+                if len(rest) > int(length):
+                    body = rest[: int(length)]
+                    assert rest[int(length) :] == b"\n"
+                    assert int(crc, 16) == zlib.crc32(b"<%b %b %b" % (number, status, length) + body)
+                    return int(number), int(status), body
+            assert select.select([self.master], [], [], max(deadline - time.monotonic(), 0.0))[0], f"only {data!r}"
+            data += os.read(self.master, 65536)
+
+    def ask(self, method: str, path: str, timeout: float = 5.0) -> tuple[int, bytes]:
+        """Status and body of a request over the line."""
+        self.number += 1
+        self.send(encode_request(self.number, method, path))
+        number, status, body = self.receive(timeout)
+        assert number == self.number
+        return status, body
+
+    def pump(self, pump: str, reactor: str, target: float = 0.5) -> None:
+        assert self.ask("POST", f"/SetOutputTarget/{pump}/{reactor}/{target}")[0] == 204
+        assert self.ask("POST", f"/SetOutputOn/{pump}/1/{reactor}")[0] == 204
+
+    def motors(self) -> set[str]:
+        """What really turns, e.g. {"M0/Pump1"}."""
+        truth = self.emulator.truth()
+        return {f"{m}/{pump}" for m in ("M0", "M1") for pump, on in truth[m]["motors"].items() if on}
+
+    @staticmethod
+    def until(condition: object, timeout: float = 8.0) -> float:
+        """Seconds until `condition()` holds."""
+        began = time.monotonic()
+        while not condition():  # type: ignore[operator]
+            assert time.monotonic() - began < timeout, "waited in vain"
+            time.sleep(0.02)
+        return time.monotonic() - began
+
+    def end(self) -> None:
+        if self.agent.poll() is None:
+            self.agent.send_signal(signal.SIGTERM)
+            assert self.agent.wait(timeout=10) == 0
+        if self.emulator.process.poll() is None:
+            self.emulator.end()
+        assert "Traceback" not in self.log.read_text()
+        with contextlib.suppress(OSError):
+            self.unplug()
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    one = Rig(tmp_path, "--deadman", "60", "--http-timeout", "2")
+    yield one
+    one.end()
+
+
+def test_conversation(rig: Rig) -> None:
+    status, body = rig.ask("HELLO", "/")
+    hello = json.loads(body)
+    assert status == 200
+    assert (hello["agent"], hello["protocol"], hello["deadman_s"], hello["trips"]) == ("board_agent", 1, 60.0, 0)
+    assert rig.ask("PING", "/")[0] == 200
+    assert rig.ask("POST", "/changeDevice/M1") == (204, b"")
+    status, body = rig.ask("GET", "/getSysdata/")
+    assert (status, json.loads(body)["UIDevice"]) == (200, "M1")
+    assert len(body) < 1024
+    status, whole = rig.ask("RAW", "/getSysdata/")
+    assert "AS7341" in json.loads(whole)
+    assert rig.ask("POST", "/changeDevice/M9")[0] == 500
+    assert rig.ask("POST", "/nonsense")[0] == 404
+    assert rig.ask("GET", "/getSysdata")[0] == 308
+
+
+def test_resynchronises_after_garbage_and_executes_nothing_of_it(rig: Rig) -> None:
+    good = encode_request(7, "POST", "/SetOutputTarget/Stir/M0/0.7")
+    bad = good[:-4] + b"0" + good[-3:] if good[-4:-3] != b"0" else good[:-4] + b"1" + good[-3:]
+    rig.send(b"debian login: \r\nlast message repeated\n\x00\xff\xfe")
+    rig.send(bad.replace(b"0.7", b"0.9"))
+    assert rig.receive()[:2] == (0, 20)
+    rig.send(b"x" * 5000 + b"\n" + good)
+    assert rig.receive()[:2] == (7, 204)
+    rig.send(good[:10])
+    time.sleep(0.2)
+    rig.send(good[10:])
+    assert rig.receive()[:2] == (7, 204)
+    assert json.loads(rig.ask("GET", "/getSysdata/")[1])["Stir"]["target"] == 0.7
+
+
+def test_a_repeated_toggle_toggles_once(rig: Rig) -> None:
+    rig.pump("Pump3", "M0")
+    toggle = encode_request(5, "POST", "/SetOutputOn/Pump3/2/M0")
+    for _ in range(3):
+        rig.send(toggle)
+        assert rig.receive()[:2] == (5, 204)
+    assert json.loads(rig.ask("GET", "/getSysdata/")[1])["Pump3"]["ON"] == 0
+
+
+def test_a_large_answer_arrives_whole(rig: Rig) -> None:
+    for _ in range(3):
+        assert rig.ask("POST", "/Experiment/1/M0")[0] == 204
+    status, body = rig.ask("RAW", "/getSysdata/")
+    assert status == 200
+    assert len(body) > 4500
+    assert json.loads(body)["UIDevice"] == "M0"
+
+
+def test_what_became_of_a_request_without_answer(rig: Rig) -> None:
+    rig.emulator.fault("reset_after/all/1")
+    status, body = rig.ask("POST", "/SetOutputTarget/Stir/M0/0.7")
+    assert status == 11
+    assert b"/SetOutputTarget/Stir" in body
+    rig.emulator.fault("truncated/all/1")
+    assert rig.ask("RAW", "/getSysdata/")[0] == 11
+    rig.emulator.fault("lost_reply/all/1")
+    began = time.monotonic()
+    assert rig.ask("POST", "/changeDevice/M1")[0] == 11
+    assert time.monotonic() - began == pytest.approx(2.0, abs=0.5)
+    rig.emulator.fault("malformed/all/1")
+    status, body = rig.ask("GET", "/getSysdata/")
+    assert status == 200  # passed on as it is: judging is the client's task
+    with pytest.raises(json.JSONDecodeError):
+        json.loads(body)
+    rig.emulator.fault("crash")
+    time.sleep(0.2)
+    assert rig.ask("GET", "/getSysdata/")[0] == 10
+
+
+def test_line_pulled_and_plugged_again(rig: Rig) -> None:
+    assert rig.ask("PING", "/")[0] == 200
+    for _ in range(2):
+        rig.unplug()
+        time.sleep(0.3)
+        seen = rig.log.read_text().count("open")
+        rig.plug()
+        rig.until(lambda n=seen: rig.log.read_text().count("open") > n)  # type: ignore[misc]
+        assert rig.ask("HELLO", "/")[0] == 200
+        assert json.loads(rig.ask("GET", "/getSysdata/")[1])["UIDevice"] == "M0"
+
+
+def test_a_line_nobody_reads_does_not_stop_the_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(board_agent, "WRITE_TIMEOUT_S", 0.2)
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    os.set_blocking(slave, False)
+    port = board_agent.SerialPort(os.ttyname(slave), 115200, Agent(Recorder(), 10.0))
+    began = time.monotonic()
+    port._write(slave, b"x" * 20000)
+    port._write(slave, b"y" * 20000)
+    assert 0.2 < time.monotonic() - began < 2.0
+    os.close(master)
+    os.close(slave)
+
+
+# -- dead man --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Iterator[Rig]:
+    one = Rig(tmp_path, "--deadman", "1", "--http-timeout", "2")
+    yield one
+    one.end()
+
+
+def test_silence_switches_all_pumps_of_all_present_reactors_off(short: Rig) -> None:
+    running = {("Pump1", "M0"), ("Pump2", "M0"), ("Pump3", "M1"), ("Pump4", "M1")}
+    for pump, reactor in running:
+        short.pump(pump, reactor, 1.0)
+    short.until(lambda: short.motors() == {f"{m}/{p}" for p, m in running})
+    for _ in range(8):  # heartbeats keep them running
+        assert short.ask("PING", "/")[0] == 200
+        time.sleep(0.2)
+    assert len(short.motors()) == 4
+    assert 0.5 < short.until(lambda: not short.motors()) < 2.5
+    hello = json.loads(short.ask("HELLO", "/")[1])
+    assert hello["trips"] == 1
+    assert hello["silent_s"] > 1.0
+    assert hello["last_trip"].startswith("20")
+    assert "pumps verified off" in short.log.read_text()
+    assert short.emulator.truth()["alive"] is True  # the absent reactors were not touched
+
+
+def test_regulating_reactor_is_left_alone_the_other_is_not(short: Rig) -> None:
+    short.ask("POST", "/Experiment/1/M0")
+    short.ask("POST", "/SetOutputTarget/OD/M0/0.1")
+    short.ask("POST", "/SetOutputOn/OD/1/M0")
+    short.pump("Pump3", "M0", 1.0)
+    short.pump("Pump1", "M1", 1.0)
+    short.until(lambda: "M1/Pump1" not in short.motors() and "verified off" in short.log.read_text())
+    assert "M0/Pump3" in short.motors()
+    assert "M0 regulates on its own" in short.log.read_text()
+
+
+def test_bye_disarms_and_the_next_request_arms_again(short: Rig) -> None:
+    short.pump("Pump3", "M0", 1.0)
+    assert json.loads(short.ask("BYE", "/")[1])["armed"] is False
+    time.sleep(1.6)
+    assert short.motors() == {"M0/Pump3"}
+    assert json.loads(short.ask("PING", "/")[1])["armed"] is True
+    short.until(lambda: not short.motors())
+
+
+def test_dead_bus_is_unmasked_and_ends_with_everything_off(short: Rig) -> None:
+    short.emulator.fault("bus_stuck_when_pumping")
+    short.pump("Pump1", "M0", 0.9)
+    short.until(lambda: short.motors() == {"M0/Pump1"})
+    short.until(lambda: not short.motors())
+    truth = short.emulator.truth()
+    assert truth["restarts"] == 1
+    short.until(lambda: "pumps verified off" in short.log.read_text(), timeout=12.0)
+
+
+def test_switching_off_is_repeated_until_it_can_be_verified(short: Rig) -> None:
+    short.pump("Pump1", "M0", 1.0)
+    short.emulator.fault("lying/all/-1")
+    short.until(lambda: "still on: Pump1" in short.log.read_text())
+    short.emulator.fault("lying/all/0")
+    short.until(lambda: not short.motors())
+    short.until(lambda: "pumps verified off" in short.log.read_text())
+
+
+def test_a_stopped_agent_leaves_no_pump_running(short: Rig) -> None:
+    short.pump("Pump1", "M1", 1.0)
+    short.until(lambda: short.motors() == {"M1/Pump1"})
+    short.agent.send_signal(signal.SIGTERM)
+    assert short.agent.wait(timeout=5) == 0
+    assert short.motors() == set()
+
+
+def test_armed_from_the_start(tmp_path: Path) -> None:
+    one = Rig(tmp_path, "--deadman", "1")
+    try:
+        one.emulator.ask("POST", "/SetOutputTarget/Pump1/M0/1")
+        one.emulator.ask("POST", "/SetOutputOn/Pump1/1/M0")
+        one.until(lambda: one.motors() == {"M0/Pump1"})
+        one.until(lambda: not one.motors())
+    finally:
+        one.end()
+
+
+# -- beside HTTP -----------------------------------------------------------------------------------------------------
+
+
+def test_http_mode(tmp_path: Path) -> None:
+    one = Rig(tmp_path, "--deadman", "1", "--http-timeout", "1", "--http", "127.0.0.1:0", tty_line=False)
+    port = int(one.log.read_text().rsplit("127.0.0.1:", 1)[1].split(",")[0])
+
+    def ask(method: str, path: str) -> tuple[int, bytes]:
+        connection = HTTPConnection("127.0.0.1", port, timeout=5)
+        connection.request(method, path)
+        answer = connection.getresponse()
+        body = answer.read()
+        connection.close()
+        return answer.status, body
+
+    try:
+        assert ask("POST", "/SetOutputTarget/Pump1/M0/1") == (204, b"")
+        assert ask("POST", "/SetOutputOn/Pump1/1/M0") == (204, b"")
+        status, body = ask("GET", "/getSysdata/")
+        assert (status, "AS7341" in json.loads(body)) == (200, True)  # not reduced
+        assert ask("POST", "/changeDevice/M9")[0] == 500
+        for _ in range(8):
+            assert ask("POST", "/_agent/heartbeat") == (204, b"")
+            time.sleep(0.2)
+        assert one.motors() == {"M0/Pump1"}
+        one.until(lambda: not one.motors())
+        assert json.loads(ask("GET", "/_agent/status")[1])["trips"] == 1
+        assert ask("POST", "/_agent/bye")[0] == 204
+        assert json.loads(ask("GET", "/_agent/status")[1])["armed"] is False
+        assert ask("GET", "/_agent/other")[0] == 404
+        one.emulator.fault("lost_reply/all/1")
+        assert ask("POST", "/changeDevice/M0")[0] == 504
+        one.emulator.fault("crash")
+        time.sleep(0.2)
+        assert ask("GET", "/getSysdata/")[0] == 502
+    finally:
+        one.end()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["--tty", "x", "--deadman", "0"],
+        ["--tty", "x", "--deadman", "nan"],
+        ["--tty", "x", "--http-timeout", "-1"],
+        ["--tty", "x", "--url", "https://board"],
+        ["--tty", "x", "--url", "http://board/path"],
+        ["--tty", "x", "--url", "http://board:port"],
+        ["--tty", "x", "--baud", "12345"],
+        ["--http", "5001"],
+        ["--http", "203.0.113.1:5001"],
+        ["--http", "127.0.0.1:99999"],
+    ],
+)
+def test_bad_arguments_give_one_line(arguments: list[str]) -> None:
+    done = subprocess.run([PYTHON, str(SOURCE), *arguments], capture_output=True, text=True, timeout=20)
+    assert done.returncode == 2
+    assert done.stderr.startswith("board_agent: ")
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,382 @@
+"""Failure behaviour (chibio.md section 9) as a client sees it, through the in-process transport."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hardware.emulator_faults import FAULTS, inject
+from hardware.emulator_transport import EmulatorTransport
+from hardware.errors import LinkError
+from tests.hardware.emulator_lab import Lab
+
+
+class Client:
+    """A lab with a client on its transport."""
+
+    def __init__(self, timeout_s: float = 20.0, **kwargs: object) -> None:
+        self.lab = Lab(**kwargs)  # type: ignore[arg-type]
+        self.device, self.clock = self.lab.device, self.lab.clock
+        self.link = EmulatorTransport(self.device, timeout_s)
+
+    def fails(self, act: Callable[[], object]) -> tuple[str, float]:
+        """(message, how long it took) of a request that must not be answered."""
+        before = self.clock.now()
+        with pytest.raises(LinkError) as caught:
+            act()
+        return str(caught.value), self.clock.now() - before
+
+    def state(self, reactor: str = "M0") -> dict:  # type: ignore[type-arg]
+        assert self.link.post(f"/changeDevice/{reactor}").status == 204
+        return dict(json.loads(self.link.get("/getSysdata/").body))
+
+
+def wiped(state: dict) -> bool:  # type: ignore[type-arg]
+    """Signature of a worker that was replaced."""
+    return bool(
+        state["Experiment"]["cycles"] == 0
+        and state["Experiment"]["startTime"] == " Waiting "
+        and state["OD0"]["target"] == 65000.0
+        and not any(state[f"Pump{k}"]["ON"] for k in (1, 2, 3, 4))
+    )
+
+
+def test_touching_an_absent_reactor_ends_everything() -> None:
+    c = Client()
+    c.link.post("/Experiment/1/M0")
+    c.link.post("/SetOutputTarget/Pump3/M1/1")
+    c.link.post("/SetOutputOn/Pump3/1/M1")
+    c.lab.wait(30.0)
+    assert c.device.truth("M1")["motors"]["Pump3"] == 1
+    message, took = c.fails(lambda: c.link.post("/MeasureTemp/IR/M5"))
+    assert "reset" in message
+    assert took < 0.1
+    for _ in range(3):
+        assert "refused" in c.fails(lambda: c.link.get("/getSysdata/"))[0]
+    c.lab.wait(1.5)  # the latch cuts the power about a second later
+    for m in ("M0", "M1"):
+        truth = c.device.truth(m)
+        assert not truth["powered"]
+        assert (truth["heat"], truth["stir"], set(truth["motors"].values())) == (0.0, 0.0, {0})
+    c.lab.wait(3600.0)
+    assert "refused" in c.fails(lambda: c.link.get("/getSysdata/"))[0]  # nobody restarts it by itself
+    inject(c.device, "restart")
+    assert c.link.post("/changeDevice/M0").status == 204  # waits for the boot
+    assert wiped(c.state("M0"))
+    assert wiped(c.state("M1"))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/MeasureOD/M5",
+        "/MeasureTemp/Internal/M5",
+        "/SetOutputOn/Stir/1/M5",
+        "/SetOutputOn/LEDA/1/M5",
+        "/Experiment/1/M5",
+        "/GetSpectrum/x1/M5",
+    ],
+)
+def test_every_blocking_access_to_an_absent_reactor_is_deadly(path: str) -> None:
+    c = Client()
+    c.fails(lambda: c.link.post(path))
+    assert not c.device.alive
+
+
+def test_a_pump_of_an_absent_reactor_is_deadly_a_moment_after_its_204() -> None:
+    c = Client()
+    assert c.link.post("/SetOutputOn/Pump1/0/M5").status == 204
+    c.lab.wait(0.2)
+    assert not c.device.alive
+
+
+@pytest.mark.parametrize("path", ["/SetOutputTarget/Pump1/M5/0.1", "/changeDevice/M5", "/scanDevices/M5"])
+def test_harmless_calls_for_an_absent_reactor(path: str) -> None:
+    c = Client()
+    assert c.link.post(path).status == 204
+    c.lab.wait(1.0)
+    assert c.device.alive
+
+
+def test_unplugging_a_running_reactor_takes_all_down() -> None:
+    c = Client()
+    for m in ("M0", "M1"):
+        c.link.post(f"/Experiment/1/{m}")
+    c.lab.wait(100.0)
+    inject(c.device, "unplugged", "M1")
+    c.lab.wait(60.0)
+    assert not c.device.alive
+    assert not c.device.truth("M0")["powered"]
+    inject(c.device, "restart")
+    c.lab.wait(20.0)
+    assert c.state("M0")["presentDevices"]["M1"] == 0
+    assert c.state("M0")["presentDevices"]["M0"] == 1
+
+
+def test_a_scan_marks_an_unplugged_reactor_absent_and_then_its_threads_kill() -> None:
+    c = Client()
+    c.link.post("/Experiment/1/M1")
+    c.lab.wait(40.0)
+    inject(c.device, "unplugged", "M1")
+    assert c.link.post("/scanDevices/M1").status == 204
+    state = c.state("M0")
+    assert state["presentDevices"]["M1"] == 0
+    c.lab.wait(60.0)
+    assert not c.device.alive
+
+
+def test_a_slow_request_delays_everybody_and_is_answered_after_all() -> None:
+    c = Client()
+    inject(c.device, "hang_s", value=25.0)
+    _, took = c.fails(lambda: c.link.post("/SetOutputTarget/Stir/M0/0.7"))
+    assert took == pytest.approx(20.0, abs=0.01)
+    before = c.clock.now()
+    assert c.state()["Stir"]["target"] == 0.7  # it acted although the client had given up
+    assert c.clock.now() - before == pytest.approx(5.0, abs=0.1)
+
+
+def test_a_hang_beyond_30_s_costs_the_worker_and_its_memory() -> None:
+    c = Client()
+    for m in ("M0", "M1"):
+        c.link.post(f"/Experiment/1/{m}")
+    c.lab.wait(200.0)
+    inject(c.device, "hang_s", value=60.0)
+    began = c.clock.now()
+    c.fails(lambda: c.link.post("/SetOutputTarget/Stir/M0/0.7"))
+    assert c.link.get("/getSysdata/").status == 200
+    assert c.clock.now() - began == pytest.approx(30.0 + 8.0, abs=0.1)  # killed at 30 s, booted in 8
+    assert wiped(c.state("M0"))
+    assert wiped(c.state("M1"))
+    assert c.device.restarts == 1
+
+
+def test_a_client_that_waits_long_enough_sees_the_reset_of_the_killed_worker() -> None:
+    c = Client(timeout_s=300.0)
+    inject(c.device, "hang_s", value=60.0)
+    message, took = c.fails(lambda: c.link.get("/getSysdata/"))
+    assert "reset" in message
+    assert took == pytest.approx(30.0, abs=0.01)
+
+
+def test_stuck_bus_lies_with_204_and_the_temperature_probe_is_the_kill_switch() -> None:
+    c = Client()
+    c.link.post("/Experiment/1/M0")
+    c.lab.wait(70.0)
+    inject(c.device, "bus_stuck_when_pumping")
+    c.link.post("/SetOutputTarget/Pump1/M0/0.05")
+    c.link.post("/SetOutputOn/Pump1/1/M0")
+    c.lab.wait(10.0)
+    assert c.link.post("/SetOutputOn/Pump1/0/M0").status == 204
+    state = c.state()
+    assert state["Pump1"]["ON"] == 0  # says the device
+    assert c.device.truth("M0")["motors"]["Pump1"] == 1
+    cycles = state["Experiment"]["cycles"]
+    c.lab.wait(120.0)
+    assert c.state()["Experiment"]["cycles"] <= cycles + 1  # measurement hangs
+    assert c.device.truth("M0")["motors"]["Pump1"] == 1
+    c.fails(lambda: c.link.post("/MeasureTemp/IR/M0"))
+    c.lab.wait(20.0)
+    assert wiped(c.state())
+    assert set(c.device.truth("M0")["motors"].values()) == {0}
+    assert c.link.post("/MeasureTemp/IR/M0").status == 204
+
+
+def test_a_full_disk_stalls_the_cycles_of_all_reactors_while_the_server_answers() -> None:
+    c = Client()
+    for m in ("M0", "M1"):
+        c.link.post(f"/Experiment/1/{m}")
+    c.lab.wait_until(100.0)
+    inject(c.device, "disk_full")
+    c.lab.wait_until(600.0)
+    assert [c.state(m)["Experiment"]["cycles"] for m in ("M0", "M1")] == [3, 3]
+    assert c.state()["Experiment"]["ON"] == 1
+
+
+def test_a_reactor_marked_absent_by_a_glitch_is_killed_by_its_own_threads() -> None:
+    c = Client()
+    c.link.post("/Experiment/1/M1")
+    c.lab.wait(20.0)
+    inject(c.device, "marked_absent", "M1")
+    assert c.state("M0")["presentDevices"]["M1"] == 0
+    c.lab.wait(60.0)
+    assert not c.device.alive
+
+
+def test_after_a_power_cut_the_clock_starts_again_and_everything_is_off() -> None:
+    c = Client()
+    c.link.post("/SetOutputTarget/Pump3/M0/1")
+    c.link.post("/SetOutputOn/Pump3/1/M0")
+    c.lab.wait(1000.0)
+    inject(c.device, "power_cut")
+    assert set(c.device.truth("M0")["motors"].values()) == {0}
+    c.lab.wait(600.0)
+    inject(c.device, "restart")
+    c.link.post("/Experiment/1/M0")
+    assert wiped(c.state("M1"))
+    assert c.state("M0")["Experiment"]["startTime"].startswith("2026-01-01 00:10")
+
+
+def test_worker_wipe_while_pumping_stops_the_pumps() -> None:
+    c = Client(blanked=True)
+    for m in ("M0", "M1"):
+        c.link.post(f"/Experiment/1/{m}")
+        c.link.post(f"/SetOutputTarget/Pump1/{m}/0.5")
+        c.link.post(f"/SetOutputOn/Pump1/1/{m}")
+    c.lab.wait(5.0)
+    inject(c.device, "worker_wipe")
+    c.lab.wait(1.5)
+    assert c.device.truth("M0")["motors"]["Pump1"] == 0
+    assert wiped(c.state("M1"))
+    c.lab.wait(300.0)
+    assert c.device.truth("M0")["on_s"]["Pump1"] < 8.0
+    assert c.state("M0")["Experiment"]["ON"] == 0
+
+
+@pytest.mark.parametrize(
+    ("fault", "acted", "patience", "word"),
+    [
+        ("reset_before", False, 0.0, "reset"),
+        ("reset_after", True, 0.0, "reset"),
+        ("lost_request", False, 20.0, "no answer"),
+        ("lost_reply", True, 20.0, "no answer"),
+    ],
+)
+def test_link_faults(fault: str, acted: bool, patience: float, word: str) -> None:
+    c = Client()
+    inject(c.device, fault, value=2)
+    for value in (0.7, 0.8):
+        message, took = c.fails(lambda v=value: c.link.post(f"/SetOutputTarget/Stir/M0/{v}"))  # type: ignore[misc]
+        assert word in message
+        assert took == pytest.approx(patience, abs=0.1)
+        assert c.device.apps["M0"].data["Stir"]["target"] == (value if acted else 0.5)
+    assert c.link.post("/SetOutputTarget/Stir/M0/0.6").status == 204
+
+
+def test_slow_network_and_its_recovery() -> None:
+    c = Client()
+    inject(c.device, "slow_s", value=5.0)
+    before = c.clock.now()
+    assert c.link.get("/getSysdata/").status == 200
+    assert c.clock.now() - before == pytest.approx(5.0, abs=0.1)
+    inject(c.device, "slow_s", value=25.0)
+    c.fails(lambda: c.link.post("/SetOutputTarget/Stir/M0/0.7"))
+    inject(c.device, "slow_s", value=0.0)
+    assert c.state()["Stir"]["target"] == 0.5
+    c.lab.wait(10.0)
+    assert c.state()["Stir"]["target"] == 0.7  # the late one arrives all the same
+
+
+def test_malformed_and_truncated_answers() -> None:
+    c = Client()
+    inject(c.device, "malformed", value=1)
+    with pytest.raises(json.JSONDecodeError):
+        json.loads(c.link.get("/getSysdata/").body)
+    inject(c.device, "truncated", value=1)
+    assert "before the end" in c.fails(lambda: c.link.get("/getSysdata/"))[0]
+    assert json.loads(c.link.get("/getSysdata/").body)["present"] == 1
+
+
+def test_lying_server() -> None:
+    c = Client()
+    inject(c.device, "lying", value=1)
+    assert c.link.post("/SetOutputTarget/Stir/M0/0.7").status == 204
+    assert c.state()["Stir"]["target"] == 0.5
+
+
+def test_a_foreign_client_changes_the_selection_between_two_requests() -> None:
+    c = Client()
+    inject(c.device, "foreign_selects", value=0.5)
+    wrong = 0
+    for _ in range(200):
+        c.link.post("/changeDevice/M0")
+        wrong += json.loads(c.link.get("/getSysdata/").body)["UIDevice"] != "M0"
+    assert wrong == pytest.approx(100, abs=30)
+
+
+def test_clock_set_back_in_the_working_part_of_a_cycle_freezes_it_for_that_long() -> None:
+    c = Client()
+    c.link.post("/Experiment/1/M0")
+    c.lab.wait_until(68.0)  # cycle 2 is measuring
+    inject(c.device, "clock_step", value=-600.0)
+    c.lab.wait_until(120.0 + 500.0)
+    assert c.state()["Experiment"]["cycles"] == 2
+    c.lab.wait_until(120.0 + 630.0)
+    assert c.state()["Experiment"]["cycles"] == 3
+    assert c.state()["time"]["record"][-1] == pytest.approx(120.0, abs=1.0)  # wall-clock time
+
+
+def test_clock_set_forward_gives_one_short_cycle() -> None:
+    c = Client()
+    c.link.post("/Experiment/1/M0")
+    c.lab.wait_until(68.0)
+    inject(c.device, "clock_step", value=3600.0)
+    c.lab.wait_until(78.0)
+    assert c.state()["Experiment"]["cycles"] == 3
+    c.lab.wait_until(78.0 + 120.0)
+    assert c.state()["Experiment"]["cycles"] in (4, 5)
+    assert np.diff(c.state()["time"]["record"]).max() > 3600.0
+
+
+def test_clock_set_back_during_a_dose_lengthens_the_pause_not_the_dose() -> None:
+    c = Client()
+    c.link.post("/SetOutputTarget/Pump1/M0/0.05")
+    c.link.post("/SetOutputOn/Pump1/1/M0")
+    c.lab.wait(1.0)
+    inject(c.device, "clock_step", value=-300.0)
+    c.lab.wait(350.0)
+    assert [round(length, 2) for _, length in c.lab.doses()] == [3.25]
+    c.lab.wait(30.0)
+    assert len(c.lab.doses()) == 2
+
+
+def test_stirrer_that_fails_lets_cells_settle() -> None:
+    c = Client(od=0.5, blanked=True)
+    c.link.post("/Experiment/1/M0")
+    inject(c.device, "stirrer_dead", "M0")
+    c.lab.wait(20 * 60.0)
+    assert c.state()["OD"]["record"][-1] < 0.48
+
+
+@pytest.mark.parametrize(
+    ("name", "reactor", "value"),
+    [
+        ("no_such_fault", "M0", 1.0),
+        ("od_offset", "M7", 1.0),
+        ("od_offset", "M0", float("nan")),
+        ("slow_s", "all", -1.0),
+    ],
+)
+def test_impossible_faults_are_refused_by_name(name: str, reactor: str, value: float) -> None:
+    with pytest.raises(ValueError, match="allowed"):
+        inject(Lab().device, name, reactor, value)
+
+
+@pytest.mark.parametrize("name", sorted(FAULTS))
+def test_every_fault_can_be_injected_into_a_running_device(name: str) -> None:
+    c = Client(blanked=True)
+    c.link.post("/Experiment/1/M0")
+    c.lab.wait(30.0)
+    inject(c.device, name, "M0")
+    for _ in range(20):
+        c.lab.wait(10.0)
+        try:
+            c.link.post("/changeDevice/M0")
+            c.link.get("/getSysdata/")
+        except LinkError:
+            continue
+    assert c.device.truth("M0")["volume_ml"] > 0.0
+
+
+def test_timeout_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="timeout_s = 0"):
+        EmulatorTransport(Lab().device, 0.0)
+
+
+def test_every_fault_is_documented() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "emulator.md").read_text(encoding="utf-8")
+    for name, (_, values, effect) in FAULTS.items():
+        assert f"| `{name}` |" in text
+        assert values in text
+        assert effect in text

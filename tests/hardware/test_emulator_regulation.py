@@ -1,0 +1,153 @@
+"""The on-board turbidostat (chibio.md section 6): the law by hand, and in closed loop."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.hardware.emulator_lab import Lab, quiet
+
+
+def regulate(lab: Lab, target: float) -> None:
+    lab.post(f"/SetOutputTarget/OD/M0/{target}")
+    lab.post("/Experiment/1/M0")
+    lab.post("/SetOutputOn/OD/1/M0")
+
+
+def after_regulation(lab: Lab, cycle: int) -> None:
+    """Just after the regulator of a cycle has run, before the next record."""
+    lab.wait_until(60.07 * (cycle - 1) + 10.3)
+
+
+def test_first_two_cycles_feed_nothing_but_run_the_waste() -> None:
+    lab = Lab(od=0.8, blanked=True)
+    regulate(lab, 0.5)
+    for cycle in (1, 2):
+        after_regulation(lab, cycle)
+        data = lab.peek()
+        assert (data["Pump1"]["target"], data["Pump1"]["ON"]) == (0.0, 0)
+        assert (data["Pump2"]["target"], data["Pump2"]["ON"]) == (0.25 if cycle == 1 else 0.07, 1)
+
+
+def law(data: dict, previous: float, integrals: tuple[float, float]) -> tuple[float, float, float]:  # type: ignore[type-arg]
+    """Feed duty, integral 1, integral 2 as section 6 words it, from what the client can see."""
+    x, r, v = data["OD"]["current"], data["OD"]["target"], data["Volume"]["target"]
+    t = data["time"]["record"]
+    p = math.log(x / r) / ((t[-1] - t[-2]) / 60.0) / (240.0 / v) if x > 0 else 0.0
+    e, d = x - r, x - previous
+    i1, i2 = integrals
+    if e < 0.01:
+        i1 = 0.0
+    elif abs(d) < 0.05 and e > 0.025:
+        i1 += 0.1 * e
+    if abs(e) > 0.1 and abs(d) < 0.05:
+        i2 = 0.0
+    elif abs(d) < 0.1:
+        i2 += 0.01 * e
+        p *= 0.7
+    duty = 0.0 if d > 0.04 else p + i1 + i2
+    return min(max(duty, 0.0), 0.02), i1, i2
+
+
+@pytest.mark.parametrize(
+    ("od", "target", "mu"), [(0.58, 0.5, 0.0), (0.51, 0.5, 0.0), (0.65, 0.5, 0.0), (0.4, 0.5, 0.03), (0.48, 0.5, 0.03)]
+)
+def test_law_cycle_by_cycle(od: float, target: float, mu: float) -> None:
+    lab = Lab(od=od, mu=mu, blanked=True)
+    regulate(lab, target)
+    integrals = (0.0, 0.0)
+    seen = set()
+    for cycle in range(3, 16):
+        after_regulation(lab, cycle)
+        data = lab.peek()
+        assert data["Experiment"]["cycles"] == cycle
+        duty, *new = law(data, data["OD"]["record"][-1], integrals)
+        integrals = (new[0], new[1])
+        assert data["Pump1"]["target"] == pytest.approx(duty)
+        assert (data["OD"]["Integral"], data["OD"]["Integral2"]) == pytest.approx(integrals)
+        assert data["Pump2"]["target"] == pytest.approx(0.25 if cycle % 5 == 1 else 4 * duty + 0.07)
+        assert (data["Pump1"]["ON"], data["Pump2"]["ON"]) == (int(duty > 0), 1)
+        seen.add(round(duty, 6))
+    assert len(seen) > 1 or od == 0.4
+
+
+def test_a_jump_upwards_stops_the_feed_for_that_cycle() -> None:
+    lab = Lab(od=0.6, blanked=True)
+    regulate(lab, 0.5)
+    after_regulation(lab, 5)
+    assert lab.peek()["Pump1"]["target"] > 0.0
+    lab.device.vial("M0").od_jump = 0.1
+    after_regulation(lab, 6)
+    assert lab.peek()["Pump1"]["target"] == 0.0
+
+
+def test_idle_waste_pump_rests_from_cycle_16_on() -> None:
+    lab = Lab(od=0.2, blanked=True)
+    regulate(lab, 0.5)
+    after_regulation(lab, 15)
+    assert lab.peek()["Pump2"]["ON"] == 1
+    after_regulation(lab, 16)
+    data = lab.peek()
+    assert (data["Pump2"]["target"], data["Pump2"]["ON"], data["Pump1"]["ON"]) == (0.0, 0, 0)
+
+
+def test_chemostat_mode_feeds_its_fixed_rate_which_no_route_can_set() -> None:
+    lab = Lab(od=0.8, blanked=True)
+    regulate(lab, 0.5)
+    lab.post("/SetOutputOn/Chemostat/1/M0")
+    after_regulation(lab, 5)
+    assert lab.peek()["Pump1"]["target"] == 0.0
+
+
+def test_volume_0_ends_the_cycle_thread() -> None:
+    lab = Lab(od=0.8, blanked=True)
+    lab.post("/SetOutputTarget/Volume/M0/0")
+    regulate(lab, 0.5)
+    lab.wait(600.0)
+    assert lab.state()["Experiment"]["cycles"] == 1
+
+
+def test_od_on_without_experiment_does_nothing() -> None:
+    lab = Lab(od=0.8)
+    lab.post("/SetOutputOn/OD/1/M0")
+    lab.wait(600.0)
+    assert lab.doses() == []
+
+
+def test_closed_loop_brings_061_to_050_in_a_few_cycles_and_holds_it() -> None:
+    """Behaviour of the real software with a 1 mL/s pump: 5 cycles, then mean 0.502, sd 0.007 (section 5.1)."""
+    lab = Lab(od=0.61, mu=0.03, blanked=True)
+    regulate(lab, 0.5)
+    lab.wait(8 * 60.07)
+    assert lab.state()["OD"]["record"][-1] == pytest.approx(0.5, abs=0.04)
+    lab.wait(170 * 60.07)
+    held = np.array(lab.state()["OD"]["record"][-120:])
+    assert held.mean() == pytest.approx(0.502, abs=0.015)
+    assert held.std() < 0.015
+    assert lab.device.truth("M0")["peak_ml"] < 23.0
+
+
+def test_bang_bang_through_the_turbidostat() -> None:
+    """OD.target 0 pumps at the cap at the next measurement, 10 does not (section 7, D)."""
+    lab = Lab(od=0.5, blanked=True)
+    regulate(lab, 0.0)
+    after_regulation(lab, 7)
+    assert lab.peek()["Pump1"]["target"] == 0.02
+    lab.post("/SetOutputTarget/OD/M0/10")
+    after_regulation(lab, 8)
+    assert lab.peek()["Pump1"]["target"] == 0.0
+
+
+def test_zigzag_swings_between_grow_and_dilute_and_estimates_growth() -> None:
+    lab = Lab(od=0.5, mu=0.03, blanked=True, options=quiet(mu=0.03))
+    regulate(lab, 0.5)
+    lab.post("/SetOutputOn/Zigzag/1/M0")
+    targets = set()
+    for _ in range(180):
+        lab.wait(60.07)
+        targets.add(round(lab.peek()["Zigzag"]["target"], 3))
+    data = lab.state()
+    assert targets == {5.0, 0.44}  # grow, or centre - 1.5 * 0.04
+    assert data["OD"]["target"] == 0.5
+    assert data["GrowthRate"]["current"] == pytest.approx(60 * 0.03, rel=0.15)
+    assert data["GrowthRate"]["record"][-1] == data["GrowthRate"]["current"]

@@ -1,0 +1,219 @@
+"""The emulator as a separate process: real sockets, scaled real time, faults, clean end."""
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from http.client import HTTPConnection, IncompleteRead
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+class Process:
+    """`python -m hardware.emulator` on free ports."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hardware.emulator", "--port", "0", *arguments],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.ready = self.process.stdout.readline()
+        found = re.search(r"http://127.0.0.1:(\d+) .*control http://127.0.0.1:(\d+)", self.ready)
+        assert found, self.ready
+        self.port, self.control_port = int(found[1]), int(found[2])
+
+    def ask(self, method: str, path: str, port: int | None = None, timeout: float = 5.0) -> tuple[int, bytes]:
+        connection = HTTPConnection("127.0.0.1", port or self.port, timeout=timeout)
+        try:
+            connection.request(method, path)
+            response = connection.getresponse()
+            return response.status, response.read()
+        finally:
+            connection.close()
+
+    def fault(self, text: str) -> None:
+        assert self.ask("POST", f"/_emulator/fault/{text}", self.control_port)[0] == 204
+
+    def truth(self) -> dict:  # type: ignore[type-arg]
+        return dict(json.loads(self.ask("GET", "/_emulator/truth", self.control_port)[1]))
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+        self.process.send_signal(number)
+        output, _ = self.process.communicate(timeout=5)
+        return self.process.returncode, output
+
+
+@pytest.fixture
+def emulator() -> Iterator[Process]:
+    process = Process("--reactors", "M0,M1", "--speed", "60")
+    yield process
+    if process.process.poll() is None:
+        code, output = process.end()
+        assert (code, output) == (0, "")
+
+
+def test_an_experiment_over_http(emulator: Process) -> None:
+    assert emulator.ready.count("\n") == 1
+    assert emulator.ask("POST", "/Experiment/1/M0") == (204, b"")
+    deadline = time.monotonic() + 10.0
+    state: dict = {}  # type: ignore[type-arg]
+    while time.monotonic() < deadline and state.get("Experiment", {}).get("cycles", 0) < 4:
+        time.sleep(0.1)
+        state = json.loads(emulator.ask("GET", "/getSysdata/")[1])
+    assert state["Experiment"]["cycles"] == 4
+    assert state["OD"]["record"][0] == pytest.approx(0.3, abs=0.05)  # started with a blank
+    assert [b - a for a, b in zip(state["time"]["record"], state["time"]["record"][1:], strict=False)] == pytest.approx(
+        [60.07] * (len(state["time"]["record"]) - 1), abs=1.0
+    )
+    assert emulator.ask("GET", "/getSysdata")[0] == 308
+    assert emulator.ask("GET", "/changeDevice/M1")[0] == 405
+    assert emulator.ask("POST", "/changeDevice/M11")[0] == 500
+
+
+def test_requests_are_served_one_at_a_time(emulator: Process) -> None:
+    emulator.ask("POST", "/SetOutputTarget/Stir/M0/0.9")
+    spans: list[float] = []
+
+    def kick() -> None:
+        began = time.monotonic()
+        emulator.ask("POST", "/SetOutputOn/Stir/1/M0", timeout=10.0)  # 3 device seconds
+        spans.append(time.monotonic() - began)
+
+    threads = [threading.Thread(target=kick) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert max(spans) >= 4 * 3.0 / 60.0
+    assert sorted(spans) == pytest.approx([0.05, 0.1, 0.15, 0.2], abs=0.15)
+
+
+def test_socket_faults(emulator: Process) -> None:
+    emulator.fault("reset_after/all/1")
+    with pytest.raises(ConnectionResetError):
+        emulator.ask("POST", "/SetOutputTarget/Stir/M0/0.7")
+    emulator.fault("lost_reply/all/1")
+    with pytest.raises(TimeoutError):
+        emulator.ask("POST", "/SetOutputTarget/Stir/M1/0.7", timeout=0.5)
+    emulator.fault("truncated/all/1")
+    with pytest.raises(IncompleteRead):
+        emulator.ask("GET", "/getSysdata/")
+    emulator.fault("malformed")
+    with pytest.raises(json.JSONDecodeError):
+        json.loads(emulator.ask("GET", "/getSysdata/")[1])
+    for reactor in ("M0", "M1"):
+        emulator.ask("POST", f"/changeDevice/{reactor}")
+        assert json.loads(emulator.ask("GET", "/getSysdata/")[1])["Stir"]["target"] == 0.7
+
+
+def test_death_refuses_connections_until_somebody_restarts_it(emulator: Process) -> None:
+    with pytest.raises((ConnectionResetError, ConnectionError)):
+        emulator.ask("POST", "/MeasureOD/M7")
+    time.sleep(0.2)
+    with pytest.raises(ConnectionRefusedError):
+        emulator.ask("GET", "/getSysdata/")
+    truth = emulator.truth()
+    assert truth["alive"] is False
+    assert truth["M0"]["powered"] is False
+    emulator.fault("restart")
+    time.sleep(0.3)
+    assert json.loads(emulator.ask("GET", "/getSysdata/")[1])["OD0"]["target"] == 65000.0
+
+
+def test_truth_doses_and_list_of_faults(emulator: Process) -> None:
+    emulator.ask("POST", "/SetOutputTarget/Pump1/M1/0.02")
+    emulator.ask("POST", "/SetOutputOn/Pump1/1/M1")
+    time.sleep(0.2)
+    emulator.ask("POST", "/SetOutputOn/Pump1/0/M1")
+    time.sleep(0.1)
+    doses = json.loads(emulator.ask("GET", "/_emulator/doses/M1", emulator.control_port)[1])
+    assert [d["pump"] for d in doses] == ["Pump1"]
+    assert doses[0]["seconds"] == pytest.approx(1.26, abs=0.25)
+    assert emulator.truth()["M1"]["feed_ml"] == pytest.approx(doses[0]["feed_ml"])
+    assert "od_frozen" in json.loads(emulator.ask("GET", "/_emulator/faults")[1])
+    status, text = emulator.ask("POST", "/_emulator/fault/nonsense")
+    assert status == 400
+    assert text.startswith(b"fault = nonsense: allowed ")
+    assert emulator.ask("POST", "/_emulator/fault/od_offset/M0/much")[0] == 400
+    assert emulator.ask("GET", "/_emulator/nonsense")[0] == 404
+
+
+def test_httpx_and_urllib_can_talk_to_it(emulator: Process) -> None:
+    import httpx
+
+    with httpx.Client(base_url=f"http://127.0.0.1:{emulator.port}") as client:
+        for _ in range(20):
+            assert client.post("/changeDevice/M1").status_code == 204
+            assert client.get("/getSysdata/").json()["UIDevice"] == "M1"
+    with urllib.request.urlopen(f"http://127.0.0.1:{emulator.port}/getSysdata", timeout=5) as answer:  # follows 308
+        assert json.load(answer)["UIDevice"] == "M1"
+
+
+def test_garbage_on_the_socket_does_not_end_it(emulator: Process) -> None:
+    for data in (
+        b"",
+        b"\x00\xff\xfe\n\n",
+        b"GET\r\n\r\n",
+        b"POST / HTTP/1.1\r\nContent-Length: x\r\n\r\n",
+        b"A" * 70000,
+    ):
+        with socket.create_connection(("127.0.0.1", emulator.port), timeout=2) as connection:
+            connection.sendall(data)
+    assert emulator.ask("GET", "/getSysdata/")[0] == 200
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_end_it_cleanly(number: int) -> None:
+    assert Process().end(number) == (0, "")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--reactors", "M9"],
+        ["--reactors", ""],
+        ["--speed", "0"],
+        ["--speed", "nan"],
+        ["--od", "0.3,0.4", "--reactors", "M0"],
+        ["--od", "-1"],
+        ["--od", "much"],
+        ["--port", "70000"],
+        ["--host", "203.0.113.1"],
+    ],
+)
+def test_bad_arguments_give_one_line(arguments: list[str]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "hardware.emulator", "--port", "0", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=20,
+    )
+    assert done.returncode == 2
+    assert done.stdout.startswith("emulator: ")
+    assert done.stdout.count("\n") == 1
+    assert done.stderr == ""
+
+
+def test_a_port_in_use_gives_one_line(emulator: Process) -> None:
+    for port in (["--port", str(emulator.port)], ["--port", "0", "--control-port", str(emulator.control_port)]):
+        done = subprocess.run(
+            [sys.executable, "-m", "hardware.emulator", *port], cwd=ROOT, capture_output=True, text=True, timeout=20
+        )
+        assert (done.returncode, done.stderr, done.stdout.count("\n")) == (2, "", 1)
+        assert "in use" in done.stdout
+        assert port[-1] in done.stdout

@@ -1,0 +1,307 @@
+"""The recording format: written so that a crash costs one row, read so that nothing bad passes in silence."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hardware.errors import RecordingError
+from hardware.recording import Recorder, read_recording
+from tests.real_recording import DITHER, needs_dither
+
+COLUMNS = ("time_min", "od", "pump_rate_ml_s")
+T = np.arange(40.0)
+OD = 0.1 * np.exp(0.02 * T)
+U = np.where(T > 20, 0.02, 0.0)
+
+CHIBIO_HEADER = (
+    "exp_time,od_measured,od_setpoint,od_zero_setpoint,thermostat_setpoint,heating_rate,internal_air_temp,"
+    "external_air_temp,media_temp,opt_gen_act_int,pump_1_rate,pump_2_rate,pump_3_rate,pump_4_rate,media_vol,"
+    "stirring_rate,LED_395nm_setpoint,LED_457nm_setpoint,LED_500nm_setpoint,LED_523nm_setpoint,LED_595nm_setpoint,"
+    "LED_623nm_setpoint,LED_6500K_setpoint,LED_600nm_setpoint,LED_550nm_setpoint,LED_White_setpoint,laser_setpoint,"
+    "LED_UV_int,FP1_base,FP1_emit1,FP1_emit2,FP2_base,FP2_emit1,FP2_emit2,FP3_base,FP3_emit1,FP3_emit2,"
+    "custom_prog_param1,custom_prog_param2,custom_prog_param3,custom_prog_status,zigzag_target,growth_rate"
+)
+CHIBIO = CHIBIO_HEADER.split(",")
+
+
+def chibio_lines(names: list[str] = CHIBIO) -> list[str]:
+    known = {"exp_time": 60.0 * T, "od_measured": OD, "pump_1_rate": U, "media_temp": 37.0 + 0.01 * T}
+    table = np.array([known.get(n, np.full(len(T), 7.0)) for n in names]).T
+    return [",".join(map(repr, map(float, row))) for row in table]
+
+
+def tidy(od: np.ndarray = OD, t: np.ndarray = T, u: np.ndarray = U, header: str = ",".join(COLUMNS)) -> str:
+    body = "".join(f"{a!r},{b!r},{c!r}\n" for a, b, c in zip(t.tolist(), od.tolist(), u.tolist(), strict=True))
+    return (header + "\n" if header else "") + body
+
+
+def changed(values: np.ndarray, where: object, to: object) -> np.ndarray:
+    copy = values.copy()
+    copy[where] = to  # type: ignore[index]
+    return copy
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., object]:
+    def write_and_read(content: str | bytes, **options: object) -> object:
+        path = tmp_path / "recording.csv"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return read_recording(path, **options)  # type: ignore[arg-type]
+
+    return write_and_read
+
+
+# ---------------------------------------------------------------- writing
+
+
+def test_what_is_written_is_read_to_the_bit(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    with Recorder(path, (*COLUMNS, "temperature_degc", "decision")) as recorder:
+        for t, y, u in zip(T, OD, U, strict=True):
+            recorder.write(
+                {"time_min": t, "od": y, "pump_rate_ml_s": u, "temperature_degc": None, "decision": 'pass, "ok"'}
+            )
+    back = read_recording(path)
+    np.testing.assert_array_equal(back.time_min, T)
+    np.testing.assert_array_equal(back.od, OD)
+    np.testing.assert_array_equal(back.pump_rate, U)
+    assert np.isnan(back.temperature).all()
+    assert back.notes == ()
+
+
+def test_every_returned_row_survives_kill_9_and_the_torn_line_is_cut(tmp_path: Path) -> None:
+    path, acknowledged = tmp_path / "run.csv", tmp_path / "acknowledged"
+    script = (
+        "import sys\nfrom hardware.recording import Recorder\n"
+        f"r = Recorder({str(path)!r}, ('time_min', 'od', 'pump_rate_ml_s'))\n"
+        "i = 0\nwhile True:\n"
+        "    r.write({'time_min': float(i), 'od': 0.5, 'pump_rate_ml_s': 0.01})\n"
+        f"    i += 1\n    open({str(acknowledged)!r}, 'w').write(str(i))\n"
+    )
+    child = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parents[2])
+    deadline = time.monotonic() + 20
+    while not (acknowledged.exists() and (acknowledged.read_text() or "0") > "2") and time.monotonic() < deadline:
+        time.sleep(0.02)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    whole = path.read_bytes()
+    rows = whole.count(b"\n") - 1
+    assert rows >= int(acknowledged.read_text() or "0") > 0
+    with open(path, "ab") as f:
+        f.write(b"99999.0,0.")
+    with Recorder(path, COLUMNS) as recorder:
+        assert recorder.repaired is not None
+        assert "10 bytes" in recorder.repaired
+        recorder.write({"time_min": float(rows), "od": 0.5, "pump_rate_ml_s": 0.0})
+    assert path.read_bytes() == whole + f"{float(rows)!r},0.5,0.0\n".encode()
+
+
+def test_torn_header_is_begun_anew(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_bytes(b"time_min,o")
+    with Recorder(path, COLUMNS) as recorder:
+        assert recorder.repaired is not None
+    assert path.read_text() == "time_min,od,pump_rate_ml_s\n"
+
+
+@pytest.mark.parametrize("content", ["time_min,od\n1,2\n", "my shopping list"])
+def test_foreign_files_are_left_alone(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text(content)
+    with pytest.raises(RecordingError, match="choose another file"):
+        Recorder(path, COLUMNS)
+    assert path.read_text() == content
+
+
+def test_misuse_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="No such file"):
+        Recorder(tmp_path / "absent" / "run.csv", COLUMNS)
+    with pytest.raises(ValueError, match="unique"):
+        Recorder(tmp_path / "run.csv", ("od", "od"))
+    recorder = Recorder(tmp_path / "run.csv", COLUMNS, fsync=False)
+    with pytest.raises(RecordingError, match=r"lacks columns \['od'\].*unknown columns \['odd'\]"):
+        recorder.write({"time_min": 0.0, "odd": 0.5, "pump_rate_ml_s": 0.0})
+    recorder.close()
+    recorder.close()
+    with pytest.raises(RecordingError, match="closed"):
+        recorder.write({"time_min": 0.0, "od": 0.5, "pump_rate_ml_s": 0.0})
+
+
+def test_fsync_per_row_unless_declined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[int] = []
+    real = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda fd: (synced.append(fd), real(fd))[1])
+    for fsync, expected in ((True, 1), (False, 0)):
+        with Recorder(tmp_path / f"{fsync}.csv", COLUMNS, fsync=fsync) as recorder:
+            synced.clear()
+            recorder.write({"time_min": 0.0, "od": 0.5, "pump_rate_ml_s": 0.0})
+            assert len(synced) == expected
+
+
+# ---------------------------------------------------------------- reading what is good
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param("\n".join([",".join(CHIBIO), *chibio_lines()]) + "\n", id="chibio-43"),
+        pytest.param("\n".join(chibio_lines()) + "\n", id="chibio-43-no-header"),
+        pytest.param("\n".join(chibio_lines([c for c in CHIBIO if "600" not in c])) + "\n", id="chibio-42-no-header"),
+        pytest.param(
+            "\n".join([",".join([*CHIBIO[:3], "od_raw", *CHIBIO[3:]]), *chibio_lines([*CHIBIO[:3], "x", *CHIBIO[3:]])])
+            + "\n",
+            id="chibio-extra-column",
+        ),
+        pytest.param("\r\n".join([",".join(CHIBIO), *chibio_lines()]) + "\r\n", id="chibio-windows"),
+        pytest.param(tidy(), id="tidy"),
+        pytest.param(tidy(header=""), id="tidy-no-header"),
+        pytest.param("\ufeff" + tidy(header="Time (min),OD,Pump rate (mL/s)").replace(",", ";"), id="tidy-semicolon"),
+        pytest.param("# a comment\n\n" + tidy().replace(",", "\t"), id="tidy-tab"),
+        pytest.param(tidy(t=60 * T, header="time_s,od,pump_rate"), id="seconds"),
+    ],
+)
+def test_every_layout_reads_alike(read: Callable[..., object], content: str) -> None:
+    r = read(content)
+    np.testing.assert_allclose(r.time_min, T)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(r.od, OD)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(r.pump_rate, U)  # type: ignore[attr-defined]
+    assert r.notes == ()  # type: ignore[attr-defined]
+
+
+def test_pump_flow_turns_duty_into_rate_but_leaves_rates_alone(read: Callable[..., object]) -> None:
+    duty = read("\n".join([",".join(CHIBIO), *chibio_lines()]) + "\n", pump_ml_s=0.8)
+    np.testing.assert_allclose(duty.pump_rate, 0.8 * U)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(duty.temperature, 37.0 + 0.01 * T)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(read(tidy(), pump_ml_s=0.8).pump_rate, U)  # type: ignore[attr-defined]
+
+
+@needs_dither
+def test_real_chibio_file() -> None:
+    r = read_recording(DITHER)
+    assert (r.source, len(r.od), r.runs, r.notes) == ("Chi.Bio CSV", 1209, ((0, 1208),), ())
+    assert int(np.argmax(r.pump_rate > 0)) == 279
+    assert np.unique(r.pump_rate).tolist() == [0.0, 0.02]
+    assert np.median(np.diff(r.time_min)) * 60 == pytest.approx(60.06, abs=0.02)
+    assert 36 < np.median(r.temperature) < 38
+
+
+@pytest.mark.parametrize("header", [",".join(COLUMNS), ""])
+def test_concatenated_runs(read: Callable[..., object], header: str) -> None:
+    short = tidy(OD[:12], T[:12], U[:12], header)
+    longest = read(short + tidy(header=header) + short)
+    assert longest.row.tolist() == list(range(12, 52))  # type: ignore[attr-defined]
+    assert longest.runs == ((0, 11), (12, 51), (52, 63))  # type: ignore[attr-defined]
+    assert "3 runs" in longest.notes[0]  # type: ignore[attr-defined]
+    third = read(short + tidy(header=header) + short, run=2)
+    assert third.row.tolist() == list(range(52, 64))  # type: ignore[attr-defined]
+    with pytest.raises(RecordingError, match="run = 3: allowed 0 to 2"):
+        read(short + tidy(header=header) + short, run=3)
+
+
+def test_one_reactor_of_several(read: Callable[..., object]) -> None:
+    lines = [f"{m},{t!r},{y + 0.1 * m!r},0.0" for t, y in zip(T.tolist(), OD.tolist(), strict=True) for m in (0, 1)]
+    content = "\n".join(["reactor,time_min,od,pump_rate_ml_s", *lines]) + "\n"
+    np.testing.assert_allclose(read(content, reactor="1").od, OD + 0.1)  # type: ignore[attr-defined]
+    first = read(content)
+    np.testing.assert_allclose(first.od, OD)  # type: ignore[attr-defined]
+    assert first.notes == ("reactor 0 taken; the file also holds 1",)  # type: ignore[attr-defined]
+
+
+# ---------------------------------------------------------------- reading what is bad
+
+
+@pytest.mark.parametrize(
+    ("content", "missing", "note"),
+    [
+        pytest.param(tidy(changed(OD, [5, 6, 9], np.nan)), [5, 6, 9], "3 rows: 5-6, 9: OD is not a finite", id="nan"),
+        pytest.param(tidy(changed(OD, 7, np.inf)), [7], "row 7: OD is not a finite", id="inf"),
+        pytest.param(tidy(changed(OD, 7, -0.3)), [7], "row 7: OD below -0.05", id="negative"),
+        pytest.param(tidy(changed(OD, 7, 14.06)), [7], "row 7: OD above 10", id="dead-spectrometer"),
+        pytest.param(tidy().replace(repr(float(OD[3])), "broken"), [3], "row 3: OD is not a finite", id="text"),
+    ],
+)
+def test_unusable_readings_are_reported(
+    read: Callable[..., object], content: str, missing: list[int], note: str
+) -> None:
+    r = read(content)
+    assert np.flatnonzero(np.isnan(r.od)).tolist() == missing  # type: ignore[attr-defined]
+    assert len(r.notes) == 1  # type: ignore[attr-defined]
+    assert r.notes[0].startswith(note)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("content", "rows", "note"),
+    [
+        pytest.param(tidy(t=changed(T, 8, 7.0)), [8], "row 8: time does not advance", id="duplicate"),
+        pytest.param(tidy(t=changed(T, [8, 9], [3.0, 4.0])), [8, 9], "2 rows: 8-9: time does not", id="backward"),
+        pytest.param(tidy(t=changed(T, 8, np.nan)), [8], "row 8: time or pump rate is not", id="time-nan"),
+        pytest.param(tidy(u=changed(U, 8, np.nan)), [8], "row 8: time or pump rate is not", id="pump-nan"),
+        pytest.param(tidy().replace("\n8.0,", "\n8.0;"), [8], "row 8: fewer than 3 columns", id="short-row"),
+    ],
+)
+def test_unusable_rows_are_dropped_and_reported(
+    read: Callable[..., object], content: str, rows: list[int], note: str
+) -> None:
+    r = read(content)
+    assert sorted(set(range(40)) - set(r.row.tolist())) == rows  # type: ignore[attr-defined]
+    assert r.notes[0].startswith(note)  # type: ignore[attr-defined]
+
+
+def test_small_negative_od_is_noise(read: Callable[..., object]) -> None:
+    r = read(tidy(changed(OD, 3, -0.02)))
+    assert r.od[3] == -0.02  # type: ignore[attr-defined]
+    assert r.notes == ()  # type: ignore[attr-defined]
+
+
+def test_torn_last_line_is_dropped_and_reported(read: Callable[..., object]) -> None:
+    r = read(tidy() + "40.0,0.2,0.0")
+    assert len(r.od) == 40  # type: ignore[attr-defined]
+    assert r.notes == ("line 42: has no line end, so it may be torn: dropped",)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        pytest.param("", "is empty", id="empty"),
+        pytest.param(" \n\n", "is empty", id="blank"),
+        pytest.param("# only a comment\n", "holds no data", id="comment"),
+        pytest.param(",".join(COLUMNS) + "\n", "no complete data row", id="header-only"),
+        pytest.param(b"\x7fELF\x02\x01\x00\x00", "not a text file", id="binary"),
+        pytest.param(np.random.default_rng(0).bytes(4000), "not a text file", id="random-bytes"),
+        pytest.param("hello world\n1 2\n", "no column for the time.*hello, world", id="words"),
+        pytest.param("time_min,od\n1,0.1\n", "no column for the pump rate", id="no-pump"),
+        pytest.param("1,2,3,4\n1,2,3,4\n", "4 columns and no header", id="four-columns"),
+        pytest.param(tidy(13000 * 10**-OD), "raw detector counts", id="counts"),
+        pytest.param(tidy(np.full(40, np.nan)), "only 0 of 40 rows", id="all-nan"),
+        pytest.param(tidy(-OD), "only 0 of 40 rows.*below -0.05", id="all-negative"),
+        pytest.param(tidy(t=T[::-1]), "only 1 of 1 rows.*time does not advance", id="time-backward"),
+        pytest.param(tidy(t=np.zeros(40)), "only 1 of 1 rows.*time does not advance", id="time-still"),
+        pytest.param(tidy(t=np.full(40, np.nan)), "no row has a finite time", id="time-nan"),
+        pytest.param(tidy(u=changed(U, 4, -0.01)), "row 4: pump rate -0.01 mL/s: allowed 0 to 1", id="pump-reversed"),
+        pytest.param(tidy(u=1200 * U), "pump rate 24 mL/s.*mL/min", id="pump-unit"),
+    ],
+)
+def test_what_is_no_recording_is_refused_in_one_line(
+    read: Callable[..., object], content: str | bytes, message: str
+) -> None:
+    with pytest.raises(RecordingError, match=message) as caught:
+        read(content)
+    assert "\n" not in str(caught.value)
+
+
+def test_paths_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="No such file"):
+        read_recording(tmp_path / "absent.csv")
+    with pytest.raises(RecordingError, match="Is a directory"):
+        read_recording(tmp_path)
+    with pytest.raises(RecordingError, match="pump_ml_s = 0"):
+        read_recording(tmp_path / "absent.csv", pump_ml_s=0.0)
