@@ -115,7 +115,7 @@ def _read(path: Path) -> list[Row]:
         return []
     with open(path, newline="", encoding="utf-8") as f:
         return [
-            Row(r["ablation"], int(r["seed"]), *(float(r[k]) for k in (*MEASURES, "train_seconds")))
+            Row(r["ablation"], int(r["seed"]), **{k: float(r[k]) for k in (*MEASURES, "train_seconds")})
             for r in csv.DictReader(f)
         ]
 
@@ -147,10 +147,16 @@ def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
     kept = report(build.act_with(agent.online, session.best.weights), agent.n_agents)
     last = report(build.act_with(agent.online, agent.greedy.flat), agent.n_agents)
     return [
-        Row(name, seed, *(float(v) for v in measures), session.seconds)
-        for seed, *measures in zip(
-            session.seeds, kept.regret_pct, kept.steady_abs_error, last.regret_pct, last.steady_abs_error, strict=True
+        Row(
+            ablation=name,
+            seed=seed,
+            regret_pct=float(kept.regret_pct[i]),
+            steady_abs_error=float(kept.steady_abs_error[i]),
+            regret_pct_last=float(last.regret_pct[i]),
+            steady_abs_error_last=float(last.steady_abs_error[i]),
+            train_seconds=session.seconds,
         )
+        for i, seed in enumerate(session.seeds)
     ]
 
 
@@ -216,7 +222,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
         entry = summarise(rows)[name]
         regret, steady, last = (entry[m] for m in MEASURES[:3])
         log.info(
-            "%s: regret %.3f %% (worst %.3f), steady error %.4f (worst %.4f), last iterate %.3f %% (worst %.3f), %.0f s",
+            "%s: regret %.3f %% (worst %.3f), steady error %.4f (worst %.4f), last regret %.3f %% (worst %.3f), %.0f s",
             name, regret["median"], regret["worst"], steady["median"], steady["worst"], last["median"], last["worst"],
             entry["train_seconds"],
         )  # fmt: skip

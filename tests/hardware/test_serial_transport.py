@@ -247,22 +247,22 @@ def test_a_run_over_a_noisy_line_that_is_unplugged_for_a_while(cable: tuple[Cabl
     line.noise = 0.01
     cut = plugged = np.inf
     samples: list[float] = []
-    while reactors.elapsed() < 960.0:
+    while reactors.elapsed() < 660.0:
         m = reactors.measure()
         reactors.actuate(Command(m.fresh, np.where(m.fresh, 0.008, 0.0), np.full(2, 37.0)))
         samples += [reactors.elapsed()] * int(m.fresh.sum())
-        if reactors.elapsed() > 300.0 and cut == np.inf:
+        if reactors.elapsed() > 200.0 and cut == np.inf:
             line.unplug()
             cut = reactors.elapsed()
-        if reactors.elapsed() > cut + 150.0 and plugged == np.inf:
+        if reactors.elapsed() > cut + 120.0 and plugged == np.inf:
             plugged = reactors.elapsed()
             line.plug()
     reactors.stop()
     transport.close()
-    assert len([t for t in samples if t < cut]) >= 8
+    assert len([t for t in samples if t < cut]) >= 5
     assert not [t for t in samples if cut + 1.0 < t < plugged]
     back = [t for t in samples if t > plugged + 90.0]  # two a minute again, of which noise may cost some
-    assert len(back) >= 0.6 * (960.0 - plugged - 90.0) / 30.0
+    assert len(back) >= 0.6 * (660.0 - plugged - 90.0) / 30.0
     acted = [(r["reactor"], *r["sample"]) for r in rows if r["kind"] == "intent"]  # type: ignore[misc]
     assert len(set(acted)) == len(acted)
     assert [r["not_verified"] for r in rows if r["kind"] == "stop"] == [[]]
