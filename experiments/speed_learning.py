@@ -1,4 +1,4 @@
-"""Measurements of `experiments.speed` that concern learning: training, updates, vector environment, start-up, scaling."""
+"""Measurements of `experiments.speed` on learning: training, updates, vector environment, start-up, scaling."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def environment() -> Iterator[Measurement]:
                 np.copyto(destination, source)
 
     per = 500 * COPIES
-    yield Measurement("vector environment", f"{COPIES} copies, ten sub-steps, autoreset", "NumPy copy of the bytes moved",
+    yield Measurement("vector environment", f"{COPIES} copies, ten sub-steps, autoreset", "NumPy copy of its bytes",
                       lambda: steps(native, 500), lambda: copies(500), "ns per control step", 1e9, per)  # fmt: skip
     yield Measurement("vector environment, 10 steps", f"{COPIES} copies, ten sub-steps", "Gymnasium's sync vector env",
                       lambda: steps(native, 10), lambda: steps(sync, 10),
