@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -118,6 +119,7 @@ def learned(config: BenchmarkConfig, wanted: set[str], figures: Figures) -> tupl
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         keys = ("seeds", "env_steps", "updates", "regret_pct", "steady_abs_error", "policy_seed", "config_hash")
         told[name] = {"policy": f"training/{name}/policy.npz", **{key: summary[key] for key in keys}}
+        told[name]["agent"] = asdict(config.agents[name])
         at = summary["seeds"].index(summary["policy_seed"])
         figures.refer(
             f"training/{name}/figures/learning.svg",
