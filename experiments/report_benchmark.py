@@ -297,8 +297,8 @@ def _paper_section(out: Page, summary: Row) -> None:
     items = "".join(f"<li>{typeset(s)}</li>" for s in lost)
     known = any(r["controller"] == "dqn" for r in rows)
     verdict = (
-        f"Of {cells} cells here, the learned policy (dqn) loses {cells_lost}, {certain} of them with a 95 % interval of the "
-        "paired difference that excludes 0:"
+        f"Of {cells} cells here, the learned policy (dqn) loses {cells_lost}, {certain} of them with a 95 % interval "
+        "of the paired difference that excludes 0:"
     ) if lost else (
         f"The learned policy (dqn) is lowest in all {cells} cells here." if known else "No learned policy was run."
     )  # fmt: skip

@@ -1,0 +1,81 @@
+"""The closed loops of a benchmark, spread over the cores; they run beside whatever the caller does meanwhile."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing import get_context
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from envs.plant import Plant
+from experiments import build
+from experiments.config_benchmark import BenchmarkConfig
+from experiments.controllers.base import Controller
+from experiments.trials import Trial, run_trial
+
+if TYPE_CHECKING:
+    from dqn.policy import Policy
+
+__all__ = ["Cell", "Loops", "run_cell"]
+
+log = logging.getLogger(__name__)
+
+Cell = tuple[str, str, str]  # controller, plant, scenario
+
+
+def run_cell(config: BenchmarkConfig, cell: Cell, policy: Policy | None) -> Trial:
+    """One closed loop of a benchmark; all it needs is in its arguments, so it is the same in any process."""
+    name, plant, scenario = cell
+
+    def make(vials: Plant) -> Controller:
+        return build.controller(config.controllers[name], config.env, policy, vials)
+
+    return run_trial(
+        cell, config.plants[plant], config.scenarios[scenario], make, config.env, config.replicates, config.seed
+    )
+
+
+class Loops:
+    """Runs cells in processes of their own, one per core, from `start` on.
+
+    Args: config: of the benchmark; `workers` processes, 0 for one per core.
+    A context: leaving it stops what has not begun.
+    """
+
+    def __init__(self, config: BenchmarkConfig) -> None:
+        self.config = config
+        self._running: dict[Cell, Future[Trial]] = {}
+        workers = config.workers or os.cpu_count() or 1
+        # Spawned, because a fork would copy torch's threads in whatever state they are.
+        self._pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+
+    def start(self, cells: Sequence[Cell], policy: Policy | None = None) -> None:
+        """Queue cells that all follow `policy`, or none."""
+        for cell in cells:
+            self._running[cell] = self._pool.submit(run_cell, self.config, cell, policy)
+
+    def results(self, cells: Sequence[Cell]) -> list[Trial]:
+        """Wait for the trials of these cells, in their order; a bar on a terminal, ten lines in a log."""
+        from tqdm import tqdm
+        from tqdm.contrib.logging import logging_redirect_tqdm
+
+        trials: list[Trial] = []
+        with logging_redirect_tqdm(), tqdm(total=len(cells), disable=None, unit="loop") as bar:
+            for k, cell in enumerate(cells, 1):
+                trials.append(self._running[cell].result())
+                bar.set_postfix_str(f"{cell[0]} on {cell[1]}")
+                bar.update()
+                if bar.disable and (k % max(len(cells) // 10, 1) == 0 or k == len(cells)):
+                    log.info("closed loop %d of %d: %s, %s, %s", k, len(cells), cell[2], cell[1], cell[0])
+        return trials
+
+    def __enter__(self) -> Loops:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
