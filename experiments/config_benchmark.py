@@ -31,7 +31,7 @@ class BenchmarkConfig:
     env: EnvConfig = field(default_factory=EnvConfig)  # what model-based controllers believe, and agents are trained on
     agents: dict[str, DQNConfig] = field(default_factory=dict)  # learned controllers by name
     train_seeds: int = 4  # seeds each agent is trained with; the best on the selection grid controls
-    workers: int = 0  # processes for the closed loops; 0 = one per core
+    workers: int = 0  # processes for the closed loops; 0 = one per core, 1 = none but this one
     policy: str | None = None  # a policy.npz or run folder for `dqn` in place of training
     calibration: bool = False  # simulate the open-loop protocol and fit it (Fig. 2a)
     training: bool = False  # train all agents even if no study needs them (Fig. 2b)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -41,21 +42,24 @@ def run_cell(config: BenchmarkConfig, cell: Cell, policy: Policy | None) -> Tria
 class Loops:
     """Runs cells in processes of their own, one per core, from `start` on.
 
-    Args: config: of the benchmark; `workers` processes, 0 for one per core.
+    Args: config: of the benchmark; `workers` processes, 0 for one per core, 1 for none but this one.
     A context: leaving it stops what has not begun.
     """
 
     def __init__(self, config: BenchmarkConfig) -> None:
         self.config = config
-        self._running: dict[Cell, Future[Trial]] = {}
+        self._running: dict[Cell, Callable[[], Trial]] = {}
         workers = config.workers or os.cpu_count() or 1
         # Spawned, because a fork would copy torch's threads in whatever state they are.
-        self._pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+        self._pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn")) if workers > 1 else None
 
     def start(self, cells: Sequence[Cell], policy: Policy | None = None) -> None:
         """Queue cells that all follow `policy`, or none."""
         for cell in cells:
-            self._running[cell] = self._pool.submit(run_cell, self.config, cell, policy)
+            if self._pool is None:
+                self._running[cell] = partial(run_cell, self.config, cell, policy)
+            else:
+                self._running[cell] = self._pool.submit(run_cell, self.config, cell, policy).result
 
     def results(self, cells: Sequence[Cell]) -> list[Trial]:
         """Wait for the trials of these cells, in their order; a bar on a terminal, ten lines in a log."""
@@ -65,7 +69,7 @@ class Loops:
         trials: list[Trial] = []
         with logging_redirect_tqdm(), tqdm(total=len(cells), disable=None, unit="loop") as bar:
             for k, cell in enumerate(cells, 1):
-                trials.append(self._running[cell].result())
+                trials.append(self._running[cell]())
                 bar.set_postfix_str(f"{cell[0]} on {cell[1]}")
                 bar.update()
                 if bar.disable and (k % max(len(cells) // 10, 1) == 0 or k == len(cells)):
@@ -78,4 +82,5 @@ class Loops:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)

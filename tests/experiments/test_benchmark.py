@@ -265,9 +265,9 @@ def run(*overrides: str) -> subprocess.CompletedProcess[str]:
 def test_command_line_twice_gives_the_same_summary(tmp_path):
     policies.save(tmp_path / "policy.npz", inverse_policy())
     texts = []
-    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+    for name, seed, workers in (("a", 0, 1), ("b", 0, 2), ("c", 1, 1)):
         done = run("+experiment=setpoint_steps", f"policy={tmp_path / 'policy.npz'}", f"seed={seed}",
-                   "studies.setpoint_steps.controllers=[dqn,pi]", f"hydra.run.dir={tmp_path / name}")  # fmt: skip
+                   f"workers={workers}", "studies.setpoint_steps.controllers=[dqn,pi]", f"hydra.run.dir={tmp_path / name}")  # fmt: skip
         assert done.returncode == 0, done.stderr
         assert "closed loop 2 of 2" in done.stdout + done.stderr
         texts.append((tmp_path / name / "summary.json").read_text())
