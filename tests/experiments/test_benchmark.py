@@ -267,7 +267,8 @@ def test_command_line_twice_gives_the_same_summary(tmp_path):
     texts = []
     for name, seed, workers in (("a", 0, 1), ("b", 0, 2), ("c", 1, 1)):
         done = run("+experiment=setpoint_steps", f"policy={tmp_path / 'policy.npz'}", f"seed={seed}",
-                   f"workers={workers}", "studies.setpoint_steps.controllers=[dqn,pi]", f"hydra.run.dir={tmp_path / name}")  # fmt: skip
+                   f"workers={workers}", "studies.setpoint_steps.controllers=[dqn,pi]",
+                   f"hydra.run.dir={tmp_path / name}")  # fmt: skip
         assert done.returncode == 0, done.stderr
         assert "closed loop 2 of 2" in done.stdout + done.stderr
         texts.append((tmp_path / name / "summary.json").read_text())
