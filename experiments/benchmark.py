@@ -250,7 +250,8 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
         policies, told = learned(config, names | (set(config.agents) if config.training else set()), figures)
         for name in sorted(names):
             loops.start([cell for cell in wanted if cell[0] == name], policies[name])
-        trials = loops.results(wanted)
+        found = loops.results()
+    trials = [found[cell] for cell in wanted]
     summary = summarise(config, trials) | {"calibration": fitted, "agents": told}
     draw(config, trials, summary, figures)
     summary["figures"] = figures.shown

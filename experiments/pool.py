@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -48,7 +47,8 @@ class Loops:
 
     def __init__(self, config: BenchmarkConfig) -> None:
         self.config = config
-        self._running: dict[Cell, Callable[[], Trial]] = {}
+        self._waiting: dict[Cell, Policy | None] = {}
+        self._running: dict[Future[Trial], Cell] = {}
         workers = config.workers or os.cpu_count() or 1
         # Spawned, because a fork would copy torch's threads in whatever state they are.
         self._pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn")) if workers > 1 else None
@@ -57,23 +57,30 @@ class Loops:
         """Queue cells that all follow `policy`, or none."""
         for cell in cells:
             if self._pool is None:
-                self._running[cell] = partial(run_cell, self.config, cell, policy)
+                self._waiting[cell] = policy
             else:
-                self._running[cell] = self._pool.submit(run_cell, self.config, cell, policy).result
+                self._running[self._pool.submit(run_cell, self.config, cell, policy)] = cell
 
-    def results(self, cells: Sequence[Cell]) -> list[Trial]:
-        """Wait for the trials of these cells, in their order; a bar on a terminal, ten lines in a log."""
+    def _finished(self) -> Iterator[tuple[Cell, Trial]]:
+        """Every cell with its trial, as they come."""
+        for cell, policy in self._waiting.items():
+            yield cell, run_cell(self.config, cell, policy)
+        for future in as_completed(self._running):
+            yield self._running[future], future.result()
+
+    def results(self) -> dict[Cell, Trial]:
+        """Wait for all trials; a bar on a terminal, ten lines in a log."""
         from tqdm import tqdm
         from tqdm.contrib.logging import logging_redirect_tqdm
 
-        trials: list[Trial] = []
-        with logging_redirect_tqdm(), tqdm(total=len(cells), disable=None, unit="loop") as bar:
-            for k, cell in enumerate(cells, 1):
-                trials.append(self._running[cell]())
+        total, trials = len(self._waiting) + len(self._running), {}
+        with logging_redirect_tqdm(), tqdm(total=total, disable=None, unit="loop") as bar:
+            for k, (cell, trial) in enumerate(self._finished(), 1):
+                trials[cell] = trial
                 bar.set_postfix_str(f"{cell[0]} on {cell[1]}")
                 bar.update()
-                if bar.disable and (k % max(len(cells) // 10, 1) == 0 or k == len(cells)):
-                    log.info("closed loop %d of %d: %s, %s, %s", k, len(cells), cell[2], cell[1], cell[0])
+                if bar.disable and (k % max(total // 10, 1) == 0 or k == total):
+                    log.info("closed loop %d of %d: %s, %s, %s", k, total, cell[2], cell[1], cell[0])
         return trials
 
     def __enter__(self) -> Loops:
