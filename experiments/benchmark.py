@@ -203,6 +203,8 @@ def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
     from experiments import comparison
     from experiments.published import SETTLING_MIN, TABLE_2
 
+    plants, controllers = list(config.plants), list(config.controllers)
+    ordered = sorted(trials, key=lambda t: (plants.index(t.plant), controllers.index(t.controller)))
     names = {t.controller for t in trials}
     against = [name for name in ("dqn", "oracle") if name in names]
     rows = comparison.rows(trials)
@@ -214,9 +216,9 @@ def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
             {k: r[k] for k in ("controller", "plant", "scenario", "window")} for r in table_2_rows(rows, config)
         ],
         "details": comparison.details(trials),
-        "totals": comparison.totals(trials),
+        "totals": comparison.totals(ordered),
         "paired": [p for name in against for p in comparison.pairs(trials, name)],
-        "paired_totals": [p for name in against for p in comparison.total_pairs(trials, name)],
+        "paired_totals": [p for name in against for p in comparison.total_pairs(ordered, name)],
         "replicates": config.replicates,
         "seed": config.seed,
     }

@@ -208,7 +208,9 @@ def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
             certain = e["verdict"] != "no difference shown"
             ax.plot(e["percent"], y + offset, marker, color=colour, markersize=5,
                     markerfacecolor=colour if certain else "white")  # fmt: skip
-        ax.xaxis.set_major_locator(FixedLocator([-100, -50, -20, -10, 0, 10, 20, 50, 100, 300, 1000, 3000, 10000]))
+        wide = ax.get_xlim()[1] > 200.0
+        few, many = [-100, -20, 0, 20, 100, 1000, 10000], [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200]
+        ax.xaxis.set_major_locator(FixedLocator(few if wide else many))
         ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:+g}" if v else "0"))
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.tick_params(axis="x", labelsize=8)
