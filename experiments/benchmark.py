@@ -192,9 +192,12 @@ def table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[di
     """The rows that stand beside the paper's table: first plant of the studies named like its scenarios."""
     shown = []
     for name in ("setpoint_steps", "temperature_switch"):
-        if name in config.studies:
-            plant = config.studies[name].plants[0]
-            shown += [r for r in rows if r["scenario"] == name and r["plant"] == plant]
+        if name in config.studies and config.studies[name].plants:
+            study = config.studies[name]
+            shown += [
+                r for r in rows
+                if r["scenario"] == name and r["plant"] == study.plants[0] and r["controller"] in study.controllers
+            ]  # fmt: skip
     return shown
 
 
