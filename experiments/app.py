@@ -154,7 +154,7 @@ def save_config(config: Any, folder: Path) -> None:
     OmegaConf.save(OmegaConf.create(asdict(config)), folder / "config.yaml")
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
+def write_json(path: Path, content: Mapping[str, Any], fsync: bool = True) -> None:
     """Write JSON atomically: nobody ever reads half a file. Non-finite numbers become null."""
 
     def clean(value: Any) -> Any:
@@ -173,7 +173,8 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
         json.dump(clean(content), f, indent=2)
         f.write("\n")
         f.flush()
-        os.fsync(f.fileno())
+        if fsync:
+            os.fsync(f.fileno())
     os.replace(temporary, path)
 
 

@@ -92,19 +92,39 @@ class Record:
         return rows
 
     def _complete(self) -> None:
-        """Append to the CSVs what the journal decided and a kill kept from being written."""
+        """Append to the CSVs what is in the journal and a kill kept from being written."""
+        kinds = ("sample", "decision", "intent")
         for n, name in enumerate(self.names):
             last = float(self.rows[n][-1]["time_min"] or 0.0) if self.rows[n] else -math.inf
-            mine = [r for r in self.journal.rows if r.get("reactor") == name and r["kind"] in ("decision", "intent")]
-            for k, decision in enumerate(mine):
-                if decision["kind"] != "decision" or decision["row"]["time_min"] <= last:
+            mine = [r for r in self.journal.rows if r.get("reactor") == name and r["kind"] in kinds]
+            around = zip([{}, *mine], mine, [*mine[1:], {}], strict=False)
+            for earlier, this, following in around:
+                if this["kind"] == "decision":
+                    row: Row = {c: math.nan if this["row"][c] is None else this["row"][c] for c in COLUMNS}
+                    row["volume_ml"] = float(following["feed_ml"]) if following.get("kind") == "intent" else 0.0
+                elif this["kind"] == "sample" and not following and earlier.get("kind") != "sample":
+                    row = self._undecided(this, self.rows[n])
+                else:
                     continue
-                row: Row = {c: math.nan if decision["row"][c] is None else decision["row"][c] for c in COLUMNS}
-                followed = k + 1 < len(mine) and mine[k + 1]["kind"] == "intent"
-                row["volume_ml"] = float(mine[k + 1]["feed_ml"]) if followed else 0.0
+                if float(row["time_min"] or 0.0) <= last + 1e-3:
+                    continue
                 self._recorders[n].write(row)
                 self.rows[n].append(row)
                 self.repairs.append(f"{name}: the row of minute {row['time_min']} was completed from the journal")
+
+    @staticmethod
+    def _undecided(sample: Mapping[str, Any], before: Sequence[Row]) -> Row:
+        """The row of a sample that was read, and the program killed before it was decided on: no dose."""
+        time = round(float(sample["time_s"]) / 60.0, 4)
+        row: Row = dict.fromkeys(NUMBERS, math.nan)
+        if before:
+            passed = time - float(before[-1]["time_min"] or 0.0)
+            elapsed = round(float(before[-1]["elapsed_min"] or 0.0) + passed, 4)
+            row |= {"phase": before[-1]["phase"], "setpoint": before[-1]["setpoint"], "elapsed_min": elapsed}
+        reading = {"od": sample["od"], "temperature_degc": sample["temperature"]}
+        row |= {"time_min": time, **{k: math.nan if v is None else float(v) for k, v in reading.items()}}
+        nothing = {"pump_rate_ml_s": 0.0, "proposed_ml_s": 0.0, "volume_ml": 0.0}
+        return {**row, **nothing, "interlock": "the program ended before it decided"}
 
     def decided(self, step: Step) -> None:
         """Journal every decision of a step before anything is dosed, with how the controller came to it."""
@@ -128,11 +148,11 @@ class Record:
                 self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
         if self._fsync:
             self.events.flush()
-            self.save(state)
+        self.save(state)
 
     def save(self, state: Mapping[str, Any]) -> None:
         """Replace state.json; it says up to which row of the journal it knows everything."""
-        app.write_json(self.folder / "state.json", {"journal_row": self.journal.next_row, **state})
+        app.write_json(self.folder / "state.json", {"journal_row": self.journal.next_row, **state}, self._fsync)
 
     def load_state(self) -> tuple[dict[str, Any], list[Receipt]]:
         """The saved state and the doses begun after it was written. Raises: RecordingError where there is none."""
