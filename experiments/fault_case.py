@@ -17,7 +17,7 @@ from envs.setpoints import Schedule
 from experiments.faults import INF, SICK, Fault
 from experiments.loop import Step
 from experiments.rehearsal import Killed, Rehearsal
-from hardware.emulator_bench import BenchConfig, Dose
+from hardware.emulator_bench import BenchConfig, Dose, Sample
 from hardware.emulator_device import DeviceOptions
 from hardware.errors import ReactorError
 from hardware.journal import read_journal
@@ -76,11 +76,14 @@ class Outcome:
         return {**asdict(self), "ok": self.ok}
 
 
-def audit_rows(r: Rehearsal, dark: tuple[float, float] | None = None) -> tuple[int, int, int]:
+def audit_rows(
+    r: Rehearsal, dark: tuple[float, float] | None = None, samples: Mapping[str, Sequence[Sample]] | None = None
+) -> tuple[int, int, int]:
     """Samples of the device against rows of the recordings: (missed, lost, doubled).
 
     Args:
       dark: clock times between which samples could not be read; those are missed, not lost.
+      samples: of each reactor; None takes those that the device still remembers.
     """
     missed = lost = doubled = 0
     zero = r.spans[0][0]
@@ -89,12 +92,13 @@ def audit_rows(r: Rehearsal, dark: tuple[float, float] | None = None) -> tuple[i
         doubled += int((np.diff(rows) <= 0.0).sum())
         over = bool(r.loop.done[n] or r.loop.stopped[n])
         end = rows[-1] if over and rows.size else INF
-        for sample in r.device.benches[name].samples:
+        for sample in r.device.benches[name].samples if samples is None else samples[name]:
             at = sample.stored_s
             alive = any(start + 30.0 <= at <= stop - 5.0 for start, stop in r.spans)
             if not alive or at > end:
                 continue
-            if not ((rows >= at) & (rows < at + SEEN_S)).any():
+            k = int(np.searchsorted(rows, at))
+            if k == rows.size or rows[k] >= at + SEEN_S:
                 if dark is not None and dark[0] - SEEN_S <= at <= dark[1]:
                     missed += 1
                 else:
