@@ -127,11 +127,9 @@ class DQNAgent:
             batch = Transition(*(torch.cat([a, b[:, n:]], dim=1) for a, b in zip(changed, batch, strict=True)))
         return batch
 
-    @torch.no_grad()
-    def learn(self) -> None:
-        """One update of every agent."""
+    def _td_target(self, batch: Transition) -> torch.Tensor:
+        """y of every transition, shape (S, B)."""
         c = self.config
-        batch = self._minibatch()
         q_t = self.target(batch.s_t)
         if c.double:
             target = double_q_target(batch.r_t, batch.continues, c.gamma, q_t, self.online(batch.s_t))
@@ -139,8 +137,24 @@ class DQNAgent:
             target = q_target(batch.r_t, batch.continues, c.gamma, q_t)
         if c.action_gap:
             target = advantage_target(target, c.action_gap, self.target(batch.s_tm1), batch.a_tm1)
-        q_tm1, inputs = self.online.forward(batch.s_tm1)
-        td_error, gradient = loss_gradient(q_tm1, batch.a_tm1, target, c.huber)
+        return target
+
+    @torch.no_grad()
+    def learn(self) -> None:
+        """One update of every agent."""
+        batch = self._minibatch()
+        self.fit(batch.s_tm1, batch.a_tm1, self._td_target(batch))
+
+    @torch.no_grad()
+    def fit(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> None:
+        """One Adam step towards Q(observation, action) = target, and what follows an update.
+
+        Args:
+          observation: (S, B, O). action: (S, B) int64. target: (S, B).
+        """
+        c = self.config
+        q, inputs = self.online.forward(observation)
+        td_error, gradient = loss_gradient(q, action, target, c.huber)
         self.online.backward(inputs, gradient)
         self._adam.param_groups[0]["lr"] = self.learning_rate
         self._adam.step()
@@ -149,7 +163,7 @@ class DQNAgent:
             blend(self.target.flat, self.online.flat, c.target_blend)
         if self.updates % DIAGNOSED == 0:
             self.loss = huber_loss(td_error, c.huber)
-            self.q_range = torch.stack([q_tm1.amin((1, 2)), q_tm1.amax((1, 2))], dim=1)
+            self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
         if c.average:
             blend(self.greedy.flat, self.online.flat, 1.0 - c.average)
 

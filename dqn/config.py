@@ -39,6 +39,7 @@ class DQNConfig:
     relabel: float = 0.0  # share of each minibatch whose goal is replaced by a random one (hindsight)
     relabel_near: float = 0.0  # share of those whose new goal is drawn close to the state reached
     relabel_width: tuple[float, float] = (1e-3, 0.8)  # how close: range of the distance, log-uniform
+    relabel_margin: float = 0.0  # new goals reach this share beyond the task's lowest and highest
     average: float = 0.0  # decay of the running mean of weights that acts greedily; 0 means the weights themselves
     input_matrix: tuple[float, ...] = ()  # features = M observation + c, M row by row; () means identity
     input_offset: tuple[float, ...] = ()  # c, one number per feature
@@ -74,6 +75,7 @@ class DQNConfig:
                 len(self.relabel_width) == 2 and 0.0 < self.relabel_width[0] <= self.relabel_width[1],
                 "[low, high] with 0 < low <= high",
             ),
+            ("relabel_margin", self.relabel_margin, 0.0 <= self.relabel_margin < 1.0, "0 <= margin < 1"),
             ("average", self.average, 0.0 <= self.average < 1.0, "0 <= decay < 1"),
         )
         for key, value, ok, allowed in checks:

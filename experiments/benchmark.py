@@ -178,7 +178,7 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any], 
 
     by_cell = {(t.controller, t.plant, t.scenario): t for t in trials}
     for name, study in config.studies.items():
-        if name not in CAPTIONS and len(study.plants) * len(study.scenarios) > 1:
+        if not study.controllers or (name not in CAPTIONS and len(study.plants) * len(study.scenarios) > 1):
             continue
         for scenario in study.scenarios:
             for plant in study.plants:
@@ -273,7 +273,7 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     """Calibrate, train, run every closed loop, compare, draw, report."""
     from experiments import report
 
-    if not (config.studies or config.training or config.calibration):
+    if not (cells(config) or config.training or config.calibration):
         raise app.UserError("nothing to run: choose a recipe, e.g. +experiment=paper or +experiment=setpoint_steps")
     figures = Figures(folder)
     fitted = calibration(config, figures) if config.calibration else None

@@ -19,10 +19,12 @@ def goal_relabel(env: EnvConfig, agent: DQNConfig, device: str) -> Relabel:
     """Replace the setpoint of transitions (hindsight, Andrychowicz 2017); the reward becomes that of the new one.
 
     A share `relabel_near` of each batch gets a setpoint x' +- d with d log-uniform in `relabel_width`, so that every
-    order of magnitude of the error is trained on equally often; where that lies outside the task's setpoints it goes
-    to the other side, else it is drawn like the rest: uniformly between the task's lowest and highest setpoint.
+    order of magnitude of the error is trained on equally often; where that lies outside the range of goals it goes to
+    the other side, else it is drawn like the rest: uniformly in that range, which is the task's from the lowest to the
+    highest setpoint, wider by `relabel_margin` so that the outermost setpoints have neighbours on both sides.
     """
-    low, high = min(env.setpoints), max(env.setpoints)
+    low = min(env.setpoints) * (1.0 - agent.relabel_margin)
+    high = max(env.setpoints) * (1.0 + agent.relabel_margin)
     near, far = (math.log(width) for width in agent.relabel_width)
 
     def relabel(batch: Transition, uniform: torch.Tensor) -> Transition:

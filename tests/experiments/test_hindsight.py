@@ -51,6 +51,13 @@ def test_far_goals_are_uniform() -> None:
     assert ((count - 250.0) ** 2 / 250.0).sum() < 24.3  # 99.9 % quantile with 7 degrees of freedom
 
 
+def test_margin_widens_the_range() -> None:
+    uniform = torch.rand(AGENTS, BATCH, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    goal = goal_relabel(ENV, DQNConfig(relabel_margin=0.25), "cpu")(_batch(), uniform).s_t[..., 1]
+    assert float(goal.min()) == pytest.approx(0.15, abs=0.005)
+    assert float(goal.max()) == pytest.approx(1.25, abs=0.005)
+
+
 def test_near_goals_cover_every_order_of_magnitude_on_both_sides() -> None:
     new = _relabel(1.0, _batch(od=0.6), width=(1e-3, 0.1))
     error = (new.s_t[..., 1] - 0.6).numpy().ravel()

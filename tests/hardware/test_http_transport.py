@@ -5,6 +5,7 @@ FUZZ_CASES=10000 python -m pytest tests/hardware/test_http_transport.py -k fuzz 
 
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import threading
@@ -29,7 +30,7 @@ from hardware.unit import Unit, no_log
 from tests.hardware.driver_lab import Bed
 from tests.hardware.script import answer, state
 
-FUZZ_CASES = int(os.environ.get("FUZZ_CASES", "200"))
+FUZZ_CASES = int(os.environ.get("FUZZ_CASES", "100"))
 QUICK = TransportConfig(connect_s=0.4, read_s=0.4, floor_s=0.1)
 OK = b"HTTP/1.1 204 NO CONTENT\r\nDate: Mon, 05 Jan 2026 10:00:00 GMT\r\nConnection: close\r\n\r\n"
 
@@ -290,3 +291,25 @@ def test_the_emulator_of_a_run_ends_with_it() -> None:
         pid = emulator.pid
         assert subprocess.run(["kill", "-0", str(pid)], check=False).returncode == 0
     assert subprocess.run(["kill", "-0", str(pid)], check=False, stderr=subprocess.DEVNULL).returncode != 0
+
+
+def test_ctrl_c_in_the_middle_of_a_request_leaves_a_link_that_can_still_switch_off(server: Server) -> None:
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        with link(server.url) as transport:
+            for _ in range(2):
+                server.behave = silent
+                signal.setitimer(signal.ITIMER_REAL, 0.1)
+                with pytest.raises(KeyboardInterrupt):
+                    transport.get("/getSysdata/")
+                server.behave = lambda c, _: c.sendall(OK)
+                while True:  # the one worker is still busy with the interrupted request
+                    with contextlib.suppress(LinkError):
+                        assert transport.post("/SetOutputOn/Pump1/0/M0").status == 204
+                        break
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)

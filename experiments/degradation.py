@@ -1,0 +1,234 @@
+"""Why a plain DQN gets worse late in training: `python -m experiments.degradation`.
+
+Two measurements, on the same task and seeds:
+
+1. What the target copies do. The same agent is trained with rarer and more frequent copies of its target network, and
+   every record compares its values with the optimum's: each copy is one sweep of value iteration, and looks one step
+   further into the future.
+2. What the network can do when told the answers. The network is fitted to the optimum's Q values by plain regression,
+   with the inputs, output basis, gap and loss of each variant, and its greedy policy is scored. What is left has
+   nothing to do with bootstrapping.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dqn.config import DQNConfig
+from envs.optimum import OptimalPolicy, solve
+from envs.task import EnvConfig
+from experiments import app
+from experiments.ablate import variant
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["DegradationConfig", "action_gap", "main", "optimal_q"]
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DegradationConfig:
+    """Keys of conf/degradation.yaml. Raises: ValueError naming key, value and allowed range."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    agent: DQNConfig = field(default_factory=DQNConfig)
+    trained: dict[str, dict[str, Any]] = field(default_factory=dict)  # name -> values that differ from `agent`
+    fitted: dict[str, dict[str, Any]] = field(default_factory=dict)  # the same, for the regression
+    seed: int = 0
+    n_agents: int = 8
+    eval_every: int = 500
+
+    def __post_init__(self) -> None:
+        """Check every variant before the first one trains."""
+        if not (self.n_agents >= 1 and self.eval_every >= 1 and self.seed >= 0):
+            raise ValueError(
+                f"n_agents = {self.n_agents}, eval_every = {self.eval_every}: allowed at least 1; "
+                f"seed = {self.seed}: allowed at least 0"
+            )
+        for group in (self.trained, self.fitted):
+            for name, values in group.items():
+                variant(self.agent, name, values)
+
+
+def optimal_q(policy: OptimalPolicy, od: Array, row: NDArray[np.intp]) -> Array:
+    """Q*(x, s, a) = -[(f_a x - s)^2 + gamma V(f_a x)], the discounted return, shape of `od` + (A,).
+
+    Args:
+      policy: the solved task. od: x, any shape. row: index of the setpoint in `policy.setpoints`, shape of `od`.
+    """
+    after = od[..., None] * policy.factors
+    goal = policy.setpoints[row][..., None]
+    return -((after - goal) ** 2 + policy.gamma * policy.cost_to_go(after, row[..., None]))
+
+
+def action_gap(policy: OptimalPolicy) -> float:
+    """Median over setpoints of what one level too much or too little costs at the setpoint: Q* of the best action
+    minus the mean Q* of its two neighbours."""
+    rows = np.arange(policy.setpoints.size)
+    q = optimal_q(policy, policy.setpoints, rows)
+    best = np.clip(q.argmax(-1), 1, q.shape[1] - 2)
+    return float(np.median(q[rows, best] - (q[rows, best - 1] + q[rows, best + 1]) / 2.0))
+
+
+def _watch(config: DegradationConfig, name: str) -> list[dict[str, float | str]]:
+    """Train one variant; a row per evaluation with medians over agents."""
+    import torch
+
+    from experiments import build
+    from experiments.evaluation import Evaluation, selection_grid
+
+    agent = variant(config.agent, name, config.trained[name])
+    trainer = build.trainer(config.env, agent, range(config.seed, config.seed + config.n_agents))
+    selection = Evaluation(config.env, agent.gamma, selection_grid(config.env))
+    optimum = solve(config.env, agent.gamma)
+    od, setpoint = selection_grid(config.env)
+    value = optimal_q(optimum, od, np.searchsorted(optimum.setpoints, setpoint - 1e-9)).max(-1)
+    rows: list[dict[str, float | str]] = []
+    observation = torch.from_numpy(np.stack([od, setpoint], -1).astype(np.float32)).expand(config.n_agents, -1, -1)
+    for record in trainer.run():
+        if record.step % config.eval_every and record.step != agent.total_steps:
+            continue
+        learner = trainer.agent
+        score = selection(build.act_with(learner.online, learner.greedy.flat), config.n_agents)
+        error = learner.greedy(observation).amax(-1).numpy() / agent.reward_scale - value
+        rows.append(
+            {
+                "variant": name,
+                "step": record.step,
+                "sweeps": record.updates // agent.target_period,
+                "regret_pct": float(np.median(score.regret_pct)),
+                "regret_pct_worst": float(score.regret_pct.max()),
+                "steady_abs_error": float(np.median(score.steady_abs_error)),
+                "value_error": float(np.median(np.sqrt(np.mean(error**2, axis=-1)))),
+                "lowest_value": float(np.median(record.q_min)) / agent.reward_scale,
+                "td_error": float(np.median(np.sqrt(2.0 * record.loss))) / agent.reward_scale
+                if not agent.huber
+                else np.nan,
+            }
+        )
+    log.info("%s: regret %.2f %% (worst %.2f)", name, rows[-1]["regret_pct"], rows[-1]["regret_pct_worst"])
+    return rows
+
+
+def _exact(unit: OptimalPolicy, od: Array, goal: Array, action: NDArray[np.intp], alpha: float) -> Array:
+    """Q* of (x, s, a) with gaps widened as advantage learning with `alpha` does, shape of `od`.
+
+    The model is linear in x, so V(x, s) = s^2 V(x / s, 1) and one setpoint's solution `unit` serves all.
+    """
+    s = unit.setpoints[0]
+    q = optimal_q(unit, od / goal * s, np.zeros(od.shape, dtype=np.intp)) * ((goal / s) ** 2)[..., None]
+    value = q.max(-1)
+    chosen = np.take_along_axis(q, action[..., None], -1)[..., 0]
+    return np.asarray(value - (value - chosen) / (1.0 - alpha))
+
+
+def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
+    """Regress the network on exact Q values at random (x, setpoint, action); score its greedy policy."""
+    import torch
+
+    from dqn.agent import STREAMS, DQNAgent
+    from dqn.replay import Transition
+    from experiments import build, seeding
+    from experiments.evaluation import Evaluation, report_grid
+    from experiments.hindsight import goal_relabel
+
+    agent = variant(config.agent, name, config.fitted[name])
+    seeds = range(config.seed, config.seed + config.n_agents)
+    relabel = goal_relabel(config.env, agent, "cpu")
+    learner = DQNAgent(agent, 2, config.env.n_actions, seeding.streams(seeds, STREAMS), relabel)
+    unit = solve(replace(config.env, start_od=(0.04, 3.9)), agent.gamma, setpoints=np.array([0.5]), grid=9001)
+    numbers = [np.random.default_rng(seed) for seed in seeds]
+    low, high = config.env.start_od
+    shape = (config.n_agents, agent.batch_size)
+    zero = torch.zeros(shape)
+    for _ in range(agent.total_updates):
+        u = np.stack([rng.random((4, agent.batch_size)) for rng in numbers], axis=1)
+        od, action = low + (high - low) * u[0], (u[1] * config.env.n_actions).astype(np.intp)
+        pair = [torch.from_numpy(np.stack([x, zero], -1).astype(np.float32)) for x in (od, od * unit.factors[action])]
+        batch = Transition(pair[0], torch.from_numpy(action), zero, pair[1], zero)
+        batch = relabel(batch, torch.from_numpy(np.stack([u[2], u[3]], -1)))
+        target = _exact(unit, od, batch.s_t[..., 1].double().numpy(), action, agent.action_gap)
+        learner.fit(batch.s_tm1, batch.a_tm1, torch.from_numpy(target * agent.reward_scale).float())
+    report = Evaluation(config.env, agent.gamma, report_grid(config.env))
+    score = report(build.act_with(learner.online, learner.greedy.flat), config.n_agents)
+    log.info(
+        "%s, told the answers: regret %.2f %% (worst %.2f)", name, np.median(score.regret_pct), score.regret_pct.max()
+    )
+    return {"regret_pct": score.regret_pct, "steady_abs_error": score.steady_abs_error}
+
+
+def figure(rows: list[dict[str, float | str]], fitted: dict[str, dict[str, Any]]) -> Figure:
+    """Regret and value error during training; regret and steady error of the networks that were told the answers."""
+    from experiments.charts import COLOURS, new_figure
+
+    canvas, axes = new_figure(11.0, 7.0, 2, 2)
+    for k, name in enumerate(dict.fromkeys(str(row["variant"]) for row in rows)):
+        own = [row for row in rows if row["variant"] == name]
+        step = [float(row["step"]) for row in own]
+        for ax, key in zip(axes[:2], ("regret_pct", "value_error"), strict=True):
+            ax.plot(step, [float(row[key]) for row in own], color=COLOURS[k], linewidth=1.4, label=name)
+        axes[0].plot(
+            step, [float(row["regret_pct_worst"]) for row in own], color=COLOURS[k], linewidth=0.7, linestyle=":"
+        )
+    axes[0].set(
+        yscale="log", xlabel="environment step", ylabel="regret, %: median, and worst seed (dotted)", ylim=(0.01, 300)
+    )
+    axes[1].set(yscale="log", xlabel="environment step", ylabel="rms of max Q − V*")
+    axes[0].legend(frameon=False, fontsize=8)
+    names = list(fitted)[::-1]
+    panels = (
+        ("regret_pct", "regret when told the answers, %"),
+        ("steady_abs_error", "steady error when told the answers, OD"),
+    )
+    for ax, (key, label) in zip(axes[2:], panels, strict=True):
+        for k, name in enumerate(names):
+            values = np.asarray(fitted[name][key])
+            ax.plot(values, np.full(values.size, k), "o", color=COLOURS[0], alpha=0.5, markersize=4)
+            ax.plot([np.median(values)] * 2, [k - 0.3, k + 0.3], color=COLOURS[1], linewidth=2)
+        ax.set(xscale="log", xlabel=label)
+        ax.set_yticks(range(len(names)), names, fontsize=8)
+    return canvas
+
+
+def degradation(config: DegradationConfig, folder: Path) -> float:
+    """Both measurements; returns the median regret of the first trained variant at its end."""
+    import torch
+
+    from experiments.charts import save
+
+    if not config.trained:
+        raise app.UserError("trained: no variant; name at least one, as conf/degradation.yaml does")
+    torch.set_num_threads(1)
+    rows = [row for name in config.trained for row in _watch(config, name)]
+    with open(folder / "curves.csv", "w", newline="", encoding="utf-8") as f:
+        writer = csv.DictWriter(f, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    fitted = {name: _fit(config, name) for name in config.fitted}
+    gap = action_gap(solve(config.env, config.agent.gamma))
+    log.info("one level beside the best action costs %.1e at the setpoint", gap)
+    ends = {name: [r for r in rows if r["variant"] == name][-1] for name in config.trained}
+    app.write_json(folder / "summary.json", {"action_gap": gap, "trained": ends, "fitted": fitted})
+    save(figure(rows, fitted), folder / "figures", "degradation")
+    log.info("curves %s, figure %s", folder / "curves.csv", folder / "figures" / "degradation.png")
+    return float(rows[-1]["regret_pct"])
+
+
+def main() -> None:
+    """Entry point."""
+    app.run("degradation", DegradationConfig(), degradation)
+
+
+if __name__ == "__main__":
+    main()
