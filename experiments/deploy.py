@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import signal
 from collections.abc import Iterator
@@ -109,10 +110,10 @@ def _finish(record: Record, config: DeployConfig, outcome: str) -> None:
         name: {
             "role": config.role(name),
             "volume_ml": float(v),
-            "rows": len(rows),
-            "interlock": sum(bool(row["interlock"]) for row in rows),
+            "rows": rows,
+            "interlock": alarms,
         }
-        for name, v, rows in zip(record.names, volume, record.rows, strict=True)
+        for name, v, rows, alarms in zip(record.names, volume, record.lengths, record.interlock_rows, strict=True)
     }
     summary = {
         "outcome": outcome,
@@ -184,6 +185,7 @@ def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConf
 
     announce = Announcer(loop)
     outcome = "failed: see the log"
+    record.journal.append("start", {"time_s": round(reactors.elapsed(), 3), "pid": os.getpid()})
     try:
         with logging_redirect_tqdm(), tqdm(disable=None, unit="sample") as bar:
             for step in loop.run():

@@ -87,8 +87,9 @@ def audit_rows(
     """
     missed = lost = doubled = 0
     zero = r.spans[0][0]
+    times = r.record.series("time_min") * 60.0 + zero
     for n, name in enumerate(r.names):
-        rows = np.array([float(row["time_min"] or 0.0) * 60.0 + zero for row in r.record.rows[n]])
+        rows = times[n, : r.record.lengths[n]]
         doubled += int((np.diff(rows) <= 0.0).sum())
         over = bool(r.loop.done[n] or r.loop.stopped[n])
         end = rows[-1] if over and rows.size else INF

@@ -35,7 +35,6 @@ log = logging.getLogger(__name__)
 
 SEEN_S = 75.0  # device seconds after it was stored by which a row has its sample, at the latest
 BLIND_S = 0.25  # real seconds before a kill in which a sample may not have been asked for yet
-START_S = 0.5  # real seconds from the last reactor's bring-up to the loop's first look
 PATIENCE_S = 60.0  # real seconds for a client to start
 
 
@@ -81,8 +80,8 @@ class Findings:
     doses: runs of the feed motors. doses_not_given: intents without one; doses_lost: those of them that neither a kill
     between intent and pump nor a note explains. doses_doubled: runs without an intent of their own; doses_repeated: by
     the device itself, every 63 s, while no client lived. open_doses: kills in the middle of a dose. fed_ml, booked_ml:
-    what the device delivered, and what the journals say. schedule_error_s: how much later or earlier than in the others
-    a sample is dated in any life, device s.
+    what the device delivered, and what the journals say. schedule_error_s: largest difference between the run time that
+    a sample is dated with and the device's own clock.
     """
 
     kills: int = 0
@@ -221,14 +220,13 @@ class Campaign:
         f.overflowed = any(truth[m]["overflowed"] for m in c.reactors)
         journal, _ = read_journal(self.folder / "journal.jsonl")
         self._zero = self._device_s(journal[0]["wall"])
-        # a client watches when all its reactors are up and its loop has begun
-        self._ready = np.array([self._device_s(r["wall"]) for r in journal if r["kind"] == "device"])
-        delays: list[float] = []
+        self._watching = np.array([self._device_s(r["wall"]) for r in journal if r["kind"] == "start"])
+        times = [(r["wall"], r["time_s"]) for r in journal if r["kind"] == "sample"]
+        f.schedule_error_s = max(abs(self._device_s(wall) - self._zero - time_s) for wall, time_s in times)
         for name in c.reactors:
             self._compare_doses([r for r in journal if r.get("reactor") == name], name)
-            delays += self._compare_rows([r for r in journal if r.get("reactor") == name], name)
+            self._compare_rows(name)
             f.fed_ml += truth[name]["feed_ml"]
-        f.schedule_error_s = max(delays, default=np.inf)
 
     def _device_s(self, wall: float) -> float:
         return float((wall - self._wall_zero) * self.config.speed)
@@ -255,31 +253,24 @@ class Campaign:
                 f.doses_lost += 1
         f.open_doses += sum("left open" in str(row.get("note")) for row in journal)
 
-    def _compare_rows(self, journal: Sequence[dict[str, Any]], name: str) -> list[float]:
-        """Samples made while a client watched against the rows of its CSV; delays that a life differs by, s."""
+    def _compare_rows(self, name: str) -> None:
+        """Samples made while a client watched against the rows of its CSV."""
         f, c = self.findings, self.config
         with open(self.folder / "recordings" / f"{name}.csv", newline="", encoding="utf-8") as file:
             rows = np.array([float(row["time_min"]) * 60.0 + self._zero for row in csv.DictReader(file)])
         f.rows += rows.size
         f.rows_doubled += int((np.diff(rows) < 30.0).sum())
-        ready = self._ready
         ends = np.array([self._device_s(t - BLIND_S) for t in [*self._killed, self._ended]])
-        smallest: dict[int, float] = {}
         for sample in self._ask(f"samples/{name}"):
             at = sample["stored_s"]
             k = int(np.searchsorted(ends, at))  # the life it was made in, or in the pause before
-            begun = ready[(ready > (ends[k - 1] if k else -np.inf)) & (ready < (ends[k] if k < ends.size else 0.0))]
-            if k == ends.size or begun.size < len(c.reactors) or begun.max() + START_S * c.speed > at:
+            since = ends[k - 1] if k else -np.inf
+            if not ((self._watching > since) & (self._watching <= at)).any() or k == ends.size:
                 continue
             f.samples += 1
-            mine = rows[(rows >= at - 3.0) & (rows < at + SEEN_S)]
-            if mine.size == 0:
+            if not ((rows >= at - 3.0) & (rows < at + SEEN_S)).any():
                 f.rows_lost += 1
                 f.trouble.append(f"{name}: the sample of device second {at:.0f} is in no row")
-            else:
-                smallest[k] = min(smallest.get(k, np.inf), float(mine[0] - at))
-        first = min(smallest.values(), default=0.0)
-        return [abs(delay - first) for delay in smallest.values()]
 
 
 def one_run(config: KillConfig, folder: Path, run: int) -> Findings:

@@ -1,4 +1,4 @@
-"""Days of a run with all reactors, in virtual time: does anything grow, drift or get lost? `python -m experiments.soak`."""
+"""Days of a run with all reactors in virtual time: does anything grow, drift or get lost? `experiments.soak`."""
 
 from __future__ import annotations
 
