@@ -53,7 +53,7 @@ class FaultMatrixConfig:
         by_name(self.faults)
         unknown = [m for m in self.moments if m not in MOMENTS]
         checks = (
-            ("reactors", self.reactors, self.reactors[:1] == (SICK,), f"{SICK} first, it is the one that falls sick"),
+            ("reactors", self.reactors, self.reactors[0] == SICK, f"{SICK} first, it is the one that falls sick"),
             ("moments", self.moments, bool(self.moments) and not unknown, ", ".join(MOMENTS)),
             ("controller", self.controller, self.controller in WITHOUT_POLICY, ", ".join(WITHOUT_POLICY)),
             ("controls", self.controls, 0 <= self.controls <= 1000, "0 to 1000"),

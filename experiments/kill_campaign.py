@@ -255,7 +255,7 @@ class Campaign:
 
     def _compare_rows(self, name: str) -> None:
         """Samples made while a client watched against the rows of its CSV."""
-        f, c = self.findings, self.config
+        f = self.findings
         with open(self.folder / "recordings" / f"{name}.csv", newline="", encoding="utf-8") as file:
             rows = np.array([float(row["time_min"]) * 60.0 + self._zero for row in csv.DictReader(file)])
         f.rows += rows.size

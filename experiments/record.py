@@ -7,6 +7,7 @@ that is killed in between is completed from the journal when it is resumed.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import math
@@ -154,7 +155,7 @@ class Record:
                 self.journal.append("trouble", {"reactor": self.names[n], "interlock": step.reasons[n]})
 
     def done(self, step: Step, state: Mapping[str, Any]) -> None:
-        """Write a step's rows, the state after it, and its curves."""
+        """Write a step's rows, the state after it, and its curves. Raises: RecordingError when the disk refuses."""
         for n in np.flatnonzero(step.rows):
             row = row_of(step, int(n))
             self._write(int(n), row)
@@ -162,9 +163,13 @@ class Record:
             curves = {"od": step.od, "setpoint": step.setpoint, "pump_rate_ml_s": step.rate}
             for tag, value in {**curves, "temperature_degc": step.temperature, **step.explanation}.items():
                 self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
-        if self._fsync:
-            self.events.flush()
-        self.save(state)
+        try:
+            if self._fsync:
+                self.events.flush()
+            self.save(state)
+        except OSError as error:
+            remedy = "free disk space, then resume the run"
+            raise RecordingError(f"{self.folder}: {error.strerror or error}; {remedy}") from error
 
     def save(self, state: Mapping[str, Any]) -> None:
         """Replace state.json; it says up to which row of the journal it knows everything."""
@@ -198,4 +203,5 @@ class Record:
         for recorder in self._recorders:
             recorder.close()
         self.journal.close()
-        self.events.close()
+        with contextlib.suppress(OSError):  # on a full disk the last points of the curves are lost, no row is
+            self.events.close()
