@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dqn.policy import Policy
+    from experiments.pool import Cell
     from experiments.trials import Trial
 
 log = logging.getLogger(__name__)
-
-Cell = tuple[str, str, str]  # controller, plant, scenario
 
 
 def cells(config: BenchmarkConfig) -> list[Cell]:
@@ -118,6 +117,7 @@ def learned(config: BenchmarkConfig, wanted: set[str], figures: Figures) -> tupl
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         keys = ("seeds", "env_steps", "updates", "regret_pct", "steady_abs_error", "policy_seed", "config_hash")
         told[name] = {"policy": f"training/{name}/policy.npz", **{key: summary[key] for key in keys}}
+        told[name]["agent"] = asdict(config.agents[name])
         at = summary["seeds"].index(summary["policy_seed"])
         figures.refer(
             f"training/{name}/figures/learning.svg",
@@ -127,41 +127,6 @@ def learned(config: BenchmarkConfig, wanted: set[str], figures: Figures) -> tupl
             f"best on the selection grid: regret {summary['regret_pct'][at]:.2f} % on the reported grid.",
         )
     return found, told
-
-
-def closed_loops(config: BenchmarkConfig, policies: dict[str, Policy]) -> Iterator[Trial]:
-    """Run every cell; the replicates of a cell are one batch."""
-    from envs.plant import Plant
-    from experiments import build
-    from experiments.controllers.base import Controller
-    from experiments.trials import run_trial
-
-    for name, plant_name, scenario in cells(config):
-
-        def make(plant: Plant, name: str = name) -> Controller:
-            return build.controller(config.controllers[name], config.env, policies.get(name), plant)
-
-        plant_config, schedule = config.plants[plant_name], config.scenarios[scenario]
-        yield run_trial(
-            (name, plant_name, scenario), plant_config, schedule, make, config.env, config.replicates, config.seed
-        )
-
-
-def _run(config: BenchmarkConfig, policies: dict[str, Policy]) -> list[Trial]:
-    """`closed_loops` with progress: a bar on a terminal, a line every tenth in a log."""
-    from tqdm import tqdm
-    from tqdm.contrib.logging import logging_redirect_tqdm
-
-    total, trials = len(cells(config)), []
-    with logging_redirect_tqdm(), tqdm(total=total, disable=None, unit="loop") as bar:
-        for trial in closed_loops(config, policies):
-            trials.append(trial)
-            bar.set_postfix_str(f"{trial.controller} on {trial.plant}")
-            bar.update()
-            if bar.disable and (len(trials) % max(total // 10, 1) == 0 or len(trials) == total):
-                log.info("closed loop %d of %d: %s, %s, %s", len(trials), total, trial.scenario, trial.plant,
-                         trial.controller)  # fmt: skip
-    return trials
 
 
 CAPTIONS = {
@@ -227,9 +192,12 @@ def table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[di
     """The rows that stand beside the paper's table: first plant of the studies named like its scenarios."""
     shown = []
     for name in ("setpoint_steps", "temperature_switch"):
-        if name in config.studies:
-            plant = config.studies[name].plants[0]
-            shown += [r for r in rows if r["scenario"] == name and r["plant"] == plant]
+        if name in config.studies and config.studies[name].plants:
+            study = config.studies[name]
+            shown += [
+                r for r in rows
+                if r["scenario"] == name and r["plant"] == study.plants[0] and r["controller"] in study.controllers
+            ]  # fmt: skip
     return shown
 
 
@@ -238,6 +206,8 @@ def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
     from experiments import comparison
     from experiments.published import SETTLING_MIN, TABLE_2
 
+    plants, controllers = list(config.plants), list(config.controllers)
+    ordered = sorted(trials, key=lambda t: (plants.index(t.plant), controllers.index(t.controller)))
     names = {t.controller for t in trials}
     against = [name for name in ("dqn", "oracle") if name in names]
     rows = comparison.rows(trials)
@@ -249,9 +219,9 @@ def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
             {k: r[k] for k in ("controller", "plant", "scenario", "window")} for r in table_2_rows(rows, config)
         ],
         "details": comparison.details(trials),
-        "totals": comparison.totals(trials),
+        "totals": comparison.totals(ordered),
         "paired": [p for name in against for p in comparison.pairs(trials, name)],
-        "paired_totals": [p for name in against for p in comparison.total_pairs(trials, name)],
+        "paired_totals": [p for name in against for p in comparison.total_pairs(ordered, name)],
         "replicates": config.replicates,
         "seed": config.seed,
     }
@@ -272,14 +242,21 @@ def _store(trials: list[Trial], folder: Path) -> None:
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     """Calibrate, train, run every closed loop, compare, draw, report."""
     from experiments import report
+    from experiments.pool import Loops
 
     if not (cells(config) or config.training or config.calibration):
         raise app.UserError("nothing to run: choose a recipe, e.g. +experiment=paper or +experiment=setpoint_steps")
     figures = Figures(folder)
     fitted = calibration(config, figures) if config.calibration else None
-    names = {c for c, _, _ in cells(config) if config.controllers[c].kind == "dqn"}
-    policies, told = learned(config, names | (set(config.agents) if config.training else set()), figures)
-    trials = _run(config, policies)
+    wanted = cells(config)
+    names = {c for c, _, _ in wanted if config.controllers[c].kind == "dqn"}
+    with Loops(config) as loops:
+        loops.start([cell for cell in wanted if cell[0] not in names])  # they run while the agents are trained
+        policies, told = learned(config, names | (set(config.agents) if config.training else set()), figures)
+        for name in sorted(names):
+            loops.start([cell for cell in wanted if cell[0] == name], policies[name])
+        found = loops.results()
+    trials = [found[cell] for cell in wanted]
     summary = summarise(config, trials) | {"calibration": fitted, "agents": told}
     draw(config, trials, summary, figures)
     summary["figures"] = figures.shown

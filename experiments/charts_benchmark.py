@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 LONG_MIN = 360.0  # a schedule longer than this is drawn in blocks
 BLOCK = 10  # samples
+NOTHING = 1e-5  # scores below are those of a plant without noise
 
 STYLE = {
     "dqn": (COLOURS[0], "o"),
@@ -156,7 +157,7 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
     figure, axes = new_figure(10.4, 1.6 + 0.62 * len(names), 1, 2, sharey=True)
     for metric, ax in zip(("ise", "itae"), axes, strict=True):
         seen = np.array([e[key] for e in entries for key in (f"floor_{metric}", f"{metric}_mean")])
-        ax.set_xlim(0.6 * seen[seen > 0.0].min(), 1.8 * seen.max())
+        ax.set_xlim(0.6 * seen[seen > NOTHING].min(), 1.8 * seen.max())
         for y in range(len(names)):
             if y % 2 == 0:
                 ax.axhspan(y - 0.5, y + 0.5, color="#f3f5f7", zorder=0)
@@ -169,7 +170,7 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
                 ax.plot([max(low, 1e-12), high], [y + offset] * 2, color=colour, linewidth=1.3)
             ax.plot(e[f"{metric}_mean"], y + offset, marker, color=colour, markersize=5)
             floor = e[f"floor_{metric}"]
-            if e["controller"] == witness and floor > 0.0:
+            if e["controller"] == witness and floor > NOTHING:
                 ax.plot([floor, floor], [y - 0.42, y + 0.42], color="#b00020", linewidth=1.4, zorder=1)
         _log_axis(ax)
         unit = {"ise": "ISE, OD² min", "itae": "ITAE, OD min²"}[metric]
@@ -207,7 +208,9 @@ def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
             certain = e["verdict"] != "no difference shown"
             ax.plot(e["percent"], y + offset, marker, color=colour, markersize=5,
                     markerfacecolor=colour if certain else "white")  # fmt: skip
-        ax.xaxis.set_major_locator(FixedLocator([-100, -50, -20, -10, 0, 10, 20, 50, 100, 300, 1000, 3000, 10000]))
+        wide = ax.get_xlim()[1] > 200.0
+        few, many = [-100, -20, 0, 20, 100, 1000, 10000], [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200]
+        ax.xaxis.set_major_locator(FixedLocator(few if wide else many))
         ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:+g}" if v else "0"))
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.tick_params(axis="x", labelsize=8)

@@ -15,6 +15,7 @@ __all__ = ["Spread", "details", "pairs", "row", "rows", "spread", "total_pairs",
 
 Array = NDArray[np.float64]
 METRICS = ("ise", "itae")
+NEGLIGIBLE = 1e-6  # a mean below is nothing to take a percentage of
 
 
 class Spread:
@@ -131,13 +132,14 @@ def totals(trials: Sequence[Trial]) -> list[dict[str, Any]]:
         steady = np.mean([trial.score_clean(w).steady_abs_error for w in parts], axis=0)
         entry["clean_steady_abs_error"] = Spread(steady).mean
         entry["effort_ul_s"] = Spread(np.average([trial.effort(w) for w in parts], axis=0, weights=length)).mean
+        entry["held"] = Spread(trial.held).mean
         entry["media_ml"] = Spread(np.sum([trial.media(w) for w in parts], axis=0)).mean
         found.append(entry)
     return found
 
 
 def _pair(one: Trial, other: Trial, metric: str, window: str, difference: Array, scale: Array) -> dict[str, Any]:
-    found = Spread(difference)
+    found, mean = Spread(difference), Spread(scale).mean
     return {
         "controller": one.controller,
         "against": other.controller,
@@ -148,7 +150,7 @@ def _pair(one: Trial, other: Trial, metric: str, window: str, difference: Array,
         "n": found.n,
         "difference": found.mean,
         "ci95": found.ci95,
-        "percent": 100.0 * found.mean / float(np.nanmean(scale)) if np.nanmean(scale) > 0.0 else float("nan"),
+        "percent": 100.0 * found.mean / mean if mean > NEGLIGIBLE else float("nan"),
         "verdict": ("lower", "no difference shown", "higher")[found.sign + 1],
     }
 

@@ -30,7 +30,8 @@ class BenchmarkConfig:
     seed: int = 0  # of plants, noise, training and calibration; every controller meets the same draws
     env: EnvConfig = field(default_factory=EnvConfig)  # what model-based controllers believe, and agents are trained on
     agents: dict[str, DQNConfig] = field(default_factory=dict)  # learned controllers by name
-    train_seeds: int = 8  # seeds each agent is trained with; the best on the selection grid controls
+    train_seeds: int = 4  # seeds each agent is trained with; the best on the selection grid controls
+    workers: int = 0  # processes for the closed loops; 0 = one per core, 1 = none but this one
     policy: str | None = None  # a policy.npz or run folder for `dqn` in place of training
     calibration: bool = False  # simulate the open-loop protocol and fit it (Fig. 2a)
     training: bool = False  # train all agents even if no study needs them (Fig. 2b)
@@ -44,6 +45,7 @@ class BenchmarkConfig:
         checks = (
             ("replicates", self.replicates, 1 <= self.replicates <= 10_000, "1 to 10000"),
             ("seed", self.seed, self.seed >= 0, "at least 0"),
+            ("workers", self.workers, 0 <= self.workers <= 256, "0 (one per core) to 256"),
             ("train_seeds", self.train_seeds, 1 <= self.train_seeds <= 1000, "1 to 1000"),
         )
         for key, value, ok, allowed in checks:

@@ -35,7 +35,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 def plus_minus(mean: float | None, sd: float | None, digits: int = 3) -> str:
     """mean ± sd, the deviation to two digits; the mean alone where there is none, or none beyond rounding."""
-    if mean is None or sd is None or not sd > 1e-9 * abs(mean):
+    if mean is None or sd is None or not sd > 1e-6 * abs(mean):
         return number(mean, digits)
     return f"{number(mean, digits)} ± {number(sd, 2)}"
 

@@ -17,12 +17,14 @@ from experiments.controllers.base import Controller
 from experiments.loop import ClosedLoop
 from experiments.metrics import WindowMetrics, window_metrics
 from hardware.safety import Interlock
-from hardware.safety_config import SafetyConfig
+from hardware.safety_config import Response, SafetyConfig
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 
 __all__ = ["Trial", "Window", "run_trial", "windows"]
 
 Array = NDArray[np.float64]
+
+LEAST_NOISE = 1e-9  # OD, of a sensor that is meant to have none
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,8 @@ class Trial:
     """What N replicates did, sample by sample since the schedule began; arrays (N, K).
 
     minute: (K,). od: as measured. clean: what a sensor without noise would have shown. rate: mL/s after the guard.
-    temperature: degC. media_ml: fresh medium delivered since the culture began. overflowed: at the end, (N,).
+    temperature: degC. media_ml: fresh medium delivered since the culture began.
+    held: samples on which the interlock allowed no dose, (N,). overflowed: at the end, (N,).
     """
 
     controller: str
@@ -66,6 +69,7 @@ class Trial:
     rate: Array
     temperature: Array
     media_ml: Array
+    held: Array
     overflowed: NDArray[np.bool_]
 
     def score(self, window: Window) -> WindowMetrics:
@@ -114,15 +118,16 @@ def run_trial(
       names: of controller, plant and scenario. make: builds the controller for a plant.
       model: control period and largest pump rate; the interlock's limit.
     """
+    if plant_config.sensor.noise_floor == 0.0:  # the interlock takes a sensor that repeats itself exactly for dead
+        plant_config = replace(plant_config, sensor=replace(plant_config.sensor, noise_floor=LEAST_NOISE))
     plant = Plant(plant_config, replicates, np.random.default_rng(seed))
     backend = SimulatedConfig(reactors=tuple(f"M{i}" for i in range(replicates)), control_min=model.control_min)
-    # a sensor without noise repeats itself exactly at a steady state, which on a bench means that it is dead
-    patience = SafetyConfig().frozen_samples if plant_config.sensor.noise_floor > 0.0 else 60
-    safety = SafetyConfig(max_rate=model.max_pump_rate, frozen_samples=patience)
-    loop = ClosedLoop(SimulatedReactors(plant, backend), make(plant), Interlock(replicates, safety), schedule)
+    interlock = Interlock(replicates, SafetyConfig(max_rate=model.max_pump_rate))
+    loop = ClosedLoop(SimulatedReactors(plant, backend), make(plant), interlock, schedule)
     minute = np.arange(0.0, schedule.total_min + 1e-6, model.control_min)
     fields = ("od", "clean", "rate", "temperature", "media_ml")
     stored: dict[str, Any] = {key: np.full((replicates, minute.size), np.nan) for key in fields}
+    held = np.zeros(replicates)
     for step in loop.run():
         row = np.flatnonzero(step.rows & (step.phase >= 0))
         column = np.rint(step.elapsed[row] / model.control_min).astype(np.intp)
@@ -135,4 +140,5 @@ def run_trial(
         }
         for key, values in seen.items():
             stored[key][row, column] = values[row]
-    return Trial(*names, schedule, minute, **stored, overflowed=plant.overflowed)
+        held[row] += step.response[row] >= Response.HOLD
+    return Trial(*names, schedule, minute, **stored, held=held, overflowed=plant.overflowed)

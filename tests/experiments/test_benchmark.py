@@ -162,7 +162,7 @@ def synthetic(controller: str, offset: np.ndarray) -> Trial:
     rate = np.tile([0.01, 0.013, 0.0], (n, 1))
     return Trial(
         controller, "p", "s", Schedule((1.0,), (2.0,), (37.0,)), np.arange(3.0), od, od - 0.001, rate, 37.0 * ones,
-        np.tile([1.0, 1.6, 2.4], (n, 1)), np.zeros(n, dtype=bool),
+        np.tile([1.0, 1.6, 2.4], (n, 1)), np.zeros(n), np.zeros(n, dtype=bool),
     )  # fmt: skip
 
 
@@ -237,7 +237,10 @@ def test_published_table_is_complete():
     [
         (["replicates=0"], ["replicates = 0", "1 to 10000"]),
         (["+experiment=setpoint_steps", "studies.setpoint_steps.plants=[moon]"], ["plants: moon", "nominal, "]),
-        (["+experiment=setpoint_steps", "studies.setpoint_steps.controllers=[pid]"], ["controllers: pid", "dqn, pi"]),
+        (
+            ["+experiment=setpoint_steps", "studies.setpoint_steps.controllers=[pid]"],
+            ["controllers: pid", "dqn, dqn_paper, pi"],
+        ),
         (["plants.bench.growth.mew=1"], ["mew"]),
         (["plants.bench.growth.mu=fast"], ["plants.bench.growth.mu", "fast"]),
         (["controllers.mpc.horizon=0"], ["controller.horizon = 0", "1 to 60"]),
@@ -262,9 +265,10 @@ def run(*overrides: str) -> subprocess.CompletedProcess[str]:
 def test_command_line_twice_gives_the_same_summary(tmp_path):
     policies.save(tmp_path / "policy.npz", inverse_policy())
     texts = []
-    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+    for name, seed, workers in (("a", 0, 1), ("b", 0, 2), ("c", 1, 1)):
         done = run("+experiment=setpoint_steps", f"policy={tmp_path / 'policy.npz'}", f"seed={seed}",
-                   "studies.setpoint_steps.controllers=[dqn,pi]", f"hydra.run.dir={tmp_path / name}")  # fmt: skip
+                   f"workers={workers}", "studies.setpoint_steps.controllers=[dqn,pi]",
+                   f"hydra.run.dir={tmp_path / name}")  # fmt: skip
         assert done.returncode == 0, done.stderr
         assert "closed loop 2 of 2" in done.stdout + done.stderr
         texts.append((tmp_path / name / "summary.json").read_text())
