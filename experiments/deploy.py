@@ -258,7 +258,8 @@ def deploy(config: DeployConfig, folder: Path) -> None:
             try:
                 _finish(record, config, outcome)
             except OSError as error:
-                outcome = f"failed: {outcome}; figure and summary not written ({error.strerror or error})"
+                why = f"figure and summary not written ({error.strerror or error})"
+                outcome = f"failed: {outcome.removeprefix('failed: ')}; {why}"
     except ReactorError as error:
         raise app.UserError(str(error)) from None
     finally:

@@ -28,6 +28,7 @@ __all__ = ["MOMENTS", "Case", "Outcome", "audit_doses", "audit_rows"]
 MOMENTS = ("recovery", "steady", "step", "dose")
 HEALTHY_MU, FULL_DILUTION = 0.025, 0.06  # 1/min: the emulator's healthy culture, and the largest feed rate over volume
 DEVICE_PERIOD_S = (60.0, 68.0)  # a pump left on repeats its dose so often
+OVERGROWN = 4.0  # OD; the plant would grow on, a real culture and its sensor do not
 SEEN_S = 75.0  # a row's time is that of the arrival of its sample, at most so long after it was stored
 
 
@@ -36,12 +37,17 @@ class Outcome:
     """What happened. Times s after the fault, volumes mL; nan where there is nothing to tell.
 
     detected_s, reason: first declared word on the fault. response: of the interlock to it. kinds: all reasons after
-    it. peak_ml, overflowed: of the worst vial. peak_error: largest distance of the true OD from what the schedule
-    asks and the pump can do, sick reactor, after the fault. rows_missed: samples nobody could read; rows_lost: samples
-    that could have been read and are in no row; rows_doubled; doses_doubled: runs of the feed motor beyond one per
-    decision; repeats: of these, by the device itself (every 63 s) while nobody could stop it. pumps_off: every motor
-    at rest at the end, as the program claims. early_alarms, neighbour_alarms: reasons given before the fault, and for
-    healthy neighbours. ok: as declared; wrong: what is not.
+      it; notes: of the driver.
+    peak_ml, overflowed: of the worst vial.
+    peak_error: largest distance of the true OD from what the schedule asks and the pump can do, sick reactor, after the
+      fault; 4 stands for anything above.
+    rows_missed: samples nobody could read; rows_lost: samples that could have been read and are in no row;
+      rows_doubled.
+    doses_doubled: runs of the feed motor beyond one per decision; repeats: those that are the device's own (every
+      63 s), while nobody could stop it.
+    pumps_off: every motor at rest at the end, as the program claims.
+    early_alarms, neighbour_alarms: reasons given before the fault, and for healthy neighbours.
+    outcome: how the run ended. wrong: what is not as declared.
     """
 
     fault: str
@@ -165,7 +171,7 @@ class _Watch:
             falling = self._reference * math.exp((HEALTHY_MU - FULL_DILUTION) * minutes)
             self._reference = max(asked, od if math.isnan(self._reference) else falling)
             if now >= self.struck_s and elapsed[0] < schedule.total_min:
-                self.result.peak_error = max(self.result.peak_error, abs(od - self._reference))
+                self.result.peak_error = max(self.result.peak_error, min(abs(od - self._reference), OVERGROWN))
         r.clock.at(now + 15.0, self._look)
 
     def step(self, step: Step) -> None:
@@ -181,7 +187,8 @@ class _Watch:
                     self.result.early_alarms += 1
                 elif mine:
                     self.result.kinds[kind] = self.result.kinds.get(kind, 0) + 1
-                    self.told(kind, Response(int(step.response[n])).name.lower())
+                    response = Response(int(step.response[n]))
+                    self.told(kind, "report" if response == Response.PASS else response.name.lower())
                 else:
                     self.result.neighbour_alarms += 1
         for note in step.notes if struck else ():

@@ -41,7 +41,7 @@ class FaultMatrixConfig:
         default_factory=lambda: Schedule((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8)
     )
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    controller: str = "inverse"
+    controller_kind: str = "inverse"
     faults: tuple[str, ...] = ()
     moments: tuple[str, ...] = MOMENTS
     controls: int = 10
@@ -55,7 +55,12 @@ class FaultMatrixConfig:
         checks = (
             ("reactors", self.reactors, self.reactors[0] == SICK, f"{SICK} first, it is the one that falls sick"),
             ("moments", self.moments, bool(self.moments) and not unknown, ", ".join(MOMENTS)),
-            ("controller", self.controller, self.controller in WITHOUT_POLICY, ", ".join(WITHOUT_POLICY)),
+            (
+                "controller_kind",
+                self.controller_kind,
+                self.controller_kind in WITHOUT_POLICY,
+                ", ".join(WITHOUT_POLICY),
+            ),
             ("controls", self.controls, 0 <= self.controls <= 1000, "0 to 1000"),
             ("seed", self.seed, self.seed >= 0, "at least 0"),
             ("workers", self.workers, 0 <= self.workers <= 64, "0 (one per core) to 64"),
@@ -69,7 +74,7 @@ class FaultMatrixConfig:
 def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int) -> Outcome:
     """One case, in whatever process. Args: name: of the fault, "" for a healthy run."""
     fault = by_name((name,))[0] if name else None
-    return Case(fault, moment, config.reactors, config.scenario, config.safety, config.controller, seed).run()
+    return Case(fault, moment, config.reactors, config.scenario, config.safety, config.controller_kind, seed).run()
 
 
 def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int]]:

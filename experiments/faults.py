@@ -76,6 +76,20 @@ def post(*paths: str) -> Act:
     return act
 
 
+def again(act: Act, seconds: float) -> Act:
+    """Now, and once more after a while: a first time in the middle of a dose passes with that dose."""
+
+    def later(r: Rehearsal) -> None:
+        run_device(r)
+        act(r)
+
+    def twice(r: Rehearsal) -> None:
+        act(r)
+        r.clock.at(r.clock.now() + seconds, lambda: later(r))
+
+    return twice
+
+
 def both(*acts: Act) -> Act:
     """One after another."""
 
@@ -275,8 +289,9 @@ FAULTS: tuple[Fault, ...] = (
     Fault("foreign chemostat", "a mode that pumps is switched on", post(f"/SetOutputOn/Chemostat/1/{SICK}"), ("mode",),
           post(f"/SetOutputOn/Chemostat/0/{SICK}"), 10.0),
     Fault("foreign blank", "the zero is set anew", post(f"/CalibrateOD/OD0/{SICK}/20000/0"), ("blank",), blind=True),
-    Fault("foreign pump", "the feed pump is switched on", post(f"/SetOutputOn/Pump1/1/{SICK}"),
-          ("note:pumps on", "note:pump", "mode", "pump"), rogue=True),
+    Fault("foreign pump", "the feed pump is switched on twice, 0.5 mL every 63 s",
+          again(post(f"/SetOutputTarget/Pump1/{SICK}/0.008", f"/SetOutputOn/Pump1/1/{SICK}"), 95.0),
+          ("pump", "note:pumps on", "mode"), rogue=True),
     Fault("foreign stop", "the experiment is stopped; started again after 10 min", post(f"/Experiment/0/{SICK}"),
           ("stopped",), post(f"/Experiment/1/{SICK}"), 10.0, blind=True),
     Fault("foreign thermostat off", "heating switched off", post(f"/SetOutputOn/Thermostat/0/{SICK}"),

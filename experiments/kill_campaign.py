@@ -44,7 +44,7 @@ class KillConfig:
 
     kills: in all. runs: recordings they are spread over. workers: runs at a time. speed: device seconds per second.
     longest_s: longest real time from a client's first written row to its kill. early: share of the kills that may fall
-    into the start itself. reactors, controller, seed: of the runs.
+    into the start itself. reactors, controller_kind, seed: of the runs.
     """
 
     kills: int = 200
@@ -54,7 +54,7 @@ class KillConfig:
     longest_s: float = 3.0
     early: float = 0.2
     reactors: tuple[str, ...] = ("M0", "M1", "M2")
-    controller: str = "inverse"
+    controller_kind: str = "inverse"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -81,7 +81,7 @@ class Findings:
     between intent and pump nor a note explains. doses_doubled: runs without an intent of their own; doses_repeated: by
     the device itself, every 63 s, while no client lived. open_doses: kills in the middle of a dose. fed_ml, booked_ml:
     what the device delivered, and what the journals say. schedule_error_s: largest difference between the run time that
-    a sample is dated with and the device's own clock.
+    a sample is dated with and the device's own clock. killed_s: run time of the kills.
     """
 
     kills: int = 0
@@ -102,6 +102,7 @@ class Findings:
     schedule_error_s: float = 0.0
     pumps_off: bool = False
     overflowed: bool = False
+    killed_s: list[float] = field(default_factory=list)
     trouble: list[str] = field(default_factory=list)
 
     @property
@@ -155,7 +156,7 @@ class Campaign:
             backend = ["backend=chibio", f"backend.url={self.device.url}", f"backend.speed={c.speed}"]
             names = [f"backend.reactors=[{','.join(c.reactors)}]", f"hydra.run.dir={self.folder}"]
             names += [f"backend.calibration={self.folder.parent / 'calibration'}"]
-            command += [*backend, *names, *scenario, f"controller={c.controller}", "safety.silent=100000"]
+            command += [*backend, *names, *scenario, f"controller={c.controller_kind}", "safety.silent=100000"]
         else:
             command.append(f"resume={self.folder}")
         self.findings.lives += 1
@@ -220,6 +221,7 @@ class Campaign:
         f.overflowed = any(truth[m]["overflowed"] for m in c.reactors)
         journal, _ = read_journal(self.folder / "journal.jsonl")
         self._zero = self._device_s(journal[0]["wall"])
+        f.killed_s = [round(self._device_s(t) - self._zero, 1) for t in self._killed]
         self._watching = np.array([self._device_s(r["wall"]) for r in journal if r["kind"] == "start"])
         times = [(r["wall"], r["time_s"]) for r in journal if r["kind"] == "sample"]
         f.schedule_error_s = max(abs(self._device_s(wall) - self._zero - time_s) for wall, time_s in times)
@@ -260,17 +262,18 @@ class Campaign:
             rows = np.array([float(row["time_min"]) * 60.0 + self._zero for row in csv.DictReader(file)])
         f.rows += rows.size
         f.rows_doubled += int((np.diff(rows) < 30.0).sum())
-        ends = np.array([self._device_s(t - BLIND_S) for t in [*self._killed, self._ended]])
+        ends = np.array([self._device_s(t) for t in [*self._killed, self._ended]])
         for sample in self._ask(f"samples/{name}"):
             at = sample["stored_s"]
             k = int(np.searchsorted(ends, at))  # the life it was made in, or in the pause before
-            since = ends[k - 1] if k else -np.inf
-            if not ((self._watching > since) & (self._watching <= at)).any() or k == ends.size:
+            begun = self._watching[(self._watching > (ends[k - 1] if k else -np.inf)) & (self._watching <= at)]
+            if begun.size == 0 or k == ends.size or at > ends[k] - BLIND_S * self.config.speed:
                 continue
             f.samples += 1
             if not ((rows >= at - 3.0) & (rows < at + SEEN_S)).any():
                 f.rows_lost += 1
-                f.trouble.append(f"{name}: the sample of device second {at:.0f} is in no row")
+                span = f"a client watched from {begun.max():.0f} to {ends[k]:.0f}"
+                f.trouble.append(f"{name}: the sample of device second {at:.0f} is in no row; {span}")
 
 
 def one_run(config: KillConfig, folder: Path, run: int) -> Findings:

@@ -38,7 +38,7 @@ class SoakConfig:
     days: float = 7.0
     setpoints: tuple[float, ...] = (0.5, 0.4, 0.6)
     phase_min: float = 240.0
-    controller: str = "inverse"
+    controller_kind: str = "inverse"
     safety: SafetyConfig = field(default_factory=lambda: SafetyConfig(bottle_ml=1e6, ml_per_run=1e6))
     seed: int = 0
 
@@ -128,7 +128,7 @@ def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any
     """The run; appends to `days` as they pass; returns what the audit found. Raises: ReactorError."""
     names = POSITIONS[: config.reactors]
     schedule = config.schedule()
-    r = Rehearsal(folder, names, [schedule] * len(names), config.safety, config.controller, seed=config.seed)
+    r = Rehearsal(folder, names, [schedule] * len(names), config.safety, config.controller_kind, seed=config.seed)
     doses: dict[str, list[Any]] = {name: [] for name in names}
     samples: dict[str, list[Any]] = {name: [] for name in names}
     r.begin()

@@ -251,6 +251,10 @@ class Station:
             )
         if self._stuck:
             return Fault("pump", self._stuck, "switch the pump board off by hand")
+        if any(state.pumps_on) and not self.dosing and not math.isfinite(self.handed_over):
+            return Fault(
+                "pump", f"pumps on: {state.pumps_on}, not by this program", "close the device's web page everywhere"
+            )
         acting = [m for m in state.modes if m in OWN_WILL]
         if acting or state.regulating != math.isfinite(self.handed_over):
             what = ", ".join(acting) or f"on-board OD regulation is {'on' if state.regulating else 'off'}"

@@ -44,7 +44,9 @@ class Bench:
         scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]", "controller=inverse"]
         backend = ["backend=chibio", f"backend.url={device.url}", f"backend.speed={SPEED}", "backend.reactors=[M0,M1]"]
         command = [sys.executable, *program, *scenario, *backend, f"hydra.run.dir={folder}"]
-        self.client = subprocess.Popen(command, env=ENVIRONMENT, text=True, stderr=subprocess.PIPE)
+        self.client = subprocess.Popen(
+            command, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
 
     def truth(self) -> dict[str, Any]:
         with urllib.request.urlopen(f"{self.device.control}/_emulator/truth", timeout=10.0) as answer:
@@ -64,7 +66,7 @@ class Bench:
 
     def end(self) -> tuple[int, str]:
         """Status and what was said, after the client has ended by itself."""
-        said = self.client.communicate(timeout=60.0)[1]
+        said = self.client.communicate(timeout=60.0)[0]
         return self.client.returncode, said
 
     def check(self, outcome: str) -> None:

@@ -326,6 +326,20 @@ def test_targets_changed_by_someone_are_set_back() -> None:
     assert sum("set back to" in row["note"] for row in bed.of("note")) == 2
 
 
+def test_a_pump_that_someone_switches_on_is_told_and_switched_off() -> None:
+    bed = Bed()
+    fixed(bed, 0.0)
+    bed.reactors.begin()
+    bed.run(3)
+    bed.device.handle("POST", "/SetOutputTarget/Pump1/M0/0.008")
+    bed.device.handle("POST", "/SetOutputOn/Pump1/1/M0")
+    bed.run(4)
+    assert "pump" in bed.kinds()
+    assert len(doses(bed)) <= 2
+    assert bed.motors_off()
+    assert bed.reactors.stations[0].fault is None
+
+
 def test_no_dose_when_the_device_lies() -> None:
     bed = Bed()
     bed.reactors.begin()
