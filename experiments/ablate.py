@@ -1,8 +1,8 @@
 """What each choice of an agent is worth: trains variants of one agent over the same seeds and compares them.
 
 `python -m experiments.ablate` trains every entry of `ablations` in conf/ablate.yaml: the agent of the command line with
-some of its values replaced. The run folder gets ablation.csv (a row per variant and seed), summary.json and a figure,
-and one sub-folder per variant with its TensorBoard curves. A stopped run goes on with `resume=RUN`.
+some of its values replaced. The run folder gets ablation.csv (a row per variant and seed), summary.json, table.md, a
+figure, and one sub-folder per variant with its TensorBoard curves. A stopped run goes on with `resume=RUN`.
 """
 
 from __future__ import annotations
@@ -179,6 +179,20 @@ def summarise(rows: list[Row]) -> dict[str, dict[str, Any]]:
     return out
 
 
+def table(rows: list[Row]) -> str:
+    """The summary as a Markdown table: median over seeds and, in brackets, the worst seed."""
+    lines = [
+        "| variant | seeds | regret, % | steady error, OD | last regret, % | last steady error, OD | time, s |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, entry in summarise(rows).items():
+        cells = []
+        for measure, digits in zip(MEASURES, (3, 4, 3, 4), strict=True):
+            cells.append(f"{entry[measure]['median']:.{digits}f} ({entry[measure]['worst']:.{digits}f})")
+        lines.append(f"| {name} | {entry['seeds']} | {' | '.join(cells)} | {entry['train_seconds']:.0f} |")
+    return "\n".join(lines) + "\n"
+
+
 def figure(rows: list[Row]) -> Figure:
     """One point per seed: regret and steady error of the kept policy, and regret of the last iterate."""
     from experiments.charts import COLOURS, new_figure
@@ -228,8 +242,9 @@ def ablate(config: AblateConfig, folder: Path) -> float:
         )  # fmt: skip
     summary = summarise(rows)
     app.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
+    (folder / "table.md").write_text(table(rows), encoding="utf-8")
     save(figure(rows), folder / "figures", "ablation")
-    log.info("table %s, figure %s", path, folder / "figures" / "ablation.png")
+    log.info("table %s, figure %s", folder / "table.md", folder / "figures" / "ablation.png")
     return float(summary[config.names[0]]["regret_pct"]["median"])
 
 

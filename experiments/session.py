@@ -69,21 +69,6 @@ class Best:
         self.history = [(step, list(regret), list(steady)) for step, regret, steady in state["history"]]
 
 
-def _log_record(writer: PopulationWriter, record: TrainRecord, steps_per_s: float) -> None:
-    writer.scalars(
-        record.step,
-        {
-            "train/return": record.episode_return,
-            "train/loss": record.loss,
-            "train/epsilon": record.epsilon,
-            "train/learning_rate": record.learning_rate,
-            "q/min": record.q_min,
-            "q/max": record.q_max,
-            "speed/steps_per_s": steps_per_s,
-        },
-    )
-
-
 class Session:
     """The parts of one training run and what it accumulates.
 

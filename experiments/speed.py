@@ -9,18 +9,17 @@ from __future__ import annotations
 import logging
 import os
 import platform
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from statistics import median
 from typing import Any
 
-from experiments import app
+from experiments import app, speed_learning
+from experiments.measurement import Measurement, measure
 
-__all__ = ["GROUPS", "Measurement", "SpeedConfig", "main", "measure"]
+__all__ = ["GROUPS", "SpeedConfig", "main"]
 
 log = logging.getLogger(__name__)
 
@@ -29,30 +28,12 @@ STATES = 64  # of the MPC's problem
 
 
 @dataclass(frozen=True)
-class Measurement:
-    """name: what is timed; work: one sentence about it. rival: what `theirs` is. per: the time is divided by this.
-
-    unit: of the time so divided, "s" or "ms per decision" etc., with `scale` turning seconds into it.
-    limit: the time of ours that must not be exceeded, in that unit, or None.
-    """
-
-    name: str
-    work: str
-    rival: str
-    ours: Callable[[], object]
-    theirs: Callable[[], object]
-    unit: str = "s"
-    scale: float = 1.0
-    per: int = 1
-    limit: float | None = None
-
-
-@dataclass(frozen=True)
 class SpeedConfig:
     """groups: which measurements; runs: pairs of each."""
 
-    groups: tuple[str, ...] = ("controllers", "mpc")
+    groups: tuple[str, ...] = ("training", "update", "environment", "start_up", "controllers", "mpc")
     runs: int = 5
+    scaling: bool = True  # also the figure of cost over sizes
 
     def __post_init__(self) -> None:
         unknown = [g for g in self.groups if g not in GROUPS]
@@ -60,36 +41,6 @@ class SpeedConfig:
             raise ValueError(f"groups = {unknown[0]}: allowed {', '.join(GROUPS)}")
         if not 5 <= self.runs <= 1000:
             raise ValueError(f"runs = {self.runs}: allowed 5 to 1000 (a median of fewer says little)")
-
-
-def _seconds(work: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
-def measure(m: Measurement, runs: int) -> dict[str, Any]:
-    """Time a measurement `runs` times in pairs, after one pair that is thrown away; one entry of summary.json."""
-    pairs = []
-    for k in range(runs + 1):
-        order = (m.ours, m.theirs) if k % 2 else (m.theirs, m.ours)
-        times = {work: _seconds(work) for work in order}
-        pairs.append((times[m.ours], times[m.theirs]))
-    factor = m.scale / m.per
-    kept = pairs[1:]
-    return {
-        "name": m.name,
-        "work": m.work,
-        "unit": m.unit,
-        "ours": factor * median(a for a, _ in kept),
-        "rival": m.rival,
-        "theirs": factor * median(b for _, b in kept),
-        "ratio": median(b / a for a, b in kept),
-        "ratio_range": [min(b / a for a, b in kept), max(b / a for a, b in kept)],
-        "runs": runs,
-        "limit": m.limit,
-        "within_limit": None if m.limit is None else factor * median(a for a, _ in kept) < m.limit,
-    }
 
 
 def controllers() -> Iterator[Measurement]:
@@ -196,7 +147,14 @@ def mpc() -> Iterator[Measurement]:
                       lambda: swarm(slice(0, 1)), lambda: gradient(slice(0, 1)), "ms per decision", 1e3)  # fmt: skip
 
 
-GROUPS: dict[str, Callable[[], Iterator[Measurement]]] = {"controllers": controllers, "mpc": mpc}
+GROUPS: dict[str, Callable[[], Iterator[Measurement]]] = {
+    "training": speed_learning.training,
+    "update": speed_learning.update,
+    "environment": speed_learning.environment,
+    "start_up": speed_learning.start_up,
+    "controllers": controllers,
+    "mpc": mpc,
+}
 """Name -> measurements. Whoever adds one names a rival that does the same work."""
 
 
@@ -213,6 +171,11 @@ def speed(config: SpeedConfig, folder: Path) -> None:
             found.append(measure(m, config.runs))
             log.info("%s: %.4g %s; %s: %.4g; ratio %.3g", m.name, found[-1]["ours"], m.unit, m.rival,
                      found[-1]["theirs"], found[-1]["ratio"])  # fmt: skip
+    if config.scaling:
+        from experiments import charts
+
+        log.info("scaling of updates, environment and training")
+        charts.save(charts.scaling(speed_learning.scaling(config.runs)), folder / "figures", "scaling")
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
     app.write_json(folder / "summary.json", {"machine": machine, "measurements": found})
     tables.write([table(found, config.runs, machine)], folder / "tables")

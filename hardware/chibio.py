@@ -144,10 +144,11 @@ class ChiBioReactors:
         return Measurement(column("time_s"), column("od"), column("temperature"), fresh, vitals)
 
     def _work(self) -> None:
-        """Run what is due. A task that fails costs itself only."""
-        while self._agenda.next_due() <= self._clock.now():
+        """Run what is due now. A task that fails costs itself only; on a dead link others are due again by then."""
+        now = self._clock.now()
+        while self._agenda.next_due() <= now:
             try:
-                self._agenda.run_due()
+                self._agenda.run_due(now)
             except ReactorError as error:
                 self._note_down("task_failed", {"error": str(error)})
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +29,10 @@ CYCLE_S = 60.07  # median of 3275 real cycles (chibio.md section 3)
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 OWN_WILL = ("Zigzag", "Custom", "Chemostat")  # modes that act on the pumps
+
+
+def _link_fault(error: ReactorError) -> Fault:
+    return Fault("link", str(error), "check cable, network and server")
 
 
 class Station:
@@ -196,7 +202,7 @@ class Station:
         try:
             state = self.unit.read()
         except (LinkError, ProtocolError) as error:
-            return self._report(Fault("link", str(error), "check cable, network and server"))
+            return self._report(_link_fault(error))
         except IdentityError as error:
             return self._report(Fault("identity", str(error), "reactors were exchanged: start a new run"))
         except DeviceStateError as error:
@@ -270,16 +276,28 @@ class Station:
         self._log("sample", {"reactor": self.name, "sample": self._sample, **reading, **timing})
         if self._late_s > 30.0 or self.dosing:
             return  # the stirrer may be off for the next measurement already
-        for item, on, wanted in (
-            ("Thermostat", state.heating, self._heat),
-            ("Stir", state.stirring, self.config.stir > 0.0),
-        ):
-            if wanted and not on:  # the device loses them after a quick restart, silently
-                try:
-                    self.unit.switch(item, True)
-                    self.tell(f"{item} was off and was switched on again")
-                except ReactorError as error:
-                    self.tell(f"{item} is off and could not be switched on: {error}")
+        self._look_after(state)
+
+    def _look_after(self, state: DeviceState) -> None:
+        """Heating and stirring as this run wants them: a quick restart loses them silently, a web page changes them."""
+        targets = (
+            ("Thermostat", state.temperature_target, self._target_c),
+            ("Stir", state.stir_target, self.config.stir),
+        )
+        switches = (("Thermostat", state.heating, self._heat), ("Stir", state.stirring, self.config.stir > 0.0))
+        for item, value, wanted in targets:
+            if abs(value - wanted) > 1e-3:
+                self._mend(f"{item} was set to {value:g}", f"set back to {wanted:g}", self.unit.target, item, wanted)
+        for item, on, needed in switches:
+            if needed and not on:
+                self._mend(f"{item} was off", "switched on again", self.unit.switch, item, True)
+
+    def _mend(self, found: str, done: str, request: Callable[[str, Any], None], item: str, value: float) -> None:
+        try:
+            request(item, value)
+            self.tell(f"{found} and was {done}")
+        except ReactorError as error:
+            self.tell(f"{found} and could not be {done}: {error}")
 
     def _time_arrival(self, offset: float) -> None:
         """How much later than possible this sample was seen: its offset against the smallest of recent ones.
@@ -383,8 +401,11 @@ class Station:
             try:
                 self.unit.switch(FEED, False)
                 return
+            except (LinkError, ProtocolError) as error:
+                self._report(_link_fault(error))
             except ReactorError:
-                yield min(self.config.retry_s, 2.0)
+                pass
+            yield min(self.config.retry_s, 2.0)
 
     def _finish(self, plan: DosePlan) -> Task:
         """Task: all pumps off, verified, however long it takes; then the dose is on record as ended."""
@@ -395,8 +416,8 @@ class Station:
             try:
                 self.unit.pumps_off(tries=1)
                 break
-            except (LinkError, ProtocolError):
-                pass
+            except (LinkError, ProtocolError) as error:
+                self._report(_link_fault(error))
             except DeviceStateError as error:
                 if self.unit.state is None:
                     pause = 30.0  # absent or exchanged: nothing may be sent to it

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,11 @@ from experiments.ablate import AblateConfig, Row, summarise, variant
 
 ROOT = Path(__file__).parents[2]
 SHORT = ["agent.total_steps=300", "agent.learn_start=100", "agent.epsilon_steps=100", "eval_every=300", "n_agents=2"]
+
+
+def _plain(agent: DQNConfig) -> str:
+    """As JSON, in which a list and a tuple are the same."""
+    return json.dumps(asdict(agent))
 
 
 def ablate(*overrides: str) -> subprocess.CompletedProcess[str]:
@@ -47,6 +53,7 @@ def test_a_study_leaves_table_summary_and_figure_and_resumes(tmp_path: Path) -> 
     regret = [float(r["regret_pct"]) for r in rows if r["ablation"] == "mine"]
     assert summary["ablations"]["mine"]["regret_pct"]["worst"] == pytest.approx(max(regret))
     assert summary["ablations"]["mine"]["regret_pct"]["median"] == pytest.approx(float(np.median(regret)))
+    assert len((folder / "table.md").read_text().splitlines()) == 4
     assert (folder / "figures" / "ablation.png").stat().st_size > 5000
 
     kept = [line for line in (folder / "ablation.csv").read_text().splitlines() if not line.startswith("mine")]
@@ -77,7 +84,14 @@ def test_every_shipped_variant_differs_from_the_agent_it_starts_from() -> None:
     with initialize_config_module("conf", version_base="1.3"):
         config = app.load(compose("ablate", return_hydra_config=False), AblateConfig())
     for name, values in config.ablations.items():
-        assert (config.training(name).agent != config.agent) == bool(values), name
+        assert (_plain(config.training(name).agent) != _plain(config.agent)) == bool(values), name
+
+
+def test_the_variant_paper_is_the_agent_paper() -> None:
+    with initialize_config_module("conf", version_base="1.3"):
+        config = app.load(compose("ablate"), AblateConfig())
+        paper = app.load(compose("ablate", overrides=["agent=paper"]), AblateConfig(ablations={"paper": {}}))
+    assert _plain(config.training("paper").agent) == _plain(paper.agent)
 
 
 def test_names_that_are_no_folders_are_refused() -> None:

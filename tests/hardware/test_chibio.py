@@ -287,12 +287,43 @@ def test_no_failed_request_doubles_a_dose_or_leaves_a_pump_on(fault: str, reques
         pass
     inner._request = failing  # type: ignore[method-assign]
     receipt = bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
-    bed.reactors.measure()
+    for _ in range(4):  # it also returns to tell of a link in trouble
+        bed.reactors.measure()
     given = doses(bed)
     assert len(given) <= 1
     assert sum(length for _, length in given) <= receipt.volume_ml[0] + 0.1
     assert bed.motors_off()
     assert bed.of("dose_end")
+
+
+def test_a_link_that_dies_in_a_dose_is_told_within_a_time_out() -> None:
+    """Ends of doses that time out again and again must not keep the loop from hearing of it."""
+    bed = Bed(names=("M0", "M1"))
+    bed.reactors.begin()
+    bed.run(3)
+    fixed(bed, 0.02)
+    while not bed.step().fresh[0]:
+        pass
+    bed.fault("lost_request", -1)
+    began = bed.clock.now()
+    while "link" not in bed.verdicts[-1].kinds[0]:
+        bed.step()
+    assert bed.clock.now() - began < 60.0
+    bed.fault("lost_request", 0)
+    bed.run(3)
+    assert bed.motors_off()
+
+
+def test_targets_changed_by_someone_are_set_back() -> None:
+    bed = Bed()
+    bed.reactors.begin()
+    bed.run(3)
+    for item, value in (("Thermostat", 30), ("Stir", 0.1)):
+        bed.device.handle("POST", f"/SetOutputTarget/{item}/M0/{value}")
+    bed.run(3)
+    data = bed.device.apps["M0"].data
+    assert (data["Thermostat"]["target"], data["Stir"]["target"]) == (37.0, 0.5)
+    assert sum("set back to" in row["note"] for row in bed.of("note")) == 2
 
 
 def test_no_dose_when_the_device_lies() -> None:

@@ -139,3 +139,11 @@ def test_a_state_that_is_not_readable_is_no_state() -> None:
     m0, _ = unit([("POST /changeDevice/M0", DONE), ("GET /getSysdata/", Reply(500, answer(state()).body))])
     with pytest.raises(ProtocolError, match="status 500"):
         m0.read()
+
+
+def test_after_two_time_outs_the_off_commands_of_a_dead_link_are_given_up_until_the_next_try() -> None:
+    m0, script = unit(read(state()) + [(f"POST {path}", LOST) for path in OFF[:2]])
+    m0.read()
+    with pytest.raises(LinkError):
+        m0.pumps_off(tries=1)
+    script.close()
