@@ -28,8 +28,8 @@ log = logging.getLogger(__name__)
 
 
 REGRET_UNIT, STEADY_UNIT = 0.5, 0.003
-"""Per cent of cost and OD that weigh alike when policies are compared: half a per cent is no longer seen in a recording,
-and 0.003 OD is the noise of the sensor."""
+"""Per cent of cost and OD that weigh alike when policies are compared: half a per cent of cost is not seen in a
+recording, and 0.003 OD is the noise of the sensor."""
 
 
 def merit(score: Score) -> NDArray[np.float64]:
