@@ -7,18 +7,21 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from dqn.config import DQNConfig
 from dqn.network import QNetwork, action_basis, initial_weights
-from dqn.replay import Replay, Transition
+from dqn.replay import Array, Replay, Transition
 from dqn.schedules import decayed, linear
 from dqn.streams import UniformStream
-from dqn.targets import advantage_target, blend, double_q_target, loss_gradient, q_target
+from dqn.targets import advantage_target, blend, double_q_target, huber_loss, loss_gradient, q_target
 
 __all__ = ["STREAMS", "DQNAgent", "Relabel"]
 
 STREAMS = ("init", "explore", "replay", "relabel")
 """Names of the random streams an agent needs, each independent of the others."""
+
+DIAGNOSED = 100  # updates from one look at loss and range of Q to the next
 
 Relabel = Callable[[Transition, torch.Tensor], Transition]
 """Replaces the goal of a minibatch: (transitions (S, B), uniform numbers (S, B, 2)) -> transitions (S, B)."""
@@ -68,7 +71,7 @@ class DQNAgent:
         betas = (0.9, config.adam_beta2)
         self._adam = torch.optim.Adam([parameter], config.learning_rate, betas, config.adam_eps, fused=True)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
-        self._explore = UniformStream(streams["explore"], 2, self.device)
+        self._explore = UniformStream(streams["explore"], 2, torch.device("cpu"))
         self._draws = UniformStream(streams["replay"], config.batch_size, self.device)
         self._relabelled = round(config.relabel * config.batch_size)
         self._goals = UniformStream(streams["relabel"], max(1, 2 * self._relabelled), self.device)
@@ -77,7 +80,7 @@ class DQNAgent:
             raise ValueError(f"agent.relabel = {config.relabel}: this task has no goal to replace; set it to 0")
         self.steps = 0  # environment steps taken
         self.updates = 0
-        self.loss = torch.zeros(self.n_agents, device=self.device)  # of the last update
+        self.loss = torch.zeros(self.n_agents, device=self.device)  # of the last diagnosed update
         self.q_range = torch.zeros(self.n_agents, 2, device=self.device)  # min and max Q in its minibatch
 
     @property
@@ -93,16 +96,20 @@ class DQNAgent:
         return decayed(c.learning_rate, c.learning_rate_decay, c.total_updates, self.updates)
 
     @torch.no_grad()
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Epsilon-greedy actions for one observation per agent, (S, O) -> (S,) int64."""
-        u = self._explore.next()
-        best = self.online(observation.unsqueeze(1))[:, 0].argmax(-1)
-        return torch.where(u[:, 0] < self.epsilon, (u[:, 1] * self.n_actions).long(), best)
+    def act(self, observation: Array) -> NDArray[np.int64]:
+        """Epsilon-greedy actions for one observation per agent, (S, O) -> (S,)."""
+        u = self._explore.next().numpy()
+        action = (u[:, 1] * self.n_actions).astype(np.int64)
+        greedy = u[:, 0] >= self.epsilon
+        if greedy.any():
+            seen = torch.from_numpy(observation).to(self.device).unsqueeze(1)
+            best = self.online(seen).argmax(-1).view(-1).cpu().numpy()
+            action = np.where(greedy, best, action)
+        return action
 
-    @torch.no_grad()
-    def observe(self, step: Transition) -> None:
-        """Remember one step of every agent and do the updates that are due."""
-        self.replay.add(step._replace(r_t=step.r_t * self.config.reward_scale))
+    def observe(self, s_tm1: Array, a_tm1: Array, r_t: Array, s_t: Array, continues: Array) -> None:
+        """Remember one step of every agent (arguments as `Replay.add`) and do the updates that are due."""
+        self.replay.add(s_tm1, a_tm1, r_t * self.config.reward_scale, s_t, continues)
         self.steps += 1
         if self.steps > self.config.learn_start:
             for _ in range(self.config.updates_per_step):
@@ -147,13 +154,15 @@ class DQNAgent:
         """
         c = self.config
         q, inputs = self.online.forward(observation)
-        self.loss, gradient = loss_gradient(q, action, target, c.huber)
+        td_error, gradient = loss_gradient(q, action, target, c.huber)
         self.online.backward(inputs, gradient)
         self._adam.param_groups[0]["lr"] = self.learning_rate
         self._adam.step()
         self.updates += 1
         if self.updates % c.target_period == 0:
             blend(self.target.flat, self.online.flat, c.target_blend)
+        if self.updates % DIAGNOSED == 0:
+            self.loss = huber_loss(td_error, c.huber)
             self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
         if c.average:
             blend(self.greedy.flat, self.online.flat, 1.0 - c.average)

@@ -75,6 +75,7 @@ class QNetwork:
         self._grads = self._views(self.grad)
         self._matrix = torch.eye(self.sizes[0], device=flat.device) if matrix is None else matrix
         self._offset = torch.zeros(self.sizes[0], device=flat.device) if offset is None else offset
+        self._mapped = matrix is not None
         self._basis = basis
 
     def _views(self, flat: torch.Tensor) -> list[Layer]:
@@ -89,11 +90,14 @@ class QNetwork:
 
     def with_weights(self, flat: torch.Tensor) -> QNetwork:
         """The same network with other weights, shape (S', P)."""
-        return QNetwork(flat, self.sizes, self._matrix, self._offset, self._basis)
+        matrix, offset = (self._matrix, self._offset) if self._mapped else (None, None)
+        return QNetwork(flat, self.sizes, matrix, offset, self._basis)
 
     def features(self, observation: torch.Tensor) -> torch.Tensor:
         """f = M observation + c; observation (S, B, observations) -> (S, B, features)."""
-        return torch.matmul(observation, self._matrix.T).add_(self._offset)
+        if self._mapped:
+            return torch.matmul(observation, self._matrix.T).add_(self._offset)
+        return observation
 
     def input_map(self) -> tuple[np.ndarray, np.ndarray]:
         """M (F, O) and c (F,) as NumPy arrays."""

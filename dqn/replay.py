@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 __all__ = ["Replay", "Transition"]
 
 
+Array = NDArray[Any]
+
+
 class Transition(NamedTuple):
-    """One step of S agents, or a minibatch of B steps of each: observation before, action, reward, observation after.
+    """A minibatch of B steps of each of S agents: observation before, action, reward, observation after.
 
     s_tm1, s_t: (S, B, O) float32. a_tm1: (S, B) int64. r_t: (S, B) float32.
     continues: (S, B) float32, 0 where the episode terminated (no bootstrapping), 1 also where it was truncated.
@@ -26,16 +31,19 @@ class Transition(NamedTuple):
 class Replay:
     """The last `capacity` transitions of each of S agents.
 
-    A transition is one row of 2 O + 3 float32 numbers, so that drawing a minibatch is one gather.
+    A transition is one row of 2 O + 3 float32 numbers, so that remembering one is one copy and drawing a minibatch one
+    gather.
 
     Args:
       agents: S. capacity: transitions per agent. observations: O. device: where they are kept.
     """
 
     def __init__(self, agents: int, capacity: int, observations: int, device: torch.device) -> None:
-        self._rows = torch.zeros(agents, capacity, 2 * observations + 3, device=device)
-        self._o = observations
-        self._agent = (torch.arange(agents, device=device) * capacity)[:, None]
+        self._widths = [observations, observations, 1, 1, 1]
+        self._rows = torch.zeros(agents, capacity, sum(self._widths), device=device)
+        self._flat = self._rows.view(-1, self._rows.shape[-1])
+        self._first = (torch.arange(agents, device=device) * capacity)[:, None]
+        self._new = np.zeros((agents, sum(self._widths)), dtype=np.float32)
         self.capacity = capacity
         self.added = 0  # transitions ever added, per agent
 
@@ -44,10 +52,18 @@ class Replay:
         """Transitions held per agent."""
         return min(self.added, self.capacity)
 
-    def add(self, step: Transition) -> None:
-        """Append one transition per agent (B = 1), replacing the oldest when full."""
-        scalars = torch.stack([step.a_tm1.to(torch.float32), step.r_t, step.continues], dim=-1)
-        self._rows[:, self.added % self.capacity] = torch.cat([step.s_tm1, step.s_t, scalars], dim=-1)[:, 0]
+    def add(self, s_tm1: Array, a_tm1: Array, r_t: Array, s_t: Array, continues: Array) -> None:
+        """Append one transition per agent, replacing the oldest when full.
+
+        Args: as the fields of `Transition`, as NumPy arrays without the axis B.
+        """
+        o = self._widths[0]
+        self._new[:, :o] = s_tm1
+        self._new[:, o : 2 * o] = s_t
+        self._new[:, 2 * o] = a_tm1
+        self._new[:, 2 * o + 1] = r_t
+        self._new[:, 2 * o + 2] = continues
+        self._rows[:, self.added % self.capacity].copy_(torch.from_numpy(self._new))
         self.added += 1
 
     def sample(self, uniform: torch.Tensor) -> Transition:
@@ -59,17 +75,10 @@ class Replay:
         """
         if self.added == 0:
             raise ValueError("replay memory is empty: add transitions before sampling")
-        index = (uniform * self.size).long() + self._agent
-        flat = self._rows.view(-1, self._rows.shape[-1]).index_select(0, index.view(-1))
-        rows = flat.view(*uniform.shape, -1)
-        o = self._o
-        return Transition(
-            s_tm1=rows[..., :o],
-            s_t=rows[..., o : 2 * o],
-            a_tm1=rows[..., 2 * o].long(),
-            r_t=rows[..., 2 * o + 1],
-            continues=rows[..., 2 * o + 2],
-        )
+        index = torch.mul(uniform, self.size).long().add_(self._first)
+        rows = self._flat.index_select(0, index.view(-1)).view(*uniform.shape, -1)
+        s_tm1, s_t, a_tm1, r_t, continues = torch.split(rows, self._widths, dim=-1)
+        return Transition(s_tm1, a_tm1.squeeze(-1).long(), r_t.squeeze(-1), s_t, continues.squeeze(-1))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue."""

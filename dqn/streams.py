@@ -23,7 +23,7 @@ class UniformStream:
     Args:
       seeds: one per agent, S.
       width: numbers per agent and call.
-      device: where the numbers go.
+      device: where the numbers go; a block at a time travels there.
     """
 
     def __init__(self, seeds: Sequence[np.random.SeedSequence], width: int, device: torch.device) -> None:

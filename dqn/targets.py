@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["advantage_target", "blend", "double_q_target", "loss_gradient", "q_target"]
+__all__ = ["advantage_target", "blend", "double_q_target", "huber_loss", "loss_gradient", "q_target"]
 
 
 def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor) -> torch.Tensor:
@@ -14,7 +14,7 @@ def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torc
       r_t, continues: shape (S, B); q_t: target network at s', shape (S, B, A).
     Returns: shape (S, B).
     """
-    return r_t + gamma * continues * q_t.amax(-1)
+    return torch.addcmul(r_t, continues, q_t.amax(-1), value=gamma)
 
 
 def double_q_target(
@@ -22,7 +22,7 @@ def double_q_target(
 ) -> torch.Tensor:
     """y = r + gamma c Q_target(s', argmax_a Q_online(s', a)) (van Hasselt 2016); arguments as `q_target`."""
     best = q_t_online.argmax(-1, keepdim=True)
-    return r_t + gamma * continues * q_t.gather(-1, best).squeeze(-1)
+    return torch.addcmul(r_t, continues, q_t.gather(-1, best).squeeze(-1), value=gamma)
 
 
 def advantage_target(target: torch.Tensor, alpha: float, q_tm1: torch.Tensor, a_tm1: torch.Tensor) -> torch.Tensor:
@@ -41,20 +41,23 @@ def advantage_target(target: torch.Tensor, alpha: float, q_tm1: torch.Tensor, a_
 def loss_gradient(
     q_tm1: torch.Tensor, a_tm1: torch.Tensor, target: torch.Tensor, huber: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Loss of each agent and its gradient by all Q values.
-
-    L = mean_B l(d), d = Q(s, a) - y, with l(d) = d^2 / 2, or beyond |d| = huber its tangent (Huber 1964).
+    """TD errors d = Q(s, a) - y and the gradient of `huber_loss` of each agent by all Q values.
 
     Args:
       q_tm1: (S, B, A); a_tm1: (S, B) int64; target: y (S, B); huber: 0 means squared error.
-    Returns: loss (S,), dL/dQ (S, B, A).
+    Returns: d (S, B), dL/dQ (S, B, A).
     """
     action = a_tm1.unsqueeze(-1)
     d = q_tm1.gather(-1, action).squeeze(-1) - target
     slope = d if huber == 0.0 else d.clamp(-huber, huber)
-    loss = (slope * (d - 0.5 * slope)).mean(-1)
     gradient = torch.zeros_like(q_tm1).scatter_(-1, action, slope.unsqueeze(-1) / d.shape[-1])
-    return loss, gradient
+    return d, gradient
+
+
+def huber_loss(td_error: torch.Tensor, huber: float) -> torch.Tensor:
+    """L = mean_B l(d) with l(d) = d^2 / 2, or beyond |d| = huber its tangent (Huber 1964); (S, B) -> (S,)."""
+    slope = td_error if huber == 0.0 else td_error.clamp(-huber, huber)
+    return (slope * (td_error - 0.5 * slope)).mean(-1)
 
 
 def blend(target: torch.Tensor, online: torch.Tensor, share: float) -> None:

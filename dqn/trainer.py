@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from dqn.agent import DQNAgent
-from dqn.replay import Transition
 
 __all__ = ["TrainRecord", "Trainer", "TrainingEnv"]
 
@@ -45,7 +43,7 @@ class TrainRecord:
     """What happened in one interval of training; arrays have one entry per agent, shape (S,).
 
     episode_return: undiscounted reward of the last episode that ended in the interval, nan where none did.
-    loss, q_min, q_max: of the last update (q range: at the last target blend).
+    loss, q_min, q_max: of the last update they were looked at, at most 100 updates ago.
     """
 
     step: int
@@ -90,22 +88,16 @@ class Trainer:
         """One environment step of every agent, and its updates."""
         assert self._observation is not None
         agent = self.agent
-        before = torch.from_numpy(self._observation).to(agent.device)
+        before = self._observation
         action = agent.act(before)
-        self._observation, reward, terminated, truncated, infos = self.env.step(action.cpu().numpy())
+        self._observation, reward, terminated, truncated, infos = self.env.step(action)
         done = terminated | truncated
+        ended = done.any()
         # the state that was really reached: at an episode's end the environment already shows the next episode
-        reached = np.where(done[:, None], infos["final_obs"], self._observation) if done.any() else self._observation
-        step = Transition(
-            s_tm1=before.unsqueeze(1),
-            a_tm1=action.unsqueeze(1),
-            r_t=torch.from_numpy(reward.astype(np.float32)).to(agent.device).unsqueeze(1),
-            s_t=torch.from_numpy(reached).to(agent.device).unsqueeze(1),
-            continues=torch.from_numpy(~terminated).to(agent.device, torch.float32).unsqueeze(1),
-        )
-        agent.observe(step)
+        reached = np.where(done[:, None], infos["final_obs"], self._observation) if ended else self._observation
+        agent.observe(before, action, reward, reached, ~terminated)
         self._return += reward
-        if done.any():
+        if ended:
             self._finished[done] = self._return[done]
             self._return[done] = 0.0
 

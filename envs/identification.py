@@ -15,8 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.special import stdtrit
 
 from envs.screening import OD_FLOOR, Series, pumped_volume
 
@@ -181,6 +179,8 @@ def _solve(problem: _Problem, robust: bool) -> _Solution:
     A reading counts in full up to 3 robust sd, the larger of that of the residuals and that of the relative residuals
     times the model, so that the noisier readings at a high OD are not taken for outliers.
     """
+    from scipy.optimize import least_squares  # half a second, which a refused command line need not wait for
+
     y, basis = problem.y, problem.basis()
     size = np.maximum(y, OD_FLOOR)
     best = np.linalg.lstsq(basis * size[:, None], np.log(size) * size, rcond=None)[0]  # sd of ln y is sd(y) / y
@@ -297,6 +297,8 @@ def _interval(value: float, influence: Array, n_parameters: int) -> tuple[float,
     Satterthwaite's effective number of readings, 3 (sum z^2)^2 / sum z^4 for normal errors, halved because their
     correlation is estimated from the same readings. docs/calibration.md measures the coverage.
     """
+    from scipy.special import stdtrit
+
     squares = influence**2
     independent = max(float(squares.sum()), 1e-300)
     variance = max(_sum_variance(influence), independent)

@@ -154,13 +154,15 @@ def save_config(config: Any, folder: Path) -> None:
     OmegaConf.save(OmegaConf.create(asdict(config)), folder / "config.yaml")
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
+def write_json(path: Path, content: Mapping[str, Any], fsync: bool = True, indent: int | None = 2) -> None:
     """Write JSON atomically: nobody ever reads half a file. Non-finite numbers become null."""
 
     def clean(value: Any) -> Any:
         if isinstance(value, Mapping):
             return {str(k): clean(v) for k, v in value.items()}
         if isinstance(value, (list, tuple)):
+            if all(type(v) is float and v - v == 0.0 for v in value):
+                return value
             return [clean(v) for v in value]
         if hasattr(value, "tolist"):
             return clean(value.tolist())
@@ -170,10 +172,10 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
     temporary = path.with_suffix(path.suffix + ".part")
     with open(temporary, "w", encoding="utf-8") as f:
-        json.dump(clean(content), f, indent=2)
-        f.write("\n")
+        f.write(json.dumps(clean(content), indent=indent) + "\n")
         f.flush()
-        os.fsync(f.fileno())
+        if fsync:
+            os.fsync(f.fileno())
     os.replace(temporary, path)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -39,17 +40,16 @@ def blank(config: BlankConfig, folder: Path) -> None:
     backend = config.backend
     log.info("clear medium in %s; this takes %d minutes", ", ".join(backend.reactors), config.samples + 1)
     try:
-        transport = open_transport(backend.transport, backend.url, backend.speed)
-        reactors = ChiBioReactors(transport, RealClock(backend.speed), backend)
-        try:
-            reactors.begin()
-            found = measure_blanks(reactors, config.samples)
-            stored = [s.unit.device_id for s in reactors.stations]
-            reactors.end()
-        except BaseException:
-            reactors.stop()
-            raise
-        transport.close()
+        with closing(open_transport(backend.transport, backend.url, backend.speed)) as transport:
+            reactors = ChiBioReactors(transport, RealClock(backend.speed), backend)
+            try:
+                reactors.begin()
+                found = measure_blanks(reactors, config.samples)
+                stored = [s.unit.device_id for s in reactors.stations]
+                reactors.end()
+            except BaseException:
+                reactors.stop()
+                raise
     except ReactorError as error:
         raise app.UserError(str(error)) from None
     rows = {}

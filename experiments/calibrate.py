@@ -9,19 +9,20 @@ import re
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from envs.calibration import Calibration, Drift, IdentifyConfig, calibrate
 from envs.identification import Parameter
 from envs.open_loop import OpenLoop, open_loop
 from envs.screening import Series, row_spans
 from experiments import app
-from experiments.charts_calibration import coverage_figure, drift_figure, fit_figure, pixels, save
 from hardware.errors import RecordingError
 from hardware.recording import Recorder, Recording, read_recording
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["CalibrateConfig", "body", "environment_yaml", "main", "summary"]
 
@@ -88,20 +89,23 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
         result = calibrate(raw, config.identify)
     except ValueError as error:
         raise app.UserError(f"{source}: {error}") from None
+    from experiments.charts import save
+    from experiments.charts_calibration import drift_figure, fit_figure
+
     name = Path(source).name
     figures = {
         "fit": fit_figure(raw, result, f"{name}: measured and free-running model"),
         "drift": drift_figure(result, f"{name}: segments of about {config.identify.segment_min:g} min, fitted alone"),
     }
     for key, figure in figures.items():
-        save(figure, folder / f"{key}.png")
+        save(figure, folder / "figures", key)
     environment = folder / f"{config.name}.yaml"
     environment.write_text(environment_yaml(result, name), encoding="utf-8")
     content = summary(result, recording, raw)
     app.write_json(folder / "summary.json", {**content, "data": source, "env_file": str(environment)})
     _events(folder, result, figures)
     print(report(result, recording, content))
-    print(f"\n  files       {environment}\n              {folder}/{{summary.json, fit.png, drift.png}}")
+    print(f"\n  files       {environment}\n              {folder}/{{summary.json, figures/}}")
     return result.fit.pmse_pct
 
 
@@ -210,22 +214,23 @@ def environment_yaml(result: Calibration, source: str) -> str:
 
 
 def _events(folder: Path, result: Calibration, figures: dict[str, Figure]) -> None:
-    """Scalars and figures for TensorBoard; imported here because it costs seconds that a refusal need not wait for."""
-    from torch.utils.tensorboard import SummaryWriter
+    """Scalars and figures for TensorBoard."""
+    from experiments.writers import Events
 
-    with SummaryWriter(str(folder)) as writer:
-        for tag, value in (
-            ("calibration/mu_per_min", result.fit.mu.value),
-            ("calibration/tau", result.tau.value),
-            ("calibration/pmse_pct", result.fit.pmse_pct),
-        ):
-            writer.add_scalar(tag, value, 0)
-        for i, segment in enumerate(result.segments):
-            for name, parameter in (("mu_per_min", segment.mu), ("tau", segment.tau)):
-                if parameter is not None:
-                    writer.add_scalar(f"drift/{name}", parameter.value, i)
-        for key, figure in figures.items():
-            writer.add_image(f"calibration/{key}", pixels(figure), 0, dataformats="HWC")
+    events = Events(folder)
+    for tag, value in (
+        ("calibration/mu_per_min", result.fit.mu.value),
+        ("calibration/tau", result.tau.value),
+        ("calibration/pmse_pct", result.fit.pmse_pct),
+    ):
+        events.scalar(tag, value, 0)
+    for i, segment in enumerate(result.segments):
+        for name, parameter in (("mu_per_min", segment.mu), ("tau", segment.tau)):
+            if parameter is not None:
+                events.scalar(f"drift/{name}", parameter.value, i)
+    for key, figure in figures.items():
+        events.figure(f"calibration/{key}", figure, 0)
+    events.close()
 
 
 def report(result: Calibration, recording: Recording, content: dict[str, Any]) -> str:
@@ -295,7 +300,10 @@ def _coverage(config: CalibrateConfig, folder: Path) -> float:
     truth = (protocol.mu, protocol.tau)
     shares = [_share(values, true) for values, true in zip((mu, tau), truth, strict=True)]
     title = f"{n} simulated recordings of {protocol.hours:g} h, {100 * protocol.noise:g} % noise (seed {protocol.seed})"
-    save(coverage_figure(mu, tau, truth, title), folder / "coverage.png")
+    from experiments.charts import save
+    from experiments.charts_calibration import coverage_figure
+
+    save(coverage_figure(mu, tau, truth, title), folder / "figures", "coverage")
     app.write_json(
         folder / "summary.json",
         {

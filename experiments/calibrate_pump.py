@@ -6,6 +6,7 @@ import csv
 import logging
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -101,21 +102,20 @@ def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tup
     Args: ask: puts a question and returns the answer.
     Raises: ReactorError.
     """
-    clock = RealClock(config.backend.speed)
-    transport = open_transport(config.backend.transport, config.backend.url, config.backend.speed)
-    unit = Unit(config.reactor, [config.reactor], transport, clock, no_log)
-    found = []
-    identity = unit.read().device_id
-    print(
-        f"{config.reactor} {config.pump} pump, unit {identity}. Put its inlet into water, prime the tube, and let its"
-    )
-    print("outlet drip into a beaker on a balance, the tube not touching the beaker.")
-    for duty in config.duties:
-        ask(f"\n{config.doses} doses of {PERIOD_S * duty:.2f} s: tare the balance, then press Enter ")
-        for given in dose_series(unit, clock, PUMP_OF[config.pump], duty, config.doses):
-            print(f"\r  dose {given} of {config.doses}", end="", flush=True)
-        found.append(Series(duty, config.doses, _number(ask, "\n  grams on the balance: ")))
-    transport.close()
+    clock, backend, found = RealClock(config.backend.speed), config.backend, []
+    with closing(open_transport(backend.transport, backend.url, backend.speed)) as transport:
+        unit = Unit(config.reactor, [config.reactor], transport, clock, no_log)
+        identity = unit.read().device_id
+        print(
+            f"{config.reactor} {config.pump} pump, unit {identity}. Put its inlet into water, prime the tube, and let"
+        )
+        print("its outlet drip into a beaker on a balance, the tube not touching the beaker.")
+        for duty in config.duties:
+            ask(f"\n{config.doses} doses of {PERIOD_S * duty:.2f} s: tare the balance, then press Enter ")
+            for given in dose_series(unit, clock, PUMP_OF[config.pump], duty, config.doses):
+                print(f"\r  dose {given} of {config.doses}", end="", flush=True)
+            found.append(Series(duty, config.doses, _number(ask, "\n  grams on the balance: ")))
+        transport.disarm()
     return found, identity
 
 

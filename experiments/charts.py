@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-__all__ = ["COLOURS", "culture", "learning", "new_figure", "policy_map", "save", "trajectories"]
+__all__ = ["COLOURS", "culture", "learning", "new_figure", "policy_map", "save", "scaling", "trajectories"]
 
 Array = NDArray[np.float64]
 
@@ -162,4 +162,22 @@ def culture(
     if temperature is not None:
         axes[2].set_ylabel("temperature, °C")
     axes[-1].set_xlabel("time, min")
+    return figure
+
+
+def scaling(costs: Mapping[str, tuple[NDArray[np.int64], Array]]) -> Figure:
+    """Cost over one size at a time, with the line of proportional growth through the largest.
+
+    Args: costs: title -> (sizes (K,), seconds (K,)).
+    """
+    figure, axes = new_figure(10.0, 2.9, 1, len(costs))
+    for ax, (title, (sizes, seconds)) in zip(axes, costs.items(), strict=True):
+        ax.loglog(sizes, seconds, marker="o", markersize=3.5, color=COLOURS[0], linewidth=1.2, label="measured")
+        ax.loglog(
+            sizes, seconds[-1] * sizes / sizes[-1], color="black", linewidth=0.8, linestyle=":", label="proportional"
+        )
+        ax.set_title(title, fontsize=9)
+        ax.set_xlabel(title.split(",")[0])
+    axes[0].set_ylabel("time, s")
+    axes[0].legend(frameon=False, fontsize=8)
     return figure

@@ -5,13 +5,11 @@ Each function returns a matplotlib Figure; nothing touches pyplot's global state
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -19,7 +17,7 @@ from envs.calibration import Calibration, Segment
 from envs.identification import Parameter
 from envs.screening import Series
 
-__all__ = ["coverage_figure", "drift_figure", "fit_figure", "pixels", "save"]
+__all__ = ["coverage_figure", "drift_figure", "fit_figure"]
 
 Array = NDArray[np.float64]
 
@@ -33,19 +31,6 @@ STYLE: Any = {
     "legend.frameon": False,
     "legend.fontsize": 9,
 }
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG."""
-    figure.savefig(path, dpi=130)
-
-
-def pixels(figure: Figure) -> NDArray[np.uint8]:
-    """The figure as an RGB image, shape (height, width, 3), for TensorBoard."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()  # type: ignore[no-untyped-call]
-    image: NDArray[np.uint8] = np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
-    return image
 
 
 def fit_figure(raw: Series, result: Calibration, title: str) -> Figure:

@@ -21,6 +21,7 @@ def commands(folder: Path) -> list[list[str]]:
         ["calibrate", f"hydra.run.dir={folder / '1_calibrate'}"],
         ["train", f"env_file={calibrated}", f"hydra.run.dir={folder / '2_train'}"],
         ["deploy", f"policy={policy}", f"env_file={calibrated}", f"hydra.run.dir={folder / '3_deploy'}"],
+        ["report", f"run={folder}", f"hydra.run.dir={folder / '4_report'}"],
     ]
     return [["-m", f"experiments.{name}", *overrides] for name, *overrides in steps]
 
@@ -36,6 +37,7 @@ def main() -> None:
     print(
         f"\npolicy    {folder / '2_train' / 'policy.npz'}"
         f"\nfigures   {folder / '2_train' / 'figures'}, {folder / '3_deploy' / 'figures'}"
+        f"\nreport    {folder / 'report.html'}"
         f"\ncurves    tensorboard --logdir {folder}"
     )
 

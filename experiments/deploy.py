@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -109,10 +110,10 @@ def _finish(record: Record, config: DeployConfig, outcome: str) -> None:
         name: {
             "role": config.role(name),
             "volume_ml": float(v),
-            "rows": len(rows),
-            "interlock": sum(bool(row["interlock"]) for row in rows),
+            "rows": rows,
+            "interlock": alarms,
         }
-        for name, v, rows in zip(record.names, volume, record.rows, strict=True)
+        for name, v, rows, alarms in zip(record.names, volume, record.lengths, record.interlock_rows, strict=True)
     }
     summary = {
         "outcome": outcome,
@@ -135,17 +136,26 @@ def _finish(record: Record, config: DeployConfig, outcome: str) -> None:
 
 
 @contextmanager
-def terminated_as_interrupt() -> Iterator[None]:
-    """SIGTERM (a service manager, a shutting-down PC) ends the run like Ctrl-C: pumps off, files closed."""
-
-    def handler(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, handler)
+def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[None]:
+    """These signals call `handler` for a while, except those that are ignored on purpose (nohup)."""
+    before = {n: old for n in numbers if (old := signal.getsignal(n)) is not signal.SIG_IGN}
+    for number in before:
+        signal.signal(number, handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """SIGTERM (a service manager, a shutting-down PC) and SIGHUP (a closed terminal) end the run like Ctrl-C."""
+    raise KeyboardInterrupt
+
+
+def patience(number: int, frame: FrameType | None) -> None:
+    """A second Ctrl-C must not end the program before the pumps are verified off."""
+    log.warning("the pumps are being switched off and verified; this takes up to a minute")
 
 
 class Announcer:
@@ -184,6 +194,7 @@ def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConf
 
     announce = Announcer(loop)
     outcome = "failed: see the log"
+    record.journal.append("start", {"time_s": round(reactors.elapsed(), 3), "pid": os.getpid()})
     try:
         with logging_redirect_tqdm(), tqdm(disable=None, unit="sample") as bar:
             for step in loop.run():
@@ -196,12 +207,16 @@ def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConf
         outcome = "stopped by the operator"
     except ReactorError as error:
         outcome = f"failed: {error}"
+    except Exception as error:  # whatever it is, what was recorded is worth a summary
+        log.exception("the run ends")
+        outcome = f"failed: {type(error).__name__}: {error}"
     finally:
-        try:
-            reactors.stop()
-            log.info("pumps verified off")
-        except ReactorError as error:
-            outcome = f"failed: {error}"
+        with handled(patience, signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            try:
+                reactors.stop()
+                log.info("pumps verified off")
+            except ReactorError as error:
+                outcome = f"failed: {error}"
     return outcome
 
 
@@ -229,7 +244,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         if config.preflight_only:
             backends.run_preflight(config, folder)
             return
-        with terminated_as_interrupt():
+        with handled(interrupt, signal.SIGTERM, signal.SIGHUP):
             record = Record(folder, backend.reactors, config.fsync)
             for repair in record.repairs:
                 log.warning("%s", repair)
@@ -240,7 +255,11 @@ def deploy(config: DeployConfig, folder: Path) -> None:
                 if config.resume is not None:
                     backends.continue_loop(loop, record)
                 outcome = _run(loop, record, reactors, config)
-            _finish(record, config, outcome)
+            try:
+                _finish(record, config, outcome)
+            except OSError as error:
+                why = f"figure and summary not written ({error.strerror or error})"
+                outcome = f"failed: {outcome.removeprefix('failed: ')}; {why}"
     except ReactorError as error:
         raise app.UserError(str(error)) from None
     finally:

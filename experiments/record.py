@@ -7,9 +7,11 @@ that is killed in between is completed from the journal when it is resumed.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import math
+from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -60,8 +62,8 @@ class Record:
       folder: run folder; what an earlier life of the run left there is continued.
       names: of the reactors.
       fsync: each row on the disk before the call returns.
-    Attributes: journal (the driver writes into it, too); rows, per reactor, what the CSV holds; repairs, what was
-      mended on opening, one line each.
+    Attributes: journal (the driver writes into it, too); interlock_rows, per reactor, rows in which the interlock had
+      something to say; repairs, what was mended on opening, one line each.
     Raises: RecordingError.
     """
 
@@ -73,38 +75,74 @@ class Record:
         self.repairs = [f"journal: cut a torn last line of {self.journal.cut} bytes"] if self.journal.cut else []
         self._recorders = [Recorder(self._csv(name), COLUMNS, fsync) for name in names]
         self.repairs += [r.repaired for r in self._recorders if r.repaired]
-        self.rows: list[list[Row]] = [self._read(name) for name in names]
+        self._columns = [{key: array("d") for key in NUMBERS} for _ in names]
+        self.interlock_rows = [0] * len(self.names)
+        for n in range(len(self.names)):
+            self._read(n)
         self._complete()
-        first = max((len(rows) for rows in self.rows), default=0)
+        first = max(self.lengths, default=0)
         self.events = Events(folder, first)
         self._points = first
 
     def _csv(self, name: str) -> Path:
         return self.folder / "recordings" / f"{name}.csv"
 
-    def _read(self, name: str) -> list[Row]:
-        """Rows an earlier life wrote."""
-        with open(self._csv(name), newline="", encoding="utf-8") as f:
-            rows: list[Row] = []
+    @property
+    def lengths(self) -> list[int]:
+        """Rows of each recording."""
+        return [len(columns["time_min"]) for columns in self._columns]
+
+    def _keep(self, n: int, row: Mapping[str, Any]) -> None:
+        for key, column in self._columns[n].items():
+            column.append(float(row[key]))
+        self.interlock_rows[n] += bool(row["interlock"])
+
+    def _write(self, n: int, row: Row) -> None:
+        self._recorders[n].write(row)
+        self._keep(n, row)
+
+    def _read(self, n: int) -> None:
+        """Take over the rows an earlier life wrote."""
+        with open(self._csv(self.names[n]), newline="", encoding="utf-8") as f:
             for raw in csv.DictReader(f):
-                row: Row = {key: float(raw[key]) if raw[key] else math.nan for key in NUMBERS}
-                rows.append({**row, "interlock": raw["interlock"]})
-        return rows
+                self._keep(
+                    n,
+                    {key: value or "nan" for key, value in raw.items() if key in NUMBERS}
+                    | {"interlock": raw["interlock"]},
+                )
 
     def _complete(self) -> None:
-        """Append to the CSVs what the journal decided and a kill kept from being written."""
+        """Append to the CSVs what is in the journal and a kill kept from being written."""
+        kinds = ("sample", "decision", "intent")
         for n, name in enumerate(self.names):
-            last = float(self.rows[n][-1]["time_min"] or 0.0) if self.rows[n] else -math.inf
-            mine = [r for r in self.journal.rows if r.get("reactor") == name and r["kind"] in ("decision", "intent")]
-            for k, decision in enumerate(mine):
-                if decision["kind"] != "decision" or decision["row"]["time_min"] <= last:
+            last = self._columns[n]["time_min"][-1] if self.lengths[n] else -math.inf
+            mine = [r for r in self.journal.rows if r.get("reactor") == name and r["kind"] in kinds]
+            around = zip([{}, *mine], mine, [*mine[1:], {}], strict=False)
+            for earlier, this, following in around:
+                if this["kind"] == "decision":
+                    row: Row = {c: math.nan if this["row"][c] is None else this["row"][c] for c in COLUMNS}
+                    row["volume_ml"] = float(following["feed_ml"]) if following.get("kind") == "intent" else 0.0
+                elif this["kind"] == "sample" and not following and earlier.get("kind") != "sample":
+                    row = self._undecided(this, n)
+                else:
                     continue
-                row: Row = {c: math.nan if decision["row"][c] is None else decision["row"][c] for c in COLUMNS}
-                followed = k + 1 < len(mine) and mine[k + 1]["kind"] == "intent"
-                row["volume_ml"] = float(mine[k + 1]["feed_ml"]) if followed else 0.0
-                self._recorders[n].write(row)
-                self.rows[n].append(row)
+                if float(row["time_min"] or 0.0) <= last + 1e-3:
+                    continue
+                self._write(n, row)
                 self.repairs.append(f"{name}: the row of minute {row['time_min']} was completed from the journal")
+
+    def _undecided(self, sample: Mapping[str, Any], n: int) -> Row:
+        """The row of a sample that was read, and the program killed before it was decided on: no dose."""
+        time = round(float(sample["time_s"]) / 60.0, 4)
+        row: Row = dict.fromkeys(NUMBERS, math.nan)
+        if self.lengths[n]:
+            before = {key: column[-1] for key, column in self._columns[n].items()}
+            elapsed = round(before["elapsed_min"] + time - before["time_min"], 4)
+            row |= {"phase": int(before["phase"]), "setpoint": before["setpoint"], "elapsed_min": elapsed}
+        reading = {"od": sample["od"], "temperature_degc": sample["temperature"]}
+        row |= {"time_min": time, **{k: math.nan if v is None else float(v) for k, v in reading.items()}}
+        nothing = {"pump_rate_ml_s": 0.0, "proposed_ml_s": 0.0, "volume_ml": 0.0}
+        return {**row, **nothing, "interlock": "the program ended before it decided"}
 
     def decided(self, step: Step) -> None:
         """Journal every decision of a step before anything is dosed, with how the controller came to it."""
@@ -117,22 +155,27 @@ class Record:
                 self.journal.append("trouble", {"reactor": self.names[n], "interlock": step.reasons[n]})
 
     def done(self, step: Step, state: Mapping[str, Any]) -> None:
-        """Write a step's rows, the state after it, and its curves."""
+        """Write a step's rows, the state after it, and its curves. Raises: RecordingError when the disk refuses."""
         for n in np.flatnonzero(step.rows):
             row = row_of(step, int(n))
-            self._recorders[n].write(row)
-            self.rows[n].append(row)
+            self._write(int(n), row)
             minute = self._points = max(self._points, round(float(step.minute[n])))
             curves = {"od": step.od, "setpoint": step.setpoint, "pump_rate_ml_s": step.rate}
             for tag, value in {**curves, "temperature_degc": step.temperature, **step.explanation}.items():
-                self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
-        if self._fsync:
-            self.events.flush()
+                if np.isfinite(value[n]):
+                    self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
+        try:
+            if self._fsync:
+                self.events.flush()
             self.save(state)
+        except OSError as error:
+            remedy = "free disk space, then resume the run"
+            raise RecordingError(f"{self.folder}: {error.strerror or error}; {remedy}") from error
 
     def save(self, state: Mapping[str, Any]) -> None:
         """Replace state.json; it says up to which row of the journal it knows everything."""
-        app.write_json(self.folder / "state.json", {"journal_row": self.journal.next_row, **state})
+        content = {"journal_row": self.journal.next_row, **state}
+        app.write_json(self.folder / "state.json", content, self._fsync, indent=None)
 
     def load_state(self) -> tuple[dict[str, Any], list[Receipt]]:
         """The saved state and the doses begun after it was written. Raises: RecordingError where there is none."""
@@ -151,10 +194,9 @@ class Record:
 
     def series(self, column: str) -> Array:
         """A column of all recordings, shape (N, K); shorter recordings end in nan."""
-        longest = max((len(rows) for rows in self.rows), default=0)
-        values = np.full((len(self.names), longest), np.nan)
-        for n, rows in enumerate(self.rows):
-            values[n, : len(rows)] = [row[column] for row in rows]
+        values = np.full((len(self.names), max(self.lengths, default=0)), np.nan)
+        for n, columns in enumerate(self._columns):
+            values[n, : self.lengths[n]] = columns[column]
         return values
 
     def close(self) -> None:
@@ -162,4 +204,5 @@ class Record:
         for recorder in self._recorders:
             recorder.close()
         self.journal.close()
-        self.events.close()
+        with contextlib.suppress(OSError):  # on a full disk the last points of the curves are lost, no row is
+            self.events.close()

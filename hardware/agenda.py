@@ -29,9 +29,11 @@ class Agenda:
         """Run the first step of `task` in `delay_s` seconds."""
         heapq.heappush(self._queue, (self._clock.now() + delay_s, next(self._order), task))
 
-    def run_due(self) -> None:
-        """Run every step that is due. Raises: what a step raises; call again for the rest."""
-        while self._queue and self._queue[0][0] <= self._clock.now():
+    def run_due(self, until: float | None = None) -> None:
+        """Run every step that is due at clock time `until`, by default now. Raises: what a step raises; call again for
+        the rest, with the same `until`: what becomes due meanwhile has to wait, or slow steps would go on for ever."""
+        until = self._clock.now() if until is None else until
+        while self._queue and self._queue[0][0] <= until:
             _, _, task = heapq.heappop(self._queue)
             pause = next(task, None)
             if pause is not None:

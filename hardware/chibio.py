@@ -55,6 +55,7 @@ class ChiBioReactors:
         if len(rigs) != len(config.reactors):
             raise ValueError(f"calibrations for {len(rigs)} reactors, reactors = {list(config.reactors)}")
         self.config = config
+        self._transport = transport
         self._clock = clock
         self._log = log
         self._log_error: Exception | None = None
@@ -143,10 +144,11 @@ class ChiBioReactors:
         return Measurement(column("time_s"), column("od"), column("temperature"), fresh, vitals)
 
     def _work(self) -> None:
-        """Run what is due. A task that fails costs itself only."""
-        while self._agenda.next_due() <= self._clock.now():
+        """Run what is due now. A task that fails costs itself only; on a dead link others are due again by then."""
+        now = self._clock.now()
+        while self._agenda.next_due() <= now:
             try:
-                self._agenda.run_due()
+                self._agenda.run_due(now)
             except ReactorError as error:
                 self._note_down("task_failed", {"error": str(error)})
 
@@ -219,6 +221,7 @@ class ChiBioReactors:
         if pending:
             reasons = "; ".join(f"{s.name}: {errors[s.name]}" for s in pending)
             raise DeviceStateError(f"pumps not verified off: {reasons}. Switch the pump boards off by hand now")
+        self._transport.disarm()
 
     @staticmethod
     def _silence(station: Station, errors: dict[str, ReactorError]) -> bool:

@@ -114,13 +114,13 @@ class EmulatorServer:
                     return 204, b""
                 if method == "GET" and parts == ["truth"]:
                     return 200, _json({name: device.truth(name) for name in device.benches} | self._state())
-                if method == "GET" and parts[0] == "doses" and len(parts) == 2 and parts[1] in device.benches:
-                    return 200, _json([dose._asdict() for dose in device.benches[parts[1]].doses])
+                if method == "GET" and parts[0] in ("doses", "samples") and parts[1:] in [[m] for m in device.benches]:
+                    return 200, _json([row._asdict() for row in getattr(device.benches[parts[1]], parts[0])])
                 if method == "GET" and parts == ["faults"]:
                     return 200, _json({name: list(entry) for name, entry in FAULTS.items()})
             except ValueError as problem:
                 return 400, f"{problem}\n".encode()
-        return 404, b"allowed: POST fault/<name>/<M>/<value>, GET truth, doses/<M>, faults\n"
+        return 404, b"allowed: POST fault/<name>/<M>/<value>, GET truth, doses/<M>, samples/<M>, faults\n"
 
     def _state(self) -> dict[str, object]:
         d = self.device

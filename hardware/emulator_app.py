@@ -11,7 +11,7 @@ import math
 from collections.abc import Generator
 from typing import Any, Protocol
 
-from hardware.emulator_bench import Bench
+from hardware.emulator_bench import Bench, Sample
 from hardware.emulator_state import (
     LIGHTS,
     PUMPS,
@@ -396,6 +396,8 @@ class ReactorApp:
         if experiment["cycles"] % 10 == 9:
             clear_terminal(data, self.board.stamp())
         append_records(data, started)
+        if self.bench is not None:
+            self.bench.samples.append(Sample(self.board.now(), started, float(data["OD"]["current"])))
         thin_records(data)
         self.board.write_row(self.name)
         if experiment["cycles"] % 10 == 1:

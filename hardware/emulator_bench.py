@@ -14,7 +14,7 @@ import numpy as np
 
 from envs.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig, ThermalConfig, VesselConfig
 
-__all__ = ["PLANTS", "Bench", "BenchConfig", "Dose", "VialFaults", "density"]
+__all__ = ["PLANTS", "Bench", "BenchConfig", "Dose", "Sample", "VialFaults", "density"]
 
 FEED, WASTE = "Pump1", "Pump2"
 LINEAR, QUADRATIC = 1.833, 0.226  # OD = LINEAR R + QUADRATIC R^2, R = log10(zero / raw) (chibio.md section 4)
@@ -139,12 +139,21 @@ class Dose(NamedTuple):
     feed_ml: float
 
 
+class Sample(NamedTuple):
+    """One record of the experiment: when it became readable, the cycle's time as recorded, and the OD recorded."""
+
+    stored_s: float
+    sample_s: float
+    od: float
+
+
 class Bench:
     """One reactor as the chips see it.
 
     Args:
       plant: a plant of one vial; config: optics and electronics; rng: noise of this reactor; start: device s.
-    `doses` holds what the motors did, `on_s` their total on-time, `peak_ml` the highest volume.
+    `doses` holds what the motors did, `samples` what the software recorded, both also over its restarts; `on_s` the
+    motors' total on-time, `peak_ml` the highest volume.
     """
 
     def __init__(self, plant: Plant, config: BenchConfig, rng: np.random.Generator, start: float = 0.0) -> None:
@@ -152,6 +161,7 @@ class Bench:
         self._rng, self._at = rng, start
         self.blank = float(rng.uniform(config.blank_low, config.blank_high))
         self.doses: deque[Dose] = deque(maxlen=DOSES_KEPT)
+        self.samples: deque[Sample] = deque(maxlen=DOSES_KEPT)
         self.on_s = dict.fromkeys((FEED, WASTE, "Pump3", "Pump4"), 0.0)
         self.peak_ml = float(plant.volume_ml[0])
         self.powered = True

@@ -35,6 +35,9 @@ class EmulatorTransport:
         """Raises: LinkError when no answer came; the device may have acted all the same."""
         return self._request("POST", path)
 
+    def disarm(self) -> None:
+        """No dead-man switch in between."""
+
     def close(self) -> None:
         """Nothing to release."""
 

@@ -14,6 +14,10 @@ from hardware.errors import RecordingError
 
 __all__ = ["Journal", "read_journal"]
 
+TAIL = 20_000_000  # bytes; about 16 h of eight reactors
+LANDMARKS = (b'"kind":"device"', b'"kind":"temperature"')
+"""Identities, blanks and thermostat targets, written once and valid for days."""
+
 
 def _plain(value: Any) -> Any:
     """Arrays as lists, non-finite numbers as None: what strict JSON can hold."""
@@ -42,6 +46,27 @@ def _complete(data: bytes) -> int:
     return 0
 
 
+def _tail(path: Path, before: int) -> bytes:
+    """The file from byte `before` on, from the next line on unless it is 0."""
+    with path.open("rb") as f:
+        f.seek(before)
+        if before:
+            f.readline()
+        return f.read()
+
+
+def _landmarks(path: Path, before: int) -> Iterator[dict[str, Any]]:
+    """The rows in the first `before` bytes that a resumed run still needs, without holding the rest in memory."""
+    if before:
+        with path.open("rb") as f:
+            at = 0
+            while at < before:
+                line = f.readline()
+                if at == 0 or any(mark in line[:120] for mark in LANDMARKS):
+                    yield from _parse(line, path)
+                at += len(line)
+
+
 class Journal:
     """One row per event: {"n": number, "wall": s since 1970, "mono": s, "kind": ..., fields...}.
 
@@ -52,7 +77,8 @@ class Journal:
       path: file, created if missing; its folder must exist.
       wall: clock of the day, s since 1970; only ever for the record and for the position of a resumed run.
       fsync: False leaves the flushing to the operating system: survives a kill, not a power cut (simulated runs).
-    Attributes: cut, bytes of a torn last line that were removed on opening; rows, what was there before.
+    Attributes: cut, bytes of a torn last line that were removed on opening; rows, what was there before: all of it in a
+      file of up to 20 MB, else its first row, those of the kinds in LANDMARKS, and the last 20 MB.
     Raises: RecordingError if the file cannot be opened, read or written; the message says what to do.
     """
 
@@ -61,9 +87,12 @@ class Journal:
         self._wall = wall
         self._fsync = fsync
         try:
-            old = path.read_bytes() if path.exists() else b""
-            kept = _complete(old)
-            self.cut = len(old) - kept
+            size = path.stat().st_size if path.exists() else 0
+            before = max(size - TAIL, 0)
+            old = _tail(path, before) if size else b""
+            before = size - len(old)
+            kept = before + _complete(old)
+            self.cut = size - kept
             self._file: int | None = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
             if self.cut:
                 os.ftruncate(self._file, kept)
@@ -73,7 +102,7 @@ class Journal:
             os.close(folder)
         except OSError as error:
             raise RecordingError(f"journal {path}: {error.strerror or error}; check folder, rights and disk") from error
-        self.rows = list(_parse(old[:kept], path))
+        self.rows = [*_landmarks(path, before), *_parse(old[: kept - before], path)]
         self._n = int(self.rows[-1].get("n", len(self.rows) - 1)) + 1 if self.rows else 0
         self._size = kept
 

@@ -82,7 +82,7 @@ class Interlock:
         self._target_c, self._relief_c = np.full(n, math.nan), np.zeros(n)  # what cooling down still explains
         self._hot, self._too_hot = np.zeros(n), np.zeros(n)
         self._thermo_s = np.full(n, math.nan)
-        self._cold_reading = np.zeros(n)
+        self._nonsense = np.zeros(n)
         self._heat_off = np.zeros(n)
 
     # ------------------------------------------------------------------------------------------------------ check
@@ -162,29 +162,29 @@ class Interlock:
     def _judge_change(self, m: Measurement, believed: Mask, now: float) -> None:
         """Steps no culture makes, and changes that dose and growth do not explain."""
         c = self.config
-        t = m.time_s / 60.0
+        od, t = np.where(believed, m.od, math.nan), m.time_s / 60.0
         first = believed & np.isnan(self._od)
         with np.errstate(invalid="ignore"):
             low, high = self._band(self._od, t - self._at, self._since_ml)
-            step = believed & ~first & ~((m.od >= low) & (m.od <= high))
+            step = believed & ~first & ~((od >= low) & (od <= high))
             near_low, near_high = self._band(self._suspect, t - self._suspect_at, self._since_ml)
-            consistent = (m.od >= near_low) & (m.od <= near_high)
-            down = m.od < low
+            consistent = (od >= near_low) & (od <= near_high)
+            down = od < low
         self._suspects = np.where(
             step, np.where(consistent, self._suspects + 1, 1), np.where(believed, 0, self._suspects)
         )
-        self._suspect, self._suspect_at = np.where(step, m.od, self._suspect), np.where(step, t, self._suspect_at)
+        self._suspect, self._suspect_at = np.where(step, od, self._suspect), np.where(step, t, self._suspect_at)
         settled = step & (self._suspects >= np.where(down, c.accept_down, c.accept_up))
         before = self._od
-        self._trip("jump", step & ~down, lambda i: f"OD {before[i]:.3f} to {m.od[i]:.3f}: growth cannot do that")
-        self._trip("falls", step & down, lambda i: f"OD {before[i]:.3f} to {m.od[i]:.3f}: no dose explains that")
+        self._trip("jump", step & ~down, lambda i: f"OD {before[i]:.3f} to {od[i]:.3f}: growth cannot do that")
+        self._trip("falls", step & down, lambda i: f"OD {before[i]:.3f} to {od[i]:.3f}: no dose explains that")
         self._cool("falls", settled & down, now)
         usual = believed & ~step & ~first
-        self._accumulate(m.od, t, usual, now)
+        self._accumulate(od, t, usual, now)
         taken = first | usual | settled
         self._excess, self._deficit = (np.where(settled, 0.0, s) for s in (self._excess, self._deficit))
         self._suspects = np.where(settled, 0, self._suspects)
-        self._od, self._at = np.where(taken, m.od, self._od), np.where(taken, t, self._at)
+        self._od, self._at = np.where(taken, od, self._od), np.where(taken, t, self._at)
         self._since_ml = np.where(taken, 0.0, self._since_ml)
 
     def _accumulate(self, od: Array, t: Array, usual: Mask, now: float) -> None:
@@ -195,7 +195,8 @@ class Interlock:
         (0.8 of the largest rate and more) x must be below -0.004 dt, or the culture outgrows the pump.
         """
         c = self.config
-        usual = usual & (od > 0.05) & (self._od > 0.05)
+        with np.errstate(invalid="ignore"):
+            usual = usual & (od > 0.05) & (self._od > 0.05)
         with np.errstate(invalid="ignore", divide="ignore"):
             dt = np.where(usual, np.maximum(t - self._at, 1e-3), 1.0)
             x = np.where(usual, np.log(np.where(usual, od / self._od, 1.0)), 0.0)
@@ -210,8 +211,8 @@ class Interlock:
         self._futile = np.where(usual, futile, self._futile)
         weight = np.where(usual, 1.0 - np.exp(-dt / 60.0), 0.0)
         self._mu = self._mu + weight * (np.clip((x + d) / dt, 0.0, c.mu_max) - self._mu)
-        noise = np.hypot(c.noise_od, c.noise_fraction * od) / np.maximum(od, 0.05)
-        limit = c.drift + 6.0 * np.where(usual, noise, 0.0)
+        level = np.where(usual, od, 1.0)
+        limit = c.drift + 6.0 * np.hypot(c.noise_od, c.noise_fraction * level) / level
         sums = np.stack([self._excess, self._deficit, self._futile], axis=1)
         over = np.where(sums > limit[:, None], self._over + 1, 0)  # an outlier is over it once only
         self._over = np.where(usual[:, None], over, self._over)
@@ -234,27 +235,28 @@ class Interlock:
     def _judge_heat(self, m: Measurement, fresh: Mask, target_c: Array, now: float) -> None:
         """Too hot, where a vial that still cools down to a lower target is not; a thermometer that reads nonsense."""
         c = self.config
-        temperature = m.temperature
-        known = fresh & np.isfinite(temperature) & np.isfinite(target_c)
-        first = known & np.isnan(self._target_c)
-        minutes = np.where(known & ~first, (now - self._thermo_s) / 60.0, 0.0)
-        drop = np.where(known & ~first, np.maximum(self._target_c - target_c, 0.0), 0.0)
+        asked = fresh & np.isfinite(target_c)
+        known = asked & np.isfinite(m.temperature)
+        temperature, target = np.where(known, m.temperature, 37.0), np.where(known, target_c, 37.0)
+        seen = np.isfinite(self._target_c)
+        minutes = np.where(known & seen, (now - self._thermo_s) / 60.0, 0.0)
+        drop = np.where(known & seen, np.maximum(self._target_c - target, 0.0), 0.0)
         relief = self._relief_c * np.exp(-minutes / c.cooling) + drop
-        relief = np.where(first, np.maximum(temperature - target_c, 0.0), relief)
+        relief = np.where(seen, relief, np.maximum(temperature - target, 0.0))
         self._relief_c = np.where(known, relief, self._relief_c)
-        self._target_c, self._thermo_s = np.where(known, target_c, self._target_c), np.where(known, now, self._thermo_s)
-        with np.errstate(invalid="ignore"):
-            nonsense = known & ~((temperature > 5.0) & (temperature < 70.0))
-            hot = known & ~nonsense & (temperature > target_c + c.hot_excess + self._relief_c)
-            too_hot = known & ~nonsense & (temperature > c.max_temperature)
-            scalding = too_hot & (temperature > c.max_temperature + 3.0)
+        self._target_c, self._thermo_s = np.where(known, target, self._target_c), np.where(known, now, self._thermo_s)
+        in_range = known & (temperature > 5.0) & (temperature < 70.0)
+        nonsense = asked & ~in_range & (seen | known)  # a thermometer that falls silent, too
+        hot = in_range & (temperature > target + c.hot_excess + self._relief_c)
+        too_hot = in_range & (temperature > c.max_temperature)
+        scalding = too_hot & (temperature > c.max_temperature + 3.0)
         self._hot = np.where(known, np.where(hot, self._hot + 1, 0), self._hot)
         self._too_hot = np.where(known, np.where(too_hot, self._too_hot + 1, 0), self._too_hot)
-        self._cold_reading = np.where(known, np.where(nonsense, self._cold_reading + 1, 0), self._cold_reading)
+        self._nonsense = np.where(asked, np.where(nonsense, self._nonsense + 1, 0), self._nonsense)
         trip = known & ((self._hot >= 3) | (self._too_hot >= 2) | scalding)
-        blind = known & (self._cold_reading >= 3)
-        self._trip("hot", trip, lambda i: f"{temperature[i]:.1f} degC, target {target_c[i]:.1f}: heating off")
-        self._trip("thermometer", blind, lambda i: f"reads {temperature[i]:.1f} degC: heating off")
+        blind = asked & (self._nonsense >= 3)
+        self._trip("hot", trip, lambda i: f"{temperature[i]:.1f} degC, target {target[i]:.1f}: heating off")
+        self._trip("thermometer", blind, lambda i: f"reads {m.temperature[i]:.1f} degC: heating off")
         self._heat_off = np.where(trip | blind, 1.0, self._heat_off)
 
     def _limit(self, rate: Array, fresh: Mask, now: float) -> Array:

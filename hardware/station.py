@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +27,12 @@ __all__ = ["Station"]
 
 CYCLE_S = 60.07  # median of 3275 real cycles (chibio.md section 3)
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
+FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 OWN_WILL = ("Zigzag", "Custom", "Chemostat")  # modes that act on the pumps
+
+
+def _link_fault(error: ReactorError) -> Fault:
+    return Fault("link", str(error), "check cable, network and server")
 
 
 class Station:
@@ -119,17 +126,19 @@ class Station:
                 yield OLD_CYCLE_S
             self._prepare()
             state = self.unit.read()
-            if state.running and math.isfinite(state.sample_s):
-                self._sample = (state.sample_s, state.cycles)  # it may be a minute old: wait for the next one
+            if math.isfinite(state.sample_s):
+                self._sample = (state.sample_s, state.cycles)  # of unknown age: wait for the next one
+            self._offsets.clear()
             if not state.running:
                 self._start()
+                if state.cycles == 0:  # then the device's own time begins now, and so does the first cycle
+                    self._offsets.append(self._clock.now() + FIRST_SAMPLE_S)
                 if not self._heat:  # a start switches the thermostat on
                     self.heat_off()
             if math.isfinite(self.handed_over):
                 self.regulate(self.handed_over)
             self._start_time = self.unit.read().start_time
             self.arrived_s = self.next_poll = self._clock.now()
-            self._offsets.clear()
             identity = {"reactor": self.name, "device_id": self.unit.device_id, "blank": self._blank}
             self._log("device", {**identity, "temperature": self._target_c, "start_time": self._start_time})
         finally:
@@ -193,7 +202,7 @@ class Station:
         try:
             state = self.unit.read()
         except (LinkError, ProtocolError) as error:
-            return self._report(Fault("link", str(error), "check cable, network and server"))
+            return self._report(_link_fault(error))
         except IdentityError as error:
             return self._report(Fault("identity", str(error), "reactors were exchanged: start a new run"))
         except DeviceStateError as error:
@@ -242,6 +251,10 @@ class Station:
             )
         if self._stuck:
             return Fault("pump", self._stuck, "switch the pump board off by hand")
+        if any(state.pumps_on) and not self.dosing and not math.isfinite(self.handed_over):
+            return Fault(
+                "pump", f"pumps on: {state.pumps_on}, not by this program", "close the device's web page everywhere"
+            )
         acting = [m for m in state.modes if m in OWN_WILL]
         if acting or state.regulating != math.isfinite(self.handed_over):
             what = ", ".join(acting) or f"on-board OD regulation is {'on' if state.regulating else 'off'}"
@@ -263,20 +276,32 @@ class Station:
         self.next_poll = now + CYCLE_S - (2.5 if self._looked else 20.0)
         self._looked = False
         reading = {"od": self.od, "temperature": self.temperature, "raw": self.raw, "blank": state.blank}
-        timing = {"late_s": round(self._late_s, 3), "read_s": self.unit.took_s}
+        timing = {"late_s": self._late_s, "read_s": self.unit.took_s}
         self._log("sample", {"reactor": self.name, "sample": self._sample, **reading, **timing})
         if self._late_s > 30.0 or self.dosing:
             return  # the stirrer may be off for the next measurement already
-        for item, on, wanted in (
-            ("Thermostat", state.heating, self._heat),
-            ("Stir", state.stirring, self.config.stir > 0.0),
-        ):
-            if wanted and not on:  # the device loses them after a quick restart, silently
-                try:
-                    self.unit.switch(item, True)
-                    self.tell(f"{item} was off and was switched on again")
-                except ReactorError as error:
-                    self.tell(f"{item} is off and could not be switched on: {error}")
+        self._look_after(state)
+
+    def _look_after(self, state: DeviceState) -> None:
+        """Heating and stirring as this run wants them: a quick restart loses them silently, a web page changes them."""
+        targets = (
+            ("Thermostat", state.temperature_target, self._target_c),
+            ("Stir", state.stir_target, self.config.stir),
+        )
+        switches = (("Thermostat", state.heating, self._heat), ("Stir", state.stirring, self.config.stir > 0.0))
+        for item, value, wanted in targets:
+            if abs(value - wanted) > 1e-3:
+                self._mend(f"{item} was set to {value:g}", f"set back to {wanted:g}", self.unit.target, item, wanted)
+        for item, on, needed in switches:
+            if needed and not on:
+                self._mend(f"{item} was off", "switched on again", self.unit.switch, item, True)
+
+    def _mend(self, found: str, done: str, request: Callable[[str, Any], None], item: str, value: float) -> None:
+        try:
+            request(item, value)
+            self.tell(f"{found} and was {done}")
+        except ReactorError as error:
+            self.tell(f"{found} and could not be {done}: {error}")
 
     def _time_arrival(self, offset: float) -> None:
         """How much later than possible this sample was seen: its offset against the smallest of recent ones.
@@ -287,9 +312,9 @@ class Station:
         if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:
             self.tell(f"the board's clock moved by {min(self._offsets) - offset:.0f} s against this computer's")
             self._offsets.clear()
-        if self._looked or not self._offsets or offset < min(self._offsets):
+        if self._looked or (self._offsets and offset < min(self._offsets)):
             self._offsets.append(offset)
-        self._late_s = offset - min(self._offsets)
+        self._late_s = offset - min(self._offsets) if self._offsets else math.inf  # already there at the first look
 
     def _report(self, fault: Fault | None) -> bool:
         """Set or clear the fault; False, because a fault brings no sample."""
@@ -332,6 +357,8 @@ class Station:
         if self.dosing:
             return "the previous dose has not ended"
         past = self._clock.now() - self.arrived_s + self._late_s
+        if math.isinf(past):
+            return "its sample is of unknown age, the next one is waited for"
         if past + waste_s > self.config.window_s:
             return f"{past:.0f} s after its sample appeared it would not end before the next measurement"
         return ""
@@ -378,8 +405,11 @@ class Station:
             try:
                 self.unit.switch(FEED, False)
                 return
+            except (LinkError, ProtocolError) as error:
+                self._report(_link_fault(error))
             except ReactorError:
-                yield min(self.config.retry_s, 2.0)
+                pass
+            yield min(self.config.retry_s, 2.0)
 
     def _finish(self, plan: DosePlan) -> Task:
         """Task: all pumps off, verified, however long it takes; then the dose is on record as ended."""
@@ -390,8 +420,8 @@ class Station:
             try:
                 self.unit.pumps_off(tries=1)
                 break
-            except (LinkError, ProtocolError):
-                pass
+            except (LinkError, ProtocolError) as error:
+                self._report(_link_fault(error))
             except DeviceStateError as error:
                 if self.unit.state is None:
                     pause = 30.0  # absent or exchanged: nothing may be sent to it

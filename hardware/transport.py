@@ -53,12 +53,15 @@ class Transport(Protocol):
         """POST without a body. Raises: LinkError when no answer came; the device may have acted all the same."""
         ...
 
-    def close(self) -> None:
-        """Release the line; on a serial line also disarm the dead-man switch. Idempotent.
+    def disarm(self) -> None:
+        """Tell a dead-man switch on the way, if there is one, that all pumps were left verified off.
 
-        Call it only when the pumps were verified off: otherwise let the process end with the line open, so that
-        the dead-man switch acts.
+        The next request arms it again. Raises: nothing; an armed switch is the safe side.
         """
+        ...
+
+    def close(self) -> None:
+        """Release the line. Idempotent."""
         ...
 
 
@@ -136,6 +139,9 @@ class HttpTransport:
         """POST `path` without a body. Raises: LinkError (the device may have acted), ProtocolError."""
         return self._request("POST", path)
 
+    def disarm(self) -> None:
+        """Nothing: no switch on this way."""
+
     def close(self) -> None:
         """Close the client. Idempotent."""
         self._client.close()
@@ -153,8 +159,8 @@ class HttpTransport:
                         raise LinkError(f"{method} {path}: the answer was not complete after {self._read_s:.1f} s")
                 return Reply(answer.status_code, bytes(body), answer.headers.get("date", ""))
         except (httpx.RemoteProtocolError, httpx.DecodingError) as error:
-            if "without sending" in str(error):  # closed before a byte of answer: a dying server, not a strange one
-                raise LinkError(f"{method} {path}: {self.url} closed the connection without an answer") from error
+            if "without sending" in str(error):  # closed before the answer was whole: a dying server, not a strange one
+                raise LinkError(f"{method} {path}: {self.url} closed the connection without a whole answer") from error
             raise ProtocolError(f"{method} {path}: not an HTTP answer ({error})") from error
         except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
             reason = str(error) or type(error).__name__
@@ -184,7 +190,7 @@ class SerialTransport:
         port: str,
         speed: float = 1.0,
         config: TransportConfig | None = None,
-        attempts: int = 3,
+        attempts: int = 5,
         rng: random.Random | None = None,
     ) -> None:
         self.port = port
@@ -205,12 +211,14 @@ class SerialTransport:
         """POST `path`. Raises: LinkError (the device may have acted), ProtocolError."""
         return self._request("POST", path)
 
+    def disarm(self) -> None:
+        """BYE to the agent, whose switch then rests until the next request."""
+        if self._line is not None:
+            with contextlib.suppress(LinkError, ProtocolError):
+                self._exchange("BYE", "/")
+
     def close(self) -> None:
-        """Tell the agent that all is in order, so that its dead-man switch rests, and release the port. Idempotent."""
-        if self._line is None:
-            return
-        with contextlib.suppress(LinkError, ProtocolError):  # an armed dead-man switch is the safe side
-            self._exchange("BYE", "/")
+        """Release the port; the agent's switch stays as it is. Idempotent."""
         self._drop()
 
     def _open(self) -> None:
@@ -299,7 +307,8 @@ class SerialTransport:
         while (line := self._until_newline(deadline)) is not None:
             match = _HEADER.match(line[line.rfind(b"<") :]) if b"<" in line else None
             if match is None:
-                damaged += b"<" in line
+                if b"<" in line:  # perhaps our reply, damaged: asking again is safe and quicker than waiting
+                    return None, damaged + 1
                 continue
             number, status, length, crc = int(match[1]), int(match[2]), int(match[3]), int(match[4], 16)
             body = self._read(length, deadline) if length <= MAX_BODY else None

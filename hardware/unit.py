@@ -121,7 +121,7 @@ class Unit:
         self.post(f"/SetOutputOn/{item}/{int(on)}/{self.name}")
 
     def pumps_off(self, tries: int = 3) -> None:
-        """All four pumps off, verified. Every pump is tried even if another one fails.
+        """All four pumps off, verified. Every pump is tried even if another one fails, unless nobody answers at all.
 
         Read-back alone proves nothing, for the flags are intent: with the bus hung they say off while the motor runs.
         So a blocking call touches the bus in between. It is quick if all is well; on a hung bus it outlasts the
@@ -136,11 +136,15 @@ class Unit:
             error = None
             if self.state is None:
                 self.read()  # presence first
+            silent = 0  # time-outs are long: after feed and waste went unanswered, say so instead of going on
             for pump in PUMPS:
                 try:
                     self.switch(pump, False)
+                    silent = 0
                 except (LinkError, ProtocolError) as failed:
-                    error = failed
+                    error, silent = failed, silent + isinstance(failed, LinkError)
+                    if silent == 2:
+                        break
             if error is not None:
                 continue
             self._clock.sleep(SETTLE_S)

@@ -34,7 +34,7 @@ PERIOD_S = 63.0
 UNSET_BLANK = 65000.0
 """Blank of a device that lost its memory or was never calibrated (chibio.md section 4)."""
 
-_NUMBER = r"(\d{1,6}(?:\.\d{1,12})?)"
+_NUMBER = r"[0-9]{1,6}(?:\.[0-9]{1,12})?"
 _LIMITS: Mapping[str, tuple[float, float]] = {
     "Pump1": (0.0, 0.05),  # fifty times less than what the pump can do; the on-board regulator stays below 0.02
     "Pump2": (0.0, 0.5),  # a waste dose must end before the next measurement

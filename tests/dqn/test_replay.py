@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from dqn.replay import Replay, Transition
+from dqn.replay import Replay
 
 AGENTS, OBSERVATIONS = 3, 2
 CPU = torch.device("cpu")
 
 
-def _step(rng: np.random.Generator) -> Transition:
-    def numbers(*shape: int) -> torch.Tensor:
-        return torch.from_numpy(rng.standard_normal(shape).astype(np.float32))
-
-    return Transition(
-        s_tm1=numbers(AGENTS, 1, OBSERVATIONS),
-        a_tm1=torch.from_numpy(rng.integers(0, 17, (AGENTS, 1))),
-        r_t=numbers(AGENTS, 1),
-        s_t=numbers(AGENTS, 1, OBSERVATIONS),
-        continues=torch.from_numpy((rng.random((AGENTS, 1)) < 0.5).astype(np.float32)),
-    )
+def _step(rng: np.random.Generator, agents: int = AGENTS) -> dict[str, NDArray[Any]]:
+    """One transition per agent, as `Replay.add` takes it."""
+    return {
+        "s_tm1": rng.standard_normal((agents, OBSERVATIONS)).astype(np.float32),
+        "a_tm1": rng.integers(0, 17, agents),
+        "r_t": rng.standard_normal(agents).astype(np.float32),
+        "s_t": rng.standard_normal((agents, OBSERVATIONS)).astype(np.float32),
+        "continues": rng.random(agents) < 0.5,
+    }
 
 
 @settings(deadline=None, max_examples=25)
@@ -32,10 +33,10 @@ def _step(rng: np.random.Generator) -> Transition:
 def test_holds_the_last_ones_like_a_list(capacity: int, added: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     replay = Replay(AGENTS, capacity, OBSERVATIONS, CPU)
-    naive: list[Transition] = []
+    naive: list[dict[str, NDArray[Any]]] = []
     for k in range(added):
         step = _step(rng)
-        replay.add(step)
+        replay.add(**step)
         if len(naive) < capacity:
             naive.append(step)
         else:
@@ -46,13 +47,13 @@ def test_holds_the_last_ones_like_a_list(capacity: int, added: int, seed: int) -
     for i in range(AGENTS):
         for j in range(16):
             expected = naive[int(uniform[i, j] * len(naive))]
-            for drawn, stored in zip(batch, expected, strict=True):
-                assert torch.equal(drawn[i, j], stored[i, 0])
+            for name, drawn in batch._asdict().items():
+                np.testing.assert_array_equal(drawn[i, j].numpy(), expected[name][i])
 
 
 def test_types_of_a_minibatch() -> None:
     replay = Replay(AGENTS, 4, OBSERVATIONS, CPU)
-    replay.add(_step(np.random.default_rng(0)))
+    replay.add(**_step(np.random.default_rng(0)))
     batch = replay.sample(torch.zeros(AGENTS, 5, dtype=torch.float64))
     assert batch.a_tm1.dtype == torch.int64
     assert [tuple(field.shape) for field in batch] == [(3, 5, 2), (3, 5), (3, 5), (3, 5, 2), (3, 5)]
@@ -61,8 +62,9 @@ def test_types_of_a_minibatch() -> None:
 def test_the_largest_number_below_one_stays_inside() -> None:
     replay = Replay(AGENTS, 7, OBSERVATIONS, CPU)
     for _ in range(7):
-        replay.add(_step(np.random.default_rng(1)))
-    replay.sample(torch.full((AGENTS, 1), np.nextafter(1.0, 0.0), dtype=torch.float64))
+        replay.add(**_step(np.random.default_rng(1)))
+    batch = replay.sample(torch.full((AGENTS, 1), np.nextafter(1.0, 0.0), dtype=torch.float64))
+    assert batch.s_t.shape == (AGENTS, 1, OBSERVATIONS)
 
 
 def test_uniform_frequencies() -> None:
@@ -70,8 +72,7 @@ def test_uniform_frequencies() -> None:
     rng = np.random.default_rng(2)
     replay = Replay(1, 10, OBSERVATIONS, CPU)
     for k in range(10):
-        one = Transition(*(field[:1] for field in _step(rng)))
-        replay.add(one._replace(r_t=torch.tensor([[float(k)]])))
+        replay.add(**{**_step(rng, 1), "r_t": np.array([float(k)])})
     rows = replay.sample(torch.from_numpy(rng.random((1, 20_000)))).r_t.long()
     count = torch.bincount(rows[0], minlength=10).numpy()
     assert ((count - 2000.0) ** 2 / 2000.0).sum() < 27.9  # 99.9 % quantile with 9 degrees of freedom
@@ -79,7 +80,7 @@ def test_uniform_frequencies() -> None:
 
 def test_minibatch_is_a_copy() -> None:
     replay = Replay(AGENTS, 4, OBSERVATIONS, CPU)
-    replay.add(_step(np.random.default_rng(3)))
+    replay.add(**_step(np.random.default_rng(3)))
     zero = torch.zeros(AGENTS, 1, dtype=torch.float64)
     replay.sample(zero).s_t.add_(100.0)
     assert replay.sample(zero).s_t.abs().max() < 50.0
@@ -95,11 +96,11 @@ def test_state_continues(added: int) -> None:
     rng = np.random.default_rng(4)
     one, other = (Replay(AGENTS, 5, OBSERVATIONS, CPU) for _ in range(2))
     for _ in range(added):
-        one.add(_step(rng))
+        one.add(**_step(rng))
     other.load_state_dict(one.state_dict())
     step = _step(rng)
-    one.add(step)
-    other.add(step)
+    one.add(**step)
+    other.add(**step)
     uniform = torch.from_numpy(rng.random((AGENTS, 8)))
     for a, b in zip(one.sample(uniform), other.sample(uniform), strict=True):
         assert torch.equal(a, b)

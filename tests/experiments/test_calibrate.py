@@ -75,7 +75,7 @@ def test_shipped_recording_from_the_command_line(cli: Cli, tmp_path: Path) -> No
     assert content["pmse_pct"] < 0.05
     for word in ("mu ", "tau ", "PMSE", "window", "held out", "doubling", "calibrated.yaml"):
         assert word in done.stdout
-    for figure in ("fit.png", "drift.png"):
+    for figure in ("figures/fit.png", "figures/drift.png"):
         assert (run / figure).read_bytes().startswith(b"\x89PNG")
     assert list(run.glob("events.out.tfevents.*"))
     nominal = OmegaConf.load(str(resources.files("conf") / "env" / "sim.yaml"))
@@ -179,7 +179,7 @@ def test_coverage_study_writes_its_figure(cli: Cli, tmp_path: Path) -> None:
     content = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert content["recordings"] == 40
     assert all(80 <= share <= 100 for share in content["coverage_pct"].values())
-    assert (tmp_path / "run" / "coverage.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "run" / "figures" / "coverage.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_help_documents_the_generator(cli: Cli) -> None:

@@ -35,6 +35,9 @@ class Spy:
         self.posts.append((self.clock.now(), path))
         return self.inner.post(path)
 
+    def disarm(self) -> None:
+        self.inner.disarm()
+
     def close(self) -> None:
         self.inner.close()
 
@@ -111,6 +114,12 @@ class Bed:
 
     def of(self, kind: str) -> list[dict[str, Any]]:
         return [row for row in self.rows if row["kind"] == kind]
+
+    def peek_cycles(self, name: str = "M0") -> list[float]:
+        """Device time at which each recorded cycle of `name` began."""
+        starts = self.device.apps[name].data["time"]["record"]
+        started = next(t for t, path in self.wire.posts if path == f"/Experiment/1/{name}")
+        return [started + float(t) for t in starts]
 
     def truth(self, name: str = "M0") -> dict[str, Any]:
         self.device.run_until(self.clock.now())

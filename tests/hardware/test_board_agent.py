@@ -285,7 +285,7 @@ class Rig:
     def end(self) -> None:
         if self.agent.poll() is None:
             self.agent.send_signal(signal.SIGTERM)
-            assert self.agent.wait(timeout=10) == 0
+            assert self.agent.wait(timeout=30) == 0
         if self.emulator.process.poll() is None:
             self.emulator.end()
         assert "Traceback" not in self.log.read_text()
@@ -509,6 +509,7 @@ def test_http_mode(tmp_path: Path) -> None:
             time.sleep(0.2)
         assert one.motors() == {"M0/Pump1"}
         one.until(lambda: not one.motors())
+        one.until(lambda: "pumps verified off" in one.log.read_text())  # the pass has ended, nothing else asks
         assert json.loads(ask("GET", "/_agent/status")[1])["trips"] == 1
         assert ask("POST", "/_agent/bye")[0] == 204
         assert json.loads(ask("GET", "/_agent/status")[1])["armed"] is False

@@ -76,6 +76,9 @@ def test_an_experiment_over_http(emulator: Process) -> None:
         state = json.loads(emulator.ask("GET", "/getSysdata/")[1])
     assert state["Experiment"]["cycles"] == 4
     assert state["OD"]["record"][0] == pytest.approx(0.3, abs=0.05)  # started with a blank
+    stored = json.loads(emulator.ask("GET", "/_emulator/samples/M0", emulator.control_port)[1])
+    assert [s["sample_s"] for s in stored[: len(state["time"]["record"])]] == state["time"]["record"]
+    assert stored[0]["stored_s"] - stored[0]["sample_s"] > 10.0
     assert [b - a for a, b in zip(state["time"]["record"], state["time"]["record"][1:], strict=False)] == pytest.approx(
         [60.07] * (len(state["time"]["record"]) - 1), abs=1.0
     )

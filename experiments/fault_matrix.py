@@ -1,0 +1,224 @@
+"""Every fault at every moment of a run, in virtual time: `python -m experiments.fault_matrix`."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import math
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from envs.setpoints import Schedule
+from experiments import app
+from experiments.fault_case import MOMENTS, Case, Outcome
+from experiments.faults import FAULTS, SICK, Fault, by_name
+from hardware.safety_config import SafetyConfig
+
+__all__ = ["FaultMatrixConfig", "fault_matrix", "table"]
+
+log = logging.getLogger(__name__)
+
+WITHOUT_POLICY = ("pi", "pi_tuned", "mpc", "inverse", "threshold", "hold")
+
+
+@dataclass(frozen=True)
+class FaultMatrixConfig:
+    """Values of `conf/fault_matrix.yaml`. Raises: ValueError naming key, value and allowed range.
+
+    reactors: the first one falls sick. faults: their names; empty for all. moments: of `fault_case.MOMENTS`.
+    controls: healthy runs without sensor outliers; every word of the interlock there is a false alarm.
+    seed: of the first case. workers: processes; 0 = one per core.
+    """
+
+    reactors: tuple[str, ...] = ("M0", "M1")
+    scenario: Schedule = field(
+        default_factory=lambda: Schedule((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8)
+    )
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    controller_kind: str = "inverse"
+    faults: tuple[str, ...] = ()
+    moments: tuple[str, ...] = MOMENTS
+    controls: int = 10
+    seed: int = 0
+    workers: int = 0
+
+    def __post_init__(self) -> None:
+        """Check every range once, where the value enters."""
+        by_name(self.faults)
+        unknown = [m for m in self.moments if m not in MOMENTS]
+        checks = (
+            ("reactors", self.reactors, self.reactors[0] == SICK, f"{SICK} first, it is the one that falls sick"),
+            ("moments", self.moments, bool(self.moments) and not unknown, ", ".join(MOMENTS)),
+            (
+                "controller_kind",
+                self.controller_kind,
+                self.controller_kind in WITHOUT_POLICY,
+                ", ".join(WITHOUT_POLICY),
+            ),
+            ("controls", self.controls, 0 <= self.controls <= 1000, "0 to 1000"),
+            ("seed", self.seed, self.seed >= 0, "at least 0"),
+            ("workers", self.workers, 0 <= self.workers <= 64, "0 (one per core) to 64"),
+            ("scenario.setpoints", self.scenario.setpoints, len(self.scenario.setpoints) >= 2, "two phases or more"),
+        )
+        for key, value, ok, allowed in checks:
+            if not ok:
+                raise ValueError(f"{key} = {value}: allowed {allowed}")
+
+
+def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int) -> Outcome:
+    """One case, in whatever process. Args: name: of the fault, "" for a healthy run."""
+    fault = by_name((name,))[0] if name else None
+    return Case(fault, moment, config.reactors, config.scenario, config.safety, config.controller_kind, seed).run()
+
+
+def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int]]:
+    """(fault, moment, seed) of every case; controls first."""
+    controls = [("", "steady", config.seed + k) for k in range(config.controls)]
+    return controls + [(f.name, moment, config.seed) for f in by_name(config.faults) for moment in config.moments]
+
+
+@contextmanager
+def pool(workers: int) -> Iterator[Executor]:
+    """Fresh processes: a limit on file size, which one fault sets, is the process's."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers or None, mp_context=context) as executor:
+        yield executor
+
+
+def run_all(config: FaultMatrixConfig, tick: Callable[[], object]) -> list[Outcome]:
+    """Every case, in order."""
+    cases = all_cases(config)
+    with pool(config.workers) as executor:
+        futures = [executor.submit(run_case, config, *case) for case in cases]
+        for future in as_completed(futures):
+            future.result()
+            tick()
+        return [future.result() for future in futures]
+
+
+def _number(value: float, form: str) -> str:
+    return format(value, form) if math.isfinite(value) else "–"
+
+
+def _span(values: Sequence[float], form: str) -> str:
+    """Smallest to largest, one number if they look the same."""
+    low, high = _number(min(values), form), _number(max(values), form)
+    return low if low == high else f"{low} – {high}"
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """Markdown: one row per fault over all moments; single cases are in cases.csv."""
+    head = (
+        "fault", "told after, min", "by", "response", "peak mL", "peak OD error", "rows missed", "rows lost",
+        "doses doubled", "pumps off", "as declared",
+    )  # fmt: skip
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for name in dict.fromkeys(o.fault for o in outcomes):
+        mine = [o for o in outcomes if o.fault == name]
+        told = [o.detected_s / 60.0 for o in mine if o.reason]
+        cells = [
+            name if name != "none" else f"none ({len(mine)} healthy runs)",
+            (_span(told, ".1f") + (f" ({len(told)} of {len(mine)})" if len(told) < len(mine) else "")) if told else "–",
+            ", ".join(dict.fromkeys(o.reason for o in mine if o.reason)) or "–",
+            ", ".join(dict.fromkeys(o.response for o in mine if o.response)) or "–",
+            _span([o.peak_ml for o in mine], ".1f"),
+            _span([o.peak_error for o in mine], ".2f"),
+            str(sum(o.rows_missed for o in mine)),
+            str(sum(o.rows_lost + o.rows_doubled for o in mine)),
+            str(sum(o.doses_doubled for o in mine)),
+            f"{sum(o.pumps_off for o in mine)} of {len(mine)}",
+            "yes"
+            if all(o.ok for o in mine)
+            else "**no**: " + ", ".join(dict.fromkeys(w for o in mine for w in o.wrong)),
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def declared(faults: Sequence[Fault]) -> str:
+    """Markdown: what is not detected, or not prevented, and why."""
+    lines = ["| fault | what happens | not detected because | overflow because |", "|---|---|---|---|"]
+    for f in faults:
+        if f.why_not or f.overflow:
+            lines.append(f"| {f.name} | {f.what} | {f.why_not or '(detected)'} | {f.overflow or '–'} |")
+    return "\n".join(lines) + "\n"
+
+
+def totals(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """The sums by which the matrix passes or fails."""
+    known = {f.name: f for f in FAULTS}
+    healthy = [o for o in outcomes if o.fault == "none"]
+    allowed = [o for o in outcomes if o.fault in known and known[o.fault].overflow]
+    return {
+        "cases": len(outcomes),
+        "faults": len({o.fault for o in outcomes} - {"none"}),
+        "overflows": sum(o.overflowed for o in outcomes if o not in allowed),
+        "overflows_not_preventable": sum(o.overflowed for o in allowed),
+        "rows_lost": sum(o.rows_lost for o in outcomes),
+        "rows_doubled": sum(o.rows_doubled for o in outcomes),
+        "doses_doubled": sum(o.doses_doubled for o in outcomes),
+        "doses_repeated_by_the_device": sum(o.repeats for o in outcomes),
+        "undetected": sum("not detected" in o.wrong for o in outcomes),
+        "pumps_not_off": sum("pumps not off" in o.wrong for o in outcomes),
+        "false_alarms": sum(o.early_alarms + o.neighbour_alarms for o in outcomes)
+        + sum(sum(o.kinds.values()) for o in healthy),
+        "healthy_runs": len(healthy),
+        "healthy_peak_error": max((o.peak_error for o in healthy), default=math.nan),
+        "not_as_declared": sum(not o.ok for o in outcomes),
+    }
+
+
+def write_cases(path: Path, outcomes: Sequence[Outcome]) -> None:
+    """cases.csv: one row per case."""
+    rows = [o.as_dict() for o in outcomes]
+    with open(path, "w", newline="", encoding="utf-8") as f:
+        writer = csv.DictWriter(f, list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            counts = {k: " ".join(f"{name} x{n}" for name, n in row[k].items()) for k in ("kinds", "notes")}
+            writer.writerow({**row, **counts, "wrong": ", ".join(row["wrong"])})
+
+
+def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
+    """Run the matrix, write cases.csv, table.md, summary.json and the figure. Raises: UserError if it fails."""
+    from tqdm import tqdm
+    from tqdm.contrib.logging import logging_redirect_tqdm
+
+    from experiments import charts, charts_faults
+
+    began = time.monotonic()
+    faults = by_name(config.faults)
+    with logging_redirect_tqdm(), tqdm(total=len(all_cases(config)), disable=None, unit="case") as bar:
+        outcomes = run_all(config, bar.update)
+    if not outcomes:
+        raise app.UserError("nothing to run: give faults or controls")
+    write_cases(folder / "cases.csv", outcomes)
+    (folder / "table.md").write_text(table(outcomes) + "\n" + declared(faults), encoding="utf-8")
+    sick = [o for o in outcomes if o.fault != "none"]
+    if sick:
+        charts.save(charts_faults.fault_map(sick, config.moments), folder / "figures", "fault_matrix")
+    total = totals(outcomes)
+    seconds = {"wall_s": round(time.monotonic() - began, 1)}
+    app.write_json(folder / "summary.json", {**total, **seconds, "cases_list": [o.as_dict() for o in outcomes]})
+    for o in outcomes:
+        if not o.ok:
+            log.warning("%s, %s: %s (%s)", o.fault, o.moment, ", ".join(o.wrong), o.outcome)
+    log.info("%s", ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in {**total, **seconds}.items()))
+    log.info("table %s, cases %s", folder / "table.md", folder / "cases.csv")
+    if total["not_as_declared"]:
+        raise app.UserError(f"{total['not_as_declared']} of {len(outcomes)} cases did not go as declared; see the log")
+
+
+def main() -> None:
+    """Entry point."""
+    app.run("fault_matrix", FaultMatrixConfig(), fault_matrix)
+
+
+if __name__ == "__main__":
+    main()

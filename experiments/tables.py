@@ -1,0 +1,127 @@
+"""A table once, as HTML, CSV and LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Best", "Cell", "Table", "number", "plus_minus", "typeset", "write"]
+
+
+@dataclass(frozen=True)
+class Best:
+    """A cell to stand out."""
+
+    text: str
+
+
+Cell = str | Best
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Significant digits without an exponent where it is readable; a dash for what is not known."""
+    if value is None or value != value:
+        return "–"
+    if value == 0.0:
+        return "0"
+    text = f"{value:.{digits}g}"
+    return f"{value:.0f}" if "e+" in text else text.replace("e-0", "e-")
+
+
+def plus_minus(mean: float | None, sd: float | None, digits: int = 3) -> str:
+    """mean ± sd, the deviation to two digits; the mean alone where there is none, or none beyond rounding."""
+    if mean is None or sd is None or not sd > 1e-6 * abs(mean):
+        return number(mean, digits)
+    return f"{number(mean, digits)} ± {number(sd, 2)}"
+
+
+def typeset(text: str) -> str:
+    """Escaped for HTML, with true minus signs before numbers."""
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", html.escape(text))
+
+
+@dataclass(frozen=True)
+class Table:
+    """name: of its files. title, note: around it. columns: headings. rows: cells, the first one names the row.
+
+    Raises: ValueError for a row of another length than the headings.
+    """
+
+    name: str
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(f"table {self.name}: row of {len(row)} cells under {len(self.columns)} headings")
+
+    def html(self) -> str:
+        """A <figure> with caption, table and note."""
+        head = "".join(f"<th>{html.escape(c)}</th>" for c in self.columns)
+        body = "\n".join(f"<tr>{''.join(self._html_cell(c, k) for k, c in enumerate(row))}</tr>" for row in self.rows)
+        note = f'<p class="note">{html.escape(self.note)}</p>' if self.note else ""
+        return (
+            f'<figure class="table" id="{html.escape(self.name)}"><figcaption>{html.escape(self.title)}</figcaption>\n'
+            f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
+            f"<tbody>{body}</tbody></table></div>{note}</figure>"
+        )
+
+    @staticmethod
+    def _html_cell(cell: Cell, column: int) -> str:
+        tag = "th" if column == 0 else "td"
+        text = typeset(cell.text if isinstance(cell, Best) else cell)
+        return f'<{tag} class="best">{text}</{tag}>' if isinstance(cell, Best) else f"<{tag}>{text}</{tag}>"
+
+    def csv(self) -> str:
+        """Comma-separated values with the headings as first line."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows([c.text if isinstance(c, Best) else c for c in row] for row in self.rows)
+        return out.getvalue()
+
+    def latex(self) -> str:
+        """A booktabs table, to be read with \\input."""
+        lines = [
+            r"\begin{table}",
+            rf"\caption{{{_tex(self.title)}}}\label{{tab:{self.name}}}",
+            rf"\begin{{tabular}}{{l{'r' * (len(self.columns) - 1)}}}",
+            r"\toprule",
+            " & ".join(_tex(c) for c in self.columns) + r" \\",
+            r"\midrule",
+            *(" & ".join(_tex_cell(c) for c in row) + r" \\" for row in self.rows),
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+        ]
+        return "\n".join(lines) + "\n"
+
+
+TEX = {"\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}",
+       "±": r"$\pm$", "–": "--", "−": "$-$", "µ": r"$\mu$", "°": r"$^\circ$", "²": "$^2$", "⁻": "$^-$", "³": "$^3$",
+       "~": r"\textasciitilde{}",
+       "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$"}  # fmt: skip
+
+
+def _tex(text: str) -> str:
+    return "".join(TEX.get(character, character) for character in text)
+
+
+def _tex_cell(cell: Cell) -> str:
+    return rf"\textbf{{{_tex(cell.text)}}}" if isinstance(cell, Best) else _tex(cell)
+
+
+def write(tables: Sequence[Table], folder: Path) -> None:
+    """NAME.csv and NAME.tex of each table."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for table in tables:
+        (folder / f"{table.name}.csv").write_text(table.csv(), encoding="utf-8")
+        (folder / f"{table.name}.tex").write_text(table.latex(), encoding="utf-8")

@@ -1,0 +1,158 @@
+"""Pump calibration and blank: against the emulated device over HTTP, and from weighings in a file."""
+
+import json
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import app
+from experiments.blank import BlankConfig, blank
+from experiments.calibrate_pump import CalibratePumpConfig, calibrate, weigh
+from experiments.calibrations import load_rigs, save
+from hardware.chibio_config import ChiBioConfig
+from hardware.emulator_process import EmulatorProcess
+from hardware.wire import PERIOD_S
+
+ROOT = Path(__file__).parents[2]
+
+
+def truth(emulator: EmulatorProcess) -> dict:  # type: ignore[type-arg]
+    with urllib.request.urlopen(f"{emulator.control}/_emulator/truth") as answer:
+        return dict(json.load(answer)["M0"])
+
+
+def test_weighing_the_emulators_pump_finds_what_it_delivers() -> None:
+    with EmulatorProcess(["--speed", "200"]) as emulator:
+        backend = ChiBioConfig(url=emulator.url, speed=200.0)
+        config = CalibratePumpConfig(backend, duties=(0.008, 0.02, 0.04), doses=10)
+        on_balance = [0.0]
+        answers = iter(["no idea", "12,5"])
+
+        def ask(question: str) -> str:
+            """An operator with a balance: tares it, later reads it."""
+            if "tare" in question:
+                on_balance.append(truth(emulator)["feed_ml"])
+                return ""
+            return next(answers, str(truth(emulator)["feed_ml"] - on_balance[-1]))
+
+        found, identity = weigh(config, ask)
+        after = truth(emulator)
+    assert identity == "1000200030004000"
+    assert [s.duty for s in found] == [0.008, 0.02, 0.04]
+    assert found[0].grams == 12.5  # asked again after an answer that is no number; a comma is a point
+    assert not any(after["motors"].values())
+    expected = [10 * (PERIOD_S * s.duty + 0.06) for s in found[1:]]  # bias 0.02 to 0.2 s, of which 0.05 s are dead
+    assert [s.grams for s in found[1:]] == pytest.approx(expected, rel=0.12)
+
+
+def test_pumps_of_a_running_experiment_are_not_weighed() -> None:
+    from hardware.errors import DeviceStateError
+
+    with EmulatorProcess(["--speed", "60"]) as emulator:
+        request = urllib.request.Request(f"{emulator.url}/Experiment/1/M0", method="POST")
+        urllib.request.urlopen(request).close()
+        config = CalibratePumpConfig(ChiBioConfig(url=emulator.url, speed=60.0))
+        with pytest.raises(DeviceStateError, match="stop it before"):
+            weigh(config, lambda _: "1.0")
+
+
+def test_from_a_file_on_the_command_line(tmp_path: Path) -> None:
+    rows = [f"{d},20,{20 * 0.9 * (PERIOD_S * d + 0.1):.4f}" for d in (0.006, 0.01, 0.02, 0.04)]
+    (tmp_path / "w.csv").write_text("duty,doses,grams\n" + "\n".join(rows) + "\n")
+    command = [sys.executable, "-m", "experiments.calibrate_pump", f"csv={tmp_path}/w.csv", "reactor=M2", "pump=waste"]
+    command += ["duties=[0.1,0.2]", f"backend.calibration={tmp_path}/c", f"hydra.run.dir={tmp_path}/run"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    [rig] = load_rigs(tmp_path / "c", ["M2"])
+    assert rig.waste.flow_ml_s == pytest.approx(0.9, rel=1e-3)
+    assert rig.waste.bias_s == pytest.approx(0.1, abs=1e-3)
+    assert rig.waste.date
+    assert not rig.calibrated  # the feed pump was not weighed
+    assert np.isnan(rig.blank)
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["weighings"][0]["doses"] == 20
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "at least 2 series"),
+        ("duty,doses\n0.01,20\n", "line 2"),
+        ("duty,doses,grams\n0.01,20,1.2\n0.02,twenty,1.2\n", "line 3"),
+        ("duty,doses,grams\n0.01,20,12\n0.02,20,6\n", "weighed less"),
+        ("duty,doses,grams\n0.01,20,nan\n", "line 2"),
+        ("\0\1\2", "at least 2 series"),
+    ],
+)
+def test_a_file_of_nonsense_ends_in_one_line(tmp_path: Path, content: str, words: str) -> None:
+    path = tmp_path / "w.csv"
+    path.write_text(content)
+    config = CalibratePumpConfig(ChiBioConfig(calibration=str(tmp_path / "c")), csv=str(path))
+    with pytest.raises(app.UserError, match=words):
+        calibrate(config, tmp_path)
+    assert not (tmp_path / "c").exists()
+
+
+def test_without_a_terminal_there_is_one_clear_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "experiments.calibrate_pump", f"hydra.run.dir={tmp_path}/run"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("error: no terminal to ask for the weights; give csv=FILE")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("pump", "Pump9"), ("reactor", "M9"), ("duties", (0.02,)), ("duties", (0.02, 0.2)), ("doses", 1)]
+)
+def test_values_out_of_range(key: str, value: object) -> None:
+    with pytest.raises(ValueError, match=rf"{key} = .*: allowed"):
+        CalibratePumpConfig(**{key: value})  # type: ignore[arg-type]
+
+
+def test_the_blank_of_clear_medium_is_found_stored_and_restored(tmp_path: Path) -> None:
+    with EmulatorProcess(["--speed", "100", "--od", "0", "--unblanked", "--reactors", "M0,M1"]) as emulator:
+        backend = ChiBioConfig(
+            url=emulator.url,
+            speed=100.0,
+            reactors=("M0", "M1"),
+            calibration=str(tmp_path / "c"),
+            dosing=ChiBioConfig().dosing,
+        )
+        blank(BlankConfig(backend, samples=4), tmp_path)
+        real = truth(emulator)["blank"]
+    rigs = load_rigs(tmp_path / "c", ["M0", "M1"])
+    assert rigs[0].blank == pytest.approx(real, rel=0.01)
+    assert rigs[1].blank != rigs[0].blank
+    assert json.loads((tmp_path / "summary.json").read_text())["M0"]["samples"] == 4
+
+
+def test_a_culture_is_no_blank(tmp_path: Path) -> None:
+    with EmulatorProcess(["--speed", "100", "--od", "2.5", "--unblanked"]) as emulator:
+        backend = ChiBioConfig(url=emulator.url, speed=100.0, calibration=str(tmp_path))
+        with pytest.raises(app.UserError, match="allowed 3000 to 60000"):
+            blank(BlankConfig(backend, samples=3), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("{", "not readable"),
+        ("- 1", "no keys"),
+        ("flow_ml_s: fast", "flow|could not convert"),
+        ("flow_ml_s: 70", "flow_ml_s = 70"),
+    ],
+)
+def test_a_broken_calibration_file_is_named(tmp_path: Path, content: str, words: str) -> None:
+    (tmp_path / "M0_feed.yaml").write_text(content)
+    with pytest.raises(app.UserError, match=words):
+        load_rigs(tmp_path, ["M0"])
+
+
+def test_what_was_stored_is_loaded(tmp_path: Path) -> None:
+    save(tmp_path, "M3", "blank", {"blank": 13000.0})
+    assert load_rigs(tmp_path, ["M3"])[0].blank == 13000.0
+    save(tmp_path, "M3", "blank", {"blank": 13.0})
+    with pytest.raises(app.UserError, match="blank = 13"):
+        load_rigs(tmp_path, ["M3"])

@@ -1,0 +1,144 @@
+"""However a run ends, its pumps are verified off: real processes, real signals, a disk that really refuses."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hardware.emulator_process import EmulatorProcess
+from hardware.journal import read_journal
+
+ROOT = Path(__file__).parents[2]
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+SPEED = 30.0
+BROKEN = """
+import experiments.deploy
+from experiments.controllers.inverse import Inverse
+whole = Inverse.act
+calls = []
+def act(self, *arguments):
+    calls.append(0)
+    if len(calls) > 8:
+        raise RuntimeError("the controller failed")
+    return whole(self, *arguments)
+Inverse.act = act
+experiments.deploy.main()
+"""
+
+
+class Bench:
+    """A client at work on two reactors of an emulated device."""
+
+    def __init__(self, device: EmulatorProcess, folder: Path, code: str = "") -> None:
+        self.device, self.folder = device, folder
+        program = ["-c", code] if code else ["-m", "experiments.deploy"]
+        scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]", "controller=inverse"]
+        backend = ["backend=chibio", f"backend.url={device.url}", f"backend.speed={SPEED}", "backend.reactors=[M0,M1]"]
+        command = [sys.executable, *program, *scenario, *backend, f"hydra.run.dir={folder}"]
+        self.client = subprocess.Popen(
+            command, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+
+    def truth(self) -> dict[str, Any]:
+        with urllib.request.urlopen(f"{self.device.control}/_emulator/truth", timeout=10.0) as answer:
+            return dict(json.load(answer))
+
+    def motors(self) -> list[str]:
+        truth = self.truth()
+        return [f"{m}/{pump}" for m in ("M0", "M1") for pump, on in truth[m]["motors"].items() if on]
+
+    def until_a_dose(self) -> None:
+        """Wait until a pump runs."""
+        deadline = time.monotonic() + 60.0
+        while not self.motors():
+            assert time.monotonic() < deadline
+            assert self.client.poll() is None
+            time.sleep(0.005)
+
+    def end(self) -> tuple[int, str]:
+        """Status and what was said, after the client has ended by itself."""
+        said = self.client.communicate(timeout=60.0)[0]
+        return self.client.returncode, said
+
+    def check(self, outcome: str) -> None:
+        """Everything off, seen by the emulator and on record, and every reactor with a row."""
+        assert self.motors() == []
+        rows, torn = read_journal(self.folder / "journal.jsonl")
+        assert torn == 0
+        stops = [row for row in rows if row["kind"] == "stop"]
+        if stops:
+            assert stops[-1]["not_verified"] == []
+        summary = json.loads((self.folder / "summary.json").read_text())
+        assert outcome in summary["outcome"]
+        assert all(reactor["rows"] > 0 for reactor in summary["reactors"].values())
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with EmulatorProcess(["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5"]) as device:
+        one = Bench(device, tmp_path / "run")
+        yield one
+        if one.client.poll() is None:
+            one.client.kill()
+            one.client.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_in_the_middle_of_a_dose(bench: Bench, number: int) -> None:
+    bench.until_a_dose()
+    time.sleep(2.0 * 60.0 / SPEED)
+    bench.until_a_dose()
+    bench.client.send_signal(number)
+    status, said = bench.end()
+    assert "pumps verified off" in said
+    assert "Traceback" not in said
+    bench.check("stopped by the operator")
+    assert status == 0
+
+
+def test_an_impatient_operator_does_not_get_out_before_the_pumps_are_off(bench: Bench) -> None:
+    bench.until_a_dose()
+    time.sleep(2.0 * 60.0 / SPEED)
+    urllib.request.urlopen(
+        urllib.request.Request(f"{bench.device.control}/_emulator/fault/slow_s/all/3", method="POST"), timeout=10.0
+    ).close()
+    bench.client.send_signal(signal.SIGINT)
+    while bench.client.poll() is None:
+        time.sleep(0.1)
+        bench.client.send_signal(signal.SIGINT)
+    status, said = bench.end()
+    assert "pumps verified off" in said
+    assert bench.motors() == []
+    assert status in (0, 130, -signal.SIGINT)
+
+
+def test_a_full_disk(bench: Bench) -> None:
+    bench.until_a_dose()
+    time.sleep(3.0 * 60.0 / SPEED)
+    size = (bench.folder / "journal.jsonl").stat().st_size
+    bench.until_a_dose()
+    resource.prlimit(bench.client.pid, resource.RLIMIT_FSIZE, (size + 40, resource.RLIM_INFINITY))
+    status, said = bench.end()
+    assert status == 1
+    assert "pumps verified off" in said
+    assert "free disk space, then resume the run" in said.splitlines()[-1]
+    assert bench.motors() == []
+    assert read_journal(bench.folder / "journal.jsonl")[1] == 0
+
+
+def test_an_exception_in_the_controller(tmp_path: Path) -> None:
+    with EmulatorProcess(["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5"]) as device:
+        bench = Bench(device, tmp_path / "run", BROKEN)
+        status, said = bench.end()
+        assert status == 1
+        assert "pumps verified off" in said
+        bench.check("failed: RuntimeError: the controller failed")

@@ -1,0 +1,125 @@
+"""The fault matrix on a few faults, and that its judge would notice what it looks for."""
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from envs.setpoints import Schedule
+from experiments import app
+from experiments.fault_case import Case, Outcome, audit_doses
+from experiments.fault_matrix import FaultMatrixConfig, declared, table, totals
+from experiments.faults import FAULTS, Fault, by_name, set_
+from hardware.emulator_bench import Dose
+from hardware.safety_config import SafetyConfig
+
+ROOT = Path(__file__).parents[2]
+SCHEDULE = Schedule((0.6, 0.5), (20.0, 20.0), (37.0, 37.0), 0.6)
+
+
+def run(fault: Fault | None, moment: str = "steady", safety: SafetyConfig | None = None) -> Outcome:
+    return Case(fault, moment, ("M0", "M1"), SCHEDULE, safety or SafetyConfig(), "inverse", 3).run()
+
+
+def test_a_healthy_run_says_nothing_and_holds_the_setpoints() -> None:
+    outcome = run(None)
+    assert outcome.ok, outcome
+    assert outcome.kinds == {}
+    assert outcome.outcome == "completed"
+    assert outcome.peak_error < 0.06
+    assert outcome.pumps_off
+
+
+@pytest.mark.parametrize(
+    ("name", "moment", "reason"),
+    [
+        ("spectrometer dead", "steady", "spectrometer"),
+        ("link down 5 min", "dose", "link"),
+        ("request hangs 45 s", "dose", "restarted"),
+        ("reactor unplugged", "step", "link"),
+        ("foreign blank", "recovery", "blank"),
+        ("program killed 2 min", "dose", "end:killed"),
+        ("computer loses power", "dose", "repair:torn"),
+        ("disk full", "dose", "end:journal"),
+    ],
+)
+def test_what_the_table_declares_happens(name: str, moment: str, reason: str) -> None:
+    outcome = run(by_name((name,))[0], moment)
+    assert outcome.ok, outcome
+    assert outcome.reason == reason
+    assert outcome.rows_lost == outcome.doses_doubled == 0
+    assert not outcome.overflowed
+
+
+def test_a_fault_that_nobody_tells_of_is_found() -> None:
+    mute = Fault("mute", "a weak pump that must be told", set_("pump_gain_factor", 0.6), ("no_dilution",))
+    assert "not detected" in run(mute).wrong
+
+
+def test_an_overflow_is_found_unless_it_is_declared() -> None:
+    blocked = by_name(("waste blocked",))[0]
+    assert run(blocked).overflowed
+    assert run(replace(blocked, overflow="")).wrong == ["overflow"]
+
+
+def test_a_word_in_a_healthy_run_is_a_false_alarm() -> None:
+    nervous = SafetyConfig(jump=1e-4, jump_fraction=1e-4)
+    assert "false alarm" in run(None, safety=nervous).wrong
+
+
+def test_doses_are_audited_by_intent_and_sample() -> None:
+    def intent(at: float, cycle: int) -> dict[str, object]:
+        return {"kind": "intent", "reactor": "M0", "on_s": at, "sample": [60.0 * cycle, cycle], "feed_ml": 0.5}
+
+    journal = [{"kind": "device", "reactor": "M0", "start_time": "a"}, intent(20.0, 1), intent(80.0, 2)]
+
+    def dose(at: float, pump: str = "Pump1") -> Dose:
+        return Dose(pump, 100.0 + at, 0.5, 1, 0.5)
+
+    assert audit_doses(journal, [dose(21.0), dose(21.0, "Pump2"), dose(81.0)], "M0", 100.0) == (0, 0)
+    assert audit_doses(journal, [dose(21.0), dose(30.0), dose(81.0)], "M0", 100.0) == (1, 0)
+    assert audit_doses(journal, [dose(5.0), dose(21.0)], "M0", 100.0) == (1, 0)
+    assert audit_doses(journal, [dose(81.0), dose(144.0), dose(207.0)], "M0", 100.0) == (0, 2)
+    assert audit_doses([*journal, intent(85.0, 2)], [], "M0", 100.0) == (1, 0)
+    assert audit_doses([*journal, journal[0] | {"start_time": "b"}, intent(200.0, 2)], [], "M0", 100.0) == (0, 0)
+
+
+def test_every_fault_declares_what_is_expected_and_has_a_name_of_its_own() -> None:
+    assert len(FAULTS) >= 40
+    assert len({f.name for f in FAULTS}) == len(FAULTS)
+    with pytest.raises(ValueError, match="needs either"):
+        Fault("x", "y", set_("bus_stuck"))
+    with pytest.raises(ValueError, match="no such fault; allowed feed blocked"):
+        by_name(("nonsense",))
+
+
+def test_table_and_totals() -> None:
+    good = Outcome("feed blocked", "steady", detected_s=600.0, reason="no_dilution", response="hold", pumps_off=True)
+    bad = Outcome("feed blocked", "step", pumps_off=True, wrong=["not detected"], rows_lost=2)
+    text = table([good, bad])
+    assert "| feed blocked | 10.0 (1 of 2) | no_dilution | hold |" in text
+    assert "**no**: not detected" in text
+    assert "1 mL/s fills the headroom" in declared(by_name(("feed stuck open", "feed blocked")))
+    assert (totals([good, bad])["rows_lost"], totals([good, bad])["not_as_declared"]) == (2, 1)
+
+
+def test_the_command(tmp_path: Path) -> None:
+    faults = "faults=[OD frozen,disk full]"
+    command = [sys.executable, "-m", "experiments.fault_matrix", faults, "moments=[dose]", "controls=1", "workers=1"]
+    done = subprocess.run([*command, f"hydra.run.dir={tmp_path}"], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["cases"], summary["undetected"], summary["not_as_declared"]) == (3, 0, 0)
+    with open(tmp_path / "cases.csv", newline="") as f:
+        assert [row["reason"] for row in csv.DictReader(f)] == ["", "frozen", "end:journal"]
+    assert (tmp_path / "figures" / "fault_matrix.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("override", ["moments=[noon]", "reactors=[M1]", "controller_kind=dqn", "faults=[nonsense]"])
+def test_bad_values_are_named(override: str) -> None:
+    with pytest.raises(app.UserError, match="allowed|nonsense"):
+        app.load(app.compose("fault_matrix", [override]), FaultMatrixConfig())

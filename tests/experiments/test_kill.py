@@ -1,0 +1,36 @@
+"""SIGKILL and resume of a real run on a real emulator; the campaign: `python -m experiments.kill_campaign`."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments import app
+from experiments.kill_campaign import KillConfig, kill_campaign
+from hardware.journal import read_journal
+
+
+def test_killed_six_times_nothing_is_lost_or_doubled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    kill_campaign(KillConfig(kills=6, runs=1, workers=1, speed=60.0, longest_s=2.5), tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["lives"] == 7
+    assert summary["rows_lost"] == summary["rows_doubled"] == summary["doses_lost"] == summary["doses_doubled"] == 0
+    assert summary["rows"] >= summary["samples"] > 0
+    assert summary["doses"] > 5
+    assert summary["pumps_off"]
+    rows, torn = read_journal(tmp_path / "run0" / "journal.jsonl")
+    assert torn == 0
+    starts = [row["time_s"] for row in rows if row["kind"] == "start"]
+    assert len(starts) > 3
+    assert starts == sorted(starts)
+    state = json.loads((tmp_path / "run0" / "state.json").read_text())
+    decided = [row["row"]["elapsed_min"] - row["row"]["time_min"] for row in rows if row["kind"] == "decision"]
+    assert len({round(minutes, 3) for minutes in decided}) <= 3  # one schedule's beginning per reactor, in all lives
+    assert len(state["began"]) == 3
+
+
+@pytest.mark.parametrize("override", ["kills=0", "runs=300", "speed=0", "early=2"])
+def test_bad_values_are_named(override: str) -> None:
+    with pytest.raises(app.UserError, match=f"{override.split('=')[0]} = .*allowed"):
+        app.load(app.compose("kill_campaign", [override]), KillConfig())

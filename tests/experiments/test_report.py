@@ -1,0 +1,283 @@
+"""The page: complete, self-contained, and rendered by a real browser; its tables are the summary's numbers."""
+
+from __future__ import annotations
+
+import csv
+import html.parser
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from dqn import policy as policies
+from experiments import app, charts, report, report_benchmark
+from experiments.published import TABLE_2
+from experiments.tables import Best, Table, number, plus_minus, typeset
+from tests.experiments.test_deploy import inverse_policy
+
+ROOT = Path(__file__).parents[2]
+BROWSER = next((b for b in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if b), None)
+VOID = {"meta", "link", "br", "img", "hr"}
+
+
+@pytest.fixture(scope="module")
+def benchmark(tmp_path_factory):
+    """A small benchmark as a user runs it, with everything the page can show but training."""
+    folder = tmp_path_factory.mktemp("report")
+    policies.save(folder / "policy.npz", inverse_policy())
+    done = subprocess.run(
+        [
+            sys.executable, "-m", "experiments.benchmark", "+experiment=beyond", "replicates=4", "workers=1",
+            "calibration=true", f"policy={folder / 'policy.npz'}", f"hydra.run.dir={folder / 'run'}",
+            "studies.beyond.plants=[nominal,bench]", "studies.beyond.controllers=[dqn,pi,inverse,threshold,oracle]",
+            "+studies.setpoint_steps={scenarios:[setpoint_steps],plants:[nominal_noise],controllers:[dqn,pi,mpc]}",
+            "studies.long.controllers=[]",
+        ],
+        capture_output=True, text=True, timeout=280,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def text(benchmark):
+    return (benchmark / "report.html").read_text(encoding="utf-8")
+
+
+class Strict(html.parser.HTMLParser):
+    """Checks that every tag is closed in order, and collects ids and addresses."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in VOID:
+            self.open.append(tag)
+        self.ids += [v for k, v in attrs if k == "id"]
+        self.addresses += [v for k, v in attrs if k in ("href", "src", "xlink:href", "srcset", "data", "action")]
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_page_is_well_formed_and_points_to_nothing_outside(text):
+    page = Strict()
+    page.feed(text)
+    assert page.open == []
+    assert len(page.ids) == len(set(page.ids))
+    assert page.addresses
+    for address in page.addresses:
+        assert address.startswith(("#", "data:"))
+        assert not address.startswith("#") or address[1:] in page.ids
+    assert "http" not in text
+    assert "@import" not in text
+    assert set(re.findall(r"url\((.)", text)) <= {"#"}
+
+
+def test_page_holds_what_it_must(text, benchmark):
+    summary = json.loads((benchmark / "summary.json").read_text())
+    for figure in summary["figures"]:
+        assert figure["title"].replace("'", "&#x27;") in text
+    assert text.count("<svg") == len(summary["figures"]) >= 6
+    for word in ("What was run", "seed", "turbidostat-dqn", "overrides", "T = 1 min", "T = window",
+                 "sensor-noise floor",
+                 "control effort", "plant, pump and start are not the paper"):  # fmt: skip
+        assert word in text
+    for cell in TABLE_2:
+        if cell.scenario == "setpoint_steps":
+            assert number(cell.itae, 4) in text
+    assert "gain_ml_s: 1.11" in text  # the plants' values stand in the unfolded configuration
+
+
+def test_tables_are_the_summarys_numbers(benchmark):
+    summary = json.loads((benchmark / "summary.json").read_text())
+    with open(benchmark / "tables" / "table2_itae.csv", newline="") as f:
+        rows = list(csv.DictReader(f))
+    assert [r["window"] for r in rows] == ["OD 0.8", "OD 0.65", "OD 0.5"]
+    for r, goal in zip(rows, ("0.8", "0.65", "0.5"), strict=True):
+        published = {p.controller: p.itae for p in TABLE_2 if p.window == goal}
+        assert {c: float(r[f"{c}, published"]) for c in published} == published
+        assert r["lowest published"] == min(published, key=lambda c: published[c])
+        ours = {
+            e["controller"]: e for e in summary["rows"]
+            if (e["scenario"], e["plant"], e["window"]) == ("setpoint_steps", "nominal_noise", goal)
+        }  # fmt: skip
+        for c in published:
+            assert r[f"{c}, here"] == plus_minus(ours[c]["itae_mean"], ours[c]["itae_sd"])
+        assert r["lowest here"] == min(ours, key=lambda c: ours[c]["itae_mean"])
+    with open(benchmark / "tables" / "rows.csv", newline="") as f:
+        assert len(list(csv.DictReader(f))) == len(summary["rows"])
+    latex = (benchmark / "tables" / "table2_ise.tex").read_text()
+    assert all(line.count("&") == 8 for line in latex.splitlines() if line.endswith(r"\\"))
+    assert r"\textbf{" in latex
+    assert r"$\pm$" in latex
+
+
+def row(controller, value, window="0.8", scenario="setpoint_steps"):
+    numbers = {"ise_mean": value, "itae_mean": value, "ise_sd": 0.1, "itae_sd": 0.1}
+    return {"controller": controller, "plant": "p", "scenario": scenario, "window": window, "n": 3, **numbers}
+
+
+def test_every_lost_cell_is_said_and_no_other():
+    rows = [row("dqn", 2.0), row("pi", 1.0), row("mpc", 1.5), row("dqn", 1.0, "0.5"), row("pi", 3.0, "0.5")]
+    pair = {"controller": "pi", "against": "dqn", "plant": "p", "scenario": "setpoint_steps", "window": "0.8",
+            "metric": "ise", "difference": -1.0, "ci95": [-2.5, 0.5], "verdict": "no difference shown"}  # fmt: skip
+    said = report_benchmark.losses(rows, [pair])
+    assert len(said) == 4
+    assert said[0] == "OD 0.8, ISE: dqn 2 loses to pi 1; pi minus dqn: -1, 95 % -2.5 to 0.5, which holds 0."
+    assert said[1] == "OD 0.8, ISE: dqn 2 loses to mpc 1.5."
+    assert all(s.startswith("OD 0.8, ITAE") for s in said[2:])
+    assert report_benchmark.losses([row("dqn", 1.0), row("pi", 2.0)], []) == []
+
+
+def test_published_losses_are_the_papers():
+    """The PI beats the published DQN in three of the four temperature numbers, the MPC in the other (Table 2)."""
+    said = report_benchmark.published_losses()
+    assert [s for s in said if "°C" in s] == ["37 °C ISE (mpc)", "30 °C ISE (pi)", "37 °C ITAE (pi)", "30 °C ITAE (pi)"]
+    assert "OD 0.5 ISE" not in " ".join(said)
+    assert "OD 0.5 ITAE" not in " ".join(said)
+
+
+def test_numbers_are_readable():
+    assert [number(v) for v in (0.0, 1234.5, 0.01234, 7.3e-5, 1e6)] == ["0", "1234", "0.0123", "7.3e-5", "1000000"]
+    assert number(None) == number(float("nan")) == "–"
+    assert plus_minus(0.5, 1e-16) == "0.5"
+    assert plus_minus(9.81, 0.912) == "9.81 ± 0.91"
+    assert typeset("a-b -1 <2> [-3, 1e-5]") == "a-b −1 &lt;2&gt; [−3, 1e-5]"
+
+
+def test_a_table_escapes_what_each_format_reads_as_its_own():
+    table = Table("t", "50 % & more_", ("a", "b"), (("x<y", Best("1,5")),))
+    assert "x&lt;y" in table.html()
+    assert list(csv.reader(table.csv().splitlines())) == [["a", "b"], ["x<y", "1,5"]]
+    assert r"50 \% \& more\_" in table.latex()
+    assert r"x$<$y & \textbf{1,5} \\" in table.latex()
+    with pytest.raises(ValueError, match="row of 1 cells under 2 headings"):
+        Table("t", "", ("a", "b"), (("x",),))
+
+
+def run_folder(folder: Path, summary: dict) -> Path:
+    folder.mkdir(parents=True)
+    app.write_json(folder / "summary.json", summary)
+    (folder / "config.yaml").write_text("seed: 7\nenv:\n  mu: 0.03 # <1/min>\n")
+    return folder
+
+
+def figure():
+    drawn, (ax,) = charts.new_figure(3, 2)
+    ax.plot([0, 1], [1, 2])
+    return drawn
+
+
+def test_any_run_gets_a_page(tmp_path):
+    """Scalars, nested values, lists of entries, figures with and without SVG."""
+    windows = [{"reactor": "M0", "ise": 0.25}, {"reactor": "M1", "ise": None, "note": "x & y"}]
+    run = run_folder(tmp_path / "run", {"outcome": "done", "mu": {"value": 0.0301, "ci95": [0.02, 0.04]}, "w": windows})
+    charts.save(figure(), run / "figures", "both")
+    figure().savefig(run / "fit.png")
+    text = report.write(run).read_text(encoding="utf-8")
+    page = Strict()
+    page.feed(text)
+    assert page.open == []
+    assert text.count("<svg") == 1
+    assert text.count("data:image/png;base64,") == 1
+    for word in ("mu.value", "0.0301", "0.02, 0.04", "x &amp; y", "both", "fit", "seed: 7", "&lt;1/min&gt;"):
+        assert word in text
+    assert list(csv.reader((run / "tables" / "w.csv").read_text().splitlines())) == [
+        ["reactor", "ise", "note"], ["M0", "0.25", "–"], ["M1", "–", "x & y"]
+    ]  # fmt: skip
+
+
+def test_a_folder_of_runs_gets_one_page(tmp_path):
+    for name in ("1_calibrate", "2_train"):
+        run_folder(tmp_path / "demo" / name, {"value": name})
+    text = report.write(tmp_path / "demo").read_text(encoding="utf-8")
+    assert text.index("Calibrate: results") < text.index("Train: results")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(None, "no summary.json"), ("{torn", "damaged"), (b"\xff\xfe\x00", "damaged")],
+)
+def test_what_is_no_run_ends_in_one_line(content, message, tmp_path):
+    if content is not None:
+        data = content.encode() if isinstance(content, str) else content
+        (tmp_path / "summary.json").write_bytes(data)
+    with pytest.raises(app.UserError, match=message):
+        report.write(tmp_path)
+
+
+def test_latest_is_the_newest_run(tmp_path):
+    with pytest.raises(app.UserError, match="no finished run"):
+        report.find("latest", tmp_path)
+    old, new = (run_folder(tmp_path / "train" / name, {}) for name in ("z", "a"))
+    os.utime(old / "summary.json", (1, 1))
+    assert report.find("latest", tmp_path) == new
+    with pytest.raises(app.UserError, match="no such folder"):
+        report.find(str(tmp_path / "nowhere"))
+
+
+def chromium(folder: Path, page: Path, *arguments: str) -> str:
+    assert BROWSER is not None
+    done = subprocess.run(
+        [
+            BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
+            "--disable-background-networking", f"--user-data-dir={folder / 'profile'}", "--window-size=1300,2400",
+            *arguments, page.as_uri(),
+        ],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+PROBE = """<script>addEventListener('load', () => {
+  const of = (selector) => [...document.querySelectorAll(selector)];
+  document.body.dataset.probe = JSON.stringify({
+    requests: performance.getEntriesByType('resource').map((e) => e.name).filter((n) => !n.startsWith('data:')),
+    figures: of('svg').map((s) => [s.getBoundingClientRect().width, s.getBoundingClientRect().height]),
+    labels: of('svg text').filter((t) => t.getBoundingClientRect().width > 0).length,
+    tables: of('table').length,
+    sideways: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+  });
+});</script></body>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)")
+def test_a_browser_shows_the_page(benchmark, tmp_path):
+    """Rendered for real: figures have their size, text its width, nothing is asked from anywhere, nothing overflows."""
+    page = tmp_path / "probed.html"
+    page.write_text((benchmark / "report.html").read_text(encoding="utf-8").replace("</body>", PROBE), encoding="utf-8")
+    dom = chromium(tmp_path, page, "--dump-dom")
+    found = json.loads(re.search(r'data-probe="([^"]*)"', dom)[1].replace("&quot;", '"'))
+    assert found["requests"] == []
+    assert found["sideways"] == 0
+    assert found["tables"] >= 5
+    assert found["labels"] > 100
+    assert len(found["figures"]) >= 6
+    assert all(width > 300 and height > 150 for width, height in found["figures"])
+
+    picture = tmp_path / "page.png"
+    chromium(tmp_path, benchmark / "report.html", f"--screenshot={picture}")
+    image = imread(picture)[..., :3]
+    assert image.shape[1] == 1300
+    assert image[5, 5] == pytest.approx(np.array([0x0B, 0x5C, 0x8A]) / 255, abs=0.02)  # the header's colour
+    body = image[300:, :1200]
+    assert 0.02 < np.mean(body.min(axis=2) < 0.6) < 0.5  # ink on paper
+    assert len(np.unique((body[::4, ::4] * 8).astype(int).reshape(-1, 3), axis=0)) > 20  # drawn in colour

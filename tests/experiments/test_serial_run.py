@@ -1,0 +1,78 @@
+"""A run over the serial line as a user starts it, with the cable pulled and plugged in again."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+
+from experiments.fault_case import audit_doses
+from hardware.emulator_bench import Dose
+from hardware.emulator_process import EmulatorProcess
+from hardware.journal import read_journal
+from tests.hardware.test_serial_transport import Cable, cable  # noqa: F401  (a fixture)
+
+ROOT = Path(__file__).parents[2]
+SPEED = 60.0
+
+
+def rows(folder: Path, name: str) -> list[float]:
+    path = folder / "recordings" / f"{name}.csv"
+    if not path.exists():
+        return []
+    with open(path, newline="") as f:
+        return [60.0 * float(row["time_min"]) for row in csv.DictReader(f)]
+
+
+def test_the_line_is_unplugged_for_three_minutes(
+    cable: tuple[Cable, EmulatorProcess],  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    line, device = cable
+    folder = tmp_path / "run"
+    scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]", "controller=inverse"]
+    link = ["backend=chibio", "backend/transport=serial", f"backend.transport.port={line.pc}"]
+    numbers = [f"backend.speed={SPEED}", "backend.reactors=[M0,M1]", f"hydra.run.dir={folder}"]
+    command = [sys.executable, "-m", "experiments.deploy", *scenario, *link, *numbers]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    client = subprocess.Popen(
+        command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=tmp_path
+    )
+
+    def wait(condition: object, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():  # type: ignore[operator]
+            assert client.poll() is None, client.communicate()[0]
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+
+    wait(lambda: len(rows(folder, "M1")) >= 3, 40.0)
+    line.unplug()
+    before = len(rows(folder, "M1"))
+    time.sleep(180.0 / SPEED)
+    line.plug()
+    wait(lambda: len(rows(folder, "M1")) >= before + 4, 40.0)
+    client.send_signal(signal.SIGINT)
+    said = client.communicate(timeout=60.0)[0]
+    assert client.returncode == 0, said
+    assert "pumps verified off" in said
+    journal, torn = read_journal(folder / "journal.jsonl")
+    assert torn == 0
+    for name in ("M0", "M1"):
+        gaps = np.diff(rows(folder, name))
+        assert (gaps > 90.0).sum() == 1
+        assert gaps.max() < 180.0 + 150.0  # the minutes in between, and until the next sample was noticed
+        with urllib.request.urlopen(f"{device.control}/_emulator/doses/{name}", timeout=10.0) as answer:
+            doses = [Dose(**dose) for dose in json.load(answer)]
+        first = next(row for row in journal if row["kind"] == "intent" and row["reactor"] == name and row["feed_ml"])
+        zero = doses[0].start_s - first["on_s"] - 20.0  # a few slow requests lie between an intent and its dose
+        assert audit_doses(journal, doses, name, zero)[0] == 0
+    with urllib.request.urlopen(f"{device.control}/_emulator/truth", timeout=10.0) as answer:
+        truth = json.load(answer)
+    assert not any(any(truth[name]["motors"].values()) for name in ("M0", "M1"))

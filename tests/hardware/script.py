@@ -1,0 +1,76 @@
+"""A device that is a list: every request must be the next one expected, and gets the answer written beside it."""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hardware.clock import VirtualClock
+from hardware.emulator_device import ChiBioDevice
+from hardware.errors import LinkError
+from hardware.transport import Reply
+
+DONE = Reply(204, b"")
+
+
+def state(name: str = "M0", **changes: Any) -> dict[str, Any]:
+    """sysData of a reactor in a running experiment with one sample; `changes` by dotted path with __ for the dots."""
+    device = ChiBioDevice(("M0", "M1"), VirtualClock(), np.random.default_rng(0))
+    device.select(name)
+    data: dict[str, Any] = json.loads(device.sysdata())
+    data["OD0"].update(target=14000.0, raw=9000.0)
+    data["Experiment"].update(ON=1, cycles=1, startTime="2026-01-01 00:00:00")
+    data["Thermostat"]["ON"] = data["Stir"]["ON"] = 1
+    data["time"]["record"], data["OD"]["record"], data["ThermometerIR"]["record"] = [0.07], [0.36], [37.0]
+    for path, value in changes.items():
+        *groups, key = path.split("__")
+        node = data
+        for group in groups:
+            node = node[group]
+        node[key] = value
+    return data
+
+
+def answer(data: dict[str, Any]) -> Reply:
+    return Reply(200, json.dumps(data).encode())
+
+
+class Script:
+    """Expects `steps` of (request, answer), request as "POST /path"; an answer that is an exception is raised."""
+
+    def __init__(self, steps: Sequence[tuple[str, Reply | Exception]]) -> None:
+        self.steps = list(steps)
+
+    def _next(self, request: str) -> Reply:
+        assert self.steps, f"unexpected {request}"
+        expected, reply = self.steps.pop(0)
+        assert request == expected
+        if isinstance(reply, Exception):
+            raise reply
+        return reply
+
+    def get(self, path: str) -> Reply:
+        return self._next(f"GET {path}")
+
+    def post(self, path: str) -> Reply:
+        return self._next(f"POST {path}")
+
+    def disarm(self) -> None:
+        pass
+
+    def close(self) -> None:
+        assert not self.steps, f"never asked: {self.steps}"
+
+
+def read(data: dict[str, Any], name: str = "M0") -> list[tuple[str, Reply | Exception]]:
+    """The pair of requests that reads `name`."""
+    return [(f"POST /changeDevice/{name}", DONE), ("GET /getSysdata/", answer(data))]
+
+
+def posts(*paths: str) -> list[tuple[str, Reply | Exception]]:
+    """POSTs that succeed."""
+    return [(f"POST {path}", DONE) for path in paths]
+
+
+LOST = LinkError("no answer")

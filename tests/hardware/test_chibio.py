@@ -1,0 +1,620 @@
+"""The driver against the emulated device in virtual time: doses, timing, traps, recovery, resume."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware.chibio import ChiBioReactors
+from hardware.chibio_config import ChiBioConfig
+from hardware.errors import DeviceStateError, RecordingError
+from hardware.pumps import Rig
+from hardware.reactor import Command
+from hardware.saved import replay
+from tests.hardware.driver_lab import SOUND, Bed
+from tests.hardware.emulator_lab import quiet
+
+
+def doses(bed: Bed, name: str = "M0", pump: str = "Pump1") -> list[tuple[float, float]]:
+    """(start, length) of every run of a motor, device s."""
+    bed.device.run_until(bed.clock.now())
+    return [(d.start_s, d.seconds) for d in bed.device.benches[name].doses if d.pump == pump]
+
+
+def fixed(bed: Bed, rate: float) -> None:
+    bed.controller = lambda m: np.full(len(bed.names), rate)
+
+
+# -- a healthy run ---------------------------------------------------------------------------------------------------
+
+
+def test_three_reactors_are_held_for_two_hours_without_a_missed_or_doubled_minute() -> None:
+    bed = Bed(("M0", "M1", "M2"))
+    bed.reactors.begin()
+    bed.run(120)
+    bed.reactors.stop()
+    assert np.all(bed.samples >= 118)
+    od = np.array([m.od for m in bed.measurements[-180:]])
+    assert np.abs(od - 0.5).mean() < 0.01
+    for i, name in enumerate(bed.names):
+        starts = [t for t, _ in doses(bed, name)]
+        assert np.diff(starts).min() > 35.0  # the first is late: the start of the others was waited for
+        assert np.diff(starts)[2:].min() > 55.0
+        acted = [tuple(r["sample"]) for r in bed.of("intent") if r["reactor"] == name]
+        assert len(set(acted)) == len(acted)
+        assert bed.truth(name)["feed_ml"] == pytest.approx(bed.fed[i], rel=0.08)
+        assert bed.truth(name)["peak_ml"] < 20.5
+    assert bed.motors_off()
+    assert bed.of("fault") == []
+    assert "undosed" not in bed.kinds()
+
+
+def test_the_requests_of_one_dose_are_those_of_single_shot_dosing() -> None:
+    bed = Bed(options=quiet())
+    fixed(bed, 0.0125)
+    bed.reactors.begin()
+    bed.step()
+    begun = len(bed.wire.posts)
+    bed.run(0.5)
+    posts = [(t, path) for t, path in bed.wire.posts[begun - 6 :] if not path.startswith("/changeDevice")]
+    feed, waste = 0.75 - 0.06, 4.0 * (0.75 - 0.06) + 4.4  # seconds
+    assert [path.rsplit("/", 1)[0] for _, path in posts[:2]] == [
+        "/SetOutputTarget/Pump2/M0",
+        "/SetOutputTarget/Pump1/M0",
+    ]
+    assert [63.0 * float(path.rsplit("/", 1)[1]) for _, path in posts[:2]] == pytest.approx([waste, feed], abs=1e-3)
+    assert [path for _, path in posts[2:4]] == ["/SetOutputOn/Pump2/1/M0", "/SetOutputOn/Pump1/1/M0"]
+    on_s = posts[3][0]
+    off = [t for t, path in posts[4:] if path == "/SetOutputOn/Pump1/0/M0"]
+    assert off[0] - on_s == pytest.approx(feed + 0.5, abs=0.1)
+    assert [path for _, path in posts[5:10]] == [
+        *(f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 2, 3, 4)),
+        "/MeasureTemp/IR/M0",
+    ]
+    assert posts[5][0] - on_s == pytest.approx(waste + 0.5, abs=0.1)
+    assert doses(bed) == [(pytest.approx(on_s, abs=0.1), pytest.approx(feed + 0.1, abs=0.01))]
+
+
+def test_a_dose_ends_before_the_next_measurement_and_the_pumps_are_off_most_of_the_time() -> None:
+    bed = Bed(("M0", "M1"))
+    fixed(bed, 0.02)
+    bed.reactors.begin()
+    bed.run(30)
+    for name in bed.names:
+        starts = np.array(bed.peek_cycles(name))
+        for pump in ("Pump1", "Pump2"):
+            for start, length in doses(bed, name, pump):
+                phase = (start - starts[starts <= start][-1]) % 60.07
+                assert phase > 12.5
+                assert phase + length < 55.0
+
+
+def test_doses_of_several_reactors_overlap() -> None:
+    bed = Bed(("M0", "M1", "M2", "M3"))
+    fixed(bed, 0.02)
+    for name in bed.names:  # all in one phase: four waste doses of 9 to 16 s do not fit one after another
+        bed.device.handle("POST", f"/Experiment/1/{name}")
+    bed.reactors.begin()
+    bed.run(10)
+    assert bed.samples.min() >= 9
+    begun = [doses(bed, name, "Pump2")[-1] for name in bed.names]
+    ends = [start + length for start, length in begun]
+    assert min(ends) > max(start for start, _ in begun)
+
+
+def test_starts_are_staggered_inside_the_minute() -> None:
+    bed = Bed(("M0", "M1", "M2"))
+    bed.reactors.begin()
+    starts = [t for t, path in bed.wire.posts if path.startswith("/Experiment/1")]
+    assert np.diff(starts) == pytest.approx([20.0, 20.0], abs=1.5)
+
+
+def test_no_forbidden_request_in_a_run_with_every_trouble() -> None:
+    bed = Bed(("M0", "M1"))
+    bed.reactors.begin()
+    for name, value in (("lost_reply", 3), ("worker_wipe", 1), ("cycle_dead", 1), ("foreign_selects", 0.2)):
+        bed.run(5)
+        bed.fault(name, value)
+    bed.run(10)
+    bed.fault("foreign_selects", 0)
+    bed.reactors.stop()
+    words = {path.split("/")[1] for _, path in bed.wire.posts}
+    assert words == {
+        "changeDevice", "SetOutputTarget", "SetOutputOn", "CalibrateOD", "MeasureTemp", "Experiment",
+    }  # fmt: skip
+    targets = [float(p.split("/")[4]) for _, p in bed.wire.posts if p.startswith("/SetOutputTarget/Pump1")]
+    assert max(targets) <= 0.05
+
+
+# -- start -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_running_experiment_is_adopted_not_started_again() -> None:
+    bed = Bed()
+    bed.device.handle("POST", "/Experiment/1/M0")
+    bed.clock.sleep(200.0)
+    bed.reactors.begin()
+    assert not [p for _, p in bed.wire.posts if p.startswith("/Experiment")]
+    first = bed.step()
+    assert first.fresh[0]
+    assert bed.of("sample")[0]["sample"][0] > 180.0  # the one that was there already is not delivered
+
+
+def test_a_start_whose_answer_is_lost_is_not_repeated_before_the_state_was_read() -> None:
+    bed = Bed()
+    bed.reactors.stations[0].unit.read()
+    inner = bed.wire.inner
+    real = inner.post
+
+    def losing(path: str) -> Any:
+        if path == "/Experiment/1/M0":
+            bed.fault("lost_reply", 1)
+        return real(path)
+
+    inner.post = losing  # type: ignore[method-assign]
+    bed.reactors.begin()
+    bed.run(3)
+    assert len([p for _, p in bed.wire.posts if p == "/Experiment/1/M0"]) == 1
+    assert bed.samples[0] >= 2
+
+
+def test_a_start_soon_after_a_stop_waits_for_the_old_cycle() -> None:
+    bed = Bed()
+    bed.device.handle("POST", "/Experiment/1/M0")
+    bed.clock.sleep(90.0)
+    bed.device.handle("POST", "/Experiment/0/M0")
+    bed.reactors.begin()
+    bed.run(5)
+    data = bed.device.apps["M0"].data
+    assert data["Thermostat"]["ON"] == 1
+    assert data["Stir"]["ON"] == 1
+    assert not [row for row in bed.of("note") if "was off" in row["note"]]
+
+
+def test_a_thermostat_lost_to_the_restart_trap_is_switched_on_again() -> None:
+    bed = Bed()
+    for force, pause in ((1, 90.0), (0, 1.0), (1, 5.0)):
+        bed.device.handle("POST", f"/Experiment/{force}/M0")
+        bed.clock.sleep(pause)
+    bed.reactors.begin()
+    bed.run(4)
+    assert bed.device.apps["M0"].data["Thermostat"]["ON"] == 1
+    assert [row["note"] for row in bed.of("note") if "Thermostat was off" in row["note"]]
+
+
+def test_pumps_found_on_are_switched_off_before_anything_else() -> None:
+    bed = Bed()
+    for path in ("/SetOutputTarget/Pump1/M0/0.02", "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/OD/1/M0"):
+        bed.device.handle("POST", path)
+    bed.reactors.begin()
+    assert bed.motors_off()
+    assert bed.device.apps["M0"].data["OD"]["ON"] == 0
+
+
+def test_zigzag_is_refused_with_the_remedy() -> None:
+    bed = Bed()
+    bed.device.handle("POST", "/SetOutputOn/Zigzag/1/M0")
+    with pytest.raises(DeviceStateError, match="Zigzag is on; switch it off"):
+        bed.reactors.begin()
+
+
+def test_a_stored_blank_replaces_the_devices() -> None:
+    bed = Bed(blanked=False)
+    rig = Rig(SOUND.feed, SOUND.waste, blank=bed.device.benches["M0"].blank)
+    bed.reactors = ChiBioReactors(bed.wire, bed.clock, bed.config, [rig], bed.log)
+    bed.reactors.begin()
+    bed.run(3)
+    assert bed.measurements[-1].od[0] == pytest.approx(0.5, abs=0.06)
+
+
+# -- samples ---------------------------------------------------------------------------------------------------------
+
+
+def test_one_sample_is_acted_on_once() -> None:
+    bed = Bed()
+    bed.reactors.begin()
+    m = bed.reactors.measure()
+    command = Command(m.fresh, np.array([0.02]), np.array([37.0]))
+    assert bed.reactors.actuate(command).volume_ml[0] == pytest.approx(1.2, abs=0.01)
+    again = bed.reactors.actuate(command)
+    assert again.volume_ml[0] == 0.0
+    assert "no new sample" in again.notes[0]
+
+
+def test_a_decision_that_comes_too_late_doses_nothing() -> None:
+    bed = Bed()
+    bed.reactors.begin()
+    m = bed.reactors.measure()
+    bed.clock.sleep(33.0)
+    receipt = bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+    assert receipt.volume_ml[0] == 0.0
+    assert "before the next measurement" in receipt.notes[0]
+    assert not doses(bed)
+
+
+def test_without_samples_measure_returns_after_100_s_and_says_how_old_the_newest_is() -> None:
+    bed = Bed(recover=False)
+    bed.reactors.begin()
+    bed.run(3)
+    last = bed.clock.now()
+    bed.fault("cycle_dead")
+    while (m := bed.reactors.measure()).fresh.any():
+        last = bed.clock.now()
+    assert m.vitals is not None
+    assert 100.0 <= bed.clock.now() - last < 125.0
+    assert m.vitals.age_s[0] >= 100.0
+    fault = bed.reactors.measure().vitals.faults[0]  # type: ignore[union-attr]
+    assert fault is not None
+    assert fault.kind == "stalled"
+
+
+def test_a_lost_link_is_a_fault_not_an_exception_and_a_day_of_it_does_no_harm() -> None:
+    bed = Bed()
+    bed.reactors.begin()
+    bed.run(5)
+    bed.fault("crash")
+    bed.run(1440)
+    assert {"link", "stale", "lost", "silent"} <= bed.kinds()
+    assert len(bed.of("fault")) < 5  # not a row per try
+
+
+# -- failures of requests --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", ["lost_reply", "lost_request", "reset_before", "reset_after", "malformed"])
+@pytest.mark.parametrize("request_number", range(14))
+def test_no_failed_request_doubles_a_dose_or_leaves_a_pump_on(fault: str, request_number: int) -> None:
+    """Whichever request of a dose, from its targets to its verification, goes wrong."""
+    bed = Bed(options=quiet(mu=0.025))
+    fixed(bed, 0.0)
+    bed.reactors.begin()
+    bed.run(3)
+    assert not doses(bed)
+    fixed(bed, 0.02)
+    asked = 0
+    inner = bed.wire.inner
+    real = inner._request
+
+    def failing(method: str, path: str) -> Any:
+        nonlocal asked
+        if (asked := asked + 1) == request_number + 1:
+            bed.fault(fault, 1)
+        return real(method, path)
+
+    while not (m := bed.reactors.measure()).fresh[0]:
+        pass
+    inner._request = failing  # type: ignore[method-assign]
+    receipt = bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+    for _ in range(4):  # it also returns to tell of a link in trouble
+        bed.reactors.measure()
+    given = doses(bed)
+    assert len(given) <= 1
+    assert sum(length for _, length in given) <= receipt.volume_ml[0] + 0.1
+    assert bed.motors_off()
+    assert bed.of("dose_end")
+
+
+def test_a_link_that_dies_in_a_dose_is_told_within_a_time_out() -> None:
+    """Ends of doses that time out again and again must not keep the loop from hearing of it."""
+    bed = Bed(names=("M0", "M1"))
+    bed.reactors.begin()
+    bed.run(3)
+    fixed(bed, 0.02)
+    while not bed.step().fresh[0]:
+        pass
+    bed.fault("lost_request", -1)
+    began = bed.clock.now()
+    while "link" not in bed.verdicts[-1].kinds[0]:
+        bed.step()
+    assert bed.clock.now() - began < 60.0
+    bed.fault("lost_request", 0)
+    bed.run(3)
+    assert bed.motors_off()
+
+
+def test_targets_changed_by_someone_are_set_back() -> None:
+    bed = Bed()
+    bed.reactors.begin()
+    bed.run(3)
+    for item, value in (("Thermostat", 30), ("Stir", 0.1)):
+        bed.device.handle("POST", f"/SetOutputTarget/{item}/M0/{value}")
+    bed.run(3)
+    data = bed.device.apps["M0"].data
+    assert (data["Thermostat"]["target"], data["Stir"]["target"]) == (37.0, 0.5)
+    assert sum("set back to" in row["note"] for row in bed.of("note")) == 2
+
+
+def test_a_pump_that_someone_switches_on_is_told_and_switched_off() -> None:
+    bed = Bed()
+    fixed(bed, 0.0)
+    bed.reactors.begin()
+    bed.run(3)
+    bed.device.handle("POST", "/SetOutputTarget/Pump1/M0/0.008")
+    bed.device.handle("POST", "/SetOutputOn/Pump1/1/M0")
+    bed.run(4)
+    assert "pump" in bed.kinds()
+    assert len(doses(bed)) <= 2
+    assert bed.motors_off()
+    assert bed.reactors.stations[0].fault is None
+
+
+def test_no_dose_when_the_device_lies() -> None:
+    bed = Bed()
+    bed.reactors.begin()
+    fixed(bed, 0.0)
+    bed.run(2)
+    fixed(bed, 0.02)
+    bed.fault("lying", -1)
+    bed.run(10)
+    assert not doses(bed)
+    assert "undosed" in bed.kinds()
+    assert any("not as set" in row["note"] for row in bed.of("note"))
+
+
+def test_a_pump_that_no_command_reaches_is_reported() -> None:
+    bed = Bed(stop_s=10.0)
+    fixed(bed, 0.02)
+    bed.reactors.begin()
+    while not bed.step().fresh.any():
+        pass
+    bed.fault("lying", -1)
+    bed.run(3)
+    assert "pump" in bed.kinds()
+    assert len(bed.of("intent")) == 1
+    with pytest.raises(DeviceStateError, match="still on"):
+        bed.reactors.stop()
+
+
+def test_a_bus_that_hangs_while_pumping_is_ended_within_a_minute() -> None:
+    bed = Bed()
+    fixed(bed, 0.02)
+    bed.reactors.begin()
+    bed.run(3)
+    bed.fault("bus_stuck_when_pumping")
+    bed.run(5)
+    assert max(length for _, length in doses(bed)) < 45.0
+    assert bed.device.restarts == 1
+    bed.run(5)
+    assert bed.reactors.stations[0].fault is None
+    assert bed.truth()["peak_ml"] < 25.0
+
+
+def test_another_client_that_switches_regulation_on_is_not_fought() -> None:
+    bed = Bed()
+    fixed(bed, 0.02)
+    bed.reactors.begin()
+    bed.run(3)
+    bed.device.handle("POST", "/SetOutputOn/OD/1/M0")
+    bed.run(2)
+    mine = len(bed.wire.posts)
+    bed.run(5)
+    assert "mode" in bed.kinds()
+    assert not [p for _, p in bed.wire.posts[mine:] if p.startswith("/SetOutputTarget/Pump")]
+
+
+def test_a_blank_changed_by_someone_stops_dosing() -> None:
+    bed = Bed()
+    bed.reactors.begin()
+    bed.run(3)
+    bed.device.handle("POST", "/CalibrateOD/OD0/M0/9000/0")
+    begun = len(bed.of("intent"))
+    bed.run(5)
+    assert "blank" in bed.kinds()
+    assert len(bed.of("intent")) == begun
+
+
+def test_exchanged_reactors_end_control_of_both() -> None:
+    bed = Bed(("M0", "M1"))
+    bed.reactors.begin()
+    bed.run(3)
+    apps = bed.device.apps
+    a, b = apps["M0"].data, apps["M1"].data
+    a["DeviceID"], b["DeviceID"] = b["DeviceID"], a["DeviceID"]
+    mine = len(bed.wire.posts)
+    bed.run(5)
+    assert "identity" in bed.kinds()
+    assert {p.split("/")[1] for _, p in bed.wire.posts[mine + 30 :]} == {"changeDevice"}
+
+
+# -- recovery --------------------------------------------------------------------------------------------------------
+
+
+def test_a_device_that_lost_its_memory_is_restored() -> None:
+    bed = Bed(("M0", "M1"))
+    bed.reactors.begin()
+    bed.run(10)
+    blanks = [bed.device.apps[n].data["OD0"]["target"] for n in bed.names]
+    bed.target_c[:] = 34.0
+    bed.run(3)
+    bed.fault("worker_wipe")
+    bed.run(10)
+    assert "restarted" in bed.kinds()
+    for name, blank in zip(bed.names, blanks, strict=True):
+        data = bed.device.apps[name].data
+        assert data["OD0"]["target"] == pytest.approx(blank)
+        assert data["Thermostat"]["target"] == 34.0
+        assert data["Experiment"]["ON"] == 1
+        assert data["Experiment"]["cycles"] >= 7
+    assert bed.samples.min() >= 20
+
+
+def test_a_dead_thread_is_restarted_and_the_neighbour_never_notices() -> None:
+    bed = Bed(("M0", "M1"))
+    bed.reactors.begin()
+    bed.run(5)
+    bed.fault("cycle_dead", 1, "M0")
+    before = bed.samples.copy()
+    bed.run(12)
+    got = bed.samples - before
+    assert got[1] >= 11
+    assert 6 <= got[0] <= 10
+    assert "stalled" in bed.kinds()
+    data = bed.device.apps["M0"].data
+    assert data["Thermostat"]["ON"] == data["Stir"]["ON"] == 1
+
+
+def test_the_hot_guard_switches_heating_off_for_good() -> None:
+    bed = Bed()
+    bed.reactors.begin()
+    bed.run(5)
+    bed.reactors.heat_off(np.array([True]))
+    bed.run(5)
+    data = bed.device.apps["M0"].data
+    assert data["Thermostat"]["ON"] == data["Heat"]["ON"] == 0
+    bed.fault("worker_wipe")
+    bed.run(5)
+    assert bed.device.apps["M0"].data["Thermostat"]["ON"] == 0
+
+
+def test_handing_over_leaves_a_culture_that_regulates_itself() -> None:
+    bed = Bed()
+    bed.reactors.begin()
+    bed.run(5)
+    assert bed.reactors.regulate(np.array([True]), np.array([0.5])) == []
+    bed.run(30)
+    bed.reactors.stop()  # leaves it to itself
+    data = bed.device.apps["M0"].data
+    assert data["OD"]["ON"] == 1
+    assert bed.truth()["od"] == pytest.approx(0.5, abs=0.1)
+    assert bed.reactors.stations[0].fault is None
+
+
+# -- end and resume --------------------------------------------------------------------------------------------------
+
+
+def test_stop_in_the_middle_of_a_dose_is_verified_and_idempotent() -> None:
+    bed = Bed(("M0", "M1"))
+    fixed(bed, 0.02)
+    bed.reactors.begin()
+    bed.run(2)
+    while not bed.step().fresh.any():
+        pass
+    bed.clock.sleep(0.3)
+    assert not bed.motors_off()
+    bed.reactors.stop()
+    assert bed.motors_off()
+    bed.reactors.stop()
+    assert bed.device.apps["M0"].data["Experiment"]["ON"] == 1
+    bed.clock.sleep(300.0)
+    assert bed.motors_off()
+
+
+def test_a_stop_that_cannot_be_verified_says_so_and_what_to_do() -> None:
+    bed = Bed(stop_s=20.0)
+    bed.reactors.begin()
+    bed.fault("crash")
+    with pytest.raises(DeviceStateError, match="M0: .*refused.*by hand"):
+        bed.reactors.stop()
+
+
+def test_end_stops_the_experiments_too() -> None:
+    bed = Bed(("M0", "M1"))
+    bed.reactors.begin()
+    bed.run(3)
+    bed.reactors.end()
+    assert all(bed.device.apps[n].data["Experiment"]["ON"] == 0 for n in bed.names)
+
+
+def test_an_intent_that_cannot_be_written_prevents_the_dose() -> None:
+    bed = Bed()
+
+    def full(kind: str, fields: Any) -> None:
+        if kind == "intent":
+            raise RecordingError("journal: No space left on device")
+
+    bed.reactors = ChiBioReactors(bed.wire, bed.clock, bed.config, [SOUND], full)
+    bed.reactors.begin()
+    m = bed.reactors.measure()
+    with pytest.raises(RecordingError):
+        bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+    assert not doses(bed)
+    bed.reactors.stop()
+
+
+def test_a_full_disk_does_not_stand_in_the_way_of_pumps_off() -> None:
+    bed = Bed()
+    fixed(bed, 0.02)
+    bed.reactors.begin()
+    m = bed.reactors.measure()
+    bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+
+    def full(kind: str, fields: Any) -> None:
+        raise RecordingError("journal: No space left on device")
+
+    bed.reactors._log = full
+    with pytest.raises(RecordingError):
+        bed.reactors.measure()
+    bed.reactors.stop()
+    assert bed.motors_off()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_killed_at_a_random_request_and_resumed_no_sample_is_dosed_twice(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    bed = Bed(options=quiet(mu=0.025))
+    fixed(bed, 0.02)
+    bed.reactors.begin()
+    bed.run(4)
+    fatal = len(bed.wire.posts) + int(rng.integers(1, 60))
+    real = bed.wire.inner.post
+
+    class Killed(BaseException):
+        pass
+
+    def dying(path: str) -> Any:
+        if len(bed.wire.posts) >= fatal:
+            raise Killed
+        return real(path)
+
+    bed.wire.inner.post = dying  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        bed.run(60)
+    bed.wire.inner.post = real  # type: ignore[method-assign]
+    began = bed.reactors.elapsed()
+    dead_s = float(rng.uniform(1.0, 200.0))
+    bed.clock.sleep(dead_s)
+    rows = json.loads(json.dumps(bed.rows))
+    bed.client()
+    bed.reactors.begin(replay(rows), began + dead_s)
+    assert bed.motors_off()
+    bed.run(5)
+    bed.reactors.stop()
+    acted = [tuple(r["sample"]) for r in bed.of("intent")]
+    assert len(set(acted)) == len(acted)
+    runs = len(doses(bed))
+    repeats = math.floor(dead_s / 63.0) + 1
+    given = [r for r in bed.of("intent") if r["feed_ml"] > 0]
+    assert len(given) - 2 <= runs  # the kill may have cut one off before it began, and so did the stop at the end
+    assert runs <= len(acted) + repeats
+    assert (
+        bed.truth()["feed_ml"] <= bed.fed[0] + sum(r["feed_ml"] for r in rows if r["kind"] == "intent") + 1.5 * repeats
+    )
+    assert bed.reactors.elapsed() == pytest.approx(began + dead_s + 300.0, abs=70.0)
+
+
+def test_what_the_journal_says_of_a_reactor() -> None:
+    rows = [
+        {"kind": "device", "reactor": "M0", "device_id": "7", "blank": 14000.0, "temperature": 37.0},
+        {"kind": "intent", "reactor": "M0", "sample": [60.0, 2], "feed_ml": 0.5, "waste_ml": 6.0, "carry_ml": 0.0,
+         "doses": 1, "on_s": 75.0},
+        {"kind": "dose_end", "reactor": "M0", "verified_off": True},
+        {"kind": "temperature", "reactor": "M0", "temperature": 30.0},
+        {"kind": "intent", "reactor": "M0", "sample": [120.0, 3], "feed_ml": 0.4, "waste_ml": 6.0, "carry_ml": 0.0,
+         "doses": 2, "on_s": 135.0},
+        {"kind": "command", "reactor": "M0", "path": "/SetOutputOn/Pump1/1/M0", "answer": 204},
+    ]  # fmt: skip
+    saved = replay(rows)["M0"]
+    assert (saved.device_id, saved.blank, saved.sample, saved.doses) == ("7", 14000.0, (120.0, 3), 2)
+    assert (saved.temperature, saved.open, saved.feed_ml, saved.on_s) == (30.0, True, 0.4, 135.0)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("reactors", ("M0", "M0")), ("reactors", ()), ("reactors", ("M9",)), ("speed", 0.0), ("temperature", 55.0),
+     ("lost_s", 90.0), ("window_s", 60.0)],
+)  # fmt: skip
+def test_values_out_of_range_name_key_value_and_range(key: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=rf"backend\.{key} = .*: allowed"):
+        ChiBioConfig(**{key: value})

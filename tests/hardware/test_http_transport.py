@@ -1,0 +1,315 @@
+"""The HTTP link over real sockets: answers, silence, garbage.
+
+FUZZ_CASES=10000 python -m pytest tests/hardware/test_http_transport.py -k fuzz     the long version
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hardware.chibio import ChiBioReactors
+from hardware.chibio_config import ChiBioConfig
+from hardware.clock import RealClock, VirtualClock
+from hardware.emulator_process import EmulatorProcess
+from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
+from hardware.preflight import preflight
+from hardware.pumps import Rig
+from hardware.reactor import Command
+from hardware.transport import HttpTransport, Reply, TransportConfig, open_transport
+from hardware.unit import Unit, no_log
+from tests.hardware.driver_lab import Bed
+from tests.hardware.script import answer, state
+
+FUZZ_CASES = int(os.environ.get("FUZZ_CASES", "100"))
+QUICK = TransportConfig(connect_s=0.4, read_s=0.4, floor_s=0.1)
+OK = b"HTTP/1.1 204 NO CONTENT\r\nDate: Mon, 05 Jan 2026 10:00:00 GMT\r\nConnection: close\r\n\r\n"
+
+
+class Server:
+    """Accepts connections one by one; `behave` gets the connection and the request, its socket is closed after."""
+
+    def __init__(self) -> None:
+        self.behave: Callable[[socket.socket, bytes], None] = lambda c, _: c.sendall(OK)
+        self.requests: list[bytes] = []
+        self._socket = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._socket.getsockname()[1]}"
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                connection, _ = self._socket.accept()
+            except OSError:
+                return
+            with connection, contextlib.suppress(OSError):
+                request = b""
+                while b"\r\n\r\n" not in request and (more := connection.recv(4096)):
+                    request += more
+                self.requests.append(request)
+                self.behave(connection, request)
+
+    def close(self) -> None:
+        if self._socket.fileno() >= 0:
+            self._socket.shutdown(socket.SHUT_RDWR)
+            self._socket.close()
+            self._thread.join(5.0)
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    found = Server()
+    yield found
+    found.close()
+
+
+@contextlib.contextmanager
+def link(url: str) -> Iterator[HttpTransport]:
+    transport = HttpTransport(url, config=QUICK)
+    yield transport
+    transport.close()
+
+
+def test_requests_carry_what_forks_want_and_answers_their_date(server: Server) -> None:
+    with link(server.url) as transport:
+        assert transport.post("/Experiment/1/M0") == Reply(204, b"", "Mon, 05 Jan 2026 10:00:00 GMT")
+    request = server.requests[0].lower()
+    assert request.startswith(b"post /experiment/1/m0 http/1.1\r\n")
+    assert b"x-requested-with: xmlhttprequest" in request
+    assert b"connection: close" in request
+    assert b"accept-encoding: identity" in request
+
+
+def test_a_status_is_handed_on_and_a_redirect_not_followed(server: Server) -> None:
+    server.behave = lambda c, _: c.sendall(b"HTTP/1.1 308 X\r\nLocation: /getSysdata/\r\nContent-Length: 2\r\n\r\nno")
+    with link(server.url) as transport:
+        assert transport.get("/getSysdata") == Reply(308, b"no")
+    assert len(server.requests) == 1
+
+
+def silent(c: socket.socket, _: bytes) -> None:
+    time.sleep(0.8)
+
+
+def dribble(c: socket.socket, _: bytes) -> None:
+    c.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 1000\r\n\r\n")
+    for _ in range(30):
+        c.sendall(b"x")
+        time.sleep(0.05)
+
+
+def reset(c: socket.socket, _: bytes) -> None:
+    c.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+
+
+@pytest.mark.parametrize("behave", [silent, dribble, reset, lambda c, _: None])
+def test_no_answer_is_a_link_error_within_the_time_out(server: Server, behave: Callable[..., None]) -> None:
+    server.behave = behave
+    with link(server.url) as transport:
+        start = time.monotonic()
+        with pytest.raises(LinkError, match="/changeDevice/M0"):
+            transport.post("/changeDevice/M0")
+        assert time.monotonic() - start < 0.75
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        b"SSH-2.0-OpenSSH\r\n\r\n",
+        b"HTTP/1.1 abc\r\n\r\n",
+        b"HTTP/1.1 200 OK\r\nContent-Length: -5\r\n\r\n",
+        b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
+        b"HTTP/1.1 200 OK\r\n\r\n" + 300_000 * b"x",
+        b"\0" * 100,
+    ],
+)
+def test_what_is_not_http_is_a_protocol_error(server: Server, garbage: bytes) -> None:
+    server.behave = lambda c, _: c.sendall(garbage)
+    with link(server.url) as transport, pytest.raises(ProtocolError):
+        transport.get("/getSysdata/")
+
+
+def test_half_an_answer_is_none(server: Server) -> None:
+    server.behave = lambda c, _: c.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 10\r\n\r\n123")
+    with link(server.url) as transport, pytest.raises(LinkError, match="without a whole answer"):
+        transport.get("/getSysdata/")
+
+
+def test_nobody_listens(server: Server) -> None:
+    server.close()
+    with link(server.url) as transport, pytest.raises(LinkError, match="check cable and server"):
+        transport.get("/getSysdata/")
+
+
+def test_an_environment_proxy_is_ignored(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+    monkeypatch.setenv("ALL_PROXY", "http://127.0.0.1:9")
+    with link(server.url) as transport:
+        assert transport.post("/changeDevice/M0").status == 204
+
+
+@pytest.mark.parametrize(
+    "url", ["192.168.7.2:5000", "ftp://x", "http://", "http://x:99999", "http://x/a/", "", "http://[::"]
+)
+def test_a_malformed_address_says_what_is_allowed(url: str) -> None:
+    with pytest.raises(ValueError, match=r"allowed http://host:port"):
+        HttpTransport(url)
+
+
+def test_one_client_per_device(server: Server) -> None:
+    first = open_transport(TransportConfig(), server.url)
+    with pytest.raises(DeviceStateError, match=f"process {os.getpid()}"):
+        open_transport(TransportConfig(), server.url)
+    first.close()
+    open_transport(TransportConfig(), server.url).close()
+
+
+def test_time_outs_shrink_with_speed_down_to_a_floor() -> None:
+    assert TransportConfig().timeout(20.0, 1.0) == 20.0
+    assert TransportConfig().timeout(20.0, 10.0) == 2.0
+    assert TransportConfig().timeout(20.0, 1000.0) == 1.0
+    with pytest.raises(ValueError, match=r"transport.read_s = 30"):
+        TransportConfig(read_s=30.0)
+
+
+# -- garbage of every kind -------------------------------------------------------------------------------------------
+
+STATE = answer(state()).body
+PIECES = st.one_of(
+    st.binary(max_size=60),
+    st.sampled_from(
+        [b"HTTP/1.1 200 OK\r\n", b"HTTP/1.0 204 X\r\n", b"HTTP/1.1 500 E\r\n", b"Content-Length: 5\r\n", b"\r\n", STATE,
+         b"Content-Length: 99999999999999999999\r\n", b"Transfer-Encoding: chunked\r\n", b"Content-Encoding: gzip\r\n",
+         b"5\r\nabcde\r\n", b"0\r\n\r\n", b"{", b"NaN", STATE[: len(STATE) // 2], b"HTTP/1.1 100 Continue\r\n\r\n",
+         b"Content-Length: %d\r\n\r\n" % len(STATE) + STATE]
+    ),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def fuzzed() -> Iterator[Server]:
+    found = Server()
+    yield found
+    found.close()
+
+
+@settings(max_examples=FUZZ_CASES, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(pieces=st.lists(PIECES, max_size=6), whole=st.booleans())
+def test_fuzz_whatever_comes_back_ends_in_an_answer_or_an_error_of_ours(
+    fuzzed: Server, pieces: list[bytes], whole: bool
+) -> None:
+    """A read of a device that answers anything: a verified state or a ReactorError, never another exception."""
+    garbage = (b"HTTP/1.1 200 OK\r\n" if whole else b"") + b"".join(pieces)
+    fuzzed.behave = lambda c, request: c.sendall(OK if request.startswith(b"POST /changeDevice") else garbage)
+    fuzzed.requests.clear()
+    with link(fuzzed.url) as transport:
+        unit = Unit("M0", ("M0",), transport, VirtualClock(), no_log)
+        with contextlib.suppress(ReactorError):
+            assert unit.read().selected == "M0"
+    assert all(r.startswith((b"GET", b"POST /changeDevice")) for r in fuzzed.requests)
+
+
+def test_fuzz_no_dose_on_garbage() -> None:
+    """Damaged states and failing POSTs in a run: never two doses for a sample, never more than was asked."""
+    bed = Bed()
+    bed.reactors.begin()
+    bed.run(2)
+    inner, rng = bed.wire.inner, np.random.default_rng(0)
+    real = inner._request
+
+    def damaged(method: str, path: str) -> Reply:
+        reply = real(method, path)
+        if method == "POST":
+            return Reply(int(rng.choice([204, 204, 204, 500])), b"")
+        body = np.frombuffer(reply.body, dtype=np.uint8).copy()
+        hits = rng.integers(0, 6)
+        body[rng.integers(0, body.size, hits)] = rng.integers(32, 127, hits)
+        return Reply(200, body.tobytes()[: body.size - int(rng.integers(0, 3) == 0)])
+
+    for _ in range(FUZZ_CASES):
+        before = len(bed.wire.posts)
+        bed.clock.sleep(45.0)  # a sample is due
+        inner._request = damaged  # type: ignore[method-assign]
+        m = bed.reactors.measure()
+        bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+        inner._request = real  # type: ignore[method-assign]
+        posts = [p for _, p in bed.wire.posts[before:]]
+        assert sum(p.startswith("/SetOutputOn/Pump1/1") for p in posts) <= 1
+        assert all(float(p.split("/")[-1]) <= 0.025 for p in posts if p.startswith("/SetOutputTarget/Pump1"))
+        bed.reactors.stop()
+        assert bed.motors_off()
+    acted = [tuple(r["sample"]) for r in bed.of("intent")]
+    assert len(acted) > FUZZ_CASES // 100
+    assert len(set(acted)) == len(acted)
+
+
+# -- the whole driver over real HTTP ---------------------------------------------------------------------------------
+
+
+def test_three_reactors_over_http_at_speed_60() -> None:
+    names = ("M0", "M1", "M2")
+    with EmulatorProcess(["--reactors", ",".join(names), "--speed", "60", "--od", "0.5"]) as emulator:
+        config = ChiBioConfig(url=emulator.url, speed=60.0, reactors=names)
+        transport, clock = open_transport(config.transport, config.url, config.speed), RealClock(config.speed)
+        checks = preflight(transport, clock, config, [Rig()] * 3)
+        assert all(check.ok or not check.required for check in checks), "\n".join(map(str, checks))
+        rows: list[dict[str, object]] = []
+        reactors = ChiBioReactors(transport, clock, config, log=lambda k, f: rows.append({"kind": k, **f}))
+        reactors.begin()
+        samples = np.zeros(3)
+        while reactors.elapsed() < 300.0:
+            m = reactors.measure()
+            rate = np.clip((0.025 + 0.5 * np.log(m.od / 0.5)) / 3.0, 0.0, 0.02)
+            reactors.actuate(Command(m.fresh, np.where(m.fresh, rate, 0.0), np.full(3, 37.0)))
+            samples += m.fresh
+        reactors.stop()
+        transport.close()
+    assert np.all(samples >= 4)
+    acted = [(r["reactor"], *r["sample"]) for r in rows if r["kind"] == "intent"]  # type: ignore[misc]
+    assert len(set(acted)) == len(acted)
+    assert not [r for r in rows if r["kind"] == "fault"]
+    assert [r["not_verified"] for r in rows if r["kind"] == "stop"] == [[]]
+
+
+def test_an_emulator_that_cannot_start_says_why() -> None:
+    with pytest.raises(LinkError, match="allowed a list of different names"):
+        EmulatorProcess(["--reactors", "M0,M0"])
+
+
+def test_the_emulator_of_a_run_ends_with_it() -> None:
+    with EmulatorProcess(["--speed", "60"]) as emulator:
+        pid = emulator.pid
+        assert subprocess.run(["kill", "-0", str(pid)], check=False).returncode == 0
+    assert subprocess.run(["kill", "-0", str(pid)], check=False, stderr=subprocess.DEVNULL).returncode != 0
+
+
+def test_ctrl_c_in_the_middle_of_a_request_leaves_a_link_that_can_still_switch_off(server: Server) -> None:
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        with link(server.url) as transport:
+            for _ in range(2):
+                server.behave = silent
+                signal.setitimer(signal.ITIMER_REAL, 0.1)
+                with pytest.raises(KeyboardInterrupt):
+                    transport.get("/getSysdata/")
+                server.behave = lambda c, _: c.sendall(OK)
+                while True:  # the one worker is still busy with the interrupted request
+                    with contextlib.suppress(LinkError):
+                        assert transport.post("/SetOutputOn/Pump1/0/M0").status == 204
+                        break
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)

@@ -1,0 +1,153 @@
+"""The journal: rows survive what kills the process, a torn end is cut and told."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hardware.errors import RecordingError
+from hardware.journal import Journal, read_journal
+
+
+def test_rows_come_back_in_order_with_number_and_time(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "j", wall=lambda: 1000.25)
+    journal.append("sample", {"od": np.float64(0.5), "blank": float("nan"), "sample": (60.0, 2), "a": np.arange(2)})
+    journal.append("intent", {"reactor": "M0"})
+    journal.close()
+    rows, torn = read_journal(tmp_path / "j")
+    assert torn == 0
+    assert [row["n"] for row in rows] == [0, 1]
+    assert (rows[0]["kind"], rows[0]["wall"], rows[0]["od"]) == ("sample", 1000.25, 0.5)
+    assert (rows[0]["blank"], rows[0]["sample"], rows[0]["a"]) == (None, [60.0, 2], [0, 1])
+    again = Journal(tmp_path / "j")
+    assert again.rows == rows
+    assert again.next_row == 2
+    again.close()
+    again.close()
+    with pytest.raises(RecordingError, match="closed"):
+        again.append("x", {})
+
+
+@pytest.mark.parametrize("torn", [b'{"n":2,"ki', b"\0" * 40, b"\0" * 40 + b"\n", b'{"n":2}', b"[1]\n", b"\xff\n"])
+def test_a_torn_end_is_cut_and_told(tmp_path: Path, torn: bytes) -> None:
+    path = tmp_path / "j"
+    journal = Journal(path)
+    journal.append("a", {})
+    journal.append("b", {})
+    journal.close()
+    whole = path.read_bytes()
+    path.write_bytes(whole + torn)
+    assert read_journal(path)[1] == len(torn)
+    again = Journal(path)
+    assert again.cut == len(torn)
+    again.append("c", {})
+    again.close()
+    assert path.read_bytes().startswith(whole)
+    assert [row["kind"] for row in read_journal(path)[0]] == ["a", "b", "c"]
+
+
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(cut=st.integers(0, 400))
+def test_a_file_cut_anywhere_keeps_every_whole_row(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "j"
+    path.unlink(missing_ok=True)
+    journal = Journal(path, fsync=False)
+    for k in range(5):
+        journal.append("row", {"k": k, "text": "ä\n{"})
+    journal.close()
+    data = path.read_bytes()[:cut]
+    path.write_bytes(data)
+    again = Journal(path, fsync=False)
+    assert [row["k"] for row in again.rows] == list(range(data.count(b"\n")))
+    assert again.cut == len(data) - (data.rfind(b"\n") + 1)
+    again.close()
+
+
+def test_a_line_changed_by_hand_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    path.write_bytes(b'{"n":0}\nhello\n{"n":2}\n')
+    with pytest.raises(RecordingError, match="line 2"):
+        Journal(path)
+
+
+def test_a_missing_folder_or_file_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="check folder"):
+        Journal(tmp_path / "no" / "j")
+    with pytest.raises(RecordingError, match="folder of a run"):
+        read_journal(tmp_path / "j")
+
+
+def test_a_full_disk_is_told_and_leaves_no_half_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "j"
+    journal = Journal(path)
+    journal.append("a", {})
+    real = os.write
+    with monkeypatch.context() as m:
+        m.setattr(os, "write", lambda fd, data: real(fd, data[:10]))  # the kernel takes what still fits
+        with pytest.raises(RecordingError, match="No space left"):
+            journal.append("b", {})
+    journal.append("c", {})
+    journal.close()
+    assert [row["kind"] for row in read_journal(path)[0]] == ["a", "c"]
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from hardware.journal import Journal
+journal = Journal(Path(sys.argv[1]), fsync=False)
+k = 0
+while True:
+    journal.append("row", {"k": k, "pad": "x" * 200})
+    print(k, flush=True)
+    k += 1
+"""
+
+
+def test_kill_9_loses_no_row_that_was_confirmed(tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    for _ in range(3):
+        path.unlink(missing_ok=True)
+        process = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(0.1)
+        process.send_signal(signal.SIGKILL)
+        confirmed = int(process.stdout.read().split()[-1])
+        process.wait()
+        process.stdout.close()
+        rows, _ = read_journal(path)
+        assert [row["k"] for row in rows[: confirmed + 1]] == list(range(confirmed + 1))
+        assert json.loads(path.read_bytes().splitlines()[0])["n"] == 0
+
+
+def test_a_long_journal_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Days of eight reactors are hundreds of MB: only landmarks and the end are taken into memory."""
+    journal = Journal(tmp_path / "j", fsync=False)
+    for k in range(500):
+        journal.append("device" if k in (3, 250) else "command", {"k": k})
+    journal.close()
+    with (tmp_path / "j").open("ab") as f:
+        f.write(b'{"n":500,"ki')
+    whole = (tmp_path / "j").stat().st_size
+    monkeypatch.setattr("hardware.journal.TAIL", 4000)
+    again = Journal(tmp_path / "j")
+    kept = [row["k"] for row in again.rows]
+    assert kept[:3] == [0, 3, 250]
+    assert kept[3:] == list(range(kept[3], 500))
+    assert 30 < len(kept) < 60
+    assert (again.cut, again.next_row) == (12, 500)
+    again.append("sample", {"k": 500})
+    again.close()
+    rows, torn = read_journal(tmp_path / "j")
+    assert [row["k"] for row in rows] == list(range(501))
+    assert torn == 0
+    assert (tmp_path / "j").stat().st_size > whole

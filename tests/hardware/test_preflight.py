@@ -1,0 +1,78 @@
+"""Preflight: every check passes on a sound device and fails with a remedy on the trouble it is for."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from hardware.preflight import Check, preflight
+from hardware.pumps import PumpCalibration, Rig
+from tests.hardware.driver_lab import SOUND, Bed
+
+
+def checks(bed: Bed, rig: Rig = SOUND) -> dict[str, Check]:
+    found = preflight(bed.wire, bed.clock, bed.config, [rig] * len(bed.names), Path("."))
+    return {check.name: check for check in found}
+
+
+def test_a_sound_device_passes_and_nothing_is_switched() -> None:
+    bed = Bed(("M0", "M1"))
+    found = checks(bed)
+    assert all(check.ok for check in found.values()), "\n".join(map(str, found.values()))
+    assert {"disk", "connection", "board clock", "M0 present", "M1 blank", "M1 pump calibration"} <= set(found)
+    assert {path.split("/")[1] for _, path in bed.wire.posts} == {"changeDevice", "MeasureTemp"}
+    assert str(found["M0 modes"]) == "pass  M0 modes: none active"
+
+
+@pytest.mark.parametrize(
+    ("posts", "name", "required"),
+    [
+        (["/SetOutputOn/Zigzag/1/M0"], "M0 modes", True),
+        (["/SetOutputOn/OD/1/M0"], "M0 modes", False),
+        (["/SetOutputTarget/Pump1/M0/0.02", "/SetOutputOn/Pump1/1/M0"], "M0 pumps", False),
+        (["/CalibrateOD/OD0/M0/500/0"], "M0 blank", True),
+    ],
+)
+def test_trouble_on_the_device(posts: list[str], name: str, required: bool) -> None:
+    bed = Bed()
+    for path in posts:
+        bed.device.handle("POST", path)
+    check = checks(bed)[name]
+    assert not check.ok
+    assert check.remedy
+    assert check.required == required
+    assert str(check).startswith("FAIL" if required else "note")
+
+
+def test_an_uncalibrated_device_and_a_stored_blank() -> None:
+    bed = Bed(blanked=False)
+    assert not checks(bed)["M0 blank"].ok
+    assert "experiments.blank" in checks(bed)["M0 blank"].remedy
+    assert checks(bed, Rig(SOUND.feed, SOUND.waste, 14000.0))["M0 blank"].ok
+
+
+def test_pumps_never_weighed_weighed_elsewhere_or_too_weak() -> None:
+    bed = Bed()
+    never = checks(bed, Rig())["M0 pump calibration"]
+    assert (never.ok, never.required) == (False, False)
+    elsewhere = Rig(PumpCalibration(date="2026-01-01", device_id="other"), PumpCalibration(date="2026-01-01"))
+    assert "another unit" in checks(bed, elsewhere)["M0 pump calibration"].detail
+    weak = checks(bed, Rig(PumpCalibration(flow_ml_s=1.5), PumpCalibration(flow_ml_s=0.3)))["M0 waste over feed"]
+    assert (weak.ok, weak.required) == (False, True)
+
+
+def test_an_absent_reactor_a_dead_sensor_a_lost_link() -> None:
+    bed = Bed(("M0",))
+    bed.config = type(bed.config)(reactors=("M0", "M5"))
+    found = preflight(bed.wire, bed.clock, bed.config, [SOUND] * 2)
+    assert [c.ok for c in found if c.name == "M5 present"] == [False]
+    bed = Bed()
+    bed.reactors.begin()
+    bed.fault("spectrometer_dead")
+    bed.run(2)
+    assert not checks(bed)["M0 light sensor"].ok
+    bed.fault("crash")
+    found = checks(bed)
+    assert not found["connection"].ok
+    assert "M0 present" not in found
+    assert math.isfinite(bed.clock.now())

@@ -1,0 +1,126 @@
+"""Volume to duty and back: by formula, by property, and from weighed doses."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hardware.pumps import DosingConfig, PumpCalibration, Rig, fit_pump, plan_dose
+from hardware.wire import PERIOD_S
+
+CONFIG = DosingConfig()
+
+
+def test_volume_and_on_time_by_hand() -> None:
+    pump = PumpCalibration(flow_ml_s=0.8, bias_s=0.1)
+    assert pump.on_time(0.8) == pytest.approx(0.9)
+    assert pump.volume(0.9) == pytest.approx(0.8)
+    assert pump.min_dose_ml == pytest.approx(0.8 * 0.4)
+    assert pump.volume(0.0) == 0.0
+
+
+def test_the_fastest_rate_of_the_paper_is_a_duty_of_0_019() -> None:
+    plan = plan_dose(0.02, 0.0, 0, Rig(), CONFIG)
+    assert plan.feed_duty == pytest.approx(1.2 / 63.0, abs=1e-6)
+    assert plan.waste_s == pytest.approx(4.0 * 1.2 + 4.4, abs=1e-3)
+    assert plan.feed_ml == pytest.approx(1.2, abs=1e-4)
+
+
+def test_every_fifth_dose_clears_the_waste_tube() -> None:
+    duties = [plan_dose(0.01, 0.0, k, Rig(), CONFIG).waste_duty for k in range(10)]
+    assert [d == pytest.approx(0.25) for d in duties] == [k % 5 == 4 for k in range(10)]
+
+
+def test_small_doses_are_saved_up_and_the_mean_rate_is_right() -> None:
+    rate, carry, given_ml, doses = 0.00125, 0.0, 0.0, 0
+    for _ in range(1000):
+        plan = plan_dose(rate, carry, doses, Rig(), CONFIG)
+        carry = plan.carry_ml
+        given_ml += plan.feed_ml
+        doses += plan.feed_duty > 0.0
+        assert plan.feed_duty == 0.0 or plan.feed_s >= 0.3 - 1e-4
+    assert given_ml + carry == pytest.approx(1000 * rate * 60.0, rel=1e-3)
+    assert doses == pytest.approx(250, abs=1)
+
+
+def test_no_rate_means_no_dose_and_keeps_what_was_saved_up() -> None:
+    plan = plan_dose(0.0, 0.2, 0, Rig(), CONFIG)
+    assert (plan.feed_duty, plan.waste_duty, plan.carry_ml) == (0.0, 0.0, 0.2)
+
+
+def test_a_weak_pump_hits_the_feed_limit_and_says_what_is_missing() -> None:
+    plan = plan_dose(0.02, 0.0, 0, Rig(PumpCalibration(flow_ml_s=0.2), PumpCalibration()), CONFIG)
+    assert plan.feed_duty == 0.05
+    assert plan.feed_ml == pytest.approx(0.63)
+    assert plan.shortfall_ml == pytest.approx(0.57)
+    assert plan.carry_ml == 0.0
+
+
+@pytest.mark.parametrize("rate", [-0.001, np.nan, np.inf])
+def test_a_rate_that_is_none_is_an_error(rate: float) -> None:
+    with pytest.raises(ValueError, match="pump rate"):
+        plan_dose(rate, 0.0, 0, Rig(), CONFIG)
+
+
+@settings(max_examples=500)
+@given(
+    st.floats(0.0, 0.05),
+    st.floats(0.0, 0.5),
+    st.integers(0, 100),
+    st.floats(0.1, 3.0),
+    st.floats(0.1, 3.0),
+    st.floats(-0.2, 0.3),
+)
+def test_no_plan_breaks_a_limit(rate: float, carry: float, doses: int, q1: float, q2: float, bias: float) -> None:
+    rig = Rig(PumpCalibration(q1, bias), PumpCalibration(q2, bias))
+    plan = plan_dose(rate, carry, doses, rig, CONFIG)
+    assert 0.0 <= plan.feed_duty <= 0.05
+    assert 0.0 <= plan.waste_duty <= 0.5
+    if plan.feed_duty > 0.0:
+        assert plan.waste_s >= min(4.0 * plan.feed_s + 4.0, 31.5) - 1e-3
+        assert plan.feed_ml <= rate * 60.0 + carry + 1e-3
+        if plan.waste_duty < 0.5:
+            assert plan.waste_ml >= 1.4 * plan.feed_ml
+    assert plan.feed_ml + plan.carry_ml + plan.shortfall_ml <= rate * 60.0 + carry + 1e-3
+
+
+def test_weighed_doses_give_back_the_pump() -> None:
+    rng = np.random.default_rng(0)
+    on_s, doses = PERIOD_S * np.array([0.006, 0.01, 0.02, 0.04]), np.full(4, 40)
+    errors = []
+    for _ in range(50):
+        grams = np.array([(0.85 * (t + 0.08) * (1 + 0.08 * rng.standard_normal(40))).sum() for t in on_s])
+        fit = fit_pump(on_s, doses, grams)
+        errors.append([(fit.calibration.flow_ml_s - 0.85) / fit.flow_se, fit.calibration.bias_s - 0.08])
+    errors = np.array(errors)
+    assert np.median(np.abs(errors[:, 0])) < 2.0  # two degrees of freedom: a wide t distribution
+    assert np.abs(errors[:, 1]).mean() < 0.03
+    assert abs(errors[:, 1].mean()) < 0.02
+
+
+def test_a_dead_band_shows_as_a_larger_smallest_dose() -> None:
+    on_s = np.array([0.1, 0.4, 0.8, 1.6])
+    grams = 20 * np.array([0.001, 0.4, 0.8, 1.6])
+    assert fit_pump(on_s, np.full(4, 20), grams).calibration.min_on_s == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("on_s", "grams", "words"),
+    [
+        ([1.0], [20.0], "at least 2 series"),
+        ([1.0, 1.0], [20.0, 21.0], "range"),
+        ([0.5, 1.0], [20.0, 10.0], "weighed less"),
+        ([0.5, 1.0], [20.0, np.nan], "finite"),
+        ([0.5, 1.0], [1000.0, 3000.0], "allowed"),
+    ],
+)
+def test_weighings_that_make_no_line_are_refused(on_s: list[float], grams: list[float], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        fit_pump(np.array(on_s), np.full(len(on_s), 20), np.array(grams))
+
+
+def test_a_stored_calibration_reads_back() -> None:
+    pump = PumpCalibration(0.9, 0.05, 0.08, 0.4, "2026-02-03", "1000200030004000")
+    assert PumpCalibration.from_dict({**pump.as_dict(), "weighings": []}) == pump
+    with pytest.raises(ValueError, match="flow_ml_s"):
+        PumpCalibration.from_dict({"flow_ml_s": 70.0})

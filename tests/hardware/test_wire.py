@@ -1,0 +1,194 @@
+"""The device's language: states in, commands out, and everything that must never get through."""
+
+import contextlib
+import json
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hardware.errors import DeviceStateError, ProtocolError
+from hardware.wire import PUMPS, check_command, parse_state
+from tests.hardware.script import state
+
+
+def parse(data: Any) -> Any:
+    return parse_state(json.dumps(data).encode())
+
+
+def test_a_running_reactor() -> None:
+    found = parse(state())
+    assert (found.selected, found.present, found.running, found.cycles) == ("M0", ("M0", "M1"), True, 1)
+    assert (found.sample_s, found.sample_od, found.sample_temperature) == (0.07, 0.36, 37.0)
+    assert (found.blank, found.raw) == (14000.0, 9000.0)
+    assert found.pumps_on == (False,) * 4
+    assert found.stirring
+    assert found.heating
+    assert found.started
+    assert not found.modes
+
+
+def test_lists_that_are_just_being_replaced_hold_no_sample() -> None:
+    data = state(time__record=[0.07, 60.1])
+    assert math.isnan(parse(data).sample_s)
+    assert math.isnan(parse(state(time__record=[], OD__record=[], ThermometerIR__record=[])).sample_s)
+
+
+def test_the_lengths_that_the_serial_agent_sends_beside_its_cut_lists_count() -> None:
+    data = state()
+    data["_records"] = {"time": 30, "OD": 30, "ThermometerIR": 30}
+    assert parse(data).sample_s == 0.07
+    data["_records"]["OD"] = 29
+    assert math.isnan(parse(data).sample_s)
+
+
+def test_forks_with_a_list_terminal_extra_and_missing_fields() -> None:
+    data = state(Terminal__text=["2026-01-01 00:00:01  - Experiment Stopped", "older"])
+    data["Surprise"] = {"x": [1]}
+    del data["Light"], data["Version"], data["biofilm"]
+    assert "Experiment Stopped" in parse(data).terminal
+
+
+def test_modes_that_act_on_their_own_are_named() -> None:
+    assert parse(state(Zigzag__ON=1, FP2__ON=1)).modes == ("Zigzag", "FP2")
+
+
+def test_nan_in_a_reading_is_a_reading_and_nan_in_a_flag_is_not() -> None:
+    body = json.dumps(state()).replace("0.36", "NaN").encode()
+    assert math.isnan(parse_state(body).sample_od)
+    with pytest.raises(ProtocolError, match="OD.ON"):
+        parse(state(OD__ON=math.nan))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"{", b"[]", b"null", b"\xff\xfe", b"[" * 100_000, b"1" * 5000, b'{"UIDevice": "M0"}', b"<html>502</html>"],
+)
+def test_what_is_not_a_state_is_refused(body: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        parse_state(body)
+
+
+PATHS = [(group, key) for group, keys in state().items() if isinstance(keys, dict) for key in keys]
+VALUES = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just([]), st.just({}), st.just([None])
+)
+
+
+@settings(max_examples=300)
+@given(st.sampled_from(PATHS), VALUES)
+def test_any_value_in_any_field_parses_or_is_refused(path: tuple[str, str], value: Any) -> None:
+    data = state()
+    data[path[0]][path[1]] = value
+    try:
+        found = parse(data)
+    except ProtocolError:
+        return
+    assert all(isinstance(flag, bool) for flag in (*found.pumps_on, found.running, found.regulating))
+
+
+@settings(max_examples=300)
+@given(st.data())
+def test_damaged_bytes_parse_or_are_refused(data: st.DataObject) -> None:
+    body = bytearray(json.dumps(state()).encode())
+    for _ in range(data.draw(st.integers(1, 20))):
+        body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
+    body = body[: data.draw(st.integers(0, len(body)))]
+    with contextlib.suppress(ProtocolError):
+        parse_state(bytes(body))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/changeDevice/M0",
+        "/SetOutputTarget/Pump1/M0/0.020000",
+        "/SetOutputTarget/Pump1/M0/0.05",
+        "/SetOutputTarget/Pump2/M0/0.5",
+        "/SetOutputTarget/Thermostat/M0/37.0",
+        "/SetOutputOn/Pump1/1/M0",
+        "/SetOutputOn/Pump4/0/M0",
+        "/SetOutputOn/Heat/0/M0",
+        "/CalibrateOD/OD0/M0/14000.000000/0",
+        "/MeasureTemp/IR/M0",
+        "/Experiment/1/M0",
+        "/Experiment/0/M0",
+    ],
+)
+def test_allowed(path: str) -> None:
+    check_command(path, ["M0"])
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/SetOutputTarget/Pump1/M0/0.0501",
+        "/SetOutputTarget/Pump1/M0/1",
+        "/SetOutputTarget/Pump1/M0/-0.01",
+        "/SetOutputTarget/Pump1/M0/nan",
+        "/SetOutputTarget/Pump1/M0/inf",
+        "/SetOutputTarget/Pump1/M0/1e-2",
+        "/SetOutputTarget/Pump2/M0/0.51",
+        "/SetOutputTarget/Pump3/M0/0.01",
+        "/SetOutputTarget/Pump1/0/0.01",
+        "/SetOutputTarget/Pump1/M1/0.01",
+        "/SetOutputTarget/Thermostat/M0/42.1",
+        "/SetOutputTarget/UV/M0/0.5",
+        "/SetOutputOn/Pump1/2/M0",
+        "/SetOutputOn/Pump3/1/M0",
+        "/SetOutputOn/Heat/1/M0",
+        "/SetOutputOn/Pump1/1/M1",
+        "/SetOutputOn/Experiment/1/M0",
+        "/SetOutputOn/Zigzag/1/M0",
+        "/CalibrateOD/OD0/M0/0/0",
+        "/CalibrateOD/OD0/M0/65000/0",
+        "/CalibrateOD/OD0/M0/14000/1",
+        "/MeasureOD/M0",
+        "/MeasureTemp/Internal/M0",
+        "/Experiment/2/M0",
+        "/ExperimentReset",
+        "/CharacteriseDevice/M0/C1",
+        "/scanDevices/all",
+        "/Direction/Pump1/M0",
+        "/SetCustom/C1/0",
+        "/ClearTerminal/M0",
+        "/changeDevice/M8",
+        "/changeDevice/0",
+        "changeDevice/M0",
+        "//changeDevice/M0",
+        "/changeDevice/M0/",
+        "/changeDevice/M0?x=1",
+        "/SetOutputTarget/Pump1/M0/0.01/../1",
+        "",
+        "/",
+    ],
+)
+def test_refused(path: str) -> None:
+    with pytest.raises(DeviceStateError, match="refused"):
+        check_command(path, ["M0"])
+
+
+ITEMS = ["SetOutputTarget", "SetOutputOn", "Experiment", "changeDevice", "CalibrateOD", "Pump1", "Pump2", "Pump3"]
+WORDS = st.sampled_from(
+    [*ITEMS, "Stir", "OD0", "M0", "M1", "Zigzag", "UV", "LASER650", "0", "1", "2", "-0.01", "0.02", "0.9", "nan", ""]
+)
+
+
+@settings(max_examples=2000)
+@given(st.lists(WORDS, max_size=6))
+def test_no_combination_of_words_pumps_too_much_or_reaches_another_reactor(words: list[str]) -> None:
+    path = "/" + "/".join(words)
+    try:
+        check_command(path, ["M0"])
+    except DeviceStateError:
+        return
+    verb, args = words[0], words[1:]
+    assert "M1" not in args
+    assert args.count("M0") == 1
+    if verb == "SetOutputTarget" and args[0] in PUMPS:
+        assert 0.0 <= float(args[2]) <= (0.05 if args[0] == "Pump1" else 0.5)
+    if verb == "SetOutputOn":
+        assert args[0] in (*PUMPS, "OD", "Stir", "Thermostat", "Heat")
+        assert args[1] in ("0", "1")
