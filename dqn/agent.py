@@ -159,7 +159,7 @@ class DQNAgent:
         self._adam.param_groups[0]["lr"] = self.learning_rate
         self._adam.step()
         self.updates += 1
-        if self.updates % c.target_period == 0 and self.updates <= (1.0 - c.target_freeze) * c.total_updates:
+        if self.updates % c.target_period == 0:
             blend(self.target.flat, self.online.flat, c.target_blend)
         if self.updates % DIAGNOSED == 0:
             self.loss = huber_loss(td_error, c.huber)

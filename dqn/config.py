@@ -31,7 +31,6 @@ class DQNConfig:
     updates_per_step: int = 1
     target_period: int = 500  # updates between blends of the target network
     target_blend: float = 1.0  # share of the online network in a blend; 1 copies
-    target_freeze: float = 0.0  # fraction of all updates, at the end, in which the target network stays as it is
     double: bool = False  # double-Q targets (van Hasselt 2016)
     action_gap: float = 0.0  # alpha of advantage learning: action gaps are learned 1 / (1 - alpha) times as wide
     action_smoothness: float = 0.0  # exponent by which rough differences between actions are learned later; 0: off
@@ -64,7 +63,6 @@ class DQNConfig:
             ("updates_per_step", self.updates_per_step, self.updates_per_step >= 1, "at least 1"),
             ("target_period", self.target_period, self.target_period >= 1, "at least 1 update"),
             ("target_blend", self.target_blend, 0.0 < self.target_blend <= 1.0, "0 < blend <= 1"),
-            ("target_freeze", self.target_freeze, 0.0 <= self.target_freeze <= 1.0, "0 to 1"),
             ("action_gap", self.action_gap, 0.0 <= self.action_gap < 1.0, "0 <= alpha < 1"),
             ("action_smoothness", self.action_smoothness, self.action_smoothness >= 0.0, "at least 0 (0 = off)"),
             ("huber", self.huber, self.huber >= 0.0, "at least 0 (0 = squared error)"),

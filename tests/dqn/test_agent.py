@@ -35,7 +35,6 @@ EVERYTHING: dict[str, Any] = {
     "updates_per_step": 2,
     "relabel": 0.5,
     "target_blend": 0.5,
-    "target_freeze": 0.2,
 }
 
 
@@ -148,19 +147,6 @@ def test_truncation_bootstraps_and_termination_does_not() -> None:
     torch.testing.assert_close(values[1], torch.full((2,), 1.0), rtol=0.05, atol=0.0)
 
 
-def test_a_frozen_target_network_stays() -> None:
-    """568 updates, copies every 25 of them, none after 284: the last copy is that of update 275."""
-    config = DQNConfig(**{**SMALL.__dict__, "target_freeze": 0.5})
-    agent = DQNAgent(config, 3, 3, streams(range(2)))
-    copied = torch.empty(0)
-    for record in Trainer(IdentityEnv(range(2)), agent, interval=1).run():
-        if record.updates == 275:
-            copied = agent.online.flat.clone()
-    assert agent.updates == 568
-    assert torch.equal(agent.target.flat, copied)
-    assert not torch.equal(agent.online.flat, copied)
-
-
 def test_exploration_follows_epsilon() -> None:
     """At epsilon 0.5 with 4 actions the greedy one comes up in 0.5 + 0.5 / 4 of the steps."""
     config = DQNConfig(**{**SMALL.__dict__, "epsilon_start": 0.5, "epsilon_end": 0.5})
@@ -188,7 +174,6 @@ def test_relabelling_without_a_goal_is_refused() -> None:
         ("epsilon_end", 1.5),
         ("batch_size", 0),
         ("target_blend", 0.0),
-        ("target_freeze", 1.5),
         ("action_gap", 1.0),
         ("relabel", -0.1),
         ("average", 1.0),
