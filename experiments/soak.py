@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import logging
+import math
 import time
+from array import array
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,6 +18,7 @@ from envs.setpoints import Schedule
 from experiments import app
 from experiments.fault_case import audit_doses, audit_rows
 from experiments.rehearsal import Rehearsal
+from hardware.emulator_bench import Dose, Sample
 from hardware.journal import read_journal
 from hardware.safety_config import SafetyConfig
 from hardware.wire import POSITIONS
@@ -25,6 +28,7 @@ __all__ = ["Day", "SoakConfig", "soak", "soak_run"]
 log = logging.getLogger(__name__)
 
 MB = 1024.0 * 1024.0
+Times = dict[str, "array[float]"]  # per reactor, device s; a week of them must not look like a leak
 
 
 @dataclass(frozen=True)
@@ -129,8 +133,7 @@ def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any
     names = POSITIONS[: config.reactors]
     schedule = config.schedule()
     r = Rehearsal(folder, names, [schedule] * len(names), config.safety, config.controller_kind, seed=config.seed)
-    doses: dict[str, list[Any]] = {name: [] for name in names}
-    samples: dict[str, list[Any]] = {name: [] for name in names}
+    doses, samples = ({name: array("d") for name in names} for _ in range(2))
     r.begin()
     meter, part = _Meter(r), min(1.0, config.days)
     end = r.clock.now() + 86400.0 * config.days
@@ -154,25 +157,26 @@ def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any
     return {**_audit(r, doses, samples), "pumps_off": off}
 
 
-def _collect(r: Rehearsal, doses: dict[str, list[Any]], samples: dict[str, list[Any]]) -> None:
-    """Move what the emulator remembers, and would forget after 5000, out of it."""
+def _collect(r: Rehearsal, doses: Times, samples: Times) -> None:
+    """Move out of the emulator what it would forget after 5000: when the feed pump began, when a sample was stored."""
     for name, bench in r.device.benches.items():
-        for kept, source in ((doses, bench.doses), (samples, bench.samples)):
-            kept[name] += source
-            source.clear()
+        doses[name].extend(dose.start_s for dose in bench.doses if dose.pump == "Pump1")
+        samples[name].extend(sample.stored_s for sample in bench.samples)
+        bench.doses.clear()
+        bench.samples.clear()
 
 
-def _audit(r: Rehearsal, doses: dict[str, list[Any]], samples: dict[str, list[Any]]) -> dict[str, Any]:
+def _audit(r: Rehearsal, doses: Times, samples: Times) -> dict[str, Any]:
     """Minutes, doses and volumes: what the run believes against what the plant knows, per reactor."""
     journal, _ = read_journal(r.folder / "journal.jsonl")
     ledger, fed = r.loop.interlock.volume_ml, r.loop.interlock.fed_ml
     reactors = {}
     for n, name in enumerate(r.names):
         truth = r.truth(name)
-        doubled, repeats = audit_doses(journal, doses[name], name, r.spans[0][0])
-        given = sum(d.pump == "Pump1" for d in doses[name])
+        runs = [Dose("Pump1", start, math.nan, 1, math.nan) for start in doses[name]]
+        doubled, repeats = audit_doses(journal, runs, name, r.spans[0][0])
         reactors[name] = {
-            "doses": given,
+            "doses": len(runs),
             "doses_doubled": doubled + repeats,
             "booked_ml": float(fed[n]),
             "fed_ml": truth["feed_ml"],
@@ -181,7 +185,8 @@ def _audit(r: Rehearsal, doses: dict[str, list[Any]], samples: dict[str, list[An
             "volume_ml": truth["volume_ml"],
             "peak_ml": truth["peak_ml"],
         }
-    missed, lost, twice = audit_rows(r, None, samples)
+    made = {name: [Sample(at, math.nan, math.nan) for at in times] for name, times in samples.items()}
+    missed, lost, twice = audit_rows(r, None, made)
     return {"rows_lost": missed + lost, "rows_doubled": twice, "reactors": reactors}
 
 
