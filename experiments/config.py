@@ -28,7 +28,7 @@ class TrainConfig:
     n_agents: int = 1  # agents with seeds seed, seed + 1, ... trained in one process
     device: str = "cpu"  # cpu | cuda
     threads: int = 0  # CPU threads of torch; 0: one for a few agents, all for many
-    eval_every: int = 500  # steps between evaluations of the greedy policy
+    eval_every: int = 250  # steps between evaluations of the greedy policy
     checkpoint_every: int = 1000  # steps between checkpoints
     resume: str | None = None  # a run folder to continue
 

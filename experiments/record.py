@@ -162,7 +162,8 @@ class Record:
             minute = self._points = max(self._points, round(float(step.minute[n])))
             curves = {"od": step.od, "setpoint": step.setpoint, "pump_rate_ml_s": step.rate}
             for tag, value in {**curves, "temperature_degc": step.temperature, **step.explanation}.items():
-                self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
+                if np.isfinite(value[n]):
+                    self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
         try:
             if self._fsync:
                 self.events.flush()

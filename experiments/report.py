@@ -189,6 +189,8 @@ def _flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 def _show(value: Any) -> str:
     if isinstance(value, float):
         return number(value, 5)
+    if value == []:
+        return "none"
     if isinstance(value, list):
         return ", ".join(_show(v) for v in value) if len(value) <= 12 else f"{len(value)} values"
     return "–" if value is None else str(value)

@@ -68,7 +68,7 @@ def _export(session: Session, score: Score) -> Path:
         }
         exported = export(session.trainer.agent.online, i, best.weights, c.env.pump_rates(), metadata)
         policy.save(folder / f"seed{seed:04d}.npz", exported)
-        if i == int(best.regret.argmin()):
+        if i == int(best.merit.argmin()):
             policy.save(session.folder / "policy.npz", exported)
     return session.folder / "policy.npz"
 
@@ -142,7 +142,7 @@ def _finish(session: Session) -> None:
         "optimum_cost": report.optimum_cost,
         "optimum_steady_abs_error": report.optimum_steady,
         "policy": str(path),
-        "policy_seed": session.seeds[int(best.regret.argmin())],
+        "policy_seed": session.seeds[int(best.merit.argmin())],
         "config_hash": _fingerprint(c),
     }
     app.write_json(session.folder / "summary.json", summary)

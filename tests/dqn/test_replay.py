@@ -63,7 +63,8 @@ def test_the_largest_number_below_one_stays_inside() -> None:
     replay = Replay(AGENTS, 7, OBSERVATIONS, CPU)
     for _ in range(7):
         replay.add(**_step(np.random.default_rng(1)))
-    replay.sample(torch.full((AGENTS, 1), np.nextafter(1.0, 0.0), dtype=torch.float64))
+    batch = replay.sample(torch.full((AGENTS, 1), np.nextafter(1.0, 0.0), dtype=torch.float64))
+    assert batch.s_t.shape == (AGENTS, 1, OBSERVATIONS)
 
 
 def test_uniform_frequencies() -> None:

@@ -259,7 +259,7 @@ def test_a_wrong_override_is_one_line(overrides, parts):
 def run(*overrides: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "experiments.benchmark", *overrides]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=200)
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=280)
 
 
 def test_command_line_twice_gives_the_same_summary(tmp_path):

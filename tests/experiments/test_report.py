@@ -40,7 +40,7 @@ def benchmark(tmp_path_factory):
             "+studies.setpoint_steps={scenarios:[setpoint_steps],plants:[nominal_noise],controllers:[dqn,pi,mpc]}",
             "studies.long.controllers=[]",
         ],
-        capture_output=True, text=True, timeout=200,
+        capture_output=True, text=True, timeout=280,
         env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
