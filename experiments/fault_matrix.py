@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import logging
 import math
 import multiprocessing
@@ -194,8 +195,15 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
 
     began = time.monotonic()
     faults = by_name(config.faults)
-    with logging_redirect_tqdm(), tqdm(total=len(all_cases(config)), disable=None, unit="case") as bar:
-        outcomes = run_all(config, bar.update)
+    total_cases, over = len(all_cases(config)), itertools.count(1)
+    with logging_redirect_tqdm(), tqdm(total=total_cases, disable=None, unit="case") as bar:
+
+        def tick() -> None:
+            bar.update()
+            if (done := next(over)) % 50 == 0 and bar.disable:
+                log.info("%d of %d cases", done, total_cases)
+
+        outcomes = run_all(config, tick)
     if not outcomes:
         raise app.UserError("nothing to run: give faults or controls")
     write_cases(folder / "cases.csv", outcomes)

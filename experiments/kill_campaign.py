@@ -90,7 +90,6 @@ class Findings:
     rows: int = 0
     rows_lost: int = 0
     rows_doubled: int = 0
-    rows_repaired: int = 0
     doses: int = 0
     doses_lost: int = 0
     doses_not_given: int = 0
