@@ -101,7 +101,7 @@ def test_requests_are_served_one_at_a_time(emulator: Process) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert max(spans) >= 4 * 3.0 / 60.0
+    assert max(spans) >= 0.9 * 4 * 3.0 / 60.0  # the last one waited for the others; threads do not start at once
     assert sorted(spans) == pytest.approx([0.05, 0.1, 0.15, 0.2], abs=0.15)
 
 
