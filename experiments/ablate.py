@@ -43,7 +43,7 @@ class AblateConfig:
     seed: int = 0
     n_agents: int = 32
     device: str = "cpu"
-    threads: int = 0
+    threads: int = 1
     eval_every: int = 500
     resume: str | None = None
 

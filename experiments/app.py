@@ -30,9 +30,6 @@ __all__ = ["UserError", "compose", "load", "normalise", "run", "save_config", "w
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 
-# OpenMP's threads spin while they wait, which on cores shared with anything else makes small matrix products ten times
-# slower; this must stand before torch is loaded.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 OmegaConf.register_new_resolver("pid", os.getpid)  # makes run folders of processes started in one second differ
 
 

@@ -45,7 +45,6 @@ def training() -> Iterator[Measurement]:
     from experiments import rivals
 
     config = DQNConfig()
-    cores = torch.get_num_threads()
 
     def alone(rival: Callable[[DQNConfig, int], object]) -> Callable[[], object]:
         def run() -> object:
@@ -64,7 +63,7 @@ def training() -> Iterator[Measurement]:
         f"training, {POPULATION} agents",
         f"{schedule} each",
         "one run of Stable-Baselines3 DQN",
-        lambda: _train(POPULATION, config, cores),
+        lambda: _train(POPULATION, config, 1),
         alone(rivals.stable_baselines_dqn),
     )
 
@@ -94,20 +93,18 @@ def update() -> Iterator[Measurement]:
     import torch
 
     config = DQNConfig()
-    cores = torch.get_num_threads()
     for agents in (1, POPULATION):
         repeats = 2000 if agents == 1 else 200
-        threads = 1 if agents == 1 else cores
         learner = _warm_agent(agents, config)
         products = _matrix_work(agents, config.batch_size, (2, *config.hidden, 17))
 
-        def ours(learn: Callable[[], object] = learner.learn, n: int = repeats, t: int = threads) -> None:
-            torch.set_num_threads(t)
+        def ours(learn: Callable[[], object] = learner.learn, n: int = repeats) -> None:
+            torch.set_num_threads(1)
             for _ in range(n):
                 learn()
 
-        def theirs(work: Callable[[], object] = products, n: int = repeats, t: int = threads) -> None:
-            torch.set_num_threads(t)
+        def theirs(work: Callable[[], object] = products, n: int = repeats) -> None:
+            torch.set_num_threads(1)
             for _ in range(n):
                 work()
 

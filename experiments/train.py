@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MANY_AGENTS = 12  # from here on the matrix products are large enough to share between cores
-
 
 def read_env_file(path: str) -> EnvConfig:
     """The model a calibration wrote. Raises: UserError naming the file and what is wrong with it."""
@@ -171,8 +169,7 @@ def train(config: TrainConfig, folder: Path) -> float:
 
     if config.device == "cuda" and not torch.cuda.is_available():
         raise app.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
-    threads = config.threads or (1 if config.n_agents < MANY_AGENTS else torch.get_num_threads())
-    torch.set_num_threads(threads)
+    torch.set_num_threads(config.threads)
     try:
         session = Session(config, folder, resume=config.resume is not None)
     except CheckpointError as error:
