@@ -223,7 +223,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
 
     from experiments.charts import save
 
-    torch.set_num_threads(config.threads or torch.get_num_threads())
+    torch.set_num_threads(config.threads)
     path = folder / "ablation.csv"
     rows = _read(path)
     done = {row.ablation for row in rows}
