@@ -92,16 +92,16 @@ def test_requests_are_served_one_at_a_time(emulator: Process) -> None:
     spans: list[float] = []
 
     def kick() -> None:
-        began = time.monotonic()
         emulator.ask("POST", "/SetOutputOn/Stir/1/M0", timeout=10.0)  # 3 device seconds
         spans.append(time.monotonic() - began)
 
     threads = [threading.Thread(target=kick) for _ in range(4)]
+    began = time.monotonic()
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert max(spans) >= 0.9 * 4 * 3.0 / 60.0  # the last one waited for the others; threads do not start at once
+    assert max(spans) >= 4 * 3.0 / 60.0
     assert sorted(spans) == pytest.approx([0.05, 0.1, 0.15, 0.2], abs=0.15)
 
 
