@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from dqn.adam import Adam
 from dqn.config import DQNConfig
 from dqn.network import QNetwork, action_basis, initial_weights
 from dqn.replay import Array, Replay, Transition
@@ -66,10 +67,7 @@ class DQNAgent:
         self.online = QNetwork(weights, self.sizes, matrix, offset, basis)
         self.target = self.online.with_weights(weights.clone())
         self.greedy = self.online.with_weights(weights.clone()) if config.average else self.online
-        parameter = torch.nn.Parameter(weights)
-        parameter.grad = self.online.grad
-        betas = (0.9, config.adam_beta2)
-        self._adam = torch.optim.Adam([parameter], config.learning_rate, betas, config.adam_eps, fused=True)
+        self._adam = Adam(weights, self.online.grad, config.learning_rate, config.adam_beta2, config.adam_eps)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
         self._explore = UniformStream(streams["explore"], 2, torch.device("cpu"))
         self._draws = UniformStream(streams["replay"], config.batch_size, self.device)
@@ -95,7 +93,6 @@ class DQNAgent:
         c = self.config
         return decayed(c.learning_rate, c.learning_rate_decay, c.total_updates, self.updates)
 
-    @torch.no_grad()
     def act(self, observation: Array) -> NDArray[np.int64]:
         """Epsilon-greedy actions for one observation per agent, (S, O) -> (S,)."""
         u = self._explore.next().numpy()
@@ -139,13 +136,11 @@ class DQNAgent:
             target = advantage_target(target, c.action_gap, self.target(batch.s_tm1), batch.a_tm1)
         return target
 
-    @torch.no_grad()
     def learn(self) -> None:
         """One update of every agent."""
         batch = self._minibatch()
         self.fit(batch.s_tm1, batch.a_tm1, self._td_target(batch))
 
-    @torch.no_grad()
     def fit(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> None:
         """One Adam step towards Q(observation, action) = target, and what follows an update.
 
@@ -156,7 +151,7 @@ class DQNAgent:
         q, inputs = self.online.forward(observation)
         td_error, gradient = loss_gradient(q, action, target, c.huber)
         self.online.backward(inputs, gradient)
-        self._adam.param_groups[0]["lr"] = self.learning_rate
+        self._adam.learning_rate = self.learning_rate
         self._adam.step()
         self.updates += 1
         if self.updates % c.target_period == 0:
@@ -184,7 +179,6 @@ class DQNAgent:
             "q_range": self.q_range.cpu(),
         }
 
-    @torch.no_grad()
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue as saved. Raises: RuntimeError from torch where shapes differ."""
         self.online.flat.copy_(state["online"])

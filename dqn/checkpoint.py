@@ -10,7 +10,7 @@ import torch
 
 __all__ = ["CheckpointError", "load", "save"]
 
-FORMAT = 1
+FORMAT = 2
 
 
 class CheckpointError(Exception):

@@ -52,6 +52,9 @@ class QNetwork:
     tensor `flat`, shape (S, P), whose slices are the layers; an optimiser, a copy or a running mean is then one
     operation. Gradients are written out by hand: two matrix products a layer, no graph.
 
+    The last layer's weights lie in memory as (outputs, inputs), and Q as (S, A, B): matrix products and reductions want
+    a long innermost axis, and there are fewer actions than transitions. Shapes are the same for all layers.
+
     Args:
       flat: weights, shape (S, P), laid out as by `initial_weights`.
       sizes: units of feature, hidden and output layers.
@@ -71,6 +74,7 @@ class QNetwork:
         self.flat = flat
         self.sizes = tuple(sizes)
         self.layers = self._views(flat)
+        self._last = [view.transpose(1, 2) for view in self.layers[-1]]  # W3^T (S, A, in), b3^T (S, A, 1)
         self.grad = torch.zeros_like(flat)
         self._grads = self._views(self.grad)
         self._matrix = torch.eye(self.sizes[0], device=flat.device) if matrix is None else matrix
@@ -86,6 +90,7 @@ class QNetwork:
             middle, end = start + i * o, start + i * o + o
             views.append((flat[:, start:middle].view(-1, i, o), flat[:, middle:end].view(-1, 1, o)))
             start = end
+        views[-1] = (views[-1][0].view(-1, o, i).transpose(1, 2), views[-1][1])  # see the class's second paragraph
         return views
 
     def with_weights(self, flat: torch.Tensor) -> QNetwork:
@@ -115,8 +120,8 @@ class QNetwork:
             inputs.append(h)
             h = torch.baddbmm(bias, h, weight).relu_()
         inputs.append(h)
-        weight, bias = self.layers[-1]
-        z = torch.baddbmm(bias, h, weight)
+        weight, bias = self._last
+        z = torch.baddbmm(bias, weight, h.transpose(1, 2)).transpose(1, 2)
         return z if self._basis is None else torch.matmul(z, self._basis), inputs
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
@@ -126,9 +131,13 @@ class QNetwork:
     def backward(self, inputs: list[torch.Tensor], grad_q: torch.Tensor) -> None:
         """Fill `grad` with the gradient of a loss whose derivative by Q is `grad_q`, shape (S, B, A)."""
         delta = grad_q if self._basis is None else torch.matmul(grad_q, self._basis.T)
-        for k in range(len(self.layers) - 1, -1, -1):
+        last = len(self.layers) - 1
+        for k in range(last, -1, -1):
             grad_weight, grad_bias = self._grads[k]
-            torch.bmm(inputs[k].transpose(1, 2), delta, out=grad_weight)
+            if k == last:
+                torch.bmm(delta.transpose(1, 2), inputs[k], out=grad_weight.transpose(1, 2))
+            else:
+                torch.bmm(inputs[k].transpose(1, 2), delta, out=grad_weight)
             torch.sum(delta, 1, keepdim=True, out=grad_bias)
             if k > 0:
                 back = torch.bmm(delta, self.layers[k][0].transpose(1, 2))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -54,6 +54,21 @@ class TrainRecord:
     loss: NDArray[np.float64]
     q_min: NDArray[np.float64]
     q_max: NDArray[np.float64]
+
+    @classmethod
+    def joined(cls, records: Sequence[TrainRecord]) -> TrainRecord:
+        """One record of the agents of several, taken at the same step."""
+
+        def all_of(key: str) -> NDArray[np.float64]:
+            return np.concatenate([getattr(record, key) for record in records])
+
+        return replace(
+            records[0],
+            episode_return=all_of("episode_return"),
+            loss=all_of("loss"),
+            q_min=all_of("q_min"),
+            q_max=all_of("q_max"),
+        )
 
 
 class Trainer:

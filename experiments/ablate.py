@@ -43,8 +43,8 @@ class AblateConfig:
     seed: int = 0
     n_agents: int = 32
     device: str = "cpu"
-    threads: int = 1
-    eval_every: int = 500
+    threads: int | None = None
+    eval_every: int = 250
     resume: str | None = None
 
     def __post_init__(self) -> None:
@@ -142,10 +142,10 @@ def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
         session.run()
     finally:
         session.writer.close()
-    agent = session.trainer.agent
+    agents = session.agents
     report = Evaluation(config.env, config.agent.gamma, report_grid(config.env))
-    kept = report(build.act_with(agent.online, session.best.weights), agent.n_agents)
-    last = report(build.act_with(agent.online, agent.greedy.flat), agent.n_agents)
+    kept = report(build.act_with(agents.network, session.best.weights), agents.n_agents)
+    last = report(build.act_with(agents.network, agents.greedy_weights()), agents.n_agents)
     return [
         Row(
             ablation=name,
@@ -223,7 +223,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
 
     from experiments.charts import save
 
-    torch.set_num_threads(config.threads)
+    torch.set_num_threads(1)
     path = folder / "ablation.csv"
     rows = _read(path)
     done = {row.ablation for row in rows}

@@ -16,16 +16,28 @@ if TYPE_CHECKING:
     from dqn.config import DQNConfig
     from dqn.network import QNetwork
     from dqn.policy import Policy
+    from dqn.population import Population
     from dqn.trainer import Trainer
     from envs.plant import Plant
     from experiments.controllers.base import Controller
     from experiments.evaluation import Act
 
-__all__ = ["act_with", "controller", "trainer"]
+__all__ = ["act_with", "controller", "population", "trainer"]
+
+
+def population(
+    env: EnvConfig, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu", threads: int | None = None
+) -> Population:
+    """Agents with the given seeds in groups of a size that suits the device; arguments as `Population`."""
+    from dqn.population import GROUP, Population
+
+    size = GROUP if device == "cpu" else len(seeds)
+    groups = [seeds[k : k + size] for k in range(0, len(seeds), size)]
+    return Population([trainer(env, agent, group, device) for group in groups], threads)
 
 
 def trainer(env: EnvConfig, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu") -> Trainer:
-    """Agents with the given seeds, each in its own copy of the environment; one record per episode."""
+    """One group of agents with the given seeds, each in its own copy of the environment; one record per episode."""
     from dqn.agent import STREAMS, DQNAgent
     from dqn.trainer import Trainer
     from envs.vector_env import BioreactorVectorEnv

@@ -89,19 +89,19 @@ def _watch(config: DegradationConfig, name: str) -> list[dict[str, float | str]]
     from experiments.evaluation import Evaluation, selection_grid
 
     agent = variant(config.agent, name, config.trained[name])
-    trainer = build.trainer(config.env, agent, range(config.seed, config.seed + config.n_agents))
+    agents = build.population(config.env, agent, range(config.seed, config.seed + config.n_agents))
     selection = Evaluation(config.env, agent.gamma, selection_grid(config.env))
     optimum = solve(config.env, agent.gamma)
     od, setpoint = selection_grid(config.env)
     value = optimal_q(optimum, od, np.searchsorted(optimum.setpoints, setpoint - 1e-9)).max(-1)
     rows: list[dict[str, float | str]] = []
     observation = torch.from_numpy(np.stack([od, setpoint], -1).astype(np.float32)).expand(config.n_agents, -1, -1)
-    for record in trainer.run():
+    for record in agents.run():
         if record.step % config.eval_every and record.step != agent.total_steps:
             continue
-        learner = trainer.agent
-        score = selection(build.act_with(learner.online, learner.greedy.flat), config.n_agents)
-        error = learner.greedy(observation).amax(-1).numpy() / agent.reward_scale - value
+        greedy = agents.network.with_weights(agents.greedy_weights())
+        score = selection(build.act_with(greedy, greedy.flat), config.n_agents)
+        error = greedy(observation).amax(-1).numpy() / agent.reward_scale - value
         rows.append(
             {
                 "variant": name,

@@ -100,20 +100,20 @@ class Session:
         self.config = config
         self.folder = folder
         self.seeds: Sequence[int] = range(config.seed, config.seed + config.n_agents)
-        self.trainer = build.trainer(config.env, config.agent, self.seeds, config.device)
+        self.agents = build.population(config.env, config.agent, self.seeds, config.device, config.threads)
         self.selection = Evaluation(config.env, config.agent.gamma, selection_grid(config.env))
-        self.best = Best.empty(self.trainer.agent.greedy.flat)
+        self.best = Best.empty(self.agents.greedy_weights())
         self.returns: list[list[float]] = []  # per episode, per agent
         self.seconds = 0.0  # spent training, over all lives
         if resume:
             self._restore(checkpoint.load(folder / "checkpoint.pt"))
-        self.writer = PopulationWriter(folder, self.seeds, self.trainer.agent.steps)
+        self.writer = PopulationWriter(folder, self.seeds, self.agents.steps)
 
     def evaluate(self, step: int) -> Score:
         """Score the greedy policies on the selection grid, keep the best, log."""
-        agent = self.trainer.agent
-        score = self.selection(build.act_with(agent.online, agent.greedy.flat), agent.n_agents)
-        self.best.update(step, score, agent.greedy.flat)
+        weights = self.agents.greedy_weights()
+        score = self.selection(build.act_with(self.agents.network, weights), self.agents.n_agents)
+        self.best.update(step, score, weights)
         self.writer.scalars(
             step, {"eval/regret_pct": score.regret_pct, "eval/steady_abs_error": score.steady_abs_error}
         )
@@ -137,7 +137,7 @@ class Session:
 
     def _save(self) -> None:
         state = {
-            "trainer": self.trainer.state_dict(),
+            "agents": self.agents.state_dict(),
             "best": self.best.state_dict(),
             "returns": self.returns,
             "seconds": self.seconds,
@@ -145,7 +145,7 @@ class Session:
         checkpoint.save(self.folder / "checkpoint.pt", state)
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.trainer.load_state_dict(state["trainer"])
+        self.agents.load_state_dict(state["agents"])
         self.best.load_state_dict(state["best"])
         self.returns = [list(row) for row in state["returns"]]
         self.seconds = state["seconds"]
@@ -153,10 +153,10 @@ class Session:
     def run(self) -> None:
         """Train to the end: log every episode, evaluate, checkpoint, show progress."""
         c = self.config
-        total, last = c.agent.total_steps, self.trainer.agent.steps
+        total, last = c.agent.total_steps, self.agents.steps
         started, earlier = time.perf_counter(), self.seconds
         with logging_redirect_tqdm(), tqdm(total=total, initial=last, disable=None, unit="step") as bar:
-            for record in self.trainer.run():
+            for record in self.agents.run():
                 self.seconds = earlier + time.perf_counter() - started
                 self._log(record)
                 bar.update(record.step - last)

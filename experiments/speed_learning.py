@@ -27,14 +27,14 @@ COPIES = 4096
 ENTRY_POINTS = ("train", "deploy", "calibrate", "benchmark", "report", "speed")
 
 
-def _train(agents: int, config: DQNConfig, threads: int) -> None:
+def _train(agents: int, config: DQNConfig) -> None:
     """The schedule from scratch, no evaluation, no files: what the rivals do, too."""
     import torch
 
     from experiments import build
 
-    torch.set_num_threads(threads)
-    for _ in build.trainer(EnvConfig(), config, range(agents)).run():
+    torch.set_num_threads(1)
+    for _ in build.population(EnvConfig(), config, range(agents)).run():
         pass
 
 
@@ -58,12 +58,12 @@ def training() -> Iterator[Measurement]:
         ("Stable-Baselines3 DQN", rivals.stable_baselines_dqn),
         ("single-file loop as CleanRL's", rivals.single_file_dqn),
     ):
-        yield Measurement("training, one agent", schedule, name, lambda: _train(1, config, 1), alone(rival))
+        yield Measurement("training, one agent", schedule, name, lambda: _train(1, config), alone(rival))
     yield Measurement(
         f"training, {POPULATION} agents",
         f"{schedule} each",
         "one run of Stable-Baselines3 DQN",
-        lambda: _train(POPULATION, config, 1),
+        lambda: _train(POPULATION, config),
         alone(rivals.stable_baselines_dqn),
     )
 
@@ -114,7 +114,7 @@ def update() -> Iterator[Measurement]:
 
 
 def _warm_agent(agents: int, config: DQNConfig) -> Any:
-    """An agent whose replay memory is full."""
+    """One group of agents whose replay memory is full."""
     from experiments import build
 
     trainer = build.trainer(EnvConfig(), replace(config, learn_start=config.total_steps), range(agents))
@@ -208,6 +208,6 @@ def scaling(runs: int) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]
     found["copies N, one environment step"] = (copies, [env_step(int(n)) for n in copies])
     found["episodes, one training"] = (
         episodes,
-        [timed(partial(_train, 1, replace(config, total_steps=100 * int(e)), 1), 1) for e in episodes],
+        [timed(partial(_train, 1, replace(config, total_steps=100 * int(e))), 1) for e in episodes],
     )
     return {key: (sizes, np.array(seconds)) for key, (sizes, seconds) in found.items()}

@@ -64,7 +64,7 @@ def _export(session: Session, score: Score) -> Path:
             "regret_pct": float(score.regret_pct[i]),
             "steady_abs_error": float(score.steady_abs_error[i]),
         }
-        exported = export(session.trainer.agent.online, i, best.weights, c.env.pump_rates(), metadata)
+        exported = export(session.agents.network, i, best.weights, c.env.pump_rates(), metadata)
         policy.save(folder / f"seed{seed:04d}.npz", exported)
         if i == int(best.merit.argmin()):
             policy.save(session.folder / "policy.npz", exported)
@@ -111,7 +111,7 @@ def _figures(session: Session, policy_path: Path) -> None:
     )
     for name, figure in figures.items():
         charts.save(figure, session.folder / "figures", name)
-        session.writer.events.figure(f"figures/{name}", figure, session.trainer.agent.steps)
+        session.writer.events.figure(f"figures/{name}", figure, session.agents.steps)
 
 
 def _finish(session: Session) -> None:
@@ -121,16 +121,16 @@ def _finish(session: Session) -> None:
     from experiments import build
     from experiments.evaluation import Evaluation, report_grid
 
-    c, agent, best = session.config, session.trainer.agent, session.best
+    c, agents, best = session.config, session.agents, session.best
     report = Evaluation(c.env, c.agent.gamma, report_grid(c.env))
-    kept = report(build.act_with(agent.online, best.weights), agent.n_agents)
-    last = report(build.act_with(agent.online, agent.greedy.flat), agent.n_agents)
+    kept = report(build.act_with(agents.network, best.weights), agents.n_agents)
+    last = report(build.act_with(agents.network, agents.greedy_weights()), agents.n_agents)
     path = _export(session, kept)
     _figures(session, path)
     summary = {
         "seeds": list(session.seeds),
-        "env_steps": agent.steps,
-        "updates": agent.updates,
+        "env_steps": agents.steps,
+        "updates": agents.updates,
         "train_seconds": round(session.seconds, 3),
         "regret_pct": kept.regret_pct,
         "steady_abs_error": kept.steady_abs_error,
@@ -150,7 +150,7 @@ def _finish(session: Session) -> None:
     session.writer.events.hyper_parameters(numbers, ["eval/regret_pct", "eval/steady_abs_error"])
     log.info(
         "%d agent(s), %d steps and %d updates each in %.1f s: regret %.2f %% (worst %.2f %%), steady error %.4f OD",
-        agent.n_agents, agent.steps, agent.updates, session.seconds, np.median(kept.regret_pct),
+        agents.n_agents, agents.steps, agents.updates, session.seconds, np.median(kept.regret_pct),
         kept.regret_pct.max(), np.median(kept.steady_abs_error),
     )  # fmt: skip
     log.info("policy %s; figures %s; tensorboard --logdir %s", path, session.folder / "figures", session.folder)
@@ -169,7 +169,7 @@ def train(config: TrainConfig, folder: Path) -> float:
 
     if config.device == "cuda" and not torch.cuda.is_available():
         raise app.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
-    torch.set_num_threads(config.threads)
+    torch.set_num_threads(1)  # of one operation: matrices of this size do not gain from more
     try:
         session = Session(config, folder, resume=config.resume is not None)
     except CheckpointError as error:

@@ -114,7 +114,8 @@ def test_one_update_agrees_with_torch() -> None:
         def q(observation: torch.Tensor, flat: torch.Tensor = parameters) -> torch.Tensor:
             h, start = observation.double(), 0
             for k, (inputs, outputs) in enumerate(((3, 16), (16, 16), (16, 3))):
-                weight = flat[start : start + inputs * outputs].view(inputs, outputs)
+                weight = flat[start : start + inputs * outputs]
+                weight = weight.view(outputs, inputs).T if k == 2 else weight.view(inputs, outputs)
                 start += inputs * outputs
                 h = h @ weight + flat[start : start + outputs]
                 start += outputs

@@ -122,9 +122,10 @@ def test_killed_at_a_random_moment_and_resumed_gives_the_same_weights(whole, tmp
     done = run("train", f"resume={folder}")
     assert done.returncode == 0, done.stderr
     a, b = checkpoint.load(whole / "checkpoint.pt"), checkpoint.load(folder / "checkpoint.pt")
+    ours, theirs = (c["agents"]["groups"][0]["agent"] for c in (a, b))
     for key in ("online", "target", "greedy"):
-        assert torch.equal(a["trainer"]["agent"][key], b["trainer"]["agent"][key])
-    assert torch.equal(a["trainer"]["agent"]["replay"]["rows"], b["trainer"]["agent"]["replay"]["rows"])
+        assert torch.equal(ours[key], theirs[key])
+    assert torch.equal(ours["replay"]["rows"], theirs["replay"]["rows"])
     assert torch.equal(a["best"]["weights"], b["best"]["weights"])
     assert a["returns"] == b["returns"]
     first = [line for line in (whole / "progress.csv").read_text().splitlines() if ",speed/" not in line]
@@ -162,10 +163,10 @@ def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path):
     second.run()
     second.writer.close()
     third = Session(c, tmp_path / "b", resume=True)
-    assert third.trainer.agent.steps == 300
+    assert third.agents.steps == 300
     third.run()
     third.writer.close()
-    assert torch.equal(first.trainer.agent.online.flat, third.trainer.agent.online.flat)
+    assert torch.equal(first.agents.greedy_weights(), third.agents.greedy_weights())
     assert first.best.history == third.best.history
 
 

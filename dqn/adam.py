@@ -1,0 +1,47 @@
+"""Adam on the flat weights of S agents."""
+
+from __future__ import annotations
+
+import torch
+
+__all__ = ["Adam"]
+
+
+class Adam:
+    """w <- w - lr m^ / (sqrt(v^) + eps), m and v running means of g and g^2, ^ corrected for their start (Kingma 2015).
+
+    The step is the fused kernel that torch.optim.Adam(fused=True) calls. Called directly it costs a sixth of what the
+    optimiser's bookkeeping of parameter groups makes of it, which for one agent is a tenth of an update.
+
+    Args:
+      weights: changed in place, any shape. gradient: read at each step, same shape.
+      learning_rate: of the next step; may be set between steps. beta2, eps: as in the equation; beta1 is 0.9.
+    """
+
+    def __init__(
+        self, weights: torch.Tensor, gradient: torch.Tensor, learning_rate: float, beta2: float, eps: float
+    ) -> None:
+        self.learning_rate = learning_rate
+        self._beta2, self._eps = beta2, eps
+        self._weights, self._gradient = weights, gradient
+        self._mean, self._square = torch.zeros_like(weights), torch.zeros_like(weights)
+        self._steps = torch.zeros((), device=weights.device)
+
+    def step(self) -> None:
+        """One step along the gradient."""
+        self._steps += 1
+        torch._fused_adam_(
+            [self._weights], [self._gradient], [self._mean], [self._square], [], [self._steps],
+            lr=self.learning_rate, beta1=0.9, beta2=self._beta2, eps=self._eps,
+            weight_decay=0.0, amsgrad=False, maximize=False,
+        )  # fmt: skip
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Everything needed to continue."""
+        return {"mean": self._mean.cpu(), "square": self._square.cpu(), "steps": self._steps.cpu()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Continue as saved."""
+        self._mean.copy_(state["mean"])
+        self._square.copy_(state["square"])
+        self._steps.copy_(state["steps"])

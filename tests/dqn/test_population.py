@@ -1,0 +1,73 @@
+"""Agents in groups: the same whatever the number of threads, and whole again after a stop."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from dqn.agent import DQNAgent
+from dqn.population import Population
+from dqn.trainer import Trainer, TrainRecord
+from tests.dqn.problems import IdentityEnv, streams
+from tests.dqn.test_agent import SMALL
+
+GROUPS = (range(4), range(4, 7), range(7, 8))
+
+
+def _population(threads: int) -> Population:
+    trainers = [Trainer(IdentityEnv(s), DQNAgent(SMALL, 3, 3, streams(s)), interval=50) for s in GROUPS]
+    return Population(trainers, threads)
+
+
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
+    one, many = _population(1), _population(3)
+    for a, b in zip(one.run(), many.run(), strict=True):
+        assert a.step == b.step
+        for key in ("episode_return", "loss", "q_min", "q_max"):
+            assert getattr(a, key).shape == (8,)
+            np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
+    assert (many.n_agents, many.steps, many.updates) == (8, SMALL.total_steps, SMALL.total_updates)
+    assert torch.equal(one.greedy_weights(), many.greedy_weights())
+
+
+def test_agents_come_in_the_order_of_their_groups() -> None:
+    """Agent 5 of the population is the second of the second group, and is the seed 5 trained alone."""
+    population = _population(2)
+    for _ in population.run():
+        pass
+    weights = population.greedy_weights()
+    assert torch.equal(weights[5], population.groups[1].agent.greedy.flat[1])
+    alone = Trainer(IdentityEnv(range(5, 6)), DQNAgent(SMALL, 3, 3, streams(range(5, 6))), interval=50)
+    first = next(alone.run())
+    np.testing.assert_allclose(next(_population(2).run()).episode_return[5], first.episode_return[0])
+
+
+def test_a_resumed_population_is_the_uninterrupted_one() -> None:
+    whole = _population(2)
+    returns = [record.episode_return for record in whole.run()]
+    stopped = _population(2)
+    running = stopped.run()
+    for _ in range(5):
+        next(running)
+    resumed = _population(1)
+    resumed.load_state_dict(copy.deepcopy(stopped.state_dict()))
+    rest = [record.episode_return for record in resumed.run()]
+    np.testing.assert_array_equal(np.array(returns[5:]), np.array(rest))
+    assert torch.equal(whole.greedy_weights(), resumed.greedy_weights())
+
+
+def test_an_error_in_one_group_ends_the_run() -> None:
+    class Broken(Trainer):
+        def run(self) -> Iterator[TrainRecord]:
+            yield from ()
+            raise RuntimeError("vial 3 is missing")
+
+    population = _population(2)
+    broken = population.groups[1]
+    population.groups[1] = Broken(broken.env, broken.agent, 50)
+    with pytest.raises(RuntimeError, match="vial 3 is missing"):
+        list(population.run())
