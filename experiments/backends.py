@@ -93,7 +93,11 @@ def opened(config: DeployConfig, plant: PlantConfig, record: Record) -> Iterator
             reactors.begin(replay(earlier), (time.time() - float(earlier[0]["wall"])) * backend.speed)
         else:
             reactors.begin()
-        yield reactors
+        try:
+            yield reactors
+        except BaseException:  # before the loop, which ends with the same by itself: a guard runs already
+            reactors.stop()
+            raise
 
 
 @contextmanager

@@ -99,9 +99,10 @@ class ChiBioReactors:
         self._zero = self._clock.now() - elapsed_s
         try:
             self._bring_up(saved or {})
-        except (ReactorError, KeyboardInterrupt):
-            if self.config.guard.pump:
-                self._each(np.ones(len(self.stations), dtype=np.bool_), lambda station: station.unit.pumps_off(tries=1))
+        except (ReactorError, KeyboardInterrupt) as error:
+            guarded = np.array([station.guard.was_on or station.guard.tried for station in self.stations])
+            if failed := self._each(guarded, lambda station: station.unit.pumps_off(tries=1)):
+                raise DeviceStateError(f"{error}; overflow guard not verified off: {'; '.join(failed)}") from error
             raise
 
     def _bring_up(self, saved: Mapping[str, Saved]) -> None:

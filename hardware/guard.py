@@ -68,12 +68,13 @@ class Guard:
     Args:
       unit: the reactor's verified conversation. config: of the guard.
       log: told of every time it was switched on and verified. tell: takes a note, if it had been on before.
-    Attributes: trouble, why it could not be verified on, "" if it was; was_on, whether it was known to be on.
+    Attributes: trouble, why it could not be verified on, "" if it was; was_on, whether it was known to be on; tried,
+      whether it may have been switched on here.
     """
 
     def __init__(self, unit: Unit, config: GuardConfig, log: Log, tell: Callable[[str], None]) -> None:
         self.config = config
-        self.trouble, self.was_on = "", False
+        self.trouble, self.was_on, self.tried = "", False, False
         self._unit, self._log, self._tell = unit, log, tell
 
     def keep(self, state: DeviceState) -> DeviceState:
@@ -85,6 +86,7 @@ class Guard:
         if not (found := config.astray(state)):
             self.trouble, self.was_on = "", self.was_on or bool(config.pump)
             return state
+        self.tried = True
         if found != "off" or state.pump_targets[PUMPS.index(config.pump)] != config.duty:
             unit.target(config.pump, config.duty)
         if found == "off":
