@@ -206,7 +206,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     from experiments import charts, charts_faults
 
     began = time.monotonic()
-    faults = by_name(config.faults)
+    faults = [f for f in by_name(config.faults) if config.guard.pump or not f.guard]
     total_cases, over = len(all_cases(config)), itertools.count(1)
     with logging_redirect_tqdm(), tqdm(total=total_cases, disable=None, unit="case") as bar:
 
