@@ -89,6 +89,7 @@ class VesselConfig:
     """The vial and its bottle.
 
     volume_ml, volume_sd_ml: culture up to the waste tube, mean and spread between vials.
+    guard_above_ml: an overflow guard's tube, if there is one, ends so far above the waste tube.
     capacity_ml: where it overflows.
     evaporation_ml_day: water lost.
     media_ml: fresh medium in the bottle; inf = never empty.
@@ -96,6 +97,7 @@ class VesselConfig:
 
     volume_ml: float = 20.0
     volume_sd_ml: float = 0.0
+    guard_above_ml: float = 2.0
     capacity_ml: float = 30.0
     evaporation_ml_day: float = 0.0
     media_ml: float = float("inf")
@@ -104,6 +106,7 @@ class VesselConfig:
         ranges = {
             "volume_ml": (5.0, 50.0, "mL"),
             "volume_sd_ml": (0.0, 1.5, "mL"),
+            "guard_above_ml": (0.0, 10.0, "mL"),
             "capacity_ml": (self.volume_ml + 4.5, 200.0, "mL"),
             "evaporation_ml_day": (0.0, 50.0, "mL/day"),
             "media_ml": (0.0, np.inf, "mL"),
@@ -173,6 +176,12 @@ def _response(config: GrowthConfig) -> Callable[[Array], Array]:
     return lambda temperature: phi(temperature) / reference
 
 
+def _moved(on_s: Array, flow: Array) -> Array:
+    """Volume a pump of `flow` mL/s could move, mL, shape (N,): nothing backwards, nothing if it is blocked."""
+    able = np.zeros_like(flow)  # a blocked pump moves nothing, however long it runs (0 times infinity is 0 here)
+    return np.multiply(np.maximum(on_s, 0.0), flow, out=able, where=flow > 0.0)
+
+
 class Plant:
     """N vials, advanced together.
 
@@ -184,7 +193,8 @@ class Plant:
     With `dosing = pulse` the dose enters at the start of an interval: x <- x F, s <- 1 - (1 - s) F, and D = 0 after it;
     F = exp(-v/V) for what feed and waste pump exchange at constant volume, V/(V + v) for what stays in the vial.
     Volume: the waste pump lowers V to its tube, never below; what it does not take raises V up to the rim, where
-    `overflowed` is set. Source of the terms and numbers: biology.md sections 2 to 7.
+    `overflowed` is set. An overflow guard is a second such outlet a little higher. Source of the terms and numbers:
+    biology.md sections 2 to 7.
 
     What is drawn once (growth rate, pump flow, optics, tube height) is drawn here, recorded in `draws`, and stays over
     `reset`: a reset is a new culture in the same reactor. Process noise is drawn per minute of plant time and sensor
@@ -200,8 +210,9 @@ class Plant:
     State, shape (N,): `od` (true suspended biomass), `substrate`, `wall`, `volume_ml`, `temperature`,
     `temperature_target`, `media_ml` (fresh medium delivered since reset), `overflowed`; `minutes` since reset.
     Fault switches, shape (N,), may be set at any time and stay until set again: `mu_factor`, `stir_factor` (1 turning,
-    0 stopped; for a stirrer that fails, not for the still phase of each cycle), `waste_gain_factor`, and through the
-    parts `pump_gain_factor`, `back_leak_ml`, `media_left_ml`, `sensor_frozen`, `sensor_offset`.
+    0 stopped; for a stirrer that fails, not for the still phase of each cycle), `waste_gain_factor`,
+    `guard_gain_factor`, and through the parts `pump_gain_factor`, `back_leak_ml`, `media_left_ml`, `sensor_frozen`,
+    `sensor_offset`.
     """
 
     def __init__(self, config: PlantConfig, n: int, rng: np.random.Generator | Streams) -> None:
@@ -227,7 +238,8 @@ class Plant:
         self._phi = _response(g)
         self._integrate = INTEGRATORS[config.integrator]
         self._tape = Tape(process, normals=3, uniforms=2)
-        self.mu_factor, self.stir_factor, self.waste_gain_factor = np.ones(n), np.ones(n), np.ones(n)
+        self.mu_factor, self.stir_factor = np.ones(n), np.ones(n)
+        self.waste_gain_factor, self.guard_gain_factor = np.ones(n), np.ones(n)
         self.reset()
 
     def reset(self, od: Array | float | None = None, temperature: float = 37.0) -> None:
@@ -263,6 +275,7 @@ class Plant:
         feed_s: Array,
         waste_s: Array | None = None,
         temperature_target: Array | float | None = None,
+        guard_s: Array | float = 0.0,
     ) -> None:
         """Run pumps, growth and heater for an interval of any length; long ones are cut into minutes.
 
@@ -273,14 +286,16 @@ class Plant:
           waste_s: on-time of the waste pump, s, same shape, beside the feed; None = as much as is needed.
             Negative blows air and changes nothing.
           temperature_target: thermostat, degC, scalar or shape (N,); None or nan leaves it, 0 is off.
+          guard_s: on-time of the overflow guard's pump, s, as `waste_s`; 0 = there is none.
         Raises: ValueError for an interval not positive or an on-time not finite.
         """
         if not (minutes > 0.0 and np.isfinite(minutes)):
             raise ValueError(f"interval = {minutes} min: allowed > 0")
         feed = np.broadcast_to(np.asarray(feed_s, dtype=np.float64), (self.n,))
         waste = np.full(self.n, np.inf) if waste_s is None else np.broadcast_to(waste_s, (self.n,))
-        if not np.all(np.isfinite(feed)) or np.any(np.isnan(waste)):
-            raise ValueError(f"pump on-time = feed {feed} s, waste {waste} s: allowed finite numbers")
+        guard = np.broadcast_to(np.asarray(guard_s, dtype=np.float64), (self.n,))
+        if not np.all(np.isfinite(feed)) or np.any(np.isnan(waste + guard)):
+            raise ValueError(f"pump on-time = feed {feed} s, waste {waste} s, guard {guard} s: allowed finite numbers")
         if temperature_target is not None:
             target = np.broadcast_to(np.asarray(temperature_target, dtype=np.float64), (self.n,))
             self.temperature_target = np.where(np.isnan(target), self.temperature_target, target)
@@ -288,15 +303,16 @@ class Plant:
         continuous = self.config.pump.dosing == "continuous"
         for k in range(pieces):
             share = 1.0 / pieces if continuous else float(k == 0)
-            self._advance_piece(minutes / pieces, feed * share, waste * share if share else np.zeros(self.n))
+            outlets = (waste * share, guard * share) if share else (np.zeros(self.n), np.zeros(self.n))
+            self._advance_piece(minutes / pieces, feed * share, *outlets)
 
-    def _advance_piece(self, minutes: float, feed_s: Array, waste_s: Array) -> None:
+    def _advance_piece(self, minutes: float, feed_s: Array, waste_s: Array, guard_s: Array) -> None:
         """At most one minute: this minute's draws, doses, heat, growth, evaporation."""
         self._catch_up()
         fresh = self.feed.deliver(np.maximum(feed_s, 0.0), minutes, self.minutes)
         self.media_ml = self.media_ml + fresh
         volume = self.volume_ml
-        kept = self._exchange(fresh, waste_s)
+        kept = self._exchange(fresh, waste_s, guard_s)
         drawn = self.draws["pump_gain_ml_s"] * self.feed.gain_factor * np.maximum(-feed_s, 0.0)
         self.volume_ml = np.maximum(self.volume_ml - drawn, MIN_VOLUME_ML)
         if self.config.pump.dosing == "pulse":
@@ -325,20 +341,30 @@ class Plant:
             self._ripple = z_ripple
             self._minute += 1
 
-    def _exchange(self, fresh: Array, waste_s: Array) -> Array:
-        """Move liquid; returns F, the share of what was in the vial that its concentrations keep, shape (N,)."""
-        able = np.zeros(self.n)  # a blocked pump moves nothing, however long it runs (0 times infinity is 0 here)
-        flow = self.config.pump.waste_ml_s * self.waste_gain_factor
-        np.multiply(np.maximum(waste_s, 0.0), flow, out=able, where=flow > 0.0)
-        fill = np.minimum(fresh, np.maximum(self._tube_ml - self.volume_ml, 0.0))
-        level = self.volume_ml + fill
-        swapped = np.minimum(fresh - fill, able)
-        rest = fresh - fill - swapped
-        raised = level + rest
-        kept = self.volume_ml / raised * np.exp(-swapped / level)
-        lowered = np.maximum(raised - (able - swapped), np.minimum(self._tube_ml, raised))
-        self.overflowed = self.overflowed | (raised > self.config.vessel.capacity_ml)
-        self.volume_ml = np.minimum(lowered, self.config.vessel.capacity_ml)
+    def _exchange(self, fresh: Array, waste_s: Array, guard_s: Array) -> Array:
+        """Move liquid; returns F, the share of what was in the vial that its concentrations keep, shape (N,).
+
+        Fresh medium fills the vial up to an outlet's tube, is exchanged there for what its pump takes, and rises on.
+        """
+        pump = self.config.pump
+        guard_ml = self._tube_ml + self.config.vessel.guard_above_ml
+        outlets = [  # from below: level of the tube, mL the pump is able to move
+            [self._tube_ml, _moved(waste_s, pump.waste_ml_s * self.waste_gain_factor)],
+            [guard_ml, _moved(guard_s, pump.guard_ml_s * self.guard_gain_factor)],
+        ]
+        level, left, kept = self.volume_ml, fresh, np.ones(self.n)
+        for outlet in outlets:
+            tube, able = outlet
+            fill = np.minimum(left, np.maximum(tube - level, 0.0))
+            swapped = np.minimum(left - fill, able)
+            kept = kept * (level / (level + fill)) * np.exp(-swapped / (level + fill))
+            level, left, outlet[1] = level + fill, left - fill - swapped, able - swapped
+        kept = kept * (level / (level + left))
+        level = level + left
+        self.overflowed = self.overflowed | (level > self.config.vessel.capacity_ml)
+        for tube, able in outlets:
+            level = np.maximum(level - able, np.minimum(tube, level))
+        self.volume_ml = np.minimum(level, self.config.vessel.capacity_ml)
         return np.asarray(kept)
 
     def _heat(self, minutes: float, kept: Array) -> None:

@@ -26,6 +26,7 @@ RANGES = {
     "prime_low": (0.0, 1.0, ""),
     "prime_high": (0.0, 1.0, ""),
     "waste_ml_s": (0.05, 5.0, "mL/s"),
+    "guard_ml_s": (0.05, 5.0, "mL/s"),
     "back_leak_ml": (0.0, 1.0, "mL"),
 }
 
@@ -43,7 +44,7 @@ class PumpConfig:
     min_pulse_s: pulses shorter than this deliver nothing.
     timing_error_s: each pulse lasts longer by a uniform draw from 0 to this.
     prime_idle_min, prime_low, prime_high: after more idle minutes than this, a pulse delivers only a fraction between.
-    waste_ml_s: flow of the waste pump at full power.
+    waste_ml_s, guard_ml_s: flow of the waste pump and of the overflow guard's pump at full power.
     back_leak_ml: volume that siphons back after each pulse.
     """
 
@@ -60,6 +61,7 @@ class PumpConfig:
     prime_low: float = 1.0
     prime_high: float = 1.0
     waste_ml_s: float = 1.0
+    guard_ml_s: float = 1.0
     back_leak_ml: float = 0.0
 
     def __post_init__(self) -> None:

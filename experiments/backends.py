@@ -93,7 +93,11 @@ def opened(config: DeployConfig, plant: PlantConfig, record: Record) -> Iterator
             reactors.begin(replay(earlier), (time.time() - float(earlier[0]["wall"])) * backend.speed)
         else:
             reactors.begin()
-        yield reactors
+        try:
+            yield reactors
+        except BaseException:  # before the loop, which ends with the same by itself: a guard runs already
+            reactors.stop()
+            raise
 
 
 @contextmanager
@@ -104,6 +108,7 @@ def device_of(config: DeployConfig) -> Iterator[str]:
         yield backend.url
         return
     arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
+    arguments |= {"guard": backend.guard.pump, "guard-flow": backend.guard.flow_ml_s} if backend.guard.pump else {}
     with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
         log.info("emulated device at %s, %g times real time; faults at %s", device.url, backend.speed, device.control)
         yield device.url

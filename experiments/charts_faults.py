@@ -20,12 +20,12 @@ def fault_map(outcomes: Sequence[Outcome], moments: Sequence[str]) -> Figure:
 
     A dash means that it was not told; a frame, that the case did not go as declared.
     """
-    names = list(dict.fromkeys(o.fault for o in outcomes))
+    names = list(dict.fromkeys(o.label for o in outcomes))
     error = np.full((len(names), len(moments)), np.nan)
     figure, (ax,) = new_figure(3.6 + 1.1 * len(moments), 1.2 + 0.2 * len(names))
     ax.grid(False)
     for o in outcomes:
-        row, column = names.index(o.fault), list(moments).index(o.moment)
+        row, column = names.index(o.label), list(moments).index(o.moment)
         error[row, column] = max(o.peak_error, 0.01)
         text = f"{o.detected_s / 60.0:.1f}" if math.isfinite(o.detected_s) else "–"
         dark = o.peak_error > 0.4

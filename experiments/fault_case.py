@@ -20,6 +20,7 @@ from experiments.rehearsal import Killed, Rehearsal
 from hardware.emulator_bench import BenchConfig, Dose, Sample
 from hardware.emulator_device import DeviceOptions
 from hardware.errors import ReactorError
+from hardware.guard import GuardConfig
 from hardware.journal import read_journal
 from hardware.safety_config import Response, SafetyConfig
 
@@ -36,6 +37,7 @@ SEEN_S = 75.0  # a row's time is that of the arrival of its sample, at most so l
 class Outcome:
     """What happened. Times s after the fault, volumes mL; nan where there is nothing to tell.
 
+    guarded: whether the rig has an overflow guard.
     detected_s, reason: first declared word on the fault. response: of the interlock to it. kinds: all reasons after
       it; notes: of the driver.
     peak_ml, overflowed: of the worst vial.
@@ -52,6 +54,7 @@ class Outcome:
 
     fault: str
     moment: str
+    guarded: bool = True
     at_min: float = math.nan
     detected_s: float = math.nan
     reason: str = ""
@@ -76,6 +79,11 @@ class Outcome:
     def ok(self) -> bool:
         """Nothing is wrong."""
         return not self.wrong
+
+    @property
+    def label(self) -> str:
+        """The fault's name, and the rig if it is the standard one."""
+        return self.fault if self.guarded else f"{self.fault}, no guard"
 
     def as_dict(self) -> dict[str, Any]:
         """For summary.json."""
@@ -229,6 +237,7 @@ class Case:
     Args:
       fault: None for a healthy control run. moment: of `MOMENTS`. names: of the reactors, `SICK` first.
       schedule, safety, controller: as of deploy. seed: of all noise.
+      guard: of the rig; an overflow may be declared only where there is none.
       outlier_rate: share of readings that jump for no reason; 0 keeps them from being taken for the fault.
     """
 
@@ -241,20 +250,23 @@ class Case:
         safety: SafetyConfig,
         controller: str,
         seed: int,
+        guard: GuardConfig | None = None,
         outlier_rate: float = 0.0,
     ) -> None:
         self.fault, self.moment, self.names = fault, moment, tuple(names)
         self.schedule, self.safety, self.controller, self.seed = schedule, safety, controller, seed
+        self.guard = guard or GuardConfig()
         self.options = DeviceOptions(bench=BenchConfig(outlier_rate=outlier_rate))
-        self.result = Outcome(fault.name if fault else "none", moment)
+        self.result = Outcome(fault.name if fault else "none", moment, bool(self.guard.pump))
 
     def run(self) -> Outcome:
         """Rehearse, judge. Raises: nothing of what the fault brings about."""
         with tempfile.TemporaryDirectory() as folder:
             schedules = [self.schedule] * len(self.names)
             self.r = Rehearsal(
-                Path(folder), self.names, schedules, self.safety, self.controller, self.options, seed=self.seed
-            )
+                Path(folder), self.names, schedules, self.safety, self.controller, self.options, seed=self.seed,
+                guard=self.guard,
+            )  # fmt: skip
             self.watch = _Watch(self.fault, self.r, self.result)
             self.r.clock.at(1.0, self._wait_for_it)
             self._live()
@@ -344,7 +356,7 @@ class Case:
         """Compare with what is declared."""
         out, fault = self.result, self.fault
         checks = {
-            "overflow": out.overflowed and not (fault and fault.overflow),
+            "overflow": out.overflowed and (out.guarded or not (fault and fault.overflow)),
             "rows lost": out.rows_lost > 0,
             "rows doubled": out.rows_doubled > 0,
             "doses doubled": out.doses_doubled > 0,

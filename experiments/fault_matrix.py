@@ -18,7 +18,8 @@ from typing import Any
 from envs.setpoints import Schedule
 from experiments import app
 from experiments.fault_case import MOMENTS, Case, Outcome
-from experiments.faults import FAULTS, SICK, Fault, by_name
+from experiments.faults import SICK, Fault, by_name
+from hardware.guard import GuardConfig
 from hardware.safety_config import SafetyConfig
 
 __all__ = ["FaultMatrixConfig", "fault_matrix", "table"]
@@ -33,6 +34,8 @@ class FaultMatrixConfig:
     """Values of `conf/fault_matrix.yaml`. Raises: ValueError naming key, value and allowed range.
 
     reactors: the first one falls sick. faults: their names; empty for all. moments: of `fault_case.MOMENTS`.
+    guard: overflow guard of the rig; faults that overflow without one are run on a rig without as well. Without a pump
+      everything is run on that rig, and faults of the guard are left out.
     controls: healthy runs without sensor outliers; every word of the interlock there is a false alarm.
     seed: of the first case. workers: processes; 0 = one per core.
     """
@@ -43,6 +46,7 @@ class FaultMatrixConfig:
     )
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     controller_kind: str = "inverse"
+    guard: GuardConfig = field(default_factory=lambda: GuardConfig("Pump3", 0.95, 1.2))
     faults: tuple[str, ...] = ()
     moments: tuple[str, ...] = MOMENTS
     controls: int = 10
@@ -72,16 +76,21 @@ class FaultMatrixConfig:
                 raise ValueError(f"{key} = {value}: allowed {allowed}")
 
 
-def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int) -> Outcome:
-    """One case, in whatever process. Args: name: of the fault, "" for a healthy run."""
+def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int, guarded: bool) -> Outcome:
+    """One case, in whatever process. Args: name: of the fault, "" for a healthy run. guarded: the rig has a guard."""
     fault = by_name((name,))[0] if name else None
-    return Case(fault, moment, config.reactors, config.scenario, config.safety, config.controller_kind, seed).run()
+    what = (config.reactors, config.scenario, config.safety, config.controller_kind, seed)
+    return Case(fault, moment, *what, config.guard if guarded else GuardConfig()).run()
 
 
-def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int]]:
-    """(fault, moment, seed) of every case; controls first."""
-    controls = [("", "steady", config.seed + k) for k in range(config.controls)]
-    return controls + [(f.name, moment, config.seed) for f in by_name(config.faults) for moment in config.moments]
+def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
+    """(fault, moment, seed, rig with guard) of every case; controls first, the rig without guard last."""
+    there = bool(config.guard.pump)
+    faults = by_name(config.faults)
+    rigs = [(f.name, there) for f in faults if there or not f.guard]
+    rigs += [(f.name, False) for f in faults if there and f.overflow]
+    controls = [("", "steady", config.seed + k, there) for k in range(config.controls)]
+    return controls + [(name, moment, config.seed, guarded) for name, guarded in rigs for moment in config.moments]
 
 
 @contextmanager
@@ -120,11 +129,11 @@ def table(outcomes: Sequence[Outcome]) -> str:
         "doses doubled", "pumps off", "as declared",
     )  # fmt: skip
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for name in dict.fromkeys(o.fault for o in outcomes):
-        mine = [o for o in outcomes if o.fault == name]
+    for name in dict.fromkeys(o.label for o in outcomes):
+        mine = [o for o in outcomes if o.label == name]
         told = [o.detected_s / 60.0 for o in mine if o.reason]
         cells = [
-            name if name != "none" else f"none ({len(mine)} healthy runs)",
+            name if mine[0].fault != "none" else f"{name} ({len(mine)} healthy runs)",
             (_span(told, ".1f") + (f" ({len(told)} of {len(mine)})" if len(told) < len(mine) else "")) if told else "–",
             ", ".join(dict.fromkeys(o.reason for o in mine if o.reason)) or "–",
             ", ".join(dict.fromkeys(o.response for o in mine if o.response)) or "–",
@@ -143,8 +152,11 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 
 def declared(faults: Sequence[Fault]) -> str:
-    """Markdown: what is not detected, or not prevented, and why."""
-    lines = ["| fault | what happens | not detected because | overflow because |", "|---|---|---|---|"]
+    """Markdown: what is not detected, or overflows without a guard, and why."""
+    lines = [
+        "| fault | what happens | not detected because | without a guard it overflows because |",
+        "|---|---|---|---|",
+    ]
     for f in faults:
         if f.why_not or f.overflow:
             lines.append(f"| {f.name} | {f.what} | {f.why_not or '(detected)'} | {f.overflow or '–'} |")
@@ -153,14 +165,14 @@ def declared(faults: Sequence[Fault]) -> str:
 
 def totals(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """The sums by which the matrix passes or fails."""
-    known = {f.name: f for f in FAULTS}
     healthy = [o for o in outcomes if o.fault == "none"]
-    allowed = [o for o in outcomes if o.fault in known and known[o.fault].overflow]
+    bare = [o for o in outcomes if not o.guarded]
     return {
         "cases": len(outcomes),
         "faults": len({o.fault for o in outcomes} - {"none"}),
-        "overflows": sum(o.overflowed for o in outcomes if o not in allowed),
-        "overflows_not_preventable": sum(o.overflowed for o in allowed),
+        "overflows": sum(o.overflowed for o in outcomes if o.guarded),
+        "cases_without_guard": len(bare),
+        "overflows_without_guard": sum(o.overflowed for o in bare),
         "rows_lost": sum(o.rows_lost for o in outcomes),
         "rows_doubled": sum(o.rows_doubled for o in outcomes),
         "doses_doubled": sum(o.doses_doubled for o in outcomes),
@@ -194,7 +206,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     from experiments import charts, charts_faults
 
     began = time.monotonic()
-    faults = by_name(config.faults)
+    faults = [f for f in by_name(config.faults) if config.guard.pump or not f.guard]
     total_cases, over = len(all_cases(config)), itertools.count(1)
     with logging_redirect_tqdm(), tqdm(total=total_cases, disable=None, unit="case") as bar:
 
@@ -207,7 +219,10 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     if not outcomes:
         raise app.UserError("nothing to run: give faults or controls")
     write_cases(folder / "cases.csv", outcomes)
-    (folder / "table.md").write_text(table(outcomes) + "\n" + declared(faults), encoding="utf-8")
+    rigs = [[o for o in outcomes if o.guarded], [o for o in outcomes if not o.guarded]]
+    heads = (f"With an overflow guard ({config.guard.pump} at {config.guard.duty:g})", "Without")
+    parts = [f"## {head}\n\n{table(rig)}" for head, rig in zip(heads, rigs, strict=True) if rig]
+    (folder / "table.md").write_text("\n".join([*parts, declared(faults)]), encoding="utf-8")
     sick = [o for o in outcomes if o.fault != "none"]
     if sick:
         charts.save(charts_faults.fault_map(sick, config.moments), folder / "figures", "fault_matrix")
@@ -216,7 +231,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     app.write_json(folder / "summary.json", {**total, **seconds, "cases_list": [o.as_dict() for o in outcomes]})
     for o in outcomes:
         if not o.ok:
-            log.warning("%s, %s: %s (%s)", o.fault, o.moment, ", ".join(o.wrong), o.outcome)
+            log.warning("%s, %s: %s (%s)", o.label, o.moment, ", ".join(o.wrong), o.outcome)
     log.info("%s", ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in {**total, **seconds}.items()))
     log.info("table %s, cases %s", folder / "table.md", folder / "cases.csv")
     if total["not_as_declared"]:

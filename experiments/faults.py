@@ -39,7 +39,9 @@ class Fault:
     program: the program ends; it is resumed after `minutes`.
     rogue: something else than this program moves the feed pump, so its runs say nothing about doubled doses.
     stuck: a motor that runs whatever it is told cannot be at rest at the end.
-    overflow: why an overflow cannot be prevented; empty if there must be none.
+    overflow: why it overflows on a rig without an overflow guard, on which it is run as well; empty if there must be no
+      overflow on either.
+    guard: it is a fault of the overflow guard, run only where there is one.
     """
 
     name: str
@@ -55,10 +57,16 @@ class Fault:
     rogue: bool = False
     stuck: bool = False
     overflow: str = ""
+    guard: bool = False
 
     def __post_init__(self) -> None:
         if bool(self.by) == bool(self.why_not):
             raise ValueError(f"fault {self.name}: needs either `by` or `why_not`")
+
+
+def guard_off(r: Rehearsal) -> None:
+    """Another client switches the overflow guard's pump off."""
+    post(f"/SetOutputOn/{r.backend.guard.pump}/0/{SICK}")(r)
 
 
 def set_(name: str, value: float = 1.0) -> Act:
@@ -204,6 +212,10 @@ FAULTS: tuple[Fault, ...] = (
         "waste stuck open", "waste pump runs for good", set_("waste_stuck_open"), stuck=True,
         why_not="the level is set by the height of the waste tube: it sucks air",
     ),
+    Fault(
+        "guard blocked", "the overflow guard moves nothing", set_("guard_gain_factor", 0.0), guard=True,
+        why_not="nothing flows there unless the level rises: its tube is checked daily, like the waste tube",
+    ),
     # ---- sensor
     Fault("OD frozen", "the spectrometer repeats its last count", set_("od_frozen"), ("frozen",)),
     Fault("OD offset +0.3", "a bubble or condensation that stays", set_("od_offset", 0.3), ("jump",)),
@@ -292,6 +304,8 @@ FAULTS: tuple[Fault, ...] = (
     Fault("foreign pump", "the feed pump is switched on twice, 0.5 mL every 63 s",
           again(post(f"/SetOutputTarget/Pump1/{SICK}/0.008", f"/SetOutputOn/Pump1/1/{SICK}"), 95.0),
           ("pump", "note:pumps on", "mode"), rogue=True),
+    Fault("foreign guard off", "the overflow guard's pump is switched off", guard_off, ("note:overflow guard",),
+          guard=True),
     Fault("foreign stop", "the experiment is stopped; started again after 10 min", post(f"/Experiment/0/{SICK}"),
           ("stopped",), post(f"/Experiment/1/{SICK}"), 10.0, blind=True),
     Fault("foreign thermostat off", "heating switched off", post(f"/SetOutputOn/Thermostat/0/{SICK}"),
@@ -324,11 +338,11 @@ FAULTS: tuple[Fault, ...] = (
           rogue=True),
     Fault("controller asks 1 mL/s", "fifty times the limit", control(1.0), ("limit",), wide=True),
     Fault("setpoint typo", "the schedule asks for OD 5.0", typo, ("setpoint",)),
-    # ---- beyond what a program can prevent
+    # ---- beyond what a program can prevent: an overflow guard does
     Fault("feed stuck open", "feed pump at full power for good", set_("feed_stuck_open"), ("falls",), rogue=True,
           stuck=True, overflow="1 mL/s fills the headroom of 10 mL in 10 s, OD is measured every 60 s"),
     Fault("waste blocked", "waste pump delivers nothing for good", set_("waste_gain_factor", 0.0),
-          why_not="without a level sensor it looks like faster growth",
+          why_not="without a level sensor it looks like faster growth; a guard keeps the level where its tube ends",
           overflow="10 mL of headroom fill in 15 to 25 min of feed"),
 )  # fmt: skip
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from hardware.chibio_config import ChiBioConfig
 from hardware.clock import VirtualClock
 from hardware.emulator_device import ChiBioDevice, DeviceOptions
 from hardware.emulator_transport import EmulatorTransport
+from hardware.guard import GuardConfig
 from hardware.pumps import PumpCalibration, Rig
 from hardware.safety import Interlock
 from hardware.safety_config import SafetyConfig
@@ -64,6 +66,13 @@ class ScriptedClock(VirtualClock):
         super().sleep(end - self.now())
 
 
+def _plumbed(options: DeviceOptions, guard: GuardConfig) -> DeviceOptions:
+    """The same device with a second waste tube on the guard's pump."""
+    pump = replace(options.plant.pump, guard_ml_s=guard.flow_ml_s)
+    bench = replace(options.bench, guard=guard.pump)
+    return replace(options, bench=bench, plant=replace(options.plant, pump=pump))
+
+
 class Rehearsal:
     """A run of `experiments.deploy` against the emulated device, in virtual time.
 
@@ -71,7 +80,7 @@ class Rehearsal:
       folder: run folder, must exist.
       names: positions of the reactors. schedules: one for each.
       safety, backend: as of deploy. controller: kind of controller; `dqn` is not among them (it needs a policy file).
-      options: of the device. od: at the start. seed: of all noise.
+      options: of the device. od: at the start. seed: of all noise. guard: against overflow, of rig and driver.
     Attributes: clock, device; record, reactors, loop of the present life of the program; lives; killed_s, when the
       program was killed; spans, clock times during which the program lived.
     """
@@ -86,13 +95,16 @@ class Rehearsal:
         options: DeviceOptions | None = None,
         od: float = 0.5,
         seed: int = 0,
+        guard: GuardConfig | None = None,
     ) -> None:
         self.folder, self.names, self.schedules = folder, tuple(names), list(schedules)
         self.safety, self._kind = safety or SafetyConfig(), controller
         self.clock = ScriptedClock()
         rng = np.random.default_rng(seed)
-        self.device = ChiBioDevice(self.names, self.clock, rng, options, od=od, temperature=37.0, blanked=True)
-        self.backend = ChiBioConfig(reactors=self.names)
+        guard = guard or GuardConfig()
+        plumbed = _plumbed(options or DeviceOptions(), guard)
+        self.device = ChiBioDevice(self.names, self.clock, rng, plumbed, od=od, temperature=37.0, blanked=True)
+        self.backend = ChiBioConfig(reactors=self.names, guard=guard)
         self.spans: list[list[float]] = []
         self.lives = 0
         self._dead = False

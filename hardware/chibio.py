@@ -63,7 +63,7 @@ class ChiBioReactors:
         self._zero = clock.now()
         self.stations = tuple(
             Station(
-                Unit(m, config.reactors, transport, clock, self._note_down),
+                Unit(m, config.reactors, transport, clock, self._note_down, config.guard.pump),
                 rig,
                 config,
                 self._agenda,
@@ -86,6 +86,8 @@ class ChiBioReactors:
     def begin(self, saved: Mapping[str, Saved] | None = None, elapsed_s: float = 0.0) -> None:
         """Sweep the pumps off, pin identities and blanks, start what does not run yet, staggered inside the minute.
 
+        An overflow guard is verified on before the first dose, and off again if the start fails.
+
         An experiment that already runs is adopted, never started again (a second start would stop it); its next new
         sample is the first one delivered.
 
@@ -95,9 +97,18 @@ class ChiBioReactors:
         Raises: ReactorError if a reactor cannot be brought into its running state.
         """
         self._zero = self._clock.now() - elapsed_s
+        try:
+            self._bring_up(saved or {})
+        except (ReactorError, KeyboardInterrupt) as error:
+            guarded = np.array([station.guard.was_on or station.guard.tried for station in self.stations])
+            if failed := self._each(guarded, lambda station: station.unit.pumps_off(tries=1)):
+                raise DeviceStateError(f"{error}; overflow guard not verified off: {'; '.join(failed)}") from error
+            raise
+
+    def _bring_up(self, saved: Mapping[str, Saved]) -> None:
         for station in self.stations:
             station.zero = self._zero
-            station.restore((saved or {}).get(station.name, Saved()))
+            station.restore(saved.get(station.name, Saved()))
         slot = 0
         for station in self.stations:
             running = station.unit.read().running
@@ -107,6 +118,9 @@ class ChiBioReactors:
         while any(station.busy for station in self.stations):
             self._agenda.run_due()
             self._clock.sleep(min(self._agenda.next_due() - self._clock.now(), 1.0))
+        for station in self.stations:
+            if station.guard.trouble:
+                raise DeviceStateError(f"{station.name}: {station.guard.trouble}; run the preflight")
 
     def measure(self) -> Measurement:
         """The newest samples; waits for one, working through the agenda.
@@ -174,8 +188,8 @@ class ChiBioReactors:
         return Receipt(volume, notes, waste)
 
     def pumps_off(self, rows: Mask) -> list[str]:
-        """All pumps of `rows` off, verified; returns what failed, one line per reactor."""
-        return self._each(rows, lambda station: station.unit.pumps_off(tries=1))
+        """All pumps of `rows` off, verified, but for an overflow guard; returns what failed, one line per reactor."""
+        return self._each(rows, lambda station: station.pumps_off(tries=1))
 
     def heat_off(self, rows: Mask) -> list[str]:
         """Thermostat and heater of `rows` off, and not switched on again; returns what failed."""
@@ -200,9 +214,10 @@ class ChiBioReactors:
         return failed
 
     def stop(self) -> None:
-        """All pumps of all reactors off, verified; tried for `stop_s`, then escalated. Idempotent.
+        """All pumps of all reactors off, guards too, verified; tried for `stop_s`, then escalated. Idempotent.
 
-        Experiments go on (stirred, heated, measured). A reactor handed over to the on-board regulation is left to it.
+        Experiments go on (stirred, heated, measured). A reactor handed over to the on-board regulation is left to it,
+        with its guard.
         Raises: DeviceStateError naming every reactor whose pumps could not be verified off, and what to do.
         """
         pending = [s for s in self.stations if not math.isfinite(s.handed_over)]

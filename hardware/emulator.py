@@ -18,13 +18,14 @@ import struct
 import sys
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, HTTPServer, ThreadingHTTPServer
 from types import FrameType
 
 import numpy as np
 
 from hardware.clock import RealClock
-from hardware.emulator_bench import PLANTS
+from hardware.emulator_bench import PLANTS, SPARE, BenchConfig
 from hardware.emulator_device import ChiBioDevice, DeviceOptions, Exchange
 from hardware.emulator_faults import FAULTS, inject
 
@@ -250,6 +251,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--plant", choices=sorted(PLANTS), default="healthy", help="cultures and pumps (default %(default)s)"
     )
+    p.add_argument(
+        "--guard", choices=SPARE, default="", help="pump whose tube is an overflow guard's (default: there is none)"
+    )
+    p.add_argument("--guard-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
     p.add_argument("--unblanked", action="store_true", help="start with the zero at 65000, as after power-on")
     return p
 
@@ -260,11 +265,13 @@ def build(arguments: argparse.Namespace) -> ChiBioDevice:
         ods = [float(x) for x in arguments.od.split(",")]
     except ValueError:
         raise ValueError(f"od = {arguments.od}: allowed a number, or one per reactor, e.g. 0.3,0.4") from None
+    plant = PLANTS[arguments.plant]()
+    plant = replace(plant, pump=replace(plant.pump, guard_ml_s=arguments.guard_flow))
     return ChiBioDevice(
         tuple(arguments.reactors.split(",")),
         RealClock(arguments.speed),
         np.random.default_rng(arguments.seed),
-        DeviceOptions(plant=PLANTS[arguments.plant]()),
+        DeviceOptions(bench=BenchConfig(guard=arguments.guard), plant=plant),
         od=ods[0] if len(ods) == 1 else ods,
         temperature=arguments.temperature,
         blanked=not arguments.unblanked,

@@ -17,6 +17,7 @@ from envs.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfi
 __all__ = ["PLANTS", "Bench", "BenchConfig", "Dose", "Sample", "VialFaults", "density"]
 
 FEED, WASTE = "Pump1", "Pump2"
+SPARE = ("Pump3", "Pump4")
 LINEAR, QUADRATIC = 1.833, 0.226  # OD = LINEAR R + QUADRATIC R^2, R = log10(zero / raw) (chibio.md section 4)
 FULL_SCALE = 65535
 DARK_COUNTS = 3.0  # what the spectrometer counts without light
@@ -74,6 +75,7 @@ class BenchConfig:
     stir_factor, stir_noise: raw while stirring, relative to still, mean and spread.
     on_time_bias_low_s, on_time_bias_high_s: how much longer than asked a pump runs (chibio.md section 5.1).
     air_c: air outside.
+    guard: pump whose tube is an overflow guard's (docs/chibio.md); "" = the spare pumps have no tubes.
     """
 
     blank_low: float = 11600.0
@@ -86,6 +88,7 @@ class BenchConfig:
     on_time_bias_low_s: float = 0.02
     on_time_bias_high_s: float = 0.2
     air_c: float = 24.0
+    guard: str = ""
 
     def __post_init__(self) -> None:
         ranges = {
@@ -104,6 +107,8 @@ class BenchConfig:
             value = getattr(self, key)
             if not low <= value <= high:
                 raise ValueError(f"bench.{key} = {value}: allowed {low:g} to {high:g}; change it")
+        if self.guard not in ("", *SPARE):
+            raise ValueError(f"bench.guard = {self.guard}: allowed {', '.join(SPARE)}, or nothing")
 
 
 @dataclass
@@ -162,7 +167,7 @@ class Bench:
         self.blank = float(rng.uniform(config.blank_low, config.blank_high))
         self.doses: deque[Dose] = deque(maxlen=DOSES_KEPT)
         self.samples: deque[Sample] = deque(maxlen=DOSES_KEPT)
-        self.on_s = dict.fromkeys((FEED, WASTE, "Pump3", "Pump4"), 0.0)
+        self.on_s = dict.fromkeys((FEED, WASTE, *SPARE), 0.0)
         self.peak_ml = float(plant.volume_ml[0])
         self.powered = True
         self.heat, self.stir = 0.0, 0.0
@@ -268,6 +273,7 @@ class Bench:
 
     def _step(self, seconds: float) -> None:
         feed, waste = (np.array([self.motor(pump) * seconds]) for pump in (FEED, WASTE))
+        guard = self.motor(self.config.guard) * seconds if self.config.guard else 0.0
         for pump in self._motors:
             self.on_s[pump] += abs(self.motor(pump)) * seconds
         thermal, plant = self.plant.config.thermal, self.plant
@@ -276,7 +282,7 @@ class Bench:
         cooled = thermal.ambient_c + (plant.temperature - thermal.ambient_c) * np.exp(-minutes / thermal.cooling_min)
         still = self.stir == 0.0 and self._at + seconds - self._stirred_at > STIR_STOPPED_S
         plant.stir_factor[:] = 0.0 if still else 1.0
-        plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes)
+        plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, guard)
         self._at += seconds
         self.peak_ml = max(self.peak_ml, float(plant.volume_ml[0]))
 

@@ -92,6 +92,7 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "stirrer_dead": ("vial", "0 or 1", "the stirrer does not turn"),
     "pump_gain_factor": ("plant", "factor >= 0", "feed flow: 0 blocked, 0.5 weak, 1 sound"),
     "waste_gain_factor": ("plant", "factor >= 0", "waste flow: 0 blocked, 1 sound"),
+    "guard_gain_factor": ("plant", "factor >= 0", "flow of the overflow guard: 0 blocked, 1 sound"),
     "back_leak_ml": ("plant", "mL >= 0", "siphons back after each feed pulse"),
     "media_left_ml": ("plant", "mL >= 0", "fresh medium left in the bottle; 0 = empty"),
     "mu_factor": ("plant", "factor >= 0", "growth rate relative to healthy"),

@@ -12,13 +12,16 @@ from pathlib import Path
 from hardware.chibio_config import ChiBioConfig
 from hardware.clock import Clock
 from hardware.errors import ReactorError
-from hardware.pumps import Rig
+from hardware.guard import GuardConfig
+from hardware.pumps import MAX_FEED_DUTY, Rig
 from hardware.transport import Transport
 from hardware.unit import Unit, no_log
 from hardware.wire import PERIOD_S, UNSET_BLANK, DeviceState
 
 __all__ = ["Check", "preflight"]
 
+SURE = 1.1  # times the feed, for what pumps differ from their calibration
+VIAL_ML = 30.0  # up to its rim (biology.md section 3)
 FREE_MB = 1000.0  # a week of eight reactors writes about 240 MB (docs/faults.md)
 
 
@@ -40,7 +43,7 @@ class Check:
 def preflight(
     transport: Transport, clock: Clock, config: ChiBioConfig, rigs: list[Rig], folder: Path | None = None
 ) -> list[Check]:
-    """Connection, clock, disk, and per reactor presence, identity, blank, modes, sensors and pump calibration.
+    """Disk, guard, connection, clock, and per reactor presence, identity, blank, modes, sensors, pump calibration.
 
     Args:
       transport, clock, config, rigs: as for `ChiBioReactors`.
@@ -48,6 +51,7 @@ def preflight(
     Raises: nothing about the device; a check that cannot be made has failed.
     """
     checks = [_disk(folder)] if folder is not None else []
+    checks.append(_guard(config, rigs))
     try:
         checks += [_link(transport, clock), _board_clock(transport, clock, config)]
     except ReactorError as error:
@@ -67,7 +71,7 @@ def preflight(
         checks.append(
             Check(f"{name} present", True, f"identity {state.device_id}, software {state.version or 'unnamed'}")
         )
-        checks += _reactor(name, state, rig)
+        checks += _reactor(name, state, rig, config.guard)
     return checks
 
 
@@ -101,7 +105,29 @@ def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Ch
     )
 
 
-def _reactor(name: str, state: DeviceState, rig: Rig) -> Iterator[Check]:
+def _guard(config: ChiBioConfig, rigs: list[Rig]) -> Check:
+    """What the overflow guard covers; without one, what then cannot be prevented."""
+    guard, feed = config.guard, max(rig.feed.flow_ml_s for rig in rigs)
+    if not guard.pump:
+        return Check(
+            "overflow guard",
+            False,
+            f"none: with a blocked waste tube a vial overflows after about {VIAL_ML - config.volume_ml:.0f} mL of feed",
+            "a second waste tube on Pump3, backend.guard.pump=Pump3 (docs/chibio.md)",
+            required=False,
+        )
+    covers = "a blocked waste tube" + " and a feed motor stuck on" * (guard.removes_ml_s > SURE * feed)
+    return Check(
+        "overflow guard",
+        guard.removes_ml_s > MAX_FEED_DUTY * feed,
+        f"{guard.pump} at duty {guard.duty:g} takes {guard.removes_ml_s:.2f} mL/s, feed pump {feed:.2f} mL/s at full "
+        f"power: covers {covers}; verified on when the run starts",
+        "less than the largest feed: raise backend.guard.duty",
+        required=False,
+    )
+
+
+def _reactor(name: str, state: DeviceState, rig: Rig, guard: GuardConfig) -> Iterator[Check]:
     """Checks of one reactor's state."""
     blank = rig.blank if math.isfinite(rig.blank) else state.blank
     source = "stored" if math.isfinite(rig.blank) else "of the device"
@@ -146,11 +172,11 @@ def _reactor(name: str, state: DeviceState, rig: Rig) -> Iterator[Check]:
         f"waste moves {stronger:.1f} times the feed in its on-time",
         "exchange or repair the waste pump",
     )
-    on = [p for p, is_on in zip(("Pump1", "Pump2", "Pump3", "Pump4"), state.pumps_on, strict=True) if is_on]
+    on = ", ".join(p for p in state.running_pumps if p in guard.others)
     yield Check(
         f"{name} pumps",
         not on,
-        f"{', '.join(on) or 'all'} {'on' if on else 'off'}",
+        f"{on or 'all'} {'on' if on else 'off'}",
         f"an earlier client left them on, each repeats its dose every {PERIOD_S:.0f} s; the run switches them off",
         required=False,
     )

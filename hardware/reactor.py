@@ -24,7 +24,8 @@ class Fault:
 
     kind: link (no or no readable answer), selection (another client keeps choosing reactors), identity, absent,
       restarted (the device lost its memory), stopped (its experiment was ended), stalled (it answers, its experiment
-      does not go on), mode (something else acts on its pumps), blank (its zero was changed), pump (not verified off).
+      does not go on), mode (something else acts on its pumps), blank (its zero was changed), pump (not verified off),
+      guard (not verified on).
     """
 
     kind: str
@@ -121,7 +122,7 @@ class Reactor(Protocol):
         ...
 
     def pumps_off(self, rows: Mask) -> list[str]:
-        """All pumps of `rows` off, verified; returns what failed, one line per reactor, its name first."""
+        """All pumps that feed or empty `rows` off, verified; returns what failed, one line per reactor, name first."""
         ...
 
     def heat_off(self, rows: Mask) -> list[str]:

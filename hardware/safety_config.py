@@ -70,7 +70,7 @@ SENSOR_REASONS = ("impossible", "spectrometer", "frozen", "jump", "no_dilution",
 class Responses:
     """The declared response to every reason: report | hold | pumps_off | regulate | stop.
 
-    link to pump are the kinds of `reactor.Fault`. A reason that means the sensor cannot be believed may not regulate:
+    link to guard are the kinds of `reactor.Fault`. A reason that means the sensor cannot be believed may not regulate:
     the device would pump by the same reading.
     """
 
@@ -104,6 +104,7 @@ class Responses:
     mode: str = "hold"
     blank: str = "hold"
     pump: str = "pumps_off"
+    guard: str = "hold"
 
     def __post_init__(self) -> None:
         for f in fields(self):

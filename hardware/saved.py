@@ -14,6 +14,7 @@ __all__ = ["Saved", "replay"]
 class Saved:
     """What a run must remember of one reactor across a restart of this program.
 
+    guarded: its overflow guard was verified on.
     sample: (record time, cycles) of the last sample a dose was decided for. open: a dose was begun and its end was
     never recorded; then feed_ml, waste_ml are its volumes and on_s the run time at which it began, s.
     """
@@ -24,6 +25,7 @@ class Saved:
     carry_ml: float = 0.0
     doses: int = 0
     temperature: float = math.nan
+    guarded: bool = False
     open: bool = False
     feed_ml: float = 0.0
     waste_ml: float = 0.0
@@ -38,7 +40,7 @@ def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, Saved]:
     """
     known: dict[str, dict[str, Any]] = {}
     for row in rows:
-        if row.get("kind") not in ("device", "intent", "dose_end", "temperature"):
+        if row.get("kind") not in ("device", "intent", "dose_end", "temperature", "guard"):
             continue
         entry = known.setdefault(str(row["reactor"]), {})
         keys = ("device_id", "blank", "carry_ml", "doses", "temperature", "feed_ml", "waste_ml", "on_s")
@@ -47,4 +49,6 @@ def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, Saved]:
             entry.update(sample=(float(row["sample"][0]), int(row["sample"][1])), open=row["feed_ml"] > 0.0)
         elif row["kind"] == "dose_end":
             entry["open"] = False
+        elif row["kind"] == "guard":
+            entry["guarded"] = True
     return {name: Saved(**entry) for name, entry in known.items()}

@@ -17,6 +17,7 @@ from hardware.agenda import Agenda, Task
 from hardware.chibio_config import ChiBioConfig
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
+from hardware.guard import Guard
 from hardware.pumps import DosePlan, Rig, plan_dose
 from hardware.reactor import Fault
 from hardware.saved import Saved
@@ -47,8 +48,9 @@ class Station:
       zero: clock time at which the run began.
 
     Attributes: od, temperature, raw, time_s of the newest sample (nan before the first); arrived_s, the clock time
-      at which it appeared; fault; busy while the reactor is being started or recovered; next_poll; notes for the next
-      receipt; repeated_ml and repeated_waste_ml, what the device may have dosed again on its own.
+      at which it appeared; fault; guard, against overflow; busy while the reactor is being started or recovered;
+      next_poll; notes for the next receipt; repeated_ml and repeated_waste_ml, what the device may have dosed again on
+      its own.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class Station:
     ) -> None:
         self.unit, self.rig, self.config = unit, rig, config
         self._agenda, self._clock, self._log, self._intend_log = agenda, clock, log, intend
+        self.guard = Guard(unit, config.guard, log, self.tell)
         self.zero = clock.now()
         self.od = self.temperature = self.raw = self.time_s = math.nan
         self.arrived_s = self.next_poll = clock.now()
@@ -89,7 +92,7 @@ class Station:
     # ------------------------------------------------------------------------------------------- start and recovery
 
     def restore(self, saved: Saved) -> None:
-        """Take over identity and memory of an earlier run; the pumps are verified off afterwards.
+        """Take over identity and memory of an earlier run; the pumps, but for the guard, are verified off afterwards.
 
         Raises: ReactorError if the reactor is not reachable, another unit, or its pumps stay on.
         """
@@ -99,9 +102,10 @@ class Station:
             self._target_c = saved.temperature
         state = self.unit.read()
         self._blank = next((b for b in (saved.blank, self.rig.blank) if math.isfinite(b)), state.blank)
-        self.unit.pumps_off()
-        if any(state.pumps_on):
-            self.tell(f"pumps were found on and switched off: {state.pumps_on}")
+        self.guard.was_on = saved.guarded
+        self.pumps_off()
+        if running := self._running(state):
+            self.tell(f"pumps were found on and switched off: {running}")
         if saved.open:  # the device repeats what was left on every 63 s (chibio.md section 0.7)
             times = max(math.floor((self.elapsed() - saved.on_s) / PERIOD_S), 0)
             self.repeated_ml = saved.feed_ml * times * state.pumps_on[0]
@@ -137,7 +141,7 @@ class Station:
                     self.heat_off()
             if math.isfinite(self.handed_over):
                 self.regulate(self.handed_over)
-            self._start_time = self.unit.read().start_time
+            self._start_time = self.guard.keep(self.unit.read()).start_time
             self.arrived_s = self.next_poll = self._clock.now()
             identity = {"reactor": self.name, "device_id": self.unit.device_id, "blank": self._blank}
             self._log("device", {**identity, "temperature": self._target_c, "start_time": self._start_time})
@@ -174,6 +178,7 @@ class Station:
                 return
             try:
                 self.unit.post(f"/Experiment/1/{self.name}")
+                self.guard.was_on = False  # a start switches every pump off
             except LinkError:
                 self._clock.sleep(self.config.retry_s)
         if not self.unit.read().running:
@@ -182,7 +187,7 @@ class Station:
     def _recover(self, kind: str) -> Task:
         """Task: pumps off, then a running experiment again, by way of a stop if its thread is dead."""
         try:
-            self.unit.pumps_off()
+            self.pumps_off()
             if kind == "stalled":
                 self.unit.post(f"/Experiment/0/{self.name}")
                 yield OLD_CYCLE_S
@@ -200,7 +205,7 @@ class Station:
         """Look at the reactor; True if it has a new sample. Trouble becomes `fault`."""
         self.next_poll = self._clock.now() + self.config.retry_s
         try:
-            state = self.unit.read()
+            state = self.guard.keep(self.unit.read())
         except (LinkError, ProtocolError) as error:
             return self._report(_link_fault(error))
         except IdentityError as error:
@@ -228,7 +233,7 @@ class Station:
         if fault is not None and recoverable and self.config.recover:
             self.busy = True
             self._agenda.add(self._recover(fault.kind))
-        if is_new and (fault is None or fault.kind in ("mode", "pump")):
+        if is_new and (fault is None or fault.kind in ("mode", "pump", "guard")):
             self._take(state, now)
             return True
         self._looked = not is_new
@@ -251,10 +256,9 @@ class Station:
             )
         if self._stuck:
             return Fault("pump", self._stuck, "switch the pump board off by hand")
-        if any(state.pumps_on) and not self.dosing and not math.isfinite(self.handed_over):
-            return Fault(
-                "pump", f"pumps on: {state.pumps_on}, not by this program", "close the device's web page everywhere"
-            )
+        running = self._running(state)
+        if running and not self.dosing and not math.isfinite(self.handed_over):
+            return Fault("pump", f"pumps on: {running}, not by this program", "close the device's web page everywhere")
         acting = [m for m in state.modes if m in OWN_WILL]
         if acting or state.regulating != math.isfinite(self.handed_over):
             what = ", ".join(acting) or f"on-board OD regulation is {'on' if state.regulating else 'off'}"
@@ -265,6 +269,8 @@ class Station:
                 f"no new sample for {age_s:.0f} s, cycles {state.cycles}",
                 f"after {self.config.lost_s:.0f} s its experiment is restarted; look at the device's terminal",
             )
+        if self.guard.trouble:
+            return Fault("guard", self.guard.trouble, "close the device's web page everywhere; restart the device")
         return None
 
     def _take(self, state: DeviceState, now: float) -> None:
@@ -380,8 +386,9 @@ class Station:
             unit.target(FEED, plan.feed_duty)
             state = unit.read()
             told = np.allclose(state.pump_targets[:2], (plan.feed_duty, plan.waste_duty), rtol=0.0, atol=1e-5)
-            if not told or any(state.pumps_on) or not state.running or state.regulating:
-                raise DeviceStateError(f"targets {state.pump_targets[:2]}, pumps on {state.pumps_on}: not as set")
+            running = self._running(state)
+            if not told or running or not state.running or state.regulating:
+                raise DeviceStateError(f"targets {state.pump_targets[:2]}, pumps on: {running or 'none'}: not as set")
             past = self._clock.now() - self.arrived_s + self._late_s
             if past + plan.waste_s > self.config.window_s:
                 raise DeviceStateError(f"the device answers too slowly ({past:.0f} s after the sample)")
@@ -412,13 +419,13 @@ class Station:
             yield min(self.config.retry_s, 2.0)
 
     def _finish(self, plan: DosePlan) -> Task:
-        """Task: all pumps off, verified, however long it takes; then the dose is on record as ended."""
+        """Task: the pumps off, verified, however long it takes; then the dose is on record as ended."""
         due = self._clock.now()  # the moment the dose should be over
         self.dosing = True
         for refusals in range(10**9):
             pause = min(self.config.retry_s, 2.0)
             try:
-                self.unit.pumps_off(tries=1)
+                self.pumps_off(tries=1)
                 break
             except (LinkError, ProtocolError) as error:
                 self._report(_link_fault(error))
@@ -438,6 +445,14 @@ class Station:
             self.tell(f"the pumps were verified off late: the dose may have been repeated {repeats} times")
         self.dosing = False
         self._log("dose_end", {"reactor": self.name, "verified_off": True, "repeated_ml": repeats * plan.feed_ml})
+
+    def pumps_off(self, tries: int = 3) -> None:
+        """All pumps off, verified, but for the overflow guard's. Raises: as `Unit.pumps_off`."""
+        self.unit.pumps_off(tries, self.config.guard.others)
+
+    def _running(self, state: DeviceState) -> str:
+        """Names of the pumps that are on beside the overflow guard's."""
+        return ", ".join(p for p in state.running_pumps if p in self.config.guard.others)
 
     def escalate(self) -> None:
         """A pump that stays on: end the experiment (which switches everything off), then touch the bus."""
@@ -472,7 +487,7 @@ class Station:
 
     def regulate(self, setpoint: float) -> None:
         """Hand over to the on-board regulation, which feeds at most 0.02 of full power. Raises: ReactorError."""
-        self.unit.pumps_off()
+        self.pumps_off()
         self.unit.target("OD", setpoint)
         self.unit.switch("OD", True)
         if not self.unit.read().regulating:

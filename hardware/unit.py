@@ -35,9 +35,12 @@ class Unit:
       reactors: all positions this client owns.
       transport, clock: how requests travel, how time passes.
       log: told of every command and its answer.
+      guard: pump of the overflow guard, which may be switched on; "" if there is none.
     """
 
-    def __init__(self, name: str, reactors: Sequence[str], transport: Transport, clock: Clock, log: Log) -> None:
+    def __init__(
+        self, name: str, reactors: Sequence[str], transport: Transport, clock: Clock, log: Log, guard: str = ""
+    ) -> None:
         self.name = name
         self.device_id = ""  # pinned at the first read
         self.state: DeviceState | None = None  # the last verified one
@@ -46,6 +49,7 @@ class Unit:
         self._transport = transport
         self._clock = clock
         self._log = log
+        self._guard = guard
 
     def read(self, tries: int = 3) -> DeviceState:
         """The reactor's state, certainly its own.
@@ -91,7 +95,7 @@ class Unit:
         self._post(path)
 
     def _post(self, path: str, quiet: bool = False) -> None:
-        check_command(path, self._reactors)
+        check_command(path, self._reactors, self._guard)
         start = self._clock.now()
         answer: int | str = ""
         try:
@@ -120,8 +124,8 @@ class Unit:
         """Switch `item`; never a toggle. Raises: as `post`."""
         self.post(f"/SetOutputOn/{item}/{int(on)}/{self.name}")
 
-    def pumps_off(self, tries: int = 3) -> None:
-        """All four pumps off, verified. Every pump is tried even if another one fails, unless nobody answers at all.
+    def pumps_off(self, tries: int = 3, pumps: Sequence[str] = PUMPS) -> None:
+        """These pumps off, verified. Every one is tried even if another one fails, unless nobody answers at all.
 
         Read-back alone proves nothing, for the flags are intent: with the bus hung they say off while the motor runs.
         So a blocking call touches the bus in between. It is quick if all is well; on a hung bus it outlasts the
@@ -137,7 +141,7 @@ class Unit:
             if self.state is None:
                 self.read()  # presence first
             silent = 0  # time-outs are long: after feed and waste went unanswered, say so instead of going on
-            for pump in PUMPS:
+            for pump in pumps:
                 try:
                     self.switch(pump, False)
                     silent = 0
@@ -150,7 +154,7 @@ class Unit:
             self._clock.sleep(SETTLE_S)
             try:
                 self.probe()
-                on = [p for p, is_on in zip(PUMPS, self.read().pumps_on, strict=True) if is_on]
+                on = [p for p in self.read().running_pumps if p in pumps]
             except (LinkError, ProtocolError) as failed:
                 error = failed
                 continue

@@ -16,9 +16,11 @@ from hardware.errors import DeviceStateError, ProtocolError
 
 __all__ = [
     "FEED",
+    "MAX_GUARD_DUTY",
     "PERIOD_S",
     "POSITIONS",
     "PUMPS",
+    "SPARE",
     "UNSET_BLANK",
     "WASTE",
     "DeviceState",
@@ -29,6 +31,10 @@ __all__ = [
 POSITIONS = tuple(f"M{k}" for k in range(8))
 PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")
 FEED, WASTE = "Pump1", "Pump2"
+SPARE = ("Pump3", "Pump4")
+"""Without tubes on a standard reactor; one of them may drive an overflow guard (`hardware/guard.py`)."""
+MAX_GUARD_DUTY = 0.95
+"""Never 1: the device does not switch such a pump off between its periods (chibio.md sections 5.1 and 12.1)."""
 PERIOD_S = 63.0
 """A pump that is ON runs at full power for PERIOD_S * target seconds of every PERIOD_S (chibio.md section 5.1)."""
 UNSET_BLANK = 65000.0
@@ -81,6 +87,11 @@ class DeviceState:
     modes: tuple[str, ...]
     volume_ml: float
     terminal: str
+
+    @property
+    def running_pumps(self) -> tuple[str, ...]:
+        """Names of the pumps that are on."""
+        return tuple(p for p, is_on in zip(PUMPS, self.pumps_on, strict=True) if is_on)
 
     @property
     def started(self) -> bool:
@@ -196,25 +207,28 @@ def parse_state(body: bytes) -> DeviceState:
     )
 
 
-def check_command(path: str, reactors: Sequence[str]) -> None:
+def check_command(path: str, reactors: Sequence[str], guard: str = "") -> None:
     """The last gate before the wire: only these POSTs, only for these reactors, only within these limits.
 
+    Args: guard: which of the spare pumps drives an overflow guard; "" if none does.
+
     Allowed are changeDevice; SetOutputTarget of feed (at most 0.05), waste (0.5), Stir, Thermostat (42 degC), OD,
-    Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; CalibrateOD to a
-    blank; MeasureTemp/IR; Experiment. Everything else the device understands wipes, toggles or kills something
-    (chibio.md sections 2 and 12).
+    Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; both for the guard's
+    pump (at most 0.95); CalibrateOD to a blank; MeasureTemp/IR; Experiment. Everything else the device understands
+    wipes, toggles or kills something (chibio.md sections 2 and 12).
 
     Raises: DeviceStateError if the command is not one of them.
     """
     verb, *args = path.removeprefix("/").split("/")
+    spare = guard if guard in SPARE else None
     match verb, args:
         case "changeDevice", [_]:
             allowed = True
         case "SetOutputTarget", [item, _, value] if item in _LIMITS and re.fullmatch(_NUMBER, value):
-            low, high = _LIMITS[item]
+            low, high = (0.0, MAX_GUARD_DUTY) if item == spare else _LIMITS[item]
             allowed = low <= float(value) <= high
         case "SetOutputOn", [item, force, _] if item in _SWITCHES:
-            allowed = force == "0" or (force == "1" and item in _MAY_GO_ON)
+            allowed = force == "0" or (force == "1" and item in (*_MAY_GO_ON, spare))
         case "CalibrateOD", ["OD0", _, raw, "0"] if re.fullmatch(_NUMBER, raw):
             allowed = 3000.0 <= float(raw) <= 60000.0
         case ("MeasureTemp", ["IR", _]) | ("Experiment", ["0" | "1", _]):

@@ -81,6 +81,34 @@ def test_blocked_waste_overflows_after_the_minutes_the_rim_allows() -> None:
     assert p.volume_ml[1] == 30.0
 
 
+def test_an_overflow_guard_keeps_the_level_where_its_tube_ends() -> None:
+    """Three vials with blocked waste: a guard that is on, one that is blocked, one that is too slow."""
+    p = plant(PlantConfig(pump=PULSE, growth=GrowthConfig(mu=0.0)), 3)
+    p.waste_gain_factor[:] = 0.0
+    p.guard_gain_factor[:] = [1.0, 0.0, 0.1]
+    for _ in range(8):
+        p.advance(1.0, np.full(3, 1.5), np.full(3, 15.0), guard_s=6.3)
+    assert p.volume_ml == pytest.approx([22.0, 30.0, 22.0 + 8 * (1.5 - 0.63) - (2.0 / 1.5) * (1.5 - 0.63)], abs=0.5)
+    np.testing.assert_array_equal(p.overflowed, [False, True, False])
+
+
+def test_above_its_tube_the_guard_exchanges_what_is_fed_and_below_it_takes_nothing() -> None:
+    p = plant(PlantConfig(pump=PULSE, growth=GrowthConfig(mu=0.0)))
+    p.advance(1.0, np.array([1.0]), np.array([0.0]), guard_s=60.0)  # from 20 to 21 mL: nothing to take yet
+    assert p.volume_ml[0] == pytest.approx(21.0)
+    assert p.od[0] == pytest.approx(0.5 * 20.0 / 21.0)
+    p.advance(1.0, np.array([3.0]), np.array([0.0]), guard_s=60.0)  # fills 1 mL to the tube, the rest is exchanged
+    assert p.volume_ml[0] == pytest.approx(22.0)
+    assert p.od[0] == pytest.approx(0.5 * 20.0 / 22.0 * np.exp(-2.0 / 22.0))
+    p.advance(1.0, np.array([4.0]), np.array([0.0]))  # without it the level rises
+    assert p.volume_ml[0] == pytest.approx(26.0)
+    od = p.od[0]
+    p.advance(1.0, np.array([0.0]), np.array([0.0]), guard_s=3.0)  # it takes culture: OD unchanged
+    assert (p.volume_ml[0], p.od[0]) == (pytest.approx(23.0), pytest.approx(od))
+    p.advance(1.0, np.array([0.0]), np.array([30.0]), guard_s=30.0)  # the waste tube is the lower one
+    assert p.volume_ml[0] == pytest.approx(20.0)
+
+
 def test_substrate_is_conserved_in_a_batch_and_exhausted_at_the_yield() -> None:
     config = PlantConfig(growth=GrowthConfig(yield_od=3.0, k_s=0.2))
     p = plant(config)

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +38,15 @@ experiments.deploy.main()
 class Bench:
     """A client at work on two reactors of an emulated device."""
 
-    def __init__(self, device: EmulatorProcess, folder: Path, code: str = "") -> None:
+    def __init__(
+        self, device: EmulatorProcess, folder: Path, code: str = "", more: Sequence[str] = (), resume: bool = False
+    ) -> None:
         self.device, self.folder = device, folder
         program = ["-c", code] if code else ["-m", "experiments.deploy"]
         scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]", "controller=inverse"]
         backend = ["backend=chibio", f"backend.url={device.url}", f"backend.speed={SPEED}", "backend.reactors=[M0,M1]"]
-        command = [sys.executable, *program, *scenario, *backend, f"hydra.run.dir={folder}"]
+        new = [*scenario, *backend, *more, f"hydra.run.dir={folder}"]
+        command = [sys.executable, *program, *([f"resume={folder}"] if resume else new)]
         self.client = subprocess.Popen(
             command, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         )
@@ -142,3 +145,41 @@ def test_an_exception_in_the_controller(tmp_path: Path) -> None:
         assert status == 1
         assert "pumps verified off" in said
         bench.check("failed: RuntimeError: the controller failed")
+
+
+def test_an_overflow_guard_runs_over_doses_and_a_kill_and_is_off_after_every_other_end(tmp_path: Path) -> None:
+    guard = ["backend.guard.pump=Pump3", "backend.guard.duty=0.95"]
+    folder = tmp_path / "run"
+    state = folder / "state.json"
+
+    def until_fed(bench: Bench) -> None:
+        """Until a dose is given beside a running guard."""
+        deadline = time.monotonic() + 60.0
+        while not (state.exists() and any({f"{m}/Pump1", f"{m}/Pump3"} <= set(bench.motors()) for m in ("M0", "M1"))):
+            assert time.monotonic() < deadline
+            assert bench.client.poll() is None
+            time.sleep(0.005)
+
+    with EmulatorProcess(["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5", "--guard", "Pump3"]) as device:
+        bench = Bench(device, folder, more=guard)
+        until_fed(bench)
+        bench.client.kill()
+        assert "overflow guard: Pump3 at duty 0.95" in bench.end()[1]
+        whole = state.read_text()
+        state.write_text("{")  # a resumed run that fails between the reactors' start and the loop
+        bench = Bench(device, folder, resume=True)
+        status, said = bench.end()
+        assert status == 1
+        assert "no state to resume from" in said.splitlines()[-1]
+        assert bench.motors() == []
+        state.write_text(whole)
+        bench = Bench(device, folder, resume=True)
+        until_fed(bench)
+        time.sleep(2.0 * 60.0 / SPEED)
+        bench.client.send_signal(signal.SIGTERM)
+        status, said = bench.end()
+        assert status == 0, said
+        assert "pumps verified off" in said
+        notes = [row["note"] for row in read_journal(folder / "journal.jsonl")[0] if row["kind"] == "note"]
+        assert sum("the overflow guard was found off" in note for note in notes) == 2
+        bench.check("stopped by the operator")

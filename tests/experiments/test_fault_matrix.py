@@ -12,17 +12,23 @@ import pytest
 from envs.setpoints import Schedule
 from experiments import app
 from experiments.fault_case import Case, Outcome, audit_doses
-from experiments.fault_matrix import FaultMatrixConfig, declared, table, totals
+from experiments.fault_matrix import FaultMatrixConfig, all_cases, declared, table, totals
 from experiments.faults import FAULTS, Fault, by_name, set_
 from hardware.emulator_bench import Dose
+from hardware.guard import GuardConfig
 from hardware.safety_config import SafetyConfig
 
 ROOT = Path(__file__).parents[2]
 SCHEDULE = Schedule((0.6, 0.5), (20.0, 20.0), (37.0, 37.0), 0.6)
 
 
-def run(fault: Fault | None, moment: str = "steady", safety: SafetyConfig | None = None) -> Outcome:
-    return Case(fault, moment, ("M0", "M1"), SCHEDULE, safety or SafetyConfig(), "inverse", 3).run()
+def run(
+    fault: Fault | None,
+    moment: str = "steady",
+    safety: SafetyConfig | None = None,
+    guard: GuardConfig | None = None,
+) -> Outcome:
+    return Case(fault, moment, ("M0", "M1"), SCHEDULE, safety or SafetyConfig(), "inverse", 3, guard).run()
 
 
 def test_a_healthy_run_says_nothing_and_holds_the_setpoints() -> None:
@@ -64,6 +70,46 @@ def test_an_overflow_is_found_unless_it_is_declared() -> None:
     blocked = by_name(("waste blocked",))[0]
     assert run(blocked).overflowed
     assert run(replace(blocked, overflow="")).wrong == ["overflow"]
+
+
+@pytest.mark.parametrize("name", ["feed stuck open", "waste blocked"])
+def test_what_overflows_on_the_standard_rig_does_not_with_a_guard(name: str) -> None:
+    fault = by_name((name,))[0]
+    without = run(fault)
+    assert without.ok, without
+    assert (without.overflowed, without.label) == (True, f"{name}, no guard")
+    guarded = run(fault, guard=FaultMatrixConfig().guard)
+    assert guarded.ok, guarded
+    assert (guarded.overflowed, guarded.label) == (False, name)
+    assert guarded.peak_ml < 27.0
+
+
+def test_an_overflow_beside_a_guard_is_never_as_declared() -> None:
+    too_weak = GuardConfig("Pump3", 0.95, 0.9)
+    assert run(by_name(("feed stuck open",))[0], guard=too_weak).wrong == ["overflow"]
+
+
+@pytest.mark.parametrize("name", ["guard blocked", "foreign guard off"])
+def test_faults_of_the_guard_itself(name: str) -> None:
+    outcome = run(by_name((name,))[0], guard=FaultMatrixConfig().guard)
+    assert outcome.ok, outcome
+
+
+def test_rigs_with_and_without_guard_are_counted_apart() -> None:
+    names = ("waste blocked", "guard blocked", "feed blocked")
+    config = FaultMatrixConfig(faults=names, moments=("dose",), controls=1)
+    assert [(name, guarded) for name, _, _, guarded in all_cases(config)] == [
+        ("", True), ("waste blocked", True), ("guard blocked", True), ("feed blocked", True), ("waste blocked", False),
+    ]  # fmt: skip
+    bare = replace(config, guard=GuardConfig())
+    assert [(name, guarded) for name, _, _, guarded in all_cases(bare)] == [
+        ("", False), ("waste blocked", False), ("feed blocked", False),
+    ]  # fmt: skip
+    found = [Outcome("a", "dose", guarded, overflowed=over) for guarded, over in ((True, True), (True, False))]
+    found += [Outcome("a", "dose", False, overflowed=True)] * 3
+    total = totals(found)
+    assert (total["overflows"], total["cases_without_guard"], total["overflows_without_guard"]) == (1, 3, 3)
+    assert "| a, no guard |" in table(found)
 
 
 def test_a_word_in_a_healthy_run_is_a_false_alarm() -> None:

@@ -1,10 +1,12 @@
 """Pump periods, thread replacement, doses, volume (chibio.md section 5.1 and 5.2) with independently computed times."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hardware.emulator_faults import inject
-from tests.hardware.emulator_lab import BIAS_S, Lab
+from tests.hardware.emulator_lab import BIAS_S, Lab, quiet
 
 
 def set_pump(lab: Lab, pump: str, target: float, on: bool = True, reactor: str = "M0") -> None:
@@ -173,6 +175,22 @@ def test_volume_balance_waste_level_and_overflow() -> None:
     truth = lab.device.truth("M0")
     assert truth["overflowed"]
     assert truth["peak_ml"] == pytest.approx(30.0)
+
+
+@pytest.mark.parametrize(("guard", "level"), [("Pump3", 22.0), ("", 25.0 + BIAS_S)])
+def test_a_spare_pump_moves_liquid_only_if_it_has_a_tube(guard: str, level: float) -> None:
+    options = quiet()
+    lab = Lab(options=replace(options, bench=replace(options.bench, guard=guard)))
+    set_pump(lab, "Pump3", 0.5)
+    set_pump(lab, "Pump1", 5.0 / 63.0)
+    lab.wait(8.0)
+    lab.post("/SetOutputOn/Pump1/0/M0")
+    assert lab.device.truth("M0")["motors"]["Pump3"] == 1
+    assert lab.device.truth("M0")["volume_ml"] == pytest.approx(level)
+    inject(lab.device, "guard_gain_factor", "M0", 0.0)
+    set_pump(lab, "Pump1", 1.0 / 63.0)
+    lab.wait(5.0)
+    assert lab.device.truth("M0")["volume_ml"] == pytest.approx(level + 1.0 + BIAS_S)
 
 
 def test_feed_dilutes_by_what_it_adds() -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from hardware.guard import GuardConfig
 from hardware.preflight import Check, preflight
 from hardware.pumps import PumpCalibration, Rig
 from tests.hardware.driver_lab import SOUND, Bed
@@ -16,12 +17,44 @@ def checks(bed: Bed, rig: Rig = SOUND) -> dict[str, Check]:
 
 
 def test_a_sound_device_passes_and_nothing_is_switched() -> None:
-    bed = Bed(("M0", "M1"))
+    bed = Bed(("M0", "M1"), guard=GuardConfig("Pump3"))
     found = checks(bed)
     assert all(check.ok for check in found.values()), "\n".join(map(str, found.values()))
     assert {"disk", "connection", "board clock", "M0 present", "M1 blank", "M1 pump calibration"} <= set(found)
     assert {path.split("/")[1] for _, path in bed.wire.posts} == {"changeDevice", "MeasureTemp"}
     assert str(found["M0 modes"]) == "pass  M0 modes: none active"
+
+
+def test_without_an_overflow_guard_a_note_says_what_may_happen_and_nothing_else_is_wrong() -> None:
+    found = checks(Bed())
+    assert [check.name for check in found.values() if not check.ok] == ["overflow guard"]
+    assert str(found["overflow guard"]) == (
+        "note  overflow guard: none: with a blocked waste tube a vial overflows after about 10 mL of feed -> a second "
+        "waste tube on Pump3, backend.guard.pump=Pump3 (docs/chibio.md)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("guard", "feed_ml_s", "ok", "covers"),
+    [
+        (GuardConfig("Pump3", 0.1), 1.0, True, "covers a blocked waste tube;"),
+        (GuardConfig("Pump3", 0.95), 1.0, True, "covers a blocked waste tube;"),
+        (GuardConfig("Pump4", 0.95, 1.2), 1.0, True, "covers a blocked waste tube and a feed motor stuck on;"),
+        (GuardConfig("Pump3", 0.1, 0.5), 1.5, False, "0.05 mL/s"),
+    ],
+)
+def test_what_an_overflow_guard_covers(guard: GuardConfig, feed_ml_s: float, ok: bool, covers: str) -> None:
+    found = checks(Bed(guard=guard), Rig(PumpCalibration(flow_ml_s=feed_ml_s), SOUND.waste))["overflow guard"]
+    assert (found.ok, found.required) == (ok, False)
+    assert covers in found.detail
+    assert "verified on when the run starts" in found.detail
+
+
+def test_a_guard_that_runs_already_is_no_pump_left_on() -> None:
+    bed = Bed(guard=GuardConfig("Pump3"))
+    for path in ("/SetOutputTarget/Pump3/M0/0.1", "/SetOutputOn/Pump3/1/M0"):
+        bed.device.handle("POST", path)
+    assert checks(bed)["M0 pumps"].ok
 
 
 @pytest.mark.parametrize(

@@ -170,6 +170,34 @@ def test_refused(path: str) -> None:
         check_command(path, ["M0"])
 
 
+@pytest.mark.parametrize(
+    ("path", "guard", "allowed"),
+    [
+        ("/SetOutputTarget/Pump3/M0/0.950000", "Pump3", True),
+        ("/SetOutputTarget/Pump4/M0/0.1", "Pump4", True),
+        ("/SetOutputOn/Pump3/1/M0", "Pump3", True),
+        ("/SetOutputOn/Pump4/0/M0", "Pump3", True),
+        ("/SetOutputTarget/Pump3/M0/0.9501", "Pump3", False),
+        ("/SetOutputTarget/Pump3/M0/1", "Pump3", False),
+        ("/SetOutputTarget/Pump3/M0/-0.1", "Pump3", False),
+        ("/SetOutputTarget/Pump3/M1/0.5", "Pump3", False),
+        ("/SetOutputTarget/Pump4/M0/0.5", "Pump3", False),
+        ("/SetOutputOn/Pump4/1/M0", "Pump3", False),
+        ("/SetOutputOn/Pump3/2/M0", "Pump3", False),
+        ("/SetOutputTarget/Pump1/M0/0.06", "Pump3", False),
+        ("/SetOutputTarget/Pump1/M0/0.06", "Pump1", False),
+        ("/SetOutputTarget/Pump2/M0/0.6", "Pump2", False),
+        ("/SetOutputOn/Heat/1/M0", "Heat", False),
+    ],
+)
+def test_a_guards_pump_has_limits_of_its_own_and_loosens_no_other(path: str, guard: str, allowed: bool) -> None:
+    if allowed:
+        check_command(path, ["M0"], guard)
+        return
+    with pytest.raises(DeviceStateError, match="refused"):
+        check_command(path, ["M0"], guard)
+
+
 ITEMS = ["SetOutputTarget", "SetOutputOn", "Experiment", "changeDevice", "CalibrateOD", "Pump1", "Pump2", "Pump3"]
 WORDS = st.sampled_from(
     [*ITEMS, "Stir", "OD0", "M0", "M1", "Zigzag", "UV", "LASER650", "0", "1", "2", "-0.01", "0.02", "0.9", "nan", ""]
@@ -177,18 +205,19 @@ WORDS = st.sampled_from(
 
 
 @settings(max_examples=2000)
-@given(st.lists(WORDS, max_size=6))
-def test_no_combination_of_words_pumps_too_much_or_reaches_another_reactor(words: list[str]) -> None:
+@given(st.lists(WORDS, max_size=6), st.sampled_from(["", "Pump1", "Pump3"]))
+def test_no_combination_of_words_pumps_too_much_or_reaches_another_reactor(words: list[str], guard: str) -> None:
     path = "/" + "/".join(words)
     try:
-        check_command(path, ["M0"])
+        check_command(path, ["M0"], guard)
     except DeviceStateError:
         return
     verb, args = words[0], words[1:]
     assert "M1" not in args
     assert args.count("M0") == 1
     if verb == "SetOutputTarget" and args[0] in PUMPS:
-        assert 0.0 <= float(args[2]) <= (0.05 if args[0] == "Pump1" else 0.5)
+        limits = {"Pump1": 0.05, "Pump2": 0.5, "Pump3": 0.95 if guard == "Pump3" else 0.0, "Pump4": 0.0}
+        assert 0.0 <= float(args[2]) <= limits[args[0]]
     if verb == "SetOutputOn":
         assert args[0] in (*PUMPS, "OD", "Stir", "Thermostat", "Heat")
         assert args[1] in ("0", "1")
