@@ -26,6 +26,7 @@ from hardware.emulator_process import EmulatorProcess
 from hardware.preflight import preflight
 from hardware.pumps import Rig
 from hardware.reactor import Reactor
+from hardware.safety_config import Response
 from hardware.saved import replay
 from hardware.simulated import SimulatedReactors
 from hardware.transport import Transport, open_transport
@@ -138,15 +139,16 @@ def run_preflight(config: DeployConfig, folder: Path) -> None:
 
 
 def continue_loop(loop: ClosedLoop, record: Record) -> None:
-    """Put the loop where its state was saved, and book the doses begun after that.
+    """Put the loop where its state was saved, and book the doses and hand-overs begun after that.
 
-    Raises: RecordingError, UserError for a state that does not fit.
+    Raises: RecordingError for a state that is damaged or does not fit.
     """
     state, doses = record.load_state()
     try:
         loop.load_state_dict(state)
-    except (KeyError, ValueError, TypeError) as error:
-        raise app.UserError(f"resume: state.json does not fit this run ({error}); start a new run") from None
+    except ValueError as error:
+        raise record.no_state(str(error)) from None
+    loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
     now = loop.reactors.elapsed()
     for receipt in doses:
         loop.interlock.confirm(receipt, now)

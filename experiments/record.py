@@ -37,6 +37,7 @@ COLUMNS = (
     "temperature_degc", "interlock",
 )  # fmt: skip
 NUMBERS = COLUMNS[:-1]
+REBUILD = "move it away and resume again: it is written anew from the last 20 MB of the journal"
 
 
 def row_of(step: Step, n: int) -> Row:
@@ -73,7 +74,7 @@ class Record:
         (folder / "recordings").mkdir(exist_ok=True)
         self.journal = Journal(folder / "journal.jsonl", fsync=fsync)
         self.repairs = [f"journal: cut a torn last line of {self.journal.cut} bytes"] if self.journal.cut else []
-        self._recorders = [Recorder(self._csv(name), COLUMNS, fsync) for name in names]
+        self._recorders = [Recorder(self._csv(name), COLUMNS, fsync, REBUILD) for name in names]
         self.repairs += [r.repaired for r in self._recorders if r.repaired]
         self._columns = [{key: array("d") for key in NUMBERS} for _ in names]
         self.interlock_rows = [0] * len(self.names)
@@ -102,34 +103,45 @@ class Record:
         self._keep(n, row)
 
     def _read(self, n: int) -> None:
-        """Take over the rows an earlier life wrote."""
-        with open(self._csv(self.names[n]), newline="", encoding="utf-8") as f:
-            for raw in csv.DictReader(f):
-                self._keep(
-                    n,
-                    {key: value or "nan" for key, value in raw.items() if key in NUMBERS}
-                    | {"interlock": raw["interlock"]},
-                )
+        """Take over the rows an earlier life wrote. Raises: RecordingError for a row that was damaged."""
+        path = self._csv(self.names[n])
+        with open(path, newline="", encoding="utf-8") as f:
+            try:
+                for raw in csv.DictReader(f):
+                    if raw.keys() != set(COLUMNS) or None in raw.values() or not math.isfinite(float(raw["time_min"])):
+                        raise ValueError("a row without a time, or not with a cell for every column")
+                    self._keep(n, {key: value if key == "interlock" else value or "nan" for key, value in raw.items()})
+            except (ValueError, csv.Error) as error:
+                raise RecordingError(f"{path}: damaged after {self.lengths[n]} rows ({error}); {REBUILD}") from None
 
     def _complete(self) -> None:
         """Append to the CSVs what is in the journal and a kill kept from being written."""
-        kinds = ("sample", "decision", "intent")
         for n, name in enumerate(self.names):
-            last = self._columns[n]["time_min"][-1] if self.lengths[n] else -math.inf
-            mine = [r for r in self.journal.rows if r.get("reactor") == name and r["kind"] in kinds]
-            around = zip([{}, *mine], mine, [*mine[1:], {}], strict=False)
-            for earlier, this, following in around:
-                if this["kind"] == "decision":
-                    row: Row = {c: math.nan if this["row"][c] is None else this["row"][c] for c in COLUMNS}
-                    row["volume_ml"] = float(following["feed_ml"]) if following.get("kind") == "intent" else 0.0
-                elif this["kind"] == "sample" and not following and earlier.get("kind") != "sample":
-                    row = self._undecided(this, n)
-                else:
-                    continue
-                if float(row["time_min"] or 0.0) <= last + 1e-3:
-                    continue
-                self._write(n, row)
-                self.repairs.append(f"{name}: the row of minute {row['time_min']} was completed from the journal")
+            try:
+                self._complete_one(n, name)
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                raise RecordingError(
+                    f"journal {self.journal.path}: a row of {name} is damaged ({type(error).__name__}: {error}); "
+                    "put the file back as the run wrote it, or start a new run"
+                ) from None
+
+    def _complete_one(self, n: int, name: str) -> None:
+        last = self._columns[n]["time_min"][-1] if self.lengths[n] else -math.inf
+        kinds = ("sample", "decision", "intent")
+        mine = [r for r in self.journal.rows if r.get("reactor") == name and r["kind"] in kinds]
+        around = zip([{}, *mine], mine, [*mine[1:], {}], strict=False)
+        for earlier, this, following in around:
+            if this["kind"] == "decision":
+                row: Row = {c: math.nan if this["row"][c] is None else this["row"][c] for c in COLUMNS}
+                row["volume_ml"] = float(following["feed_ml"]) if following.get("kind") == "intent" else 0.0
+            elif this["kind"] == "sample" and not following and earlier.get("kind") != "sample":
+                row = self._undecided(this, n)
+            else:
+                continue
+            if float(row["time_min"] or 0.0) <= last + 1e-3:
+                continue
+            self._write(n, row)
+            self.repairs.append(f"{name}: the row of minute {row['time_min']} was completed from the journal")
 
     def _undecided(self, sample: Mapping[str, Any], n: int) -> Row:
         """The row of a sample that was read, and the program killed before it was decided on: no dose."""
@@ -179,18 +191,29 @@ class Record:
 
     def load_state(self) -> tuple[dict[str, Any], list[Receipt]]:
         """The saved state and the doses begun after it was written. Raises: RecordingError where there is none."""
-        path = self.folder / "state.json"
         try:
-            state: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise RecordingError(f"{path}: no state to resume from ({error}); start a new run") from None
+            state = json.loads((self.folder / "state.json").read_text(encoding="utf-8"))
+        except OSError as error:
+            raise self.no_state(error.strerror or str(error)) from None
+        except (ValueError, RecursionError) as error:
+            raise self.no_state(f"not JSON: {error}") from None
+        if not isinstance(state, dict):
+            raise self.no_state(f"it holds {str(state)[:40]}, expected keys and values")
+        known = state.get("journal_row")
+        if type(known) is not int or known < 0:
+            raise self.no_state(f"journal_row = {str(known)[:40]}: expected the number of a row")
         later = []
         for row in self.journal.rows:
-            if row.get("kind") == "intent" and row["n"] >= state["journal_row"]:
+            if row.get("kind") == "intent" and row["n"] >= known:
                 volume = np.array([row["feed_ml"] if name == row["reactor"] else 0.0 for name in self.names])
                 waste = np.array([row["waste_ml"] if name == row["reactor"] else 0.0 for name in self.names])
                 later.append(Receipt(volume, (), waste))
         return state, later
+
+    def no_state(self, why: str) -> RecordingError:
+        """The error for a state that cannot be resumed from."""
+        remedy = "journal and recordings are kept; start a new run, or put back the file as the run wrote it"
+        return RecordingError(f"{self.folder / 'state.json'}: no state to resume from ({why}); {remedy}")
 
     def series(self, column: str) -> Array:
         """A column of all recordings, shape (N, K); shorter recordings end in nan."""

@@ -79,6 +79,11 @@ class ChiBioReactors:
         """Positions, e.g. ("M0", "M1")."""
         return tuple(s.name for s in self.stations)
 
+    @property
+    def handed_over(self) -> Mask:
+        """Reactors that were handed over to the on-board regulation, shape (N,)."""
+        return np.array([math.isfinite(station.handed_over) for station in self.stations])
+
     def elapsed(self) -> float:
         """Run time, s: counted from `begin`, or from what it was told."""
         return self._clock.now() - self._zero
@@ -89,7 +94,7 @@ class ChiBioReactors:
         An overflow guard is verified on before the first dose, and off again if the start fails.
 
         An experiment that already runs is adopted, never started again (a second start would stop it); its next new
-        sample is the first one delivered.
+        sample is the first one delivered. So is a reactor that was handed over to the on-board regulation: it stays so.
 
         Args:
           saved: `replay` of the journal of the run that is resumed.
@@ -101,7 +106,7 @@ class ChiBioReactors:
             self._bring_up(saved or {})
         except (ReactorError, KeyboardInterrupt) as error:
             guarded = np.array([station.guard.was_on or station.guard.tried for station in self.stations])
-            if failed := self._each(guarded, lambda station: station.unit.pumps_off(tries=1)):
+            if failed := self._each(guarded & ~self.handed_over, lambda station: station.unit.pumps_off(tries=1)):
                 raise DeviceStateError(f"{error}; overflow guard not verified off: {'; '.join(failed)}") from error
             raise
 
@@ -220,7 +225,7 @@ class ChiBioReactors:
         with its guard.
         Raises: DeviceStateError naming every reactor whose pumps could not be verified off, and what to do.
         """
-        pending = [s for s in self.stations if not math.isfinite(s.handed_over)]
+        pending = [s for s, regulated in zip(self.stations, self.handed_over, strict=True) if not regulated]
         errors: dict[str, ReactorError] = {}
         deadline = self._clock.now() + self.config.stop_s
         while pending:

@@ -15,8 +15,8 @@ from hardware.errors import RecordingError
 __all__ = ["Journal", "read_journal"]
 
 TAIL = 20_000_000  # bytes; about 16 h of eight reactors
-LANDMARKS = (b'"kind":"device"', b'"kind":"temperature"')
-"""Identities, blanks and thermostat targets, written once and valid for days."""
+LANDMARKS = (b'"kind":"device"', b'"kind":"temperature"', b'"kind":"regulate"')
+"""Identities, blanks, thermostat targets and hand-overs, written once and valid for days."""
 
 
 def _plain(value: Any) -> Any:
@@ -102,8 +102,13 @@ class Journal:
             os.close(folder)
         except OSError as error:
             raise RecordingError(f"journal {path}: {error.strerror or error}; check folder, rights and disk") from error
-        self.rows = [*_landmarks(path, before), *_parse(old[: kept - before], path)]
-        self._n = int(self.rows[-1].get("n", len(self.rows) - 1)) + 1 if self.rows else 0
+        try:
+            self.rows = [*_landmarks(path, before), *_parse(old[: kept - before], path)]
+            _check(self.rows, path)
+        except RecordingError:
+            self.close()
+            raise
+        self._n = self.rows[-1]["n"] + 1 if self.rows else 0
         self._size = kept
 
     def append(self, kind: str, fields: Mapping[str, Any]) -> None:
@@ -147,6 +152,17 @@ def _parse(data: bytes, path: Path) -> Iterator[dict[str, Any]]:
         if not isinstance(row, dict):
             raise RecordingError(f"journal {path}, line {number}: not a row; the file was changed by hand")
         yield row
+
+
+def _check(rows: list[dict[str, Any]], path: Path) -> None:
+    """Whether every row has what all rows have. Raises: RecordingError."""
+    kinds: dict[str, Any] = {"n": int, "wall": (int, float), "kind": str}
+    for row in rows:
+        if wrong := [key for key, kind in kinds.items() if not isinstance(row.get(key), kind)]:
+            raise RecordingError(
+                f"journal {path}: a row without a usable {wrong[0]} ({str(row)[:60]}); put the file back as the run "
+                "wrote it, or start a new run"
+            )
 
 
 def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:

@@ -105,6 +105,11 @@ class Reactor(Protocol):
         """One name per reactor, e.g. ("M0", "M1")."""
         ...
 
+    @property
+    def handed_over(self) -> Mask:
+        """Reactors that the device's own regulation has been given for good, shape (N,)."""
+        ...
+
     def measure(self) -> Measurement:
         """Wait for a new sample of at least one reactor, or, when none comes in time, return with none fresh.
 

@@ -54,14 +54,17 @@ class Recorder:
       path: of the CSV; its folder must exist.
       columns: names with their unit, e.g. ("time_min", "od", "pump_rate_ml_s"); unique.
       fsync: False leaves rows in the operating system's cache (simulations that can be repeated).
+      remedy: what to do about a file that is another one.
     Raises: RecordingError if the file cannot be opened or has another header; ValueError for unusable column names.
     """
 
-    def __init__(self, path: str | Path, columns: Sequence[str], fsync: bool = True) -> None:
+    def __init__(
+        self, path: str | Path, columns: Sequence[str], fsync: bool = True, remedy: str = "choose another file"
+    ) -> None:
         self.path = Path(path)
         self.columns = tuple(columns)
         self.repaired: str | None = None
-        self._fsync = fsync
+        self._fsync, self._remedy = fsync, remedy
         if not self.columns or len(set(self.columns)) != len(self.columns):
             raise ValueError(f"columns {self.columns}: allowed are unique names, at least one")
         try:
@@ -105,7 +108,7 @@ class Recorder:
         whole = content[: content.rfind(b"\n") + 1]
         if torn := content[len(whole) :]:
             if not whole and not header.startswith(torn):
-                raise RecordingError(f"{self.path}: exists and is not a recording; choose another file")
+                raise RecordingError(f"{self.path}: exists and is not a recording; {self._remedy}")
             os.ftruncate(self._fd, len(whole))
             self.repaired = f"{self.path}: cut a torn last line of {len(torn)} bytes"
         if not whole:
@@ -114,7 +117,7 @@ class Recorder:
         elif (found := whole[: whole.index(b"\n") + 1]) != header:
             raise RecordingError(
                 f"{self.path}: has the header {found.decode(errors='replace').strip()!r}, "
-                f"expected {header.decode().strip()!r}; choose another file"
+                f"expected {header.decode().strip()!r}; {self._remedy}"
             )
 
     def _append(self, line: bytes) -> None:

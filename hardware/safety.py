@@ -351,18 +351,35 @@ class Interlock:
         """Everything it remembers, as plain lists; times are those given to `check`, so give it run time."""
         return {k: v.tolist() for k, v in vars(self).items() if isinstance(v, np.ndarray)}
 
-    def restore(self, state: dict[str, list[Any]]) -> None:
-        """The inverse of `state`; None stands for the nan or -inf that JSON cannot hold.
+    def latch(self, response: Response, rows: Mask) -> None:
+        """Never respond with less than this for `rows`, shape (N,), in this run."""
+        self._latched = np.where(rows, np.maximum(self._latched, float(response)), self._latched)
 
-        Raises: ValueError if it is of another number of reactors or another version.
+    def restore(self, state: Any) -> None:
+        """The inverse of `state`, of an interlock that has not been used; None stands for nan or -inf, as in JSON.
+
+        Raises: ValueError if it is of another number of reactors or another version, or damaged.
         """
         mine = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        if not isinstance(state, dict):
+            raise ValueError(f"saved interlock = {str(state)[:40]}: expected its fields")
         if set(state) != set(mine):
-            raise ValueError(f"saved interlock has other fields: {sorted(set(state) ^ set(mine))}; start a new run")
+            raise ValueError(f"saved interlock has other fields: {', '.join(sorted(set(state) ^ set(mine)))[:80]}")
+        restored = {}
         for key, old in mine.items():
-            new = np.array(state[key], dtype=np.float64)
+            try:
+                new = np.array(state[key], dtype=np.float64)
+            except (TypeError, ValueError, OverflowError):
+                raise ValueError(f"saved interlock: {key} = {str(state[key])[:40]}: expected numbers") from None
+            if new.ndim and len(new) != self.n:
+                raise ValueError(f"saved interlock is for {len(new)} reactors, this run has {self.n}")
             if new.shape != old.shape:
-                raise ValueError(f"saved interlock is for {len(state[key])} reactors, this run has {self.n}")
-            if key in ("_dose_s", "_hold_until_s"):
-                new = np.where(np.isnan(new), -math.inf, new)
+                raise ValueError(f"saved interlock: {key} has the shape {new.shape}, expected {old.shape}")
+            if not np.isfinite(new).all() and np.isfinite(old).all():  # nan would pass every limit
+                raise ValueError(f"saved interlock: {key} = {str(state[key])[:40]}: expected finite numbers")
+            restored[key] = np.where(np.isnan(new), -math.inf, new) if key in ("_dose_s", "_hold_until_s") else new
+        for key, codes in (("_latched", list(Response)), ("_hold_kind", range(-1, len(REMEDIES)))):
+            if not np.isin(restored[key], np.array(codes)).all():
+                raise ValueError(f"saved interlock: {key} = {state[key]}: no such code")
+        for key, new in restored.items():
             setattr(self, key, new)

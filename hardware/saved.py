@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from hardware.errors import RecordingError
+
 __all__ = ["Saved", "replay"]
+
+KEYS: Mapping[str, Callable[[Any], Any]] = {
+    "device_id": str, "blank": float, "carry_ml": float, "doses": int, "temperature": float, "feed_ml": float,
+    "waste_ml": float, "on_s": float,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Saved:
     """What a run must remember of one reactor across a restart of this program.
 
-    guarded: its overflow guard was verified on.
+    guarded: its overflow guard was verified on. handed_over: OD at which it was handed over to the on-board regulation.
     sample: (record time, cycles) of the last sample a dose was decided for. open: a dose was begun and its end was
     never recorded; then feed_ml, waste_ml are its volumes and on_s the run time at which it began, s.
     """
@@ -26,10 +33,25 @@ class Saved:
     doses: int = 0
     temperature: float = math.nan
     guarded: bool = False
+    handed_over: float = math.nan
     open: bool = False
     feed_ml: float = 0.0
     waste_ml: float = 0.0
     on_s: float = 0.0
+
+
+def _take(entry: dict[str, Any], row: Mapping[str, Any]) -> None:
+    """What one row says."""
+    entry.update({key: kind(row[key]) for key, kind in KEYS.items() if row.get(key) is not None})
+    if row["kind"] == "intent":
+        sample, volumes = row["sample"], (float(row["feed_ml"]), float(row["waste_ml"]))
+        entry.update(sample=(float(sample[0]), int(sample[1])), open=volumes[0] > 0.0)
+    elif row["kind"] == "dose_end":
+        entry["open"] = False
+    elif row["kind"] == "guard":
+        entry["guarded"] = True
+    elif row["kind"] == "regulate":
+        entry["handed_over"] = float(row["setpoint"])
 
 
 def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, Saved]:
@@ -37,18 +59,17 @@ def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, Saved]:
 
     Args:
       rows: rows of a journal this driver has written into, oldest first.
+    Raises: RecordingError for a row that is not as the driver wrote it.
     """
     known: dict[str, dict[str, Any]] = {}
     for row in rows:
-        if row.get("kind") not in ("device", "intent", "dose_end", "temperature", "guard"):
+        if row.get("kind") not in ("device", "intent", "dose_end", "temperature", "guard", "regulate"):
             continue
-        entry = known.setdefault(str(row["reactor"]), {})
-        keys = ("device_id", "blank", "carry_ml", "doses", "temperature", "feed_ml", "waste_ml", "on_s")
-        entry.update({k: row[k] for k in keys if row.get(k) is not None})
-        if row["kind"] == "intent":
-            entry.update(sample=(float(row["sample"][0]), int(row["sample"][1])), open=row["feed_ml"] > 0.0)
-        elif row["kind"] == "dose_end":
-            entry["open"] = False
-        elif row["kind"] == "guard":
-            entry["guarded"] = True
+        try:
+            _take(known.setdefault(str(row["reactor"]), {}), row)
+        except (IndexError, KeyError, TypeError, ValueError) as error:
+            raise RecordingError(
+                f"journal.jsonl: row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error}); "
+                "put the file back as the run wrote it, or start a new run"
+            ) from None
     return {name: Saved(**entry) for name, entry in known.items()}

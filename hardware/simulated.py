@@ -91,6 +91,11 @@ class SimulatedReactors:
         self._feed_s = np.where(rows, 0.0, self._feed_s)
         return []
 
+    @property
+    def handed_over(self) -> Mask:
+        """None ever is."""
+        return np.zeros(self.plant.n, dtype=np.bool_)
+
     def heat_off(self, rows: Mask) -> list[str]:
         """The heater of `rows` is off until a temperature is commanded. Nothing can fail."""
         self._target = np.where(rows, 0.0, self._target)

@@ -94,6 +94,7 @@ class Station:
     def restore(self, saved: Saved) -> None:
         """Take over identity and memory of an earlier run; the pumps, but for the guard, are verified off afterwards.
 
+        A reactor that regulates itself as it was handed over is not interrupted.
         Raises: ReactorError if the reactor is not reachable, another unit, or its pumps stay on.
         """
         self.unit.device_id = saved.device_id
@@ -103,10 +104,13 @@ class Station:
         state = self.unit.read()
         self._blank = next((b for b in (saved.blank, self.rig.blank) if math.isfinite(b)), state.blank)
         self.guard.was_on = saved.guarded
-        self.pumps_off()
-        if running := self._running(state):
-            self.tell(f"pumps were found on and switched off: {running}")
-        if saved.open:  # the device repeats what was left on every 63 s (chibio.md section 0.7)
+        self.handed_over = saved.handed_over
+        left_alone = self._regulates(state)
+        if not left_alone:
+            self.pumps_off()
+            if running := self._running(state):
+                self.tell(f"pumps were found on and switched off: {running}")
+        if saved.open and not left_alone:  # the device repeats what was left on every 63 s (chibio.md section 0.7)
             times = max(math.floor((self.elapsed() - saved.on_s) / PERIOD_S), 0)
             self.repeated_ml = saved.feed_ml * times * state.pumps_on[0]
             self.repeated_waste_ml = saved.waste_ml * times * state.pumps_on[1]
@@ -140,7 +144,7 @@ class Station:
                 if not self._heat:  # a start switches the thermostat on
                     self.heat_off()
             if math.isfinite(self.handed_over):
-                self.regulate(self.handed_over)
+                self._regulate_again()
             self._start_time = self.guard.keep(self.unit.read()).start_time
             self.arrived_s = self.next_poll = self._clock.now()
             identity = {"reactor": self.name, "device_id": self.unit.device_id, "blank": self._blank}
@@ -149,12 +153,13 @@ class Station:
             self.busy = False
 
     def _prepare(self) -> None:
-        """Blank and targets as they belong to this run; on-board regulation off."""
+        """Blank and targets as they belong to this run; on-board regulation off, unless it was handed over to that."""
         unit, state = self.unit, self.unit.read()
         if acting := [m for m in state.modes if m in OWN_WILL]:
             raise DeviceStateError(f"{self.name}: {', '.join(acting)} is on; switch it off in the device's web page")
-        if state.regulating:
+        if state.regulating and not math.isfinite(self.handed_over):
             unit.switch("OD", False)
+            self.tell("the on-board OD regulation was found on and switched off: this run controls")
         if abs(state.blank - self._blank) > 0.5:
             unit.post(f"/CalibrateOD/OD0/{self.name}/{self._blank:.6f}/0")
         for item, value, wanted in (
@@ -260,8 +265,9 @@ class Station:
         if running and not self.dosing and not math.isfinite(self.handed_over):
             return Fault("pump", f"pumps on: {running}, not by this program", "close the device's web page everywhere")
         acting = [m for m in state.modes if m in OWN_WILL]
-        if acting or state.regulating != math.isfinite(self.handed_over):
-            what = ", ".join(acting) or f"on-board OD regulation is {'on' if state.regulating else 'off'}"
+        handed_over = math.isfinite(self.handed_over)
+        if acting or (not self._regulates(state) if handed_over else state.regulating):
+            what = ", ".join(acting) or self._regulation(state)
             return Fault("mode", f"{what}: not as this program left it", "set it back in the device's web page")
         if age_s > self.config.stale_s:
             return Fault(
@@ -486,13 +492,36 @@ class Station:
         self.unit.switch("Heat", False)
 
     def regulate(self, setpoint: float) -> None:
-        """Hand over to the on-board regulation, which feeds at most 0.02 of full power. Raises: ReactorError."""
+        """Hand over to the on-board regulation, which feeds at most 0.02 of full power; target and ON read back.
+
+        Written down before it is done: a run that is killed in between hands over when it is resumed.
+        Raises: ReactorError.
+        """
         self.pumps_off()
+        self._log("regulate", {"reactor": self.name, "setpoint": setpoint})
         self.unit.target("OD", setpoint)
         self.unit.switch("OD", True)
-        if not self.unit.read().regulating:
-            raise DeviceStateError(f"{self.name}: the on-board regulation did not go on")
+        state = self.unit.read()
+        if not (state.regulating and abs(state.regulation_target - setpoint) <= 1e-5):
+            raise DeviceStateError(f"{self.name}: {self._regulation(state)} after it was switched on at {setpoint:g}")
         self.handed_over = setpoint
+
+    def _regulates(self, state: DeviceState) -> bool:
+        """Whether it regulates itself as it was handed over; False if it never was."""
+        return state.regulating and abs(state.regulation_target - self.handed_over) <= 1e-5
+
+    @staticmethod
+    def _regulation(state: DeviceState) -> str:
+        return f"on-board OD regulation is {'on' if state.regulating else 'off'}, target {state.regulation_target:g}"
+
+    def _regulate_again(self) -> None:
+        """It was handed over for good, so it stays so over a restart of program or device. Raises: ReactorError."""
+        state = self.unit.read()
+        what = "left to it"
+        if not self._regulates(state):
+            self.regulate(self.handed_over)
+            what = f"handed over again, because its {self._regulation(state)}"
+        self.tell(f"handed over to the on-board regulation at OD {self.handed_over:g} earlier in this run: {what}")
 
     def tell(self, note: str) -> None:
         """A note for the next receipt and the log."""

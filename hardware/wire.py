@@ -60,7 +60,8 @@ class DeviceState:
     """What a client needs of one reactor's state. Times in s, temperatures in degC, blank and raw in counts.
 
     sample_s, sample_od, sample_temperature: last entries of the records; nan if there is none yet or the device was
-    just replacing its lists. pumps_on, pump_targets: Pump1 to Pump4. modes: what else would act on its own.
+    just replacing its lists. pumps_on, pump_targets: Pump1 to Pump4. regulating, regulation_target: the on-board OD
+    regulation. modes: what else would act on its own.
     """
 
     selected: str
@@ -84,6 +85,7 @@ class DeviceState:
     heating: bool
     temperature_target: float
     regulating: bool
+    regulation_target: float
     modes: tuple[str, ...]
     volume_ml: float
     terminal: str
@@ -201,6 +203,7 @@ def parse_state(body: bytes) -> DeviceState:
         heating=_flag(data, "Thermostat", "ON"),
         temperature_target=_number(data, "Thermostat", "target"),
         regulating=_flag(data, "OD", "ON"),
+        regulation_target=_number(data, "OD", "target"),
         modes=_modes(data),
         volume_ml=_number(data, "Volume", "target"),
         terminal=_terminal(data),

@@ -1,0 +1,243 @@
+"""A reactor that was handed over to the on-board regulation is never without control, however the program ends."""
+
+import json
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.setpoints import Schedule
+from experiments.controllers.base import Array, Controller, Mask
+from experiments.rehearsal import Killed, Rehearsal
+from hardware.emulator_faults import inject
+from hardware.emulator_process import EmulatorProcess
+from hardware.errors import DeviceStateError
+from hardware.journal import read_journal
+from tests.experiments.test_exits import SPEED, Bench
+
+LOST = """
+import experiments.deploy
+import numpy as np
+from experiments.controllers.inverse import Inverse
+whole = Inverse.act
+calls = []
+def act(self, *arguments):
+    calls.append(0)
+    rate = whole(self, *arguments)
+    return np.where([len(calls) > 2, False], np.nan, rate)
+Inverse.act = act
+experiments.deploy.main()
+"""
+
+
+class Losing:
+    """A sound controller that is lost for the first reactor after some samples, and says when it has been for five."""
+
+    def __init__(self, inner: Controller, run: "Losable") -> None:
+        self.inner, self.run = inner, run
+        self.reset = inner.reset
+
+    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
+        rate = self.inner.act(od, setpoint, minute, rows)
+        if self.run.sound:
+            return rate
+        self.run.unusable += bool(rows[0])
+        return np.where(np.arange(rows.size) == 0, np.nan, rate)
+
+
+class Losable(Rehearsal):
+    """Two reactors of which the first loses its controller; the program dies at the n-th request after that."""
+
+    def __init__(self, folder: Path, dies_at: int | None = None) -> None:
+        super().__init__(folder, ("M0", "M1"), [Schedule((0.5,), (600.0,), (37.0,))] * 2, seed=3)
+        self.sound, self.unusable, self.requests, self.dies_at = False, 0, 0, dies_at
+        self._submit = self.device.submit
+        self.device.submit = self._counted  # type: ignore[method-assign]
+
+    def _controller(self) -> Controller:
+        return Losing(super()._controller(), self)
+
+    def _counted(self, method: str, path: str, *rest: Any) -> Any:
+        exchange = self._submit(method, path, *rest)
+        if self.unusable >= 5 and self.lives == 1:
+            self.requests += 1
+            if self.requests == self.dies_at:
+                self.kill()  # the device carries it out, nobody waits for the answer
+        return exchange
+
+    def live(self, minutes: float) -> None:
+        for _ in self.run(self.clock.now() + 60.0 * minutes):
+            pass
+
+    def data(self, name: str = "M0") -> dict[str, Any]:
+        self.device.run_until(self.clock.now())
+        return dict(self.device.apps[name].data)
+
+    def journaled(self, kind: str, since: int = 0) -> list[dict[str, Any]]:
+        rows, _ = read_journal(self.folder / "journal.jsonl")
+        return [row for row in rows[since:] if row["kind"] == kind and row["reactor"] == "M0"]
+
+
+def handed_over(folder: Path, dead_s: float = 300.0) -> Losable:
+    """A run that handed over its first reactor, went on, and was killed."""
+    run = Losable(folder)
+    run.begin()
+    run.live(20)
+    assert run.reactors.handed_over.tolist() == [True, False]
+    run.bury()
+    run.wait(dead_s)
+    return run
+
+
+def regulated_at(run: Losable, target: float = 0.5) -> None:
+    """It regulates itself, was verified, is not dosed beside it, and the interlock knows."""
+    since = len(run.record.journal.rows)
+    run.live(30)
+    data = run.data()
+    assert (data["OD"]["ON"], data["OD"]["target"]) == (1, target)
+    assert run.reactors.handed_over.tolist() == [True, False]
+    assert run.reactors.stations[0].fault is None
+    assert not run.journaled("intent", since)
+    assert all("handed over" in row["row"]["interlock"] for row in run.journaled("decision", since))
+    assert run.truth("M0")["od"] == pytest.approx(0.5, abs=0.1)
+    assert run.truth("M1")["od"] == pytest.approx(0.5, abs=0.05)
+
+
+def posted(run: Losable) -> list[str]:
+    """Every POST to the first reactor from here on."""
+    paths: list[str] = []
+    before = run.device.submit
+
+    def listening(method: str, path: str, *rest: Any) -> Any:
+        if method == "POST" and "M0" in path and "changeDevice" not in path:
+            paths.append(path)
+        return before(method, path, *rest)
+
+    run.device.submit = listening  # type: ignore[method-assign]
+    return paths
+
+
+@pytest.mark.parametrize("sound", [True, False])
+def test_a_resumed_run_leaves_it_to_the_regulation_it_was_handed_over_to(tmp_path: Path, sound: bool) -> None:
+    run = handed_over(tmp_path)
+    run.sound = sound
+    paths = posted(run)
+    run.begin()
+    assert not [path for path in paths if "Pump" in path or "OD" in path]  # not even interrupted
+    regulated_at(run)
+    notes = [row["note"] for row in run.journaled("note")]
+    assert "handed over to the on-board regulation at OD 0.5 earlier in this run: left to it" in notes
+    run.reactors.stop()
+    assert run.data()["OD"]["ON"] == 1
+
+
+@pytest.mark.parametrize("what", ["/SetOutputOn/OD/0/M0", "/SetOutputTarget/OD/M0/1.2", "/Experiment/0/M0", "wipe"])
+def test_a_resumed_run_hands_over_again_what_lost_its_regulation_meanwhile(tmp_path: Path, what: str) -> None:
+    run = handed_over(tmp_path)
+    run.sound = True
+    if what == "wipe":
+        inject(run.device, "worker_wipe", "all", 1)
+    else:
+        run.device.handle("POST", what)
+    run.wait(100.0)
+    run.begin()
+    regulated_at(run)
+    notes = [row["note"] for row in run.journaled("note")]
+    assert len([note for note in notes if "handed over again, because its on-board OD regulation is" in note]) == 1
+
+
+def test_a_regulation_that_does_not_come_back_is_an_error_and_not_believed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = handed_over(tmp_path)
+    run.device.handle("POST", "/SetOutputOn/OD/0/M0")
+    whole = run.device.submit
+    monkeypatch.setattr(
+        run.device, "submit", lambda m, p, *rest: whole(m, p.replace("/SetOutputOn/OD/1", "/SetOutputOn/OD/0"), *rest)
+    )
+    with pytest.raises(DeviceStateError, match="M0: on-board OD regulation is off, target 0.5 after"):
+        run.begin()
+
+
+@pytest.mark.parametrize("dies_at", range(1, 17))
+def test_killed_in_the_middle_of_handing_over_it_is_dosed_or_regulated(tmp_path: Path, dies_at: int) -> None:
+    run = Losable(tmp_path, dies_at)
+    run.begin()
+    with pytest.raises(Killed):
+        run.live(20)
+    run.bury()
+    run.wait(200.0)
+    run.sound = True
+    run.begin()
+    resumed = len(run.record.journal.rows)
+    run.live(30)
+    regulated = bool(run.data()["OD"]["ON"])
+    assert regulated == run.reactors.handed_over[0] == bool(run.journaled("regulate"))
+    dosed = [row for row in run.journaled("intent", resumed) if row["feed_ml"] > 0.0]
+    assert bool(dosed) != regulated
+    decisions = run.journaled("decision", resumed)
+    assert regulated == ("handed over" in decisions[-1]["row"]["interlock"])
+    assert run.truth("M0")["od"] == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_new_run_takes_control_back_and_says_so(tmp_path: Path) -> None:
+    run = handed_over(tmp_path)
+    (tmp_path / "new").mkdir()
+    run.folder, run.lives, run.sound = tmp_path / "new", 0, True
+    run.spans.clear()
+    run.begin()
+    run.live(10)
+    assert run.data()["OD"]["ON"] == 0
+    notes = [row["note"] for row in run.journaled("note")]
+    assert "the on-board OD regulation was found on and switched off: this run controls" in notes
+    assert [row for row in run.journaled("intent") if row["feed_ml"] > 0.0]
+    assert not run.reactors.handed_over.any()
+
+
+def test_a_run_of_an_earlier_version_hands_over_again(tmp_path: Path) -> None:
+    """Its journal does not tell of the hand-over, its state does."""
+    run = handed_over(tmp_path)
+    path = tmp_path / "journal.jsonl"
+    rows = [row for row in path.read_bytes().splitlines(keepends=True) if b'"kind":"regulate"' not in row]
+    path.write_bytes(b"".join(rows))
+    run.sound = True
+    run.begin()
+    assert not run.reactors.handed_over.any()
+    regulated_at(run)
+
+
+def test_kill_9_and_resume_of_a_real_run(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+
+    def od(device: EmulatorProcess) -> dict[str, Any]:
+        with urllib.request.urlopen(f"{device.control}/_emulator/truth", timeout=10.0) as answer:
+            return dict(json.load(answer)["M0"])
+
+    def until(kind: str, count: int) -> None:
+        deadline = time.monotonic() + 60.0
+        path = folder / "journal.jsonl"
+        while not path.exists() or path.read_bytes().count(kind.encode()) < count:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+    with EmulatorProcess(["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.4"]) as device:
+        bench = Bench(device, folder, LOST, ["safety.controller_patience=1"])
+        until("handed over to the on-board regulation earlier in this run", 1)
+        bench.client.kill()
+        bench.end()
+        time.sleep(2.0 * 60.0 / SPEED)
+        rows = len(read_journal(folder / "journal.jsonl")[0])
+        bench = Bench(device, folder, resume=True)
+        until("earlier in this run: left to it", 1)
+        time.sleep(3.0 * 60.0 / SPEED)
+        bench.client.terminate()
+        status, said = bench.end()
+        assert status == 0, said
+        assert "pumps verified off, M0 left to the on-board regulation" in said
+        assert od(device)["od"] == pytest.approx(0.4, abs=0.1)
+    later = [r for r in read_journal(folder / "journal.jsonl")[0][rows:] if r.get("reactor") == "M0"]
+    assert not [r for r in later if r["kind"] == "intent" or "/OD/" in r.get("path", "")]
+    assert [r for r in later if r["kind"] == "sample"]
