@@ -24,6 +24,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError  # type: ignore[import-untyped]
 
 __all__ = ["UserError", "compose", "load", "normalise", "run", "save_config", "write_json"]
 
@@ -179,6 +180,20 @@ def write_json(path: Path, content: Mapping[str, Any], fsync: bool = True, inden
     os.replace(temporary, path)
 
 
+def _stored(path: Path, resume: str, fitting: Callable[[DictConfig], T]) -> T:
+    """The config a run was started with. Raises: UserError naming the file and what is wrong with it."""
+    try:
+        stored = OmegaConf.load(path)
+        if not isinstance(stored, DictConfig):
+            raise UserError("it holds no keys and values")
+        stored.resume = resume
+        return load(stored, fitting(stored))
+    except (UserError, OSError, ValueError, AttributeError, YAMLError, OmegaConfBaseException) as error:
+        why = _one_line(error) or type(error).__name__
+        remedy = "put it back as the run wrote it, or start a new run"
+        raise UserError(f"{path}: not the config of this run ({why}); {remedy}") from None
+
+
 def run(
     name: str,
     schema: T,
@@ -202,10 +217,7 @@ def run(
         try:
             folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
             if cfg.get("resume"):
-                stored = OmegaConf.load(folder / "config.yaml")
-                assert isinstance(stored, DictConfig)
-                stored.resume = cfg.resume
-                config = load(stored, fitting(stored))
+                config = _stored(folder / "config.yaml", str(cfg.resume), fitting)
             else:
                 config = load(cfg, fitting(cfg))
                 save_config(config, folder)

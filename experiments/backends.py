@@ -23,6 +23,7 @@ from experiments.record import Record
 from hardware.chibio import ChiBioReactors
 from hardware.clock import RealClock
 from hardware.emulator_process import EmulatorProcess
+from hardware.errors import RecordingError
 from hardware.preflight import preflight
 from hardware.pumps import Rig
 from hardware.reactor import Reactor
@@ -87,6 +88,8 @@ def opened(config: DeployConfig, plant: PlantConfig, record: Record) -> Iterator
         clock = RealClock(backend.speed)
         rigs = load_rigs(Path(backend.calibration), backend.reactors)
         earlier = record.journal.rows
+        if config.resume is not None and not earlier:
+            raise RecordingError(f"journal {record.journal.path}: missing or empty; put it back, or start a new run")
         if not earlier:
             _check(transport, clock, config, rigs, record.folder)
         reactors = ChiBioReactors(transport, clock, backend, rigs, record.journal.append)

@@ -78,7 +78,10 @@ class DeployConfig:
             raise ValueError(f"each.{unknown[0]}: no such reactor; allowed {', '.join(self.backend.reactors)}")
         schedules = []
         for name in self.backend.reactors:
-            own = {k: v for k, v in dict(self.each.get(name, {})).items() if k != "role"}
+            given = self.each.get(name, {})
+            if not isinstance(given, dict):
+                raise ValueError(f"each.{name} = {given}: allowed keys and values, as each.{name}.minutes=[90]")
+            own = {k: v for k, v in given.items() if k != "role"}
             wrong = set(own) - {f.name for f in fields(Schedule)}
             if wrong:
                 allowed = ", ".join([f.name for f in fields(Schedule)] + ["role"])

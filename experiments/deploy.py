@@ -48,20 +48,24 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     path = find_policy(name)
     try:
         policy = policies.load(path)
+        trained = float(policy.metadata.get("control_min", float("nan")))
+        regret = float(policy.metadata.get("regret_pct", float("nan")))
+        fastest = float(policy.pump_rates.max())
     except policies.PolicyError as error:
         raise app.UserError(str(error)) from None
-    trained = float(policy.metadata.get("control_min", float("nan")))
+    except Exception as error:  # whatever a damaged file makes NumPy say
+        why = (str(error).splitlines() or [type(error).__name__])[0]
+        raise app.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
     if not abs(trained - control_min) <= 1e-9:
         raise app.UserError(
             f"policy {path} was trained for a control period of {trained} min, the backend has {control_min} min; "
             f"train with env.control_min={control_min}"
         )
-    if policy.pump_rates.max() > max_rate + 1e-12:
+    if not fastest <= max_rate + 1e-12:
         raise app.UserError(
-            f"policy {path} pumps up to {policy.pump_rates.max()} mL/s, the interlock allows {max_rate} mL/s; "
+            f"policy {path} pumps up to {fastest} mL/s, the interlock allows {max_rate} mL/s; "
             "train with a smaller env.max_pump_rate or raise safety.max_rate"
         )
-    regret = float(policy.metadata.get("regret_pct", float("nan")))
     log.info("policy %s: regret %.2f %% against the optimum of its model", path, regret)
     if not regret <= POOR_REGRET_PCT:
         log.warning("this policy is far from optimal (regret %.0f %%): train longer or with another seed", regret)
@@ -214,7 +218,8 @@ def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConf
         with handled(patience, signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             try:
                 reactors.stop()
-                log.info("pumps verified off")
+                left = [name for name, own in zip(reactors.names, reactors.handed_over, strict=True) if own]
+                log.info("pumps verified off%s", f", {', '.join(left)} left to the on-board regulation" if left else "")
             except ReactorError as error:
                 outcome = f"failed: {error}"
     return outcome

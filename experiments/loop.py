@@ -164,12 +164,12 @@ class ClosedLoop:
             ("done", bool, "true or false"),
             ("stopped", bool, "true or false"),
         ):
-            values = state.get(key)
+            values = state.get(key, "missing")
             if not (isinstance(values, list) and all(isinstance(value, kinds) for value in values)):
-                raise ValueError(f"{key} = {str(values)[:40]}: expected a list, {what}")
+                raise ValueError(f"{key}: {str(values)[:40]}, expected a list of {what}")
             if len(values) != len(self.done):
                 raise ValueError(f"{key} is for {len(values)} reactors, this run has {len(self.done)}")
         self.began = np.array(state["began"], dtype=np.float64)
         self.done = np.array(state["done"], dtype=np.bool_)
         self.stopped = np.array(state["stopped"], dtype=np.bool_)
-        self.interlock.restore(state.get("interlock"))
+        self.interlock.restore(state.get("interlock", "missing"))

@@ -23,7 +23,7 @@ from experiments import app
 from experiments.loop import Step
 from experiments.writers import Events
 from hardware.errors import RecordingError
-from hardware.journal import Journal
+from hardware.journal import REMEDY, Journal
 from hardware.reactor import Receipt
 from hardware.recording import Recorder
 
@@ -106,13 +106,16 @@ class Record:
         """Take over the rows an earlier life wrote. Raises: RecordingError for a row that was damaged."""
         path = self._csv(self.names[n])
         with open(path, newline="", encoding="utf-8") as f:
+            rows = csv.DictReader(f)
             try:
-                for raw in csv.DictReader(f):
+                for raw in rows:
                     if raw.keys() != set(COLUMNS) or None in raw.values() or not math.isfinite(float(raw["time_min"])):
                         raise ValueError("a row without a time, or not with a cell for every column")
                     self._keep(n, {key: value if key == "interlock" else value or "nan" for key, value in raw.items()})
             except (ValueError, csv.Error) as error:
-                raise RecordingError(f"{path}: damaged after {self.lengths[n]} rows ({error}); {REBUILD}") from None
+                raise RecordingError(
+                    f"{path}: damaged near line {max(rows.line_num, 1)} ({error}); {REBUILD}"
+                ) from None
 
     def _complete(self) -> None:
         """Append to the CSVs what is in the journal and a kill kept from being written."""
@@ -120,10 +123,8 @@ class Record:
             try:
                 self._complete_one(n, name)
             except (AttributeError, KeyError, TypeError, ValueError) as error:
-                raise RecordingError(
-                    f"journal {self.journal.path}: a row of {name} is damaged ({type(error).__name__}: {error}); "
-                    "put the file back as the run wrote it, or start a new run"
-                ) from None
+                what = f"a row of {name} is damaged ({type(error).__name__}: {error})"
+                raise RecordingError(f"journal {self.journal.path}: {what}; {REMEDY}") from None
 
     def _complete_one(self, n: int, name: str) -> None:
         last = self._columns[n]["time_min"][-1] if self.lengths[n] else -math.inf
@@ -199,9 +200,9 @@ class Record:
             raise self.no_state(f"not JSON: {error}") from None
         if not isinstance(state, dict):
             raise self.no_state(f"it holds {str(state)[:40]}, expected keys and values")
-        known = state.get("journal_row")
+        known = state.get("journal_row", "missing")
         if type(known) is not int or known < 0:
-            raise self.no_state(f"journal_row = {str(known)[:40]}: expected the number of a row")
+            raise self.no_state(f"journal_row: {str(known)[:40]}, expected the number of a row")
         later = []
         for row in self.journal.rows:
             if row.get("kind") == "intent" and row["n"] >= known:

@@ -12,9 +12,10 @@ from typing import Any
 
 from hardware.errors import RecordingError
 
-__all__ = ["Journal", "read_journal"]
+__all__ = ["REMEDY", "Journal", "read_journal"]
 
 TAIL = 20_000_000  # bytes; about 16 h of eight reactors
+REMEDY = "the file was changed by hand: put it back as the run wrote it, or start a new run"
 LANDMARKS = (b'"kind":"device"', b'"kind":"temperature"', b'"kind":"regulate"')
 """Identities, blanks, thermostat targets and hand-overs, written once and valid for days."""
 
@@ -148,9 +149,9 @@ def _parse(data: bytes, path: Path) -> Iterator[dict[str, Any]]:
         try:
             row = json.loads(line)
         except ValueError as error:
-            raise RecordingError(f"journal {path}, line {number}: {error}; the file was changed by hand") from error
+            raise RecordingError(f"journal {path}, line {number}: {error}; {REMEDY}") from error
         if not isinstance(row, dict):
-            raise RecordingError(f"journal {path}, line {number}: not a row; the file was changed by hand")
+            raise RecordingError(f"journal {path}, line {number}: not a row; {REMEDY}")
         yield row
 
 
@@ -158,11 +159,10 @@ def _check(rows: list[dict[str, Any]], path: Path) -> None:
     """Whether every row has what all rows have. Raises: RecordingError."""
     kinds: dict[str, Any] = {"n": int, "wall": (int, float), "kind": str}
     for row in rows:
-        if wrong := [key for key, kind in kinds.items() if not isinstance(row.get(key), kind)]:
-            raise RecordingError(
-                f"journal {path}: a row without a usable {wrong[0]} ({str(row)[:60]}); put the file back as the run "
-                "wrote it, or start a new run"
-            )
+        wrong = [key for key, kind in kinds.items() if not isinstance(row.get(key), kind)]
+        if wrong or not math.isfinite(row["wall"]):
+            wrong = wrong or ["wall"]
+            raise RecordingError(f"journal {path}: a row without a usable {wrong[0]} ({str(row)[:60]}); {REMEDY}")
 
 
 def read_journal(path: Path) -> tuple[list[dict[str, Any]], int]:

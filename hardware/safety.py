@@ -362,7 +362,7 @@ class Interlock:
         """
         mine = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray)}
         if not isinstance(state, dict):
-            raise ValueError(f"saved interlock = {str(state)[:40]}: expected its fields")
+            raise ValueError(f"saved interlock: {str(state)[:40]}, expected its fields")
         if set(state) != set(mine):
             raise ValueError(f"saved interlock has other fields: {', '.join(sorted(set(state) ^ set(mine)))[:80]}")
         restored = {}

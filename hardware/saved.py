@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hardware.errors import RecordingError
+from hardware.journal import REMEDY
 
 __all__ = ["Saved", "replay"]
 
@@ -68,8 +69,6 @@ def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, Saved]:
         try:
             _take(known.setdefault(str(row["reactor"]), {}), row)
         except (IndexError, KeyError, TypeError, ValueError) as error:
-            raise RecordingError(
-                f"journal.jsonl: row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error}); "
-                "put the file back as the run wrote it, or start a new run"
-            ) from None
+            what = f"row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error})"
+            raise RecordingError(f"journal.jsonl: {what}; {REMEDY}") from None
     return {name: Saved(**entry) for name, entry in known.items()}

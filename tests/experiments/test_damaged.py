@@ -1,0 +1,244 @@
+"""A run folder that was damaged: every file a resume reads ends in one line with file, reason and remedy."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dqn import policy
+from envs.setpoints import Schedule
+from experiments import app
+from experiments.app import UserError, save_config
+from experiments.config import DeployConfig
+from experiments.deploy import _schema, load_policy
+from experiments.record import Record
+from experiments.rehearsal import Rehearsal
+from hardware.emulator_process import EmulatorProcess
+from hardware.errors import RecordingError
+from tests.experiments.test_deploy import ENVIRONMENT, inverse_policy
+
+Change = Callable[[Any], object]
+HOLD = Schedule((0.4,), (600.0,), (37.0,))
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Rehearsal:
+    """A run that was killed after ten minutes."""
+    run = Rehearsal(tmp_path_factory.mktemp("run"), ("M0",), [HOLD])
+    run.begin()
+    for _ in run.run(600.0):
+        pass
+    run.bury()
+    return run
+
+
+@pytest.fixture
+def run(interrupted: Rehearsal, tmp_path: Path) -> Iterator[Rehearsal]:
+    """The same, to be damaged and resumed."""
+    shutil.copytree(interrupted.folder, tmp_path, dirs_exist_ok=True)
+    whole, interrupted.folder = interrupted.folder, tmp_path
+    yield interrupted
+    interrupted.folder = whole
+
+
+def refused(run: Rehearsal, *said: str) -> None:
+    """Resuming is refused in one line, and what was recorded stays."""
+    files = [run.folder / "journal.jsonl", run.folder / "recordings" / "M0.csv"]
+    before = [path.read_bytes() for path in files]
+    with pytest.raises(RecordingError) as caught:
+        run.begin()
+    assert "\n" not in str(caught.value)
+    for words in said:
+        assert words in str(caught.value)
+    for path, content in zip(files, before, strict=True):
+        assert path.read_bytes().startswith(content)
+
+
+def of(key: str, value: Any) -> Change:
+    return lambda state: state["interlock"].update({key: value})
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ("{", "not JSON"),
+        ("", "not JSON"),
+        ("[" * 100_000, "not JSON"),
+        ("[]", "it holds [], expected keys and values"),
+        ("null", "it holds None"),
+        (lambda s: s.pop("journal_row"), "journal_row: missing, expected the number of a row"),
+        (lambda s: s.update(journal_row="7"), "journal_row: 7, expected"),
+        (lambda s: s.update(journal_row=True), "journal_row: True, expected"),
+        (lambda s: s.pop("began"), "began: missing, expected a list of numbers"),
+        (lambda s: s.update(began=5), "began: 5, expected a list of numbers"),
+        (lambda s: s.update(began=["0"]), "began: ['0'], expected a list of numbers"),
+        (lambda s: s.update(done=[0]), "done: [0], expected a list of true or false"),
+        (lambda s: s.update(stopped=[False] * 2), "stopped is for 2 reactors, this run has 1"),
+        (lambda s: s.pop("interlock"), "saved interlock: missing"),
+        (lambda s: s.update(interlock=[1]), "saved interlock: [1]"),
+        (lambda s: s["interlock"].pop("fed_ml"), "saved interlock has other fields: fed_ml"),
+        (of("fed_ml", ["x"]), "saved interlock: fed_ml = ['x']: expected numbers"),
+        (of("fed_ml", [10**400]), "saved interlock: fed_ml = [1000"),
+        (of("fed_ml", [None]), "saved interlock: fed_ml = [None]: expected finite numbers"),
+        (of("fed_ml", 1.0), "saved interlock: fed_ml has the shape (), expected (1,)"),
+        (of("fed_ml", [1.0, 2.0]), "saved interlock is for 2 reactors, this run has 1"),
+        (of("_latched", [7]), "saved interlock: _latched = [7]: no such code"),
+        (of("_hold_kind", [99]), "saved interlock: _hold_kind = [99]: no such code"),
+    ],
+)
+def test_a_state_that_was_damaged(run: Rehearsal, change: str | Change, why: str) -> None:
+    path = run.folder / "state.json"
+    if isinstance(change, str):
+        path.write_text(change)
+    else:
+        state = json.loads(path.read_text())
+        change(state)
+        path.write_text(json.dumps(state))
+    refused(run, f"{path}: no state to resume from ({why}", "journal and recordings are kept; start a new run, or put")
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "why"),
+    [
+        ("sample", lambda r: r.pop("kind"), "a row without a usable kind"),
+        ("start", lambda r: r.update(wall="noon"), "a row without a usable wall"),
+        ("start", lambda r: r.update(wall=float("nan")), "a row without a usable wall"),
+        ("intent", lambda r: r.update(n="7"), "a row without a usable n"),
+        ("intent", lambda r: r.update(sample=None), "(intent) is damaged (TypeError"),
+        ("intent", lambda r: r.pop("feed_ml"), "is damaged (KeyError: 'feed_ml')"),
+        ("intent", lambda r: r.pop("waste_ml"), "(intent) is damaged (KeyError: 'waste_ml')"),
+        ("intent", lambda r: r.pop("reactor"), "(intent) is damaged (KeyError: 'reactor')"),
+        ("decision", lambda r: r.pop("row"), "a row of M0 is damaged (KeyError: 'row')"),
+        ("decision", lambda r: r["row"].pop("od"), "a row of M0 is damaged (KeyError: 'od')"),
+        ("device", lambda r: r.update(blank="clear"), "(device) is damaged (ValueError"),
+        ("device", lambda r: r.update(blank=[1]), "(device) is damaged (TypeError"),
+    ],
+)
+def test_a_journal_row_that_was_damaged(run: Rehearsal, kind: str, change: Change, why: str) -> None:
+    path = run.folder / "journal.jsonl"
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    if kind == "start":  # written by deploy, not here
+        rows.insert(0, {**rows[0], "kind": "start"})
+    change(next(row for row in rows if row["kind"] == kind))
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    refused(run, "journal", why, "put it back as the run wrote it, or start a new run")
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda rows: [b"a,b\n", *rows[1:]], "has the header 'a,b'"),
+        (lambda rows: [b"\0\xff\xfe" * 50], "exists and is not a recording"),
+        (lambda rows: [rows[0], b"\xff\xfe,1\n"], "damaged near line 1"),
+        (lambda rows: [*rows[:2], b"x" * 50 + b"\n"], "damaged near line 3"),
+        (lambda rows: [*rows[:2], rows[2].replace(b",0,", b",high,", 1)], "damaged near line 3"),
+        (lambda rows: [*rows[:3], b"7.5,2\n"], "damaged near line 4 (a row without a time, or not with a cell"),
+        (lambda rows: [*rows[:3], rows[3].strip() + b",1\n"], "damaged near line 4"),
+        (lambda rows: [*rows[:3], b"," + rows[3].split(b",", 1)[1]], "damaged near line 4"),
+        (lambda rows: [*rows[:3], b'"' + rows[3]], "damaged near line 4"),
+    ],
+)
+def test_a_recording_that_was_damaged_is_written_anew(run: Rehearsal, change: Change, why: str) -> None:
+    path = run.folder / "recordings" / "M0.csv"
+    whole = path.read_bytes()
+    rows = change(whole.splitlines(keepends=True))
+    assert isinstance(rows, list)
+    path.write_bytes(b"".join(rows))
+    refused(
+        run, f"{path}: {why}", "move it away and resume again: it is written anew from the last 20 MB of the journal"
+    )
+    path.rename(run.folder / "M0_damaged.csv")
+    Record(run.folder, ("M0",), fsync=False).close()
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"", "Missing key backend"),
+        (b"7\n", "Invalid loaded object type: int"),
+        (b"[1]\n", "it holds no keys and values"),
+        (b"a: [", "while parsing a flow node"),
+        (b"a: *x\n", "undefined alias"),
+        (b"\xff\xfe\0\1", "can't decode byte 0xff"),
+        (b"backend: x\n", "'str' object has no attribute 'kind'"),
+        (b"backend:\n  kind: [1]\ncontroller:\n  kind: pi\n", "backend.kind = [1]: allowed sim, chibio, emulator"),
+        (b"backend:\n  kind: sim\ncontroller:\n  kind: x\n", "controller.kind = x: allowed dqn"),
+        (b"backend:\n  kind: sim\ncontroller:\n  kind: pi\nfsync: ${nowhere}\n", "'nowhere' not found"),
+        (
+            b"backend:\n  kind: chibio\n  speed: fast\ncontroller:\n  kind: pi\n",
+            "backend.speed = fast: allowed a number",
+        ),
+    ],
+)
+def test_a_config_that_was_damaged(tmp_path: Path, content: bytes, why: str) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_bytes(content)
+    with pytest.raises(UserError) as caught:
+        app._stored(path, "RUN", _schema)
+    assert f"{path}: not the config of this run (" in str(caught.value)
+    assert why in str(caught.value)
+    assert str(caught.value).endswith("put it back as the run wrote it, or start a new run")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_config_comes_back_as_it_was_stored(tmp_path: Path) -> None:
+    config = DeployConfig(policy="here.npz")
+    save_config(config, tmp_path)
+    loaded = app._stored(tmp_path / "config.yaml", "RUN", _schema)
+    assert (loaded.policy, loaded.resume) == ("here.npz", "RUN")
+
+
+@pytest.mark.parametrize("value", [5, [1]])
+def test_what_differs_for_one_reactor_must_be_keys_and_values(value: Any) -> None:
+    with pytest.raises(ValueError, match=r"each.M0 = .*: allowed keys and values"):
+        DeployConfig(each={"M0": value}).schedules()
+
+
+@pytest.mark.parametrize("metadata", [{"control_min": "one"}, {"control_min": None}, {"regret_pct": [1]}])
+def test_a_policy_whose_metadata_were_damaged(tmp_path: Path, metadata: dict[str, Any]) -> None:
+    whole = inverse_policy()
+    whole.metadata.update(metadata)
+    policy.save(tmp_path / "policy.npz", whole)
+    with pytest.raises(UserError, match=r"policy\.npz: damaged \(.*\); give the policy\.npz of a training run"):
+        load_policy(str(tmp_path / "policy.npz"), 1.0, 0.02)
+
+
+def test_a_user_who_resumes_reads_one_line(tmp_path: Path) -> None:
+    """The same through the entry point: what goes wrong before and after the reactors are opened."""
+
+    def deploy(*arguments: str) -> list[str]:
+        command = [sys.executable, "-m", "experiments.deploy", *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, timeout=60, check=False)
+        assert done.returncode == 1
+        assert "Traceback" not in done.stderr
+        return [line for line in done.stderr.strip().splitlines() if not line[:2].isdigit()]
+
+    folder = tmp_path / "run"
+    with EmulatorProcess(["--reactors", "M0", "--speed", "60", "--od", "0.5"]) as device:
+        backend = ["backend=chibio", f"backend.url={device.url}", "backend.speed=60", "backend.reactors=[M0]"]
+        command = [sys.executable, "-m", "experiments.deploy", *backend, "controller=pi", f"hydra.run.dir={folder}"]
+        first = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while not (folder / "state.json").exists():
+            assert first.poll() is None
+            os.sched_yield()
+        first.kill()
+        first.wait()
+        for name, content in (
+            ("state.json", b'{"began": [null]}'),
+            ("recordings/M0.csv", b"time_min,od\n1,2\n"),
+            ("journal.jsonl", b""),
+            ("config.yaml", b"- 1\n"),
+        ):
+            whole = (folder / name).read_bytes()
+            (folder / name).write_bytes(content)
+            said = deploy(f"resume={folder}")
+            assert len(said) == 1, said
+            assert Path(name).name in said[0]
+            (folder / name).write_bytes(whole)
