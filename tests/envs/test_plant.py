@@ -147,6 +147,16 @@ def test_cooling_is_passive_and_heating_fast() -> None:
     assert p.temperature[0] == pytest.approx(24.0, abs=1e-3)
 
 
+def test_feed_halves_the_time_of_cooling() -> None:
+    p = Plant(PlantConfig(), 3, np.random.default_rng(0))
+    minutes = np.zeros(3)
+    while (p.temperature > 30.0).any():
+        minutes += p.temperature > 30.0
+        p.advance(1.0, 60.0 * np.array([0.0, 0.009, 0.02]), temperature_target=30.0)
+    dilution = np.array([0.0, 0.027, 0.06])  # 60 u / 20 mL; T' = -(T - 24) (1/39 + D), from 13 to 6 degC over 24
+    assert minutes.tolist() == np.ceil(np.log(13.0 / 6.0) / (1.0 / 39.0 + dilution)).tolist() == [31.0, 15.0, 10.0]
+
+
 def test_fresh_medium_cools_the_vial() -> None:
     p = plant(PlantConfig(pump=PULSE, thermal=ThermalConfig(medium_c=20.0, heating_c_per_min=0.1)))
     p.advance(1e-6, np.array([1.2]))
