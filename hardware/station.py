@@ -111,7 +111,10 @@ class Station:
             times = max(math.floor((self.elapsed() - saved.on_s) / PERIOD_S), 0)
             self.repeated_ml = saved.feed_ml * times * state.pumps_on[0]
             self.repeated_waste_ml = saved.waste_ml * times * state.pumps_on[1]
-            self.tell(f"a dose of {saved.feed_ml:.2f} mL was left open; {self.repeated_ml:.2f} mL may have followed")
+            followed = f"{self.repeated_ml:.2f} mL may have followed"
+            if times > 0 and not state.pumps_on[0]:
+                followed = "repeated every 63 s until something else switched the pump off: unknown, not booked"
+            self.tell(f"a dose of {saved.feed_ml:.2f} mL was left open; {followed}")
             self._log("dose_end", {"reactor": self.name, "verified_off": True, "repeated_ml": self.repeated_ml})
 
     def bring_up(self, waited: bool = False) -> Task:

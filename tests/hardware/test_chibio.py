@@ -624,6 +624,22 @@ def test_killed_at_a_random_request_and_resumed_no_sample_is_dosed_twice(seed: i
     assert bed.reactors.elapsed() == pytest.approx(began + dead_s + 300.0, abs=70.0)
 
 
+def test_a_dose_left_open_and_ended_by_something_else_is_told_as_unknown() -> None:
+    bed = Bed(options=quiet(mu=0.025))
+    fixed(bed, 0.01)
+    bed.reactors.begin()
+    bed.step()  # begins a dose, whose end this client does not live to see
+    bed.clock.sleep(100.0)
+    for pump in (1, 2):
+        bed.device.handle("POST", f"/SetOutputOn/Pump{pump}/0/M0")  # as the board agent does
+    bed.clock.sleep(20.0)
+    rows, elapsed = json.loads(json.dumps(bed.rows)), bed.reactors.elapsed()
+    bed.client()
+    bed.reactors.begin(replay(rows), elapsed)
+    assert len(doses(bed)) == 2
+    assert "unknown, not booked" in bed.of("note")[0]["note"]
+
+
 def test_what_the_journal_says_of_a_reactor() -> None:
     rows = [
         {"kind": "device", "reactor": "M0", "device_id": "7", "blank": 14000.0, "temperature": 37.0},
