@@ -104,6 +104,8 @@ class Station:
         state = self.unit.read()
         self._blank = next((b for b in (saved.blank, self.rig.blank) if math.isfinite(b)), state.blank)
         self.guard.was_on = saved.guarded
+        if state.regulating:  # or it would switch them on again
+            self.unit.switch("OD", False)
         self.pumps_off()
         if running := self._running(state):
             self.tell(f"pumps were found on and switched off: {running}")

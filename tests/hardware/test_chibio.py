@@ -205,6 +205,20 @@ def test_pumps_found_on_are_switched_off_before_anything_else() -> None:
     assert bed.device.apps["M0"].data["OD"]["ON"] == 0
 
 
+@pytest.mark.parametrize("phase_s", [1.0, 6.0, 9.0, 30.0])
+def test_a_device_that_regulates_itself_gives_no_dose_of_its_own_once_taken_over(phase_s: float) -> None:
+    bed = Bed(od=0.6)
+    bed.device.handle("POST", "/SetOutputOn/OD/1/M0")
+    bed.device.handle("POST", "/Experiment/1/M0")
+    bed.clock.sleep(4 * 60.07 + phase_s)
+    assert doses(bed)
+    taken_over = bed.clock.now()
+    bed.reactors.begin()
+    bed.clock.sleep(20.0)
+    assert not [start for start, _ in doses(bed) if start > taken_over]
+    assert bed.motors_off()
+
+
 def test_zigzag_is_refused_with_the_remedy() -> None:
     bed = Bed()
     bed.device.handle("POST", "/SetOutputOn/Zigzag/1/M0")
