@@ -82,7 +82,7 @@ class ClosedLoop:
         self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
         self.done = np.zeros(n, dtype=np.bool_)
         self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
-        self._handed_over = np.zeros(n, dtype=np.bool_)
+        self.handed_over = np.zeros(n, dtype=np.bool_)  # regulated by the devices themselves
         controller.reset(n)
 
     def run(self) -> Iterator[Step]:
@@ -138,10 +138,10 @@ class ClosedLoop:
         if (off | stop).any():
             failed += self.reactors.pumps_off(off | stop)
             self.stopped = self.stopped | (stop & ~self._named(failed))
-        regulate = (verdict.response == Response.REGULATE) & ~self._handed_over
+        regulate = (verdict.response == Response.REGULATE) & ~self.handed_over
         if regulate.any():
             trouble = self.reactors.regulate(regulate, verdict.setpoint)
-            self._handed_over = self._handed_over | (regulate & ~self._named(trouble))
+            self.handed_over = self.handed_over | (regulate & ~self._named(trouble))
             failed += trouble
         if verdict.heat_off.any():
             failed += self.reactors.heat_off(verdict.heat_off)
@@ -157,16 +157,18 @@ class ClosedLoop:
             "began": self.began.tolist(),
             "done": self.done.tolist(),
             "stopped": self.stopped.tolist(),
-            "handed_over": self._handed_over.tolist(),
             "interlock": self.interlock.state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue as saved; None stands for nan. Raises: ValueError for another number of reactors."""
+        """Continue as saved; None stands for nan. Raises: ValueError for another number of reactors.
+
+        A reactor that was handed over was taken back when the program began anew; the interlock, which remembers it,
+        has it handed over again at the first step.
+        """
         if len(state["began"]) != len(self.done):
             raise ValueError(f"saved loop is for {len(state['began'])} reactors, this run has {len(self.done)}")
         self.began = np.array(state["began"], dtype=np.float64)
         self.done = np.array(state["done"], dtype=np.bool_)
         self.stopped = np.array(state["stopped"], dtype=np.bool_)
-        self._handed_over = np.array(state["handed_over"], dtype=np.bool_)
         self.interlock.restore(state["interlock"])

@@ -29,6 +29,7 @@ __all__ = ["Station"]
 CYCLE_S = 60.07  # median of 3275 real cycles (chibio.md section 3)
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
+FEED_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 OWN_WILL = ("Zigzag", "Custom", "Chemostat")  # modes that act on the pumps
 
 
@@ -103,6 +104,8 @@ class Station:
         state = self.unit.read()
         self._blank = next((b for b in (saved.blank, self.rig.blank) if math.isfinite(b)), state.blank)
         self.guard.was_on = saved.guarded
+        if state.regulating:  # or it would switch them on again
+            self.unit.switch("OD", False)
         self.pumps_off()
         if running := self._running(state):
             self.tell(f"pumps were found on and switched off: {running}")
@@ -110,7 +113,10 @@ class Station:
             times = max(math.floor((self.elapsed() - saved.on_s) / PERIOD_S), 0)
             self.repeated_ml = saved.feed_ml * times * state.pumps_on[0]
             self.repeated_waste_ml = saved.waste_ml * times * state.pumps_on[1]
-            self.tell(f"a dose of {saved.feed_ml:.2f} mL was left open; {self.repeated_ml:.2f} mL may have followed")
+            followed = f"{self.repeated_ml:.2f} mL may have followed"
+            if times > 0 and not state.pumps_on[0]:
+                followed = "repeated every 63 s until something else switched the pump off: unknown, not booked"
+            self.tell(f"a dose of {saved.feed_ml:.2f} mL was left open; {followed}")
             self._log("dose_end", {"reactor": self.name, "verified_off": True, "repeated_ml": self.repeated_ml})
 
     def bring_up(self, waited: bool = False) -> Task:
@@ -397,7 +403,7 @@ class Station:
             self._agenda.add(self._finish(DosePlan()))
             return False
         self.dosing = True
-        self._agenda.add(self._feed_off(), plan.feed_s + 0.5)
+        self._agenda.add(self._feed_off(), plan.feed_s + FEED_OFF_S)
         self._agenda.add(self._finish(plan), plan.waste_s + 0.5)
         try:
             unit.switch(WASTE, True)
