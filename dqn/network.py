@@ -13,36 +13,56 @@ __all__ = ["QNetwork", "action_basis", "initial_weights"]
 Layer = tuple[torch.Tensor, torch.Tensor]
 
 
-def initial_weights(sizes: Sequence[int], seed: np.random.SeedSequence) -> np.ndarray:
+def initial_weights(
+    sizes: Sequence[int], seed: np.random.SeedSequence, mirror: Sequence[int] = (), zero_output: bool = False
+) -> np.ndarray:
     """Weights of one network, flat: W and b of each layer uniform in +-1/sqrt(inputs) (the default of torch.nn.Linear).
 
+    With `mirror`, the second half of each hidden layer is the mirror image of the first: with f the features and m the
+    mirror, unit H/2 + j answers to f as unit j does to m f. Whatever a network favours on one side because of its draw
+    it then favours on the other side as well.
+
     Args:
-      sizes: units of input, hidden and output layers.
+      sizes: units of feature, hidden and output layers; hidden ones even with `mirror`.
       seed: the agent's own stream.
-    Returns: float32, shape (P,).
+      mirror: 1 or -1 for each feature; () = every unit is drawn.
+      zero_output: the last layer starts at 0, and with it every Q value.
+    Returns: float32, shape (P,), laid out as `QNetwork` wants it.
     """
     rng = np.random.default_rng(seed)
     parts = []
-    for inputs, outputs in pairwise(sizes):
+    signs = np.asarray(mirror, dtype=np.float64)
+    for layer, (inputs, outputs) in enumerate(pairwise(sizes)):
         bound = 1.0 / np.sqrt(inputs)
-        parts += [rng.uniform(-bound, bound, inputs * outputs), rng.uniform(-bound, bound, outputs)]
+        weight, bias = rng.uniform(-bound, bound, (inputs, outputs)), rng.uniform(-bound, bound, outputs)
+        last, half = layer == len(sizes) - 2, outputs // 2
+        if last and zero_output:
+            weight[:], bias[:] = 0.0, 0.0
+        elif signs.size and not last:
+            image = weight[:, :half] * signs[:, None] if layer == 0 else np.roll(weight[:, :half], inputs // 2, axis=0)
+            weight[:, half:], bias[half:] = image, bias[:half]
+        parts += [(weight.T if last else weight).ravel(), bias]
     return np.concatenate(parts).astype(np.float32)
 
 
 def action_basis(actions: int, smoothness: float) -> torch.Tensor:
-    """C with Q = z C: row k is cos(pi k (a + 1/2) / A) / (1 + k)^smoothness, a fixed basis of functions of the action.
+    """C with Q = z C: row k is the polynomial of degree k in the action, scaled by (1 + k)^-smoothness.
 
-    C is invertible, so the network can represent the same Q values with it as without. It changes the direction in
-    which gradient steps go: one sample then moves Q of similar actions alike, and the rougher a difference between
-    actions is, the more slowly it is learned.
+    The polynomials are orthogonal on the A equidistant actions and have mean square 1 there (discrete Legendre or Gram
+    polynomials). C is invertible, so the network can represent the same Q values with it as without. It changes the
+    direction in which gradient steps go: one sample then moves Q of similar actions alike, and the rougher a difference
+    between actions is, the more slowly it is learned. What Q really is, a parabola in the pump rate to good
+    approximation, takes three of them, also at the ends of the grid, where a cosine series would flatten it.
 
     Args:
       actions: A. smoothness: >= 0.
     Returns: shape (A, A), float32.
     """
-    k, a = np.arange(actions)[:, None], np.arange(actions)[None, :]
-    basis = np.cos(np.pi * k * (a + 0.5) / actions) / (1.0 + k) ** smoothness
-    return torch.from_numpy(basis.astype(np.float32))
+    grid = np.linspace(-1.0, 1.0, actions)
+    powers = np.polynomial.legendre.legvander(grid, actions - 1)
+    orthonormal, triangle = np.linalg.qr(powers)
+    rows = (orthonormal * np.sign(np.diag(triangle))).T * np.sqrt(actions)
+    return torch.from_numpy((rows / (1.0 + np.arange(actions))[:, None] ** smoothness).astype(np.float32))
 
 
 class QNetwork:

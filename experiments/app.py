@@ -30,6 +30,7 @@ __all__ = ["UserError", "compose", "load", "normalise", "run", "save_config", "w
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
+logging.getLogger("httpx").setLevel(logging.WARNING)  # it tells of every request; journal and summary do that better
 
 OmegaConf.register_new_resolver("pid", os.getpid)  # makes run folders of processes started in one second differ
 

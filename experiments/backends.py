@@ -36,7 +36,6 @@ __all__ = ["continue_loop", "controller_of", "model_of", "opened", "plant_of", "
 
 log = logging.getLogger(__name__)
 EMULATED = ("speed", "seed", "od", "plant")  # values of backend=emulator that its process is started with
-logging.getLogger("httpx").setLevel(logging.WARNING)  # it tells of every request; the journal does that better
 
 
 def plant_of(config: DeployConfig) -> PlantConfig:

@@ -71,7 +71,7 @@ def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_st
     left.set(xlabel="episode", ylabel="cost of the episode, sum of (x − setpoint)²", yscale="log")
     left.set_title("Cost per training episode (minus the reward)", fontsize=10)
     left.legend(frameon=False, fontsize=8)
-    _population(right, eval_step, np.maximum(regret_pct, 1e-2), COLOURS[1], "greedy policy")
+    _population(right, eval_step, np.maximum(regret_pct, 1e-3), COLOURS[1], "greedy policy")
     if best_step.size == 1:
         right.axvline(best_step[0], color=COLOURS[2], linewidth=1, linestyle="--", label="policy kept")
     right.set(xlabel="environment step", ylabel="regret against the optimum, %", yscale="log")

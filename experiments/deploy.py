@@ -178,7 +178,10 @@ class Announcer:
                 self._phase[n] = int(step.phase[n])
                 what = "recovery" if self._phase[n] < 0 else f"setpoint {step.setpoint[n]:g}"
                 log.info("%s: %s from minute %.0f, OD %.3f", name, what, step.minute[n], step.od[n])
-            kinds = (step.reasons[n] or "").split(":")[0]
+            reason = step.reasons[n] or ""
+            if not step.rows[n] and (not reason or reason.endswith("earlier in this run")):
+                continue  # what a sample was refused for is not over because there is no new one yet
+            kinds = reason.split(":")[0]
             if kinds != (self._reason[n] or ""):
                 self._reason[n] = kinds
                 log.warning("%s: %s", name, step.reasons[n] or "interlock: all well again")
@@ -218,8 +221,8 @@ def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConf
         with handled(patience, signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             try:
                 reactors.stop()
-                left = [name for name, own in zip(reactors.names, reactors.handed_over, strict=True) if own]
-                log.info("pumps verified off%s", f", {', '.join(left)} left to the on-board regulation" if left else "")
+                left = ", ".join(n for n, h in zip(reactors.names, loop.handed_over, strict=True) if h)
+                log.info("pumps verified off%s", f"; {left}: left to the on-board regulation" if left else "")
             except ReactorError as error:
                 outcome = f"failed: {error}"
     return outcome

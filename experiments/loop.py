@@ -84,6 +84,11 @@ class ClosedLoop:
         self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
         controller.reset(n)
 
+    @property
+    def handed_over(self) -> Mask:
+        """Reactors that are regulated by the devices themselves."""
+        return self.reactors.handed_over
+
     def run(self) -> Iterator[Step]:
         """Go on until every reactor's schedule is over or was stopped. Raises: ReactorError."""
         while not (self.done | self.stopped).all():
@@ -137,7 +142,7 @@ class ClosedLoop:
         if (off | stop).any():
             failed += self.reactors.pumps_off(off | stop)
             self.stopped = self.stopped | (stop & ~self._named(failed))
-        regulate = (verdict.response == Response.REGULATE) & ~self.reactors.handed_over
+        regulate = (verdict.response == Response.REGULATE) & ~self.handed_over
         if regulate.any():
             failed += self.reactors.regulate(regulate, verdict.setpoint)
         if verdict.heat_off.any():

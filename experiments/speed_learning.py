@@ -76,14 +76,21 @@ def _matrix_work(agents: int, batch: int, units: tuple[int, ...]) -> Callable[[]
     inputs = [torch.randn(agents, batch, i) for i, _ in shapes]
     outputs = [torch.randn(agents, batch, o) for _, o in shapes]
     weights = [torch.randn(agents, i, o) for i, o in shapes]
+    # the last layer transposed, as in dqn.network
+    outputs[-1], weights[-1] = (m.transpose(1, 2).contiguous() for m in (outputs[-1], weights[-1]))
 
     def work() -> None:
-        for k, (x, y, w) in enumerate(zip(inputs, outputs, weights, strict=True)):
+        for k, (x, y, w) in enumerate(zip(inputs[:-1], outputs[:-1], weights[:-1], strict=True)):
             torch.bmm(x, w)  # target network
             torch.bmm(x, w)  # online network
             torch.bmm(x.transpose(1, 2), y)  # gradient by the weights
             if k:
                 torch.bmm(y, w.transpose(1, 2))  # gradient by the layer's input
+        x, y, w = inputs[-1], outputs[-1], weights[-1]
+        torch.bmm(w, x.transpose(1, 2))
+        torch.bmm(w, x.transpose(1, 2))
+        torch.bmm(y, x)
+        torch.bmm(y.transpose(1, 2), w)
 
     return work
 

@@ -19,6 +19,7 @@ __all__ = ["Blank", "dose_series", "measure_blanks"]
 Array = NDArray[np.float64]
 
 PAUSE_S = 2.0  # between two doses, so that the fluid comes to rest
+LATE_S = 2.0  # a pump starts a little after the answer, and later on a busy bus; its dose must not be cut short
 
 
 def dose_series(unit: Unit, clock: Clock, pump: str, duty: float, doses: int) -> Iterator[int]:
@@ -35,7 +36,7 @@ def dose_series(unit: Unit, clock: Clock, pump: str, duty: float, doses: int) ->
         unit.target(pump, duty)
         for given in range(1, doses + 1):
             unit.switch(pump, True)
-            clock.sleep(PERIOD_S * duty + 0.5)
+            clock.sleep(PERIOD_S * duty + LATE_S)
             unit.pumps_off()
             yield given
             clock.sleep(PAUSE_S)

@@ -52,7 +52,7 @@ def _take(entry: dict[str, Any], row: Mapping[str, Any]) -> None:
     elif row["kind"] == "guard":
         entry["guarded"] = True
     elif row["kind"] == "regulate":
-        entry["handed_over"] = float(row["setpoint"])
+        entry.update(handed_over=float(row["setpoint"]), open=False)  # its pumps were verified off before
 
 
 def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, Saved]:

@@ -29,6 +29,7 @@ __all__ = ["Station"]
 CYCLE_S = 60.07  # median of 3275 real cycles (chibio.md section 3)
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
+FEED_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 OWN_WILL = ("Zigzag", "Custom", "Chemostat")  # modes that act on the pumps
 
 
@@ -107,14 +108,19 @@ class Station:
         self.handed_over = saved.handed_over
         left_alone = self._regulates(state)
         if not left_alone:
+            if state.regulating:  # or it would switch them on again
+                self._end_regulation()
             self.pumps_off()
             if running := self._running(state):
                 self.tell(f"pumps were found on and switched off: {running}")
-        if saved.open and not left_alone:  # the device repeats what was left on every 63 s (chibio.md section 0.7)
+        if saved.open:  # the device repeats what was left on every 63 s (chibio.md section 0.7)
             times = max(math.floor((self.elapsed() - saved.on_s) / PERIOD_S), 0)
             self.repeated_ml = saved.feed_ml * times * state.pumps_on[0]
             self.repeated_waste_ml = saved.waste_ml * times * state.pumps_on[1]
-            self.tell(f"a dose of {saved.feed_ml:.2f} mL was left open; {self.repeated_ml:.2f} mL may have followed")
+            followed = f"{self.repeated_ml:.2f} mL may have followed"
+            if times > 0 and not state.pumps_on[0]:
+                followed = "repeated every 63 s until something else switched the pump off: unknown, not booked"
+            self.tell(f"a dose of {saved.feed_ml:.2f} mL was left open; {followed}")
             self._log("dose_end", {"reactor": self.name, "verified_off": True, "repeated_ml": self.repeated_ml})
 
     def bring_up(self, waited: bool = False) -> Task:
@@ -158,8 +164,7 @@ class Station:
         if acting := [m for m in state.modes if m in OWN_WILL]:
             raise DeviceStateError(f"{self.name}: {', '.join(acting)} is on; switch it off in the device's web page")
         if state.regulating and not math.isfinite(self.handed_over):
-            unit.switch("OD", False)
-            self.tell("the on-board OD regulation was found on and switched off: this run controls")
+            self._end_regulation()
         if abs(state.blank - self._blank) > 0.5:
             unit.post(f"/CalibrateOD/OD0/{self.name}/{self._blank:.6f}/0")
         for item, value, wanted in (
@@ -403,7 +408,7 @@ class Station:
             self._agenda.add(self._finish(DosePlan()))
             return False
         self.dosing = True
-        self._agenda.add(self._feed_off(), plan.feed_s + 0.5)
+        self._agenda.add(self._feed_off(), plan.feed_s + FEED_OFF_S)
         self._agenda.add(self._finish(plan), plan.waste_s + 0.5)
         try:
             unit.switch(WASTE, True)
@@ -505,6 +510,11 @@ class Station:
         if not (state.regulating and abs(state.regulation_target - setpoint) <= 1e-5):
             raise DeviceStateError(f"{self.name}: {self._regulation(state)} after it was switched on at {setpoint:g}")
         self.handed_over = setpoint
+
+    def _end_regulation(self) -> None:
+        self.unit.switch("OD", False)
+        if not math.isfinite(self.handed_over):
+            self.tell("the on-board OD regulation was found on and switched off: this run controls")
 
     def _regulates(self, state: DeviceState) -> bool:
         """Whether it regulates itself as it was handed over; False if it never was."""

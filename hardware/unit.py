@@ -28,7 +28,9 @@ class Unit:
 
     The device shows one selected reactor to everybody, so a read is changeDevice and GET as a pair, believed only if
     the answer names this reactor and its pinned identity (chibio.md section 12.2). A command is sent only if the last
-    verified read saw this reactor present: one request to an absent one ends the whole server (section 0.3).
+    verified read saw this reactor present: one request to an absent one ends the whole server (section 0.3). After a
+    request without an answer nothing is known: the server may have been started again without this reactor. Then the
+    next command looks first.
 
     Args:
       name: position, M0 to M7.
@@ -45,6 +47,7 @@ class Unit:
         self.device_id = ""  # pinned at the first read
         self.state: DeviceState | None = None  # the last verified one
         self.took_s = 0.0  # how long the last verified read took
+        self._unsure = False  # a request was not answered as expected since presence was last seen
         self._reactors = tuple(reactors)
         self._transport = transport
         self._clock = clock
@@ -61,14 +64,8 @@ class Unit:
         for _ in range(tries):
             start = self._clock.now()
             self._post(f"/changeDevice/{self.name}", quiet=True)
-            reply = self._transport.get("/getSysdata/")
-            if reply.status != 200:
-                raise ProtocolError(f"GET /getSysdata/: status {reply.status}, expected 200")
-            state = parse_state(reply.body)
+            state = self._look()
             selected = state.selected
-            if self.name not in state.present:
-                self.state = None  # nothing is sent to it from now on
-                raise DeviceStateError(f"{self.name} is absent (present: {', '.join(state.present) or 'none'})")
             if selected == self.name:
                 break
         else:
@@ -84,12 +81,31 @@ class Unit:
         self.state, self.took_s = state, self._since(start)
         return state
 
+    def _look(self) -> DeviceState:
+        """The state of whichever reactor is selected, which tells of all whether they are present.
+
+        Raises: LinkError, ProtocolError; DeviceStateError if this one is absent.
+        """
+        before, self._unsure = self._unsure, True
+        reply = self._transport.get("/getSysdata/")
+        if reply.status != 200:
+            raise ProtocolError(f"GET /getSysdata/: status {reply.status}, expected 200")
+        self._unsure = before  # whoever answers 200 is the server, even if its words are garbled
+        state = parse_state(reply.body)
+        self._unsure = False
+        if self.name not in state.present:
+            self.state = None  # nothing is sent to it from now on
+            raise DeviceStateError(f"{self.name} is absent (present: {', '.join(state.present) or 'none'})")
+        return state
+
     def post(self, path: str) -> None:
         """Send one command of `wire.check_command`.
 
         Raises: LinkError (it may have been carried out), ProtocolError for a status other than 204, DeviceStateError
-          if the command is not allowed or the reactor was not present at the last verified read.
+          if the command is not allowed or the reactor was not present when it was last looked at.
         """
+        if self.state is not None and self._unsure:
+            self._look()
         if self.state is None or self.name not in self.state.present:
             raise DeviceStateError(f"refused to send POST {path}: {self.name} was not seen present")
         self._post(path)
@@ -98,6 +114,7 @@ class Unit:
         check_command(path, self._reactors, self._guard)
         start = self._clock.now()
         answer: int | str = ""
+        before, self._unsure = self._unsure, True
         try:
             reply = self._transport.post(path)
             answer = reply.status
@@ -112,6 +129,7 @@ class Unit:
         if reply.status != 204:
             hint = "; the server wants X-Requested-With" if reply.status == 403 else ""
             raise ProtocolError(f"POST {path}: status {reply.status}, expected 204{hint}")
+        self._unsure = before
 
     def _since(self, start: float) -> float:
         return round(self._clock.now() - start, 3)

@@ -158,6 +158,15 @@ def test_exploration_follows_epsilon() -> None:
     assert float(share) == pytest.approx(0.625, abs=0.01)
 
 
+def test_a_mirrored_start_needs_even_layers() -> None:
+    given = {"input_matrix": (1.0, 0.0, 0.0, 1.0), "input_offset": (0.0, 0.0), "init_mirror": (-1, 1)}
+    assert DQNConfig(**given).init_mirror == (-1, 1)
+    with pytest.raises(ValueError, match=r"agent\.hidden = \[64, 33\]: allowed even sizes"):
+        DQNConfig(**given, hidden=(64, 33))
+    with pytest.raises(ValueError, match=r"agent\.init_mirror = \[0, 1\]"):
+        DQNConfig(**{**given, "init_mirror": (0, 1)})
+
+
 def test_relabelling_without_a_goal_is_refused() -> None:
     config = DQNConfig(**{**SMALL.__dict__, "relabel": 0.5})
     with pytest.raises(ValueError, match=r"agent\.relabel = 0\.5"):
@@ -179,6 +188,7 @@ def test_relabelling_without_a_goal_is_refused() -> None:
         ("relabel", -0.1),
         ("average", 1.0),
         ("input_offset", (1.0,)),
+        ("init_mirror", (-1, 1)),
     ],
 )
 def test_values_out_of_range_are_named(key: str, value: Any) -> None:

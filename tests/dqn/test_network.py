@@ -107,3 +107,36 @@ def test_action_basis_spans_everything_and_prefers_smooth_differences() -> None:
     moved = basis.T @ basis  # what a gradient step on one Q value does to all of them
     assert bool((moved[8, 8] >= moved[8]).all())
     assert float(moved[8, 7]) > float(moved[8, 3])
+
+
+def test_three_functions_of_the_basis_make_a_parabola() -> None:
+    """Any parabola of the action, at the ends of the grid too, without the other fourteen."""
+    basis = action_basis(17, 3.0).double()
+    action = torch.arange(17, dtype=torch.float64)
+    q = 3.0 - 0.5 * (action - 12.3) ** 2
+    weights = torch.linalg.lstsq(basis[:3].T, q[:, None]).solution
+    torch.testing.assert_close((basis[:3].T @ weights)[:, 0], q, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("hidden", [(8, 6), (8,), (4, 6, 8)])
+def test_half_of_the_units_start_as_mirror_images(hidden: tuple[int, ...]) -> None:
+    """Layer by layer, the second half answers to the features as the first half does to their mirror image."""
+    mirror = (-1, -1, 1)
+    sizes = (3, *hidden, 4)
+    flat = torch.from_numpy(initial_weights(sizes, np.random.SeedSequence(3), mirror)[None])
+    network = QNetwork(flat, sizes)
+    features = torch.randn(1, 50, 3, generator=torch.Generator().manual_seed(0))
+    _, seen = network.forward(features)
+    _, mirrored = network.forward(features * torch.tensor(mirror))
+    for units, images in zip(seen[1:], mirrored[1:], strict=True):
+        half = units.shape[-1] // 2
+        torch.testing.assert_close(units[..., half:], images[..., :half])
+        assert not torch.allclose(units[..., half:], units[..., :half])
+
+
+def test_outputs_may_start_at_zero() -> None:
+    drawn = initial_weights((3, 8, 4), np.random.SeedSequence(3))
+    flat = initial_weights((3, 8, 4), np.random.SeedSequence(3), zero_output=True)
+    assert np.array_equal(flat[:32], drawn[:32])
+    q = QNetwork(torch.from_numpy(flat[None]), (3, 8, 4))(torch.ones(1, 5, 3))
+    assert torch.equal(q, torch.zeros(1, 5, 4))

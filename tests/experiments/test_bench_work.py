@@ -156,3 +156,12 @@ def test_what_was_stored_is_loaded(tmp_path: Path) -> None:
     save(tmp_path, "M3", "blank", {"blank": 13.0})
     with pytest.raises(app.UserError, match="blank = 13"):
         load_rigs(tmp_path, ["M3"])
+
+
+def test_the_operator_is_not_shown_every_request(tmp_path: Path) -> None:
+    with EmulatorProcess(["--speed", "200", "--od", "0", "--unblanked"]) as emulator:
+        command = [sys.executable, "-m", "experiments.blank", "samples=3", f"hydra.run.dir={tmp_path}/run"]
+        command += [f"backend.url={emulator.url}", "backend.speed=200", f"backend.calibration={tmp_path}/c"]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert len((done.stdout + done.stderr).splitlines()) == 2  # what it does, what it found

@@ -114,14 +114,17 @@ def test_no_feedback_loses_to_feedback():
 
 
 def test_threshold_loses_to_graded_feedback():
-    """It pumps fully or not at all; on ITAE it may still beat the device's own PI, whose gain is too low."""
+    """It pumps fully or not at all. On ITAE it may still beat the device's own PI, whose gain is too low by four."""
     lost = total(trial("threshold", "nominal_noise", "setpoint_steps", 8), "itae")
     for controller in ("mpc", "inverse", "pi_tuned"):
         assert lost > 1.5 * total(trial(controller, "nominal_noise", "setpoint_steps", 8), "itae")
 
 
 def test_the_devices_pi_lands_where_the_published_one_does():
-    """Published range of the law in the same kind of simulation: ISE 0.036-0.093, ITAE 5.7-9.8 (field.md section d)."""
+    """Range of the law over steps of the setpoint in this kind of simulation: ISE 0.036-0.093, ITAE 5.7-9.8.
+
+    Source: field.md section d. The first window has no step: the recovery ends at its setpoint.
+    """
     t = trial("pi", "nominal_noise", "setpoint_steps", 64)
     for window in windows(t.schedule)[1:]:
         score = t.score(window)

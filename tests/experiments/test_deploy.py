@@ -16,10 +16,14 @@ from envs.plant import Plant, PlantConfig, SensorConfig
 from envs.setpoints import Schedule
 from envs.task import EnvConfig, step_factors
 from experiments.controllers.learned import LearnedController
+from experiments.deploy import Announcer
 from experiments.loop import ClosedLoop
 from hardware.recording import read_recording
 from hardware.safety import Interlock
+from hardware.safety_config import Responses, SafetyConfig
+from hardware.saved import replay
 from hardware.simulated import SimulatedConfig, SimulatedReactors
+from tests.hardware.driver_lab import Bed
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
@@ -173,3 +177,42 @@ def test_a_reading_that_is_no_number_is_answered_with_no_dose():
     loop = ClosedLoop(reactors, LearnedController(inverse_policy()), Interlock(1), Schedule((0.5,), (5.0,), (37.0,)))
     loop.began[:] = 0.0
     assert all(step.rate[0] == 0.0 for step in loop.run())
+
+
+def handing_over(bed: Bed) -> ClosedLoop:
+    """A loop whose interlock hands every reactor over once its budget is spent."""
+    safety = SafetyConfig(ml_per_hour=1.0, responses=Responses(budget="regulate"))
+    schedule = Schedule((0.5,), (600.0,), (37.0,))
+    return ClosedLoop(bed.reactors, LearnedController(inverse_policy()), Interlock(len(bed.names), safety), schedule)
+
+
+def test_a_reactor_left_to_the_on_board_regulation_is_so_again_after_a_resume():
+    bed = Bed(od=0.55)
+    bed.reactors.begin()
+    loop = handing_over(bed)
+    while bed.clock.now() < 900.0:
+        loop.step()
+    assert loop.handed_over.all()
+    assert bed.device.apps["M0"].data["OD"]["ON"] == 1
+    state = json.loads(json.dumps(loop.state_dict()))
+    bed.client()
+    bed.reactors.begin(replay(json.loads(json.dumps(bed.rows))), bed.clock.now())
+    again = handing_over(bed)
+    again.load_state_dict(state)
+    while bed.clock.now() < 3600.0:
+        again.step()
+    assert bed.device.apps["M0"].data["OD"]["ON"] == 1
+    assert bed.truth()["od"] == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_lasting_reason_is_told_once(caplog):
+    bed = Bed(("M0", "M1"), od=0.55)
+    bed.reactors.begin()
+    loop = handing_over(bed)
+    announce = Announcer(loop)
+    with caplog.at_level("WARNING"):
+        while bed.clock.now() < 1800.0:
+            announce(loop.step())
+    assert loop.handed_over.all()
+    assert len([r for r in caplog.records if "budget" in r.message]) == 2
+    assert len(caplog.records) <= 4

@@ -236,7 +236,7 @@ def test_kill_9_and_resume_of_a_real_run(tmp_path: Path) -> None:
         bench.client.terminate()
         status, said = bench.end()
         assert status == 0, said
-        assert "pumps verified off, M0 left to the on-board regulation" in said
+        assert "pumps verified off; M0: left to the on-board regulation" in said
         assert od(device)["od"] == pytest.approx(0.4, abs=0.1)
     later = [r for r in read_journal(folder / "journal.jsonl")[0][rows:] if r.get("reactor") == "M0"]
     assert not [r for r in later if r["kind"] == "intent" or "/OD/" in r.get("path", "")]

@@ -68,13 +68,25 @@ def test_the_requests_of_one_dose_are_those_of_single_shot_dosing() -> None:
     assert [path for _, path in posts[2:4]] == ["/SetOutputOn/Pump2/1/M0", "/SetOutputOn/Pump1/1/M0"]
     on_s = posts[3][0]
     off = [t for t, path in posts[4:] if path == "/SetOutputOn/Pump1/0/M0"]
-    assert off[0] - on_s == pytest.approx(feed + 0.5, abs=0.1)
+    assert off[0] - on_s == pytest.approx(feed + 2.0, abs=0.1)
     assert [path for _, path in posts[5:10]] == [
         *(f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 2, 3, 4)),
         "/MeasureTemp/IR/M0",
     ]
     assert posts[5][0] - on_s == pytest.approx(waste + 0.5, abs=0.1)
     assert doses(bed) == [(pytest.approx(on_s, abs=0.1), pytest.approx(feed + 0.1, abs=0.01))]
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.4, 0.6, 0.9])
+def test_a_slow_link_does_not_cut_doses_short(delay_s: float) -> None:
+    bed = Bed(options=quiet())
+    fixed(bed, 0.01)
+    bed.reactors.begin()
+    bed.fault("slow_s", delay_s)
+    bed.run(10)
+    given = doses(bed)
+    assert len(given) >= 9
+    assert [length for _, length in given] == pytest.approx([0.54 + 0.1] * len(given), abs=0.01)
 
 
 def test_a_dose_ends_before_the_next_measurement_and_the_pumps_are_off_most_of_the_time() -> None:
@@ -191,6 +203,20 @@ def test_pumps_found_on_are_switched_off_before_anything_else() -> None:
     bed.reactors.begin()
     assert bed.motors_off()
     assert bed.device.apps["M0"].data["OD"]["ON"] == 0
+
+
+@pytest.mark.parametrize("phase_s", [1.0, 6.0, 9.0, 30.0])
+def test_a_device_that_regulates_itself_gives_no_dose_of_its_own_once_taken_over(phase_s: float) -> None:
+    bed = Bed(od=0.6)
+    bed.device.handle("POST", "/SetOutputOn/OD/1/M0")
+    bed.device.handle("POST", "/Experiment/1/M0")
+    bed.clock.sleep(4 * 60.07 + phase_s)
+    assert doses(bed)
+    taken_over = bed.clock.now()
+    bed.reactors.begin()
+    bed.clock.sleep(20.0)
+    assert not [start for start, _ in doses(bed) if start > taken_over]
+    assert bed.motors_off()
 
 
 def test_zigzag_is_refused_with_the_remedy() -> None:
@@ -440,6 +466,24 @@ def test_a_device_that_lost_its_memory_is_restored() -> None:
     assert bed.samples.min() >= 20
 
 
+@pytest.mark.parametrize("minutes", [1, 5, 20])
+def test_a_device_started_again_without_one_of_its_reactors_is_not_ended_by_this_program(minutes: float) -> None:
+    bed = Bed(("M0", "M1"))
+    bed.reactors.begin()
+    bed.run(5)
+    bed.fault("unplugged", 1.0, "M1")
+    bed.run(2)  # the next access to it ends the software
+    assert "link" in bed.kinds()
+    bed.run(minutes)
+    bed.fault("restart")
+    before = bed.samples.copy()
+    bed.run(10)
+    assert bed.device.alive
+    assert "absent" in bed.kinds()
+    assert (bed.samples - before)[0] >= 8
+    assert (bed.samples - before)[1] == 0
+
+
 def test_a_dead_thread_is_restarted_and_the_neighbour_never_notices() -> None:
     bed = Bed(("M0", "M1"))
     bed.reactors.begin()
@@ -592,6 +636,22 @@ def test_killed_at_a_random_request_and_resumed_no_sample_is_dosed_twice(seed: i
         bed.truth()["feed_ml"] <= bed.fed[0] + sum(r["feed_ml"] for r in rows if r["kind"] == "intent") + 1.5 * repeats
     )
     assert bed.reactors.elapsed() == pytest.approx(began + dead_s + 300.0, abs=70.0)
+
+
+def test_a_dose_left_open_and_ended_by_something_else_is_told_as_unknown() -> None:
+    bed = Bed(options=quiet(mu=0.025))
+    fixed(bed, 0.01)
+    bed.reactors.begin()
+    bed.step()  # begins a dose, whose end this client does not live to see
+    bed.clock.sleep(100.0)
+    for pump in (1, 2):
+        bed.device.handle("POST", f"/SetOutputOn/Pump{pump}/0/M0")  # as the board agent does
+    bed.clock.sleep(20.0)
+    rows, elapsed = json.loads(json.dumps(bed.rows)), bed.reactors.elapsed()
+    bed.client()
+    bed.reactors.begin(replay(rows), elapsed)
+    assert len(doses(bed)) == 2
+    assert "unknown, not booked" in bed.of("note")[0]["note"]
 
 
 def test_what_the_journal_says_of_a_reactor() -> None:

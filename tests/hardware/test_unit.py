@@ -13,9 +13,10 @@ from tests.hardware.script import DONE, LOST, Script, answer, posts, read, state
 
 OFF = [f"/SetOutputOn/{pump}/0/M0" for pump in ("Pump1", "Pump2", "Pump3", "Pump4")]
 PROBE = "/MeasureTemp/IR/M0"
+Steps = Sequence[tuple[str, Reply | Exception]]
 
 
-def unit(steps: Sequence[tuple[str, Reply | Exception]], log: list[Any] | None = None) -> tuple[Unit, Script]:
+def unit(steps: Steps, log: list[Any] | None = None) -> tuple[Unit, Script]:
     script = Script(steps)
     told = [] if log is None else log
     return Unit("M0", ("M0", "M1"), script, VirtualClock(), lambda kind, fields: told.append((kind, fields))), script
@@ -61,6 +62,26 @@ def test_nothing_is_sent_before_the_first_read() -> None:
         m0.switch("Pump1", False)
 
 
+@pytest.mark.parametrize("refusal", [LOST, Reply(502, b"the board agent finds no server")])
+def test_after_a_lost_answer_presence_is_looked_at_before_the_next_command(refusal: Reply | Exception) -> None:
+    gone, here, look = answer(state("M1", presentDevices={"M0": 0, "M1": 1})), answer(state("M1")), "GET /getSysdata/"
+    steps = [*read(state()), (f"POST {OFF[0]}", refusal), (look, here), *posts(OFF[1], OFF[2])]
+    m0, script = unit([*steps, (f"POST {OFF[3]}", refusal), (look, refusal), (look, gone)])
+    m0.read()
+    with pytest.raises((LinkError, ProtocolError)):
+        m0.post(OFF[0])
+    m0.post(OFF[1])
+    m0.post(OFF[2])
+    for _ in range(2):
+        with pytest.raises((LinkError, ProtocolError)):
+            m0.post(OFF[3])
+    with pytest.raises(DeviceStateError, match="absent"):
+        m0.post(OFF[3])
+    with pytest.raises(DeviceStateError, match="not seen present"):
+        m0.post(OFF[3])
+    script.close()
+
+
 def test_no_identity_is_no_reactor() -> None:
     m0, _ = unit(read(state(DeviceID="")))
     with pytest.raises(IdentityError):
@@ -83,7 +104,7 @@ def test_pumps_off_touches_the_bus_and_reads_back() -> None:
 
 
 def test_pumps_off_tries_every_pump_even_when_one_request_is_lost_and_then_all_again() -> None:
-    lost = [(f"POST {OFF[0]}", LOST), *posts(*OFF[1:])]
+    lost: Steps = [(f"POST {OFF[0]}", LOST), ("GET /getSysdata/", answer(state())), *posts(*OFF[1:])]
     m0, script = unit([*read(state()), *lost, *posts(*OFF, PROBE), *read(state())])
     m0.read()
     m0.pumps_off()
@@ -142,7 +163,7 @@ def test_a_state_that_is_not_readable_is_no_state() -> None:
 
 
 def test_after_two_time_outs_the_off_commands_of_a_dead_link_are_given_up_until_the_next_try() -> None:
-    m0, script = unit(read(state()) + [(f"POST {path}", LOST) for path in OFF[:2]])
+    m0, script = unit([*read(state()), (f"POST {OFF[0]}", LOST), ("GET /getSysdata/", LOST)])
     m0.read()
     with pytest.raises(LinkError):
         m0.pumps_off(tries=1)
