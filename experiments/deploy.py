@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -69,6 +70,23 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     log.info("policy %s: regret %.2f %% against the optimum of its model", path, regret)
     if not regret <= POOR_REGRET_PCT:
         log.warning("this policy is far from optimal (regret %.0f %%): train longer or with another seed", regret)
+    return policy
+
+
+def policy_of(config: DeployConfig, folder: Path) -> Policy:
+    """The policy of this run, of which the run folder keeps a copy. A resumed run goes on with that, whatever has been
+    trained meanwhile.
+
+    Raises: UserError as `load_policy`, and if the copy cannot be written.
+    """
+    kept = folder / "policy.npz"
+    if config.resume is not None and kept.is_file():
+        return load_policy(str(kept), config.backend.control_min, config.safety.max_rate)
+    policy = load_policy(config.policy, config.backend.control_min, config.safety.max_rate)
+    try:
+        shutil.copyfile(find_policy(config.policy), kept)
+    except OSError as error:
+        raise app.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free the disk") from None
     return policy
 
 
@@ -246,7 +264,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
     plant, model = backends.plant_of(config), backends.model_of(config)
     policy = None
     if config.controller.kind == "dqn":
-        policy = load_policy(config.policy, backend.control_min, config.safety.max_rate)
+        policy = policy_of(config, folder)
     record = None
     try:
         if config.preflight_only:

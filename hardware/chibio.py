@@ -194,7 +194,7 @@ class ChiBioReactors:
 
     def pumps_off(self, rows: Mask) -> list[str]:
         """All pumps of `rows` off, verified, but for an overflow guard; returns what failed, one line per reactor."""
-        return self._each(rows, lambda station: station.pumps_off(tries=1))
+        return self._each(rows, Station.halt)
 
     def heat_off(self, rows: Mask) -> list[str]:
         """Thermostat and heater of `rows` off, and not switched on again; returns what failed."""

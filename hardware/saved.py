@@ -52,7 +52,8 @@ def _take(entry: dict[str, Any], row: Mapping[str, Any]) -> None:
     elif row["kind"] == "guard":
         entry["guarded"] = True
     elif row["kind"] == "regulate":
-        entry.update(handed_over=float(row["setpoint"]), open=False)  # its pumps were verified off before
+        setpoint = math.nan if row["setpoint"] is None else float(row["setpoint"])  # None: control was taken back
+        entry.update(handed_over=setpoint, open=False)  # its pumps were verified off before
 
 
 def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, Saved]:

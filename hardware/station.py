@@ -461,6 +461,18 @@ class Station:
         """All pumps off, verified, but for the overflow guard's. Raises: as `Unit.pumps_off`."""
         self.unit.pumps_off(tries, self.config.guard.others)
 
+    def halt(self) -> None:
+        """All pumps off, verified, once, as the interlock demands; on-board regulation too, or it would dose again.
+
+        A reactor that had been handed over is this program's again. Raises: as `Unit.pumps_off`.
+        """
+        if math.isfinite(self.handed_over):
+            self.unit.switch("OD", False)
+            self._log("regulate", {"reactor": self.name, "setpoint": None})
+            self.handed_over = math.nan
+            self.tell("on-board regulation switched off: the interlock demands that nothing is pumped")
+        self.pumps_off(tries=1)
+
     def _running(self, state: DeviceState) -> str:
         """Names of the pumps that are on beside the overflow guard's."""
         return ", ".join(p for p in state.running_pumps if p in self.config.guard.others)

@@ -15,8 +15,9 @@ from dqn import policy
 from envs.plant import Plant, PlantConfig, SensorConfig
 from envs.setpoints import Schedule
 from envs.task import EnvConfig, step_factors
+from experiments.config import DeployConfig
 from experiments.controllers.learned import LearnedController
-from experiments.deploy import Announcer
+from experiments.deploy import Announcer, policy_of
 from experiments.loop import ClosedLoop
 from hardware.recording import read_recording
 from hardware.safety import Interlock
@@ -216,3 +217,20 @@ def test_a_lasting_reason_is_told_once(caplog):
     assert loop.handed_over.all()
     assert len([r for r in caplog.records if "budget" in r.message]) == 2
     assert len(caplog.records) <= 4
+
+
+def test_a_resumed_run_goes_on_with_its_own_policy(tmp_path):
+    """Whatever became of the file, or is the latest one, meanwhile."""
+    source, folder = tmp_path / "policy.npz", tmp_path / "run"
+    folder.mkdir()
+    policy.save(source, inverse_policy())
+    config = DeployConfig(policy=str(source))
+    first = policy_of(config, folder)
+    other = replace(first, biases=(first.biases[0] + 1.0, *first.biases[1:]))
+    policy.save(source, other)
+    resumed = policy_of(replace(config, resume=str(folder)), folder)
+    np.testing.assert_array_equal(resumed.biases[0], first.biases[0])
+    source.unlink()
+    policy_of(replace(config, resume=str(folder)), folder)
+    policy.save(source, other)
+    np.testing.assert_array_equal(policy_of(config, folder).biases[0], other.biases[0])

@@ -16,6 +16,7 @@ from hardware.emulator_faults import inject
 from hardware.emulator_process import EmulatorProcess
 from hardware.errors import DeviceStateError
 from hardware.journal import read_journal
+from hardware.safety import Response
 from tests.experiments.test_exits import SPEED, Bench
 
 LOST = """
@@ -195,6 +196,27 @@ def test_a_new_run_takes_control_back_and_says_so(tmp_path: Path) -> None:
     assert "the on-board OD regulation was found on and switched off: this run controls" in notes
     assert [row for row in run.journaled("intent") if row["feed_ml"] > 0.0]
     assert not run.reactors.handed_over.any()
+
+
+def test_giving_a_reactor_up_ends_its_regulation_too(tmp_path: Path) -> None:
+    """Pumps that are switched off under a regulation that is on would run again with its next cycle."""
+    run = handed_over(tmp_path)
+    run.begin()
+    run.live(5)
+    assert run.data()["OD"]["ON"] == 1
+    run.loop.interlock.latch(Response.STOP, np.array([True, False]))
+    run.live(5)
+    assert run.loop.stopped.tolist() == [True, False]
+    fed = run.device.benches["M0"].on_s["Pump1"]
+    assert run.data()["OD"]["ON"] == 0
+    assert not run.reactors.handed_over.any()
+    run.bury()
+    run.sound = True
+    run.begin()
+    run.live(10)
+    assert run.data()["OD"]["ON"] == 0
+    assert run.device.benches["M0"].on_s["Pump1"] == fed
+    assert run.device.benches["M1"].on_s["Pump1"] > 0.0
 
 
 def test_a_run_of_an_earlier_version_hands_over_again(tmp_path: Path) -> None:
