@@ -83,12 +83,18 @@ class ClosedLoop:
         self.done = np.zeros(n, dtype=np.bool_)
         self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
         self.handed_over = np.zeros(n, dtype=np.bool_)  # regulated by the devices themselves
+        self.gone = np.zeros(n, dtype=np.bool_)  # given up, and not there any more for its pumps to be verified off
         controller.reset(n)
 
     def run(self) -> Iterator[Step]:
-        """Go on until every reactor's schedule is over or was stopped. Raises: ReactorError."""
-        while not (self.done | self.stopped).all():
+        """Go on until every reactor's schedule is over or it was given up. Raises: ReactorError."""
+        while not self.over:
             yield self.step()
+
+    @property
+    def over(self) -> bool:
+        """Whether every reactor's schedule is over, or the reactor was given up."""
+        return bool((self.done | self.stopped | self.gone).all())
 
     def _asked(self, elapsed: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """Phase, setpoint and temperature of each reactor, each (N,)."""
@@ -124,6 +130,9 @@ class ClosedLoop:
 
         if self._before_dose is not None:
             self._before_dose(told(np.full(len(self.done), np.nan), ()))
+        faults = m.vitals.faults if m.vitals is not None else (None,) * len(self.done)
+        absent = np.array([fault is not None and fault.kind == "absent" for fault in faults])
+        self.gone = absent & (verdict.response == Response.STOP)
         failures = self._respond(verdict)
         heat = np.where(verdict.heat_off, np.nan, temperature)
         receipt = self.reactors.actuate(Command(rows, verdict.rate, heat))

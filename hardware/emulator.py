@@ -125,7 +125,13 @@ class EmulatorServer:
 
     def _state(self) -> dict[str, object]:
         d = self.device
-        return {"alive": d.alive, "restarts": d.restarts, "selected": d.selected, "errors": list(d.errors)}
+        return {
+            "alive": d.alive,
+            "restarts": d.restarts,
+            "exits": d.exits,
+            "selected": d.selected,
+            "errors": list(d.errors),
+        }
 
 
 def _json(value: object) -> bytes:

@@ -124,7 +124,7 @@ class ChiBioDevice:
         self._queue: deque[Exchange] = deque()
         self._serving: Exchange | None = None
         self.errors: deque[str] = deque(maxlen=200)
-        self.restarts = 0
+        self.restarts = self.exits = 0
         noise, *streams = rng.spawn(1 + len(reactors))
         self._rng = noise
         self.benches: dict[str, Bench] = {}
@@ -260,6 +260,7 @@ class ChiBioDevice:
         """Exit code 4: gunicorn gives up, nobody listens any more."""
         self._end_process()
         self.alive = False
+        self.exits += 1
         while self._queue:
             self._queue.popleft().fate = "reset"
 

@@ -55,7 +55,11 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "worker_wipe": ("act", "any", "the web worker is killed and replaced: state wiped, everything off"),
     "crash": ("act", "any", "the software ends itself (code 4): connections refused, power cut after 1 s"),
     "power_cut": ("act", "any", "the whole board loses power; its clock, without a battery, starts again in 2026"),
-    "restart": ("act", "any", "somebody starts the crashed software again, with defaults"),
+    "restart": (
+        "act",
+        "any",
+        "somebody starts the crashed software again, with defaults; what is unplugged then is absent",
+    ),
     "clock_step": ("act", "seconds", "the board's clock is set forward, or back if negative"),
     "cycle_dead": ("act", "any", "the experiment thread of the reactor ends; Experiment.ON stays 1"),
     "marked_absent": (
