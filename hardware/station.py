@@ -29,7 +29,7 @@ __all__ = ["Station"]
 CYCLE_S = 60.07  # median of 3275 real cycles (chibio.md section 3)
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
-FEED_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
+DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 OWN_WILL = ("Zigzag", "Custom", "Chemostat")  # modes that act on the pumps
 
 
@@ -403,8 +403,8 @@ class Station:
             self._agenda.add(self._finish(DosePlan()))
             return False
         self.dosing = True
-        self._agenda.add(self._feed_off(), plan.feed_s + FEED_OFF_S)
-        self._agenda.add(self._finish(plan), plan.waste_s + 0.5)
+        self._agenda.add(self._feed_off(), plan.feed_s + DOSE_OFF_S)
+        self._agenda.add(self._finish(plan), plan.waste_s + DOSE_OFF_S)
         try:
             unit.switch(WASTE, True)
             unit.switch(FEED, True)
