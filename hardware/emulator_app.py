@@ -140,7 +140,10 @@ class ReactorApp:
         yield from self._apply(item)
 
     def _apply(self, item: str) -> Steps:
-        """`SetOutput`: make the electronics do what `ON` and `target` say."""
+        """`SetOutput`: make the electronics do what `ON` and `target` say.
+
+        Raises: AppError for an item that drives nothing; its flag is set by then.
+        """
         output = self.data[item]
         if item == "Stir":
             yield from self._stir()
@@ -162,6 +165,8 @@ class ReactorApp:
         elif item == "Zigzag":
             output["target"] = 5.0
             output["SwitchPoint"] = self.data["Experiment"]["cycles"]
+        else:
+            raise AppError(f"{item} is no output")
 
     def _stir(self) -> Steps:
         """Kick at full power, then down to the target; off at once."""

@@ -132,7 +132,7 @@ class Station:
             while state.measuring:  # a blank changed in the middle of a measurement would spoil it
                 yield 2.0
                 state = self.unit.read()
-            if not state.running and state.cycles > 0 and not waited and "Experiment Stopped" not in state.terminal:
+            if not state.running and state.cycles > 0 and not waited and not state.ended:
                 yield OLD_CYCLE_S
             self._prepare()
             state = self.unit.read()

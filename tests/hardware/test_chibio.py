@@ -237,6 +237,26 @@ def test_a_device_that_regulates_itself_gives_no_dose_of_its_own_once_taken_over
     assert bed.motors_off()
 
 
+@pytest.mark.parametrize("named", [0, 1])
+@pytest.mark.parametrize(("rest_s", "waits"), [(90.0, False), (10.0, True)])
+def test_a_stopped_experiment_is_started_at_once_if_the_device_says_that_it_has_ended(
+    named: int, rest_s: float, waits: bool
+) -> None:
+    """Newer apps name the reactor in the line that says so."""
+    bed = Bed()
+    bed.fault("terminal_named", named)
+    bed.device.handle("POST", "/Experiment/1/M0")
+    bed.clock.sleep(80.0)
+    bed.device.handle("POST", "/Experiment/0/M0")
+    bed.clock.sleep(rest_s)
+    before = bed.clock.now()
+    bed.reactors.begin()
+    assert (bed.clock.now() - before > 65.0) is waits
+    bed.run(3)
+    assert bed.samples[0] >= 2
+    assert bed.device.apps["M0"].data["Thermostat"]["ON"] == 1
+
+
 def test_zigzag_is_refused_with_the_remedy() -> None:
     bed = Bed()
     bed.device.handle("POST", "/SetOutputOn/Zigzag/1/M0")
