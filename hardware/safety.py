@@ -354,6 +354,9 @@ class Interlock:
     def restore(self, state: dict[str, list[Any]]) -> None:
         """The inverse of `state`; None stands for the nan or -inf that JSON cannot hold.
 
+        Only the age of the newest sample begins anew: while the program was gone nobody could have seen one, and a
+        reactor is stale, lost or silent once it had its chance.
+
         Raises: ValueError if it is of another number of reactors or another version.
         """
         mine = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray)}
@@ -366,3 +369,4 @@ class Interlock:
             if key in ("_dose_s", "_hold_until_s"):
                 new = np.where(np.isnan(new), -math.inf, new)
             setattr(self, key, new)
+        self._fresh_s = np.full(self.n, math.nan)
