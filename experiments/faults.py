@@ -285,7 +285,7 @@ FAULTS: tuple[Fault, ...] = (
           ("absent", *LINK), both(set_("unplugged", 0.0), set_("restart")), 10.0, wide=True, blind=True),
     Fault("started without a reactor", "cable out, device started again after 10 min, reactor still missing",
           set_("unplugged"), ("absent",), set_("restart"), 10.0, wide=True, blind=True, gone=True),
-    Fault("the same within 3 s", "cable out, software ended and started again by a supervisor, reactor missing",
+    Fault("started without it in 3 s", "cable out, software ended and started again by a supervisor, reactor missing",
           both(set_("unplugged"), set_("crash")), ("absent",), set_("restart"), 0.05, wide=True, blind=True,
           gone=True),
     Fault("reactor marked absent", "a thermometer poll failed; started again after 10 min", set_("marked_absent"),

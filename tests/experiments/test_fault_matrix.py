@@ -49,7 +49,7 @@ def test_a_healthy_run_says_nothing_and_holds_the_setpoints() -> None:
         ("request hangs 45 s", "dose", "restarted"),
         ("reactor unplugged", "step", "link"),
         ("started without a reactor", "dose", "absent"),
-        ("the same within 3 s", "dose", "absent"),
+        ("started without it in 3 s", "dose", "absent"),
         ("foreign blank", "recovery", "blank"),
         ("program killed 2 min", "dose", "end:killed"),
         ("computer loses power", "dose", "repair:torn"),
