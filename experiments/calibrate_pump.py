@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import logging
+import math
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -127,10 +128,18 @@ def report(fit: PumpFit, found: list[Series]) -> str:
         f"{PERIOD_S * s.duty:8.3f} {s.doses:6d} {s.grams / s.doses:9.4f} {c.volume(PERIOD_S * s.duty):9.4f}"
         for s in found
     ]
-    lines.append(
-        f"flow {c.flow_ml_s:.4f} +- {fit.flow_se:.4f} mL/s, bias {c.bias_s:+.3f} +- {fit.bias_se:.3f} s, "
-        f"spread of a dose {100.0 * c.spread:.1f} %, smallest useful dose {c.min_dose_ml:.3f} mL ({c.min_on_s:.2f} s)"
-    )
+    smallest = f"smallest useful dose {c.min_dose_ml:.3f} mL ({c.min_on_s:.2f} s)"
+    if math.isfinite(fit.flow_se):
+        lines.append(
+            f"flow {c.flow_ml_s:.4f} +- {fit.flow_se:.4f} mL/s, bias {c.bias_s:+.3f} +- {fit.bias_se:.3f} s, "
+            f"spread of a dose {100.0 * c.spread:.1f} %, {smallest}"
+        )
+    else:
+        lines.append(f"flow {c.flow_ml_s:.4f} mL/s, bias {c.bias_s:+.3f} s, {smallest}")
+        lines.append(
+            f"a line fits two series exactly, so the spread is unknown ({100.0 * c.spread:.0f} % is assumed): weigh a "
+            "third one with another duty (duties=[...], or all three with csv=FILE)"
+        )
     return "\n".join(lines)
 
 

@@ -47,6 +47,8 @@ class Outcome:
       rows_doubled.
     doses_doubled: runs of the feed motor beyond one per decision; repeats: those that are the device's own (every
       63 s), while nobody could stop it.
+    exits: how often the device's software ended itself although the fault was over, or was not of that kind: a command
+      to an absent reactor does that. neighbours_lost: healthy neighbours whose schedule did not end.
     pumps_off: every motor at rest at the end, as the program claims.
     early_alarms, neighbour_alarms: reasons given before the fault, and for healthy neighbours.
     outcome: how the run ended. wrong: what is not as declared.
@@ -69,6 +71,8 @@ class Outcome:
     rows_doubled: int = 0
     doses_doubled: int = 0
     repeats: int = 0
+    exits: int = 0
+    neighbours_lost: int = 0
     pumps_off: bool = False
     early_alarms: int = 0
     neighbour_alarms: int = 0
@@ -258,6 +262,7 @@ class Case:
         self.guard = guard or GuardConfig()
         self.options = DeviceOptions(bench=BenchConfig(outlier_rate=outlier_rate))
         self.result = Outcome(fault.name if fault else "none", moment, bool(self.guard.pump))
+        self._exits = 0  # of the device's software up to the fault, or its end
 
     def run(self) -> Outcome:
         """Rehearse, judge. Raises: nothing of what the fault brings about."""
@@ -285,6 +290,7 @@ class Case:
         if self.fault is None:
             return
         r.device.run_until(r.clock.now())
+        self._exits = r.device.exits
         if self.fault.end is not None and not self.fault.program and self.fault.minutes < INF:
             r.clock.at(r.clock.now() + 60.0 * self.fault.minutes, self._mend)
         self.fault.begin(r)
@@ -294,6 +300,7 @@ class Case:
         assert self.fault.end is not None
         self.r.device.run_until(self.r.clock.now())
         self.fault.end(self.r)
+        self._exits = self.r.device.exits
 
     def _live(self) -> None:
         """Lives of the program, one after another, until the schedule is over."""
@@ -324,10 +331,17 @@ class Case:
         self.result.outcome = ended or whole
 
     def _stop(self) -> bool:
-        """What deploy does at its end: pumps off, verified. True if it says so and every motor is at rest."""
+        """What deploy does at its end: pumps off, verified. True if every motor is at rest and it claims what it can.
+
+        That is verified off for all, but for a reactor that is gone: of that one it must say that it is not.
+        """
+        unverified = ""
         try:
             self.r.reactors.stop()
-        except ReactorError:
+        except ReactorError as error:
+            unverified = str(error)
+        gone = [SICK] if self.fault is not None and self.fault.gone else []
+        if [name for name in self.names if f"{name}: " in unverified] != gone:
             return False
         handed_over = [math.isfinite(s.handed_over) for s in self.r.reactors.stations]
         return all(
@@ -346,6 +360,8 @@ class Case:
             lasts = fault.minutes if fault.minutes < INF else 1e6
             dark = (self.watch.struck_s, self.watch.struck_s + 60.0 * (lasts + 6.0))
         out.rows_missed, out.rows_lost, out.rows_doubled = audit_rows(r, dark)
+        out.exits = r.device.exits - self._exits
+        out.neighbours_lost = int((~r.loop.done[1:]).sum())
         journal, _ = read_journal(r.folder / "journal.jsonl")
         for name in r.names:
             if fault is None or not fault.rogue or (name != SICK and not fault.wide):
@@ -360,6 +376,8 @@ class Case:
             "rows lost": out.rows_lost > 0,
             "rows doubled": out.rows_doubled > 0,
             "doses doubled": out.doses_doubled > 0,
+            "device ended": out.exits > 0,
+            "neighbour lost": out.neighbours_lost > 0,
             "pumps not off": not out.pumps_off and not (fault and fault.stuck),
             "not detected": fault is not None and bool(fault.by) and not out.reason,
             "false alarm": out.early_alarms + out.neighbour_alarms > 0 or (fault is None and bool(out.kinds)),

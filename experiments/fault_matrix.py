@@ -178,6 +178,8 @@ def totals(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "doses_doubled": sum(o.doses_doubled for o in outcomes),
         "doses_repeated_by_the_device": sum(o.repeats for o in outcomes),
         "undetected": sum("not detected" in o.wrong for o in outcomes),
+        "software_ended": sum(o.exits for o in outcomes),
+        "neighbours_lost": sum(o.neighbours_lost for o in outcomes),
         "pumps_not_off": sum("pumps not off" in o.wrong for o in outcomes),
         "false_alarms": sum(o.early_alarms + o.neighbour_alarms for o in outcomes)
         + sum(sum(o.kinds.values()) for o in healthy),

@@ -39,6 +39,7 @@ class Fault:
     program: the program ends; it is resumed after `minutes`.
     rogue: something else than this program moves the feed pump, so its runs say nothing about doubled doses.
     stuck: a motor that runs whatever it is told cannot be at rest at the end.
+    gone: the reactor is absent at the end: its pumps rest without power, which cannot be verified and must be told.
     overflow: why it overflows on a rig without an overflow guard, on which it is run as well; empty if there must be no
       overflow on either.
     guard: it is a fault of the overflow guard, run only where there is one.
@@ -56,6 +57,7 @@ class Fault:
     program: bool = False
     rogue: bool = False
     stuck: bool = False
+    gone: bool = False
     overflow: str = ""
     guard: bool = False
 
@@ -281,6 +283,11 @@ FAULTS: tuple[Fault, ...] = (
           ("restarted", *LINK), set_("disk_full", 0.0), 10.0, wide=True, blind=True),
     Fault("reactor unplugged", "cable out; back and started again after 10 min", set_("unplugged"),
           ("absent", *LINK), both(set_("unplugged", 0.0), set_("restart")), 10.0, wide=True, blind=True),
+    Fault("started without a reactor", "cable out, device started again after 10 min, reactor still missing",
+          set_("unplugged"), ("absent",), set_("restart"), 10.0, wide=True, blind=True, gone=True),
+    Fault("started without it in 3 s", "cable out, software ended and started again by a supervisor, reactor missing",
+          both(set_("unplugged"), set_("crash")), ("absent",), set_("restart"), 0.05, wide=True, blind=True,
+          gone=True),
     Fault("reactor marked absent", "a thermometer poll failed; started again after 10 min", set_("marked_absent"),
           ("absent", *LINK), set_("restart"), 10.0, wide=True, blind=True),
     Fault("measuring thread dead", "Experiment.ON stays 1, nothing happens", set_("cycle_dead"), ("stale", "stalled"),

@@ -82,6 +82,7 @@ class ClosedLoop:
         self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
         self.done = np.zeros(n, dtype=np.bool_)
         self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
+        self.gone = np.zeros(n, dtype=np.bool_)  # given up, and not there any more for its pumps to be verified off
         controller.reset(n)
 
     @property
@@ -90,9 +91,14 @@ class ClosedLoop:
         return self.reactors.handed_over
 
     def run(self) -> Iterator[Step]:
-        """Go on until every reactor's schedule is over or was stopped. Raises: ReactorError."""
-        while not (self.done | self.stopped).all():
+        """Go on until every reactor's schedule is over or it was given up. Raises: ReactorError."""
+        while not self.over:
             yield self.step()
+
+    @property
+    def over(self) -> bool:
+        """Whether every reactor's schedule is over, or the reactor was given up."""
+        return bool((self.done | self.stopped | self.gone).all())
 
     def _asked(self, elapsed: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """Phase, setpoint and temperature of each reactor, each (N,)."""
@@ -128,6 +134,9 @@ class ClosedLoop:
 
         if self._before_dose is not None:
             self._before_dose(told(np.full(len(self.done), np.nan), ()))
+        faults = m.vitals.faults if m.vitals is not None else (None,) * len(self.done)
+        absent = np.array([fault is not None and fault.kind == "absent" for fault in faults])
+        self.gone = absent & (verdict.response == Response.STOP)
         failures = self._respond(verdict)
         heat = np.where(verdict.heat_off, np.nan, temperature)
         receipt = self.reactors.actuate(Command(rows, verdict.rate, heat))
@@ -139,8 +148,10 @@ class ClosedLoop:
         failed: list[str] = []
         off = verdict.response == Response.PUMPS_OFF
         stop = (verdict.response == Response.STOP) & ~self.stopped
-        if (off | stop).any():
-            failed += self.reactors.pumps_off(off | stop)
+        if off.any():
+            failed += self.reactors.pumps_off(off)
+        if stop.any():
+            failed += self.reactors.give_up(stop)
             self.stopped = self.stopped | (stop & ~self._named(failed))
         regulate = (verdict.response == Response.REGULATE) & ~self.handed_over
         if regulate.any():

@@ -143,7 +143,7 @@ class Rehearsal:
 
     def run(self, until_s: float = np.inf) -> Iterator[Step]:
         """Steps of the loop up to its end or a clock time. Raises: ReactorError, Killed."""
-        while not (self.loop.done | self.loop.stopped).all() and self.clock.now() < until_s:
+        while not self.loop.over and self.clock.now() < until_s:
             step = self.loop.step()
             self.record.done(step, self.loop.state_dict())
             yield step

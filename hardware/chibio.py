@@ -194,7 +194,11 @@ class ChiBioReactors:
 
     def pumps_off(self, rows: Mask) -> list[str]:
         """All pumps of `rows` off, verified, but for an overflow guard; returns what failed, one line per reactor."""
-        return self._each(rows, Station.halt)
+        return self._each(rows, lambda station: station.pumps_off(tries=1))
+
+    def give_up(self, rows: Mask) -> list[str]:
+        """`pumps_off` for the rest of the run: a reactor that regulates itself no longer does; returns what failed."""
+        return self._each(rows, Station.give_up)
 
     def heat_off(self, rows: Mask) -> list[str]:
         """Thermostat and heater of `rows` off, and not switched on again; returns what failed."""

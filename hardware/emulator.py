@@ -125,7 +125,13 @@ class EmulatorServer:
 
     def _state(self) -> dict[str, object]:
         d = self.device
-        return {"alive": d.alive, "restarts": d.restarts, "selected": d.selected, "errors": list(d.errors)}
+        return {
+            "alive": d.alive,
+            "restarts": d.restarts,
+            "exits": d.exits,
+            "selected": d.selected,
+            "errors": list(d.errors),
+        }
 
 
 def _json(value: object) -> bytes:
@@ -255,6 +261,15 @@ def parser() -> argparse.ArgumentParser:
         "--guard", choices=SPARE, default="", help="pump whose tube is an overflow guard's (default: there is none)"
     )
     p.add_argument("--guard-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
+    default = BenchConfig()
+    p.add_argument(
+        "--pump-start",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        default=(default.pump_start_low_s, default.pump_start_high_s),
+        help="from the answer to a pump command until its motor turns, s (default %(default)s)",
+    )
     p.add_argument("--unblanked", action="store_true", help="start with the zero at 65000, as after power-on")
     return p
 
@@ -265,13 +280,15 @@ def build(arguments: argparse.Namespace) -> ChiBioDevice:
         ods = [float(x) for x in arguments.od.split(",")]
     except ValueError:
         raise ValueError(f"od = {arguments.od}: allowed a number, or one per reactor, e.g. 0.3,0.4") from None
+    low, high = arguments.pump_start
+    bench = BenchConfig(guard=arguments.guard, pump_start_low_s=low, pump_start_high_s=high)
     plant = PLANTS[arguments.plant]()
     plant = replace(plant, pump=replace(plant.pump, guard_ml_s=arguments.guard_flow))
     return ChiBioDevice(
         tuple(arguments.reactors.split(",")),
         RealClock(arguments.speed),
         np.random.default_rng(arguments.seed),
-        DeviceOptions(bench=BenchConfig(guard=arguments.guard), plant=plant),
+        DeviceOptions(bench=bench, plant=plant),
         od=ods[0] if len(ods) == 1 else ods,
         temperature=arguments.temperature,
         blanked=not arguments.unblanked,

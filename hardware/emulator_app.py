@@ -11,7 +11,7 @@ import math
 from collections.abc import Generator
 from typing import Any, Protocol
 
-from hardware.emulator_bench import Bench, Sample
+from hardware.emulator_bench import Bench, BenchConfig, Sample
 from hardware.emulator_state import (
     LIGHTS,
     PUMPS,
@@ -34,7 +34,7 @@ READINGS = 4
 READING_PAUSE_S = 0.25
 SETTLE_S = 5.0
 BUS_S = 0.02  # a register written and read back
-PUMP_START_S = 0.05  # thread start and first writes
+OFF_SHARE, QUIET_SHARE = 0.2, 0.8  # of a pump's start delay: until a running motor stops, until the pause is counted
 CYCLE_EXTRA_S = 0.05  # what a cycle's bookkeeping adds to its 60 s
 FILE_DUMP_S = 0.2  # writing the whole state; startTimeRaw reads 0 meanwhile
 FEED_CAP = 0.02  # the on-board regulator's own limit
@@ -140,7 +140,10 @@ class ReactorApp:
         yield from self._apply(item)
 
     def _apply(self, item: str) -> Steps:
-        """`SetOutput`: make the electronics do what `ON` and `target` say."""
+        """`SetOutput`: make the electronics do what `ON` and `target` say.
+
+        Raises: AppError for an item that drives nothing; its flag is set by then.
+        """
         output = self.data[item]
         if item == "Stir":
             yield from self._stir()
@@ -162,6 +165,8 @@ class ReactorApp:
         elif item == "Zigzag":
             output["target"] = 5.0
             output["SwitchPoint"] = self.data["Experiment"]["cycles"]
+        else:
+            raise AppError(f"{item} is no output")
 
     def _stir(self) -> Steps:
         """Kick at full power, then down to the target; off at once."""
@@ -187,12 +192,18 @@ class ReactorApp:
             yield from self.set_on(item, 0)
 
     def _pump(self, item: str) -> Steps:
-        """`PumpModulation`: one period of 63 s; a newer thread of the same pump takes over."""
+        """`PumpModulation`: one period of 63 s; a newer thread of the same pump takes over.
+
+        Five registers are written one after another: In1, In2, In1, In2 to off, then the one that drives to on.
+        """
         pump, board = self.data[item], self.board
         mine = self._threads[item] = (self._threads[item] + 1) % 100
-        yield PUMP_START_S
+        config = self.bench.config if self.bench is not None else BenchConfig()
+        delay = board.uniform(config.pump_start_low_s, config.pump_start_high_s)
+        yield OFF_SHARE * delay
         if abs(pump["target"] * pump["ON"]) != 1 and mine == self._threads[item]:
             self._hardware().drive(item, 0, board.now())
+        yield (QUIET_SHARE - OFF_SHARE) * delay
         if pump["ON"] == 0:
             return
         began = board.wall()
@@ -200,6 +211,7 @@ class ReactorApp:
         on_s = period * abs(pump["target"])
         if math.isnan(on_s):
             raise AppError("sleep length is not a number")
+        yield (1.0 - QUIET_SHARE) * delay
         bench = self._hardware()
         if mine == self._threads[item] and pump["target"] != 0:
             bench.drive(item, 1 if pump["target"] > 0 else -1, board.now())

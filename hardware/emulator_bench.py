@@ -74,6 +74,9 @@ class BenchConfig:
     outlier_rate: probability per measurement of an isolated jump of more than 0.04 OD.
     stir_factor, stir_noise: raw while stirring, relative to still, mean and spread.
     on_time_bias_low_s, on_time_bias_high_s: how much longer than asked a pump runs (chibio.md section 5.1).
+    pump_start_low_s, pump_start_high_s: range of the time from the answer to a pump command until the motor turns,
+      drawn per start: what the thread's register writes take on the bus. 0.2 to 0.7 s is what the device's own software
+      took on simulated electronics with bus time.
     air_c: air outside.
     guard: pump whose tube is an overflow guard's (docs/chibio.md); "" = the spare pumps have no tubes.
     """
@@ -87,6 +90,8 @@ class BenchConfig:
     stir_noise: float = 0.05
     on_time_bias_low_s: float = 0.02
     on_time_bias_high_s: float = 0.2
+    pump_start_low_s: float = 0.2
+    pump_start_high_s: float = 0.7
     air_c: float = 24.0
     guard: str = ""
 
@@ -101,6 +106,8 @@ class BenchConfig:
             "stir_noise": (0.0, 0.5),
             "on_time_bias_low_s": (0.0, 1.0),
             "on_time_bias_high_s": (self.on_time_bias_low_s, 1.0),
+            "pump_start_low_s": (0.0, 5.0),
+            "pump_start_high_s": (self.pump_start_low_s, 5.0),
             "air_c": (0.0, 45.0),
         }
         for key, (low, high) in ranges.items():

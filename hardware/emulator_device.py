@@ -9,6 +9,7 @@ from __future__ import annotations
 import heapq
 import json
 import math
+import re
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -124,7 +125,7 @@ class ChiBioDevice:
         self._queue: deque[Exchange] = deque()
         self._serving: Exchange | None = None
         self.errors: deque[str] = deque(maxlen=200)
-        self.restarts = 0
+        self.restarts = self.exits = 0
         noise, *streams = rng.spawn(1 + len(reactors))
         self._rng = noise
         self.benches: dict[str, Bench] = {}
@@ -260,6 +261,7 @@ class ChiBioDevice:
         """Exit code 4: gunicorn gives up, nobody listens any more."""
         self._end_process()
         self.alive = False
+        self.exits += 1
         while self._queue:
             self._queue.popleft().fate = "reset"
 
@@ -375,8 +377,15 @@ class ChiBioDevice:
         """Body of getSysdata: the selected reactor, sorted keys, NaN as the bare token."""
         data = self.apps[self.selected].data
         data["presentDevices"] = {name: app.data["present"] for name, app in self.apps.items()}
-        if self.faults.terminal_as_list or self.faults.extra_fields:
+        if self.faults.terminal_as_list or self.faults.terminal_named or self.faults.extra_fields:
             data = dict(data)
+        if self.faults.terminal_named:
+            text = re.sub(
+                r" - (Experiment|Terminal|Cycle \d+) (St|C)",
+                rf" - \1 on {self.selected} ({data['DeviceID']}) \2",
+                data["Terminal"]["text"],
+            )
+            data["Terminal"] = {"text": text}
         if self.faults.terminal_as_list:
             data["Terminal"] = {"text": [line for line in data["Terminal"]["text"].split("</br>") if line]}
         if self.faults.extra_fields:

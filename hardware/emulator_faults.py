@@ -21,7 +21,8 @@ class LinkFaults:
     length. lying: POST routes answer 204 and do nothing. bus_stuck: the bus lock is never released.
     bus_stuck_when_pumping: it gets stuck as soon as a feed pump runs. disk_full: when a cycle writes its row.
     foreign_selects: probability that somebody else's page selects another reactor before a request.
-    require_requested_with, terminal_as_list, extra_fields: variants seen in forks (chibio.md section 11).
+    require_requested_with, terminal_as_list, terminal_named, extra_fields: variants seen in forks and newer apps
+    (chibio.md section 11).
     """
 
     slow_s: float = 0.0
@@ -39,6 +40,7 @@ class LinkFaults:
     foreign_selects: float = 0.0
     require_requested_with: bool = False
     terminal_as_list: bool = False
+    terminal_named: bool = False
     extra_fields: bool = False
 
     def take(self, name: str) -> bool:
@@ -55,7 +57,11 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "worker_wipe": ("act", "any", "the web worker is killed and replaced: state wiped, everything off"),
     "crash": ("act", "any", "the software ends itself (code 4): connections refused, power cut after 1 s"),
     "power_cut": ("act", "any", "the whole board loses power; its clock, without a battery, starts again in 2026"),
-    "restart": ("act", "any", "somebody starts the crashed software again, with defaults"),
+    "restart": (
+        "act",
+        "any",
+        "somebody starts the crashed software again, with defaults; what is unplugged then is absent",
+    ),
     "clock_step": ("act", "seconds", "the board's clock is set forward, or back if negative"),
     "cycle_dead": ("act", "any", "the experiment thread of the reactor ends; Experiment.ON stays 1"),
     "marked_absent": (
@@ -78,6 +84,7 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "foreign_selects": ("board", "probability", "before a request, somebody's page selects another reactor"),
     "require_requested_with": ("board", "0 or 1", "fork: 403 for a POST without X-Requested-With"),
     "terminal_as_list": ("board", "0 or 1", "fork: Terminal.text is a list of lines"),
+    "terminal_named": ("board", "0 or 1", "newer app: lines of the log name reactor and identity"),
     "extra_fields": ("board", "0 or 1", "fork: more fields in getSysdata"),
     "unplugged": ("vial", "0 or 1", "cable out: the next access to the reactor ends the software"),
     "od_frozen": ("vial", "0 or 1", "the spectrometer repeats its last count"),

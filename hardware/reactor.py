@@ -130,6 +130,10 @@ class Reactor(Protocol):
         """All pumps that feed or empty `rows` off, verified; returns what failed, one line per reactor, name first."""
         ...
 
+    def give_up(self, rows: Mask) -> list[str]:
+        """`pumps_off` for the rest of the run, the device's own regulation too; returns what failed, as `pumps_off`."""
+        ...
+
     def heat_off(self, rows: Mask) -> list[str]:
         """Heating of `rows` off for the rest of the run; returns what failed, as `pumps_off`."""
         ...

@@ -358,6 +358,9 @@ class Interlock:
     def restore(self, state: Any) -> None:
         """The inverse of `state`, of an interlock that has not been used; None stands for nan or -inf, as in JSON.
 
+        Only the age of the newest sample begins anew: while the program was gone nobody could have seen one, and a
+        reactor is stale, lost or silent once it had its chance.
+
         Raises: ValueError if it is of another number of reactors or another version, or damaged.
         """
         mine = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray)}
@@ -383,3 +386,4 @@ class Interlock:
                 raise ValueError(f"saved interlock: {key} = {state[key]}: no such code")
         for key, new in restored.items():
             setattr(self, key, new)
+        self._fresh_s = np.full(self.n, math.nan)

@@ -96,6 +96,10 @@ class SimulatedReactors:
         """None ever is."""
         return np.zeros(self.plant.n, dtype=np.bool_)
 
+    def give_up(self, rows: Mask) -> list[str]:
+        """As `pumps_off`."""
+        return self.pumps_off(rows)
+
     def heat_off(self, rows: Mask) -> list[str]:
         """The heater of `rows` is off until a temperature is commanded. Nothing can fail."""
         self._target = np.where(rows, 0.0, self._target)

@@ -29,7 +29,7 @@ __all__ = ["Station"]
 CYCLE_S = 60.07  # median of 3275 real cycles (chibio.md section 3)
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
-FEED_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
+DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 OWN_WILL = ("Zigzag", "Custom", "Chemostat")  # modes that act on the pumps
 
 
@@ -136,7 +136,7 @@ class Station:
             while state.measuring:  # a blank changed in the middle of a measurement would spoil it
                 yield 2.0
                 state = self.unit.read()
-            if not state.running and state.cycles > 0 and not waited and "Experiment Stopped" not in state.terminal:
+            if not state.running and state.cycles > 0 and not waited and not state.ended:
                 yield OLD_CYCLE_S
             self._prepare()
             state = self.unit.read()
@@ -408,8 +408,8 @@ class Station:
             self._agenda.add(self._finish(DosePlan()))
             return False
         self.dosing = True
-        self._agenda.add(self._feed_off(), plan.feed_s + FEED_OFF_S)
-        self._agenda.add(self._finish(plan), plan.waste_s + 0.5)
+        self._agenda.add(self._feed_off(), plan.feed_s + DOSE_OFF_S)
+        self._agenda.add(self._finish(plan), plan.waste_s + DOSE_OFF_S)
         try:
             unit.switch(WASTE, True)
             unit.switch(FEED, True)
@@ -461,16 +461,13 @@ class Station:
         """All pumps off, verified, but for the overflow guard's. Raises: as `Unit.pumps_off`."""
         self.unit.pumps_off(tries, self.config.guard.others)
 
-    def halt(self) -> None:
-        """All pumps off, verified, once, as the interlock demands; on-board regulation too, or it would dose again.
-
-        A reactor that had been handed over is this program's again. Raises: as `Unit.pumps_off`.
-        """
+    def give_up(self) -> None:
+        """All pumps off for good, verified; on-board regulation too, or it would dose again. Raises: ReactorError."""
         if math.isfinite(self.handed_over):
             self.unit.switch("OD", False)
             self._log("regulate", {"reactor": self.name, "setpoint": None})
             self.handed_over = math.nan
-            self.tell("on-board regulation switched off: the interlock demands that nothing is pumped")
+            self.tell("on-board regulation switched off: the reactor is given up")
         self.pumps_off(tries=1)
 
     def _running(self, state: DeviceState) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,9 @@ from hardware.wire import PUMPS, DeviceState, check_command, parse_state
 
 __all__ = ["Log", "Unit", "no_log"]
 
+SEEN_S = 1.0
+"""Who was seen so lately is still there: a device that ended takes longer to listen again. What it is sent while it
+starts it carries out afterwards, whoever is absent by then."""
 SETTLE_S = 0.3
 """A pump command is answered before its thread has written to the bus (chibio.md section 5.1)."""
 
@@ -29,8 +33,8 @@ class Unit:
     The device shows one selected reactor to everybody, so a read is changeDevice and GET as a pair, believed only if
     the answer names this reactor and its pinned identity (chibio.md section 12.2). A command is sent only if the last
     verified read saw this reactor present: one request to an absent one ends the whole server (section 0.3). After a
-    request without an answer nothing is known: the server may have been started again without this reactor. Then the
-    next command looks first.
+    request without an answer, or a while without a request, nothing is known: the server may have been started again
+    without this reactor. Then the next command looks first.
 
     Args:
       name: position, M0 to M7.
@@ -48,6 +52,7 @@ class Unit:
         self.state: DeviceState | None = None  # the last verified one
         self.took_s = 0.0  # how long the last verified read took
         self._unsure = False  # a request was not answered as expected since presence was last seen
+        self._seen_s = -math.inf  # clock time at which this reactor was last known to be present
         self._reactors = tuple(reactors)
         self._transport = transport
         self._clock = clock
@@ -96,6 +101,7 @@ class Unit:
         if self.name not in state.present:
             self.state = None  # nothing is sent to it from now on
             raise DeviceStateError(f"{self.name} is absent (present: {', '.join(state.present) or 'none'})")
+        self._seen_s = self._clock.now()
         return state
 
     def post(self, path: str) -> None:
@@ -104,11 +110,12 @@ class Unit:
         Raises: LinkError (it may have been carried out), ProtocolError for a status other than 204, DeviceStateError
           if the command is not allowed or the reactor was not present when it was last looked at.
         """
-        if self.state is not None and self._unsure:
+        if self.state is not None and (self._unsure or self._clock.now() - self._seen_s > SEEN_S):
             self._look()
         if self.state is None or self.name not in self.state.present:
             raise DeviceStateError(f"refused to send POST {path}: {self.name} was not seen present")
         self._post(path)
+        self._seen_s = self._clock.now()
 
     def _post(self, path: str, quiet: bool = False) -> None:
         check_command(path, self._reactors, self._guard)

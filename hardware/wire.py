@@ -96,6 +96,14 @@ class DeviceState:
         return tuple(p for p, is_on in zip(PUMPS, self.pumps_on, strict=True) if is_on)
 
     @property
+    def ended(self) -> bool:
+        """Whether the newest line of the log says that the experiment's last thread has ended.
+
+        "Experiment Stopped", or "Experiment on M0 (IDENTITY) Stopped" of newer apps; "Stopping" is not yet.
+        """
+        return re.search(r"\bExperiment\b.*\bStopped\b", self.terminal) is not None
+
+    @property
     def started(self) -> bool:
         """Whether the device remembers an experiment; False after a restart of its server."""
         return self.cycles > 0 or "Waiting" not in self.start_time

@@ -11,10 +11,11 @@ import pytest
 
 from experiments import app
 from experiments.blank import BlankConfig, blank
-from experiments.calibrate_pump import CalibratePumpConfig, calibrate, weigh
+from experiments.calibrate_pump import CalibratePumpConfig, Series, calibrate, report, weigh
 from experiments.calibrations import load_rigs, save
 from hardware.chibio_config import ChiBioConfig
 from hardware.emulator_process import EmulatorProcess
+from hardware.pumps import fit_pump
 from hardware.wire import PERIOD_S
 
 ROOT = Path(__file__).parents[2]
@@ -94,6 +95,20 @@ def test_a_file_of_nonsense_ends_in_one_line(tmp_path: Path, content: str, words
     with pytest.raises(app.UserError, match=words):
         calibrate(config, tmp_path)
     assert not (tmp_path / "c").exists()
+
+
+def test_two_series_leave_the_spread_unknown_and_say_what_to_do() -> None:
+    series = [Series(duty, 20, 20 * 0.9 * (PERIOD_S * duty + 0.1)) for duty in (0.01, 0.02, 0.04)]
+
+    def told(found: list[Series]) -> str:
+        on_s, doses, grams = np.array([[PERIOD_S * s.duty, s.doses, s.grams] for s in found]).T
+        return report(fit_pump(on_s, doses, grams), found)
+
+    assert "nan" not in told(series[:2])
+    assert "spread is unknown (10 % is assumed): weigh a third one" in told(series[:2])
+    assert "flow 0.9000 mL/s, bias +0.100 s, smallest" in told(series[:2])
+    assert "+- 0.0000 mL/s" in told(series)
+    assert "unknown" not in told(series)
 
 
 def test_without_a_terminal_there_is_one_clear_line(tmp_path: Path) -> None:

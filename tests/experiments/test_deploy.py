@@ -19,6 +19,7 @@ from experiments.config import DeployConfig
 from experiments.controllers.learned import LearnedController
 from experiments.deploy import Announcer, policy_of
 from experiments.loop import ClosedLoop
+from hardware.errors import DeviceStateError
 from hardware.recording import read_recording
 from hardware.safety import Interlock
 from hardware.safety_config import Responses, SafetyConfig
@@ -234,3 +235,28 @@ def test_a_resumed_run_goes_on_with_its_own_policy(tmp_path):
     policy_of(replace(config, resume=str(folder)), folder)
     policy.save(source, other)
     np.testing.assert_array_equal(policy_of(config, folder).biases[0], other.biases[0])
+
+
+def test_a_run_ends_although_an_absent_reactor_cannot_be_verified_off_and_says_so():
+    bed = Bed(("M0", "M1"), od=0.5)
+    bed.reactors.begin()
+    schedule = Schedule((0.5,), (60.0,), (37.0,))
+    interlock = Interlock(2, SafetyConfig(silent=20.0))
+    loop = ClosedLoop(bed.reactors, LearnedController(inverse_policy()), interlock, schedule)
+    steps = loop.run()
+    while bed.clock.now() < 300.0:
+        next(steps)
+    bed.fault("unplugged", 1.0, "M1")
+    while bed.device.alive:
+        next(steps)
+    bed.fault("restart")
+    reasons = [step.reasons[1] or "" for step in steps]  # comes to its end
+    assert bed.clock.now() < 5000.0
+    assert loop.done.tolist() == [True, False]
+    assert loop.gone.tolist() == [False, True]
+    assert any("absent" in reason for reason in reasons)
+    assert any("silent" in reason for reason in reasons)
+    with pytest.raises(DeviceStateError, match=r"pumps not verified off: M1: .*absent.*by hand"):
+        bed.reactors.stop()
+    assert bed.motors_off()
+    assert bed.device.exits == 1

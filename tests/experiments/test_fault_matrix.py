@@ -13,7 +13,8 @@ from envs.setpoints import Schedule
 from experiments import app
 from experiments.fault_case import Case, Outcome, audit_doses
 from experiments.fault_matrix import FaultMatrixConfig, all_cases, declared, table, totals
-from experiments.faults import FAULTS, Fault, by_name, set_
+from experiments.faults import FAULTS, Fault, both, by_name, post, run_device, set_
+from experiments.rehearsal import Rehearsal
 from hardware.emulator_bench import Dose
 from hardware.guard import GuardConfig
 from hardware.safety_config import SafetyConfig
@@ -47,6 +48,8 @@ def test_a_healthy_run_says_nothing_and_holds_the_setpoints() -> None:
         ("link down 5 min", "dose", "link"),
         ("request hangs 45 s", "dose", "restarted"),
         ("reactor unplugged", "step", "link"),
+        ("started without a reactor", "dose", "absent"),
+        ("started without it in 3 s", "dose", "absent"),
         ("foreign blank", "recovery", "blank"),
         ("program killed 2 min", "dose", "end:killed"),
         ("computer loses power", "dose", "repair:torn"),
@@ -64,6 +67,26 @@ def test_what_the_table_declares_happens(name: str, moment: str, reason: str) ->
 def test_a_fault_that_nobody_tells_of_is_found() -> None:
     mute = Fault("mute", "a weak pump that must be told", set_("pump_gain_factor", 0.6), ("no_dilution",))
     assert "not detected" in run(mute).wrong
+
+
+@pytest.mark.parametrize("after_s", [0.0, 2.0, 7.0, 12.0])
+def test_a_device_back_without_a_reactor_before_anybody_misses_it_is_not_ended_by_the_end_of_a_dose(
+    after_s: float,
+) -> None:
+    def begin(r: Rehearsal) -> None:
+        back = both(run_device, set_("unplugged"), set_("crash"), set_("restart"))
+        r.clock.at(r.clock.now() + after_s, lambda: back(r))
+
+    outcome = run(Fault("back at once", "", begin, ("absent",), wide=True, blind=True, gone=True), "dose")
+    assert outcome.exits == 1, outcome  # the one of the fault itself
+    assert outcome.wrong == ["device ended"]
+    assert outcome.reason == "absent"
+
+
+def test_a_program_that_ends_the_device_or_leaves_a_neighbour_is_found() -> None:
+    careless = Fault("careless", "", both(set_("unplugged"), set_("crash"), set_("restart")), ("absent",), gone=True,
+                     end=post("/MeasureTemp/IR/M0"), minutes=2.0, wide=True, blind=True)  # fmt: skip
+    assert {"device ended", "neighbour lost"} <= set(run(careless).wrong)
 
 
 def test_an_overflow_is_found_unless_it_is_declared() -> None:
@@ -93,6 +116,23 @@ def test_an_overflow_beside_a_guard_is_never_as_declared() -> None:
 def test_faults_of_the_guard_itself(name: str) -> None:
     outcome = run(by_name((name,))[0], guard=FaultMatrixConfig().guard)
     assert outcome.ok, outcome
+
+
+@pytest.mark.parametrize("minutes", [3.0, 30.0])
+def test_a_resumed_run_does_not_speak_of_lost_reactors_before_they_had_their_chance(
+    tmp_path: Path, minutes: float
+) -> None:
+    r = Rehearsal(tmp_path, ("M0", "M1", "M2"), [SCHEDULE] * 3)
+    r.begin()
+    for _ in r.run(600.0):
+        pass
+    r.bury()
+    r.wait(60.0 * minutes)
+    r.begin()
+    words = [reason for step in r.run(r.clock.now() + 600.0) for reason in step.reasons if reason]
+    assert [word for word in words if word.startswith(("stale", "lost", "silent"))] == []
+    r.reactors.stop()
+    r.bury()
 
 
 def test_rigs_with_and_without_guard_are_counted_apart() -> None:

@@ -12,10 +12,12 @@ from hardware.emulator_device import ChiBioDevice, DeviceOptions
 
 BLANK = 14000.0
 BIAS_S = 0.1  # every pump run is longer than asked by this
+START_S = 0.45  # from the answer to a pump command until the motor turns
+STOP_S = 0.09  # and until one that runs stands still
 
 
 def quiet(mu: float = 0.0, **bench: float) -> DeviceOptions:
-    """No noise, known blank, constant pump bias, a culture that grows with mu (1/min)."""
+    """No noise, known blank, constant pump bias and delay, a culture that grows with mu (1/min)."""
     fixed = {
         "blank_low": BLANK,
         "blank_high": BLANK,
@@ -25,6 +27,8 @@ def quiet(mu: float = 0.0, **bench: float) -> DeviceOptions:
         "stir_noise": 0.0,
         "on_time_bias_low_s": BIAS_S,
         "on_time_bias_high_s": BIAS_S,
+        "pump_start_low_s": START_S,
+        "pump_start_high_s": START_S,
     } | bench
     plant = PlantConfig(growth=GrowthConfig(mu=mu), pump=PumpConfig(dosing="pulse"))
     return DeviceOptions(bench=BenchConfig(**fixed), plant=plant)

@@ -14,7 +14,7 @@ from hardware.pumps import Rig
 from hardware.reactor import Command
 from hardware.saved import replay
 from tests.hardware.driver_lab import SOUND, Bed
-from tests.hardware.emulator_lab import quiet
+from tests.hardware.emulator_lab import BIAS_S, START_S, quiet
 
 
 def doses(bed: Bed, name: str = "M0", pump: str = "Pump1") -> list[tuple[float, float]]:
@@ -73,8 +73,10 @@ def test_the_requests_of_one_dose_are_those_of_single_shot_dosing() -> None:
         *(f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 2, 3, 4)),
         "/MeasureTemp/IR/M0",
     ]
-    assert posts[5][0] - on_s == pytest.approx(waste + 0.5, abs=0.1)
-    assert doses(bed) == [(pytest.approx(on_s, abs=0.1), pytest.approx(feed + 0.1, abs=0.01))]
+    assert posts[5][0] - on_s == pytest.approx(waste + 2.0, abs=0.1)
+    assert doses(bed) == [(pytest.approx(on_s + START_S, abs=0.1), pytest.approx(feed + BIAS_S, abs=0.01))]
+    [(_, length)] = doses(bed, pump="Pump2")
+    assert length == pytest.approx(waste + BIAS_S, abs=0.01)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.4, 0.6, 0.9])
@@ -84,9 +86,25 @@ def test_a_slow_link_does_not_cut_doses_short(delay_s: float) -> None:
     bed.reactors.begin()
     bed.fault("slow_s", delay_s)
     bed.run(10)
-    given = doses(bed)
-    assert len(given) >= 9
-    assert [length for _, length in given] == pytest.approx([0.54 + 0.1] * len(given), abs=0.01)
+    for pump, asked in (("Pump1", [0.54] * 20), ("Pump2", ([4.0 * 0.54 + 4.4] * 4 + [63.0 * 0.25]) * 4)):
+        given = doses(bed, pump=pump)
+        assert len(given) >= 9
+        assert [length for _, length in given] == pytest.approx([s + BIAS_S for s in asked[: len(given)]], abs=0.01)
+
+
+def test_a_late_motor_still_runs_its_whole_dose() -> None:
+    """It starts 0.2 to 0.7 s after the answer, drawn anew for every dose."""
+    bed = Bed(("M0", "M1", "M2"), options=quiet(pump_start_low_s=0.2, pump_start_high_s=0.7))
+    fixed(bed, 0.02)
+    bed.reactors.begin()
+    bed.run(30)
+    for name in bed.names:
+        asked = [row for row in bed.of("intent") if row["reactor"] == name]
+        for pump, key in (("Pump1", "feed_duty"), ("Pump2", "waste_duty")):
+            lengths = [length for _, length in doses(bed, name, pump)]
+            expected = [63.0 * row[key] + BIAS_S for row in asked[: len(lengths)]]
+            assert len(lengths) >= 28
+            assert lengths == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_dose_ends_before_the_next_measurement_and_the_pumps_are_off_most_of_the_time() -> None:
@@ -217,6 +235,26 @@ def test_a_device_that_regulates_itself_gives_no_dose_of_its_own_once_taken_over
     bed.clock.sleep(20.0)
     assert not [start for start, _ in doses(bed) if start > taken_over]
     assert bed.motors_off()
+
+
+@pytest.mark.parametrize("named", [0, 1])
+@pytest.mark.parametrize(("rest_s", "waits"), [(90.0, False), (10.0, True)])
+def test_a_stopped_experiment_is_started_at_once_if_the_device_says_that_it_has_ended(
+    named: int, rest_s: float, waits: bool
+) -> None:
+    """Newer apps name the reactor in the line that says so."""
+    bed = Bed()
+    bed.fault("terminal_named", named)
+    bed.device.handle("POST", "/Experiment/1/M0")
+    bed.clock.sleep(80.0)
+    bed.device.handle("POST", "/Experiment/0/M0")
+    bed.clock.sleep(rest_s)
+    before = bed.clock.now()
+    bed.reactors.begin()
+    assert (bed.clock.now() - before > 65.0) is waits
+    bed.run(3)
+    assert bed.samples[0] >= 2
+    assert bed.device.apps["M0"].data["Thermostat"]["ON"] == 1
 
 
 def test_zigzag_is_refused_with_the_remedy() -> None:
@@ -528,15 +566,17 @@ def test_handing_over_leaves_a_culture_that_regulates_itself() -> None:
 # -- end and resume --------------------------------------------------------------------------------------------------
 
 
-def test_stop_in_the_middle_of_a_dose_is_verified_and_idempotent() -> None:
+@pytest.mark.parametrize(("after_s", "running"), [(0.05, False), (1.0, True)])
+def test_stop_in_the_middle_of_a_dose_is_verified_and_idempotent(after_s: float, running: bool) -> None:
+    """Also while the motor has not started yet."""
     bed = Bed(("M0", "M1"))
     fixed(bed, 0.02)
     bed.reactors.begin()
     bed.run(2)
     while not bed.step().fresh.any():
         pass
-    bed.clock.sleep(0.3)
-    assert not bed.motors_off()
+    bed.clock.sleep(after_s)
+    assert bed.motors_off() is not running
     bed.reactors.stop()
     assert bed.motors_off()
     bed.reactors.stop()

@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hardware.emulator import build, parser
 from hardware.emulator_faults import inject
-from tests.hardware.emulator_lab import BIAS_S, Lab, quiet
+from tests.hardware.emulator_lab import BIAS_S, START_S, STOP_S, Lab, quiet
+
+PERIOD_S = 63.0 + 0.8 * START_S  # it counts from when the registers are off, four of the five writes of a start
 
 
 def set_pump(lab: Lab, pump: str, target: float, on: bool = True, reactor: str = "M0") -> None:
@@ -18,18 +21,18 @@ def set_pump(lab: Lab, pump: str, target: float, on: bool = True, reactor: str =
 def test_a_pump_left_on_doses_63_s_times_target_every_63_s_for_ever() -> None:
     lab = Lab()
     set_pump(lab, "Pump1", 0.02)
-    lab.wait(630.0 + 5.0)
+    lab.wait(10.0 * PERIOD_S + 5.0)
     starts, lengths = zip(*lab.doses(), strict=True)
     assert len(starts) == 11
-    assert starts[0] < 0.15  # the dose comes first, the pause after
-    np.testing.assert_allclose(np.diff(starts), 63.0, atol=0.1)
+    assert starts[0] == pytest.approx(START_S, abs=0.02)  # the dose comes first, the pause after
+    np.testing.assert_allclose(np.diff(starts), PERIOD_S, atol=0.02)
     np.testing.assert_allclose(lengths, 63 * 0.02 + BIAS_S, atol=1e-6)
 
 
 def test_single_shot_dose_is_one_dose() -> None:
     lab = Lab()
     set_pump(lab, "Pump1", 0.05)
-    lab.wait(63 * 0.05 + 0.5)
+    lab.wait(START_S + 63 * 0.05 + BIAS_S)
     lab.post("/SetOutputOn/Pump1/0/M0")
     lab.wait(300.0)
     assert [length for _, length in lab.doses()] == pytest.approx([3.15 + BIAS_S])
@@ -39,10 +42,48 @@ def test_single_shot_dose_is_one_dose() -> None:
 def test_off_ends_a_dose_in_progress() -> None:
     lab = Lab()
     set_pump(lab, "Pump1", 0.5)
-    lab.wait(2.0)
+    lab.wait(START_S + 2.0)
     lab.post("/SetOutputOn/Pump1/0/M0")
     lab.wait(200.0)
-    assert [length for _, length in lab.doses()] == pytest.approx([2.0], abs=0.1)
+    assert [length for _, length in lab.doses()] == pytest.approx([2.0 + STOP_S], abs=0.02)
+
+
+def test_off_before_the_motor_turns_is_no_dose() -> None:
+    lab = Lab()
+    set_pump(lab, "Pump1", 0.5)
+    lab.wait(0.5 * START_S)
+    lab.post("/SetOutputOn/Pump1/0/M0")
+    lab.wait(200.0)
+    assert lab.doses() == []
+
+
+def test_the_motor_starts_after_a_delay_of_its_own_each_time() -> None:
+    lab = Lab(options=quiet(pump_start_low_s=0.2, pump_start_high_s=0.7))
+    delays = []
+    for _ in range(200):
+        lab.post("/SetOutputTarget/Pump1/M0/0.05")
+        lab.post("/SetOutputOn/Pump1/1/M0")
+        answered = lab.clock.now()
+        lab.wait(10.0)
+        lab.post("/SetOutputOn/Pump1/0/M0")
+        [start, length] = lab.doses()[-1]
+        delays.append(start - answered)
+        assert length == pytest.approx(3.15 + BIAS_S)
+    assert 0.2 <= min(delays) < 0.23
+    assert 0.67 < max(delays) <= 0.7
+    assert np.mean(delays) == pytest.approx(0.45, abs=0.03)
+
+
+def test_the_delay_is_an_option_of_the_program() -> None:
+    for arguments, expected in (([], (0.2, 0.7)), (["--pump-start", "0.1", "3"], (0.1, 3.0))):
+        bench = build(parser().parse_args(arguments)).options.bench
+        assert (bench.pump_start_low_s, bench.pump_start_high_s) == expected
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.1, 0.7), (0.5, 0.2), (0.0, 9.0)])
+def test_a_delay_out_of_range_is_named(low: float, high: float) -> None:
+    with pytest.raises(ValueError, match=r"bench\.pump_start_(low|high)_s = .*allowed"):
+        quiet(pump_start_low_s=low, pump_start_high_s=high)
 
 
 def test_rewriting_the_target_while_on_doses_at_once_and_restarts_the_period() -> None:
@@ -53,7 +94,7 @@ def test_rewriting_the_target_while_on_doses_at_once_and_restarts_the_period() -
     lab.wait_until(120.0)
     starts = [start for start, _ in lab.doses()]
     lengths = [length for _, length in lab.doses()]
-    assert starts == pytest.approx([0.05, 30.05, 93.05], abs=0.1)
+    assert starts == pytest.approx([START_S, 30.0 + START_S, 30.0 + START_S + PERIOD_S], abs=0.03)
     assert lengths == pytest.approx([1.26 + BIAS_S, 3.15 + BIAS_S, 3.15 + BIAS_S])
 
 
@@ -71,9 +112,9 @@ def test_writing_every_60_07_s_gives_1_049_times_the_nominal_flow() -> None:
 def test_writing_later_than_63_s_gives_two_doses() -> None:
     lab = Lab()
     set_pump(lab, "Pump1", 0.05)
-    lab.wait_until(67.0)
+    lab.wait_until(68.0)
     set_pump(lab, "Pump1", 0.05, on=False)
-    lab.wait_until(75.0)
+    lab.wait_until(76.0)
     assert sum(length for _, length in lab.doses()) == pytest.approx(3 * (3.15 + BIAS_S))
 
 
@@ -87,7 +128,7 @@ def test_full_duty_is_continuous(target: float) -> None:
     lab.post("/SetOutputOn/Pump3/0/M0")
     lab.wait(1.0)
     [(_, length)] = lab.doses(pump="Pump3")
-    assert length == pytest.approx(400.0, abs=0.3)
+    assert length == pytest.approx(400.0 - START_S + STOP_S, abs=0.03)
 
 
 def test_target_0_refuses_to_go_on_and_stays_off_when_a_target_comes() -> None:
@@ -138,7 +179,9 @@ def test_set_output_on_returns_before_the_motor_turns() -> None:
     lab.post("/SetOutputOn/Pump1/1/M0")
     assert lab.clock.now() - before < 0.02
     assert lab.device.benches["M0"].motor("Pump1") == 0
-    lab.wait(0.1)
+    lab.wait(START_S - 0.02)
+    assert lab.device.benches["M0"].motor("Pump1") == 0
+    lab.wait(0.04)
     assert lab.device.benches["M0"].motor("Pump1") == 1
 
 

@@ -46,6 +46,10 @@ SAMPLE = Path(__file__).parents[2].parent / "shared" / "samples" / "chibio_sysda
         ("POST", "/SetOutputOn/Pump1/0/M0", 204),
         ("POST", "/SetOutputOn/Pump1/0.5/M0", 500),
         ("POST", "/SetOutputOn/Zigzag/1/M0", 204),
+        ("POST", "/SetOutputOn/Volume/0/M0", 500),
+        ("POST", "/SetOutputOn/Chemostat/0/M0", 500),
+        ("POST", "/SetOutputOn/OD0/0/M0", 500),
+        ("POST", "/SetOutputOn/Pump9/0/M0", 500),
         ("POST", "/Direction/Pump1/M0", 204),
         ("POST", "/MeasureOD/M0", 204),
         ("POST", "/CalibrateOD/OD0/M0/14000/0", 204),
@@ -134,9 +138,17 @@ def test_force_is_on_off_and_anything_else_toggles() -> None:
         assert lab.state()["Pump1"]["ON"] == on
 
 
+@pytest.mark.parametrize("item", ["Chemostat", "Custom", "Volume", "OD0"])
+def test_the_flag_of_what_drives_nothing_is_set_and_then_answers_500(item: str) -> None:
+    lab = Lab()
+    for force in (1, 0):
+        assert lab.post(f"/SetOutputOn/{item}/{force}/M0") == 500
+        assert lab.state()[item]["ON"] == force
+
+
 def test_experiment_flag_set_through_set_output_starts_no_thread() -> None:
     lab = Lab()
-    assert lab.post("/SetOutputOn/Experiment/1/M0") == 204
+    assert lab.post("/SetOutputOn/Experiment/1/M0") == 500
     lab.wait(200.0)
     state = lab.state()
     assert (state["Experiment"]["ON"], state["Experiment"]["cycles"]) == (1, 0)
@@ -249,6 +261,25 @@ def test_forks() -> None:
     data = json.loads(lab.device.handle("GET", "/getSysdata/")[1])
     assert isinstance(data["Terminal"]["text"], list)
     assert "Pump5" in data
+
+
+def test_a_newer_app_names_the_reactor_in_its_log() -> None:
+    lab = Lab()
+    lab.post("/Experiment/1/M0")
+    lab.wait(1.0)
+    lab.post("/Experiment/0/M0")
+    lab.wait(80.0)
+    plain = lab.state()["Terminal"]["text"]
+    inject(lab.device, "terminal_named")
+    state = lab.state()
+    lines, where = state["Terminal"]["text"].split("</br>"), f"on M0 ({state['DeviceID']}) "
+    assert [line.replace(where, "") for line in lines] == plain.split("</br>")
+    assert [line.split(" - ")[1] for line in lines[:4]] == [
+        f"Experiment {where}Stopped",
+        f"Experiment {where}Stopping at end of cycle",
+        f"Cycle 1 {where}Started",
+        f"Experiment {where}Started",
+    ]
 
 
 @pytest.mark.parametrize("reactors", [(), ("M8",), ("M0", "M0"), ("m0",)])

@@ -195,6 +195,7 @@ def test_signals_end_it_cleanly(number: int) -> None:
         ["--od", "-1"],
         ["--od", "much"],
         ["--port", "70000"],
+        ["--pump-start", "0.7", "0.2"],
         ["--host", "203.0.113.1"],
     ],
 )

@@ -89,7 +89,7 @@ def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_t
     assert len(bed.of("intent")) >= 15
     assert guard_posts(bed) == ["/SetOutputTarget/Pump3/M0/0.500000", "/SetOutputOn/Pump3/1/M0"]
     starts = [d.start_s for d in bed.device.benches["M0"].doses if d.pump == "Pump3"]
-    assert np.diff(starts) == pytest.approx(63.0, abs=0.5)  # the device's own period, never begun anew
+    assert np.diff(starts) == pytest.approx(63.5, abs=0.5)  # the device's own period, never begun anew
     assert bed.of("fault") == []
     assert not [row for row in bed.of("note") if "guard" in row["note"]]
     bed.reactors.stop()
@@ -271,7 +271,7 @@ def test_a_resumed_run_finds_it_on_and_does_not_interrupt_it() -> None:
     assert guard_posts(bed) == before
     assert runs(bed)
     starts = [d.start_s for d in bed.device.benches["M0"].doses if d.pump == "Pump3"]
-    assert np.diff(starts) == pytest.approx(63.0, abs=0.5)
+    assert np.diff(starts) == pytest.approx(63.5, abs=0.5)
     bed.reactors.stop()
     assert bed.motors_off()
 

@@ -405,6 +405,22 @@ def test_one_reactor_of_eight_is_the_same_as_one_alone() -> None:
         assert v.kinds == tuple(s.kinds[0] for s in singles)
 
 
+def test_after_a_resume_a_reactor_is_stale_only_once_it_had_its_chance() -> None:
+    def check(lock: Interlock, now: float, fresh: list[bool], age_s: list[float]) -> tuple[tuple[str, ...], ...]:
+        vitals = Vitals(np.array(age_s), np.full(2, 9000.0), (None, None))
+        m = Measurement(np.full(2, now), np.full(2, 0.5 + 1e-6 * now), np.full(2, 37.0), np.array(fresh), vitals)
+        return lock.check(m, np.full(2, 0.01), np.full(2, 0.5), np.full(2, 37.0), now).kinds
+
+    before, after = Interlock(2), Interlock(2)
+    check(before, 600.0, [True, True], [0.0, 0.0])
+    after.restore(json.loads(json.dumps(before.state()).replace("-Infinity", "null").replace("NaN", "null")))
+    assert check(after, 3000.0, [True, False], [0.0, 20.0]) == ((), ())
+    assert check(after, 3060.0, [True, False], [0.0, 80.0]) == ((), ())
+    assert check(after, 3105.0, [True, False], [0.0, 125.0]) == ((), ("stale",))
+    assert check(after, 3190.0, [True, False], [0.0, 210.0]) == ((), ("lost",))
+    assert check(after, 3200.0, [False, True], [10.0, 0.0]) == ((), ())
+
+
 def test_state_of_another_run_is_refused() -> None:
     with pytest.raises(ValueError, match="for 2 reactors, this run has 3"):
         Interlock(3).restore(Interlock(2).state())

@@ -82,6 +82,22 @@ def test_after_a_lost_answer_presence_is_looked_at_before_the_next_command(refus
     script.close()
 
 
+def test_after_a_while_without_a_request_presence_is_looked_at_before_the_next_command() -> None:
+    gone, here, look = answer(state("M1", presentDevices={"M0": 0, "M1": 1})), answer(state("M1")), "GET /getSysdata/"
+    clock = VirtualClock()
+    script = Script([*read(state()), *posts(OFF[0]), (look, here), *posts(OFF[1], OFF[2]), (look, gone)])
+    m0 = Unit("M0", ("M0", "M1"), script, clock, lambda kind, fields: None)
+    m0.read()
+    m0.post(OFF[0])
+    clock.sleep(3.0)
+    m0.post(OFF[1])
+    m0.post(OFF[2])
+    clock.sleep(3.0)
+    with pytest.raises(DeviceStateError, match="absent"):
+        m0.post(OFF[3])
+    script.close()
+
+
 def test_no_identity_is_no_reactor() -> None:
     m0, _ = unit(read(state(DeviceID="")))
     with pytest.raises(IdentityError):
