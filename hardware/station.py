@@ -30,6 +30,7 @@ CYCLE_S = 60.07  # median of 3275 real cycles (chibio.md section 3)
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
+WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: fluid must not come before it is taken off
 OWN_WILL = ("Zigzag", "Custom", "Chemostat")  # modes that act on the pumps
 
 
@@ -408,10 +409,11 @@ class Station:
             self._agenda.add(self._finish(DosePlan()))
             return False
         self.dosing = True
-        self._agenda.add(self._feed_off(), plan.feed_s + DOSE_OFF_S)
+        self._agenda.add(self._feed_off(), WASTE_FIRST_S + plan.feed_s + DOSE_OFF_S)
         self._agenda.add(self._finish(plan), plan.waste_s + DOSE_OFF_S)
         try:
             unit.switch(WASTE, True)
+            self._clock.sleep(WASTE_FIRST_S)
             unit.switch(FEED, True)
         except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
             self.tell(f"the answer to a pump command was lost, counted as dosed: {error}")

@@ -66,14 +66,15 @@ def test_the_requests_of_one_dose_are_those_of_single_shot_dosing() -> None:
     ]
     assert [63.0 * float(path.rsplit("/", 1)[1]) for _, path in posts[:2]] == pytest.approx([waste, feed], abs=1e-3)
     assert [path for _, path in posts[2:4]] == ["/SetOutputOn/Pump2/1/M0", "/SetOutputOn/Pump1/1/M0"]
-    on_s = posts[3][0]
+    waste_on_s, on_s = posts[2][0], posts[3][0]
+    assert on_s - waste_on_s == pytest.approx(1.0, abs=0.1)
     off = [t for t, path in posts[4:] if path == "/SetOutputOn/Pump1/0/M0"]
     assert off[0] - on_s == pytest.approx(feed + 2.0, abs=0.1)
     assert [path for _, path in posts[5:10]] == [
         *(f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 2, 3, 4)),
         "/MeasureTemp/IR/M0",
     ]
-    assert posts[5][0] - on_s == pytest.approx(waste + 2.0, abs=0.1)
+    assert posts[5][0] - waste_on_s == pytest.approx(waste + 2.0, abs=0.1)
     assert doses(bed) == [(pytest.approx(on_s + START_S, abs=0.1), pytest.approx(feed + BIAS_S, abs=0.01))]
     [(_, length)] = doses(bed, pump="Pump2")
     assert length == pytest.approx(waste + BIAS_S, abs=0.01)
@@ -90,6 +91,20 @@ def test_a_slow_link_does_not_cut_doses_short(delay_s: float) -> None:
         given = doses(bed, pump=pump)
         assert len(given) >= 9
         assert [length for _, length in given] == pytest.approx([s + BIAS_S for s in asked[: len(given)]], abs=0.01)
+
+
+def test_the_waste_motor_turns_before_fluid_comes_and_until_after_it() -> None:
+    """Both start late by draws of their own; a bus that dies once the feed runs must find the waste running, too."""
+    bed = Bed(("M0", "M1", "M2"), options=quiet(pump_start_low_s=0.2, pump_start_high_s=0.7))
+    fixed(bed, 0.02)
+    bed.reactors.begin()
+    bed.run(30)
+    for name in bed.names:
+        pairs = list(zip(doses(bed, name), doses(bed, name, "Pump2"), strict=False))
+        assert len(pairs) >= 28
+        for (feed_s, feed), (waste_s, waste) in pairs:
+            assert waste_s < feed_s < feed_s + feed < waste_s + waste
+        assert bed.truth(name)["peak_ml"] < 20.0 + 1e-6
 
 
 def test_a_late_motor_still_runs_its_whole_dose() -> None:
@@ -374,6 +389,7 @@ def test_a_link_that_dies_in_a_dose_is_told_within_a_time_out() -> None:
         bed.step()
     assert bed.clock.now() - began < 60.0
     bed.fault("lost_request", 0)
+    fixed(bed, 0.0)
     bed.run(3)
     assert bed.motors_off()
 
@@ -576,7 +592,8 @@ def test_stop_in_the_middle_of_a_dose_is_verified_and_idempotent(after_s: float,
     while not bed.step().fresh.any():
         pass
     bed.clock.sleep(after_s)
-    assert bed.motors_off() is not running
+    assert not bed.motors_off()
+    assert any(bed.truth(name)["motors"]["Pump1"] for name in bed.names) is running
     bed.reactors.stop()
     assert bed.motors_off()
     bed.reactors.stop()
