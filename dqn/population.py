@@ -21,7 +21,7 @@ GROUP = 16
 class Population:
     """S agents as groups that share nothing, each with its own part of the environment and a thread while it trains.
 
-    Torch releases Python's lock during its operations, so two groups on two cores take 0.6 of the time of one after the
+    Torch releases Python's lock during its operations, so two groups on two cores take two thirds of the time of one after the
     other. How agents are grouped does not depend on the number of threads, and neither does any result.
 
     Args:
