@@ -18,11 +18,16 @@ GROUP = 16
 """Agents per group on a CPU: enough that the cost of calling torch does not count, few enough for its caches."""
 
 
+def _cores() -> int:
+    """Cores this process may use; where the system cannot say (macOS, Windows), all there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Population:
     """S agents as groups that share nothing, each with its own part of the environment and a thread while it trains.
 
-    Torch releases Python's lock during its operations, so two groups on two cores take two thirds of the time of one after the
-    other. How agents are grouped does not depend on the number of threads, and neither does any result.
+    Torch releases Python's lock during its operations, so two groups on two cores take two thirds of the time of one
+    after the other. How agents are grouped does not depend on the number of threads, and neither does any result.
 
     Args:
       groups: trainers of the same config and interval; the agents of the first come first.
@@ -31,7 +36,7 @@ class Population:
 
     def __init__(self, groups: Sequence[Trainer], threads: int | None = None) -> None:
         self.groups = list(groups)
-        self.threads = threads or len(os.sched_getaffinity(0))
+        self.threads = threads or _cores()
 
     @property
     def n_agents(self) -> int:
