@@ -83,19 +83,19 @@ def test_every_returned_row_survives_kill_9_and_the_torn_line_is_cut(tmp_path: P
     script = (
         "import sys\nfrom hardware.recording import Recorder\n"
         f"r = Recorder({str(path)!r}, ('time_min', 'od', 'pump_rate_ml_s'))\n"
-        "i = 0\nwhile True:\n"
+        f"i, done = 0, open({str(acknowledged)!r}, 'ab', buffering=0)\nwhile True:\n"
         "    r.write({'time_min': float(i), 'od': 0.5, 'pump_rate_ml_s': 0.01})\n"
-        f"    i += 1\n    open({str(acknowledged)!r}, 'w').write(str(i))\n"
+        "    i += 1\n    done.write(b'.')\n"
     )
     child = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parents[2])
     deadline = time.monotonic() + 20
-    while not (acknowledged.exists() and (acknowledged.read_text() or "0") > "2") and time.monotonic() < deadline:
+    while not (acknowledged.exists() and acknowledged.stat().st_size > 2) and time.monotonic() < deadline:
         time.sleep(0.02)
     child.send_signal(signal.SIGKILL)
     child.wait()
     whole = path.read_bytes()
     rows = whole.count(b"\n") - 1
-    assert rows >= int(acknowledged.read_text() or "0") > 0
+    assert rows >= acknowledged.stat().st_size > 0
     with open(path, "ab") as f:
         f.write(b"99999.0,0.")
     with Recorder(path, COLUMNS) as recorder:
