@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
-from experiments import app
-from experiments.config import TrainConfig
+from experiments.cli import frame
+from experiments.control.config import TrainConfig
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -132,9 +132,9 @@ def _write(path: Path, rows: list[Row]) -> None:
 
 def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
     """Train one variant and score it on the reported grid."""
-    from experiments import build
-    from experiments.evaluation import Evaluation, report_grid
-    from experiments.session import Session
+    from experiments.training import build
+    from experiments.training.evaluation import Evaluation, report_grid
+    from experiments.training.session import Session
 
     folder.mkdir(parents=True, exist_ok=True)
     session = Session(config, folder)
@@ -162,7 +162,7 @@ def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
 
 def summarise(rows: list[Row]) -> dict[str, dict[str, Any]]:
     """Per variant: median, interquartile mean and worst seed of every measure."""
-    from experiments.writers import interquartile_mean
+    from experiments.reporting.tensorboard import interquartile_mean
 
     out: dict[str, dict[str, Any]] = {}
     for name in dict.fromkeys(row.ablation for row in rows):
@@ -195,7 +195,7 @@ def table(rows: list[Row]) -> str:
 
 def figure(rows: list[Row]) -> Figure:
     """One point per seed: regret and steady error of the kept policy, and regret of the last iterate."""
-    from experiments.charts import COLOURS, new_figure
+    from experiments.reporting.charts import COLOURS, new_figure
 
     names = list(dict.fromkeys(row.ablation for row in rows))[::-1]
     panels = (
@@ -221,7 +221,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
     """Train all variants; returns the median regret of the first, the objective of a sweep."""
     import torch
 
-    from experiments.charts import save
+    from experiments.reporting.charts import save
 
     torch.set_num_threads(1)
     path = folder / "ablation.csv"
@@ -241,7 +241,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
             entry["train_seconds"],
         )  # fmt: skip
     summary = summarise(rows)
-    app.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
+    frame.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
     (folder / "table.md").write_text(table(rows), encoding="utf-8")
     save(figure(rows), folder / "figures", "ablation")
     log.info("table %s, figure %s", folder / "table.md", folder / "figures" / "ablation.png")
@@ -250,7 +250,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
 
 def main() -> None:
     """Entry point."""
-    app.run("ablate", AblateConfig(), ablate)
+    frame.run("ablate", AblateConfig(), ablate)
 
 
 if __name__ == "__main__":

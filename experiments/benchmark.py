@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig
 
 from dqn.config import DQNConfig
-from envs.plant import PlantConfig
-from envs.setpoints import Schedule
-from experiments import app
-from experiments.config import TrainConfig, controller_config
-from experiments.config_benchmark import BenchmarkConfig, StudyConfig
+from envs.plant.plant import PlantConfig
+from envs.scenario import Schedule
+from experiments.cli import frame
+from experiments.comparison.config import BenchmarkConfig, StudyConfig
+from experiments.control.config import TrainConfig, controller_config
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dqn.policy import Policy
-    from experiments.pool import Cell
-    from experiments.trials import Trial
+    from experiments.comparison.trials import Trial
+    from experiments.comparison.workers import Cell
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class Figures:
 
     def add(self, name: str, figure: Figure, title: str, caption: str) -> None:
         """Save and remember a figure."""
-        from experiments import charts
+        from experiments.reporting import charts
 
         charts.save(figure, self.folder / "figures", name)
         self.refer(f"figures/{name}.svg", title, caption)
@@ -58,14 +58,14 @@ class Figures:
 def calibration(config: BenchmarkConfig, figures: Figures) -> dict[str, Any]:
     """The open-loop protocol on the training model with 1 % noise, and the fit to it.
 
-    Raises: app.UserError where the recording cannot be fitted.
+    Raises: frame.UserError where the recording cannot be fitted.
     """
     import numpy as np
 
-    from envs.calibration import IdentifyConfig, calibrate
-    from envs.open_loop import OpenLoop, open_loop
-    from envs.screening import Series
-    from experiments.charts_calibration import fit_figure
+    from envs.identification.open_loop import OpenLoop, open_loop
+    from envs.identification.screening import Series
+    from envs.identification.window import IdentifyConfig, calibrate
+    from experiments.reporting.calibration_charts import fit_figure
 
     protocol = OpenLoop(mu=config.env.mu, tau=config.env.tau, control_min=config.env.control_min, seed=config.seed)
     time, od, rate = open_loop(protocol, np.random.default_rng(config.seed))
@@ -73,7 +73,7 @@ def calibration(config: BenchmarkConfig, figures: Figures) -> dict[str, Any]:
     try:
         result = calibrate(raw, IdentifyConfig())
     except ValueError as error:
-        raise app.UserError(f"calibration: {error}") from None
+        raise frame.UserError(f"calibration: {error}") from None
     mu, tau = result.fit.mu, result.tau
     figures.add(
         "fig2a_calibration",
@@ -106,12 +106,12 @@ def learned(config: BenchmarkConfig, wanted: set[str], figures: Figures) -> tupl
         told["dqn"] = {"policy": config.policy, "regret_pct": found["dqn"].metadata.get("regret_pct")}
     for name in sorted(wanted - set(found)):
         if name not in config.agents:
-            raise app.UserError(f"controller {name}: learned, and agents holds only {', '.join(config.agents)}")
+            raise frame.UserError(f"controller {name}: learned, and agents holds only {', '.join(config.agents)}")
         log.info("training %s: %d seeds", name, config.train_seeds)
         folder = figures.folder / "training" / name
         folder.mkdir(parents=True)
         setup = TrainConfig(env=config.env, agent=config.agents[name], seed=config.seed, n_agents=config.train_seeds)
-        app.save_config(setup, folder)
+        frame.save_config(setup, folder)
         train(setup, folder)
         found[name] = policies.load(folder / "policy.npz")
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
@@ -139,7 +139,7 @@ CAPTIONS = {
 
 def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any], figures: Figures) -> None:
     """The figures of the studies."""
-    from experiments import charts_benchmark as charts
+    from experiments.comparison import figures as charts
 
     by_cell = {(t.controller, t.plant, t.scenario): t for t in trials}
     for name, study in config.studies.items():
@@ -203,8 +203,8 @@ def table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[di
 
 def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
     """All numbers of the closed loops, and the paper's."""
-    from experiments import comparison
-    from experiments.published import SETTLING_MIN, TABLE_2
+    from experiments.comparison import statistics as comparison
+    from experiments.comparison.published import SETTLING_MIN, TABLE_2
 
     plants, controllers = list(config.plants), list(config.controllers)
     ordered = sorted(trials, key=lambda t: (plants.index(t.plant), controllers.index(t.controller)))
@@ -242,10 +242,10 @@ def _store(trials: list[Trial], folder: Path) -> None:
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     """Calibrate, train, run every closed loop, compare, draw, report."""
     from experiments import report
-    from experiments.pool import Loops
+    from experiments.comparison.workers import Loops
 
     if not (cells(config) or config.training or config.calibration):
-        raise app.UserError("nothing to run: choose a recipe, e.g. +experiment=paper or +experiment=setpoint_steps")
+        raise frame.UserError("nothing to run: choose a recipe, e.g. +experiment=paper or +experiment=setpoint_steps")
     figures = Figures(folder)
     fitted = calibration(config, figures) if config.calibration else None
     wanted = cells(config)
@@ -261,7 +261,7 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     draw(config, trials, summary, figures)
     summary["figures"] = figures.shown
     _store(trials, folder)
-    app.write_json(folder / "summary.json", summary)
+    frame.write_json(folder / "summary.json", summary)
     page = report.write(folder)
     log.info("%d closed loops of %d replicates; report %s", len(trials), config.replicates, page)
 
@@ -283,7 +283,7 @@ def _schema(cfg: DictConfig) -> BenchmarkConfig:
 
 def main() -> None:
     """Entry point."""
-    app.run("benchmark", BenchmarkConfig(), benchmark, choose=_schema)
+    frame.run("benchmark", BenchmarkConfig(), benchmark, choose=_schema)
 
 
 if __name__ == "__main__":

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
 
-from experiments import app
-from experiments.calibrations import save
-from hardware.bench import measure_blanks
-from hardware.chibio import ChiBioReactors
-from hardware.chibio_config import ChiBioConfig
+from experiments.cli import frame
+from experiments.control.rig_files import save
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.procedures import measure_blanks
+from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import RealClock
 from hardware.errors import ReactorError
-from hardware.transport import open_transport
+from hardware.link.transport import open_transport
 
 __all__ = ["BlankConfig", "blank"]
 
@@ -51,7 +51,7 @@ def blank(config: BlankConfig, folder: Path) -> None:
                 reactors.stop()
                 raise
     except ReactorError as error:
-        raise app.UserError(str(error)) from None
+        raise frame.UserError(str(error)) from None
     rows = {}
     for name, identity, raw, sd in zip(reactors.names, stored, found.raw, found.sd, strict=True):
         when = {"date": date.today().isoformat(), "device_id": identity}
@@ -59,12 +59,12 @@ def blank(config: BlankConfig, folder: Path) -> None:
         path = save(Path(backend.calibration), name, "blank", values)
         rows[name] = {**values, "file": str(path)}
         log.info("%s: blank %.0f +- %.0f counts, stored in %s", name, raw, sd, path)
-    app.write_json(folder / "summary.json", rows)
+    frame.write_json(folder / "summary.json", rows)
 
 
 def main() -> None:
     """Entry point."""
-    app.run("blank", BlankConfig(), blank)
+    frame.run("blank", BlankConfig(), blank)
 
 
 if __name__ == "__main__":

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from envs.calibration import Calibration, Drift, IdentifyConfig, calibrate
-from envs.identification import Parameter
-from envs.open_loop import OpenLoop, open_loop
-from envs.screening import Series, row_spans
-from experiments import app
+from envs.identification.fit import Parameter
+from envs.identification.open_loop import OpenLoop, open_loop
+from envs.identification.screening import Series, row_spans
+from envs.identification.window import Calibration, Drift, IdentifyConfig, calibrate
+from experiments.cli import frame
 from hardware.errors import RecordingError
-from hardware.recording import Recorder, Recording, read_recording
+from hardware.storage.recorder import Recorder, Recording, read_recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,13 +59,13 @@ class CalibrateConfig:
 
 def main() -> None:
     """Command line."""
-    app.run("calibrate", CalibrateConfig(), body)
+    frame.run("calibrate", CalibrateConfig(), body)
 
 
 def body(config: CalibrateConfig, folder: Path) -> float | None:
     """Calibrate, generate a recording, or study the coverage, as the config says.
 
-    Returns: PMSE in % of a calibration. Raises: app.UserError.
+    Returns: PMSE in % of a calibration. Raises: frame.UserError.
     """
     if config.generate:
         _generate(config, folder)
@@ -81,16 +81,16 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     try:
         recording = read_recording(source, pump_ml_s=config.pump_ml_s, run=config.run, reactor=config.reactor)
     except RecordingError as error:
-        raise app.UserError(str(error)) from None
+        raise frame.UserError(str(error)) from None
     raw = _series(recording, config.rows, source)
     hours = (raw.time[-1] - raw.time[0]) / 60
     print(f"{recording.source}: rows {raw.row[0]}-{raw.row[-1]}, {hours:.1f} h; fitting", flush=True)
     try:
         result = calibrate(raw, config.identify)
     except ValueError as error:
-        raise app.UserError(f"{source}: {error}") from None
-    from experiments.charts import save
-    from experiments.charts_calibration import drift_figure, fit_figure
+        raise frame.UserError(f"{source}: {error}") from None
+    from experiments.reporting.calibration_charts import drift_figure, fit_figure
+    from experiments.reporting.charts import save
 
     name = Path(source).name
     figures = {
@@ -102,7 +102,7 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     environment = folder / f"{config.name}.yaml"
     environment.write_text(environment_yaml(result, name), encoding="utf-8")
     content = summary(result, recording, raw)
-    app.write_json(folder / "summary.json", {**content, "data": source, "env_file": str(environment)})
+    frame.write_json(folder / "summary.json", {**content, "data": source, "env_file": str(environment)})
     _events(folder, result, figures)
     print(report(result, recording, content))
     print(f"\n  files       {environment}\n              {folder}/{{summary.json, figures/}}")
@@ -110,14 +110,14 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
 
 
 def _series(recording: Recording, rows: str | None, source: str) -> Series:
-    """The asked-for rows of a recording. Raises: app.UserError if there are fewer than ten."""
+    """The asked-for rows of a recording. Raises: frame.UserError if there are fewer than ten."""
     first, end = 0, int(recording.row[-1]) + 1
     if rows is not None:
         low, high = rows.split(":")
         first, end = int(low or 0), int(high or end)
     keep = (recording.row >= first) & (recording.row < end)
     if np.isfinite(recording.od[keep]).sum() < 10:
-        raise app.UserError(
+        raise frame.UserError(
             f"rows = {rows}: {int(keep.sum())} rows of {source} lie there; the recording has rows "
             f"{recording.row[0]}:{recording.row[-1] + 1}; at least 10 readings are needed"
         )
@@ -215,7 +215,7 @@ def environment_yaml(result: Calibration, source: str) -> str:
 
 def _events(folder: Path, result: Calibration, figures: dict[str, Figure]) -> None:
     """Scalars and figures for TensorBoard."""
-    from experiments.writers import Events
+    from experiments.reporting.tensorboard import Events
 
     events = Events(folder)
     for tag, value in (
@@ -269,15 +269,15 @@ def _generate(config: CalibrateConfig, folder: Path) -> None:
     protocol = config.protocol
     path = Path(config.out) if config.out else folder / "open_loop.csv"
     if path.exists():
-        raise app.UserError(f"out={path}: exists; remove it or choose another file")
+        raise frame.UserError(f"out={path}: exists; remove it or choose another file")
     time, od, pump_rate = open_loop(protocol, np.random.default_rng(protocol.seed))
     try:
         with Recorder(path, COLUMNS, fsync=False) as recorder:
             for t, y, u in zip(time, od[0], pump_rate[0], strict=True):
                 recorder.write({"time_min": round(float(t), 4), "od": round(float(y), 5), "pump_rate_ml_s": float(u)})
     except RecordingError as error:
-        raise app.UserError(str(error)) from None
-    app.write_json(
+        raise frame.UserError(str(error)) from None
+    frame.write_json(
         folder / "summary.json", {"file": str(path), "rows": len(time), "mu": protocol.mu, "tau": protocol.tau}
     )
     print(f"{len(time)} rows of the open-loop protocol (mu {protocol.mu:g}, tau {protocol.tau:g}) in {path}")
@@ -294,17 +294,17 @@ def _coverage(config: CalibrateConfig, folder: Path) -> float:
         try:
             found.append(calibrate(Series(time, od[i], pump_rate[i], rows), config.identify))
         except ValueError as error:
-            raise app.UserError(f"simulated recording {i}: {error}") from None
+            raise frame.UserError(f"simulated recording {i}: {error}") from None
     mu = np.array([(c.fit.mu.value, c.fit.mu.low, c.fit.mu.high) for c in found])
     tau = np.array([(c.tau.value, c.tau.low, c.tau.high) for c in found])
     truth = (protocol.mu, protocol.tau)
     shares = [_share(values, true) for values, true in zip((mu, tau), truth, strict=True)]
     title = f"{n} simulated recordings of {protocol.hours:g} h, {100 * protocol.noise:g} % noise (seed {protocol.seed})"
-    from experiments.charts import save
-    from experiments.charts_calibration import coverage_figure
+    from experiments.reporting.calibration_charts import coverage_figure
+    from experiments.reporting.charts import save
 
     save(coverage_figure(mu, tau, truth, title), folder / "figures", "coverage")
-    app.write_json(
+    frame.write_json(
         folder / "summary.json",
         {
             "recordings": n,

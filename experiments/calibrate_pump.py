@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import app
-from experiments.calibrations import save
-from hardware.bench import dose_series
-from hardware.chibio_config import ChiBioConfig
+from experiments.cli import frame
+from experiments.control.rig_files import save
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import Unit, no_log
+from hardware.chibio.dosing import PumpFit, fit_pump
+from hardware.chibio.procedures import dose_series
+from hardware.chibio.protocol import FEED, PERIOD_S, WASTE
 from hardware.clock import RealClock
 from hardware.errors import ReactorError
-from hardware.pumps import PumpFit, fit_pump
-from hardware.transport import open_transport
-from hardware.unit import Unit, no_log
-from hardware.wire import FEED, PERIOD_S, WASTE
+from hardware.link.transport import open_transport
 
 __all__ = ["CalibratePumpConfig", "Series", "calibrate", "read_weighings"]
 
@@ -72,7 +72,9 @@ def read_weighings(path: Path) -> list[Series]:
         with open(path, newline="", encoding="utf-8") as f:
             rows = list(csv.DictReader(f))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise app.UserError(f"csv={path}: not readable ({error}); give a file with columns duty,doses,grams") from None
+        raise frame.UserError(
+            f"csv={path}: not readable ({error}); give a file with columns duty,doses,grams"
+        ) from None
     found = []
     for number, row in enumerate(rows, 2):
         try:
@@ -80,7 +82,7 @@ def read_weighings(path: Path) -> list[Series]:
             if not (0.0 < series.duty <= 1.0 and series.doses >= 1 and 0.0 <= series.grams < 10_000.0):
                 raise ValueError("duty 0 to 1, doses at least 1, grams at least 0")
         except (KeyError, TypeError, ValueError) as error:
-            raise app.UserError(f"csv={path}, line {number}: {error}; columns duty,doses,grams") from None
+            raise frame.UserError(f"csv={path}, line {number}: {error}; columns duty,doses,grams") from None
         found.append(series)
     return found
 
@@ -151,22 +153,22 @@ def calibrate(config: CalibratePumpConfig, folder: Path) -> None:
         elif sys.stdin.isatty():
             found, identity = weigh(config)
         else:
-            raise app.UserError("no terminal to ask for the weights; give csv=FILE with columns duty,doses,grams")
+            raise frame.UserError("no terminal to ask for the weights; give csv=FILE with columns duty,doses,grams")
         on_s, doses, grams = np.array([[PERIOD_S * s.duty, s.doses, s.grams] for s in found]).reshape(-1, 3).T
         fit = fit_pump(on_s, doses, grams, date.today().isoformat(), identity)
     except (ReactorError, ValueError) as error:
-        raise app.UserError(str(error)) from None
+        raise frame.UserError(str(error)) from None
     weighings = [{"duty": s.duty, "doses": s.doses, "grams": s.grams} for s in found]
     uncertainty = {"flow_se": fit.flow_se, "bias_se": fit.bias_se}
     values = {**fit.calibration.as_dict(), **uncertainty, "weighings": weighings}
     path = save(Path(config.backend.calibration), config.reactor, config.pump, values)
-    app.write_json(folder / "summary.json", {**values, "file": str(path)})
+    frame.write_json(folder / "summary.json", {**values, "file": str(path)})
     log.info("%s %s pump\n%s\nstored in %s", config.reactor, config.pump, report(fit, found), path)
 
 
 def main() -> None:
     """Entry point."""
-    app.run("calibrate_pump", CalibratePumpConfig(), calibrate)
+    frame.run("calibrate_pump", CalibratePumpConfig(), calibrate)
 
 
 if __name__ == "__main__":

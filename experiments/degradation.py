@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from dqn.config import DQNConfig
 from envs.optimum import OptimalPolicy, solve
 from envs.task import EnvConfig
-from experiments import app
 from experiments.ablate import variant
+from experiments.cli import frame
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,8 +85,8 @@ def _watch(config: DegradationConfig, name: str) -> list[dict[str, float | str]]
     """Train one variant; a row per evaluation with medians over agents."""
     import torch
 
-    from experiments import build
-    from experiments.evaluation import Evaluation, selection_grid
+    from experiments.training import build
+    from experiments.training.evaluation import Evaluation, selection_grid
 
     agent = variant(config.agent, name, config.trained[name])
     agents = build.population(config.env, agent, range(config.seed, config.seed + config.n_agents))
@@ -139,9 +139,9 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
 
     from dqn.agent import STREAMS, DQNAgent
     from dqn.replay import Transition
-    from experiments import build, seeding
-    from experiments.evaluation import Evaluation, report_grid
     from experiments.hindsight import goal_relabel
+    from experiments.training import build, seeding
+    from experiments.training.evaluation import Evaluation, report_grid
 
     agent = variant(config.agent, name, config.fitted[name])
     seeds = range(config.seed, config.seed + config.n_agents)
@@ -170,7 +170,7 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
 
 def figure(rows: list[dict[str, float | str]], fitted: dict[str, dict[str, Any]]) -> Figure:
     """Regret and value error during training; regret and steady error of the networks that were told the answers."""
-    from experiments.charts import COLOURS, new_figure
+    from experiments.reporting.charts import COLOURS, new_figure
 
     canvas, axes = new_figure(11.0, 7.0, 2, 2)
     for k, name in enumerate(dict.fromkeys(str(row["variant"]) for row in rows)):
@@ -205,10 +205,10 @@ def degradation(config: DegradationConfig, folder: Path) -> float:
     """Both measurements; returns the median regret of the first trained variant at its end."""
     import torch
 
-    from experiments.charts import save
+    from experiments.reporting.charts import save
 
     if not config.trained:
-        raise app.UserError("trained: no variant; name at least one, as conf/degradation.yaml does")
+        raise frame.UserError("trained: no variant; name at least one, as conf/degradation.yaml does")
     torch.set_num_threads(1)
     rows = [row for name in config.trained for row in _watch(config, name)]
     with open(folder / "curves.csv", "w", newline="", encoding="utf-8") as f:
@@ -219,7 +219,7 @@ def degradation(config: DegradationConfig, folder: Path) -> float:
     gap = action_gap(solve(config.env, config.agent.gamma))
     log.info("one level beside the best action costs %.1e at the setpoint", gap)
     ends = {name: [r for r in rows if r["variant"] == name][-1] for name in config.trained}
-    app.write_json(folder / "summary.json", {"action_gap": gap, "trained": ends, "fitted": fitted})
+    frame.write_json(folder / "summary.json", {"action_gap": gap, "trained": ends, "fitted": fitted})
     save(figure(rows, fitted), folder / "figures", "degradation")
     log.info("curves %s, figure %s", folder / "curves.csv", folder / "figures" / "degradation.png")
     return float(rows[-1]["regret_pct"])
@@ -227,7 +227,7 @@ def degradation(config: DegradationConfig, folder: Path) -> float:
 
 def main() -> None:
     """Entry point."""
-    app.run("degradation", DegradationConfig(), degradation)
+    frame.run("degradation", DegradationConfig(), degradation)
 
 
 if __name__ == "__main__":

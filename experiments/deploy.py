@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
-from experiments import app
-from experiments.config import DeployConfig, deploy_schema
+from experiments.cli import frame
+from experiments.control.config import DeployConfig, deploy_schema
 
 if TYPE_CHECKING:
     from dqn.policy import Policy
-    from envs.setpoints import Schedule
-    from experiments.loop import ClosedLoop, Step
-    from experiments.record import Record
+    from envs.scenario import Schedule
+    from experiments.control.loop import ClosedLoop, Step
+    from experiments.control.record import Record
     from hardware.reactor import Reactor
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ def find_policy(name: str, root: Path = Path("runs/train")) -> Path:
     if name == "latest":
         found = sorted(root.glob("**/policy.npz"), key=lambda p: p.stat().st_mtime)
         if not found:
-            raise app.UserError(f"policy=latest: no policy.npz under {root}; train one first or give policy=PATH")
+            raise frame.UserError(f"policy=latest: no policy.npz under {root}; train one first or give policy=PATH")
         return found[-1]
     path = Path(name)
     return path / "policy.npz" if path.is_dir() else path
@@ -53,17 +53,17 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
         regret = float(policy.metadata.get("regret_pct", float("nan")))
         fastest = float(policy.pump_rates.max())
     except policies.PolicyError as error:
-        raise app.UserError(str(error)) from None
+        raise frame.UserError(str(error)) from None
     except Exception as error:  # whatever a damaged file makes NumPy say
         why = (str(error).splitlines() or [type(error).__name__])[0]
-        raise app.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
+        raise frame.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
     if not abs(trained - control_min) <= 1e-9:
-        raise app.UserError(
+        raise frame.UserError(
             f"policy {path} was trained for a control period of {trained} min, the backend has {control_min} min; "
             f"train with env.control_min={control_min}"
         )
     if not fastest <= max_rate + 1e-12:
-        raise app.UserError(
+        raise frame.UserError(
             f"policy {path} pumps up to {fastest} mL/s, the interlock allows {max_rate} mL/s; "
             "train with a smaller env.max_pump_rate or raise safety.max_rate"
         )
@@ -86,13 +86,13 @@ def policy_of(config: DeployConfig, folder: Path) -> Policy:
     try:
         shutil.copyfile(find_policy(config.policy), kept)
     except OSError as error:
-        raise app.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free the disk") from None
+        raise frame.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free the disk") from None
     return policy
 
 
 def windows_of(record: Record, schedules: list[Schedule]) -> list[dict[str, Any]]:
     """Metrics of every phase and reactor, as in summary.json."""
-    from experiments.metrics import window_metrics
+    from experiments.control.metrics import window_metrics
 
     elapsed, od = record.series("elapsed_min"), record.series("od")
     rows = []
@@ -116,7 +116,7 @@ def _finish(record: Record, config: DeployConfig, outcome: str) -> None:
     """Figure and summary.json, whatever the outcome."""
     import numpy as np
 
-    from experiments import charts
+    from experiments.reporting import charts
 
     schedules, folder = config.schedules(), record.folder
     volume, minute = np.nansum(record.series("volume_ml"), axis=1), record.series("time_min")
@@ -146,7 +146,7 @@ def _finish(record: Record, config: DeployConfig, outcome: str) -> None:
         "repairs": record.repairs,
         "figure": str(path),
     }
-    app.write_json(folder / "summary.json", summary)
+    frame.write_json(folder / "summary.json", summary)
     log.info("%s after %.0f min, %.1f mL of fresh medium", outcome, summary["minutes"], summary["volume_ml"])
     heads = ("reactor", "setpoint", "ISE", "ITAE", "ISE/T", "ITAE/T", "settled", "steady")
     header = f"{heads[0]:8} " + " ".join(f"{h:>8}" for h in heads[1:])
@@ -248,19 +248,19 @@ def _run(loop: ClosedLoop, record: Record, reactors: Reactor, config: DeployConf
 
 def deploy(config: DeployConfig, folder: Path) -> None:
     """One closed loop over the scenario."""
-    from experiments import backends
-    from experiments.loop import ClosedLoop
-    from experiments.record import Record
+    from experiments.control import assemble as backends
+    from experiments.control.loop import ClosedLoop
+    from experiments.control.record import Record
     from hardware.errors import ReactorError
-    from hardware.safety import Interlock
+    from hardware.safety.interlock import Interlock
 
     backend = config.backend
     try:
         schedules = config.schedules()
     except ValueError as error:
-        raise app.UserError(str(error)) from None
+        raise frame.UserError(str(error)) from None
     if config.resume is not None and backend.kind == "sim":
-        raise app.UserError(f"resume={config.resume}: a simulated run takes a second; run it again")
+        raise frame.UserError(f"resume={config.resume}: a simulated run takes a second; run it again")
     plant, model = backends.plant_of(config), backends.model_of(config)
     policy = None
     if config.controller.kind == "dqn":
@@ -287,12 +287,12 @@ def deploy(config: DeployConfig, folder: Path) -> None:
                 why = f"figure and summary not written ({error.strerror or error})"
                 outcome = f"failed: {outcome.removeprefix('failed: ')}; {why}"
     except ReactorError as error:
-        raise app.UserError(str(error)) from None
+        raise frame.UserError(str(error)) from None
     finally:
         if record is not None:
             record.close()
     if outcome.startswith("failed"):
-        raise app.UserError(outcome)
+        raise frame.UserError(outcome)
 
 
 def _schema(cfg: DictConfig) -> DeployConfig:
@@ -301,7 +301,7 @@ def _schema(cfg: DictConfig) -> DeployConfig:
 
 def main() -> None:
     """Entry point."""
-    app.run("deploy", DeployConfig(), deploy, choose=_schema)
+    frame.run("deploy", DeployConfig(), deploy, choose=_schema)
 
 
 if __name__ == "__main__":

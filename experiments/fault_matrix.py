@@ -15,12 +15,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from envs.setpoints import Schedule
-from experiments import app
-from experiments.fault_case import MOMENTS, Case, Outcome
-from experiments.faults import SICK, Fault, by_name
-from hardware.guard import GuardConfig
-from hardware.safety_config import SafetyConfig
+from envs.scenario import Schedule
+from experiments.cli import frame
+from experiments.reliability.case import MOMENTS, Case, Outcome
+from experiments.reliability.faults import SICK, Fault, by_name
+from hardware.chibio.overflow_guard import GuardConfig
+from hardware.safety.config import SafetyConfig
 
 __all__ = ["FaultMatrixConfig", "fault_matrix", "table"]
 
@@ -205,7 +205,8 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     from tqdm import tqdm
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    from experiments import charts, charts_faults
+    from experiments.reliability import chart as charts_faults
+    from experiments.reporting import charts
 
     began = time.monotonic()
     faults = [f for f in by_name(config.faults) if config.guard.pump or not f.guard]
@@ -219,7 +220,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
 
         outcomes = run_all(config, tick)
     if not outcomes:
-        raise app.UserError("nothing to run: give faults or controls")
+        raise frame.UserError("nothing to run: give faults or controls")
     write_cases(folder / "cases.csv", outcomes)
     rigs = [[o for o in outcomes if o.guarded], [o for o in outcomes if not o.guarded]]
     heads = (f"With an overflow guard ({config.guard.pump} at {config.guard.duty:g})", "Without")
@@ -230,19 +231,21 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
         charts.save(charts_faults.fault_map(sick, config.moments), folder / "figures", "fault_matrix")
     total = totals(outcomes)
     seconds = {"wall_s": round(time.monotonic() - began, 1)}
-    app.write_json(folder / "summary.json", {**total, **seconds, "cases_list": [o.as_dict() for o in outcomes]})
+    frame.write_json(folder / "summary.json", {**total, **seconds, "cases_list": [o.as_dict() for o in outcomes]})
     for o in outcomes:
         if not o.ok:
             log.warning("%s, %s: %s (%s)", o.label, o.moment, ", ".join(o.wrong), o.outcome)
     log.info("%s", ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in {**total, **seconds}.items()))
     log.info("table %s, cases %s", folder / "table.md", folder / "cases.csv")
     if total["not_as_declared"]:
-        raise app.UserError(f"{total['not_as_declared']} of {len(outcomes)} cases did not go as declared; see the log")
+        raise frame.UserError(
+            f"{total['not_as_declared']} of {len(outcomes)} cases did not go as declared; see the log"
+        )
 
 
 def main() -> None:
     """Entry point."""
-    app.run("fault_matrix", FaultMatrixConfig(), fault_matrix)
+    frame.run("fault_matrix", FaultMatrixConfig(), fault_matrix)
 
 
 if __name__ == "__main__":

@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from experiments import app
-from experiments.fault_case import audit_doses
-from hardware.emulator_bench import Dose
-from hardware.emulator_process import EmulatorProcess
-from hardware.journal import read_journal
+from experiments.cli import frame
+from experiments.reliability.case import audit_doses
+from hardware.emulator.process import EmulatorProcess
+from hardware.emulator.vial import Dose
+from hardware.storage.journal import read_journal
 
 __all__ = ["Campaign", "KillConfig", "kill_campaign"]
 
@@ -277,8 +277,8 @@ class Campaign:
 
 def one_run(config: KillConfig, folder: Path, run: int) -> Findings:
     """One recording with its share of the kills."""
-    from experiments.calibrations import save
-    from experiments.rehearsal import SOUND
+    from experiments.control.rig_files import save
+    from experiments.reliability.rehearsal import SOUND
 
     for name in config.reactors:
         for part, pump in (("feed", SOUND.feed), ("waste", SOUND.waste)):
@@ -300,18 +300,18 @@ def kill_campaign(config: KillConfig, folder: Path) -> None:
     total["schedule_error_s"] = max(f.schedule_error_s for f in found)
     total |= {"pumps_off": all(f.pumps_off for f in found), "overflowed": any(f.overflowed for f in found)}
     total["wall_s"] = round(time.monotonic() - began, 1)
-    app.write_json(folder / "summary.json", {**total, "runs": [asdict(f) for f in found]})
+    frame.write_json(folder / "summary.json", {**total, "runs": [asdict(f) for f in found]})
     for f in found:
         for line in f.trouble:
             log.warning("%s", line)
     log.info("%s", ", ".join(f"{k.replace('_', ' ')} {round(v, 2)}" for k, v in total.items()))
     if not all(f.ok for f in found):
-        raise app.UserError("something was lost or doubled; see summary.json and the logs beside the runs")
+        raise frame.UserError("something was lost or doubled; see summary.json and the logs beside the runs")
 
 
 def main() -> None:
     """Entry point."""
-    app.run("kill_campaign", KillConfig(), kill_campaign)
+    frame.run("kill_campaign", KillConfig(), kill_campaign)
 
 
 if __name__ == "__main__":

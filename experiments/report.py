@@ -18,8 +18,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from experiments import app, tables
-from experiments.tables import Table, number, typeset
+from experiments.cli import frame
+from experiments.reporting import tables
+from experiments.reporting.tables import Table, number, typeset
 
 __all__ = ["Page", "ReportConfig", "inline_svg", "main", "write"]
 
@@ -221,15 +222,15 @@ def write(run: Path) -> Path:
     """Write RUN/report.html and RUN/tables/; returns the page's path.
 
     A benchmark gets a page of its own; any other run its summary and figures; a folder of runs (as `make run` leaves
-    one) a section for each. Raises: app.UserError where there is nothing to report on.
+    one) a section for each. Raises: frame.UserError where there is nothing to report on.
     """
     parts = [run] if (run / "summary.json").is_file() else sorted(p.parent for p in run.glob("*/summary.json"))
     if not parts:
-        raise app.UserError(f"run={run}: holds no summary.json; give the folder of a finished run")
+        raise frame.UserError(f"run={run}: holds no summary.json; give the folder of a finished run")
     try:
         page = _compose(run, parts)
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise app.UserError(f"run={run}: its summary.json is damaged ({error}); run it again") from None
+        raise frame.UserError(f"run={run}: its summary.json is damaged ({error}); run it again") from None
     tables.write(page.tables, run / "tables")
     target = run / "report.html"
     target.write_text(page.html(), encoding="utf-8")
@@ -238,9 +239,9 @@ def write(run: Path) -> Path:
 
 def _compose(run: Path, parts: Sequence[Path]) -> Page:
     if parts == [run] and "beside_paper" in json.loads((run / "summary.json").read_text(encoding="utf-8")):
-        from experiments import report_benchmark
+        from experiments.comparison import page as benchmark_page
 
-        return report_benchmark.page(run)
+        return benchmark_page.page(run)
     name = run.resolve()
     page = Page(f"{name.parent.name}, {name.name}", f"{PACKAGE} {_version()}")
     for part in parts:
@@ -253,14 +254,14 @@ def _compose(run: Path, parts: Sequence[Path]) -> Page:
 
 
 def find(name: str, root: Path = Path("runs")) -> Path:
-    """A run folder from its path or `latest`. Raises: app.UserError naming what to give."""
+    """A run folder from its path or `latest`. Raises: frame.UserError naming what to give."""
     if name != "latest":
         if not Path(name).is_dir():
-            raise app.UserError(f"run={name}: no such folder; give the folder of a finished run")
+            raise frame.UserError(f"run={name}: no such folder; give the folder of a finished run")
         return Path(name)
     found = sorted(root.glob("*/*/summary.json"), key=lambda p: p.stat().st_mtime)
     if not found:
-        raise app.UserError(f"run=latest: no finished run under {root}; give run=FOLDER")
+        raise frame.UserError(f"run=latest: no finished run under {root}; give run=FOLDER")
     return found[-1].parent
 
 
@@ -271,7 +272,7 @@ def report(config: ReportConfig, folder: Path) -> None:
 
 def main() -> None:
     """Entry point."""
-    app.run("report", ReportConfig(), report)
+    frame.run("report", ReportConfig(), report)
 
 
 if __name__ == "__main__":

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from envs.setpoints import Schedule
-from experiments import app
-from experiments.fault_case import audit_doses, audit_rows
-from experiments.rehearsal import Rehearsal
-from hardware.emulator_bench import Dose, Sample
-from hardware.journal import read_journal
-from hardware.safety_config import SafetyConfig
-from hardware.wire import POSITIONS
+from envs.scenario import Schedule
+from experiments.cli import frame
+from experiments.reliability.case import audit_doses, audit_rows
+from experiments.reliability.rehearsal import Rehearsal
+from hardware.chibio.protocol import POSITIONS
+from hardware.emulator.vial import Dose, Sample
+from hardware.safety.config import SafetyConfig
+from hardware.storage.journal import read_journal
 
 __all__ = ["Day", "SoakConfig", "soak", "soak_run"]
 
@@ -207,7 +207,7 @@ def soak(config: SoakConfig, folder: Path) -> None:
     growth = {key: round(_growth(days, key), 2) for key in ("memory_mb", "journal_mb", "csv_mb", "events_mb")}
     wall = round(time.monotonic() - began, 1)
     summary = {**found, "growth_per_day": growth, "wall_s": wall, "days": [asdict(d) for d in days]}
-    app.write_json(folder / "summary.json", summary)
+    frame.write_json(folder / "summary.json", summary)
     head = list(asdict(days[0]))
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     lines += ["| " + " | ".join(str(v) for v in asdict(d).values()) + " |" for d in days]
@@ -226,12 +226,12 @@ def soak(config: SoakConfig, folder: Path) -> None:
         "pumps not off": not found["pumps_off"],
     }
     if any(bad.values()):
-        raise app.UserError("; ".join(name for name, is_bad in bad.items() if is_bad))
+        raise frame.UserError("; ".join(name for name, is_bad in bad.items() if is_bad))
 
 
 def main() -> None:
     """Entry point."""
-    app.run("soak", SoakConfig(), soak)
+    frame.run("soak", SoakConfig(), soak)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from experiments import app, speed_learning
-from experiments.measurement import Measurement, measure
+from experiments.cli import frame
+from experiments.timing import learning
+from experiments.timing.measurement import Measurement, measure
 
 __all__ = ["GROUPS", "SpeedConfig", "main"]
 
@@ -47,16 +48,16 @@ def controllers() -> Iterator[Measurement]:
     """Closed loops of 90 min on `nominal_noise`: 64 vials as a batch beside the same 64 one after another."""
     import numpy as np
 
-    from envs.plant import Plant, PlantConfig
-    from envs.setpoints import Schedule
+    from envs.plant.plant import Plant, PlantConfig
+    from envs.scenario import Schedule
     from envs.task import EnvConfig
-    from experiments import build
-    from experiments.config import controller_config
+    from experiments.comparison.trials import run_trial
+    from experiments.control.config import controller_config
     from experiments.controllers.base import Controller
-    from experiments.trials import run_trial
+    from experiments.training import build
 
     model = EnvConfig()
-    plant = app.load(app.compose("plant/nominal_noise", []).plant, PlantConfig())
+    plant = frame.load(frame.compose("plant/nominal_noise", []).plant, PlantConfig())
     schedule = Schedule((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), recovery_od=0.8)
     policy = _untrained_policy(model)
 
@@ -148,10 +149,10 @@ def mpc() -> Iterator[Measurement]:
 
 
 GROUPS: dict[str, Callable[[], Iterator[Measurement]]] = {
-    "training": speed_learning.training,
-    "update": speed_learning.update,
-    "environment": speed_learning.environment,
-    "start_up": speed_learning.start_up,
+    "training": learning.training,
+    "update": learning.update,
+    "environment": learning.environment,
+    "start_up": learning.start_up,
     "controllers": controllers,
     "mpc": mpc,
 }
@@ -163,7 +164,8 @@ def speed(config: SpeedConfig, folder: Path) -> None:
     from tqdm import tqdm
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    from experiments import report, tables
+    from experiments import report
+    from experiments.reporting import tables
 
     found = []
     with logging_redirect_tqdm():
@@ -172,19 +174,19 @@ def speed(config: SpeedConfig, folder: Path) -> None:
             log.info("%s: %.4g %s; %s: %.4g; ratio %.3g", m.name, found[-1]["ours"], m.unit, m.rival,
                      found[-1]["theirs"], found[-1]["ratio"])  # fmt: skip
     if config.scaling:
-        from experiments import charts
+        from experiments.reporting import charts
 
         log.info("scaling of updates, environment and training")
-        charts.save(charts.scaling(speed_learning.scaling(config.runs)), folder / "figures", "scaling")
+        charts.save(charts.scaling(learning.scaling(config.runs)), folder / "figures", "scaling")
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
-    app.write_json(folder / "summary.json", {"machine": machine, "measurements": found})
+    frame.write_json(folder / "summary.json", {"machine": machine, "measurements": found})
     tables.write([table(found, config.runs, machine)], folder / "tables")
     log.info("report %s", report.write(folder))
 
 
 def table(found: list[dict[str, Any]], runs: int, machine: str) -> Any:
     """The measurements as a table."""
-    from experiments.tables import Table, number
+    from experiments.reporting.tables import Table, number
 
     rows = tuple(
         (
@@ -201,7 +203,7 @@ def table(found: list[dict[str, Any]], runs: int, machine: str) -> Any:
 
 def main() -> None:
     """Entry point."""
-    app.run("speed", SpeedConfig(), speed)
+    frame.run("speed", SpeedConfig(), speed)
 
 
 if __name__ == "__main__":

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig, OmegaConf
 
 from envs.task import EnvConfig
-from experiments import app
-from experiments.config import TrainConfig
+from experiments.cli import frame
+from experiments.control.config import TrainConfig
 
 if TYPE_CHECKING:
-    from experiments.evaluation import Score
-    from experiments.session import Session
+    from experiments.training.evaluation import Score
+    from experiments.training.session import Session
 
 log = logging.getLogger(__name__)
 
@@ -28,15 +28,15 @@ def read_env_file(path: str) -> EnvConfig:
     try:
         content = OmegaConf.load(path)
     except OSError as error:
-        raise app.UserError(f"env_file={path}: {error.strerror}; {remedy}") from None
+        raise frame.UserError(f"env_file={path}: {error.strerror}; {remedy}") from None
     except Exception as error:  # whatever PyYAML's parser meets, and text that is no UTF-8
-        raise app.UserError(f"env_file={path}: not YAML ({str(error).splitlines()[0]}); {remedy}") from None
+        raise frame.UserError(f"env_file={path}: not YAML ({str(error).splitlines()[0]}); {remedy}") from None
     if not isinstance(content, DictConfig):
-        raise app.UserError(f"env_file={path}: holds no key: value pairs; {remedy}")
+        raise frame.UserError(f"env_file={path}: holds no key: value pairs; {remedy}")
     try:
-        return app.load(content, EnvConfig())
-    except app.UserError as error:
-        raise app.UserError(f"env_file={path}: {error}") from None
+        return frame.load(content, EnvConfig())
+    except frame.UserError as error:
+        raise frame.UserError(f"env_file={path}: {error}") from None
 
 
 def _fingerprint(config: TrainConfig) -> str:
@@ -77,8 +77,8 @@ def _figures(session: Session, policy_path: Path) -> None:
 
     from dqn import policy
     from envs.optimum import solve
-    from experiments import charts
-    from experiments.evaluation import rollout
+    from experiments.reporting import charts
+    from experiments.training.evaluation import rollout
 
     env, gamma, best = session.config.env, session.config.agent.gamma, session.best
     rates, factors = env.pump_rates(), session.selection.factors
@@ -118,8 +118,8 @@ def _finish(session: Session) -> None:
     """Score on the reported grid, export, draw, write summary.json."""
     import numpy as np
 
-    from experiments import build
-    from experiments.evaluation import Evaluation, report_grid
+    from experiments.training import build
+    from experiments.training.evaluation import Evaluation, report_grid
 
     c, agents, best = session.config, session.agents, session.best
     report = Evaluation(c.env, c.agent.gamma, report_grid(c.env))
@@ -143,7 +143,7 @@ def _finish(session: Session) -> None:
         "policy_seed": session.seeds[int(best.merit.argmin())],
         "config_hash": _fingerprint(c),
     }
-    app.write_json(session.folder / "summary.json", summary)
+    frame.write_json(session.folder / "summary.json", summary)
     numbers = {
         k: v for k, v in {**asdict(c.agent), "mu": c.env.mu, "tau": c.env.tau}.items() if isinstance(v, int | float)
     }
@@ -160,20 +160,20 @@ def train(config: TrainConfig, folder: Path) -> float:
     """Train, export and report; returns the median regret, the objective of a sweep."""
     if config.env_file is not None:
         config = replace(config, env=read_env_file(config.env_file), env_file=None)
-        app.save_config(config, folder)
+        frame.save_config(config, folder)
 
     import torch
 
     from dqn.checkpoint import CheckpointError
-    from experiments.session import Session
+    from experiments.training.session import Session
 
     if config.device == "cuda" and not torch.cuda.is_available():
-        raise app.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
+        raise frame.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
     torch.set_num_threads(1)  # of one operation: matrices of this size do not gain from more
     try:
         session = Session(config, folder, resume=config.resume is not None)
     except CheckpointError as error:
-        raise app.UserError(f"resume={config.resume}: {error}") from None
+        raise frame.UserError(f"resume={config.resume}: {error}") from None
     try:
         session.run()
         _finish(session)
@@ -186,7 +186,7 @@ def train(config: TrainConfig, folder: Path) -> float:
 
 def main() -> None:
     """Entry point."""
-    app.run("train", TrainConfig(), train)
+    frame.run("train", TrainConfig(), train)
 
 
 if __name__ == "__main__":

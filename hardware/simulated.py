@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envs.plant import Plant
+from envs.plant.plant import Plant
 from hardware.clock import Clock, VirtualClock
 from hardware.reactor import Array, Command, Mask, Measurement, Receipt
 

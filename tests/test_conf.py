@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from experiments import app
-from experiments.config import TrainConfig, deploy_schema
+from experiments.cli import frame
+from experiments.control.config import TrainConfig, deploy_schema
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -16,12 +16,12 @@ def options(group: str) -> list[str]:
 
 
 def load_train(*overrides: str) -> TrainConfig:
-    return app.load(app.compose("train", overrides), TrainConfig())
+    return frame.load(frame.compose("train", overrides), TrainConfig())
 
 
 def load_deploy(*overrides: str):
-    cfg = app.compose("deploy", overrides)
-    return app.load(cfg, deploy_schema(cfg.backend.kind))
+    cfg = frame.compose("deploy", overrides)
+    return frame.load(cfg, deploy_schema(cfg.backend.kind))
 
 
 @pytest.mark.parametrize("form", [[], ["+env=sim"], ["env=sim"]])
@@ -63,7 +63,7 @@ def test_the_overflow_guard_of_the_device_is_off_and_its_values_are_checked():
     assert load_deploy("backend=chibio").backend.guard.pump == ""
     assert load_deploy("backend=emulator", "backend.guard.pump=Pump4").backend.guard.pump == "Pump4"
     for override in ("pump=Pump2", "duty=1.0", "duty=much", "tube=22"):
-        with pytest.raises(app.UserError, match=rf"guard\.{override.split('=')[0]}"):
+        with pytest.raises(frame.UserError, match=rf"guard\.{override.split('=')[0]}"):
             load_deploy("backend=chibio", f"backend.guard.{override}")
 
 
@@ -75,7 +75,7 @@ def test_the_papers_schedule():
 
 def test_yaml_and_dataclass_defaults_are_the_same():
     """A value stands in YAML with its source; the dataclass must not quietly hold another."""
-    shown = OmegaConf.to_container(app.compose("train", []), resolve=True)
+    shown = OmegaConf.to_container(frame.compose("train", []), resolve=True)
     default = OmegaConf.to_container(OmegaConf.create(OmegaConf.to_container(OmegaConf.structured(TrainConfig()))))
     shown.pop("agent")  # a choice of the defaults list
     default.pop("agent")
@@ -105,7 +105,7 @@ def test_yaml_and_dataclass_defaults_are_the_same():
     ],
 )
 def test_a_wrong_override_is_one_line_with_key_value_and_what_is_allowed(override, parts):
-    with pytest.raises(app.UserError) as caught:
+    with pytest.raises(frame.UserError) as caught:
         load_train(override)
     message = str(caught.value)
     assert "\n" not in message

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envs.randomization import check_ranges
+from envs.plant.noise import check_ranges
 from envs.task import EnvConfig
 from experiments.controllers.base import Array, Mask, usable
 

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from envs.optimum import OptimalPolicy, solve
-from envs.plant import Plant
+from envs.plant.plant import Plant
 from envs.task import EnvConfig
 from experiments.controllers.base import Array, Mask
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from envs.calibration import Calibration, IdentifyConfig, calibrate
 from envs.growth import Culture, Exponential
-from envs.identification import NotIdentifiable, _sum_variance, fit, pmse, trajectory
+from envs.identification.fit import NotIdentifiable, _sum_variance, fit, pmse, trajectory
+from envs.identification.open_loop import OpenLoop, open_loop
+from envs.identification.screening import Series, noise_sd, pumped_volume, screen
+from envs.identification.window import Calibration, IdentifyConfig, calibrate
 from envs.integrators import rk4
-from envs.open_loop import OpenLoop, open_loop
-from envs.screening import Series, noise_sd, pumped_volume, screen
-from hardware.recording import read_recording
+from hardware.storage.recorder import read_recording
 from tests.real_recording import DITHER, needs_dither
 
 

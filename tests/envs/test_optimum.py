@@ -5,7 +5,7 @@ import pytest
 
 from envs.optimum import solve
 from envs.task import EnvConfig, step_factors
-from experiments.evaluation import Evaluation, report_grid
+from experiments.training.evaluation import Evaluation, report_grid
 
 
 @pytest.fixture(scope="module")

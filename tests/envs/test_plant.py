@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from envs.growth import Culture, Exponential
 from envs.integrators import euler
-from envs.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig, ThermalConfig, VesselConfig
-from experiments import app
+from envs.plant.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig, ThermalConfig, VesselConfig
+from experiments.cli import frame
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ PULSE = PumpConfig(dosing="pulse")
 
 
 def preset(name: str) -> PlantConfig:
-    return app.load(app.compose(f"plant/{name}", []).plant, PlantConfig())
+    return frame.load(frame.compose(f"plant/{name}", []).plant, PlantConfig())
 
 
 def plant(config: PlantConfig, n: int = 1, seed: int = 0) -> Plant:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from envs.sensors import OdSensor, SensorConfig, counts_from_od, od_from_counts
+from envs.plant.sensor import OdSensor, SensorConfig, counts_from_od, od_from_counts
 
 Array = NDArray[np.float64]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from envs.setpoints import Schedule
+from envs.scenario import Schedule
 
 STEPS = Schedule((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 30.0), recovery_od=0.8)
 

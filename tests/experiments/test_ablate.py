@@ -15,8 +15,8 @@ import pytest
 from hydra import compose, initialize_config_module
 
 from dqn.config import DQNConfig
-from experiments import app
 from experiments.ablate import AblateConfig, Row, summarise, variant
+from experiments.cli import frame
 
 ROOT = Path(__file__).parents[2]
 SHORT = ["agent.total_steps=300", "agent.learn_start=100", "agent.epsilon_steps=100", "eval_every=300", "n_agents=2"]
@@ -82,15 +82,15 @@ def test_mistakes_are_one_line(override: str, message: str) -> None:
 
 def test_every_shipped_variant_differs_from_the_agent_it_starts_from() -> None:
     with initialize_config_module("conf", version_base="1.3"):
-        config = app.load(compose("ablate", return_hydra_config=False), AblateConfig())
+        config = frame.load(compose("ablate", return_hydra_config=False), AblateConfig())
     for name, values in config.ablations.items():
         assert (_plain(config.training(name).agent) != _plain(config.agent)) == bool(values), name
 
 
 def test_the_variant_paper_is_the_agent_paper() -> None:
     with initialize_config_module("conf", version_base="1.3"):
-        config = app.load(compose("ablate"), AblateConfig())
-        paper = app.load(compose("ablate", overrides=["agent=paper"]), AblateConfig(ablations={"paper": {}}))
+        config = frame.load(compose("ablate"), AblateConfig())
+        paper = frame.load(compose("ablate", overrides=["agent=paper"]), AblateConfig(ablations={"paper": {}}))
     assert _plain(config.training("paper").agent) == _plain(paper.agent)
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import app
 from experiments.blank import BlankConfig, blank
 from experiments.calibrate_pump import CalibratePumpConfig, Series, calibrate, report, weigh
-from experiments.calibrations import load_rigs, save
-from hardware.chibio_config import ChiBioConfig
-from hardware.emulator_process import EmulatorProcess
-from hardware.pumps import fit_pump
-from hardware.wire import PERIOD_S
+from experiments.cli import frame
+from experiments.control.rig_files import load_rigs, save
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.dosing import fit_pump
+from hardware.chibio.protocol import PERIOD_S
+from hardware.emulator.process import EmulatorProcess
 
 ROOT = Path(__file__).parents[2]
 
@@ -92,7 +92,7 @@ def test_a_file_of_nonsense_ends_in_one_line(tmp_path: Path, content: str, words
     path = tmp_path / "w.csv"
     path.write_text(content)
     config = CalibratePumpConfig(ChiBioConfig(calibration=str(tmp_path / "c")), csv=str(path))
-    with pytest.raises(app.UserError, match=words):
+    with pytest.raises(frame.UserError, match=words):
         calibrate(config, tmp_path)
     assert not (tmp_path / "c").exists()
 
@@ -146,7 +146,7 @@ def test_the_blank_of_clear_medium_is_found_stored_and_restored(tmp_path: Path) 
 def test_a_culture_is_no_blank(tmp_path: Path) -> None:
     with EmulatorProcess(["--speed", "100", "--od", "2.5", "--unblanked"]) as emulator:
         backend = ChiBioConfig(url=emulator.url, speed=100.0, calibration=str(tmp_path))
-        with pytest.raises(app.UserError, match="allowed 3000 to 60000"):
+        with pytest.raises(frame.UserError, match="allowed 3000 to 60000"):
             blank(BlankConfig(backend, samples=3), tmp_path)
 
 
@@ -161,7 +161,7 @@ def test_a_culture_is_no_blank(tmp_path: Path) -> None:
 )
 def test_a_broken_calibration_file_is_named(tmp_path: Path, content: str, words: str) -> None:
     (tmp_path / "M0_feed.yaml").write_text(content)
-    with pytest.raises(app.UserError, match=words):
+    with pytest.raises(frame.UserError, match=words):
         load_rigs(tmp_path, ["M0"])
 
 
@@ -169,7 +169,7 @@ def test_what_was_stored_is_loaded(tmp_path: Path) -> None:
     save(tmp_path, "M3", "blank", {"blank": 13000.0})
     assert load_rigs(tmp_path, ["M3"])[0].blank == 13000.0
     save(tmp_path, "M3", "blank", {"blank": 13.0})
-    with pytest.raises(app.UserError, match="blank = 13"):
+    with pytest.raises(frame.UserError, match="blank = 13"):
         load_rigs(tmp_path, ["M3"])
 
 

@@ -15,12 +15,14 @@ import pytest
 from scipy import stats
 
 from dqn import policy as policies
-from envs.setpoints import Schedule
-from experiments import app, build, comparison
+from envs.scenario import Schedule
 from experiments.benchmark import _schema, cells
-from experiments.config_benchmark import BenchmarkConfig
-from experiments.published import TABLE_2
-from experiments.trials import Trial, Window, run_trial, windows
+from experiments.cli import frame
+from experiments.comparison import statistics as comparison
+from experiments.comparison.config import BenchmarkConfig
+from experiments.comparison.published import TABLE_2
+from experiments.comparison.trials import Trial, Window, run_trial, windows
+from experiments.training import build
 from tests.experiments.test_deploy import inverse_policy
 
 ROOT = Path(__file__).parents[2]
@@ -33,8 +35,8 @@ ROW_KEYS = {
 
 
 def load(*overrides: str) -> BenchmarkConfig:
-    cfg = app.compose("benchmark", overrides)
-    return app.load(cfg, _schema(cfg))
+    cfg = frame.compose("benchmark", overrides)
+    return frame.load(cfg, _schema(cfg))
 
 
 @cache
@@ -251,7 +253,7 @@ def test_published_table_is_complete():
     ],
 )
 def test_a_wrong_override_is_one_line(overrides, parts):
-    with pytest.raises((app.UserError, ValueError)) as caught:
+    with pytest.raises((frame.UserError, ValueError)) as caught:
         load(*overrides)
     message = str(caught.value)
     assert "\n" not in message

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from envs.calibration import calibrate
-from envs.open_loop import OpenLoop, open_loop
-from envs.screening import Series
-from experiments import app
+from envs.identification.open_loop import OpenLoop, open_loop
+from envs.identification.screening import Series
+from envs.identification.window import calibrate
 from experiments.calibrate import CalibrateConfig, environment_yaml
-from hardware.recording import read_recording
+from experiments.cli import frame
+from hardware.storage.recorder import read_recording
 from tests.real_recording import DITHER, needs_dither
 
 ROOT = Path(__file__).parents[2]
@@ -202,12 +202,12 @@ def test_help_documents_the_generator(cli: Cli) -> None:
     ],
 )
 def test_wrong_values_name_key_value_and_range(override: str, message: str) -> None:
-    with pytest.raises(app.UserError, match=message.replace("+", r"\+").replace(".", r"\.")):
-        app.load(app.compose("calibrate", [override]), CalibrateConfig())
+    with pytest.raises(frame.UserError, match=message.replace("+", r"\+").replace(".", r"\.")):
+        frame.load(frame.compose("calibrate", [override]), CalibrateConfig())
 
 
 def test_yaml_and_dataclass_hold_the_same_defaults() -> None:
-    loaded = asdict(app.load(app.compose("calibrate", []), CalibrateConfig()))
+    loaded = asdict(frame.load(frame.compose("calibrate", []), CalibrateConfig()))
     loaded["protocol"]["keep_od"] = tuple(loaded["protocol"]["keep_od"])  # YAML knows lists only
     assert loaded == asdict(CalibrateConfig())
 

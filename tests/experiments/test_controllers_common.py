@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from envs.task import EnvConfig
-from experiments import app
+from experiments.cli import frame
 from experiments.controllers.base import Controller, Explains
 from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
 from experiments.controllers.inverse import Inverse, InverseConfig
@@ -100,8 +100,8 @@ def test_explanations_have_one_row_per_reactor(name: str) -> None:
 @pytest.mark.parametrize("name", CONFIGS)
 def test_the_conf_file_holds_the_defaults(name: str) -> None:
     default = CONFIGS[name]
-    assert app.load(app.compose(f"controller/{name}", []).controller, default) == default
-    assert set(app.compose(f"controller/{name}", []).controller) == set(asdict(default))
+    assert frame.load(frame.compose(f"controller/{name}", []).controller, default) == default
+    assert set(frame.compose(f"controller/{name}", []).controller) == set(asdict(default))
 
 
 def test_threshold_and_hold_by_hand() -> None:

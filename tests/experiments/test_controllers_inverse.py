@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from envs.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig
+from envs.plant.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig
 from envs.task import EnvConfig
 from experiments.controllers.inverse import Inverse, InverseConfig
 

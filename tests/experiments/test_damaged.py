@@ -12,14 +12,14 @@ from typing import Any
 import pytest
 
 from dqn import policy
-from envs.setpoints import Schedule
-from experiments import app
-from experiments.app import UserError, save_config
-from experiments.config import DeployConfig
+from envs.scenario import Schedule
+from experiments.cli import frame
+from experiments.cli.frame import UserError, save_config
+from experiments.control.config import DeployConfig
+from experiments.control.record import Record
 from experiments.deploy import _schema, load_policy
-from experiments.record import Record
-from experiments.rehearsal import Rehearsal
-from hardware.emulator_process import EmulatorProcess
+from experiments.reliability.rehearsal import Rehearsal
+from hardware.emulator.process import EmulatorProcess
 from hardware.errors import RecordingError
 from tests.experiments.test_deploy import ENVIRONMENT, inverse_policy
 
@@ -181,7 +181,7 @@ def test_a_config_that_was_damaged(tmp_path: Path, content: bytes, why: str) -> 
     path = tmp_path / "config.yaml"
     path.write_bytes(content)
     with pytest.raises(UserError) as caught:
-        app._stored(path, "RUN", _schema)
+        frame._stored(path, "RUN", _schema)
     assert f"{path}: not the config of this run (" in str(caught.value)
     assert why in str(caught.value)
     assert str(caught.value).endswith("put it back as the run wrote it, or start a new run")
@@ -191,7 +191,7 @@ def test_a_config_that_was_damaged(tmp_path: Path, content: bytes, why: str) -> 
 def test_a_config_comes_back_as_it_was_stored(tmp_path: Path) -> None:
     config = DeployConfig(policy="here.npz")
     save_config(config, tmp_path)
-    loaded = app._stored(tmp_path / "config.yaml", "RUN", _schema)
+    loaded = frame._stored(tmp_path / "config.yaml", "RUN", _schema)
     assert (loaded.policy, loaded.resume) == ("here.npz", "RUN")
 
 

@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 
 from dqn import policy
-from envs.plant import Plant, PlantConfig, SensorConfig
-from envs.setpoints import Schedule
+from envs.plant.plant import Plant, PlantConfig, SensorConfig
+from envs.scenario import Schedule
 from envs.task import EnvConfig, step_factors
-from experiments.config import DeployConfig
+from experiments.control.config import DeployConfig
+from experiments.control.loop import ClosedLoop
 from experiments.controllers.learned import LearnedController
 from experiments.deploy import Announcer, policy_of
-from experiments.loop import ClosedLoop
+from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError
-from hardware.recording import read_recording
-from hardware.safety import Interlock
-from hardware.safety_config import Responses, SafetyConfig
-from hardware.saved import replay
+from hardware.safety.config import Responses, SafetyConfig
+from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
+from hardware.storage.recorder import read_recording
 from tests.hardware.driver_lab import Bed
 
 ROOT = Path(__file__).parents[2]

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from hardware.emulator_process import EmulatorProcess
-from hardware.journal import read_journal
+from hardware.emulator.process import EmulatorProcess
+from hardware.storage.journal import read_journal
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from envs.setpoints import Schedule
-from experiments import app
-from experiments.fault_case import Case, Outcome, audit_doses
+from envs.scenario import Schedule
+from experiments.cli import frame
 from experiments.fault_matrix import FaultMatrixConfig, all_cases, declared, table, totals
-from experiments.faults import FAULTS, Fault, both, by_name, post, run_device, set_
-from experiments.rehearsal import Rehearsal
-from hardware.emulator_bench import Dose
-from hardware.guard import GuardConfig
-from hardware.safety_config import SafetyConfig
+from experiments.reliability.case import Case, Outcome, audit_doses
+from experiments.reliability.faults import FAULTS, Fault, both, by_name, post, run_device, set_
+from experiments.reliability.rehearsal import Rehearsal
+from hardware.chibio.overflow_guard import GuardConfig
+from hardware.emulator.vial import Dose
+from hardware.safety.config import SafetyConfig
 
 ROOT = Path(__file__).parents[2]
 SCHEDULE = Schedule((0.6, 0.5), (20.0, 20.0), (37.0, 37.0), 0.6)
@@ -207,5 +207,5 @@ def test_the_command(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("override", ["moments=[noon]", "reactors=[M1]", "controller_kind=dqn", "faults=[nonsense]"])
 def test_bad_values_are_named(override: str) -> None:
-    with pytest.raises(app.UserError, match="allowed|nonsense"):
-        app.load(app.compose("fault_matrix", [override]), FaultMatrixConfig())
+    with pytest.raises(frame.UserError, match="allowed|nonsense"):
+        frame.load(frame.compose("fault_matrix", [override]), FaultMatrixConfig())

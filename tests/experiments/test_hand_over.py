@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envs.setpoints import Schedule
+from envs.scenario import Schedule
 from experiments.controllers.base import Array, Controller, Mask
-from experiments.rehearsal import Killed, Rehearsal
-from hardware.emulator_faults import inject
-from hardware.emulator_process import EmulatorProcess
+from experiments.reliability.rehearsal import Killed, Rehearsal
+from hardware.emulator.faults import inject
+from hardware.emulator.process import EmulatorProcess
 from hardware.errors import DeviceStateError
-from hardware.journal import read_journal
-from hardware.safety import Response
+from hardware.safety.interlock import Response
+from hardware.storage.journal import read_journal
 from tests.experiments.test_exits import SPEED, Bench
 
 LOST = """

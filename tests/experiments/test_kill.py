@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments import app
+from experiments.cli import frame
 from experiments.kill_campaign import KillConfig, kill_campaign
-from hardware.journal import read_journal
+from hardware.storage.journal import read_journal
 
 
 def test_killed_six_times_nothing_is_lost_or_doubled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,5 +34,5 @@ def test_killed_six_times_nothing_is_lost_or_doubled(tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize("override", ["kills=0", "runs=300", "speed=0", "early=2"])
 def test_bad_values_are_named(override: str) -> None:
-    with pytest.raises(app.UserError, match=f"{override.split('=')[0]} = .*allowed"):
-        app.load(app.compose("kill_campaign", [override]), KillConfig())
+    with pytest.raises(frame.UserError, match=f"{override.split('=')[0]} = .*allowed"):
+        frame.load(frame.compose("kill_campaign", [override]), KillConfig())

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.record import COLUMNS, Record
+from experiments.control.record import COLUMNS, Record
 from hardware.errors import RecordingError
 
 

@@ -17,9 +17,12 @@ import pytest
 from matplotlib.image import imread
 
 from dqn import policy as policies
-from experiments import app, charts, report, report_benchmark
-from experiments.published import TABLE_2
-from experiments.tables import Best, Table, number, plus_minus, typeset
+from experiments import report
+from experiments.cli import frame
+from experiments.comparison import page
+from experiments.comparison.published import TABLE_2
+from experiments.reporting import charts
+from experiments.reporting.tables import Best, Table, number, plus_minus, typeset
 from tests.experiments.test_deploy import inverse_policy
 
 ROOT = Path(__file__).parents[2]
@@ -138,17 +141,17 @@ def test_every_lost_cell_is_said_and_no_other():
     rows = [row("dqn", 2.0), row("pi", 1.0), row("mpc", 1.5), row("dqn", 1.0, "0.5"), row("pi", 3.0, "0.5")]
     pair = {"controller": "pi", "against": "dqn", "plant": "p", "scenario": "setpoint_steps", "window": "0.8",
             "metric": "ise", "difference": -1.0, "ci95": [-2.5, 0.5], "verdict": "no difference shown"}  # fmt: skip
-    said = report_benchmark.losses(rows, [pair])
+    said = page.losses(rows, [pair])
     assert len(said) == 4
     assert said[0] == "OD 0.8, ISE: dqn 2 loses to pi 1; pi minus dqn: -1, 95 % -2.5 to 0.5, which holds 0."
     assert said[1] == "OD 0.8, ISE: dqn 2 loses to mpc 1.5."
     assert all(s.startswith("OD 0.8, ITAE") for s in said[2:])
-    assert report_benchmark.losses([row("dqn", 1.0), row("pi", 2.0)], []) == []
+    assert page.losses([row("dqn", 1.0), row("pi", 2.0)], []) == []
 
 
 def test_published_losses_are_the_papers():
     """The PI beats the published DQN in three of the four temperature numbers, the MPC in the other (Table 2)."""
-    said = report_benchmark.published_losses()
+    said = page.published_losses()
     assert [s for s in said if "°C" in s] == ["37 °C ISE (mpc)", "30 °C ISE (pi)", "37 °C ITAE (pi)", "30 °C ITAE (pi)"]
     assert "OD 0.5 ISE" not in " ".join(said)
     assert "OD 0.5 ITAE" not in " ".join(said)
@@ -174,7 +177,7 @@ def test_a_table_escapes_what_each_format_reads_as_its_own():
 
 def run_folder(folder: Path, summary: dict) -> Path:
     folder.mkdir(parents=True)
-    app.write_json(folder / "summary.json", summary)
+    frame.write_json(folder / "summary.json", summary)
     (folder / "config.yaml").write_text("seed: 7\nenv:\n  mu: 0.03 # <1/min>\n")
     return folder
 
@@ -219,17 +222,17 @@ def test_what_is_no_run_ends_in_one_line(content, message, tmp_path):
     if content is not None:
         data = content.encode() if isinstance(content, str) else content
         (tmp_path / "summary.json").write_bytes(data)
-    with pytest.raises(app.UserError, match=message):
+    with pytest.raises(frame.UserError, match=message):
         report.write(tmp_path)
 
 
 def test_latest_is_the_newest_run(tmp_path):
-    with pytest.raises(app.UserError, match="no finished run"):
+    with pytest.raises(frame.UserError, match="no finished run"):
         report.find("latest", tmp_path)
     old, new = (run_folder(tmp_path / "train" / name, {}) for name in ("z", "a"))
     os.utime(old / "summary.json", (1, 1))
     assert report.find("latest", tmp_path) == new
-    with pytest.raises(app.UserError, match="no such folder"):
+    with pytest.raises(frame.UserError, match="no such folder"):
         report.find(str(tmp_path / "nowhere"))
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments import app
+from experiments.cli import frame
 from experiments.soak import Day, SoakConfig, soak, soak_run
-from hardware.recording import read_recording
+from hardware.storage.recorder import read_recording
 
 
 def test_hours_of_two_reactors(tmp_path: Path) -> None:
@@ -39,5 +39,5 @@ def test_memory_is_flat_over_two_days(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("override", ["reactors=9", "days=0", "phase_min=1"])
 def test_bad_values_are_named(override: str) -> None:
-    with pytest.raises(app.UserError, match=f"{override.split('=')[0]} = .*allowed"):
-        app.load(app.compose("soak", [override]), SoakConfig())
+    with pytest.raises(frame.UserError, match=f"{override.split('=')[0]} = .*allowed"):
+        frame.load(frame.compose("soak", [override]), SoakConfig())

@@ -5,7 +5,7 @@ from itertools import count
 
 import pytest
 
-from experiments import app
+from experiments.cli import frame
 from experiments.speed import GROUPS, Measurement, SpeedConfig, measure, table
 
 
@@ -56,7 +56,7 @@ def test_every_measurement_names_its_rival_and_does_its_work():
     [("groups=[nothing]", ["groups = nothing", "controllers"]), ("runs=2", ["runs = 2", "5 to 1000"])],
 )
 def test_a_wrong_override_is_one_line(override, parts):
-    with pytest.raises(app.UserError) as caught:
-        app.load(app.compose("speed", [override]), SpeedConfig())
+    with pytest.raises(frame.UserError) as caught:
+        frame.load(frame.compose("speed", [override]), SpeedConfig())
     assert all(part in str(caught.value) for part in parts)
     assert "\n" not in str(caught.value)

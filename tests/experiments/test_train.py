@@ -15,10 +15,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from dqn import checkpoint, policy
 from envs.task import EnvConfig
-from experiments import build
-from experiments.config import TrainConfig
-from experiments.evaluation import Evaluation, report_grid, selection_grid
-from experiments.session import Session
+from experiments.control.config import TrainConfig
+from experiments.training import build
+from experiments.training.evaluation import Evaluation, report_grid, selection_grid
+from experiments.training.session import Session
 
 SHORT = [
     "agent.total_steps=1000",

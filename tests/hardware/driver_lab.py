@@ -5,17 +5,17 @@ from typing import Any
 
 import numpy as np
 
-from hardware.chibio import ChiBioReactors
-from hardware.chibio_config import ChiBioConfig
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.dosing import PumpCalibration, Rig
+from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import VirtualClock
-from hardware.emulator_device import ChiBioDevice, DeviceOptions
-from hardware.emulator_faults import inject
-from hardware.emulator_transport import EmulatorTransport
-from hardware.pumps import PumpCalibration, Rig
+from hardware.emulator.device import ChiBioDevice, DeviceOptions
+from hardware.emulator.faults import inject
+from hardware.emulator.transport import EmulatorTransport
+from hardware.link.transport import Reply
 from hardware.reactor import Command, Measurement
-from hardware.safety import Interlock, Verdict
-from hardware.safety_config import Response, SafetyConfig
-from hardware.transport import Reply
+from hardware.safety.config import Response, SafetyConfig
+from hardware.safety.interlock import Interlock, Verdict
 
 # what weighing the emulator's healthy pumps gives: on-time bias 0.11 s, of which 0.05 s deliver nothing
 SOUND = Rig(PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01"))

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from envs.plant import GrowthConfig, PlantConfig, PumpConfig
+from envs.plant.plant import GrowthConfig, PlantConfig, PumpConfig
 from hardware.clock import VirtualClock
-from hardware.emulator_bench import BenchConfig
-from hardware.emulator_device import ChiBioDevice, DeviceOptions
+from hardware.emulator.device import ChiBioDevice, DeviceOptions
+from hardware.emulator.vial import BenchConfig
 
 BLANK = 14000.0
 BIAS_S = 0.1  # every pump run is longer than asked by this

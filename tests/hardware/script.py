@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from hardware.clock import VirtualClock
-from hardware.emulator_device import ChiBioDevice
+from hardware.emulator.device import ChiBioDevice
 from hardware.errors import LinkError
-from hardware.transport import Reply
+from hardware.link.transport import Reply
 
 DONE = Reply(204, b"")
 

@@ -25,8 +25,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware import board_agent
-from hardware.board_agent import Agent, Device, decode_request, encode_reply, encode_request, reduce_sysdata
+from hardware.board import board_agent
+from hardware.board.board_agent import Agent, Device, decode_request, encode_reply, encode_request, reduce_sysdata
 from tests.hardware.emulator_lab import Lab
 from tests.hardware.test_emulator_server import Process
 

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hardware.chibio import ChiBioReactors
-from hardware.chibio_config import ChiBioConfig
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.dosing import Rig
+from hardware.chibio.reactors import ChiBioReactors
+from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError, RecordingError
-from hardware.pumps import Rig
 from hardware.reactor import Command
-from hardware.saved import replay
 from tests.hardware.driver_lab import SOUND, Bed
 from tests.hardware.emulator_lab import BIAS_S, START_S, quiet
 

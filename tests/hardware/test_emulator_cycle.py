@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hardware.emulator_faults import inject
-from hardware.emulator_state import append_records, fresh_sysdata, thin_records
+from hardware.emulator.faults import inject
+from hardware.emulator.sysdata import append_records, fresh_sysdata, thin_records
 from tests.hardware.emulator_lab import Lab, quiet
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hardware.emulator_faults import FAULTS, inject
-from hardware.emulator_transport import EmulatorTransport
+from hardware.emulator.faults import FAULTS, inject
+from hardware.emulator.transport import EmulatorTransport
 from hardware.errors import LinkError
 from tests.hardware.emulator_lab import Lab
 

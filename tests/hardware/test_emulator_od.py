@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hardware.emulator_bench import density
-from hardware.emulator_faults import inject
+from hardware.emulator.faults import inject
+from hardware.emulator.vial import density
 from tests.hardware.emulator_lab import BLANK, Lab, quiet
 
 A, B = 0.226, 1.833

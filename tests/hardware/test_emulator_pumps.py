@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hardware.emulator import build, parser
-from hardware.emulator_faults import inject
+from hardware.emulator.faults import inject
+from hardware.emulator.server import build, parser
 from tests.hardware.emulator_lab import BIAS_S, START_S, STOP_S, Lab, quiet
 
 PERIOD_S = 63.0 + 0.8 * START_S  # it counts from when the registers are off, four of the five writes of a start

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hardware.clock import VirtualClock
-from hardware.emulator_device import ChiBioDevice
-from hardware.emulator_faults import inject
+from hardware.emulator.device import ChiBioDevice
+from hardware.emulator.faults import inject
 from tests.hardware.emulator_lab import BLANK, Lab
 
 SAMPLE = Path(__file__).parents[2].parent / "shared" / "samples" / "chibio_sysdata.json"

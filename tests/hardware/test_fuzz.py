@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hardware.chibio import ChiBioReactors
-from hardware.chibio_config import ChiBioConfig
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import VirtualClock
-from hardware.emulator_device import ChiBioDevice
-from hardware.emulator_transport import EmulatorTransport
+from hardware.emulator.device import ChiBioDevice
+from hardware.emulator.transport import EmulatorTransport
 from hardware.errors import RecordingError
+from hardware.link.transport import Reply
 from hardware.reactor import Command
-from hardware.recording import read_recording
-from hardware.transport import Reply
+from hardware.storage.recorder import read_recording
 
 CASES = int(os.environ.get("FUZZ_CASES", "300"))
 STRANGE: tuple[Any, ...] = (None, "", "x", -1, 0, 1, 2, 1e308, float("nan"), float("inf"), True, [], {}, [[]], "M7")

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hardware.chibio_config import ChiBioConfig
-from hardware.emulator import build, parser
-from hardware.emulator_bench import BenchConfig, healthy_plant
-from hardware.emulator_device import DeviceOptions
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.protocol import parse_state
+from hardware.chibio.resume import replay
+from hardware.emulator.device import DeviceOptions
+from hardware.emulator.server import build, parser
+from hardware.emulator.vial import BenchConfig, healthy_plant
 from hardware.errors import DeviceStateError
-from hardware.guard import GuardConfig
-from hardware.saved import replay
-from hardware.wire import parse_state
 from tests.hardware.driver_lab import Bed
 from tests.hardware.script import state
 

@@ -17,16 +17,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hardware.chibio import ChiBioReactors
-from hardware.chibio_config import ChiBioConfig
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import Unit, no_log
+from hardware.chibio.dosing import Rig
+from hardware.chibio.preflight import preflight
+from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import RealClock, VirtualClock
-from hardware.emulator_process import EmulatorProcess
+from hardware.emulator.process import EmulatorProcess
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
-from hardware.preflight import preflight
-from hardware.pumps import Rig
+from hardware.link.transport import HttpTransport, Reply, TransportConfig, open_transport
 from hardware.reactor import Command
-from hardware.transport import HttpTransport, Reply, TransportConfig, open_transport
-from hardware.unit import Unit, no_log
 from tests.hardware.driver_lab import Bed
 from tests.hardware.script import answer, state
 

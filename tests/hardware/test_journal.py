@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hardware.errors import RecordingError
-from hardware.journal import Journal, read_journal
+from hardware.storage.journal import Journal, read_journal
 
 
 def test_rows_come_back_in_order_with_number_and_time(tmp_path: Path) -> None:
@@ -102,7 +102,7 @@ def test_a_full_disk_is_told_and_leaves_no_half_row(tmp_path: Path, monkeypatch:
 WRITER = """
 import sys
 from pathlib import Path
-from hardware.journal import Journal
+from hardware.storage.journal import Journal
 journal = Journal(Path(sys.argv[1]), fsync=False)
 k = 0
 while True:
@@ -138,7 +138,7 @@ def test_a_long_journal_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.Mo
     with (tmp_path / "j").open("ab") as f:
         f.write(b'{"n":500,"ki')
     whole = (tmp_path / "j").stat().st_size
-    monkeypatch.setattr("hardware.journal.TAIL", 4000)
+    monkeypatch.setattr("hardware.storage.journal.TAIL", 4000)
     again = Journal(tmp_path / "j")
     kept = [row["k"] for row in again.rows]
     assert kept[:3] == [0, 3, 250]

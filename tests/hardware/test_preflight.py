@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from hardware.guard import GuardConfig
-from hardware.preflight import Check, preflight
-from hardware.pumps import PumpCalibration, Rig
+from hardware.chibio.dosing import PumpCalibration, Rig
+from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.preflight import Check, preflight
 from tests.hardware.driver_lab import SOUND, Bed
 
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware.pumps import DosingConfig, PumpCalibration, Rig, fit_pump, plan_dose
-from hardware.wire import PERIOD_S
+from hardware.chibio.dosing import DosingConfig, PumpCalibration, Rig, fit_pump, plan_dose
+from hardware.chibio.protocol import PERIOD_S
 
 CONFIG = DosingConfig()
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from hardware.errors import RecordingError
-from hardware.recording import Recorder, read_recording
+from hardware.storage.recorder import Recorder, read_recording
 from tests.real_recording import DITHER, needs_dither
 
 COLUMNS = ("time_min", "od", "pump_rate_ml_s")
@@ -81,7 +81,7 @@ def test_what_is_written_is_read_to_the_bit(tmp_path: Path) -> None:
 def test_every_returned_row_survives_kill_9_and_the_torn_line_is_cut(tmp_path: Path) -> None:
     path, acknowledged = tmp_path / "run.csv", tmp_path / "acknowledged"
     script = (
-        "import sys\nfrom hardware.recording import Recorder\n"
+        "import sys\nfrom hardware.storage.recorder import Recorder\n"
         f"r = Recorder({str(path)!r}, ('time_min', 'od', 'pump_rate_ml_s'))\n"
         f"i, done = 0, open({str(acknowledged)!r}, 'ab', buffering=0)\nwhile True:\n"
         "    r.write({'time_min': float(i), 'od': 0.5, 'pump_rate_ml_s': 0.01})\n"

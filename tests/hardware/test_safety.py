@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envs.plant import Plant, PlantConfig
-from envs.sensors import SensorConfig
-from experiments import app
-from hardware.emulator_bench import bench_plant
+from envs.plant.plant import Plant, PlantConfig
+from envs.plant.sensor import SensorConfig
+from experiments.cli import frame
+from hardware.emulator.vial import bench_plant
 from hardware.reactor import Fault, Measurement, Receipt, Vitals
-from hardware.safety import Interlock, Verdict
-from hardware.safety_config import REMEDIES, Response, Responses, SafetyConfig, check_setpoints
+from hardware.safety.config import REMEDIES, Response, Responses, SafetyConfig, check_setpoints
+from hardware.safety.interlock import Interlock, Verdict
 
 
 class Drive:
@@ -432,8 +432,8 @@ def test_state_of_another_run_is_refused() -> None:
 
 
 def test_the_yaml_file_says_what_the_code_does() -> None:
-    cfg = app.compose("deploy", [])
-    assert app.load(cfg.safety, SafetyConfig()) == SafetyConfig()
+    cfg = frame.compose("deploy", [])
+    assert frame.load(cfg.safety, SafetyConfig()) == SafetyConfig()
 
 
 @pytest.mark.parametrize("reason", ["spectrometer", "frozen", "jump", "stale", "blank"])

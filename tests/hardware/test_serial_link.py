@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from hardware.chibio.protocol import parse_state
 from hardware.errors import LinkError
-from hardware.transport import SerialTransport, TransportConfig
-from hardware.wire import parse_state
+from hardware.link.transport import SerialTransport, TransportConfig
 from tests.hardware.test_board_agent import PYTHON, SOURCE, Rig
 from tests.hardware.test_emulator_server import Process
 

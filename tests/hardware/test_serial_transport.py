@@ -15,17 +15,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hardware.board_agent import encode_reply
-from hardware.chibio import ChiBioReactors
-from hardware.chibio_config import ChiBioConfig
+from hardware.board.board_agent import encode_reply
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.protocol import parse_state
+from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import RealClock
-from hardware.emulator_process import EmulatorProcess
+from hardware.emulator.process import EmulatorProcess
 from hardware.errors import LinkError, ProtocolError
+from hardware.link.transport import Reply, SerialTransport, TransportConfig, open_transport
 from hardware.reactor import Command
-from hardware.transport import Reply, SerialTransport, TransportConfig, open_transport
-from hardware.wire import parse_state
 
-AGENT = Path(__file__).parents[2] / "hardware" / "board_agent.py"
+AGENT = Path(__file__).parents[2] / "hardware" / "board" / "board_agent.py"
 HELLO = b'{"agent": "board_agent", "protocol": 1}'
 
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
+from hardware.chibio.connection import Unit
 from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError
-from hardware.transport import Reply
-from hardware.unit import Unit
+from hardware.link.transport import Reply
 from tests.hardware.script import DONE, LOST, Script, answer, posts, read, state
 
 OFF = [f"/SetOutputOn/{pump}/0/M0" for pump in ("Pump1", "Pump2", "Pump3", "Pump4")]

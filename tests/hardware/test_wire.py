@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hardware.chibio.protocol import PUMPS, check_command, parse_state
 from hardware.errors import DeviceStateError, ProtocolError
-from hardware.wire import PUMPS, check_command, parse_state
 from tests.hardware.script import state
 
 

@@ -1,0 +1,339 @@
+"""Growth rate mu and dilution constant tau of x' = (mu - u/tau) x from a recording, with honest intervals.
+
+With u held from each row to the next, equation (5) of the paper has the exact solution
+
+    x_i = x_0 exp(mu (t_i - t_0) - C_i / tau),    C_i = sum_{j<i} u_j (t_{j+1} - t_j),
+
+so the simulated trajectory, its derivatives and the fit need no integrator. The fit is least squares on the OD of that
+trajectory, run freely from a fitted start. Pure functions of arrays; no file, no clock, no random numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.identification.screening import OD_FLOOR, Series, pumped_volume
+
+__all__ = ["Fit", "NotIdentifiable", "Parameter", "check_excitation", "fit", "pmse", "start_level", "trajectory"]
+
+Array = NDArray[np.float64]
+
+CONFIDENCE = 0.95
+HUBER_SD = 3.0
+MAX_REWEIGHTINGS = 20
+WORST_CONDITION = 1e12
+MIN_READINGS = 20
+MIN_STEPS = 3  # rows at a low and at a high pump rate that a fit of tau needs
+WIDEST_TAU = 0.5  # an interval wider than +-50 % is no measurement of tau
+
+
+class NotIdentifiable(ValueError):
+    """The rows cannot tell the parameters; the message says which, why, and what recording could."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """An estimate with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def half_width(self) -> float:
+        """Half the interval's width, in the parameter's unit."""
+        return 0.5 * (self.high - self.low)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted pair and how well it describes its rows.
+
+    mu: 1/min. tau: u/tau is the dilution rate in 1/min for u in mL/s; None where only mu was fitted.
+    start_od: fitted OD at the first row of each segment, shape (S,).
+    model: simulated OD, shape (n,). residual: OD minus model, nan without reading, shape (n,).
+    pmse_pct, rms: see `pmse`; root mean square of the residuals, OD.
+    n_used: readings fitted. autocorrelation: of the residuals at lag 1.
+    """
+
+    mu: Parameter
+    tau: Parameter | None
+    start_od: Array
+    model: Array
+    residual: Array
+    pmse_pct: float
+    rms: float
+    n_used: int
+    autocorrelation: float
+
+
+def trajectory(time: Array, pump_rate: Array, mu: Array | float, tau: Array | float, start_od: Array | float) -> Array:
+    """x of equation (5) at the rows' times, started at the first row; exact for u held between rows.
+
+    Args:
+      time: min, shape (n,) or (N, n). pump_rate: mL/s, same shape.
+      mu: 1/min. tau: > 0. start_od: OD. Scalars or shape (N,).
+    Returns: shape (n,) for scalars and one recording, else (N, n). Raises: nothing.
+    """
+    mu, tau, start_od = (np.asarray(p, dtype=np.float64)[..., None] for p in (mu, tau, start_od))
+    elapsed = time - time[..., :1]
+    return np.asarray(start_od * np.exp(mu * elapsed - pumped_volume(time, pump_rate) / tau))
+
+
+def pmse(od: Array, model: Array) -> float:
+    """Percentage mean square error, 100 * sum (x - x_model)^2 / sum x^2, over the rows with a reading; in %.
+
+    Args:
+      od: measured, nan where there is none, shape (n,). model: same shape.
+    """
+    used = np.isfinite(od)
+    return float(100.0 * np.sum((od[used] - model[used]) ** 2) / np.sum(od[used] ** 2))
+
+
+def check_excitation(series: Series) -> None:
+    """Refuse rows in which the pump cannot have told dilution from growth.
+
+    tau shows only where the pump rate changes: without any feed 1/tau multiplies zero, and with a constant one only
+    mu - u/tau can be seen.
+
+    Raises: NotIdentifiable.
+    """
+    used = np.flatnonzero(np.isfinite(series.od))
+    where = f"rows {series.row[0]}-{series.row[-1]}"
+    if len(used) < MIN_READINGS:
+        raise NotIdentifiable(f"{where}: {len(used)} usable readings; at least {MIN_READINGS} are needed")
+    rate = series.pump_rate[used[0] : used[-1]]
+    if rate.max() == 0.0:
+        raise NotIdentifiable(
+            f"{where}: the pump never runs, so tau cannot be determined (mu alone could); use a recording with "
+            "dilutions, e.g. the open-loop protocol of generate=true"
+        )
+    low, high = float(rate.min()), float(rate.max())
+    middle = 0.5 * (low + high)
+    if high - low < 1e-3 * high:
+        raise NotIdentifiable(
+            f"{where}: the pump never stops nor changes its rate (always {high:g} mL/s), so growth and dilution cannot "
+            "be told apart (only mu - u/tau could); use a recording in which the pump rests for a while"
+        )
+    on, off = int((rate > middle).sum()), int((rate <= middle).sum())
+    if min(on, off) < MIN_STEPS:
+        raise NotIdentifiable(
+            f"{where}: the pump is above {middle:g} mL/s in {on} rows and below in {off}; at least {MIN_STEPS} of each "
+            "are needed to tell dilution from growth; use a longer recording"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The readings of a fit: y, minutes and pumped volume since the segment's start, segment of each reading."""
+
+    y: Array
+    elapsed: Array
+    volume: Array
+    segment: NDArray[np.int64]
+    n_segments: int
+    with_tau: bool
+
+    def basis(self) -> Array:
+        """Derivatives of ln x with respect to (mu, [1/tau], ln x_0 per segment), shape (m, p); ln x is linear."""
+        starts = np.zeros((len(self.y), self.n_segments))
+        starts[np.arange(len(self.y)), self.segment] = 1.0
+        slopes = [self.elapsed, -self.volume] if self.with_tau else [self.elapsed]
+        return np.column_stack([*slopes, starts])
+
+
+def _problem(series: Series, starts: Sequence[int], with_tau: bool) -> _Problem:
+    used = np.flatnonzero(np.isfinite(series.od))
+    begin = np.asarray(starts, dtype=np.int64)
+    volume = pumped_volume(series.time, series.pump_rate)
+    segment = np.searchsorted(begin, used, side="right") - 1
+    present, segment = np.unique(segment, return_inverse=True)
+    origin = begin[present][segment]
+    return _Problem(
+        y=series.od[used],
+        elapsed=series.time[used] - series.time[origin],
+        volume=volume[used] - volume[origin],
+        segment=segment,
+        n_segments=len(present),
+        with_tau=with_tau,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """Parameters (p,), derivatives of the model (m, p), residuals model - y clipped by the loss (m,), where it did."""
+
+    best: Array
+    jacobian: Array
+    error: Array
+    clipped: NDArray[np.bool_]
+
+
+def _solve(problem: _Problem, robust: bool) -> _Solution:
+    """Levenberg-Marquardt with the exact derivatives; Huber's loss by reweighting.
+
+    A reading counts in full up to 3 robust sd, the larger of that of the residuals and that of the relative residuals
+    times the model, so that the noisier readings at a high OD are not taken for outliers.
+    """
+    from scipy.optimize import least_squares  # half a second, which a refused command line need not wait for
+
+    y, basis = problem.y, problem.basis()
+    size = np.maximum(y, OD_FLOOR)
+    best = np.linalg.lstsq(basis * size[:, None], np.log(size) * size, rcond=None)[0]  # sd of ln y is sd(y) / y
+    weight = np.ones(len(y))
+    limit = np.full(len(y), np.inf)
+
+    def simulated(p: Array) -> Array:
+        return np.exp(np.clip(basis @ p, -50.0, 50.0))
+
+    for _ in range(MAX_REWEIGHTINGS):
+        previous, root = best, np.sqrt(weight)
+
+        def residual(p: Array, root: Array = root) -> Array:
+            return root * (simulated(p) - y)
+
+        def jacobian(p: Array, root: Array = root) -> Array:
+            return (root * simulated(p))[:, None] * basis
+
+        best = np.asarray(least_squares(residual, previous, jac=jacobian, method="lm", x_scale="jac").x)
+        model = simulated(best)
+        size = np.abs(model - y)
+        if robust:
+            scale = np.maximum(np.median(size), model * np.median(size / model))
+            limit = HUBER_SD * 1.4826 * np.maximum(scale, 1e-9)
+        weight = np.minimum(1.0, limit / np.maximum(size, 1e-300))
+        if (weight == 1.0).all() or np.allclose(best, previous, rtol=1e-7, atol=1e-12):
+            break
+    model = simulated(best)
+    return _Solution(best, model[:, None] * basis, np.clip(model - y, -limit, limit), np.abs(model - y) > limit)
+
+
+def fit(series: Series, starts: Sequence[int] = (0,), robust: bool = True) -> Fit:
+    """Least squares of the simulated OD on the readings: sum rho(x_i - y_i) over mu, 1/tau and the starts' ln x_0.
+
+    rho is the square, beyond 3 robust sd linear (Huber). Intervals come from the sandwich covariance
+    H^-1 S H^-1 with S the long-run covariance of the scores (see `_sum_variance`), so that correlated and uneven
+    errors widen them, each residual divided by 1 - leverage (the jackknife's correction, MacKinnon & White 1985, J.
+    Econom. 29:305), and Student's t with the degrees of freedom of the effective number of readings. The interval
+    of tau is that of 1/tau turned over.
+
+    Args:
+      series: readings may be nan; time and pump rate count throughout.
+      starts: positions at which the trajectory starts anew from its own fitted OD, the first 0, ascending.
+      robust: False is plain least squares.
+    Returns: see `Fit`; tau is None when the pump never runs.
+    Raises: NotIdentifiable when the readings are too few or the interval of 1/tau reaches zero.
+    """
+    with_tau = bool((series.pump_rate[:-1] > 0.0).any())
+    problem = _problem(series, starts, with_tau)
+    if len(problem.y) <= problem.n_segments + 3:
+        raise NotIdentifiable(f"rows {series.row[0]}-{series.row[-1]}: {len(problem.y)} readings are too few for a fit")
+    solution = _solve(problem, robust)
+    best, jacobian = solution.best, solution.jacobian
+    normal = jacobian[~solution.clipped].T @ jacobian[~solution.clipped]
+    if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)))) > WORST_CONDITION:
+        raise NotIdentifiable(
+            f"rows {series.row[0]}-{series.row[-1]}: growth and dilution cannot be told apart (the pump's rate never "
+            "changes); use a recording in which the pump rests and runs"
+        )
+    inverse = np.linalg.inv(normal)
+    leverage = np.minimum(np.einsum("ij,jk,ik->i", jacobian, inverse, jacobian), 0.5)
+    score = jacobian * (solution.error / (1.0 - leverage))[:, None]
+    influence = inverse @ score.T  # (p, m): how far each reading pulled a parameter
+    mu = Parameter(*_interval(best[0], influence[0], len(best)))
+    tau = _turned_over(series, _interval(best[1], influence[1], len(best))) if with_tau else None
+    model = _model(series, starts, problem, best)
+    residual = series.od - model
+    r = residual[np.isfinite(residual)]
+    return Fit(
+        mu=mu,
+        tau=tau,
+        start_od=np.exp(best[2 if with_tau else 1 :]),
+        model=model,
+        residual=residual,
+        pmse_pct=pmse(series.od, model),
+        rms=float(np.sqrt(np.mean(r**2))),
+        n_used=len(r),
+        autocorrelation=float(np.sum(r[1:] * r[:-1]) / max(np.sum(r * r), 1e-300)),
+    )
+
+
+def _model(series: Series, starts: Sequence[int], problem: _Problem, best: Array) -> Array:
+    """Simulated OD at every row, also at those without a reading, shape (n,); a segment without readings is nan."""
+    used = np.flatnonzero(np.isfinite(series.od))
+    rate = 1.0 / best[1] if problem.with_tau else np.inf
+    first_level = 2 if problem.with_tau else 1
+    model = np.full(len(series.time), np.nan)
+    ends = [*starts[1:], len(series.time)]
+    for a, b in zip(starts, ends, strict=True):
+        inside = (used >= a) & (used < b)
+        if inside.any():
+            level = float(np.exp(best[first_level + problem.segment[int(np.argmax(inside))]]))
+            model[a:b] = trajectory(series.time[a:b], series.pump_rate[a:b], float(best[0]), rate, level)
+    return model
+
+
+def _turned_over(series: Series, inverse: tuple[float, float, float]) -> Parameter:
+    value, low, high = inverse
+    if low <= 0.0 or (high - low) / 2 > WIDEST_TAU * value:
+        raise NotIdentifiable(
+            f"rows {series.row[0]}-{series.row[-1]}: 1/tau = {value:.3g} with the 95 % interval {low:.3g} to "
+            f"{high:.3g}; allowed within +-{100 * WIDEST_TAU:.0f} %: they do not determine tau: too little "
+            "dilution, too much noise, or a culture that drifts; choose other rows"
+        )
+    return Parameter(1.0 / value, 1.0 / high, 1.0 / low)
+
+
+def _interval(value: float, influence: Array, n_parameters: int) -> tuple[float, float, float]:
+    """Value and 95 % interval from the influence of each reading, shape (m,), in the order of time.
+
+    Half width t_{0.975, nu} sqrt(V), V = `_sum_variance`, but never below sum z^2: readings that repel one another are
+    an accident of a short record. Few readings at a high OD carry most of the information and correlated ones repeat
+    each other, so V is itself uncertain: nu = 1.5 (sum z^2)^2 / sum z^4 * sum z^2 / V - p, at least 4, after
+    Satterthwaite's effective number of readings, 3 (sum z^2)^2 / sum z^4 for normal errors, halved because their
+    correlation is estimated from the same readings. docs/calibration.md measures the coverage.
+    """
+    from scipy.special import stdtrit
+
+    squares = influence**2
+    independent = max(float(squares.sum()), 1e-300)
+    variance = max(_sum_variance(influence), independent)
+    effective = 1.5 * independent**2 / max(float((squares**2).sum()), 1e-300) * independent / variance
+    half = float(stdtrit(max(effective - n_parameters, 4.0), 0.5 + CONFIDENCE / 2) * np.sqrt(variance))
+    return float(value), float(value) - half, float(value) + half
+
+
+def _sum_variance(z: Array) -> float:
+    """Variance of sum z_i for a serially correlated z of mean 0, shape (m,).
+
+    Newey-West type estimate: AR(1) prewhitening, quadratic spectral kernel, automatic bandwidth
+    1.3221 (4 rho^2/(1 - rho)^4 m)^(1/5) (Andrews 1991, Econometrica 59:817; Andrews & Monahan 1992, 60:953).
+    The AR(1) coefficient is corrected for its small-sample bias, (1 + 3 rho)/m (Kendall 1954).
+    """
+    m = len(z)
+
+    def lag_one(v: Array) -> float:
+        rho = float(v[1:] @ v[:-1]) / max(float(v[:-1] @ v[:-1]), 1e-300)
+        return float(np.clip(rho + (1.0 + 3.0 * rho) / m, -0.95, 0.97))
+
+    rho = lag_one(z)
+    white = z[1:] - rho * z[:-1]
+    again = lag_one(white)
+    bandwidth = max(1.3221 * (4.0 * again**2 / (1.0 - again) ** 4 * m) ** 0.2, 1e-3)
+    longest = min(m - 2, int(np.ceil(8.0 * bandwidth)))
+    lags = np.arange(1, longest + 1)
+    covariance = np.array([white[k:] @ white[:-k] for k in lags])
+    angle = 1.2 * np.pi * lags / bandwidth
+    kernel = 3.0 / angle**2 * (np.sin(angle) / angle - np.cos(angle))
+    total = float(white @ white + 2.0 * kernel @ covariance)
+    return total / (1.0 - rho) ** 2
+
+
+def start_level(series: Series, mu: float, tau: float, readings: int = 5) -> float:
+    """OD at the first row that the first few readings point to under known (mu, tau); median, so one may be wrong."""
+    ratio = series.od / trajectory(series.time, series.pump_rate, mu, tau, 1.0)
+    return float(np.median(ratio[np.isfinite(ratio)][:readings]))

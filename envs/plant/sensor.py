@@ -1,0 +1,170 @@
+"""The optical-density sensor of one vial: optics, noise, outliers, bubbles, drift and freezing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.plant.noise import Streams, Tape, check_ranges, spread, uniform
+
+__all__ = ["OdSensor", "SensorConfig", "counts_from_od", "od_from_counts"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LINEAR, QUADRATIC = 1.833, 0.226  # OD = 1.833 R + 0.226 R^2, R = log10(blank / raw) (chibio.md section 4)
+FULL_SCALE = 65535.0  # counts of the 16-bit converter
+
+RANGES = {
+    "noise_floor": (0.0, 0.1, "OD"),
+    "noise_relative": (0.0, 0.1, ""),
+    "noise_factor_sd": (0.0, 1.0, ""),
+    "lag1": (0.0, 0.95, ""),
+    "gain_cv": (0.0, 0.3, ""),
+    "curvature": (-0.3, 0.0, "1/OD"),
+    "blank_error": (0.0, 0.2, "OD"),
+    "drift_per_h": (-0.05, 0.05, "OD/h"),
+    "wall_gain": (0.0, 1.0, ""),
+    "outlier_rate": (0.0, 0.2, ""),
+    "bubble_rate": (0.0, 0.2, ""),
+    "zero_rate": (0.0, 0.2, ""),
+    "freeze_rate": (0.0, 0.2, ""),
+    "blank_counts": (3000.0, 60000.0, "counts"),
+    "blank_cv": (0.0, 0.25, ""),
+}
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """What the averaged reading of one minute adds to the truth; the defaults are a perfect sensor.
+
+    noise_floor, noise_relative: sd of a reading = hypot(noise_floor, noise_relative * OD).
+    noise_factor_sd: sd of the logarithm of a reactor's own noise factor (median 1).
+    lag1: correlation of neighbouring readings' noise.
+    gain_cv: spread between reactors of the slope k in y = k (x + c x^2).
+    curvature: c is drawn uniformly between this and 0, 1/OD.
+    blank_error: offset drawn uniformly in +- this, OD.
+    drift_per_h: rise of the offset, OD/h.
+    wall_gain: OD seen per OD-equivalent of wall biomass.
+    outlier_rate: probability per reading of an isolated jump of more than 0.04, 54 % upward.
+    bubble_rate: probability per reading that a bubble adds 0.05 to 0.3 for 1 to 5 readings.
+    zero_rate: probability per reading of an exact zero.
+    freeze_rate: probability per reading that the value repeats for the next 5 to 30 readings.
+    quantised: round to whole counts of the converter.
+    blank_counts, blank_cv: counts of clear medium, mean and spread between reactors.
+    """
+
+    noise_floor: float = 0.0
+    noise_relative: float = 0.0
+    noise_factor_sd: float = 0.0
+    lag1: float = 0.0
+    gain_cv: float = 0.0
+    curvature: float = 0.0
+    blank_error: float = 0.0
+    drift_per_h: float = 0.0
+    wall_gain: float = 0.0
+    outlier_rate: float = 0.0
+    bubble_rate: float = 0.0
+    zero_rate: float = 0.0
+    freeze_rate: float = 0.0
+    quantised: bool = False
+    blank_counts: float = 14000.0
+    blank_cv: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "plant.sensor", RANGES)
+
+
+def counts_from_od(od: Array, blank: Array | float) -> Array:
+    """Raw count the device would show, from inverting its OD formula; not rounded, at least 1 (chibio.md section 4).
+
+    Args:
+      od: device OD; blank: count of clear medium; broadcastable.
+    """
+    half = LINEAR / (2.0 * QUADRATIC)
+    ratio = np.sqrt(np.maximum(od / QUADRATIC + half * half, 0.0)) - half
+    return np.clip(blank * 10.0**-ratio, 1.0, FULL_SCALE)
+
+
+def od_from_counts(raw: Array, blank: Array | float) -> Array:
+    """The device's own formula, OD = 1.833 R + 0.226 R^2 with R = log10(blank / raw), raw > 0."""
+    ratio = np.log10(blank / raw)
+    return np.asarray(LINEAR * ratio + QUADRATIC * ratio * ratio)
+
+
+class OdSensor:
+    """N sensors. y = k (x + c x^2) + wall_gain w + offset + drift t, then noise and misreadings.
+
+    Args:
+      config: what is wrong with them.
+      rngs: one stream per vial for what is drawn once (slope, curvature, offset, noise factor, blank).
+      noise_rngs: one stream per vial for the readings; a reading draws one row, always of the same length.
+    `frozen` (bool) and `extra_offset` (OD), shape (N,), are fault switches that may be set at any time.
+    """
+
+    def __init__(self, config: SensorConfig, rngs: Streams, noise_rngs: Streams) -> None:
+        n = len(rngs)
+        self.config = config
+        self.draws: dict[str, Array] = {
+            "sensor_gain": spread(rngs, 1.0, config.gain_cv),
+            "sensor_curvature": uniform(rngs, config.curvature, 0.0),
+            "sensor_offset": uniform(rngs, -config.blank_error, config.blank_error),
+            "sensor_noise_factor": np.exp(spread(rngs, 1.0, config.noise_factor_sd) - 1.0),
+            "sensor_blank_counts": spread(rngs, config.blank_counts, config.blank_cv),
+        }
+        self.frozen: Mask = np.zeros(n, dtype=bool)
+        self.extra_offset: Array = np.zeros(n)
+        self._tape = Tape(noise_rngs, normals=1, uniforms=9)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget past readings: no bubble in the light path, nothing frozen by chance, no noise carried over."""
+        n = self.frozen.size
+        self._noise = np.zeros(n)
+        self._bubble, self._bubble_left, self._freeze_left = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._last = np.full(n, np.nan)
+
+    def apparent(self, od: Array, wall: Array, minutes: float) -> Array:
+        """What a noise-free sensor would show, OD, shape (N,).
+
+        Args:
+          od: suspended biomass in the light path, shape (N,); wall: biomass on the wall, OD-equivalent, shape (N,).
+          minutes: age of the blank, min.
+        """
+        d = self.draws
+        optical = d["sensor_gain"] * (od + d["sensor_curvature"] * od * od)
+        offset = d["sensor_offset"] + self.config.drift_per_h * minutes / 60.0 + self.extra_offset
+        return np.asarray(optical + self.config.wall_gain * wall + offset)
+
+    def read(self, od: Array, wall: Array, minutes: float) -> Array:
+        """One averaged reading with everything that is configured; arguments as `apparent`, OD, shape (N,)."""
+        c = self.config
+        (z,), u = self._tape.next()
+        clean = self.apparent(od, wall, minutes)
+        self._noise = c.lag1 * self._noise + np.sqrt(1.0 - c.lag1**2) * z
+        sd = np.hypot(c.noise_floor, c.noise_relative * clean) * self.draws["sensor_noise_factor"]
+        value = clean + sd * self._noise + self._misreading(u)
+        if c.quantised:
+            blank = np.round(self.draws["sensor_blank_counts"])
+            value = od_from_counts(np.round(counts_from_od(value, blank)), blank)
+        value = np.where(u[6] < c.zero_rate, 0.0, value)
+        repeats = (self.frozen | (self._freeze_left > 0)) & ~np.isnan(self._last)
+        starts = (self._freeze_left <= 0) & (u[7] < c.freeze_rate)
+        self._freeze_left = np.where(starts, 5.0 + np.floor(26.0 * u[8]), np.maximum(self._freeze_left - 1.0, 0.0))
+        self._last = np.where(repeats, self._last, value)
+        return self._last.copy()
+
+    def _misreading(self, u: Array) -> Array:
+        """Isolated outliers and bubbles of this reading, OD, shape (N,)."""
+        c = self.config
+        # jumps start at 0.04 (the threshold they were counted with); beyond it an exponential tail of 0.05 OD
+        jump = (0.04 - 0.05 * np.log1p(-u[1])) * np.where(u[2] < 0.54, 1.0, -1.0)
+        outlier = np.where(u[0] < c.outlier_rate, jump, 0.0)
+        starts = (self._bubble_left <= 0) & (u[3] < c.bubble_rate)
+        self._bubble = np.where(starts, 0.05 + 0.25 * u[4], self._bubble)
+        self._bubble_left = np.where(starts, 1.0 + np.floor(5.0 * u[5]), self._bubble_left)
+        bubble = np.where(self._bubble_left > 0, self._bubble, 0.0)
+        self._bubble_left = np.maximum(self._bubble_left - 1.0, 0.0)
+        return np.asarray(outlier + bubble)

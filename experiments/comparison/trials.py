@@ -1,0 +1,144 @@
+"""One controller on one plant in one scenario, all replicates as a single batch through the closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.plant.plant import Plant, PlantConfig
+from envs.scenario import Schedule
+from envs.task import EnvConfig
+from experiments.control.loop import ClosedLoop
+from experiments.control.metrics import WindowMetrics, window_metrics
+from experiments.controllers.base import Controller
+from hardware.safety.config import Response, SafetyConfig
+from hardware.safety.interlock import Interlock
+from hardware.simulated import SimulatedConfig, SimulatedReactors
+
+__all__ = ["Trial", "Window", "run_trial", "windows"]
+
+Array = NDArray[np.float64]
+
+LEAST_NOISE = 1e-9  # OD, of a sensor that is meant to have none
+
+
+@dataclass(frozen=True)
+class Window:
+    """A phase of a schedule, named by what tells it from the others: setpoint, temperature (degC) or hours."""
+
+    label: str
+    setpoint: float
+    start: float
+    end: float
+
+
+def windows(schedule: Schedule) -> list[Window]:
+    """The phases of a schedule with their names."""
+    edges = schedule.edges
+    by_setpoint = [f"{s:g}" for s in schedule.setpoints]
+    by_temperature = [f"{t:g}" for t in schedule.temperatures]
+    by_hours = [f"{a / 60:g}-{b / 60:g} h" for a, b in pairwise(edges)]
+    names = next((n for n in (by_setpoint, by_temperature) if len(set(n)) == len(n)), by_hours)
+    return [
+        Window(name, s, float(a), float(b))
+        for name, s, a, b in zip(names, schedule.setpoints, edges[:-1], edges[1:], strict=True)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What N replicates did, sample by sample since the schedule began; arrays (N, K).
+
+    minute: (K,). od: as measured. clean: what a sensor without noise would have shown. rate: mL/s after the guard.
+    temperature: degC. media_ml: fresh medium delivered since the culture began.
+    held: samples on which the interlock allowed no dose, (N,). overflowed: at the end, (N,).
+    """
+
+    controller: str
+    plant: str
+    scenario: str
+    schedule: Schedule
+    minute: Array
+    od: Array
+    clean: Array
+    rate: Array
+    temperature: Array
+    media_ml: Array
+    held: Array
+    overflowed: NDArray[np.bool_]
+
+    def score(self, window: Window) -> WindowMetrics:
+        """Metrics of the measured OD, as the paper takes them."""
+        return self._score(self.od, window)
+
+    def score_clean(self, window: Window) -> WindowMetrics:
+        """Metrics of the noise-free OD: how well the culture really was on the setpoint."""
+        return self._score(self.clean, window)
+
+    def score_floor(self, window: Window) -> WindowMetrics:
+        """Metrics of the sensor's error alone: what a culture that is exactly on the setpoint would be scored."""
+        return self._score(self.od - self.clean, replace(window, setpoint=0.0))
+
+    def _score(self, od: Array, window: Window) -> WindowMetrics:
+        minute = np.broadcast_to(self.minute, od.shape)
+        return window_metrics(minute, od, window.setpoint, window.start, window.end)
+
+    def _inside(self, window: Window) -> NDArray[np.bool_]:
+        return (self.minute > window.start - 1e-6) & (self.minute < window.end - 1e-6)
+
+    def media(self, window: Window) -> Array:
+        """Fresh medium delivered within the window, mL, (N,)."""
+        first, last = np.searchsorted(self.minute, [window.start - 1e-6, window.end - 1e-6])
+        return np.asarray(self.media_ml[:, last] - self.media_ml[:, first])
+
+    def effort(self, window: Window) -> Array:
+        """Control effort: mean change of the pump rate from one decision to the next, µL/s, (N,)."""
+        return np.asarray(1000.0 * np.abs(np.diff(self.rate[:, self._inside(window)], axis=1)).mean(axis=1))
+
+
+def run_trial(
+    names: tuple[str, str, str],
+    plant_config: PlantConfig,
+    schedule: Schedule,
+    make: Callable[[Plant], Controller],
+    model: EnvConfig,
+    replicates: int,
+    seed: int,
+) -> Trial:
+    """Run N replicates, which are named M0, M1, ..., as one batch.
+
+    The plant is built anew from the seed, so every controller meets the same vials, pumps, sensors and noise.
+
+    Args:
+      names: of controller, plant and scenario. make: builds the controller for a plant.
+      model: control period and largest pump rate; the interlock's limit.
+    """
+    if plant_config.sensor.noise_floor == 0.0:  # the interlock takes a sensor that repeats itself exactly for dead
+        plant_config = replace(plant_config, sensor=replace(plant_config.sensor, noise_floor=LEAST_NOISE))
+    plant = Plant(plant_config, replicates, np.random.default_rng(seed))
+    backend = SimulatedConfig(reactors=tuple(f"M{i}" for i in range(replicates)), control_min=model.control_min)
+    interlock = Interlock(replicates, SafetyConfig(max_rate=model.max_pump_rate))
+    loop = ClosedLoop(SimulatedReactors(plant, backend), make(plant), interlock, schedule)
+    minute = np.arange(0.0, schedule.total_min + 1e-6, model.control_min)
+    fields = ("od", "clean", "rate", "temperature", "media_ml")
+    stored: dict[str, Any] = {key: np.full((replicates, minute.size), np.nan) for key in fields}
+    held = np.zeros(replicates)
+    for step in loop.run():
+        row = np.flatnonzero(step.rows & (step.phase >= 0))
+        column = np.rint(step.elapsed[row] / model.control_min).astype(np.intp)
+        seen = {
+            "od": step.od,
+            "clean": plant.apparent_od,
+            "rate": step.rate,
+            "temperature": step.temperature,
+            "media_ml": plant.media_ml,
+        }
+        for key, values in seen.items():
+            stored[key][row, column] = values[row]
+        held[row] += step.response[row] >= Response.HOLD
+    return Trial(*names, schedule, minute, **stored, held=held, overflowed=plant.overflowed)

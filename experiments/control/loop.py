@@ -1,0 +1,191 @@
+"""The closed loop, the same for simulation, emulator and bench: measure, decide, guard, actuate.
+
+It is a generator of what happened; clocks and wires are the reactors', files and screens are the caller's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.scenario import Schedule
+from experiments.controllers.base import Array, Controller, Explains, Mask
+from hardware.reactor import Command, Reactor
+from hardware.safety.config import Response
+from hardware.safety.interlock import Interlock, Verdict
+
+__all__ = ["ClosedLoop", "Step"]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One pass through the loop; arrays (N,).
+
+    rows: reactors with a new sample, for which the rest is to be read. now_s: run time, s.
+    minute: when the OD was measured, min since the run began. elapsed: since the schedule began, nan in recovery.
+    phase: of the schedule, -1 in recovery. proposed, rate: before and after the interlock, mL/s.
+    volume_ml: asked of the pump; known only after the dose was begun. reasons: of the interlock, for all reactors.
+    response: of the interlock. notes: of the reactors. explanation: of the controller. done: schedule over.
+    """
+
+    now_s: float
+    rows: Mask
+    minute: Array
+    elapsed: Array
+    phase: NDArray[np.intp]
+    od: Array
+    temperature: Array
+    setpoint: Array
+    proposed: Array
+    rate: Array
+    volume_ml: Array
+    reasons: Sequence[str | None]
+    response: NDArray[np.int64]
+    notes: Sequence[str]
+    explanation: dict[str, Array]
+    done: Mask
+
+
+class ClosedLoop:
+    """Controller x interlock x reactors over one schedule per reactor; reactors may be sampled at different moments.
+
+    Each reactor first recovers (grows undiluted until `recovery_od`), then runs its schedule on its own time.
+
+    Args:
+      reactors: N reactors. controller: decides. interlock: of N reactors.
+      schedules: one per reactor, or one for all.
+      before_dose: called with the step as decided, before anything is dosed (volume_ml still nan): the journal.
+    Raises: ValueError for another number of schedules than of reactors.
+    """
+
+    def __init__(
+        self,
+        reactors: Reactor,
+        controller: Controller,
+        interlock: Interlock,
+        schedules: Sequence[Schedule] | Schedule,
+        before_dose: Callable[[Step], None] | None = None,
+    ) -> None:
+        n = len(reactors.names)
+        self.reactors, self.controller, self.interlock = reactors, controller, interlock
+        self.schedules = [schedules] * n if isinstance(schedules, Schedule) else list(schedules)
+        if len(self.schedules) != n:
+            raise ValueError(f"{len(self.schedules)} schedules: allowed one for each of the {n} reactors")
+        self._before_dose = before_dose
+        self._recovery_od = np.array([s.recovery_od for s in self.schedules])
+        self._recovery_limit = np.array([s.recovery_limit_min for s in self.schedules])
+        self._total = np.array([s.total_min for s in self.schedules])
+        self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
+        self.done = np.zeros(n, dtype=np.bool_)
+        self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
+        self.gone = np.zeros(n, dtype=np.bool_)  # given up, and not there any more for its pumps to be verified off
+        controller.reset(n)
+
+    @property
+    def handed_over(self) -> Mask:
+        """Reactors that are regulated by the devices themselves."""
+        return self.reactors.handed_over
+
+    def run(self) -> Iterator[Step]:
+        """Go on until every reactor's schedule is over or it was given up. Raises: ReactorError."""
+        while not self.over:
+            yield self.step()
+
+    @property
+    def over(self) -> bool:
+        """Whether every reactor's schedule is over, or the reactor was given up."""
+        return bool((self.done | self.stopped | self.gone).all())
+
+    def _asked(self, elapsed: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """Phase, setpoint and temperature of each reactor, each (N,)."""
+        first = self.schedules[0]
+        if all(s is first for s in self.schedules):
+            return (first.phase(elapsed), *first.at(elapsed))
+        phase = np.array([int(s.phase(elapsed[i : i + 1])[0]) for i, s in enumerate(self.schedules)])
+        pairs = [s.at(elapsed[i : i + 1]) for i, s in enumerate(self.schedules)]
+        return phase, np.array([p[0][0] for p in pairs]), np.array([p[1][0] for p in pairs])
+
+    def step(self) -> Step:
+        """Wait for a sample of at least one reactor (or for trouble), and act on it."""
+        m = self.reactors.measure()
+        now = self.reactors.elapsed()
+        rows = m.fresh & ~self.done & ~self.stopped
+        minute = m.time_s / 60.0
+        recovered = (m.od >= self._recovery_od) | (minute >= self._recovery_limit)
+        self.began = np.where(rows & np.isnan(self.began) & recovered, minute, self.began)
+        elapsed = minute - self.began
+        phase, setpoint, temperature = self._asked(elapsed)
+        self.done = self.done | (rows & (elapsed >= self._total - 1e-6))
+
+        decided = self.controller.act(m.od, setpoint, minute, rows & (phase >= 0))
+        proposed = np.where((phase >= 0) & ~self.done, decided, 0.0)
+        verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
+        explanation = self.controller.explain() if isinstance(self.controller, Explains) else {}
+
+        def told(volume_ml: Array, notes: Sequence[str]) -> Step:
+            return Step(
+                now, rows, minute, elapsed, phase, m.od, m.temperature, setpoint, proposed, verdict.rate, volume_ml,
+                verdict.reasons, verdict.response, notes, explanation, self.done.copy(),
+            )  # fmt: skip
+
+        if self._before_dose is not None:
+            self._before_dose(told(np.full(len(self.done), np.nan), ()))
+        faults = m.vitals.faults if m.vitals is not None else (None,) * len(self.done)
+        absent = np.array([fault is not None and fault.kind == "absent" for fault in faults])
+        self.gone = absent & (verdict.response == Response.STOP)
+        failures = self._respond(verdict)
+        heat = np.where(verdict.heat_off, np.nan, temperature)
+        receipt = self.reactors.actuate(Command(rows, verdict.rate, heat))
+        self.interlock.confirm(receipt, now)
+        return told(receipt.volume_ml, (*failures, *receipt.notes))
+
+    def _respond(self, verdict: Verdict) -> list[str]:
+        """Carry out what the interlock demands beyond not dosing; returns what failed (it is tried again next time)."""
+        failed: list[str] = []
+        off = verdict.response == Response.PUMPS_OFF
+        stop = (verdict.response == Response.STOP) & ~self.stopped
+        if off.any():
+            failed += self.reactors.pumps_off(off)
+        if stop.any():
+            failed += self.reactors.give_up(stop)
+            self.stopped = self.stopped | (stop & ~self._named(failed))
+        regulate = (verdict.response == Response.REGULATE) & ~self.handed_over
+        if regulate.any():
+            failed += self.reactors.regulate(regulate, verdict.setpoint)
+        if verdict.heat_off.any():
+            failed += self.reactors.heat_off(verdict.heat_off)
+        return failed
+
+    def _named(self, failures: Sequence[str]) -> Mask:
+        """Reactors that a list of failures speaks of."""
+        return np.array([any(line.startswith(f"{name}:") for line in failures) for name in self.reactors.names])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where each reactor's schedule and the interlock stand; plain numbers and lists."""
+        return {
+            "began": self.began.tolist(),
+            "done": self.done.tolist(),
+            "stopped": self.stopped.tolist(),
+            "interlock": self.interlock.state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit."""
+        for key, kinds, what in (
+            ("began", (int, float, type(None)), "numbers"),
+            ("done", bool, "true or false"),
+            ("stopped", bool, "true or false"),
+        ):
+            values = state.get(key, "missing")
+            if not (isinstance(values, list) and all(isinstance(value, kinds) for value in values)):
+                raise ValueError(f"{key}: {str(values)[:40]}, expected a list of {what}")
+            if len(values) != len(self.done):
+                raise ValueError(f"{key} is for {len(values)} reactors, this run has {len(self.done)}")
+        self.began = np.array(state["began"], dtype=np.float64)
+        self.done = np.array(state["done"], dtype=np.bool_)
+        self.stopped = np.array(state["stopped"], dtype=np.bool_)
+        self.interlock.restore(state.get("interlock", "missing"))

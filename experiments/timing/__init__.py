@@ -1,0 +1,3 @@
+"""How fast things are, each beside a named rival in the same run.
+
+Entered by speed."""

@@ -1,0 +1,220 @@
+"""Measurements of `experiments.speed` on learning: training, updates, vector environment, start-up, scaling."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from dqn.config import DQNConfig
+from envs.task import EnvConfig
+from experiments.timing.measurement import Measurement
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+__all__ = ["environment", "scaling", "start_up", "training", "update"]
+
+POPULATION = 32
+COPIES = 4096
+ENTRY_POINTS = ("train", "deploy", "calibrate", "benchmark", "report", "speed")
+
+
+def _train(agents: int, config: DQNConfig) -> None:
+    """The schedule from scratch, no evaluation, no files: what the rivals do, too."""
+    import torch
+
+    from experiments.training import build
+
+    torch.set_num_threads(1)
+    for _ in build.population(EnvConfig(), config, range(agents)).run():
+        pass
+
+
+def training() -> Iterator[Measurement]:
+    """10 000 steps, 9 500 updates of batch 64, 64x64 units (agent=paper), beside other implementations."""
+    import torch
+
+    from experiments.timing import rivals
+
+    config = DQNConfig()
+
+    def alone(rival: Callable[[DQNConfig, int], object]) -> Callable[[], object]:
+        def run() -> object:
+            torch.set_num_threads(1)  # the faster setting for networks of this size, for them as for us
+            return rival(config, 0)
+
+        return run
+
+    schedule = "10 000 steps, 9 500 updates"
+    for name, rival in (
+        ("Stable-Baselines3 DQN", rivals.stable_baselines_dqn),
+        ("single-file loop as CleanRL's", rivals.single_file_dqn),
+    ):
+        yield Measurement("training, one agent", schedule, name, lambda: _train(1, config), alone(rival))
+    yield Measurement(
+        f"training, {POPULATION} agents",
+        f"{schedule} each",
+        "one run of Stable-Baselines3 DQN",
+        lambda: _train(POPULATION, config),
+        alone(rivals.stable_baselines_dqn),
+    )
+
+
+def _matrix_work(agents: int, batch: int, units: tuple[int, ...]) -> Callable[[], object]:
+    """The matrix products of one DQN update and nothing else: two forward passes, one backward pass."""
+    import torch
+
+    shapes = list(pairwise(units))
+    inputs = [torch.randn(agents, batch, i) for i, _ in shapes]
+    outputs = [torch.randn(agents, batch, o) for _, o in shapes]
+    weights = [torch.randn(agents, i, o) for i, o in shapes]
+    # the last layer transposed, as in dqn.network
+    outputs[-1], weights[-1] = (m.transpose(1, 2).contiguous() for m in (outputs[-1], weights[-1]))
+
+    def work() -> None:
+        for k, (x, y, w) in enumerate(zip(inputs[:-1], outputs[:-1], weights[:-1], strict=True)):
+            torch.bmm(x, w)  # target network
+            torch.bmm(x, w)  # online network
+            torch.bmm(x.transpose(1, 2), y)  # gradient by the weights
+            if k:
+                torch.bmm(y, w.transpose(1, 2))  # gradient by the layer's input
+        x, y, w = inputs[-1], outputs[-1], weights[-1]
+        torch.bmm(w, x.transpose(1, 2))
+        torch.bmm(w, x.transpose(1, 2))
+        torch.bmm(y, x)
+        torch.bmm(y.transpose(1, 2), w)
+
+    return work
+
+
+def update() -> Iterator[Measurement]:
+    """One update beside the matrix products it cannot do without, at the rate this machine does them."""
+    import torch
+
+    config = DQNConfig()
+    for agents in (1, POPULATION):
+        repeats = 2000 if agents == 1 else 200
+        learner = _warm_agent(agents, config)
+        products = _matrix_work(agents, config.batch_size, (2, *config.hidden, 17))
+
+        def ours(learn: Callable[[], object] = learner.learn, n: int = repeats) -> None:
+            torch.set_num_threads(1)
+            for _ in range(n):
+                learn()
+
+        def theirs(work: Callable[[], object] = products, n: int = repeats) -> None:
+            torch.set_num_threads(1)
+            for _ in range(n):
+                work()
+
+        yield Measurement(
+            f"update, {agents} agent(s)", "batch 64", "its matrix products alone", ours, theirs, "µs", 1e6, repeats
+        )
+
+
+def _warm_agent(agents: int, config: DQNConfig) -> Any:
+    """One group of agents whose replay memory is full."""
+    from experiments.training import build
+
+    trainer = build.trainer(EnvConfig(), replace(config, learn_start=config.total_steps), range(agents))
+    for _ in trainer.run():
+        pass
+    return trainer.agent
+
+
+def environment() -> Iterator[Measurement]:
+    """Control steps of 4 096 copies, autoreset included, beside Gymnasium's sync and the memory it must move."""
+    import numpy as np
+
+    from envs.vector_env import BioreactorVectorEnv
+    from experiments.timing import rivals
+
+    rng = np.random.default_rng(0)
+    actions = [rng.integers(0, 17, COPIES) for _ in range(8)]
+    native, sync = BioreactorVectorEnv(COPIES), rivals.sync_vector_env(COPIES)
+    native.reset(seed=0)
+    sync.reset(seed=0)
+
+    def steps(env: Any, n: int) -> None:
+        for k in range(n):
+            env.step(actions[k % len(actions)])
+
+    # what a step must read and write: action, OD, setpoint, step count; OD, count, observation, reward, two flags
+    fields = [
+        (np.zeros(COPIES, dtype=d), np.zeros(COPIES, dtype=d)) for d in ("i8", "f8", "f8", "i8", "f8", "f8", "i2")
+    ]
+
+    def copies(n: int) -> None:
+        for _ in range(n):
+            for source, destination in fields:
+                np.copyto(destination, source)
+
+    per = 500 * COPIES
+    yield Measurement("vector environment", f"{COPIES} copies, ten sub-steps, autoreset", "NumPy copy of its bytes",
+                      lambda: steps(native, 500), lambda: copies(500), "ns per control step", 1e9, per)  # fmt: skip
+    yield Measurement("vector environment, 10 steps", f"{COPIES} copies, ten sub-steps", "Gymnasium's sync vector env",
+                      lambda: steps(native, 10), lambda: steps(sync, 10),
+                      "ns per control step", 1e9, 10 * COPIES)  # fmt: skip
+
+
+def start_up() -> Iterator[Measurement]:
+    """How long `--help` takes, beside a Python process that only imports torch."""
+
+    def process(*arguments: str) -> Callable[[], object]:
+        return lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
+
+    for name in ENTRY_POINTS:
+        yield Measurement(
+            f"start-up, {name} --help", "a whole process", "python -c 'import torch'",
+            process("-m", f"experiments.{name}", "--help"), process("-c", "import torch"),
+        )  # fmt: skip
+
+
+def scaling(runs: int) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Median cost over one size at a time: agents S and batch B of an update, copies N of an environment step,
+    episodes of a training, each as (sizes, seconds)."""
+    import numpy as np
+
+    from envs.vector_env import BioreactorVectorEnv
+
+    def timed(work: Callable[[], object], repeats: int) -> float:
+        work()
+        seconds = []
+        for _ in range(runs):
+            start = time.perf_counter()
+            for _ in range(repeats):
+                work()
+            seconds.append((time.perf_counter() - start) / repeats)
+        return median(seconds)
+
+    config = DQNConfig()
+    agents = np.array([1, 2, 4, 8, 16, 32, 64, 128])
+    batches = np.array([16, 32, 64, 128, 256, 512])
+    copies = np.array([1, 16, 256, 4096, 65536])
+    episodes = np.array([10, 20, 50, 100])
+    found = {"agents S, one update": (agents, [timed(_warm_agent(int(s), config).learn, 50) for s in agents])}
+    found["batch B, one update"] = (
+        batches,
+        [timed(_warm_agent(1, replace(config, batch_size=int(b))).learn, 200) for b in batches],
+    )
+
+    def env_step(n: int) -> float:
+        env = BioreactorVectorEnv(n)
+        env.reset(seed=0)
+        action = np.random.default_rng(0).integers(0, 17, n)
+        return timed(lambda: env.step(action), 200)
+
+    found["copies N, one environment step"] = (copies, [env_step(int(n)) for n in copies])
+    found["episodes, one training"] = (
+        episodes,
+        [timed(partial(_train, 1, replace(config, total_steps=100 * int(e))), 1) for e in episodes],
+    )
+    return {key: (sizes, np.array(seconds)) for key, (sizes, seconds) in found.items()}

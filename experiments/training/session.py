@@ -1,0 +1,173 @@
+"""One training run: agents, evaluation, records and checkpoints, which together continue to the bit after a stop."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from dqn import checkpoint
+from dqn.trainer import TrainRecord
+from experiments.control.config import TrainConfig
+from experiments.reporting.tensorboard import PopulationWriter
+from experiments.training import build
+from experiments.training.evaluation import Evaluation, Score, selection_grid
+
+__all__ = ["Best", "Session", "merit"]
+
+log = logging.getLogger(__name__)
+
+
+REGRET_UNIT, STEADY_UNIT = 0.5, 0.003
+"""Per cent of cost and OD that weigh alike when policies are compared: half a per cent of cost is not seen in a
+recording, and 0.003 OD is the noise of the sensor."""
+
+
+def merit(score: Score) -> NDArray[np.float64]:
+    """How far a policy is from what matters, (S,), lower is better: the larger of regret and steady error in units.
+
+    Regret alone does not see a small offset at rest: 0.006 OD for a whole episode is 0.1 % of its cost.
+    """
+    return np.maximum(score.regret_pct / REGRET_UNIT, score.steady_abs_error / STEADY_UNIT)
+
+
+@dataclass
+class Best:
+    """For each agent the weights that scored best on the selection grid so far, and every score."""
+
+    weights: torch.Tensor  # (S, P)
+    merit: NDArray[np.float64]  # (S,)
+    regret: NDArray[np.float64]  # of the best by merit, (S,)
+    step: NDArray[np.int64]  # (S,)
+    history: list[tuple[int, list[float], list[float]]] = field(default_factory=list)
+    """Step, regret_pct and steady_abs_error of every evaluation, per agent."""
+
+    @classmethod
+    def empty(cls, weights: torch.Tensor) -> Best:
+        """Nothing scored yet; `weights` (S, P) stand until something is."""
+        n = weights.shape[0]
+        return cls(weights.cpu().clone(), np.full(n, np.inf), np.full(n, np.inf), np.zeros(n, dtype=np.int64))
+
+    def update(self, step: int, score: Score, weights: torch.Tensor) -> None:
+        """Keep what is better than before."""
+        self.history.append((step, score.regret_pct.tolist(), score.steady_abs_error.tolist()))
+        value = merit(score)
+        better = value < self.merit
+        for i in better.nonzero()[0]:
+            self.weights[i] = weights[i].cpu()
+        self.merit[better] = value[better]
+        self.regret[better] = score.regret_pct[better]
+        self.step[better] = step
+
+    def state_dict(self) -> dict[str, Any]:
+        """Complete state, tensors and plain values."""
+        return {
+            "weights": self.weights,
+            "merit": self.merit.tolist(),
+            "regret": self.regret.tolist(),
+            "step": self.step.tolist(),
+            "history": self.history,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue as saved."""
+        self.weights.copy_(state["weights"])
+        self.merit[:] = state["merit"]
+        self.regret[:] = state["regret"]
+        self.step[:] = state["step"]
+        self.history = [(step, list(regret), list(steady)) for step, regret, steady in state["history"]]
+
+
+class Session:
+    """The parts of one training run and what it accumulates.
+
+    Args:
+      config: what to train. folder: run folder, for events, progress.csv and checkpoint.pt.
+      resume: continue from the folder's checkpoint.
+    Raises: dqn.checkpoint.CheckpointError where there is none to continue from.
+    """
+
+    def __init__(self, config: TrainConfig, folder: Path, resume: bool = False) -> None:
+        self.config = config
+        self.folder = folder
+        self.seeds: Sequence[int] = range(config.seed, config.seed + config.n_agents)
+        self.agents = build.population(config.env, config.agent, self.seeds, config.device, config.threads)
+        self.selection = Evaluation(config.env, config.agent.gamma, selection_grid(config.env))
+        self.best = Best.empty(self.agents.greedy_weights())
+        self.returns: list[list[float]] = []  # per episode, per agent
+        self.seconds = 0.0  # spent training, over all lives
+        if resume:
+            self._restore(checkpoint.load(folder / "checkpoint.pt"))
+        self.writer = PopulationWriter(folder, self.seeds, self.agents.steps)
+
+    def evaluate(self, step: int) -> Score:
+        """Score the greedy policies on the selection grid, keep the best, log."""
+        weights = self.agents.greedy_weights()
+        score = self.selection(build.act_with(self.agents.network, weights), self.agents.n_agents)
+        self.best.update(step, score, weights)
+        self.writer.scalars(
+            step, {"eval/regret_pct": score.regret_pct, "eval/steady_abs_error": score.steady_abs_error}
+        )
+        self.writer.flush()
+        return score
+
+    def _log(self, record: TrainRecord) -> None:
+        self.returns.append(record.episode_return.tolist())
+        self.writer.scalars(
+            record.step,
+            {
+                "train/return": record.episode_return,
+                "train/loss": record.loss,
+                "train/epsilon": record.epsilon,
+                "train/learning_rate": record.learning_rate,
+                "q/min": record.q_min,
+                "q/max": record.q_max,
+                "speed/steps_per_s": record.step * len(self.seeds) / max(self.seconds, 1e-9),
+            },
+        )
+
+    def _save(self) -> None:
+        state = {
+            "agents": self.agents.state_dict(),
+            "best": self.best.state_dict(),
+            "returns": self.returns,
+            "seconds": self.seconds,
+        }
+        checkpoint.save(self.folder / "checkpoint.pt", state)
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        self.agents.load_state_dict(state["agents"])
+        self.best.load_state_dict(state["best"])
+        self.returns = [list(row) for row in state["returns"]]
+        self.seconds = state["seconds"]
+
+    def run(self) -> None:
+        """Train to the end: log every episode, evaluate, checkpoint, show progress."""
+        c = self.config
+        total, last = c.agent.total_steps, self.agents.steps
+        started, earlier = time.perf_counter(), self.seconds
+        with logging_redirect_tqdm(), tqdm(total=total, initial=last, disable=None, unit="step") as bar:
+            for record in self.agents.run():
+                self.seconds = earlier + time.perf_counter() - started
+                self._log(record)
+                bar.update(record.step - last)
+                final = record.step == total
+                if final or record.step // c.eval_every > last // c.eval_every:
+                    score = self.evaluate(record.step)
+                    line = f"regret {np.median(score.regret_pct):.2f} %, best {np.median(self.best.regret):.2f} %"
+                    bar.set_postfix_str(line)
+                    if bar.disable:
+                        log.info("step %d of %d: %s", record.step, total, line)
+                if final or record.step // c.checkpoint_every > last // c.checkpoint_every:
+                    self.seconds = earlier + time.perf_counter() - started
+                    self._save()
+                last = record.step

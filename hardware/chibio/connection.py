@@ -1,0 +1,194 @@
+"""One reactor position: every request to it, verified. No schedule, no policy, no safety rules."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from hardware.chibio.protocol import PUMPS, DeviceState, check_command, parse_state
+from hardware.clock import Clock
+from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
+from hardware.link.transport import Transport
+
+__all__ = ["Log", "Unit", "no_log"]
+
+SEEN_S = 1.0
+"""Who was seen so lately is still there: a device that ended takes longer to listen again. What it is sent while it
+starts it carries out afterwards, whoever is absent by then."""
+SETTLE_S = 0.3
+"""A pump command is answered before its thread has written to the bus (chibio.md section 5.1)."""
+
+Log = Callable[[str, Mapping[str, Any]], None]
+"""Takes a kind and its fields, for instance `Journal.append`."""
+
+
+def no_log(kind: str, fields: Mapping[str, Any]) -> None:
+    """Keeps nothing."""
+
+
+class Unit:
+    """The verified conversation with one reactor.
+
+    The device shows one selected reactor to everybody, so a read is changeDevice and GET as a pair, believed only if
+    the answer names this reactor and its pinned identity (chibio.md section 12.2). A command is sent only if the last
+    verified read saw this reactor present: one request to an absent one ends the whole server (section 0.3). After a
+    request without an answer, or a while without a request, nothing is known: the server may have been started again
+    without this reactor. Then the next command looks first.
+
+    Args:
+      name: position, M0 to M7.
+      reactors: all positions this client owns.
+      transport, clock: how requests travel, how time passes.
+      log: told of every command and its answer.
+      guard: pump of the overflow guard, which may be switched on; "" if there is none.
+    """
+
+    def __init__(
+        self, name: str, reactors: Sequence[str], transport: Transport, clock: Clock, log: Log, guard: str = ""
+    ) -> None:
+        self.name = name
+        self.device_id = ""  # pinned at the first read
+        self.state: DeviceState | None = None  # the last verified one
+        self.took_s = 0.0  # how long the last verified read took
+        self._unsure = False  # a request was not answered as expected since presence was last seen
+        self._seen_s = -math.inf  # clock time at which this reactor was last known to be present
+        self._reactors = tuple(reactors)
+        self._transport = transport
+        self._clock = clock
+        self._log = log
+        self._guard = guard
+
+    def read(self, tries: int = 3) -> DeviceState:
+        """The reactor's state, certainly its own.
+
+        Raises: LinkError, ProtocolError; DeviceStateError if it is absent or another client keeps selecting reactors;
+          IdentityError if another unit answers at this position than before.
+        """
+        selected = ""
+        for _ in range(tries):
+            start = self._clock.now()
+            self._post(f"/changeDevice/{self.name}", quiet=True)
+            state = self._look()
+            selected = state.selected
+            if selected == self.name:
+                break
+        else:
+            raise DeviceStateError(
+                f"{self.name} cannot be read: the device shows {selected}; another client keeps selecting reactors"
+            )
+        if not state.device_id or (self.device_id and state.device_id != self.device_id):
+            self.state = None
+            raise IdentityError(
+                f"{self.name} answers with identity {state.device_id or 'none'}, pinned is {self.device_id or 'none'}"
+            )
+        self.device_id = state.device_id
+        self.state, self.took_s = state, self._since(start)
+        return state
+
+    def _look(self) -> DeviceState:
+        """The state of whichever reactor is selected, which tells of all whether they are present.
+
+        Raises: LinkError, ProtocolError; DeviceStateError if this one is absent.
+        """
+        before, self._unsure = self._unsure, True
+        reply = self._transport.get("/getSysdata/")
+        if reply.status != 200:
+            raise ProtocolError(f"GET /getSysdata/: status {reply.status}, expected 200")
+        self._unsure = before  # whoever answers 200 is the server, even if its words are garbled
+        state = parse_state(reply.body)
+        self._unsure = False
+        if self.name not in state.present:
+            self.state = None  # nothing is sent to it from now on
+            raise DeviceStateError(f"{self.name} is absent (present: {', '.join(state.present) or 'none'})")
+        self._seen_s = self._clock.now()
+        return state
+
+    def post(self, path: str) -> None:
+        """Send one command of `wire.check_command`.
+
+        Raises: LinkError (it may have been carried out), ProtocolError for a status other than 204, DeviceStateError
+          if the command is not allowed or the reactor was not present when it was last looked at.
+        """
+        if self.state is not None and (self._unsure or self._clock.now() - self._seen_s > SEEN_S):
+            self._look()
+        if self.state is None or self.name not in self.state.present:
+            raise DeviceStateError(f"refused to send POST {path}: {self.name} was not seen present")
+        self._post(path)
+        self._seen_s = self._clock.now()
+
+    def _post(self, path: str, quiet: bool = False) -> None:
+        check_command(path, self._reactors, self._guard)
+        start = self._clock.now()
+        answer: int | str = ""
+        before, self._unsure = self._unsure, True
+        try:
+            reply = self._transport.post(path)
+            answer = reply.status
+        except ReactorError as error:
+            answer = str(error)
+            raise
+        finally:
+            if not quiet or answer != 204:
+                self._log(
+                    "command", {"reactor": self.name, "path": path, "answer": answer, "took_s": self._since(start)}
+                )
+        if reply.status != 204:
+            hint = "; the server wants X-Requested-With" if reply.status == 403 else ""
+            raise ProtocolError(f"POST {path}: status {reply.status}, expected 204{hint}")
+        self._unsure = before
+
+    def _since(self, start: float) -> float:
+        return round(self._clock.now() - start, 3)
+
+    def target(self, item: str, value: float) -> None:
+        """Set the target of `item`. Raises: as `post`."""
+        self.post(f"/SetOutputTarget/{item}/{self.name}/{value:.6f}")
+
+    def switch(self, item: str, on: bool) -> None:
+        """Switch `item`; never a toggle. Raises: as `post`."""
+        self.post(f"/SetOutputOn/{item}/{int(on)}/{self.name}")
+
+    def pumps_off(self, tries: int = 3, pumps: Sequence[str] = PUMPS) -> None:
+        """These pumps off, verified. Every one is tried even if another one fails, unless nobody answers at all.
+
+        Read-back alone proves nothing, for the flags are intent: with the bus hung they say off while the motor runs.
+        So a blocking call touches the bus in between. It is quick if all is well; on a hung bus it outlasts the
+        server's worker, whose end switches everything off: the remote kill switch (chibio.md section 9).
+
+        Raises: LinkError, ProtocolError, DeviceStateError if it could not be verified.
+        """
+        error: ReactorError | None = None
+        for attempt in range(tries):
+            if attempt:
+                self._clock.sleep(1.0)
+            error = None
+            if self.state is None:
+                self.read()  # presence first
+            silent = 0  # time-outs are long: after feed and waste went unanswered, say so instead of going on
+            for pump in pumps:
+                try:
+                    self.switch(pump, False)
+                    silent = 0
+                except (LinkError, ProtocolError) as failed:
+                    error, silent = failed, silent + isinstance(failed, LinkError)
+                    if silent == 2:
+                        break
+            if error is not None:
+                continue
+            self._clock.sleep(SETTLE_S)
+            try:
+                self.probe()
+                on = [p for p in self.read().running_pumps if p in pumps]
+            except (LinkError, ProtocolError) as failed:
+                error = failed
+                continue
+            if not on:
+                return
+            error = DeviceStateError(f"{self.name}: {', '.join(on)} still on after the off command")
+        assert error is not None
+        raise error
+
+    def probe(self) -> None:
+        """Touch the bus with a blocking call. Raises: LinkError if it hangs."""
+        self.post(f"/MeasureTemp/IR/{self.name}")

@@ -1,0 +1,246 @@
+"""Volume to pump time: the one place where mL become a duty (chibio.md sections 5.1, 5.2 and 12.18)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware.chibio.protocol import PERIOD_S
+
+__all__ = ["DosePlan", "DosingConfig", "PumpCalibration", "PumpFit", "Rig", "fit_pump", "plan_dose"]
+
+Array = NDArray[np.float64]
+
+MAX_FEED_DUTY = 0.05  # chibio.md section 12.1; the lowest layer (`wire.check_command`) refuses more
+MAX_WASTE_DUTY = 0.5  # 63 s * duty must end before the next measurement
+
+
+@dataclass(frozen=True)
+class PumpCalibration:
+    """Volume of one dose: v = flow_ml_s * (63 s * duty + bias_s), with a relative spread from dose to dose.
+
+    flow_ml_s: flow at full power, mL/s.
+    bias_s: the motor runs this much longer than asked (positive), or delivers nothing for that long (negative), s.
+    spread: standard deviation of a single dose relative to its volume.
+    min_on_s: shortest on-time that delivers dependably, s.
+    date, device_id: when and on which unit it was weighed; "" for nominal values.
+    """
+
+    flow_ml_s: float = 1.0
+    bias_s: float = 0.0
+    spread: float = 0.1
+    min_on_s: float = 0.3
+    date: str = ""
+    device_id: str = ""
+
+    def __post_init__(self) -> None:
+        ranges = {"flow_ml_s": (0.05, 5.0), "bias_s": (-1.0, 1.0), "spread": (0.0, 1.0), "min_on_s": (0.0, 2.0)}
+        for key, (low, high) in ranges.items():
+            value = getattr(self, key)
+            if not low <= value <= high:
+                raise ValueError(
+                    f"pump calibration {key} = {value}: allowed {low} to {high}; weigh the doses again "
+                    "(python -m experiments.calibrate_pump)"
+                )
+
+    def on_time(self, volume_ml: float) -> float:
+        """Seconds to ask for so that `volume_ml` flows; not below 0."""
+        return max(volume_ml / self.flow_ml_s - self.bias_s, 0.0)
+
+    def volume(self, on_s: float) -> float:
+        """mL that `on_s` seconds deliver; not below 0."""
+        return max(self.flow_ml_s * (on_s + self.bias_s), 0.0) if on_s > 0.0 else 0.0
+
+    @property
+    def min_dose_ml(self) -> float:
+        """Smallest dose worth giving, mL."""
+        return self.volume(self.min_on_s)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for a file."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> PumpCalibration:
+        """The inverse of `as_dict`; further keys are ignored. Raises: ValueError if a value is no number of its range.
+
+        A file may hold more than this, for instance the weighings it rests on.
+        """
+        known = {f.name for f in fields(cls)}
+        try:
+            numbers = {k: float(v) for k, v in values.items() if k in known - {"date", "device_id"}}
+            return cls(**numbers, date=str(values.get("date", "")), device_id=str(values.get("device_id", "")))
+        except TypeError as error:
+            raise ValueError(f"pump calibration: {error}; weigh the doses again") from error
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What belongs to one reactor position: its two calibrated pumps, its blank, the unit they were measured on.
+
+    blank: raw counts of clear medium under run conditions; nan = take what the device holds.
+    """
+
+    feed: PumpCalibration = PumpCalibration()
+    waste: PumpCalibration = PumpCalibration()
+    blank: float = math.nan
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether both pumps were weighed."""
+        return bool(self.feed.date and self.waste.date)
+
+
+@dataclass(frozen=True)
+class DosingConfig:
+    """How a feed rate becomes a dose of feed and a dose of waste.
+
+    period_s: control period one dose stands for, s.
+    waste_factor, waste_extra_s: waste on-time is at least factor * feed on-time + extra, s (the device's own law is
+      4 and 4.4 s; the level is set by the height of the waste tube, so too much does no harm).
+    clear_every, clear_duty: every so many doses the waste pump runs at this duty, to clear its tube.
+    """
+
+    period_s: float = 60.0
+    waste_factor: float = 4.0
+    waste_extra_s: float = 4.4
+    clear_every: int = 5
+    clear_duty: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not 10.0 <= self.period_s <= 600.0:
+            raise ValueError(f"dosing.period_s = {self.period_s} s: allowed 10 to 600 (the device measures every 60 s)")
+        if self.waste_factor < 4.0 or self.waste_extra_s < 4.0:
+            raise ValueError(
+                f"dosing.waste_factor = {self.waste_factor}, waste_extra_s = {self.waste_extra_s} s: allowed at "
+                "least 4 and 4 s; less risks an overflow"
+            )
+        if self.clear_every < 1 or not 0.0 < self.clear_duty <= MAX_WASTE_DUTY:
+            raise ValueError(
+                f"dosing.clear_every = {self.clear_every}, clear_duty = {self.clear_duty}: allowed >= 1 and over 0 to "
+                f"{MAX_WASTE_DUTY}"
+            )
+
+
+@dataclass(frozen=True)
+class DosePlan:
+    """One dose: feed and waste duty (targets of the device), their volumes in mL, and what is carried to the next.
+
+    carry_ml: asked but not dosed, because it is less than the pump can deliver; shortfall_ml: cut off by the limit of
+    the feed duty and not carried.
+    """
+
+    feed_duty: float = 0.0
+    waste_duty: float = 0.0
+    feed_ml: float = 0.0
+    waste_ml: float = 0.0
+    carry_ml: float = 0.0
+    shortfall_ml: float = 0.0
+
+    @property
+    def feed_s(self) -> float:
+        """Feed on-time, s."""
+        return PERIOD_S * self.feed_duty
+
+    @property
+    def waste_s(self) -> float:
+        """Waste on-time, s."""
+        return PERIOD_S * self.waste_duty
+
+
+def plan_dose(rate: float, carry_ml: float, doses: int, rig: Rig, config: DosingConfig) -> DosePlan:
+    """The dose that brings `rate` over one control period, together with what earlier periods left over.
+
+    feed duty = (v / q - bias) / 63 with v = rate * period + carry; nothing is dosed while v is below the smallest dose,
+    v is then the new carry. So the mean flow is right even for rates whose single doses the pump cannot deliver, and
+    a carry never exceeds one smallest dose.
+
+    Args:
+      rate: mean feed rate, mL/s, >= 0.
+      carry_ml: `carry_ml` of the previous plan, mL.
+      doses: number of feed doses given so far; every `clear_every`-th clears the waste tube.
+      rig: calibrated pumps of this reactor.
+      config: period and waste law.
+    Raises: ValueError if the rate is negative or not finite.
+    """
+    if not (math.isfinite(rate) and rate >= 0.0):
+        raise ValueError(f"pump rate = {rate} mL/s: allowed a finite number >= 0")
+    volume = rate * config.period_s + carry_ml
+    # a period that asks for nothing doses nothing: left-overs wait for the controller to want fluid again
+    if rate == 0.0 or volume < rig.feed.min_dose_ml or volume == 0.0:
+        return DosePlan(carry_ml=min(volume, rig.feed.min_dose_ml))
+    duty = math.floor(rig.feed.on_time(volume) / PERIOD_S * 1e6) / 1e6  # what the URL carries
+    feed_duty = min(duty, MAX_FEED_DUTY)
+    feed_s = PERIOD_S * feed_duty
+    feed_ml = rig.feed.volume(feed_s)
+    # the law of the tubes in seconds, and never less than 1.5 times the fed volume if the waste pump is the weaker
+    waste_s = max(config.waste_factor * feed_s + config.waste_extra_s, rig.waste.on_time(1.5 * feed_ml))
+    if (doses + 1) % config.clear_every == 0:
+        waste_s = max(waste_s, PERIOD_S * config.clear_duty)
+    waste_duty = min(math.ceil(waste_s / PERIOD_S * 1e6) / 1e6, MAX_WASTE_DUTY)
+    left = max(volume - feed_ml, 0.0)
+    return DosePlan(
+        feed_duty=feed_duty,
+        waste_duty=waste_duty,
+        feed_ml=feed_ml,
+        waste_ml=rig.waste.volume(PERIOD_S * waste_duty),
+        shortfall_ml=left if duty > feed_duty else 0.0,
+    )
+
+
+@dataclass(frozen=True)
+class PumpFit:
+    """A fitted calibration with the uncertainty of its parameters (one standard error) and the residuals, mL."""
+
+    calibration: PumpCalibration
+    flow_se: float
+    bias_se: float
+    residual_ml: Array
+
+
+def fit_pump(on_s: Array, doses: Array, grams: Array, date: str = "", device_id: str = "") -> PumpFit:
+    """Least-squares fit of v = q (t + bias) to weighed series of doses; water or medium, 1 g = 1 mL.
+
+    Each series of n doses of t seconds weighs g grams, so its mean dose g/n has variance proportional to 1/n: weighted
+    linear regression of g/n on t with weights n. The spread of a single dose follows from the weighted residuals. The
+    smallest useful on-time is the shortest one weighed whose mean dose is at least 0.7 of the fitted line, not under
+    0.3 s (chibio.md section 5.1).
+
+    Args:
+      on_s: asked on-time of the series, s, shape (K,), > 0, at least two different values.
+      doses: number of doses, shape (K,), >= 1.
+      grams: mass delivered, g, shape (K,), >= 0.
+    Raises: ValueError if the series cannot determine a line, or the fitted pump is out of range.
+    """
+    t, n, y = (np.asarray(a, dtype=np.float64) for a in (on_s, doses, grams))
+    if not (t.shape == n.shape == y.shape and t.ndim == 1 and t.size >= 2):
+        raise ValueError(f"pump calibration needs at least 2 series of equal length, got {t.size}, {n.size}, {y.size}")
+    if not (np.all(np.isfinite(t + n + y)) and np.all(t > 0.0) and np.all(n >= 1) and np.all(y >= 0.0)):
+        raise ValueError("pump calibration: on-times must be > 0 s, doses >= 1, grams >= 0, all finite")
+    if np.ptp(t) < 0.2:
+        raise ValueError(
+            f"pump calibration: on-times {t.min():.2f} to {t.max():.2f} s: allowed a range of 0.2 s or more"
+        )
+    dose = y / n
+    mean_t, mean_y = np.average(t, weights=n), np.average(dose, weights=n)
+    sxx = np.sum(n * (t - mean_t) ** 2)
+    flow = float(np.sum(n * (t - mean_t) * (dose - mean_y)) / sxx)
+    if flow <= 0.0:
+        raise ValueError(
+            f"pump calibration: fitted flow {flow:.3f} mL/s: longer doses weighed less; repeat the weighing"
+        )
+    bias = float(mean_y / flow - mean_t)
+    residual = dose - flow * (t + bias)
+    freedom = t.size - 2
+    sigma = math.sqrt(float(np.sum(n * residual**2)) / freedom) if freedom > 0 else math.nan  # mL, of one dose
+    flow_se = sigma / math.sqrt(float(sxx))
+    bias_se = sigma / flow * math.sqrt(1.0 / float(np.sum(n)) + (mean_t + bias) ** 2 / float(sxx))
+    spread = min(sigma / float(np.mean(dose)), 1.0) if math.isfinite(sigma) else 0.1
+    useful = t[dose >= 0.7 * flow * np.maximum(t + bias, 1e-9)]
+    min_on = float(np.clip(useful.min() if useful.size else t.max(), 0.3, 2.0))
+    calibration = PumpCalibration(flow, bias, spread, min_on, date, device_id)
+    return PumpFit(calibration, flow_se, bias_se, residual)

@@ -1,0 +1,182 @@
+"""Before a run: one line per check, passed or with the remedy. Looks, touches nothing but the selected reactor."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
+from pathlib import Path
+
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import Unit, no_log
+from hardware.chibio.dosing import MAX_FEED_DUTY, Rig
+from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.protocol import PERIOD_S, UNSET_BLANK, DeviceState
+from hardware.clock import Clock
+from hardware.errors import ReactorError
+from hardware.link.transport import Transport
+
+__all__ = ["Check", "preflight"]
+
+SURE = 1.1  # times the feed, for what pumps differ from their calibration
+VIAL_ML = 30.0  # up to its rim (biology.md section 3)
+FREE_MB = 1000.0  # a week of eight reactors writes about 240 MB (docs/faults.md)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line: what was checked, whether it passed, what was seen, what to do. `required` ones stop a run."""
+
+    name: str
+    ok: bool
+    detail: str
+    remedy: str = ""
+    required: bool = True
+
+    def __str__(self) -> str:
+        mark = "pass" if self.ok else ("FAIL" if self.required else "note")
+        return f"{mark}  {self.name}: {self.detail}" + ("" if self.ok else f" -> {self.remedy}")
+
+
+def preflight(
+    transport: Transport, clock: Clock, config: ChiBioConfig, rigs: list[Rig], folder: Path | None = None
+) -> list[Check]:
+    """Disk, guard, connection, clock, and per reactor presence, identity, blank, modes, sensors, pump calibration.
+
+    Args:
+      transport, clock, config, rigs: as for `ChiBioReactors`.
+      folder: where the run will write; its disk is checked.
+    Raises: nothing about the device; a check that cannot be made has failed.
+    """
+    checks = [_disk(folder)] if folder is not None else []
+    checks.append(_guard(config, rigs))
+    try:
+        checks += [_link(transport, clock), _board_clock(transport, clock, config)]
+    except ReactorError as error:
+        return [*checks, Check("connection", False, str(error), "check cable, address and that the server runs")]
+    for name, rig in zip(config.reactors, rigs, strict=True):
+        unit = Unit(name, config.reactors, transport, clock, no_log)
+        try:
+            state = unit.read()
+            if not state.running:
+                unit.probe()  # a device that never ran an experiment shows no temperature yet
+                state = unit.read()
+        except ReactorError as error:
+            checks.append(
+                Check(f"{name} present", False, str(error), "plug it in with the server stopped, or leave it out")
+            )
+            continue
+        checks.append(
+            Check(f"{name} present", True, f"identity {state.device_id}, software {state.version or 'unnamed'}")
+        )
+        checks += _reactor(name, state, rig, config.guard)
+    return checks
+
+
+def _disk(folder: Path) -> Check:
+    free = shutil.disk_usage(folder).free / 1e6
+    return Check("disk", free > FREE_MB, f"{free:.0f} MB free", f"free at least {FREE_MB:.0f} MB under {folder}")
+
+
+def _link(transport: Transport, clock: Clock) -> Check:
+    start = clock.now()
+    for _ in range(3):
+        transport.get("/getSysdata/")
+    took = (clock.now() - start) / 3.0
+    return Check("connection", took < 2.0, f"{took:.2f} s per answer", "close web pages; use a faster link")
+
+
+def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Check:
+    """Whether the board's clock runs evenly; what it shows does not matter (chibio.md section 9)."""
+    dates, times = [], []
+    for pause in (5.0, 0.0):
+        reply = transport.get("/getSysdata/")
+        times.append(clock.now())
+        try:
+            dates.append(parsedate_to_datetime(reply.date).timestamp())
+        except ValueError:
+            return Check("board clock", True, "not visible over this link", required=False)
+        clock.sleep(pause)
+    drift = (dates[1] - dates[0]) - (times[1] - times[0]) / config.speed
+    return Check(
+        "board clock", abs(drift) < 2.5, f"{drift:+.1f} s against this computer", "stop clock corrections on the board"
+    )
+
+
+def _guard(config: ChiBioConfig, rigs: list[Rig]) -> Check:
+    """What the overflow guard covers; without one, what then cannot be prevented."""
+    guard, feed = config.guard, max(rig.feed.flow_ml_s for rig in rigs)
+    if not guard.pump:
+        return Check(
+            "overflow guard",
+            False,
+            f"none: with a blocked waste tube a vial overflows after about {VIAL_ML - config.volume_ml:.0f} mL of feed",
+            "a second waste tube on Pump3, backend.guard.pump=Pump3 (docs/chibio.md)",
+            required=False,
+        )
+    covers = "a blocked waste tube" + " and a feed motor stuck on" * (guard.removes_ml_s > SURE * feed)
+    return Check(
+        "overflow guard",
+        guard.removes_ml_s > MAX_FEED_DUTY * feed,
+        f"{guard.pump} at duty {guard.duty:g} takes {guard.removes_ml_s:.2f} mL/s, feed pump {feed:.2f} mL/s at full "
+        f"power: covers {covers}; verified on when the run starts",
+        "less than the largest feed: raise backend.guard.duty",
+        required=False,
+    )
+
+
+def _reactor(name: str, state: DeviceState, rig: Rig, guard: GuardConfig) -> Iterator[Check]:
+    """Checks of one reactor's state."""
+    blank = rig.blank if math.isfinite(rig.blank) else state.blank
+    source = "stored" if math.isfinite(rig.blank) else "of the device"
+    yield Check(
+        f"{name} blank",
+        3000.0 <= blank <= 60000.0 and blank != UNSET_BLANK,
+        f"{blank:.0f} counts ({source})",
+        "measure it with clear medium: python -m experiments.blank",
+    )
+    yield Check(
+        f"{name} modes",
+        not state.modes and not state.regulating,
+        ", ".join([*state.modes, *(["OD regulation"] if state.regulating else [])]) or "none active",
+        "switch them off in the web page (OD regulation is switched off by the run itself)",
+        required=bool(state.modes),
+    )
+    yield Check(
+        f"{name} temperature",
+        10.0 < state.temperature < 45.0,
+        f"{state.temperature:.1f} degC",
+        "check that the vial is seated under the thermometer",
+    )
+    yield Check(
+        f"{name} light sensor",
+        state.cycles == 0 or state.raw >= 5.0,
+        f"raw {state.raw:.0f} after {state.cycles} cycles",
+        "check the spectrometer; restart the device",
+    )
+    same = all(not p.device_id or p.device_id == state.device_id for p in (rig.feed, rig.waste))
+    dates = f"feed {rig.feed.date or 'never weighed'}, waste {rig.waste.date or 'never weighed'}"
+    yield Check(
+        f"{name} pump calibration",
+        rig.calibrated and same,
+        dates + ("" if same else ", on another unit"),
+        f"python -m experiments.calibrate_pump reactor={name}; until then {rig.feed.flow_ml_s:g} mL/s is assumed",
+        required=False,
+    )
+    stronger = 4.0 * rig.waste.flow_ml_s / rig.feed.flow_ml_s
+    yield Check(
+        f"{name} waste over feed",
+        stronger >= 1.5,
+        f"waste moves {stronger:.1f} times the feed in its on-time",
+        "exchange or repair the waste pump",
+    )
+    on = ", ".join(p for p in state.running_pumps if p in guard.others)
+    yield Check(
+        f"{name} pumps",
+        not on,
+        f"{on or 'all'} {'on' if on else 'off'}",
+        f"an earlier client left them on, each repeats its dose every {PERIOD_S:.0f} s; the run switches them off",
+        required=False,
+    )

@@ -1,0 +1,82 @@
+"""Work on the bench before a run: series of doses to weigh, and the blank of clear medium under run conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hardware.chibio.connection import Unit
+from hardware.chibio.protocol import PERIOD_S
+from hardware.chibio.reactors import ChiBioReactors
+from hardware.clock import Clock
+from hardware.errors import DeviceStateError, SensorError
+
+__all__ = ["Blank", "dose_series", "measure_blanks"]
+
+Array = NDArray[np.float64]
+
+PAUSE_S = 2.0  # between two doses, so that the fluid comes to rest
+LATE_S = 2.0  # a pump starts a little after the answer, and later on a busy bus; its dose must not be cut short
+
+
+def dose_series(unit: Unit, clock: Clock, pump: str, duty: float, doses: int) -> Iterator[int]:
+    """Give `doses` single-shot doses of 63 s * `duty`, one per step; yields how many have been given.
+
+    The pump is verified off after every dose and when the generator is closed.
+    Raises: DeviceStateError if an experiment runs or a dose did not begin; LinkError, ProtocolError.
+    """
+    state = unit.read()
+    if state.running:
+        raise DeviceStateError(f"{unit.name}: an experiment is running; stop it before pumps are weighed")
+    try:
+        unit.pumps_off()
+        unit.target(pump, duty)
+        for given in range(1, doses + 1):
+            unit.switch(pump, True)
+            clock.sleep(PERIOD_S * duty + LATE_S)
+            unit.pumps_off()
+            yield given
+            clock.sleep(PAUSE_S)
+    finally:
+        unit.pumps_off()
+
+
+@dataclass(frozen=True)
+class Blank:
+    """Counts of clear medium: mean and standard deviation over `samples` cycles, shape (N,)."""
+
+    raw: Array
+    sd: Array
+    samples: int
+
+
+def measure_blanks(reactors: ChiBioReactors, samples: int) -> Blank:
+    """Average the raw counts of `samples` cycles of every reactor and set them as the devices' blanks.
+
+    Needs clear medium in stirred, heated vials and `reactors.begin()`; the counts are those of the experiment's own
+    measurement, stirrer still, so they hold under run conditions (chibio.md section 4).
+    Raises: SensorError if a count is impossible or they scatter by more than 2 %; ReactorError.
+    """
+    rows: list[list[float]] = [[] for _ in reactors.names]
+    while min(map(len, rows)) < samples:
+        m = reactors.measure()
+        assert m.vitals is not None
+        faults = [f"{n}: {f}" for n, f in zip(reactors.names, m.vitals.faults, strict=True) if f is not None]
+        if faults:
+            raise DeviceStateError("; ".join(faults))
+        for i in np.flatnonzero(m.fresh):
+            rows[i].append(float(m.vitals.raw[i]))
+    counts = np.array([row[:samples] for row in rows])
+    mean, sd = counts.mean(axis=1), counts.std(axis=1, ddof=1)
+    for name, value, spread in zip(reactors.names, mean, sd, strict=True):
+        if not 3000.0 <= value <= 60000.0 or spread > 0.02 * value:
+            raise SensorError(
+                f"{name}: blank {value:.0f} +- {spread:.0f} counts, allowed 3000 to 60000 with a scatter under 2 %; "
+                "check that the vial is seated, the medium clear and without bubbles"
+            )
+    for station, value in zip(reactors.stations, mean, strict=True):
+        station.set_blank(float(value))
+    return Blank(mean, sd, samples)

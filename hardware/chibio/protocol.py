@@ -1,0 +1,254 @@
+"""The Chi.Bio's language as pure functions: its state out of JSON, and the few commands a client may ever send.
+
+Nothing here talks to a device. Facts and traps: chibio.md sections 2, 3, 8 and 12.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hardware.errors import DeviceStateError, ProtocolError
+
+__all__ = [
+    "FEED",
+    "MAX_GUARD_DUTY",
+    "PERIOD_S",
+    "POSITIONS",
+    "PUMPS",
+    "SPARE",
+    "UNSET_BLANK",
+    "WASTE",
+    "DeviceState",
+    "check_command",
+    "parse_state",
+]
+
+POSITIONS = tuple(f"M{k}" for k in range(8))
+PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")
+FEED, WASTE = "Pump1", "Pump2"
+SPARE = ("Pump3", "Pump4")
+"""Without tubes on a standard reactor; one of them may drive an overflow guard (`overflow_guard.py`)."""
+MAX_GUARD_DUTY = 0.95
+"""Never 1: the device does not switch such a pump off between its periods (chibio.md sections 5.1 and 12.1)."""
+PERIOD_S = 63.0
+"""A pump that is ON runs at full power for PERIOD_S * target seconds of every PERIOD_S (chibio.md section 5.1)."""
+UNSET_BLANK = 65000.0
+"""Blank of a device that lost its memory or was never calibrated (chibio.md section 4)."""
+
+_NUMBER = r"[0-9]{1,6}(?:\.[0-9]{1,12})?"
+_LIMITS: Mapping[str, tuple[float, float]] = {
+    "Pump1": (0.0, 0.05),  # fifty times less than what the pump can do; the on-board regulator stays below 0.02
+    "Pump2": (0.0, 0.5),  # a waste dose must end before the next measurement
+    "Pump3": (0.0, 0.0),
+    "Pump4": (0.0, 0.0),
+    "Stir": (0.0, 1.0),
+    "Thermostat": (0.0, 42.0),  # the device has no over-temperature cut-off of its own
+    "OD": (0.01, 1.5),
+    "Volume": (10.0, 30.0),
+}
+_SWITCHES = (*PUMPS, "OD", "Stir", "Thermostat", "Heat")
+_MAY_GO_ON = ("Pump1", "Pump2", "OD", "Stir", "Thermostat")
+
+
+@dataclass(frozen=True)
+class DeviceState:
+    """What a client needs of one reactor's state. Times in s, temperatures in degC, blank and raw in counts.
+
+    sample_s, sample_od, sample_temperature: last entries of the records; nan if there is none yet or the device was
+    just replacing its lists. pumps_on, pump_targets: Pump1 to Pump4. regulating, regulation_target: the on-board OD
+    regulation. modes: what else would act on its own.
+    """
+
+    selected: str
+    present: tuple[str, ...]
+    device_id: str
+    version: str
+    running: bool
+    cycles: int
+    start_time: str
+    sample_s: float
+    sample_od: float
+    sample_temperature: float
+    measuring: bool
+    raw: float
+    blank: float
+    temperature: float
+    pumps_on: tuple[bool, ...]
+    pump_targets: tuple[float, ...]
+    stirring: bool
+    stir_target: float
+    heating: bool
+    temperature_target: float
+    regulating: bool
+    regulation_target: float
+    modes: tuple[str, ...]
+    volume_ml: float
+    terminal: str
+
+    @property
+    def running_pumps(self) -> tuple[str, ...]:
+        """Names of the pumps that are on."""
+        return tuple(p for p, is_on in zip(PUMPS, self.pumps_on, strict=True) if is_on)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the newest line of the log says that the experiment's last thread has ended.
+
+        "Experiment Stopped", or "Experiment on M0 (IDENTITY) Stopped" of newer apps; "Stopping" is not yet.
+        """
+        return re.search(r"\bExperiment\b.*\bStopped\b", self.terminal) is not None
+
+    @property
+    def started(self) -> bool:
+        """Whether the device remembers an experiment; False after a restart of its server."""
+        return self.cycles > 0 or "Waiting" not in self.start_time
+
+
+def _get(data: Any, *keys: str) -> Any:
+    for key in keys:
+        if not isinstance(data, dict) or key not in data:
+            raise ProtocolError(f"device state: field {'.'.join(keys)} is missing")
+        data = data[key]
+    return data
+
+
+def _number(data: Any, *keys: str) -> float:
+    value = _get(data, *keys)
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except OverflowError:
+            pass
+    raise ProtocolError(f"device state: {'.'.join(keys)} = {str(value)[:40]!r}, expected a number")
+
+
+def _flag(data: Any, *keys: str) -> bool:
+    value = _get(data, *keys)
+    if value in (0, 1):  # also True, False, 0.0 and 1.0
+        return bool(value)
+    raise ProtocolError(f"device state: {'.'.join(keys)} = {str(value)[:40]!r}, expected 0 or 1")
+
+
+def _text(data: Any, *keys: str) -> str:
+    value = _get(data, *keys)
+    if isinstance(value, str):
+        return value
+    raise ProtocolError(f"device state: {'.'.join(keys)} = {str(value)[:40]!r}, expected text")
+
+
+def _lengths(data: Any) -> tuple[int, ...]:
+    """Lengths of the three records; the serial agent sends them apart because it cuts the lists."""
+    paths = (("time", "record"), ("OD", "record"), ("ThermometerIR", "record"))
+    lists = [_get(data, *path) for path in paths]
+    if not all(isinstance(x, list) for x in lists):
+        raise ProtocolError("device state: a record is not a list")
+    cut = data.get("_records")
+    if isinstance(cut, dict):
+        return tuple(int(_number(cut, path[0])) if math.isfinite(_number(cut, path[0])) else -1 for path in paths)
+    return tuple(len(x) for x in lists)
+
+
+def _last(data: Any, group: str) -> float:
+    values = _get(data, group, "record")
+    return _number({"last": values[-1]}, "last") if values else math.nan
+
+
+def _terminal(data: Any) -> str:
+    """The newest line of the text log; some forks keep a list instead of a text."""
+    text = data.get("Terminal", {})
+    text = text.get("text", "") if isinstance(text, dict) else ""
+    if isinstance(text, list):
+        text = text[0] if text else ""
+    return str(text).split("</br>", 1)[0][:160]
+
+
+def _modes(data: Any) -> tuple[str, ...]:
+    names = ("Zigzag", "Custom", "Chemostat", "Light", "FP1", "FP2", "FP3")
+    return tuple(n for n in names if n in data and _flag(data, n, "ON"))
+
+
+def parse_state(body: bytes) -> DeviceState:
+    """The state out of an answer to GET /getSysdata/; unknown fields are ignored, NaN is accepted in readings.
+
+    Raises: ProtocolError naming the first field that is missing or malformed.
+    """
+    try:
+        data = json.loads(body)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"device state: not JSON ({str(error)[:80]}): {body[:60]!r}") from error
+    if not isinstance(data, dict):
+        raise ProtocolError(f"device state: expected an object, got {body[:60]!r}")
+    present = _get(data, "presentDevices")
+    lengths = _lengths(data)
+    whole = len(set(lengths)) == 1 and lengths[0] > 0
+    cycles = _number(data, "Experiment", "cycles")
+    if not (math.isfinite(cycles) and -1 <= cycles < 1e9):
+        raise ProtocolError(f"device state: Experiment.cycles = {cycles}, expected a count")
+    return DeviceState(
+        selected=_text(data, "UIDevice"),
+        present=tuple(m for m in POSITIONS if isinstance(present, dict) and m in present and _flag(present, m)),
+        device_id=_text(data, "DeviceID"),
+        version=str(data["Version"].get("value", ""))[:60] if isinstance(data.get("Version"), dict) else "",
+        running=_flag(data, "Experiment", "ON"),
+        cycles=int(cycles),
+        start_time=_text(data, "Experiment", "startTime"),
+        sample_s=_last(data, "time") if whole else math.nan,
+        sample_od=_last(data, "OD") if whole else math.nan,
+        sample_temperature=_last(data, "ThermometerIR") if whole else math.nan,
+        measuring=_flag(data, "OD", "Measuring"),
+        raw=_number(data, "OD0", "raw"),
+        blank=_number(data, "OD0", "target"),
+        temperature=_number(data, "ThermometerIR", "current"),
+        pumps_on=tuple(_flag(data, p, "ON") for p in PUMPS),
+        pump_targets=tuple(_number(data, p, "target") for p in PUMPS),
+        stirring=_flag(data, "Stir", "ON"),
+        stir_target=_number(data, "Stir", "target"),
+        heating=_flag(data, "Thermostat", "ON"),
+        temperature_target=_number(data, "Thermostat", "target"),
+        regulating=_flag(data, "OD", "ON"),
+        regulation_target=_number(data, "OD", "target"),
+        modes=_modes(data),
+        volume_ml=_number(data, "Volume", "target"),
+        terminal=_terminal(data),
+    )
+
+
+def check_command(path: str, reactors: Sequence[str], guard: str = "") -> None:
+    """The last gate before the wire: only these POSTs, only for these reactors, only within these limits.
+
+    Args: guard: which of the spare pumps drives an overflow guard; "" if none does.
+
+    Allowed are changeDevice; SetOutputTarget of feed (at most 0.05), waste (0.5), Stir, Thermostat (42 degC), OD,
+    Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; both for the guard's
+    pump (at most 0.95); CalibrateOD to a blank; MeasureTemp/IR; Experiment. Everything else the device understands
+    wipes, toggles or kills something (chibio.md sections 2 and 12).
+
+    Raises: DeviceStateError if the command is not one of them.
+    """
+    verb, *args = path.removeprefix("/").split("/")
+    spare = guard if guard in SPARE else None
+    match verb, args:
+        case "changeDevice", [_]:
+            allowed = True
+        case "SetOutputTarget", [item, _, value] if item in _LIMITS and re.fullmatch(_NUMBER, value):
+            low, high = (0.0, MAX_GUARD_DUTY) if item == spare else _LIMITS[item]
+            allowed = low <= float(value) <= high
+        case "SetOutputOn", [item, force, _] if item in _SWITCHES:
+            allowed = force == "0" or (force == "1" and item in (*_MAY_GO_ON, spare))
+        case "CalibrateOD", ["OD0", _, raw, "0"] if re.fullmatch(_NUMBER, raw):
+            allowed = 3000.0 <= float(raw) <= 60000.0
+        case ("MeasureTemp", ["IR", _]) | ("Experiment", ["0" | "1", _]):
+            allowed = True
+        case _:
+            allowed = False
+    position = {"changeDevice": 0, "SetOutputTarget": 1, "SetOutputOn": 2, "CalibrateOD": 1}.get(verb, 1)
+    if not (allowed and path.startswith("/") and args[position] in reactors and args[position] in POSITIONS):
+        raise DeviceStateError(
+            f"refused to send POST {path[:80]}: not among the commands and limits a client may use; "
+            f"reactors of this run: {', '.join(reactors)}"
+        )

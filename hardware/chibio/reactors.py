@@ -1,0 +1,276 @@
+"""Chi.Bio reactors as a `Reactor`: one verified single-shot dose per fresh sample, one to eight units, one thread.
+
+The device keeps stirring, heating, measuring and logging by itself; its own OD regulation stays off and the pumps are
+off except during a dose (chibio.md section 7, B2). Whatever must happen later (pump off, check, restart) is a task on
+an agenda that `measure` works through while it waits, so the doses of several reactors overlap and an end of dose is
+carried out even when other requests fail.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hardware.chibio.agenda import Agenda
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import Log, Unit, no_log
+from hardware.chibio.dosing import Rig
+from hardware.chibio.resume import Saved
+from hardware.chibio.station import Station
+from hardware.clock import Clock
+from hardware.errors import DeviceStateError, ReactorError
+from hardware.link.transport import Transport
+from hardware.reactor import Array, Command, Mask, Measurement, Receipt, Vitals
+
+__all__ = ["ChiBioReactors"]
+
+
+class ChiBioReactors:
+    """One to eight Chi.Bio reactors behind one server (implements `hardware.reactor.Reactor`).
+
+    Use: `begin` (or `begin(replay(rows), elapsed_s)` after a crash), then `measure` and `actuate` in turn, `stop` in
+    any case, `end` to end the experiments too.
+
+    Args:
+      transport: the link; this object is its only user.
+      clock: device time.
+      config: checked values.
+      rigs: calibrations, one per reactor of `config.reactors`; nominal ones if left out.
+      log: told of samples, intents, doses, commands, faults and notes, e.g. `Journal.append`. An intent is written
+        before its dose, so a log that raises there prevents the dose; elsewhere its error is raised by `measure`.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        clock: Clock,
+        config: ChiBioConfig,
+        rigs: Sequence[Rig] | None = None,
+        log: Log = no_log,
+    ) -> None:
+        rigs = list(rigs) if rigs is not None else [Rig() for _ in config.reactors]
+        if len(rigs) != len(config.reactors):
+            raise ValueError(f"calibrations for {len(rigs)} reactors, reactors = {list(config.reactors)}")
+        self.config = config
+        self._transport = transport
+        self._clock = clock
+        self._log = log
+        self._log_error: Exception | None = None
+        self._agenda = Agenda(clock)
+        self._zero = clock.now()
+        self.stations = tuple(
+            Station(
+                Unit(m, config.reactors, transport, clock, self._note_down, config.guard.pump),
+                rig,
+                config,
+                self._agenda,
+                clock,
+                self._note_down,
+                self._write,
+            )
+            for m, rig in zip(config.reactors, rigs, strict=True)
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Positions, e.g. ("M0", "M1")."""
+        return tuple(s.name for s in self.stations)
+
+    @property
+    def handed_over(self) -> Mask:
+        """Reactors that were handed over to the on-board regulation, shape (N,)."""
+        return np.array([math.isfinite(station.handed_over) for station in self.stations])
+
+    def elapsed(self) -> float:
+        """Run time, s: counted from `begin`, or from what it was told."""
+        return self._clock.now() - self._zero
+
+    def begin(self, saved: Mapping[str, Saved] | None = None, elapsed_s: float = 0.0) -> None:
+        """Sweep the pumps off, pin identities and blanks, start what does not run yet, staggered inside the minute.
+
+        An overflow guard is verified on before the first dose, and off again if the start fails.
+
+        An experiment that already runs is adopted, never started again (a second start would stop it); its next new
+        sample is the first one delivered. So is a reactor that was handed over to the on-board regulation: it stays so.
+
+        Args:
+          saved: `replay` of the journal of the run that is resumed.
+          elapsed_s: run time that has passed since that run began.
+        Raises: ReactorError if a reactor cannot be brought into its running state.
+        """
+        self._zero = self._clock.now() - elapsed_s
+        try:
+            self._bring_up(saved or {})
+        except (ReactorError, KeyboardInterrupt) as error:
+            guarded = np.array([station.guard.was_on or station.guard.tried for station in self.stations])
+            if failed := self._each(guarded & ~self.handed_over, lambda station: station.unit.pumps_off(tries=1)):
+                raise DeviceStateError(f"{error}; overflow guard not verified off: {'; '.join(failed)}") from error
+            raise
+
+    def _bring_up(self, saved: Mapping[str, Saved]) -> None:
+        for station in self.stations:
+            station.zero = self._zero
+            station.restore(saved.get(station.name, Saved()))
+        slot = 0
+        for station in self.stations:
+            running = station.unit.read().running
+            station.busy = True
+            self._agenda.add(station.bring_up(), 0.0 if running else slot * 60.0 / len(self.stations))
+            slot += not running
+        while any(station.busy for station in self.stations):
+            self._agenda.run_due()
+            self._clock.sleep(min(self._agenda.next_due() - self._clock.now(), 1.0))
+        for station in self.stations:
+            if station.guard.trouble:
+                raise DeviceStateError(f"{station.name}: {station.guard.trouble}; run the preflight")
+
+    def measure(self) -> Measurement:
+        """The newest samples; waits for one, working through the agenda.
+
+        Returns with none fresh when a fault appears or disappears, and when no reactor has had a sample for
+        `stale_s` (again every 20 s while that lasts): `vitals` then says what is wrong.
+        Raises: what the log raised; nothing for trouble with device or link.
+        """
+        last = max(station.arrived_s for station in self.stations)
+        deadline = max(last + self.config.stale_s, self._clock.now() + 20.0)
+        fresh = np.zeros(len(self.stations), dtype=np.bool_)
+        while True:
+            self._work()
+            for i, station in enumerate(self.stations):
+                if self._clock.now() >= station.next_poll:
+                    fresh[i] = station.poll()
+                    self._work()
+            if self._log_error is not None:
+                error, self._log_error = self._log_error, None
+                raise error
+            now = self._clock.now()
+            if fresh.any() or now >= deadline or any(station.news for station in self.stations):
+                return self._measurement(fresh)
+            due = min([deadline, self._agenda.next_due(), *(station.next_poll for station in self.stations)])
+            self._clock.sleep(max(due - now, 0.01))
+
+    def _measurement(self, fresh: Mask) -> Measurement:
+        def column(key: str) -> Array:
+            return np.array([getattr(station, key) for station in self.stations], dtype=np.float64)
+
+        for station in self.stations:
+            station.news = False
+        age = self._clock.now() - column("arrived_s")
+        vitals = Vitals(age, column("raw"), tuple(station.fault for station in self.stations))
+        return Measurement(column("time_s"), column("od"), column("temperature"), fresh, vitals)
+
+    def _work(self) -> None:
+        """Run what is due now. A task that fails costs itself only; on a dead link others are due again by then."""
+        now = self._clock.now()
+        while self._agenda.next_due() <= now:
+            try:
+                self._agenda.run_due(now)
+            except ReactorError as error:
+                self._note_down("task_failed", {"error": str(error)})
+
+    def actuate(self, command: Command) -> Receipt:
+        """Begin one dose per row of `command.rows`, verified targets first; its end is carried out by `measure`.
+
+        Raises: what the log raises when an intent cannot be written (then nothing is dosed); ValueError for a rate
+          that is negative or not finite. Trouble with device or link becomes a note.
+        """
+        volume, waste = np.zeros(len(self.stations)), np.zeros(len(self.stations))
+        for i, station in enumerate(self.stations):
+            if command.rows[i]:
+                station.set_temperature(float(command.temperature[i]))
+                plan = station.dose(float(command.pump_rate[i]))
+                volume[i], waste[i] = plan.feed_ml, plan.waste_ml
+                self._work()
+            volume[i] += station.repeated_ml
+            waste[i] += station.repeated_waste_ml
+            station.repeated_ml = station.repeated_waste_ml = 0.0
+        notes = tuple(f"{station.name}: {note}" for station in self.stations for note in station.notes)
+        for station in self.stations:
+            station.notes.clear()
+        return Receipt(volume, notes, waste)
+
+    def pumps_off(self, rows: Mask) -> list[str]:
+        """All pumps of `rows` off, verified, but for an overflow guard; returns what failed, one line per reactor."""
+        return self._each(rows, lambda station: station.pumps_off(tries=1))
+
+    def give_up(self, rows: Mask) -> list[str]:
+        """`pumps_off` for the rest of the run: a reactor that regulates itself no longer does; returns what failed."""
+        return self._each(rows, Station.give_up)
+
+    def heat_off(self, rows: Mask) -> list[str]:
+        """Thermostat and heater of `rows` off, and not switched on again; returns what failed."""
+        return self._each(rows, lambda station: station.heat_off())
+
+    def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
+        """Hand `rows` over to the on-board regulation at `setpoint` (OD, shape (N,)); returns what failed.
+
+        The reactor then feeds itself, at most 0.02 of full power; commands for it are refused from here on.
+        """
+        targets = dict(zip(self.names, setpoint, strict=True))
+        return self._each(rows, lambda station: station.regulate(float(targets[station.name])))
+
+    def _each(self, rows: Mask, action: Callable[[Station], None]) -> list[str]:
+        failed = []
+        for station, wanted in zip(self.stations, rows, strict=True):
+            if wanted:
+                try:
+                    action(station)
+                except ReactorError as error:
+                    failed.append(f"{station.name}: {error}")
+        return failed
+
+    def stop(self) -> None:
+        """All pumps of all reactors off, guards too, verified; tried for `stop_s`, then escalated. Idempotent.
+
+        Experiments go on (stirred, heated, measured). A reactor handed over to the on-board regulation is left to it,
+        with its guard.
+        Raises: DeviceStateError naming every reactor whose pumps could not be verified off, and what to do.
+        """
+        pending = [s for s, regulated in zip(self.stations, self.handed_over, strict=True) if not regulated]
+        errors: dict[str, ReactorError] = {}
+        deadline = self._clock.now() + self.config.stop_s
+        while pending:
+            pending = [s for s in pending if not self._silence(s, errors)]
+            if not pending or self._clock.now() >= deadline:
+                break
+            self._clock.sleep(min(self.config.retry_s, 2.0))
+        self._agenda.clear()
+        for station in pending:
+            station.escalate()
+        pending = [s for s in pending if not self._silence(s, errors)]
+        self._note_down("stop", {"reactors": self.names, "not_verified": [s.name for s in pending]})
+        if pending:
+            reasons = "; ".join(f"{s.name}: {errors[s.name]}" for s in pending)
+            raise DeviceStateError(f"pumps not verified off: {reasons}. Switch the pump boards off by hand now")
+        self._transport.disarm()
+
+    @staticmethod
+    def _silence(station: Station, errors: dict[str, ReactorError]) -> bool:
+        try:
+            station.unit.pumps_off(tries=1)
+        except ReactorError as error:
+            errors[station.name] = error
+            return False
+        station.dosing = False
+        return True
+
+    def end(self) -> None:
+        """`stop`, then end every experiment. Raises: ReactorError if one goes on."""
+        self.stop()
+        for station in self.stations:
+            station.unit.post(f"/Experiment/0/{station.name}")
+            if station.unit.read().running:
+                raise DeviceStateError(f"{station.name}: the experiment does not end; stop it in the web page")
+
+    def _write(self, kind: str, fields: Mapping[str, Any]) -> None:
+        self._log(kind, {"time_s": round(self.elapsed(), 3), **fields})
+
+    def _note_down(self, kind: str, fields: Mapping[str, Any]) -> None:
+        """Log without ever standing in the way of a pump-off: an error is kept for `measure` to raise."""
+        try:
+            self._write(kind, fields)
+        except (OSError, ReactorError) as error:
+            self._log_error = error

@@ -1,0 +1,8 @@
+"""`python -m hardware.emulator`: an emulated Chi.Bio as a process of its own."""
+
+import sys
+
+from hardware.emulator.server import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""Faults of the emulated device that can be switched while it runs, by name: in process or over HTTP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hardware.emulator.device import ChiBioDevice
+
+__all__ = ["FAULTS", "LinkFaults", "inject"]
+
+
+@dataclass
+class LinkFaults:
+    """What is wrong with network, server or board; counters go down with every use, -1 = until set to 0.
+
+    slow_s: added to the way of every request. hang_s: the next request takes so long. lost_request: swallowed before
+    the server (half-open connection). lost_reply: acted on, then silence. reset_before, reset_after: connection reset
+    without or after acting. malformed, truncated: getSysdata answers broken JSON, or half its bytes under the full
+    length. lying: POST routes answer 204 and do nothing. bus_stuck: the bus lock is never released.
+    bus_stuck_when_pumping: it gets stuck as soon as a feed pump runs. disk_full: when a cycle writes its row.
+    foreign_selects: probability that somebody else's page selects another reactor before a request.
+    require_requested_with, terminal_as_list, terminal_named, extra_fields: variants seen in forks and newer apps
+    (chibio.md section 11).
+    """
+
+    slow_s: float = 0.0
+    hang_s: float = 0.0
+    lost_request: int = 0
+    lost_reply: int = 0
+    reset_before: int = 0
+    reset_after: int = 0
+    malformed: int = 0
+    truncated: int = 0
+    lying: int = 0
+    bus_stuck: bool = False
+    bus_stuck_when_pumping: bool = False
+    disk_full: bool = False
+    foreign_selects: float = 0.0
+    require_requested_with: bool = False
+    terminal_as_list: bool = False
+    terminal_named: bool = False
+    extra_fields: bool = False
+
+    def take(self, name: str) -> bool:
+        """Is this counted fault due? Counts it down."""
+        left: int = getattr(self, name)
+        if left > 0:
+            setattr(self, name, left - 1)
+        return left != 0
+
+
+# name: (kind, allowed values, what it does)
+#   board: no reactor needed; vial: a field of VialFaults; plant: a switch of the plant; act: done once
+FAULTS: dict[str, tuple[str, str, str]] = {
+    "worker_wipe": ("act", "any", "the web worker is killed and replaced: state wiped, everything off"),
+    "crash": ("act", "any", "the software ends itself (code 4): connections refused, power cut after 1 s"),
+    "power_cut": ("act", "any", "the whole board loses power; its clock, without a battery, starts again in 2026"),
+    "restart": (
+        "act",
+        "any",
+        "somebody starts the crashed software again, with defaults; what is unplugged then is absent",
+    ),
+    "clock_step": ("act", "seconds", "the board's clock is set forward, or back if negative"),
+    "cycle_dead": ("act", "any", "the experiment thread of the reactor ends; Experiment.ON stays 1"),
+    "marked_absent": (
+        "act",
+        "any",
+        "one failed thermometer poll: present = 0, so the reactor's own threads end it all",
+    ),
+    "slow_s": ("board", "seconds >= 0", "network delay of every request"),
+    "hang_s": ("board", "seconds >= 0", "the next request takes so long; above 30 s the worker is killed"),
+    "lost_request": ("board", "count", "half-open connection: the server never sees the request"),
+    "lost_reply": ("board", "count", "the server acts, its reply is never seen"),
+    "reset_before": ("board", "count", "connection reset, not acted on"),
+    "reset_after": ("board", "count", "connection reset, acted on"),
+    "malformed": ("board", "count", "getSysdata answers broken JSON"),
+    "truncated": ("board", "count", "getSysdata sends half its body"),
+    "lying": ("board", "count", "POST routes answer 204 and do nothing"),
+    "bus_stuck": ("board", "0 or 1", "the bus lock is never released: pumps stay as they are, 204 lies"),
+    "bus_stuck_when_pumping": ("board", "0 or 1", "bus_stuck, as soon as a feed pump runs"),
+    "disk_full": ("board", "0 or 1", "the next cycle cannot write its row and keeps the bus lock: as bus_stuck"),
+    "foreign_selects": ("board", "probability", "before a request, somebody's page selects another reactor"),
+    "require_requested_with": ("board", "0 or 1", "fork: 403 for a POST without X-Requested-With"),
+    "terminal_as_list": ("board", "0 or 1", "fork: Terminal.text is a list of lines"),
+    "terminal_named": ("board", "0 or 1", "newer app: lines of the log name reactor and identity"),
+    "extra_fields": ("board", "0 or 1", "fork: more fields in getSysdata"),
+    "unplugged": ("vial", "0 or 1", "cable out: the next access to the reactor ends the software"),
+    "od_frozen": ("vial", "0 or 1", "the spectrometer repeats its last count"),
+    "od_offset": ("vial", "OD", "added to every reading"),
+    "od_jump": ("vial", "OD", "added to the next measurement only"),
+    "spectrometer_dead": ("vial", "0 or 1", "raw = 1, OD reads 12 to 14"),
+    "spectrometer_dark": ("vial", "0 or 1", "raw = 0, OD reads 0"),
+    "spectrometer_glitch": ("vial", "probability", "a single reading fails (raw = 1)"),
+    "feed_stuck_open": ("vial", "0 or 1", "Pump1 runs at full power whatever it is told"),
+    "waste_stuck_open": ("vial", "0 or 1", "Pump2 runs at full power whatever it is told"),
+    "heater_runaway": ("vial", "0 or 1", "heater at full power whatever it is told"),
+    "stirrer_dead": ("vial", "0 or 1", "the stirrer does not turn"),
+    "pump_gain_factor": ("plant", "factor >= 0", "feed flow: 0 blocked, 0.5 weak, 1 sound"),
+    "waste_gain_factor": ("plant", "factor >= 0", "waste flow: 0 blocked, 1 sound"),
+    "guard_gain_factor": ("plant", "factor >= 0", "flow of the overflow guard: 0 blocked, 1 sound"),
+    "back_leak_ml": ("plant", "mL >= 0", "siphons back after each feed pulse"),
+    "media_left_ml": ("plant", "mL >= 0", "fresh medium left in the bottle; 0 = empty"),
+    "mu_factor": ("plant", "factor >= 0", "growth rate relative to healthy"),
+}
+SIGNED = {"clock_step", "od_offset", "od_jump", "lost_request", "lost_reply", "reset_before", "reset_after"}
+SIGNED |= {"malformed", "truncated", "lying"}  # counts may be -1
+
+
+def inject(device: ChiBioDevice, name: str, reactor: str = "all", value: float = 1.0) -> None:
+    """Switch fault `name` of `FAULTS` to `value`.
+
+    Args: reactor: M0 to M7, or "all"; ignored by faults of the whole board.
+    Raises: ValueError for an unknown name, a position without reactor, or a value out of range.
+    """
+    if name not in FAULTS:
+        raise ValueError(f"fault = {name}: allowed {', '.join(FAULTS)}")
+    if reactor != "all" and reactor not in device.benches:
+        raise ValueError(f"reactor = {reactor}: allowed all, {', '.join(device.benches)}")
+    if value != value or (value < 0.0 and name not in SIGNED):
+        raise ValueError(f"{name} = {value}: allowed {FAULTS[name][1]}")
+    kind = FAULTS[name][0]
+    names = tuple(device.benches) if reactor == "all" else (reactor,)
+    now = device.now()
+    if kind == "act":
+        _act(device, name, names, value)
+    elif kind == "board":
+        setattr(device.faults, name, type(getattr(device.faults, name))(value))
+    elif kind == "vial":
+        for bench in (device.benches[m] for m in names):
+            bench.set_fault(name, type(getattr(bench.faults, name))(value), now)
+    else:
+        for bench in (device.benches[m] for m in names):
+            bench.sync(now)
+            getattr(bench.plant, name)[:] = value
+
+
+def _act(device: ChiBioDevice, name: str, names: tuple[str, ...], value: float) -> None:
+    if name == "worker_wipe":
+        device.kill_worker()
+    elif name == "crash":
+        device.crash()
+    elif name == "power_cut":
+        device.cut_power()
+    elif name == "marked_absent":
+        for m in names:
+            device.apps[m].data["present"] = 0
+    elif name == "restart":
+        device.restart()
+    elif name == "clock_step":
+        device.step_clock(value)
+    else:
+        for m in names:
+            device.kill_thread(f"{m}/Experiment")

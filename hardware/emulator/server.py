@@ -1,0 +1,328 @@
+"""The emulated Chi.Bio as a separate process: a real HTTP server in scaled real time.
+
+    python -m hardware.emulator --port 5000 --reactors M0,M1,M2 --speed 60
+
+One request at a time, connection closed after each, like the device's single gunicorn worker. Faults and the truth are
+reached under /_emulator/ (docs/emulator.md), on the device's port and on a control port that also answers while the
+emulated software is dead. Sockets are handled here, not by a web framework, because resets, half answers and
+half-open connections are part of what is emulated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import socket
+import struct
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, HTTPServer, ThreadingHTTPServer
+from types import FrameType
+
+import numpy as np
+
+from hardware.clock import RealClock
+from hardware.emulator.device import ChiBioDevice, DeviceOptions, Exchange
+from hardware.emulator.faults import FAULTS, inject
+from hardware.emulator.vial import PLANTS, SPARE, BenchConfig
+
+__all__ = ["EmulatorServer", "main"]
+
+PREFIX = "/_emulator/"
+POLL_S = 0.05  # real seconds between looks at the device when nobody asks
+CLIENT_PATIENCE_S = 5.0  # real seconds for a client to send its request
+
+
+class EmulatorServer:
+    """Serves `device` on two ports until `stop`.
+
+    Args: device: on a RealClock; host; port, control_port: 0 picks a free one.
+    Raises: OSError if a port cannot be had.
+    """
+
+    def __init__(self, device: ChiBioDevice, host: str, port: int, control_port: int) -> None:
+        self.device, self.lock = device, threading.Lock()
+        self._host = host
+        self._stop = threading.Event()
+        self._web: _DevicePort | None = _DevicePort((host, port), self)
+        self.port = int(self._web.server_address[1])
+        try:
+            self._control = _ControlPort((host, control_port), self)
+        except OSError as problem:
+            self._web.server_close()
+            raise OSError(problem.errno, f"control port {control_port}: {problem.strerror}") from problem
+        self.control_port = int(self._control.server_address[1])
+
+    def stop(self) -> None:
+        """End `run` soon. May be called from a signal handler or another thread."""
+        self._stop.set()
+
+    def run(self) -> None:
+        """Serve; returns after `stop`."""
+        control = threading.Thread(target=self._control.serve_forever, args=(POLL_S,), daemon=True)
+        control.start()
+        try:
+            while not self._stop.is_set():
+                self._turn()
+        finally:
+            self._control.shutdown()
+            self._control.server_close()
+            if self._web is not None:
+                self._web.server_close()
+
+    def _turn(self) -> None:
+        """Bring the device up to date; listen while its software lives; serve at most one request."""
+        self.advance()
+        if not self.device.alive and self._web is not None:
+            self._web.server_close()
+            self._web = None
+        elif self.device.alive and self._web is None:
+            self._web = _DevicePort((self._host, self.port), self)
+        if self._web is not None:
+            self._web.handle_request()
+        else:
+            self._stop.wait(POLL_S)
+
+    def advance(self) -> None:
+        """Run what is due on the device."""
+        with self.lock:
+            self.device.run_until(self.device.clock.now())
+
+    def exchange(self, method: str, path: str, headers: dict[str, str]) -> Exchange:
+        """One request, waited for in scaled real time."""
+        self.advance()
+        with self.lock:
+            request = self.device.submit(method, path, headers)
+        clock = self.device.clock
+        while not request.done and not self._stop.is_set():
+            clock.sleep(max(min(self.device.next_time() - clock.now(), 1.0), 1e-3))
+            self.advance()
+        return request
+
+    def control(self, method: str, path: str) -> tuple[int, bytes]:
+        """The emulator's own routes: status and body."""
+        parts = path.removeprefix(PREFIX).strip("/").split("/")
+        device = self.device
+        with self.lock:
+            device.run_until(device.clock.now())
+            try:
+                if method == "POST" and parts[0] == "fault" and 2 <= len(parts) <= 4:
+                    reactor, value = [*parts[2:], *["all", "1"][len(parts) - 2 :]]
+                    inject(device, parts[1], reactor, float(value))
+                    return 204, b""
+                if method == "GET" and parts == ["truth"]:
+                    return 200, _json({name: device.truth(name) for name in device.benches} | self._state())
+                if method == "GET" and parts[0] in ("doses", "samples") and parts[1:] in [[m] for m in device.benches]:
+                    return 200, _json([row._asdict() for row in getattr(device.benches[parts[1]], parts[0])])
+                if method == "GET" and parts == ["faults"]:
+                    return 200, _json({name: list(entry) for name, entry in FAULTS.items()})
+            except ValueError as problem:
+                return 400, f"{problem}\n".encode()
+        return 404, b"allowed: POST fault/<name>/<M>/<value>, GET truth, doses/<M>, samples/<M>, faults\n"
+
+    def _state(self) -> dict[str, object]:
+        d = self.device
+        return {
+            "alive": d.alive,
+            "restarts": d.restarts,
+            "exits": d.exits,
+            "selected": d.selected,
+            "errors": list(d.errors),
+        }
+
+
+def _json(value: object) -> bytes:
+    return json.dumps(value).encode()
+
+
+class _DevicePort(HTTPServer):
+    """The device's port.
+
+    `fates` says how connections without an answer end: "reset", or "lost" = stays open and silent (kept in `held`).
+    """
+
+    timeout = POLL_S
+    allow_reuse_address = True
+    request_queue_size = 64
+
+    def __init__(self, address: tuple[str, int], owner: EmulatorServer) -> None:
+        self.owner = owner
+        self.fates: dict[socket.socket, str] = {}
+        self.held: list[socket.socket] = []
+        super().__init__(address, _DeviceHandler)
+
+    def shutdown_request(self, request: socket.socket | tuple[bytes, socket.socket]) -> None:
+        assert isinstance(request, socket.socket)
+        fate = self.fates.pop(request, "")
+        if fate == "lost":
+            self.held.append(request)
+        elif fate:  # closing without lingering makes the kernel send a reset
+            request.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            request.close()
+        else:
+            super().shutdown_request(request)
+
+    def server_close(self) -> None:
+        super().server_close()
+        for connection in self.held:
+            connection.close()
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A client that goes away is no business of the server."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+
+class _ControlPort(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def __init__(self, address: tuple[str, int], owner: EmulatorServer) -> None:
+        self.owner = owner
+        super().__init__(address, _ControlHandler)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "gunicorn", ""
+    timeout = CLIENT_PATIENCE_S
+    server: _DevicePort | _ControlPort
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Silent: thousands of requests a day."""
+
+    def _send(self, status: int, body: bytes, headers: dict[str, str], cut: int = 0) -> None:
+        self.close_connection = True
+        self.send_response(status)
+        for key, value in headers.items():
+            self.send_header(key, value)
+        if status != 204:
+            self.send_header("Content-Length", str(len(body)))
+        self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(b"" if self.command == "HEAD" else body[: len(body) - cut])
+
+    def _control(self) -> None:
+        status, body = self.server.owner.control(self.command, self.path)
+        self._send(status, body, {"Content-Type": "application/json" if status == 200 else "text/plain"})
+
+    def _read_body(self) -> None:
+        length = self.headers.get("Content-Length", "0")
+        self.rfile.read(min(int(length), 65536) if length.isdigit() else 0)
+
+
+class _ControlHandler(_Handler):
+    def do_GET(self) -> None:
+        self._read_body()
+        self._control()
+
+    do_POST = do_GET
+
+
+class _DeviceHandler(_Handler):
+    server: _DevicePort
+
+    def do_GET(self) -> None:
+        self._read_body()
+        if self.path.startswith(PREFIX):
+            self._control()
+            return
+        owner = self.server.owner
+        exchange = owner.exchange(self.command, self.path, dict(self.headers.items()))
+        self.close_connection = True
+        if exchange.answer is not None:
+            self._send(*exchange.answer, cut=exchange.cut)
+        else:
+            self.server.fates[self.connection] = exchange.fate or "reset"
+
+    do_POST = do_HEAD = do_PUT = do_DELETE = do_PATCH = do_OPTIONS = do_GET
+
+
+# -- command line --------------------------------------------------------------------------------------------------
+
+
+def parser() -> argparse.ArgumentParser:
+    """Arguments of the program."""
+    p = argparse.ArgumentParser(prog="python -m hardware.emulator", description="Emulated Chi.Bio behind HTTP.")
+    p.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
+    p.add_argument("--port", type=int, default=5000, help="port of the device; 0 = any free one (default %(default)s)")
+    p.add_argument("--control-port", type=int, help="port of /_emulator/ (default: port + 1)")
+    p.add_argument("--reactors", default="M0", help="positions with a reactor, e.g. M0,M1,M2 (default %(default)s)")
+    p.add_argument("--speed", type=float, default=1.0, help="device seconds per real second (default %(default)s)")
+    p.add_argument("--seed", type=int, default=0, help="of all noise (default %(default)s)")
+    p.add_argument("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
+    p.add_argument("--temperature", type=float, default=37.0, help="initial, degC (default %(default)s)")
+    p.add_argument(
+        "--plant", choices=sorted(PLANTS), default="healthy", help="cultures and pumps (default %(default)s)"
+    )
+    p.add_argument(
+        "--guard", choices=SPARE, default="", help="pump whose tube is an overflow guard's (default: there is none)"
+    )
+    p.add_argument("--guard-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
+    default = BenchConfig()
+    p.add_argument(
+        "--pump-start",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        default=(default.pump_start_low_s, default.pump_start_high_s),
+        help="from the answer to a pump command until its motor turns, s (default %(default)s)",
+    )
+    p.add_argument("--unblanked", action="store_true", help="start with the zero at 65000, as after power-on")
+    return p
+
+
+def build(arguments: argparse.Namespace) -> ChiBioDevice:
+    """The device the arguments describe. Raises: ValueError."""
+    try:
+        ods = [float(x) for x in arguments.od.split(",")]
+    except ValueError:
+        raise ValueError(f"od = {arguments.od}: allowed a number, or one per reactor, e.g. 0.3,0.4") from None
+    low, high = arguments.pump_start
+    bench = BenchConfig(guard=arguments.guard, pump_start_low_s=low, pump_start_high_s=high)
+    plant = PLANTS[arguments.plant]()
+    plant = replace(plant, pump=replace(plant.pump, guard_ml_s=arguments.guard_flow))
+    return ChiBioDevice(
+        tuple(arguments.reactors.split(",")),
+        RealClock(arguments.speed),
+        np.random.default_rng(arguments.seed),
+        DeviceOptions(bench=bench, plant=plant),
+        od=ods[0] if len(ods) == 1 else ods,
+        temperature=arguments.temperature,
+        blanked=not arguments.unblanked,
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run until SIGINT or SIGTERM; exit status."""
+    arguments = parser().parse_args(argv)
+    control = arguments.control_port
+    if control is None:
+        control = arguments.port + 1 if arguments.port else 0
+    try:
+        for key, port in (("port", arguments.port), ("control-port", control)):
+            if not 0 <= port <= 65535:
+                raise ValueError(f"{key} = {port}: allowed 0 to 65535; choose another")
+        server = EmulatorServer(build(arguments), arguments.host, arguments.port, control)
+    except OSError as problem:
+        where = f"{arguments.host}:{arguments.port}"
+        print(f"emulator: {where}: {problem.strerror or problem}; choose another or end what uses it")
+        return 2
+    except ValueError as problem:
+        print(f"emulator: {problem}")
+        return 2
+
+    def end(number: int, frame: FrameType | None) -> None:
+        server.stop()
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    print(
+        f"emulator ready: http://{arguments.host}:{server.port} reactors {arguments.reactors} "
+        f"speed {arguments.speed:g} control http://{arguments.host}:{server.control_port}",
+        flush=True,
+    )
+    server.run()
+    return 0
