@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Schedule"]
+__all__ = ["Scenario"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Schedule:
+class Scenario:
     """Phases one after another, counted from the end of the recovery.
 
     setpoints: OD of each phase. minutes: its length. temperatures: degC.

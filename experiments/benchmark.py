@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.comparison.config import BenchmarkConfig, StudyConfig
 from experiments.control.config import TrainConfig, controller_config
@@ -275,7 +275,7 @@ def _schema(cfg: DictConfig) -> BenchmarkConfig:
     return BenchmarkConfig(
         agents=named("agents", DQNConfig()),
         plants=named("plants", PlantConfig()),
-        scenarios=named("scenarios", Schedule()),
+        scenarios=named("scenarios", Scenario()),
         controllers={str(name): controller_config(str(c.kind)) for name, c in cfg.controllers.items()},
         studies=named("studies", StudyConfig()),
     )

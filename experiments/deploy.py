@@ -20,7 +20,7 @@ from experiments.control.config import DeployConfig, deploy_schema
 
 if TYPE_CHECKING:
     from dqn.policy import Policy
-    from envs.scenario import Schedule
+    from envs.scenario import Scenario
     from experiments.control.loop import ClosedLoop, Step
     from experiments.control.record import Record
     from hardware.reactor import Reactor
@@ -90,7 +90,7 @@ def policy_of(config: DeployConfig, folder: Path) -> Policy:
     return policy
 
 
-def windows_of(record: Record, schedules: list[Schedule]) -> list[dict[str, Any]]:
+def windows_of(record: Record, schedules: list[Scenario]) -> list[dict[str, Any]]:
     """Metrics of every phase and reactor, as in summary.json."""
     from experiments.control.metrics import window_metrics
 

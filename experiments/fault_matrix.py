@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.reliability.case import MOMENTS, Case, Outcome
 from experiments.reliability.faults import SICK, Fault, by_name
@@ -41,8 +41,8 @@ class FaultMatrixConfig:
     """
 
     reactors: tuple[str, ...] = ("M0", "M1")
-    scenario: Schedule = field(
-        default_factory=lambda: Schedule((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8)
+    scenario: Scenario = field(
+        default_factory=lambda: Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8)
     )
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     controller_kind: str = "inverse"

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.reliability.case import audit_doses, audit_rows
 from experiments.reliability.rehearsal import Rehearsal
@@ -59,11 +59,11 @@ class SoakConfig:
             if not ok:
                 raise ValueError(f"{key} = {value}: allowed {allowed}")
 
-    def schedule(self) -> Schedule:
+    def schedule(self) -> Scenario:
         """The setpoints in turn until the days are over."""
         phases = max(int(np.ceil(self.days * 1440.0 / self.phase_min)), 1)
         setpoints = tuple(self.setpoints[k % len(self.setpoints)] for k in range(phases))
-        return Schedule(setpoints, (self.phase_min,) * phases, (37.0,) * phases)
+        return Scenario(setpoints, (self.phase_min,) * phases, (37.0,) * phases)
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def controllers() -> Iterator[Measurement]:
     import numpy as np
 
     from envs.plant.plant import Plant, PlantConfig
-    from envs.scenario import Schedule
+    from envs.scenario import Scenario
     from envs.task import EnvConfig
     from experiments.comparison.trials import run_trial
     from experiments.control.config import controller_config
@@ -58,7 +58,7 @@ def controllers() -> Iterator[Measurement]:
 
     model = EnvConfig()
     plant = frame.load(frame.compose("plant/nominal_noise", []).plant, PlantConfig())
-    schedule = Schedule((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), recovery_od=0.8)
+    schedule = Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), recovery_od=0.8)
     policy = _untrained_policy(model)
 
     def loop(config: Any, replicates: int, seed: int) -> None:

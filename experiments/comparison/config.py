@@ -7,7 +7,7 @@ from typing import Any
 
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from envs.task import EnvConfig
 
 __all__ = ["BenchmarkConfig", "StudyConfig"]
@@ -36,7 +36,7 @@ class BenchmarkConfig:
     calibration: bool = False  # simulate the open-loop protocol and fit it (Fig. 2a)
     training: bool = False  # train all agents even if no study needs them (Fig. 2b)
     plants: dict[str, PlantConfig] = field(default_factory=dict)
-    scenarios: dict[str, Schedule] = field(default_factory=dict)
+    scenarios: dict[str, Scenario] = field(default_factory=dict)
     controllers: dict[str, Any] = field(default_factory=dict)
     studies: dict[str, StudyConfig] = field(default_factory=dict)
 

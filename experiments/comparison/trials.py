@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.plant.plant import Plant, PlantConfig
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.control.loop import ClosedLoop
 from experiments.control.metrics import WindowMetrics, window_metrics
@@ -37,7 +37,7 @@ class Window:
     end: float
 
 
-def windows(schedule: Schedule) -> list[Window]:
+def windows(schedule: Scenario) -> list[Window]:
     """The phases of a schedule with their names."""
     edges = schedule.edges
     by_setpoint = [f"{s:g}" for s in schedule.setpoints]
@@ -62,7 +62,7 @@ class Trial:
     controller: str
     plant: str
     scenario: str
-    schedule: Schedule
+    schedule: Scenario
     minute: Array
     od: Array
     clean: Array
@@ -104,7 +104,7 @@ class Trial:
 def run_trial(
     names: tuple[str, str, str],
     plant_config: PlantConfig,
-    schedule: Schedule,
+    schedule: Scenario,
     make: Callable[[Plant], Controller],
     model: EnvConfig,
     replicates: int,

@@ -7,7 +7,7 @@ from typing import Any
 
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.controllers.learned import LearnedConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
@@ -62,7 +62,7 @@ class DeployConfig:
     backend: Any = field(default_factory=SimulatedConfig)  # one of BACKENDS
     plant: PlantConfig = field(default_factory=PlantConfig)  # of a simulated backend
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    scenario: Schedule = field(default_factory=Schedule)
+    scenario: Scenario = field(default_factory=Scenario)
     each: dict[str, Any] = field(default_factory=dict)  # reactor -> what differs from `scenario`, and its `role`
     controller: Any = field(default_factory=LearnedConfig)  # one of `controller_config`
     policy: str = "latest"  # of controller=dqn: a policy.npz, a run folder, or `latest`
@@ -71,7 +71,7 @@ class DeployConfig:
     preflight_only: bool = False  # check the device and stop
     resume: str | None = None  # a run folder to continue
 
-    def schedules(self) -> list[Schedule]:
+    def schedules(self) -> list[Scenario]:
         """One schedule per reactor. Raises: ValueError naming reactor, key and what is allowed."""
         unknown = [name for name in self.each if name not in self.backend.reactors]
         if unknown:
@@ -82,9 +82,9 @@ class DeployConfig:
             if not isinstance(given, dict):
                 raise ValueError(f"each.{name} = {given}: allowed keys and values, as each.{name}.minutes=[90]")
             own = {k: v for k, v in given.items() if k != "role"}
-            wrong = set(own) - {f.name for f in fields(Schedule)}
+            wrong = set(own) - {f.name for f in fields(Scenario)}
             if wrong:
-                allowed = ", ".join([f.name for f in fields(Schedule)] + ["role"])
+                allowed = ", ".join([f.name for f in fields(Scenario)] + ["role"])
                 raise ValueError(f"each.{name}.{sorted(wrong)[0]}: no such key; allowed {allowed}")
             try:
                 schedules.append(replace(self.scenario, **own))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from experiments.controllers.base import Array, Controller, Explains, Mask
 from hardware.reactor import Command, Reactor
 from hardware.safety.config import Response
@@ -67,12 +67,12 @@ class ClosedLoop:
         reactors: Reactor,
         controller: Controller,
         interlock: Interlock,
-        schedules: Sequence[Schedule] | Schedule,
+        schedules: Sequence[Scenario] | Scenario,
         before_dose: Callable[[Step], None] | None = None,
     ) -> None:
         n = len(reactors.names)
         self.reactors, self.controller, self.interlock = reactors, controller, interlock
-        self.schedules = [schedules] * n if isinstance(schedules, Schedule) else list(schedules)
+        self.schedules = [schedules] * n if isinstance(schedules, Scenario) else list(schedules)
         if len(self.schedules) != n:
             raise ValueError(f"{len(self.schedules)} schedules: allowed one for each of the {n} reactors")
         self._before_dose = before_dose

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from experiments.control.loop import Step
 from experiments.reliability.faults import INF, SICK, Fault
 from experiments.reliability.rehearsal import Killed, Rehearsal
@@ -178,7 +178,7 @@ class _Watch:
         if hasattr(r, "loop") and math.isfinite(r.loop.began[0]) and not r.loop.done[0]:
             schedule = r.loop.schedules[0]
             elapsed = np.array([(now - r.spans[0][0]) / 60.0 - r.loop.began[0]])
-            asked = schedule.setpoints[int(max(Schedule.phase(schedule, elapsed)[0], 0))]
+            asked = schedule.setpoints[int(max(Scenario.phase(schedule, elapsed)[0], 0))]
             od = float(r.device.benches[SICK].plant.od[0])
             falling = self._reference * math.exp((HEALTHY_MU - FULL_DILUTION) * minutes)
             self._reference = max(asked, od if math.isnan(self._reference) else falling)
@@ -250,7 +250,7 @@ class Case:
         fault: Fault | None,
         moment: str,
         names: Sequence[str],
-        schedule: Schedule,
+        schedule: Scenario,
         safety: SafetyConfig,
         controller: str,
         seed: int,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from experiments.controllers.base import Array, Mask
 from experiments.reliability.rehearsal import Rehearsal
 from hardware.emulator.faults import inject
@@ -144,7 +144,7 @@ def torn(r: Rehearsal) -> None:
         os.truncate(path, os.path.getsize(path) - 7)
 
 
-class _Typo(Schedule):
+class _Typo(Scenario):
     """A schedule whose setpoints all read 5.0: one that got past the check of its values."""
 
     def at(self, minute: Array) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.control.assemble import continue_loop
 from experiments.control.config import controller_config
@@ -89,7 +89,7 @@ class Rehearsal:
         self,
         folder: Path,
         names: Sequence[str],
-        schedules: Sequence[Schedule],
+        schedules: Sequence[Scenario],
         safety: SafetyConfig | None = None,
         controller: str = "inverse",
         options: DeviceOptions | None = None,

@@ -15,7 +15,7 @@ import pytest
 from scipy import stats
 
 from dqn import policy as policies
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from experiments.benchmark import _schema, cells
 from experiments.cli import frame
 from experiments.comparison import statistics as comparison
@@ -166,7 +166,7 @@ def synthetic(controller: str, offset: np.ndarray) -> Trial:
     od = 1.0 + offset[:, None] * ones
     rate = np.tile([0.01, 0.013, 0.0], (n, 1))
     return Trial(
-        controller, "p", "s", Schedule((1.0,), (2.0,), (37.0,)), np.arange(3.0), od, od - 0.001, rate, 37.0 * ones,
+        controller, "p", "s", Scenario((1.0,), (2.0,), (37.0,)), np.arange(3.0), od, od - 0.001, rate, 37.0 * ones,
         np.tile([1.0, 1.6, 2.4], (n, 1)), np.zeros(n), np.zeros(n, dtype=bool),
     )  # fmt: skip
 

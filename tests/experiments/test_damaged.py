@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from dqn import policy
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.cli.frame import UserError, save_config
 from experiments.control.config import DeployConfig
@@ -24,7 +24,7 @@ from hardware.errors import RecordingError
 from tests.experiments.test_deploy import ENVIRONMENT, inverse_policy
 
 Change = Callable[[Any], object]
-HOLD = Schedule((0.4,), (600.0,), (37.0,))
+HOLD = Scenario((0.4,), (600.0,), (37.0,))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import pytest
 
 from dqn import policy
 from envs.plant.plant import Plant, PlantConfig, SensorConfig
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
 from experiments.control.config import DeployConfig
 from experiments.control.loop import ClosedLoop
@@ -148,7 +148,7 @@ def test_the_perfect_plant_is_the_training_model():
     """Closed loop on the `nominal` plant against x <- f(u) x, step for step."""
     reactors = SimulatedReactors(Plant(PlantConfig(start_od=0.9), 1, np.random.default_rng(0)), SimulatedConfig())
     learned = LearnedController(inverse_policy())
-    loop = ClosedLoop(reactors, learned, Interlock(1), Schedule((0.5,), (40.0,), (37.0,)))
+    loop = ClosedLoop(reactors, learned, Interlock(1), Scenario((0.5,), (40.0,), (37.0,)))
     od = 0.9
     for step in loop.run():
         assert step.od[0] == pytest.approx(od, rel=1e-12)
@@ -161,7 +161,7 @@ def test_recovery_is_undiluted_and_each_reactor_has_its_own_clock():
         Plant(PlantConfig(), 2, np.random.default_rng(0)), SimulatedConfig(reactors=("A", "B"))
     )
     reactors.plant.reset(od=np.array([0.4, 0.79]))
-    schedule = Schedule((0.8,), (10.0,), (37.0,), recovery_od=0.8)
+    schedule = Scenario((0.8,), (10.0,), (37.0,), recovery_od=0.8)
     steps = list(ClosedLoop(reactors, LearnedController(inverse_policy()), Interlock(2), schedule).run())
     recovering = np.array([s.phase for s in steps]) < 0
     assert np.array([s.rate for s in steps])[recovering].max() == 0.0
@@ -176,7 +176,7 @@ def test_a_reading_that_is_no_number_is_answered_with_no_dose():
     plant = Plant(replace(PlantConfig(start_od=0.9), sensor=sensor), 1, np.random.default_rng(0))
     plant.sensor_offset = np.array([np.nan])
     reactors = SimulatedReactors(plant, SimulatedConfig())
-    loop = ClosedLoop(reactors, LearnedController(inverse_policy()), Interlock(1), Schedule((0.5,), (5.0,), (37.0,)))
+    loop = ClosedLoop(reactors, LearnedController(inverse_policy()), Interlock(1), Scenario((0.5,), (5.0,), (37.0,)))
     loop.began[:] = 0.0
     assert all(step.rate[0] == 0.0 for step in loop.run())
 
@@ -184,7 +184,7 @@ def test_a_reading_that_is_no_number_is_answered_with_no_dose():
 def handing_over(bed: Bed) -> ClosedLoop:
     """A loop whose interlock hands every reactor over once its budget is spent."""
     safety = SafetyConfig(ml_per_hour=1.0, responses=Responses(budget="regulate"))
-    schedule = Schedule((0.5,), (600.0,), (37.0,))
+    schedule = Scenario((0.5,), (600.0,), (37.0,))
     return ClosedLoop(bed.reactors, LearnedController(inverse_policy()), Interlock(len(bed.names), safety), schedule)
 
 
@@ -240,7 +240,7 @@ def test_a_resumed_run_goes_on_with_its_own_policy(tmp_path):
 def test_a_run_ends_although_an_absent_reactor_cannot_be_verified_off_and_says_so():
     bed = Bed(("M0", "M1"), od=0.5)
     bed.reactors.begin()
-    schedule = Schedule((0.5,), (60.0,), (37.0,))
+    schedule = Scenario((0.5,), (60.0,), (37.0,))
     interlock = Interlock(2, SafetyConfig(silent=20.0))
     loop = ClosedLoop(bed.reactors, LearnedController(inverse_policy()), interlock, schedule)
     steps = loop.run()

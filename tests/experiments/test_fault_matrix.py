@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.fault_matrix import FaultMatrixConfig, all_cases, declared, table, totals
 from experiments.reliability.case import Case, Outcome, audit_doses
@@ -20,7 +20,7 @@ from hardware.emulator.vial import Dose
 from hardware.safety.config import SafetyConfig
 
 ROOT = Path(__file__).parents[2]
-SCHEDULE = Schedule((0.6, 0.5), (20.0, 20.0), (37.0, 37.0), 0.6)
+SCHEDULE = Scenario((0.6, 0.5), (20.0, 20.0), (37.0, 37.0), 0.6)
 
 
 def run(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 from experiments.controllers.base import Array, Controller, Mask
 from experiments.reliability.rehearsal import Killed, Rehearsal
 from hardware.emulator.faults import inject
@@ -53,7 +53,7 @@ class Losable(Rehearsal):
     """Two reactors of which the first loses its controller; the program dies at the n-th request after that."""
 
     def __init__(self, folder: Path, dies_at: int | None = None) -> None:
-        super().__init__(folder, ("M0", "M1"), [Schedule((0.5,), (600.0,), (37.0,))] * 2, seed=3)
+        super().__init__(folder, ("M0", "M1"), [Scenario((0.5,), (600.0,), (37.0,))] * 2, seed=3)
         self.sound, self.unusable, self.requests, self.dies_at = False, 0, 0, dies_at
         self._submit = self.device.submit
         self.device.submit = self._counted  # type: ignore[method-assign]

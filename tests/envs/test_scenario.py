@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from envs.scenario import Schedule
+from envs.scenario import Scenario
 
-STEPS = Schedule((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 30.0), recovery_od=0.8)
+STEPS = Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 30.0), recovery_od=0.8)
 
 
 def test_phases_change_at_their_edges():
@@ -30,4 +30,4 @@ def test_phases_change_at_their_edges():
 )
 def test_values_out_of_range_are_named(key, arguments):
     with pytest.raises(ValueError, match=rf"scenario\.{key}.*allowed"):
-        Schedule(**arguments)
+        Scenario(**arguments)
