@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 __all__ = ["MAX_PUMP_RATE", "pump_rates"]
 
 MAX_PUMP_RATE = 0.02
-"""mL/s. The Chi.Bio's own regulator never feeds faster than a duty of 0.02 of a 1 mL/s pump (chibio.md section 5.1)."""
+"""mL/s. The Chi.Bio's own regulator never exceeds a duty of 0.02 of a 1 mL/s pump (docs/device.md, Regulation)."""
 
 
 def pump_rates(n: int = 17, maximum: float = MAX_PUMP_RATE) -> NDArray[np.float64]:

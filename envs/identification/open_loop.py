@@ -27,7 +27,7 @@ class OpenLoop:
     mu: 1/min. tau: u/tau is the dilution rate in 1/min for u in mL/s. start_od: OD.
     hours: length; one row per `control_min`.
     noise: sd of a reading relative to the OD. noise_correlation: of the noise from one row to the next; 0.12 is the
-      median of public Chi.Bio logs (field.md section d).
+      median of public Chi.Bio logs (docs/biology.md, Sensor).
     """
 
     mu: float = 0.028

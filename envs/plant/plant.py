@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MIN_VOLUME_ML = 1.0  # mL, what no pump can take out of a vial; keeps concentrations finite
-SETTLED_FRACTION = 0.08  # of the OD lost from the light path when the stirrer stands still (biology.md section 3)
-SETTLING_MIN = 1.5  # min, so that it is lost within about three readings (biology.md section 3)
-UNSTIRRED_GROWTH = 0.5  # relative growth without stirring (biology.md section 3)
+SETTLED_FRACTION = 0.08  # of the OD lost from the light path when the stirrer stands still (docs/biology.md, Stirring)
+SETTLING_MIN = 1.5  # min, so that it is lost within about three readings (docs/biology.md, Stirring)
+UNSTIRRED_GROWTH = 0.5  # relative growth without stirring (docs/biology.md, Stirring)
 
 TEMPERATURE_LAWS = ("none", "arrhenius", "ratkowsky", "cardinal")
 
@@ -194,7 +194,7 @@ class Plant:
     F = exp(-v/V) for what feed and waste pump exchange at constant volume, V/(V + v) for what stays in the vial.
     Volume: the waste pump lowers V to its tube, never below; what it does not take raises V up to the rim, where
     `overflowed` is set. An overflow guard is a second such outlet a little higher. Source of the terms and numbers:
-    biology.md sections 2 to 7.
+    docs/biology.md.
 
     What is drawn once (growth rate, pump flow, optics, tube height) is drawn here, recorded in `draws`, and stays over
     `reset`: a reset is a new culture in the same reactor. Process noise is drawn per minute of plant time and sensor

@@ -84,7 +84,7 @@ class FeedPump:
     """N feed pump heads, each with its own flow.
 
     Dose of a pulse of t s:  max(0, g (1 + cv z) p max(0, t + e - t0) - leak), and 0 for t < min_pulse_s, with flow g,
-    this minute's draw z, prime fraction p, timing error e and dead time t0 (biology.md section 3).
+    this minute's draw z, prime fraction p, timing error e and dead time t0 (docs/biology.md, Pumps).
 
     A pulse may be asked for in pieces: while the pump does not pause between calls it is one pulse, with one dead
     time, one timing error and one back-leak.

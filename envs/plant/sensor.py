@@ -14,7 +14,7 @@ __all__ = ["OdSensor", "SensorConfig", "counts_from_od", "od_from_counts"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LINEAR, QUADRATIC = 1.833, 0.226  # OD = 1.833 R + 0.226 R^2, R = log10(blank / raw) (chibio.md section 4)
+LINEAR, QUADRATIC = 1.833, 0.226  # OD = 1.833 R + 0.226 R^2, R = log10(blank / raw) (docs/device.md, OD measurement)
 FULL_SCALE = 65535.0  # counts of the 16-bit converter
 
 RANGES = {
@@ -78,7 +78,7 @@ class SensorConfig:
 
 
 def counts_from_od(od: Array, blank: Array | float) -> Array:
-    """Raw count the device would show, from inverting its OD formula; not rounded, at least 1 (chibio.md section 4).
+    """Raw count the device would show, its OD formula inverted; not rounded, >= 1 (docs/device.md, OD measurement).
 
     Args:
       od: device OD; blank: count of clear medium; broadcastable.

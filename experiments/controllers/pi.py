@@ -12,7 +12,7 @@ from experiments.controllers.base import Array, Mask, usable
 
 __all__ = ["ChiBioPI", "ChiBioPIConfig", "TunedPI", "TunedPIConfig"]
 
-ASSUMED_FLOW_ML_S = 4.0  # what the device's law takes a pump to deliver; real ones give about 1 (field.md section d)
+ASSUMED_FLOW_ML_S = 4.0  # what the device's law takes a pump to deliver; real ones: about 1 (docs/biology.md, Pumps)
 LOWEST_OD = 1e-6  # the device puts this for a setpoint of 0 or less
 
 
@@ -32,7 +32,7 @@ class ChiBioPIConfig:
 
 
 class ChiBioPI:
-    """The Chi.Bio's `RegulateOD`, number for number (chibio.md section 6).
+    """The Chi.Bio's `RegulateOD`, number for number (docs/device.md, Regulation).
 
     With x the reading, x' the one before, r the setpoint, e = x - r and dt the minutes between the last two recorded
     times (which are those of the two cycles before this one, because a cycle is recorded after its decision):

@@ -1,7 +1,7 @@
 """What can go wrong in an unattended run, how it is brought about, and what is expected of the system then.
 
 The table `FAULTS` is the declaration: for every fault either the reasons of which one must be given (`by`), or why no
-detection is needed or possible (`why_not`). Sources: chibio.md section 9, biology.md section 6.
+detection is needed or possible (`why_not`). Sources: docs/device.md, Failures; docs/biology.md, Faults.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ Every valid request is a heartbeat. After `--deadman` seconds without one, Pump1
 switched off, read back, and the pass is repeated until it is verified or a heartbeat comes. A reactor whose on-board
 regulation is on (OD.ON = 1) has been handed over deliberately and is left alone. Because the device answers 204 even
 if its bus is dead, each pass ends with MeasureTemp/IR: if the bus hangs, that request makes the server restart itself
-with everything off (chibio.md section 9), otherwise it does nothing. It is armed from the start on; BYE disarms it
+with everything off (docs/device.md, Failures), otherwise it does nothing. It is armed from the start on; BYE disarms it
 (a client that has left everything in order) until the next request that is not BYE. On SIGTERM a live session's pumps
 are switched off before the agent ends.
 

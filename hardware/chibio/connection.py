@@ -17,7 +17,7 @@ SEEN_S = 1.0
 """Who was seen so lately is still there: a device that ended takes longer to listen again. What it is sent while it
 starts it carries out afterwards, whoever is absent by then."""
 SETTLE_S = 0.3
-"""A pump command is answered before its thread has written to the bus (chibio.md section 5.1)."""
+"""A pump command is answered before its thread has written to the bus (docs/device.md, Pumps)."""
 
 Log = Callable[[str, Mapping[str, Any]], None]
 """Takes a kind and its fields, for instance `Journal.append`."""
@@ -31,10 +31,10 @@ class Unit:
     """The verified conversation with one reactor.
 
     The device shows one selected reactor to everybody, so a read is changeDevice and GET as a pair, believed only if
-    the answer names this reactor and its pinned identity (chibio.md section 12.2). A command is sent only if the last
-    verified read saw this reactor present: one request to an absent one ends the whole server (section 0.3). After a
-    request without an answer, or a while without a request, nothing is known: the server may have been started again
-    without this reactor. Then the next command looks first.
+    the answer names this reactor and its pinned identity (docs/device.md, Selection). A command is sent only if the
+    last verified read saw this reactor present: one request to an absent one ends the whole server (docs/device.md,
+    Absent reactors). After a request without an answer, or a while without a request, nothing is known: the server may
+    have been started again without this reactor. Then the next command looks first.
 
     Args:
       name: position, M0 to M7.
@@ -154,7 +154,7 @@ class Unit:
 
         Read-back alone proves nothing, for the flags are intent: with the bus hung they say off while the motor runs.
         So a blocking call touches the bus in between. It is quick if all is well; on a hung bus it outlasts the
-        server's worker, whose end switches everything off: the remote kill switch (chibio.md section 9).
+        server's worker, whose end switches everything off: the remote kill switch (docs/device.md, Failures).
 
         Raises: LinkError, ProtocolError, DeviceStateError if it could not be verified.
         """

@@ -1,4 +1,4 @@
-"""Volume to pump time: the one place where mL become a duty (chibio.md sections 5.1, 5.2 and 12.18)."""
+"""Volume to pump time: the one place where mL become a duty (docs/device.md, Pumps and Waste)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["DosePlan", "DosingConfig", "PumpCalibration", "PumpFit", "Rig", "fit
 
 Array = NDArray[np.float64]
 
-MAX_FEED_DUTY = 0.05  # chibio.md section 12.1; the lowest layer (`wire.check_command`) refuses more
+MAX_FEED_DUTY = 0.05  # docs/device.md, Client rules; the lowest layer (`wire.check_command`) refuses more
 MAX_WASTE_DUTY = 0.5  # 63 s * duty must end before the next measurement
 
 
@@ -208,7 +208,7 @@ def fit_pump(on_s: Array, doses: Array, grams: Array, date: str = "", device_id:
     Each series of n doses of t seconds weighs g grams, so its mean dose g/n has variance proportional to 1/n: weighted
     linear regression of g/n on t with weights n. The spread of a single dose follows from the weighted residuals. The
     smallest useful on-time is the shortest one weighed whose mean dose is at least 0.7 of the fitted line, not under
-    0.3 s (chibio.md section 5.1).
+    0.3 s (docs/device.md, Pumps).
 
     Args:
       on_s: asked on-time of the series, s, shape (K,), > 0, at least two different values.

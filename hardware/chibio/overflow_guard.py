@@ -1,9 +1,9 @@
 """The overflow guard: a second waste tube a little above the first, on a spare pump that the device runs by itself.
 
 It sucks air unless the level rises, so it may run all the time: `target` = duty and ON, and the pump repeats that every
-63 s without a client (chibio.md section 5.1), whatever becomes of doses, trips and this program. The experiment cycle
-does not look at Pump3 and Pump4 (section 3); a start or end of an experiment and a restart of the device switch them
-off. Nothing relies on it: the interlock's ledger does not know of it. Plumbing: docs/chibio.md.
+63 s without a client (docs/device.md, Pumps), whatever becomes of doses, trips and this program. The experiment cycle
+does not look at Pump3 and Pump4 (docs/device.md, Cycle); a start or end of an experiment and a restart of the device
+switch them off. Nothing relies on it: the interlock's ledger does not know of it. Plumbing: docs/chibio.md.
 """
 
 from __future__ import annotations

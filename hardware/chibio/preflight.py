@@ -21,7 +21,7 @@ from hardware.link.transport import Transport
 __all__ = ["Check", "preflight"]
 
 SURE = 1.1  # times the feed, for what pumps differ from their calibration
-VIAL_ML = 30.0  # up to its rim (biology.md section 3)
+VIAL_ML = 30.0  # up to its rim (docs/biology.md, Volume)
 FREE_MB = 1000.0  # a week of eight reactors writes about 240 MB (docs/faults.md)
 
 
@@ -89,7 +89,7 @@ def _link(transport: Transport, clock: Clock) -> Check:
 
 
 def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Check:
-    """Whether the board's clock runs evenly; what it shows does not matter (chibio.md section 9)."""
+    """Whether the board's clock runs evenly; what it shows does not matter (docs/device.md, Failures)."""
     dates, times = [], []
     for pause in (5.0, 0.0):
         reply = transport.get("/getSysdata/")

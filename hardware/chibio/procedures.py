@@ -57,7 +57,7 @@ def measure_blanks(reactors: ChiBioReactors, samples: int) -> Blank:
     """Average the raw counts of `samples` cycles of every reactor and set them as the devices' blanks.
 
     Needs clear medium in stirred, heated vials and `reactors.begin()`; the counts are those of the experiment's own
-    measurement, stirrer still, so they hold under run conditions (chibio.md section 4).
+    measurement, stirrer still, so they hold under run conditions (docs/device.md, Blank).
     Raises: SensorError if a count is impossible or they scatter by more than 2 %; ReactorError.
     """
     rows: list[list[float]] = [[] for _ in reactors.names]

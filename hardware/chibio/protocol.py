@@ -1,6 +1,6 @@
 """The Chi.Bio's language as pure functions: its state out of JSON, and the few commands a client may ever send.
 
-Nothing here talks to a device. Facts and traps: chibio.md sections 2, 3, 8 and 12.
+Nothing here talks to a device. Facts and traps: docs/device.md.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
 """Without tubes on a standard reactor; one of them may drive an overflow guard (`overflow_guard.py`)."""
 MAX_GUARD_DUTY = 0.95
-"""Never 1: the device does not switch such a pump off between its periods (chibio.md sections 5.1 and 12.1)."""
+"""Never 1: the device does not switch such a pump off between its periods (docs/device.md, Pumps)."""
 PERIOD_S = 63.0
-"""A pump that is ON runs at full power for PERIOD_S * target seconds of every PERIOD_S (chibio.md section 5.1)."""
+"""A pump that is ON runs at full power for PERIOD_S * target seconds of every PERIOD_S (docs/device.md, Pumps)."""
 UNSET_BLANK = 65000.0
-"""Blank of a device that lost its memory or was never calibrated (chibio.md section 4)."""
+"""Blank of a device that lost its memory or was never calibrated (docs/device.md, Blank)."""
 
 _NUMBER = r"[0-9]{1,6}(?:\.[0-9]{1,12})?"
 _LIMITS: Mapping[str, tuple[float, float]] = {
@@ -226,7 +226,7 @@ def check_command(path: str, reactors: Sequence[str], guard: str = "") -> None:
     Allowed are changeDevice; SetOutputTarget of feed (at most 0.05), waste (0.5), Stir, Thermostat (42 degC), OD,
     Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; both for the guard's
     pump (at most 0.95); CalibrateOD to a blank; MeasureTemp/IR; Experiment. Everything else the device understands
-    wipes, toggles or kills something (chibio.md sections 2 and 12).
+    wipes, toggles or kills something (docs/device.md, Routes and Client rules).
 
     Raises: DeviceStateError if the command is not one of them.
     """

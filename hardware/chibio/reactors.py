@@ -1,7 +1,7 @@
 """Chi.Bio reactors as a `Reactor`: one verified single-shot dose per fresh sample, one to eight units, one thread.
 
 The device keeps stirring, heating, measuring and logging by itself; its own OD regulation stays off and the pumps are
-off except during a dose (chibio.md section 7, B2). Whatever must happen later (pump off, check, restart) is a task on
+off except during a dose (docs/device.md, Dosing). Whatever must happen later (pump off, check, restart) is a task on
 an agenda that `measure` works through while it waits, so the doses of several reactors overlap and an end of dose is
 carried out even when other requests fail.
 """

@@ -1,4 +1,4 @@
-"""One Chi.Bio reactor under control: start, sample gate, single-shot dose, recovery (chibio.md sections 3, 7 B2, 12).
+"""One Chi.Bio reactor under control: start, sample gate, single-shot dose, recovery (docs/device.md, Dosing).
 
 A `Station` adds to the verified conversation (`unit.py`) what has to be remembered from minute to minute. Its longer
 actions are tasks on the agenda it shares with its neighbours.
@@ -26,7 +26,7 @@ from hardware.reactor import Fault
 
 __all__ = ["Station"]
 
-CYCLE_S = 60.07  # median of 3275 real cycles (chibio.md section 3)
+CYCLE_S = 60.07  # median of 3275 real cycles (docs/device.md, Cycle)
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
 FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
@@ -114,7 +114,7 @@ class Station:
             self.pumps_off()
             if running := self._running(state):
                 self.tell(f"pumps were found on and switched off: {running}")
-        if saved.open:  # the device repeats what was left on every 63 s (chibio.md section 0.7)
+        if saved.open:  # the device repeats what was left on every 63 s (docs/device.md, Pumps)
             times = max(math.floor((self.elapsed() - saved.on_s) / PERIOD_S), 0)
             self.repeated_ml = saved.feed_ml * times * state.pumps_on[0]
             self.repeated_waste_ml = saved.waste_ml * times * state.pumps_on[1]

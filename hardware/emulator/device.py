@@ -1,7 +1,7 @@
 """The whole device on device time: processes, web worker, routes, power, and the faults of link and computer.
 
 `ChiBioDevice` needs no thread and no socket. Requests are submitted and answered while events run: `run_until` for a
-virtual clock, `hardware/emulator/server.py` for a real one. Source: chibio.md sections 1, 2, 9 and 11.
+virtual clock, `hardware/emulator/server.py` for a real one. Source: docs/device.md, Hardware, Routes and Failures.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ class LinkFaults:
     bus_stuck_when_pumping: it gets stuck as soon as a feed pump runs. disk_full: when a cycle writes its row.
     foreign_selects: probability that somebody else's page selects another reactor before a request.
     require_requested_with, terminal_as_list, terminal_named, extra_fields: variants seen in forks and newer apps
-    (chibio.md section 11).
+    (docs/device.md, Variants).
     """
 
     slow_s: float = 0.0

@@ -1,4 +1,4 @@
-"""The device's own regulation of optical density, as arithmetic on sysData (chibio.md section 6)."""
+"""The device's own regulation of optical density, as arithmetic on sysData (docs/device.md, Regulation)."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Every activity that the device runs in a thread, or that makes a caller wait, is a generator that yields the seconds it
 sleeps; `emulator_device` runs them on device time. Races between threads of the real software are therefore the same
-races between generators. Source: chibio.md sections 2 to 6, checked against runs of the real software described there.
+races between generators. Source: docs/device.md, checked against runs of the real software described there.
 """
 
 from __future__ import annotations
@@ -225,7 +225,7 @@ class ReactorApp:
             board.spawn(self._pump(item), f"{self.name}/{item}")
 
     def _thermostat(self) -> Steps:
-        """`Thermostat`: one step of the PI law with feed-forward, every 30 s (chibio.md section 5.3)."""
+        """`Thermostat`: one step of the PI law with feed-forward, every 30 s (docs/device.md, Thermostat)."""
         data, thermostat, heat = self.data, self.data["Thermostat"], self.data["Heat"]
         mine = self._threads["Thermostat"] = (self._threads["Thermostat"] + 1) % 100
         if thermostat["ON"] == 0:
@@ -300,7 +300,7 @@ class ReactorApp:
                 self.data[slot].update({"Base": 120.0, "Emit1": 0.0, "Emit2": 0.0})
 
     def calibrate(self, item: str, raw: float, od: float) -> None:
-        """`CalibrateOD`: the zero with which `raw` reads as `od` (chibio.md section 4)."""
+        """`CalibrateOD`: the zero with which `raw` reads as `od` (docs/device.md, Blank)."""
         od0 = self.data["OD0"]
         a, b = od0["LASERa"], od0["LASERb"]
         od = 0 if od < 0 else od
@@ -342,7 +342,7 @@ class ReactorApp:
         self.terminal("Experiment Stopped")
 
     def _cycle(self) -> Steps:
-        """`runExperiment`: one cycle of about 60 s (chibio.md section 3)."""
+        """`runExperiment`: one cycle of about 60 s (docs/device.md, Cycle)."""
         data, experiment, board = self.data, self.data["Experiment"], self.board
         mine = experiment["threadCount"] = (experiment["threadCount"] + 1) % 100
         began = board.wall()
@@ -418,7 +418,7 @@ class ReactorApp:
             experiment["startTimeRaw"] = raw
 
     def _regulate(self) -> Steps:
-        """`RegulateOD`: the on-board turbidostat (chibio.md section 6)."""
+        """`RegulateOD`: the on-board turbidostat (docs/device.md, Regulation)."""
         data, od, cycles = self.data, self.data["OD"], self.data["Experiment"]["cycles"]
         restore = od["target"]
         if data["Volume"]["target"] == 0:

@@ -1,4 +1,4 @@
-"""The device's routes: which paths exist, the order of their arguments, what they answer (chibio.md section 2)."""
+"""The device's routes: which paths exist, the order of their arguments, what they answer (docs/device.md, Routes)."""
 
 from __future__ import annotations
 

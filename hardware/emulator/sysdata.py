@@ -68,7 +68,7 @@ def _slot(led: str, emit1: str, emit2: str) -> SysData:
 
 
 def fresh_sysdata(device_id: str, selected: str) -> SysData:
-    """Every field of one reactor after `initialise()` (chibio.md section 8 and the recorded answer of a real server).
+    """Every field of one reactor after `initialise()` (docs/device.md, State fields; a real server's recorded answer).
 
     Args:
       device_id: decimal ID of the reactor, "" where none is plugged in; selected: what the web page shows, "M0".
@@ -195,7 +195,7 @@ def append_records(data: SysData, started: float) -> None:
 
 
 def thin_records(data: SysData) -> None:
-    """Above 200 entries, keep about every other old one and the newest 10 (201 become 109; chibio.md section 3)."""
+    """Above 200 entries, keep about every other old one and the newest 10 (201 become 109; docs/device.md, Records)."""
     times = data["time"]["record"]
     if len(times) <= THIN_ABOVE:
         return

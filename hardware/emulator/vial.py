@@ -18,7 +18,7 @@ __all__ = ["PLANTS", "Bench", "BenchConfig", "Dose", "Sample", "VialFaults", "de
 
 FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
-LINEAR, QUADRATIC = 1.833, 0.226  # OD = LINEAR R + QUADRATIC R^2, R = log10(zero / raw) (chibio.md section 4)
+LINEAR, QUADRATIC = 1.833, 0.226  # OD = LINEAR R + QUADRATIC R^2, R = log10(zero/raw) (docs/device.md, OD measurement)
 FULL_SCALE = 65535
 DARK_COUNTS = 3.0  # what the spectrometer counts without light
 LONGEST_STEP_S = 60.0
@@ -38,7 +38,7 @@ def healthy_plant() -> PlantConfig:
 
 
 def bench_plant() -> PlantConfig:
-    """As public logs show them: every vial has its own growth, pump, tube height and optics (biology.md section 9)."""
+    """As public logs show them: each vial has its own growth, pump, tube and optics (docs/biology.md, Presets)."""
     return PlantConfig(
         growth=GrowthConfig(
             mu=0.025, mu_cv=0.07, drift_sd_per_h=0.02, temperature_law="arrhenius", adaptation_min=2.0, yield_od=5.0
@@ -67,13 +67,13 @@ PLANTS = {"bench": bench_plant, "healthy": healthy_plant}
 class BenchConfig:
     """Optics and electronics of a reactor.
 
-    blank_low, blank_high: range of the counts of clear medium, drawn once per reactor (chibio.md section 4).
+    blank_low, blank_high: range of the counts of clear medium, drawn once per reactor (docs/device.md, Blank).
     noise_fraction: sd of one reading, as a fraction of raw.
     common_fraction: sd that all readings of one measurement share, as a fraction of raw; with the defaults the mean of
-      four readings has sd 0.0036 at OD 0.5 (biology.md section 4).
+      four readings has sd 0.0036 at OD 0.5 (docs/biology.md, Sensor).
     outlier_rate: probability per measurement of an isolated jump of more than 0.04 OD.
     stir_factor, stir_noise: raw while stirring, relative to still, mean and spread.
-    on_time_bias_low_s, on_time_bias_high_s: how much longer than asked a pump runs (chibio.md section 5.1).
+    on_time_bias_low_s, on_time_bias_high_s: how much longer than asked a pump runs (docs/device.md, Pumps).
     pump_start_low_s, pump_start_high_s: range of the time from the answer to a pump command until the motor turns,
       drawn per start: what the thread's register writes take on the bus. 0.2 to 0.7 s is what the device's own software
       took on simulated electronics with bus time.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HttpTransport", "Reply", "SerialTransport", "Transport", "TransportConfig", "open_transport"]
 
-MAX_BODY = 262_144  # bytes; a full state is 36 KB (chibio.md section 2), the serial agent carries no more than this
+MAX_BODY = 262_144  # bytes; a full state is 36 KB (docs/device.md, Routes), the serial agent carries no more than this
 
 
 @dataclass(frozen=True)

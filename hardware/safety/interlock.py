@@ -1,8 +1,8 @@
 """The interlock between every controller and every pump: what may be dosed, and what to do when something is wrong.
 
 Pure numerics on arrays with a leading axis of N reactors and explicit times; it touches no device. A control step is
-`check` (before the dose), then `confirm` (what was really dosed). Sources: chibio.md sections 4, 9 and 12 for limits
-and signatures, biology.md sections 2 to 4 for what a culture, a pump and a sensor can do.
+`check` (before the dose), then `confirm` (what was really dosed). Sources: docs/device.md for limits and
+signatures, docs/biology.md for what a culture, a pump and a sensor can do.
 """
 
 from __future__ import annotations

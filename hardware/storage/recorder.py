@@ -37,7 +37,7 @@ CHIBIO_BY_POSITION = {"exp_time": 0, "od_measured": 1, "media_temp": 8, "pump_1_
 CHIBIO_COMMON_COLUMNS = 16  # the first 16 columns are the same in every release; later ones were inserted after them
 
 LOWEST_OD = -0.05  # blank error and noise reach this far below zero; a culture does not
-HIGHEST_OD = 10.0  # the device's own upper limit; a dead spectrometer reads 11 to 14 (chibio.md section 4)
+HIGHEST_OD = 10.0  # the device's own upper limit; a dead spectrometer reads 11 to 14 (docs/device.md, OD measurement)
 RAW_COUNT_OD = 30.0  # a median above this is a photodetector count
 HIGHEST_PUMP_RATE = 1.0  # mL/s, the Chi.Bio's pump at full power
 RESTART_ROWS = 5  # so many rows in a row behind the clock are a new run, fewer are a glitch

@@ -59,7 +59,7 @@ def test_batch_growth_follows_the_logistic_curve_when_substrate_is_everything():
     [(Arrhenius(56.0), 0.59, 0.62), (Ratkowsky(c=2.0), 0.58, 0.61), (Cardinal(), 0.64, 0.67)],
 )
 def test_thirty_degrees_against_thirty_seven(response, low, high):
-    """Ratios of the literature (biology.md section 2); the reference temperature changes nothing."""
+    """Ratios of the literature (docs/biology.md, Temperature); the reference temperature changes nothing."""
     law = Thermal(Exponential(0.03), response)
     rate = law.specific_rate(np.ones(2), np.array([30.0, 37.0]))
     assert rate[1] == pytest.approx(0.03, rel=1e-12)

@@ -29,7 +29,7 @@ def test_counts_invert_the_devices_formula() -> None:
     np.testing.assert_allclose(od_from_counts(counts_from_od(od, 14000.0), 14000.0), od, atol=1e-12)
     # By hand: raw = blank / 10 is R = 1, OD = 1.833 + 0.226.
     assert od_from_counts(np.array([1400.0]), 14000.0)[0] == pytest.approx(2.059)
-    # What the quadratic term adds at four ODs, in percent of the linear part (biology.md section 4).
+    # What the quadratic term adds at four ODs, in percent of the linear part (docs/biology.md, Sensor).
     ratio = np.array([0.1, 0.25, 0.4, 0.5])
     linear = 1.833 * ratio
     added = 100.0 * (od_from_counts(14000.0 * 10.0**-ratio, 14000.0) / linear - 1.0)

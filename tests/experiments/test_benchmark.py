@@ -125,7 +125,7 @@ def test_threshold_loses_to_graded_feedback():
 def test_the_devices_pi_lands_where_the_published_one_does():
     """Range of the law over steps of the setpoint in this kind of simulation: ISE 0.036-0.093, ITAE 5.7-9.8.
 
-    Source: field.md section d. The first window has no step: the recovery ends at its setpoint.
+    Source: docs/device.md, Regulation. The first window has no step: the recovery ends at its setpoint.
     """
     t = trial("pi", "nominal_noise", "setpoint_steps", 64)
     for window in windows(t.schedule)[1:]:

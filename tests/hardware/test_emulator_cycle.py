@@ -1,4 +1,4 @@
-"""The experiment cycle: timing, records, start, stop and their races (chibio.md section 3)."""
+"""The experiment cycle: timing, records, start and stop races (docs/device.md, Cycle, Records and Start races)."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Failure behaviour (chibio.md section 9) as a client sees it, through the in-process transport."""
+"""Failure behaviour (docs/device.md, Failures) as a client sees it, through the in-process transport."""
 
 import json
 from collections.abc import Callable

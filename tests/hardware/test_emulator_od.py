@@ -1,4 +1,4 @@
-"""Optical density and temperature as the device computes and misreads them (chibio.md sections 4 and 5.3)."""
+"""Optical density and temperature as the device misreads them (docs/device.md, OD measurement and Thermostat)."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Pump periods, thread replacement, doses, volume (chibio.md section 5.1 and 5.2) with independently computed times."""
+"""Pump periods, thread replacement, doses, volume (docs/device.md, Pumps and Waste), times computed independently."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The on-board turbidostat (chibio.md section 6): the law by hand, and in closed loop."""
+"""The on-board turbidostat (docs/device.md, Regulation): the law by hand, and in closed loop."""
 
 import math
 
@@ -30,7 +30,7 @@ def test_first_two_cycles_feed_nothing_but_run_the_waste() -> None:
 
 
 def law(data: dict, previous: float, integrals: tuple[float, float]) -> tuple[float, float, float]:  # type: ignore[type-arg]
-    """Feed duty, integral 1, integral 2 as section 6 words it, from what the client can see."""
+    """Feed duty, integral 1, integral 2 as docs/device.md words it, from what the client can see."""
     x, r, v = data["OD"]["current"], data["OD"]["target"], data["Volume"]["target"]
     t = data["time"]["record"]
     p = math.log(x / r) / ((t[-1] - t[-2]) / 60.0) / (240.0 / v) if x > 0 else 0.0
@@ -115,7 +115,7 @@ def test_od_on_without_experiment_does_nothing() -> None:
 
 
 def test_closed_loop_brings_061_to_050_in_a_few_cycles_and_holds_it() -> None:
-    """Behaviour of the real software with a 1 mL/s pump: 5 cycles, then mean 0.502, sd 0.007 (section 5.1)."""
+    """Behaviour of the real software with a 1 mL/s pump: 5 cycles, then mean 0.502, sd 0.007 (docs/device.md)."""
     lab = Lab(od=0.61, mu=0.03, blanked=True)
     regulate(lab, 0.5)
     lab.wait(8 * 60.07)
@@ -128,7 +128,7 @@ def test_closed_loop_brings_061_to_050_in_a_few_cycles_and_holds_it() -> None:
 
 
 def test_bang_bang_through_the_turbidostat() -> None:
-    """OD.target 0 pumps at the cap at the next measurement, 10 does not (section 7, D)."""
+    """OD.target 0 pumps at the cap at the next measurement, 10 does not (docs/device.md, Dosing)."""
     lab = Lab(od=0.5, blanked=True)
     regulate(lab, 0.0)
     after_regulation(lab, 7)

@@ -1,4 +1,4 @@
-"""Routes, status codes, clamps, toggles and selection, statement by statement of chibio.md section 2."""
+"""Routes, status codes, clamps, toggles and selection, statement by statement of docs/device.md, Routes."""
 
 import json
 import math
