@@ -2,43 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dqn.adam import Adam
 from dqn.config import DQNConfig
+from dqn.hindsight import Relabel
 from dqn.network import QNetwork, action_basis, initial_weights
+from dqn.optimiser import Adam, decayed, linear
 from dqn.replay import Array, Replay, Transition
-from dqn.schedules import decayed, linear
 from dqn.streams import UniformStream
-from dqn.targets import advantage_target, blend, double_q_target, huber_loss, loss_gradient, q_target
+from dqn.targets import advantage_target, double_q_target, huber_loss, loss_gradient, q_target
 
-__all__ = ["STREAMS", "DQNAgent", "Relabel"]
+__all__ = ["STREAMS", "DQNAgent"]
 
-STREAMS = ("init", "explore", "replay", "relabel")
+STREAMS = ("init", "explore", "replay", "hindsight")
 """Names of the random streams an agent needs, each independent of the others."""
 
 DIAGNOSED = 100  # updates from one look at loss and range of Q to the next
-
-Relabel = Callable[[Transition, torch.Tensor], Transition]
-"""Replaces the goal of a minibatch: (transitions (S, B), uniform numbers (S, B, 2)) -> transitions (S, B)."""
 
 
 class DQNAgent:
     """Deep Q-learning (Mnih 2015) of S agents that share nothing but the machine.
 
     One update (`learn`): draw a minibatch, form y = r + gamma max_a Q_target(s', a), take one Adam step on
-    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates blend the target network.
+    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates copy the weights to the target network.
 
     Args:
       config: hyper-parameters.
       observations: O, numbers per observation. actions: A.
       streams: for each name in STREAMS one SeedSequence per agent.
-      relabel: goal replacement, used on a share `config.relabel` of each minibatch.
+      relabel: goal replacement, used on a share `config.hindsight_share` of each minibatch.
       device: "cpu" or "cuda".
     """
 
@@ -64,19 +61,21 @@ class DQNAgent:
         start = (config.init_mirror, config.init_zero_output)
         flat = np.stack([initial_weights(self.sizes, seed, *start) for seed in streams["init"]])
         weights = torch.from_numpy(flat).to(self.device)
-        basis = action_basis(actions, config.action_smoothness).to(self.device) if config.action_smoothness else None
+        basis = action_basis(actions, config.output_basis_decay).to(self.device) if config.output_basis_decay else None
         self.online = QNetwork(weights, self.sizes, matrix, offset, basis)
         self.target = self.online.with_weights(weights.clone())
-        self.greedy = self.online.with_weights(weights.clone()) if config.average else self.online
-        self._adam = Adam(weights, self.online.grad, config.learning_rate, config.adam_beta2, config.adam_eps)
+        self.greedy = self.online.with_weights(weights.clone()) if config.ema_decay else self.online
+        self._adam = Adam(weights, self.online.grad, config.learning_rate)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
         self._explore = UniformStream(streams["explore"], 2, torch.device("cpu"))
         self._draws = UniformStream(streams["replay"], config.batch_size, self.device)
-        self._relabelled = round(config.relabel * config.batch_size)
-        self._goals = UniformStream(streams["relabel"], max(1, 2 * self._relabelled), self.device)
+        self._relabelled = round(config.hindsight_share * config.batch_size)
+        self._goals = UniformStream(streams["hindsight"], max(1, 2 * self._relabelled), self.device)
         self._relabel = relabel
         if self._relabelled and relabel is None:
-            raise ValueError(f"agent.relabel = {config.relabel}: this task has no goal to replace; set it to 0")
+            raise ValueError(
+                f"agent.hindsight_share = {config.hindsight_share}: this task has no goal to replace; set it to 0"
+            )
         self.steps = 0  # environment steps taken
         self.updates = 0
         self.loss = torch.zeros(self.n_agents, device=self.device)  # of the last diagnosed update
@@ -156,12 +155,12 @@ class DQNAgent:
         self._adam.step()
         self.updates += 1
         if self.updates % c.target_period == 0:
-            blend(self.target.flat, self.online.flat, c.target_blend)
+            self.target.flat.copy_(self.online.flat)
         if self.updates % DIAGNOSED == 0:
             self.loss = huber_loss(td_error, c.huber)
             self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
-        if c.average:
-            blend(self.greedy.flat, self.online.flat, 1.0 - c.average)
+        if c.ema_decay:
+            self.greedy.flat.lerp_(self.online.flat, 1.0 - c.ema_decay)
 
     def state_dict(self) -> dict[str, Any]:
         """The complete learning state: loading it into a new agent of the same config continues to the bit."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["advantage_target", "blend", "double_q_target", "huber_loss", "loss_gradient", "q_target"]
+__all__ = ["advantage_target", "double_q_target", "huber_loss", "loss_gradient", "q_target"]
 
 
 def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor) -> torch.Tensor:
@@ -58,11 +58,3 @@ def huber_loss(td_error: torch.Tensor, huber: float) -> torch.Tensor:
     """L = mean_B l(d) with l(d) = d^2 / 2, or beyond |d| = huber its tangent (Huber 1964); (S, B) -> (S,)."""
     slope = td_error if huber == 0.0 else td_error.clamp(-huber, huber)
     return (slope * (td_error - 0.5 * slope)).mean(-1)
-
-
-def blend(target: torch.Tensor, online: torch.Tensor, share: float) -> None:
-    """target <- (1 - share) target + share online, in place; share 1 copies."""
-    if share == 1.0:
-        target.copy_(online)
-    else:
-        target.lerp_(online, share)

@@ -141,11 +141,10 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
     from dqn.replay import Transition
     from experiments import build, seeding
     from experiments.evaluation import Evaluation, report_grid
-    from experiments.hindsight import goal_relabel
 
     agent = variant(config.agent, name, config.fitted[name])
     seeds = range(config.seed, config.seed + config.n_agents)
-    relabel = goal_relabel(config.env, agent, "cpu")
+    relabel = build.hindsight(config.env, agent)
     learner = DQNAgent(agent, 2, config.env.n_actions, seeding.streams(seeds, STREAMS), relabel)
     unit = solve(replace(config.env, start_od=(0.04, 3.9)), agent.gamma, setpoints=np.array([0.5]), grid=9001)
     numbers = [np.random.default_rng(seed) for seed in seeds]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import envs
 from dqn.config import DQNConfig
-from dqn.schedules import linear
+from dqn.optimiser import linear
 
 __all__ = ["Ring", "single_file_dqn", "stable_baselines_dqn", "sync_vector_env"]
 

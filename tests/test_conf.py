@@ -44,8 +44,8 @@ def test_every_agent_composes(option):
 def test_the_papers_agent_adds_nothing_to_a_plain_dqn():
     agent = load_train("agent=paper").agent
     assert not agent.double
-    assert agent.relabel == agent.average == agent.huber == 0.0
-    assert agent.reward_scale == agent.target_blend == 1.0
+    assert agent.hindsight_share == agent.ema_decay == agent.huber == 0.0
+    assert agent.reward_scale == 1.0
     assert len(agent.input_matrix) == 0
 
 

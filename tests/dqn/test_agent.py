@@ -30,11 +30,10 @@ EVERYTHING: dict[str, Any] = {
     "double": True,
     "action_gap": 0.5,
     "huber": 0.5,
-    "average": 0.9,
+    "ema_decay": 0.9,
     "learning_rate_decay": 0.5,
     "updates_per_step": 2,
-    "relabel": 0.5,
-    "target_blend": 0.5,
+    "hindsight_share": 0.5,
 }
 
 
@@ -56,7 +55,7 @@ def _train(trainer: Trainer, records: int | None = None) -> Trainer:
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"double": True, "action_gap": 0.5, "huber": 0.5, "average": 0.9}], ids=["plain", "all"]
+    "changes", [{}, {"double": True, "action_gap": 0.5, "huber": 0.5, "ema_decay": 0.9}], ids=["plain", "all"]
 )
 def test_solves_the_identity_problem(changes: dict[str, Any]) -> None:
     """Every one of 8 agents picks the paying action for every symbol, and Q is 1 / (1 - gamma) there."""
@@ -168,8 +167,8 @@ def test_a_mirrored_start_needs_even_layers() -> None:
 
 
 def test_relabelling_without_a_goal_is_refused() -> None:
-    config = DQNConfig(**{**SMALL.__dict__, "relabel": 0.5})
-    with pytest.raises(ValueError, match=r"agent\.relabel = 0\.5"):
+    config = DQNConfig(**{**SMALL.__dict__, "hindsight_share": 0.5})
+    with pytest.raises(ValueError, match=r"agent\.hindsight_share = 0\.5"):
         DQNAgent(config, 3, 3, streams(range(1)))
 
 
@@ -179,14 +178,11 @@ def test_relabelling_without_a_goal_is_refused() -> None:
         ("hidden", ()),
         ("gamma", 1.0),
         ("learning_rate", 0.0),
-        ("adam_eps", 0.0),
-        ("adam_beta2", 1.0),
         ("epsilon_end", 1.5),
         ("batch_size", 0),
-        ("target_blend", 0.0),
         ("action_gap", 1.0),
-        ("relabel", -0.1),
-        ("average", 1.0),
+        ("hindsight_share", -0.1),
+        ("ema_decay", 1.0),
         ("input_offset", (1.0,)),
         ("init_mirror", (-1, 1)),
     ],

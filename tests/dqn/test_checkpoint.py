@@ -16,7 +16,7 @@ from dqn.trainer import Trainer
 from tests.dqn.problems import IdentityEnv, streams
 
 CONFIG = DQNConfig(
-    hidden=(8, 8), total_steps=200, learn_start=20, batch_size=8, target_period=10, average=0.9, learning_rate_decay=0.5
+    hidden=(8, 8), total_steps=200, learn_start=20, batch_size=8, target_period=10, ema_decay=0.9, learning_rate_decay=0.5
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dqn.targets import advantage_target, blend, double_q_target, huber_loss, loss_gradient, q_target
+from dqn.targets import advantage_target, double_q_target, huber_loss, loss_gradient, q_target
 
 GAMMA = 0.9
 # Chain: in state 0 action 0 stays (reward 0), action 1 moves to state 1 (reward 1); state 1 is left by either action,
@@ -87,13 +87,3 @@ def test_loss_and_gradient_agree_with_autograd(huber: float) -> None:
     expected.sum().backward()
     assert q.grad is not None
     torch.testing.assert_close(gradient, q.grad)
-
-
-def test_blend() -> None:
-    target, online = torch.zeros(2, 3), torch.ones(2, 3)
-    blend(target, online, 0.25)
-    torch.testing.assert_close(target, torch.full((2, 3), 0.25))
-    blend(target, online, 1.0)
-    assert torch.equal(target, online)
-    online += 1.0
-    assert torch.equal(target, torch.ones(2, 3))

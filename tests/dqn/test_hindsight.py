@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from dqn.config import DQNConfig
+from dqn.hindsight import Relabel, goal_relabel
 from dqn.replay import Transition
-from envs.task import EnvConfig
-from experiments.hindsight import goal_relabel
 
-ENV = EnvConfig()
+GOALS = (0.2, 1.0)
 AGENTS, BATCH = 4, 500
 
 
@@ -25,9 +24,13 @@ def _batch(od: float | None = None) -> Transition:
     return Transition(before, action, torch.full((AGENTS, BATCH), 9.0), after, torch.ones(AGENTS, BATCH))
 
 
+def _relabelling(config: DQNConfig) -> Relabel:
+    return goal_relabel(config, GOALS, lambda x, goal: -((x - goal) ** 2))
+
+
 def _relabel(near: float, batch: Transition, width: tuple[float, float] = (1e-3, 0.8)) -> Transition:
     uniform = torch.rand(AGENTS, BATCH, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    return goal_relabel(ENV, DQNConfig(relabel_near=near, relabel_width=width), "cpu")(batch, uniform)
+    return _relabelling(DQNConfig(hindsight_near=near, hindsight_width=width))(batch, uniform)
 
 
 @pytest.mark.parametrize("near", [0.0, 0.5, 1.0])
@@ -53,7 +56,7 @@ def test_far_goals_are_uniform() -> None:
 
 def test_margin_widens_the_range() -> None:
     uniform = torch.rand(AGENTS, BATCH, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    goal = goal_relabel(ENV, DQNConfig(relabel_margin=0.25), "cpu")(_batch(), uniform).s_t[..., 1]
+    goal = _relabelling(DQNConfig(hindsight_margin=0.25))(_batch(), uniform).s_t[..., 1]
     assert float(goal.min()) == pytest.approx(0.15, abs=0.005)
     assert float(goal.max()) == pytest.approx(1.25, abs=0.005)
 
