@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from dqn.config import DQNConfig
 from dqn.hindsight import Relabel
 from dqn.network import QNetwork, action_basis, initial_weights
-from dqn.optimiser import Adam, decayed, linear
+from dqn.optimiser import Adam
 from dqn.replay import Array, Replay, Transition
 from dqn.streams import UniformStream
-from dqn.targets import advantage_target, double_q_target, huber_loss, loss_gradient, q_target
+from dqn.targets import advantage_target, huber_loss, loss_gradient, q_target
 
 __all__ = ["STREAMS", "DQNAgent"]
 
@@ -58,13 +58,11 @@ class DQNAgent:
             matrix = torch.tensor(config.input_matrix, dtype=torch.float32, device=self.device).view(len(offset), -1)
         features = observations if offset is None else len(offset)
         self.sizes = (features, *config.hidden, actions)
-        start = (config.init_mirror, config.init_zero_output)
-        flat = np.stack([initial_weights(self.sizes, seed, *start) for seed in streams["init"]])
+        flat = np.stack([initial_weights(self.sizes, seed, config.init_zero_output) for seed in streams["init"]])
         weights = torch.from_numpy(flat).to(self.device)
         basis = action_basis(actions, config.output_basis_decay).to(self.device) if config.output_basis_decay else None
         self.online = QNetwork(weights, self.sizes, matrix, offset, basis)
         self.target = self.online.with_weights(weights.clone())
-        self.greedy = self.online.with_weights(weights.clone()) if config.ema_decay else self.online
         self._adam = Adam(weights, self.online.grad, config.learning_rate)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
         self._explore = UniformStream(streams["explore"], 2, torch.device("cpu"))
@@ -84,14 +82,7 @@ class DQNAgent:
     @property
     def epsilon(self) -> float:
         """Exploration rate now."""
-        c = self.config
-        return linear(c.epsilon_start, c.epsilon_end, c.epsilon_steps, self.steps)
-
-    @property
-    def learning_rate(self) -> float:
-        """Adam's rate now."""
-        c = self.config
-        return decayed(c.learning_rate, c.learning_rate_decay, c.total_updates, self.updates)
+        return self.config.epsilon(self.steps)
 
     def act(self, observation: Array) -> NDArray[np.int64]:
         """Epsilon-greedy actions for one observation per agent, (S, O) -> (S,)."""
@@ -127,11 +118,7 @@ class DQNAgent:
     def _td_target(self, batch: Transition) -> torch.Tensor:
         """y of every transition, shape (S, B)."""
         c = self.config
-        q_t = self.target(batch.s_t)
-        if c.double:
-            target = double_q_target(batch.r_t, batch.continues, c.gamma, q_t, self.online(batch.s_t))
-        else:
-            target = q_target(batch.r_t, batch.continues, c.gamma, q_t)
+        target = q_target(batch.r_t, batch.continues, c.gamma, self.target(batch.s_t))
         if c.action_gap:
             target = advantage_target(target, c.action_gap, self.target(batch.s_tm1), batch.a_tm1)
         return target
@@ -151,7 +138,6 @@ class DQNAgent:
         q, inputs = self.online.forward(observation)
         td_error, gradient = loss_gradient(q, action, target, c.huber)
         self.online.backward(inputs, gradient)
-        self._adam.learning_rate = self.learning_rate
         self._adam.step()
         self.updates += 1
         if self.updates % c.target_period == 0:
@@ -159,15 +145,12 @@ class DQNAgent:
         if self.updates % DIAGNOSED == 0:
             self.loss = huber_loss(td_error, c.huber)
             self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
-        if c.ema_decay:
-            self.greedy.flat.lerp_(self.online.flat, 1.0 - c.ema_decay)
 
     def state_dict(self) -> dict[str, Any]:
         """The complete learning state: loading it into a new agent of the same config continues to the bit."""
         return {
             "online": self.online.flat.cpu(),
             "target": self.target.flat.cpu(),
-            "greedy": self.greedy.flat.cpu(),
             "adam": self._adam.state_dict(),
             "replay": self.replay.state_dict(),
             "explore": self._explore.state_dict(),
@@ -183,7 +166,6 @@ class DQNAgent:
         """Continue as saved. Raises: RuntimeError from torch where shapes differ."""
         self.online.flat.copy_(state["online"])
         self.target.flat.copy_(state["target"])
-        self.greedy.flat.copy_(state["greedy"])
         self._adam.load_state_dict(state["adam"])
         self.replay.load_state_dict(state["replay"])
         self._explore.load_state_dict(state["explore"])

@@ -24,14 +24,13 @@ def goal_relabel(
     Two kinds of goals are drawn. A share `hindsight_near` of each batch gets x' + d or x' - d, log d uniform over the
     range `hindsight_width`, so that errors of every order of magnitude are trained on equally often. If one side lies
     outside the range of goals, the other side is taken. The rest of the batch, and transitions for which both sides lie
-    outside, get a goal drawn uniformly from the range of goals. This range is the task's, widened by
-    `hindsight_margin`, so that the outermost goals have neighbours on both sides.
+    outside, get a goal drawn uniformly from the range of goals.
 
     Args:
       config: its keys `hindsight_*`. goals: lowest and highest goal of the task.
       reward: (x', goal) -> reward, all of one shape.
     """
-    low, high = goals[0] * (1.0 - config.hindsight_margin), goals[1] * (1.0 + config.hindsight_margin)
+    low, high = goals
     smallest, largest = (math.log(width) for width in config.hindsight_width)
 
     def relabel(batch: Transition, uniform: torch.Tensor) -> Transition:

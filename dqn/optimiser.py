@@ -1,10 +1,10 @@
-"""Adam on the flat weights of S agents, and the schedules of learning and exploration rates."""
+"""Adam on the flat weights of S agents."""
 
 from __future__ import annotations
 
 import torch
 
-__all__ = ["Adam", "decayed", "linear"]
+__all__ = ["Adam"]
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 """Constants of Adam as published (Kingma & Ba 2015, Algorithm 1)."""
@@ -18,11 +18,11 @@ class Adam:
 
     Args:
       weights: changed in place, any shape. gradient: read at each step, same shape.
-      learning_rate: of the next step; may be set between steps.
+      learning_rate: lr, the same for every step.
     """
 
     def __init__(self, weights: torch.Tensor, gradient: torch.Tensor, learning_rate: float) -> None:
-        self.learning_rate = learning_rate
+        self._learning_rate = learning_rate
         self._weights, self._gradient = weights, gradient
         self._mean, self._square = torch.zeros_like(weights), torch.zeros_like(weights)
         self._steps = torch.zeros((), device=weights.device)
@@ -32,7 +32,7 @@ class Adam:
         self._steps += 1
         torch._fused_adam_(
             [self._weights], [self._gradient], [self._mean], [self._square], [], [self._steps],
-            lr=self.learning_rate, beta1=BETA1, beta2=BETA2, eps=EPSILON,
+            lr=self._learning_rate, beta1=BETA1, beta2=BETA2, eps=EPSILON,
             weight_decay=0.0, amsgrad=False, maximize=False,
         )  # fmt: skip
 
@@ -45,17 +45,3 @@ class Adam:
         self._mean.copy_(state["mean"])
         self._square.copy_(state["square"])
         self._steps.copy_(state["steps"])
-
-
-def linear(start: float, end: float, duration: int, step: int) -> float:
-    """Falls (or rises) linearly from `start` at step 0 to `end` at step `duration` and stays there."""
-    if step >= duration:
-        return end
-    return start + (end - start) * step / duration
-
-
-def decayed(start: float, fraction: float, total: int, step: int) -> float:
-    """`start`, falling linearly to zero over the last `fraction` of `total` steps."""
-    decay = fraction * total
-    remaining = total - step
-    return start if decay <= 0.0 or remaining >= decay else start * max(0.0, remaining) / decay

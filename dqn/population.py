@@ -58,9 +58,9 @@ class Population:
         """Shape and constants of every agent's network, for `with_weights`; holds the first group's weights."""
         return self.groups[0].agent.online
 
-    def greedy_weights(self) -> torch.Tensor:
-        """Weights that act greedily now, a copy, shape (S, P)."""
-        return torch.cat([group.agent.greedy.flat for group in self.groups])
+    def weights(self) -> torch.Tensor:
+        """Weights of all agents now, a copy, shape (S, P)."""
+        return torch.cat([group.agent.online.flat for group in self.groups])
 
     def run(self) -> Iterator[TrainRecord]:
         """Train all groups to the end; one record, of all agents, per interval."""

@@ -49,7 +49,6 @@ class TrainRecord:
     step: int
     updates: int
     epsilon: float
-    learning_rate: float
     episode_return: NDArray[np.float64]
     loss: NDArray[np.float64]
     q_min: NDArray[np.float64]
@@ -123,7 +122,6 @@ class Trainer:
             step=agent.steps,
             updates=agent.updates,
             epsilon=agent.epsilon,
-            learning_rate=agent.learning_rate,
             episode_return=self._finished.copy(),
             loss=agent.loss.cpu().numpy().astype(np.float64),
             q_min=q_range[:, 0],
