@@ -1,4 +1,4 @@
-"""The agent: epsilon-greedy action choice and one DQN update, for S independent seeds at once; one is S = 1."""
+"""The agent: epsilon-greedy action choice and one DQN update, for S independent seeds at once (S = 1: one agent)."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ __all__ = ["STREAMS", "DQNAgent"]
 STREAMS = ("init", "explore", "replay", "hindsight")
 """Names of the random streams an agent needs, each independent of the others."""
 
-DIAGNOSED = 100  # updates from one look at loss and range of Q to the next
+DIAGNOSED = 100  # updates between two looks at the loss and the range of Q
 
 
 class DQNAgent:
     """Deep Q-learning (Mnih 2015) of S agents that share nothing but the machine.
 
     One update (`learn`): draw a minibatch, form y = r + gamma max_a Q_target(s', a), take one Adam step on
-    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates copy the weights to the target network.
+    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates copy the weights to the target network. Keys of the
+    config change three of these: `hindsight_share` the minibatch, `action_gap` the target y, `huber` the loss.
 
     Args:
       config: hyper-parameters.
@@ -129,7 +130,7 @@ class DQNAgent:
         self.fit(batch.s_tm1, batch.a_tm1, self._td_target(batch))
 
     def fit(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> None:
-        """One Adam step towards Q(observation, action) = target, and what follows an update.
+        """One Adam step towards Q(observation, action) = target; then, where due, the copy and a look at the loss.
 
         Args:
           observation: (S, B, O). action: (S, B) int64. target: (S, B).
@@ -147,7 +148,7 @@ class DQNAgent:
             self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
 
     def state_dict(self) -> dict[str, Any]:
-        """The complete learning state: loading it into a new agent of the same config continues to the bit."""
+        """The complete learning state. A new agent of the same config that loads it continues to the bit."""
         return {
             "online": self.online.flat.cpu(),
             "target": self.target.flat.cpu(),

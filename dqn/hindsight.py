@@ -19,7 +19,7 @@ Relabel = Callable[[Transition, torch.Tensor], Transition]
 def goal_relabel(
     config: DQNConfig, goals: tuple[float, float], reward: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 ) -> Relabel:
-    """Replace the goal of transitions and with it the reward (hindsight, Andrychowicz 2017); observations are [x, goal].
+    """Replace the goal of transitions, and with it the reward (Andrychowicz 2017); observations are [x, goal].
 
     Two kinds of goals are drawn. A share `hindsight_near` of each batch gets x' + d or x' - d, log d uniform over the
     range `hindsight_width`, so that errors of every order of magnitude are trained on equally often. If one side lies
