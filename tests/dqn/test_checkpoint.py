@@ -15,9 +15,7 @@ from dqn.config import DQNConfig
 from dqn.trainer import Trainer
 from tests.dqn.problems import IdentityEnv, streams
 
-CONFIG = DQNConfig(
-    hidden=(8, 8), total_steps=200, learn_start=20, batch_size=8, target_period=10
-)
+CONFIG = DQNConfig(hidden=(8, 8), total_steps=200, learn_start=20, batch_size=8, target_period=10)
 
 
 def _trainer() -> Trainer:
