@@ -1,44 +1,42 @@
-"""The agent: epsilon-greedy action choice and one DQN update, for S independent seeds at once; one is S = 1."""
+"""The agent: epsilon-greedy action choice and one DQN update, for S independent seeds at once (S = 1: one agent)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dqn.adam import Adam
 from dqn.config import DQNConfig
+from dqn.hindsight import Relabel
 from dqn.network import QNetwork, action_basis, initial_weights
+from dqn.optimiser import Adam
 from dqn.replay import Array, Replay, Transition
-from dqn.schedules import decayed, linear
 from dqn.streams import UniformStream
-from dqn.targets import advantage_target, blend, double_q_target, huber_loss, loss_gradient, q_target
+from dqn.targets import advantage_target, huber_loss, loss_gradient, q_target
 
-__all__ = ["STREAMS", "DQNAgent", "Relabel"]
+__all__ = ["STREAMS", "DQNAgent"]
 
-STREAMS = ("init", "explore", "replay", "relabel")
+STREAMS = ("init", "explore", "replay", "hindsight")
 """Names of the random streams an agent needs, each independent of the others."""
 
-DIAGNOSED = 100  # updates from one look at loss and range of Q to the next
-
-Relabel = Callable[[Transition, torch.Tensor], Transition]
-"""Replaces the goal of a minibatch: (transitions (S, B), uniform numbers (S, B, 2)) -> transitions (S, B)."""
+DIAGNOSED = 100  # updates between two looks at the loss and the range of Q
 
 
 class DQNAgent:
     """Deep Q-learning (Mnih 2015) of S agents that share nothing but the machine.
 
     One update (`learn`): draw a minibatch, form y = r + gamma max_a Q_target(s', a), take one Adam step on
-    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates blend the target network.
+    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates copy the weights to the target network. Keys of the
+    config change three of these: `hindsight_share` the minibatch, `action_gap` the target y, `huber` the loss.
 
     Args:
       config: hyper-parameters.
       observations: O, numbers per observation. actions: A.
       streams: for each name in STREAMS one SeedSequence per agent.
-      relabel: goal replacement, used on a share `config.relabel` of each minibatch.
+      relabel: goal replacement, used on a share `config.hindsight_share` of each minibatch.
       device: "cpu" or "cuda".
     """
 
@@ -61,22 +59,22 @@ class DQNAgent:
             matrix = torch.tensor(config.input_matrix, dtype=torch.float32, device=self.device).view(len(offset), -1)
         features = observations if offset is None else len(offset)
         self.sizes = (features, *config.hidden, actions)
-        start = (config.init_mirror, config.init_zero_output)
-        flat = np.stack([initial_weights(self.sizes, seed, *start) for seed in streams["init"]])
+        flat = np.stack([initial_weights(self.sizes, seed, config.init_zero_output) for seed in streams["init"]])
         weights = torch.from_numpy(flat).to(self.device)
-        basis = action_basis(actions, config.action_smoothness).to(self.device) if config.action_smoothness else None
+        basis = action_basis(actions, config.output_basis_decay).to(self.device) if config.output_basis_decay else None
         self.online = QNetwork(weights, self.sizes, matrix, offset, basis)
         self.target = self.online.with_weights(weights.clone())
-        self.greedy = self.online.with_weights(weights.clone()) if config.average else self.online
-        self._adam = Adam(weights, self.online.grad, config.learning_rate, config.adam_beta2, config.adam_eps)
+        self._adam = Adam(weights, self.online.grad, config.learning_rate)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
         self._explore = UniformStream(streams["explore"], 2, torch.device("cpu"))
         self._draws = UniformStream(streams["replay"], config.batch_size, self.device)
-        self._relabelled = round(config.relabel * config.batch_size)
-        self._goals = UniformStream(streams["relabel"], max(1, 2 * self._relabelled), self.device)
+        self._relabelled = round(config.hindsight_share * config.batch_size)
+        self._goals = UniformStream(streams["hindsight"], max(1, 2 * self._relabelled), self.device)
         self._relabel = relabel
         if self._relabelled and relabel is None:
-            raise ValueError(f"agent.relabel = {config.relabel}: this task has no goal to replace; set it to 0")
+            raise ValueError(
+                f"agent.hindsight_share = {config.hindsight_share}: this task has no goal to replace; set it to 0"
+            )
         self.steps = 0  # environment steps taken
         self.updates = 0
         self.loss = torch.zeros(self.n_agents, device=self.device)  # of the last diagnosed update
@@ -85,14 +83,7 @@ class DQNAgent:
     @property
     def epsilon(self) -> float:
         """Exploration rate now."""
-        c = self.config
-        return linear(c.epsilon_start, c.epsilon_end, c.epsilon_steps, self.steps)
-
-    @property
-    def learning_rate(self) -> float:
-        """Adam's rate now."""
-        c = self.config
-        return decayed(c.learning_rate, c.learning_rate_decay, c.total_updates, self.updates)
+        return self.config.epsilon(self.steps)
 
     def act(self, observation: Array) -> NDArray[np.int64]:
         """Epsilon-greedy actions for one observation per agent, (S, O) -> (S,)."""
@@ -128,11 +119,7 @@ class DQNAgent:
     def _td_target(self, batch: Transition) -> torch.Tensor:
         """y of every transition, shape (S, B)."""
         c = self.config
-        q_t = self.target(batch.s_t)
-        if c.double:
-            target = double_q_target(batch.r_t, batch.continues, c.gamma, q_t, self.online(batch.s_t))
-        else:
-            target = q_target(batch.r_t, batch.continues, c.gamma, q_t)
+        target = q_target(batch.r_t, batch.continues, c.gamma, self.target(batch.s_t))
         if c.action_gap:
             target = advantage_target(target, c.action_gap, self.target(batch.s_tm1), batch.a_tm1)
         return target
@@ -143,7 +130,7 @@ class DQNAgent:
         self.fit(batch.s_tm1, batch.a_tm1, self._td_target(batch))
 
     def fit(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> None:
-        """One Adam step towards Q(observation, action) = target, and what follows an update.
+        """One Adam step towards Q(observation, action) = target; then, where due, the copy and a look at the loss.
 
         Args:
           observation: (S, B, O). action: (S, B) int64. target: (S, B).
@@ -152,23 +139,19 @@ class DQNAgent:
         q, inputs = self.online.forward(observation)
         td_error, gradient = loss_gradient(q, action, target, c.huber)
         self.online.backward(inputs, gradient)
-        self._adam.learning_rate = self.learning_rate
         self._adam.step()
         self.updates += 1
         if self.updates % c.target_period == 0:
-            blend(self.target.flat, self.online.flat, c.target_blend)
+            self.target.flat.copy_(self.online.flat)
         if self.updates % DIAGNOSED == 0:
             self.loss = huber_loss(td_error, c.huber)
             self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
-        if c.average:
-            blend(self.greedy.flat, self.online.flat, 1.0 - c.average)
 
     def state_dict(self) -> dict[str, Any]:
-        """The complete learning state: loading it into a new agent of the same config continues to the bit."""
+        """The complete learning state. A new agent of the same config that loads it continues to the bit."""
         return {
             "online": self.online.flat.cpu(),
             "target": self.target.flat.cpu(),
-            "greedy": self.greedy.flat.cpu(),
             "adam": self._adam.state_dict(),
             "replay": self.replay.state_dict(),
             "explore": self._explore.state_dict(),
@@ -184,7 +167,6 @@ class DQNAgent:
         """Continue as saved. Raises: RuntimeError from torch where shapes differ."""
         self.online.flat.copy_(state["online"])
         self.target.flat.copy_(state["target"])
-        self.greedy.flat.copy_(state["greedy"])
         self._adam.load_state_dict(state["adam"])
         self.replay.load_state_dict(state["replay"])
         self._explore.load_state_dict(state["explore"])

@@ -10,7 +10,7 @@ import torch
 
 __all__ = ["CheckpointError", "load", "save"]
 
-FORMAT = 2
+FORMAT = 3
 
 
 class CheckpointError(Exception):

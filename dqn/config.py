@@ -17,10 +17,7 @@ class DQNConfig:
 
     hidden: tuple[int, ...] = (64, 64)  # units of the ReLU layers
     gamma: float = 0.99  # discount per step
-    learning_rate: float = 1e-3  # Adam's, at the start
-    learning_rate_decay: float = 0.0  # fraction of all updates, at the end, over which the rate falls to zero
-    adam_beta2: float = 0.999  # decay of Adam's mean of squared gradients
-    adam_eps: float = 1e-8  # added to its root
+    learning_rate: float = 1e-3  # Adam's
     total_steps: int = 10_000  # length of training
     epsilon_start: float = 1.0  # exploration rate at step 0
     epsilon_end: float = 0.05  # and from step epsilon_steps on
@@ -29,21 +26,16 @@ class DQNConfig:
     learn_start: int = 500  # steps before the first update
     batch_size: int = 64
     updates_per_step: int = 1
-    target_period: int = 500  # updates between blends of the target network
-    target_blend: float = 1.0  # share of the online network in a blend; 1 copies
-    double: bool = False  # double-Q targets (van Hasselt 2016)
-    action_gap: float = 0.0  # alpha of advantage learning: action gaps are learned 1 / (1 - alpha) times as wide
-    action_smoothness: float = 0.0  # exponent by which rough differences between actions are learned later; 0: off
+    target_period: int = 500  # updates between copies of the online network to the target network
+    action_gap: float = 0.0  # alpha of advantage learning, which makes action gaps 1 / (1 - alpha) times as wide
+    output_basis_decay: float = 0.0  # rows of the output basis fall as (1 + degree)^-decay; 0: no basis
     huber: float = 0.0  # TD errors beyond this are clipped in the gradient; 0 means squared error
     reward_scale: float = 1.0  # rewards are multiplied by this inside the agent
-    relabel: float = 0.0  # share of each minibatch whose goal is replaced by a random one (hindsight)
-    relabel_near: float = 0.0  # share of those whose new goal is drawn close to the state reached
-    relabel_width: tuple[float, float] = (1e-3, 0.8)  # how close: range of the distance, log-uniform
-    relabel_margin: float = 0.0  # new goals reach this share beyond the task's lowest and highest
-    average: float = 0.0  # decay of the running mean of weights that acts greedily; 0 means the weights themselves
+    hindsight_share: float = 0.0  # share of each minibatch that is given another goal
+    hindsight_near: float = 0.0  # share of those whose new goal lies close to the state reached
+    hindsight_width: tuple[float, float] = (1e-3, 0.8)  # range of that distance, drawn log-uniformly
     input_matrix: tuple[float, ...] = ()  # features = M observation + c, M row by row; () means identity
     input_offset: tuple[float, ...] = ()  # c, one number per feature
-    init_mirror: tuple[int, ...] = ()  # -1 or 1 per feature: half of the units start as mirror images; () = none
     init_zero_output: bool = False  # the last layer starts at zero
 
     def __post_init__(self) -> None:
@@ -52,9 +44,6 @@ class DQNConfig:
             ("hidden", self.hidden, len(self.hidden) > 0 and min(self.hidden) >= 1, "one or more layer sizes >= 1"),
             ("gamma", self.gamma, 0.0 <= self.gamma < 1.0, "0 <= gamma < 1"),
             ("learning_rate", self.learning_rate, 0.0 < self.learning_rate <= 1.0, "0 < rate <= 1"),
-            ("learning_rate_decay", self.learning_rate_decay, 0.0 <= self.learning_rate_decay <= 1.0, "0 to 1"),
-            ("adam_beta2", self.adam_beta2, 0.0 <= self.adam_beta2 < 1.0, "0 <= beta2 < 1"),
-            ("adam_eps", self.adam_eps, self.adam_eps > 0.0, "greater than 0"),
             ("total_steps", self.total_steps, self.total_steps >= 1, "at least 1"),
             ("epsilon_start", self.epsilon_start, 0.0 <= self.epsilon_start <= 1.0, "0 to 1"),
             ("epsilon_end", self.epsilon_end, 0.0 <= self.epsilon_end <= 1.0, "0 to 1"),
@@ -64,21 +53,18 @@ class DQNConfig:
             ("batch_size", self.batch_size, self.batch_size >= 1, "at least 1"),
             ("updates_per_step", self.updates_per_step, self.updates_per_step >= 1, "at least 1"),
             ("target_period", self.target_period, self.target_period >= 1, "at least 1 update"),
-            ("target_blend", self.target_blend, 0.0 < self.target_blend <= 1.0, "0 < blend <= 1"),
             ("action_gap", self.action_gap, 0.0 <= self.action_gap < 1.0, "0 <= alpha < 1"),
-            ("action_smoothness", self.action_smoothness, self.action_smoothness >= 0.0, "at least 0 (0 = off)"),
+            ("output_basis_decay", self.output_basis_decay, self.output_basis_decay >= 0.0, "at least 0 (0 = off)"),
             ("huber", self.huber, self.huber >= 0.0, "at least 0 (0 = squared error)"),
             ("reward_scale", self.reward_scale, self.reward_scale > 0.0, "greater than 0"),
-            ("relabel", self.relabel, 0.0 <= self.relabel <= 1.0, "0 to 1"),
-            ("relabel_near", self.relabel_near, 0.0 <= self.relabel_near <= 1.0, "0 to 1"),
+            ("hindsight_share", self.hindsight_share, 0.0 <= self.hindsight_share <= 1.0, "0 to 1"),
+            ("hindsight_near", self.hindsight_near, 0.0 <= self.hindsight_near <= 1.0, "0 to 1"),
             (
-                "relabel_width",
-                self.relabel_width,
-                len(self.relabel_width) == 2 and 0.0 < self.relabel_width[0] <= self.relabel_width[1],
+                "hindsight_width",
+                self.hindsight_width,
+                len(self.hindsight_width) == 2 and 0.0 < self.hindsight_width[0] <= self.hindsight_width[1],
                 "[low, high] with 0 < low <= high",
             ),
-            ("relabel_margin", self.relabel_margin, 0.0 <= self.relabel_margin < 1.0, "0 <= margin < 1"),
-            ("average", self.average, 0.0 <= self.average < 1.0, "0 <= decay < 1"),
         )
         for key, value, ok, allowed in checks:
             if not ok:
@@ -91,14 +77,11 @@ class DQNConfig:
                 f"{len(self.input_offset)}: allowed one row of the matrix per value of the offset, or neither"
             )
 
-        mirror = self.init_mirror
-        if mirror and (len(mirror) != len(self.input_offset) or set(mirror) - {-1, 1}):
-            raise ValueError(
-                f"agent.init_mirror = {list(mirror)}: allowed -1 or 1 for each of the {len(self.input_offset)} values "
-                "of agent.input_offset, or []"
-            )
-        if mirror and any(units % 2 for units in self.hidden):
-            raise ValueError(f"agent.hidden = {list(self.hidden)}: allowed even sizes with agent.init_mirror, or []")
+    def epsilon(self, step: int) -> float:
+        """Probability of a random action at an environment step: linear in the step, then constant."""
+        if step >= self.epsilon_steps:
+            return self.epsilon_end
+        return self.epsilon_start + (self.epsilon_end - self.epsilon_start) * step / self.epsilon_steps
 
     @property
     def total_updates(self) -> int:

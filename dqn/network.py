@@ -13,67 +13,56 @@ __all__ = ["QNetwork", "action_basis", "initial_weights"]
 Layer = tuple[torch.Tensor, torch.Tensor]
 
 
-def initial_weights(
-    sizes: Sequence[int], seed: np.random.SeedSequence, mirror: Sequence[int] = (), zero_output: bool = False
-) -> np.ndarray:
+def initial_weights(sizes: Sequence[int], seed: np.random.SeedSequence, zero_output: bool = False) -> np.ndarray:
     """Weights of one network, flat: W and b of each layer uniform in +-1/sqrt(inputs) (the default of torch.nn.Linear).
 
-    With `mirror`, the second half of each hidden layer is the mirror image of the first: with f the features and m the
-    mirror, unit H/2 + j answers to f as unit j does to m f. Whatever a network favours on one side because of its draw
-    it then favours on the other side as well.
-
     Args:
-      sizes: units of feature, hidden and output layers; hidden ones even with `mirror`.
+      sizes: units of feature, hidden and output layers.
       seed: the agent's own stream.
-      mirror: 1 or -1 for each feature; () = every unit is drawn.
       zero_output: the last layer starts at 0, and with it every Q value.
     Returns: float32, shape (P,), laid out as `QNetwork` wants it.
     """
     rng = np.random.default_rng(seed)
     parts = []
-    signs = np.asarray(mirror, dtype=np.float64)
     for layer, (inputs, outputs) in enumerate(pairwise(sizes)):
         bound = 1.0 / np.sqrt(inputs)
         weight, bias = rng.uniform(-bound, bound, (inputs, outputs)), rng.uniform(-bound, bound, outputs)
-        last, half = layer == len(sizes) - 2, outputs // 2
+        last = layer == len(sizes) - 2
         if last and zero_output:
             weight[:], bias[:] = 0.0, 0.0
-        elif signs.size and not last:
-            image = weight[:, :half] * signs[:, None] if layer == 0 else np.roll(weight[:, :half], inputs // 2, axis=0)
-            weight[:, half:], bias[half:] = image, bias[:half]
         parts += [(weight.T if last else weight).ravel(), bias]
     return np.concatenate(parts).astype(np.float32)
 
 
-def action_basis(actions: int, smoothness: float) -> torch.Tensor:
-    """C with Q = z C: row k is the polynomial of degree k in the action, scaled by (1 + k)^-smoothness.
+def action_basis(actions: int, decay: float) -> torch.Tensor:
+    """C with Q = z C: row k is the polynomial of degree k in the action, scaled by (1 + k)^-decay.
 
     The polynomials are orthogonal on the A equidistant actions and have mean square 1 there (discrete Legendre or Gram
     polynomials). C is invertible, so the network can represent the same Q values with it as without. It changes the
-    direction in which gradient steps go: one sample then moves Q of similar actions alike, and the rougher a difference
-    between actions is, the more slowly it is learned. What Q really is, a parabola in the pump rate to good
-    approximation, takes three of them, also at the ends of the grid, where a cosine series would flatten it.
+    direction of gradient steps. A step for one action moves Q of similar actions alike, and a difference between
+    actions is learned the more slowly the higher its degree. Q is nearly a parabola in the pump rate, which three rows
+    give exactly. A cosine series would flatten the parabola at the ends of the grid.
 
     Args:
-      actions: A. smoothness: >= 0.
+      actions: A. decay: >= 0.
     Returns: shape (A, A), float32.
     """
     grid = np.linspace(-1.0, 1.0, actions)
     powers = np.polynomial.legendre.legvander(grid, actions - 1)
     orthonormal, triangle = np.linalg.qr(powers)
     rows = (orthonormal * np.sign(np.diag(triangle))).T * np.sqrt(actions)
-    return torch.from_numpy((rows / (1.0 + np.arange(actions))[:, None] ** smoothness).astype(np.float32))
+    return torch.from_numpy((rows / (1.0 + np.arange(actions))[:, None] ** decay).astype(np.float32))
 
 
 class QNetwork:
     """Q(observation, .) = W3 relu(W2 relu(W1 f + b1) + b2) + b3 with f = M observation + c, for S agents at once.
 
-    M and c are constants of the input, stored and exported with the weights. All weights of all agents live in one
-    tensor `flat`, shape (S, P), whose slices are the layers; an optimiser, a copy or a running mean is then one
-    operation. Gradients are written out by hand: two matrix products a layer, no graph.
+    M and c are constants, exported with the weights. All weights of all agents live in one tensor `flat`, shape (S, P),
+    and the layers are views of it, so that a step of the optimiser or a copy is one operation. Gradients are written
+    out by hand: two matrix products a layer, no graph.
 
-    The last layer's weights lie in memory as (outputs, inputs), and Q as (S, A, B): matrix products and reductions want
-    a long innermost axis, and there are fewer actions than transitions. Shapes are the same for all layers.
+    Memory order differs from shape in the last layer: its weights lie as (outputs, inputs) and Q as (S, A, B). Matrix
+    products and reductions are faster with a long innermost axis, and there are more transitions than actions.
 
     Args:
       flat: weights, shape (S, P), laid out as by `initial_weights`.
@@ -110,7 +99,7 @@ class QNetwork:
             middle, end = start + i * o, start + i * o + o
             views.append((flat[:, start:middle].view(-1, i, o), flat[:, middle:end].view(-1, 1, o)))
             start = end
-        views[-1] = (views[-1][0].view(-1, o, i).transpose(1, 2), views[-1][1])  # see the class's second paragraph
+        views[-1] = (views[-1][0].view(-1, o, i).transpose(1, 2), views[-1][1])  # memory order: see the class
         return views
 
     def with_weights(self, flat: torch.Tensor) -> QNetwork:

@@ -15,7 +15,7 @@ from dqn.trainer import Trainer, TrainRecord
 __all__ = ["GROUP", "Population"]
 
 GROUP = 16
-"""Agents per group on a CPU: enough that the cost of calling torch does not count, few enough for its caches."""
+"""Agents per group on a CPU: enough to make the overhead of calling torch small, few enough for the CPU's caches."""
 
 
 def _cores() -> int:
@@ -24,10 +24,10 @@ def _cores() -> int:
 
 
 class Population:
-    """S agents as groups that share nothing, each with its own part of the environment and a thread while it trains.
+    """S agents in groups that share nothing. Each group has its own copies of the environment, and trains in a thread.
 
-    Torch releases Python's lock during its operations, so two groups on two cores take two thirds of the time of one
-    after the other. How agents are grouped does not depend on the number of threads, and neither does any result.
+    Torch releases Python's lock during its operations, so two groups on two cores finish in two thirds of the time that
+    they need one after the other. The grouping does not depend on the number of threads, so results do not either.
 
     Args:
       groups: trainers of the same config and interval; the agents of the first come first.
@@ -58,9 +58,9 @@ class Population:
         """Shape and constants of every agent's network, for `with_weights`; holds the first group's weights."""
         return self.groups[0].agent.online
 
-    def greedy_weights(self) -> torch.Tensor:
-        """Weights that act greedily now, a copy, shape (S, P)."""
-        return torch.cat([group.agent.greedy.flat for group in self.groups])
+    def weights(self) -> torch.Tensor:
+        """Weights of all agents now, a copy, shape (S, P)."""
+        return torch.cat([group.agent.online.flat for group in self.groups])
 
     def run(self) -> Iterator[TrainRecord]:
         """Train all groups to the end; one record, of all agents, per interval."""

@@ -16,9 +16,9 @@ CALLS_PER_BLOCK = 128
 class UniformStream:
     """Uniform numbers in [0, 1), `width` per agent and call, each agent from a generator of its own.
 
-    Each generator fills a block of CALLS_PER_BLOCK calls at a time, so that the cost per call does not grow with a
-    Python loop over agents. The state is that of the generators before their block and the place in it, or, once the
-    block is used up, that of the generators now.
+    Each generator draws the numbers of CALLS_PER_BLOCK calls at once, a block, so that most calls need no Python loop
+    over agents. What is saved is the place in the block and the generators as they were before they drew it, from which
+    the block is drawn again. Once the block is used up, the generators are saved as they are.
 
     Args:
       seeds: one per agent, S.

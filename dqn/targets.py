@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["advantage_target", "blend", "double_q_target", "huber_loss", "loss_gradient", "q_target"]
+__all__ = ["advantage_target", "huber_loss", "loss_gradient", "q_target"]
 
 
 def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor) -> torch.Tensor:
@@ -15,14 +15,6 @@ def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torc
     Returns: shape (S, B).
     """
     return torch.addcmul(r_t, continues, q_t.amax(-1), value=gamma)
-
-
-def double_q_target(
-    r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor, q_t_online: torch.Tensor
-) -> torch.Tensor:
-    """y = r + gamma c Q_target(s', argmax_a Q_online(s', a)) (van Hasselt 2016); arguments as `q_target`."""
-    best = q_t_online.max(-1, keepdim=True).indices  # several times as fast as argmax here
-    return torch.addcmul(r_t, continues, q_t.gather(-1, best).squeeze(-1), value=gamma)
 
 
 def advantage_target(target: torch.Tensor, alpha: float, q_tm1: torch.Tensor, a_tm1: torch.Tensor) -> torch.Tensor:
@@ -58,11 +50,3 @@ def huber_loss(td_error: torch.Tensor, huber: float) -> torch.Tensor:
     """L = mean_B l(d) with l(d) = d^2 / 2, or beyond |d| = huber its tangent (Huber 1964); (S, B) -> (S,)."""
     slope = td_error if huber == 0.0 else td_error.clamp(-huber, huber)
     return (slope * (td_error - 0.5 * slope)).mean(-1)
-
-
-def blend(target: torch.Tensor, online: torch.Tensor, share: float) -> None:
-    """target <- (1 - share) target + share online, in place; share 1 copies."""
-    if share == 1.0:
-        target.copy_(online)
-    else:
-        target.lerp_(online, share)

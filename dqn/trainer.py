@@ -43,13 +43,12 @@ class TrainRecord:
     """What happened in one interval of training; arrays have one entry per agent, shape (S,).
 
     episode_return: undiscounted reward of the last episode that ended in the interval, nan where none did.
-    loss, q_min, q_max: of the last update they were looked at, at most 100 updates ago.
+    loss, q_min, q_max: of the last update at which they were looked at, at most 100 updates ago.
     """
 
     step: int
     updates: int
     epsilon: float
-    learning_rate: float
     episode_return: NDArray[np.float64]
     loss: NDArray[np.float64]
     q_min: NDArray[np.float64]
@@ -108,7 +107,7 @@ class Trainer:
         self._observation, reward, terminated, truncated, infos = self.env.step(action)
         done = terminated | truncated
         ended = done.any()
-        # the state that was really reached: at an episode's end the environment already shows the next episode
+        # at the end of an episode the environment already shows the start of the next one
         reached = np.where(done[:, None], infos["final_obs"], self._observation) if ended else self._observation
         agent.observe(before, action, reward, reached, ~terminated)
         self._return += reward
@@ -123,7 +122,6 @@ class Trainer:
             step=agent.steps,
             updates=agent.updates,
             epsilon=agent.epsilon,
-            learning_rate=agent.learning_rate,
             episode_return=self._finished.copy(),
             loss=agent.loss.cpu().numpy().astype(np.float64),
             q_min=q_range[:, 0],

@@ -145,7 +145,7 @@ def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
     agents = session.agents
     report = Evaluation(config.env, config.agent.gamma, report_grid(config.env))
     kept = report(build.act_with(agents.network, session.best.weights), agents.n_agents)
-    last = report(build.act_with(agents.network, agents.greedy_weights()), agents.n_agents)
+    last = report(build.act_with(agents.network, agents.weights()), agents.n_agents)
     return [
         Row(
             ablation=name,

@@ -99,7 +99,7 @@ def _watch(config: DegradationConfig, name: str) -> list[dict[str, float | str]]
     for record in agents.run():
         if record.step % config.eval_every and record.step != agent.total_steps:
             continue
-        greedy = agents.network.with_weights(agents.greedy_weights())
+        greedy = agents.network.with_weights(agents.weights())
         score = selection(build.act_with(greedy, greedy.flat), config.n_agents)
         error = greedy(observation).amax(-1).numpy() / agent.reward_scale - value
         rows.append(
@@ -139,13 +139,12 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
 
     from dqn.agent import STREAMS, DQNAgent
     from dqn.replay import Transition
-    from experiments.hindsight import goal_relabel
     from experiments.training import build, seeding
     from experiments.training.evaluation import Evaluation, report_grid
 
     agent = variant(config.agent, name, config.fitted[name])
     seeds = range(config.seed, config.seed + config.n_agents)
-    relabel = goal_relabel(config.env, agent, "cpu")
+    relabel = build.hindsight(config.env, agent)
     learner = DQNAgent(agent, 2, config.env.n_actions, seeding.streams(seeds, STREAMS), relabel)
     unit = solve(replace(config.env, start_od=(0.04, 3.9)), agent.gamma, setpoints=np.array([0.5]), grid=9001)
     numbers = [np.random.default_rng(seed) for seed in seeds]
@@ -161,7 +160,7 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
         target = _exact(unit, od, batch.s_t[..., 1].double().numpy(), action, agent.action_gap)
         learner.fit(batch.s_tm1, batch.a_tm1, torch.from_numpy(target * agent.reward_scale).float())
     report = Evaluation(config.env, agent.gamma, report_grid(config.env))
-    score = report(build.act_with(learner.online, learner.greedy.flat), config.n_agents)
+    score = report(build.act_with(learner.online, learner.online.flat), config.n_agents)
     log.info(
         "%s, told the answers: regret %.2f %% (worst %.2f)", name, np.median(score.regret_pct), score.regret_pct.max()
     )

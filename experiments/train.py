@@ -124,7 +124,7 @@ def _finish(session: Session) -> None:
     c, agents, best = session.config, session.agents, session.best
     report = Evaluation(c.env, c.agent.gamma, report_grid(c.env))
     kept = report(build.act_with(agents.network, best.weights), agents.n_agents)
-    last = report(build.act_with(agents.network, agents.greedy_weights()), agents.n_agents)
+    last = report(build.act_with(agents.network, agents.weights()), agents.n_agents)
     path = _export(session, kept)
     _figures(session, path)
     summary = {

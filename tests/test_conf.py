@@ -43,9 +43,8 @@ def test_every_agent_composes(option):
 
 def test_the_papers_agent_adds_nothing_to_a_plain_dqn():
     agent = load_train("agent=paper").agent
-    assert not agent.double
-    assert agent.relabel == agent.average == agent.huber == 0.0
-    assert agent.reward_scale == agent.target_blend == 1.0
+    assert agent.hindsight_share == agent.action_gap == agent.huber == 0.0
+    assert agent.reward_scale == 1.0
     assert len(agent.input_matrix) == 0
 
 
@@ -96,7 +95,7 @@ def test_yaml_and_dataclass_defaults_are_the_same():
         ("+experiment=nope", ["experiment=nope", "no such option", "smoke"]),
         ("seed=1.5", ["seed", "1.5", "a whole number"]),
         ("seed=-1", ["seed", "-1", "at least 0"]),
-        ("agent.double=perhaps", ["agent.double", "perhaps", "true or false"]),
+        ("agent.init_zero_output=perhaps", ["agent.init_zero_output", "perhaps", "true or false"]),
         ("agent.gamma=1", ["agent.gamma", "1.0", "0 <= gamma < 1"]),
         ("agent.hidden=[64,x]", ["agent.hidden[1]", "x", "a whole number"]),
         ("device=tpu", ["device", "tpu", "cpu or cuda"]),

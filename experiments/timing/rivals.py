@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 import envs
 from dqn.config import DQNConfig
-from dqn.schedules import linear
 
 __all__ = ["Ring", "single_file_dqn", "stable_baselines_dqn", "sync_vector_env"]
 
@@ -72,7 +71,7 @@ def single_file_dqn(config: DQNConfig, seed: int) -> torch.nn.Module:
     memory = Ring(config.replay_size, 2)
     observation, _ = envs_.reset(seed=seed)
     for step in range(1, config.total_steps + 1):
-        if rng.random() < linear(config.epsilon_start, config.epsilon_end, config.epsilon_steps, step):
+        if rng.random() < config.epsilon(step):
             action = rng.integers(0, 17, 1)
         else:
             action = torch.argmax(online(torch.Tensor(observation)), dim=1).numpy()

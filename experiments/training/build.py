@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from envs.rewards import tracking_reward
 from envs.task import EnvConfig
 from experiments.training import seeding
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     import torch
 
     from dqn.config import DQNConfig
+    from dqn.hindsight import Relabel
     from dqn.network import QNetwork
     from dqn.policy import Policy
     from dqn.population import Population
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from experiments.controllers.base import Controller
     from experiments.training.evaluation import Act
 
-__all__ = ["act_with", "controller", "population", "trainer"]
+__all__ = ["act_with", "controller", "hindsight", "population", "trainer"]
 
 
 def population(
@@ -41,13 +43,19 @@ def trainer(env: EnvConfig, agent: DQNConfig, seeds: Sequence[int], device: str 
     from dqn.agent import STREAMS, DQNAgent
     from dqn.trainer import Trainer
     from envs.vector_env import BioreactorVectorEnv
-    from experiments.hindsight import goal_relabel
 
     streams = seeding.streams(seeds, (*STREAMS, "env"))
     copies = BioreactorVectorEnv(len(seeds), env)
     copies.seed_streams(streams["env"])
-    learner = DQNAgent(agent, 2, env.n_actions, streams, goal_relabel(env, agent, device), device)
+    learner = DQNAgent(agent, 2, env.n_actions, streams, hindsight(env, agent), device)
     return Trainer(copies, learner, interval=env.episode_steps)
+
+
+def hindsight(env: EnvConfig, agent: DQNConfig) -> Relabel:
+    """Goals of replayed transitions: the task's range of setpoints and its reward."""
+    from dqn.hindsight import goal_relabel
+
+    return goal_relabel(agent, (min(env.setpoints), max(env.setpoints)), tracking_reward)
 
 
 def act_with(network: QNetwork, flat: torch.Tensor) -> Act:

@@ -102,7 +102,7 @@ class Session:
         self.seeds: Sequence[int] = range(config.seed, config.seed + config.n_agents)
         self.agents = build.population(config.env, config.agent, self.seeds, config.device, config.threads)
         self.selection = Evaluation(config.env, config.agent.gamma, selection_grid(config.env))
-        self.best = Best.empty(self.agents.greedy_weights())
+        self.best = Best.empty(self.agents.weights())
         self.returns: list[list[float]] = []  # per episode, per agent
         self.seconds = 0.0  # spent training, over all lives
         if resume:
@@ -111,7 +111,7 @@ class Session:
 
     def evaluate(self, step: int) -> Score:
         """Score the greedy policies on the selection grid, keep the best, log."""
-        weights = self.agents.greedy_weights()
+        weights = self.agents.weights()
         score = self.selection(build.act_with(self.agents.network, weights), self.agents.n_agents)
         self.best.update(step, score, weights)
         self.writer.scalars(
@@ -128,7 +128,6 @@ class Session:
                 "train/return": record.episode_return,
                 "train/loss": record.loss,
                 "train/epsilon": record.epsilon,
-                "train/learning_rate": record.learning_rate,
                 "q/min": record.q_min,
                 "q/max": record.q_max,
                 "speed/steps_per_s": record.step * len(self.seeds) / max(self.seconds, 1e-9),

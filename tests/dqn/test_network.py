@@ -28,9 +28,9 @@ def _twin(network: QNetwork, agent: int) -> torch.nn.Sequential:
     return torch.nn.Sequential(*modules[:-1])
 
 
-@pytest.mark.parametrize("smoothness", [None, 0.0, 2.0])
-def test_forward_and_backward_agree_with_autograd(smoothness: float | None) -> None:
-    basis = None if smoothness is None else action_basis(SIZES[-1], smoothness)
+@pytest.mark.parametrize("decay", [None, 0.0, 2.0])
+def test_forward_and_backward_agree_with_autograd(decay: float | None) -> None:
+    basis = None if decay is None else action_basis(SIZES[-1], decay)
     network = QNetwork(_flat(), SIZES, basis=basis)
     generator = torch.Generator().manual_seed(0)
     observation = torch.randn(AGENTS, BATCH, SIZES[0], generator=generator)
@@ -116,22 +116,6 @@ def test_three_functions_of_the_basis_make_a_parabola() -> None:
     q = 3.0 - 0.5 * (action - 12.3) ** 2
     weights = torch.linalg.lstsq(basis[:3].T, q[:, None]).solution
     torch.testing.assert_close((basis[:3].T @ weights)[:, 0], q, rtol=1e-5, atol=1e-4)
-
-
-@pytest.mark.parametrize("hidden", [(8, 6), (8,), (4, 6, 8)])
-def test_half_of_the_units_start_as_mirror_images(hidden: tuple[int, ...]) -> None:
-    """Layer by layer, the second half answers to the features as the first half does to their mirror image."""
-    mirror = (-1, -1, 1)
-    sizes = (3, *hidden, 4)
-    flat = torch.from_numpy(initial_weights(sizes, np.random.SeedSequence(3), mirror)[None])
-    network = QNetwork(flat, sizes)
-    features = torch.randn(1, 50, 3, generator=torch.Generator().manual_seed(0))
-    _, seen = network.forward(features)
-    _, mirrored = network.forward(features * torch.tensor(mirror))
-    for units, images in zip(seen[1:], mirrored[1:], strict=True):
-        half = units.shape[-1] // 2
-        torch.testing.assert_close(units[..., half:], images[..., :half])
-        assert not torch.allclose(units[..., half:], units[..., :half])
 
 
 def test_outputs_may_start_at_zero() -> None:

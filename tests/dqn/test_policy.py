@@ -22,14 +22,14 @@ MATRIX = torch.tensor([[3.0, -3.0], [0.0, 3.0], [1.0, 1.0]])
 OFFSET = torch.tensor([0.0, -1.8, 0.5])
 
 
-def _network(smoothness: float = 0.0) -> QNetwork:
+def _network(decay: float = 0.0) -> QNetwork:
     flat = np.stack([initial_weights(SIZES, np.random.SeedSequence(i)) for i in range(3)])
-    basis = action_basis(SIZES[-1], smoothness) if smoothness else None
+    basis = action_basis(SIZES[-1], decay) if decay else None
     return QNetwork(torch.from_numpy(flat), SIZES, MATRIX, OFFSET, basis)
 
 
-def _policy(agent: int = 1, smoothness: float = 0.0) -> policy.Policy:
-    network = _network(smoothness)
+def _policy(agent: int = 1, decay: float = 0.0) -> policy.Policy:
+    network = _network(decay)
     return export(network, agent, network.flat, RATES, {"control_min": 1.0, "model": {"mu": 0.03, "tau": 1 / 3}})
 
 
@@ -38,12 +38,12 @@ def _observations() -> np.ndarray:
     return np.stack([od.ravel(), setpoint.ravel()], axis=1)
 
 
-@pytest.mark.parametrize(("agent", "smoothness"), [(0, 0.0), (2, 0.0), (0, 0.5)])
-def test_numpy_policy_agrees_with_torch(tmp_path: Path, agent: int, smoothness: float) -> None:
-    policy.save(tmp_path / "policy.npz", _policy(agent, smoothness))
+@pytest.mark.parametrize(("agent", "decay"), [(0, 0.0), (2, 0.0), (0, 0.5)])
+def test_numpy_policy_agrees_with_torch(tmp_path: Path, agent: int, decay: float) -> None:
+    policy.save(tmp_path / "policy.npz", _policy(agent, decay))
     read = policy.load(tmp_path / "policy.npz")
     observation = _observations()
-    expected = _network(smoothness)(torch.from_numpy(observation.astype(np.float32)).expand(3, -1, -1))[agent].numpy()
+    expected = _network(decay)(torch.from_numpy(observation.astype(np.float32)).expand(3, -1, -1))[agent].numpy()
     np.testing.assert_allclose(read.q_values(observation), expected, rtol=1e-5, atol=1e-6)
     action = expected.argmax(1)
     assert len(set(action.tolist())) > 1

@@ -31,7 +31,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
             assert getattr(a, key).shape == (8,)
             np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
     assert (many.n_agents, many.steps, many.updates) == (8, SMALL.total_steps, SMALL.total_updates)
-    assert torch.equal(one.greedy_weights(), many.greedy_weights())
+    assert torch.equal(one.weights(), many.weights())
 
 
 def test_agents_come_in_the_order_of_their_groups() -> None:
@@ -39,8 +39,8 @@ def test_agents_come_in_the_order_of_their_groups() -> None:
     population = _population(2)
     for _ in population.run():
         pass
-    weights = population.greedy_weights()
-    assert torch.equal(weights[5], population.groups[1].agent.greedy.flat[1])
+    weights = population.weights()
+    assert torch.equal(weights[5], population.groups[1].agent.online.flat[1])
     alone = Trainer(IdentityEnv(range(5, 6)), DQNAgent(SMALL, 3, 3, streams(range(5, 6))), interval=50)
     first = next(alone.run())
     np.testing.assert_allclose(next(_population(2).run()).episode_return[5], first.episode_return[0])
@@ -57,7 +57,7 @@ def test_a_resumed_population_is_the_uninterrupted_one() -> None:
     resumed.load_state_dict(copy.deepcopy(stopped.state_dict()))
     rest = [record.episode_return for record in resumed.run()]
     np.testing.assert_array_equal(np.array(returns[5:]), np.array(rest))
-    assert torch.equal(whole.greedy_weights(), resumed.greedy_weights())
+    assert torch.equal(whole.weights(), resumed.weights())
 
 
 def test_an_error_in_one_group_ends_the_run() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dqn.targets import advantage_target, blend, double_q_target, huber_loss, loss_gradient, q_target
+from dqn.targets import advantage_target, huber_loss, loss_gradient, q_target
 
 GAMMA = 0.9
 # Chain: in state 0 action 0 stays (reward 0), action 1 moves to state 1 (reward 1); state 1 is left by either action,
@@ -36,10 +36,6 @@ def test_one_target_by_hand() -> None:
     reward, continues = torch.tensor([[1.0, 2.0, 2.0]]), torch.tensor([[1.0, 1.0, 0.0]])
     # 1 + 0.9 * 5, 2 + 0.9 * 4, and 2 alone where the episode terminated
     torch.testing.assert_close(q_target(reward, continues, GAMMA, q_t), torch.tensor([[5.5, 5.6, 2.0]]))
-    online = torch.tensor([[[9.0, 1.0], [0.0, 1.0], [0.0, 1.0]]])
-    # the online network picks action 0, 1, 1; the target network says 1, 3, 3
-    expected = torch.tensor([[1.9, 4.7, 2.0]])
-    torch.testing.assert_close(double_q_target(reward, continues, GAMMA, q_t, online), expected)
 
 
 def test_q_iteration_reaches_the_exact_values() -> None:
@@ -48,8 +44,6 @@ def test_q_iteration_reaches_the_exact_values() -> None:
     for _ in range(200):
         q = q_target(reward, torch.ones(1, 4), GAMMA, q[after]).view(2, 2)
     torch.testing.assert_close(q, _exact(), rtol=1e-5, atol=1e-5)
-    double = double_q_target(reward, torch.ones(1, 4), GAMMA, q[after], q[after]).view(2, 2)
-    torch.testing.assert_close(double, q, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("alpha", [0.5, 0.9])
@@ -87,13 +81,3 @@ def test_loss_and_gradient_agree_with_autograd(huber: float) -> None:
     expected.sum().backward()
     assert q.grad is not None
     torch.testing.assert_close(gradient, q.grad)
-
-
-def test_blend() -> None:
-    target, online = torch.zeros(2, 3), torch.ones(2, 3)
-    blend(target, online, 0.25)
-    torch.testing.assert_close(target, torch.full((2, 3), 0.25))
-    blend(target, online, 1.0)
-    assert torch.equal(target, online)
-    online += 1.0
-    assert torch.equal(target, torch.ones(2, 3))

@@ -42,7 +42,7 @@ def ablate(*overrides: str) -> subprocess.CompletedProcess[str]:
 def test_a_study_leaves_table_summary_and_figure_and_resumes(tmp_path: Path) -> None:
     folder = tmp_path / "study"
     done = ablate(
-        *SHORT, "only=[tuned,mine]", "+ablations.mine={double: false, batch_size: 16}", f"hydra.run.dir={folder}"
+        *SHORT, "only=[tuned,mine]", "+ablations.mine={action_gap: 0.0, batch_size: 16}", f"hydra.run.dir={folder}"
     )
     assert done.returncode == 0, done.stderr
     with open(folder / "ablation.csv", newline="") as f:

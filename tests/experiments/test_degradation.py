@@ -12,7 +12,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 SHORT = [
     "agent.total_steps=120", "agent.learn_start=60", "agent.epsilon_steps=60", "agent.batch_size=16", "n_agents=2",
-    "eval_every=50", "~trained", "~fitted", "+trained={mine: {target_period: 30}}", "+fitted={told: {relabel: 1.0}}",
+    "eval_every=50", "~trained", "~fitted", "+trained={mine: {target_period: 30}}",
+    "+fitted={told: {hindsight_share: 1.0}}",
 ]  # fmt: skip
 COLUMNS = [
     "variant", "step", "sweeps", "regret_pct", "regret_pct_worst", "steady_abs_error", "value_error", "lowest_value",

@@ -7,11 +7,9 @@ import pytest
 import torch
 
 from dqn.config import DQNConfig
+from dqn.hindsight import goal_relabel
 from dqn.replay import Transition
-from envs.task import EnvConfig
-from experiments.hindsight import goal_relabel
 
-ENV = EnvConfig()
 AGENTS, BATCH = 4, 500
 
 
@@ -27,7 +25,8 @@ def _batch(od: float | None = None) -> Transition:
 
 def _relabel(near: float, batch: Transition, width: tuple[float, float] = (1e-3, 0.8)) -> Transition:
     uniform = torch.rand(AGENTS, BATCH, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    return goal_relabel(ENV, DQNConfig(relabel_near=near, relabel_width=width), "cpu")(batch, uniform)
+    config = DQNConfig(hindsight_near=near, hindsight_width=width)
+    return goal_relabel(config, (0.2, 1.0), lambda x, goal: -((x - goal) ** 2))(batch, uniform)
 
 
 @pytest.mark.parametrize("near", [0.0, 0.5, 1.0])
@@ -49,13 +48,6 @@ def test_far_goals_are_uniform() -> None:
     goal = _relabel(0.0, _batch()).s_t[..., 1].numpy().ravel()
     count, _ = np.histogram(goal, bins=8, range=(0.2, 1.0))
     assert ((count - 250.0) ** 2 / 250.0).sum() < 24.3  # 99.9 % quantile with 7 degrees of freedom
-
-
-def test_margin_widens_the_range() -> None:
-    uniform = torch.rand(AGENTS, BATCH, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    goal = goal_relabel(ENV, DQNConfig(relabel_margin=0.25), "cpu")(_batch(), uniform).s_t[..., 1]
-    assert float(goal.min()) == pytest.approx(0.15, abs=0.005)
-    assert float(goal.max()) == pytest.approx(1.25, abs=0.005)
 
 
 def test_near_goals_cover_every_order_of_magnitude_on_both_sides() -> None:
