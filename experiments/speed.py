@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.cli import frame
+from experiments.reporting import tables
+from experiments.reporting.tables import Table, number
 from experiments.timing import control, learning
 from experiments.timing.measurement import Measurement, measure
 
@@ -55,7 +57,7 @@ def speed(config: SpeedConfig, folder: Path) -> None:
     from tqdm import tqdm
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    from experiments.reporting import charts, page, tables
+    from experiments.reporting import charts, page
 
     found = []
     with logging_redirect_tqdm():
@@ -72,10 +74,8 @@ def speed(config: SpeedConfig, folder: Path) -> None:
     log.info("report %s", page.save(page.of_runs(folder, [folder]), folder))
 
 
-def table(found: list[dict[str, Any]], runs: int, machine: str) -> Any:
+def table(found: list[dict[str, Any]], runs: int, machine: str) -> Table:
     """The measurements as a table."""
-    from experiments.reporting.tables import Table, number
-
     rows = tuple(
         (
             str(e["name"]), str(e["work"]), f"{number(e['ours'])} {e['unit']}",
