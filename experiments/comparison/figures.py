@@ -20,8 +20,9 @@ __all__ = ["LONG_MIN", "bands", "differences", "plants", "published_and_ours"]
 
 Array = NDArray[np.float64]
 
-LONG_MIN = 360.0  # a schedule longer than this is drawn in blocks
+LONG_MIN = 360.0  # a scenario longer than this is drawn in blocks
 BLOCK = 10  # samples
+LEAST = 1e-9  # where an interval that reaches zero ends on a logarithmic axis
 NOISELESS = 1e-5  # scores below are those of a plant without noise
 
 MARKS = {
@@ -47,6 +48,16 @@ def _handles(controllers: Sequence[str]) -> list[Line2D]:
     return [Line2D([], [], color=_mark(c)[0], marker=_mark(c)[1], linestyle="", label=c) for c in controllers]
 
 
+def _estimate(
+    ax: Axes, controller: str, y: float, value: float, interval: Sequence[float], hollow: bool = False
+) -> None:
+    """A controller's mark with its 95 % interval, where it has one."""
+    colour, marker = _mark(controller)
+    if np.isfinite(interval[0]):
+        ax.plot(interval, [y, y], color=colour, linewidth=1.3)
+    ax.plot(value, y, marker, color=colour, markersize=5, markerfacecolor="white" if hollow else colour)
+
+
 def _band(ax: Axes, minute: Array, values: Array, colour: str) -> None:
     """Mean over replicates and one standard deviation around it; values (N, K)."""
     mean = values.mean(axis=0)
@@ -57,7 +68,7 @@ def _band(ax: Axes, minute: Array, values: Array, colour: str) -> None:
 
 
 def _curves(trial: Trial) -> tuple[Array, Array, Array, Array]:
-    """Time, OD (N, K), pump rate and temperature as they are drawn: as they are, or in blocks and without noise."""
+    """Time (K,), OD, pump rate and temperature (N, K): as recorded, or block means without noise in a long scenario."""
     last = trial.minute.size - 1
     if trial.schedule.total_min <= LONG_MIN:
         return trial.minute[:last], trial.od[:, :last], trial.rate[:, :last], trial.temperature[:, :last]
@@ -108,17 +119,14 @@ def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
     figure, (left, right) = new_figure(9.6, 4.3, 1, 2, sharey=True)
     controllers = list(dict.fromkeys(p.controller for p in TABLE_2))
     for k, controller in enumerate(controllers):
-        colour, marker = _mark(controller)
         for metric, ax in (("ise", left), ("itae", right)):
             for p in (p for p in TABLE_2 if p.controller == controller):
                 y = cells.index((p.scenario, p.window)) + 0.24 * (k - 1)
-                ax.plot(getattr(p, metric), y, marker, color=colour, markerfacecolor="white", markersize=6)
+                _estimate(ax, controller, y, getattr(p, metric), (np.nan, np.nan), hollow=True)
                 for r in rows:
                     if (r["controller"], r["scenario"], r["window"]) == (controller, p.scenario, p.window):
-                        mean, (low, high) = r[f"{metric}_mean"], r[f"{metric}_ci95"]
-                        if np.isfinite(low):
-                            ax.plot([max(low, 1e-9), high], [y, y], color=colour, linewidth=1.2)
-                        ax.plot(mean, y, marker, color=colour, markersize=6)
+                        low, high = r[f"{metric}_ci95"]
+                        _estimate(ax, controller, y, r[f"{metric}_mean"], (max(low, LEAST), high))
     low_ise = min([p.ise for p in TABLE_2] + [r["ise_mean"] for r in rows])
     left.set(xscale="log", xlabel="ISE (T = 1 min), OD² min", xlim=(0.6 * low_ise, None))
     left.set_yticks(range(len(cells)), names)
@@ -170,27 +178,22 @@ def _log_axis(ax: Axes) -> None:
 def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
     """ISE and ITAE summed over the windows, a line per plant: mean and 95 % interval of every controller but `hold`.
 
-    Args: entries: of `comparison.totals`, all of one scenario.
+    Args: entries: of `statistics.totals`, all of one scenario.
     """
     entries = [e for e in entries if e["controller"] != "hold"]
-    controllers = {e["controller"] for e in entries}
-    witness = (
-        "oracle" if "oracle" in controllers else entries[0]["controller"]
-    )  # whose floor is drawn; all nearly agree
+    # Whose floor is drawn: all controllers met the same sensors, so their floors nearly agree.
+    witness = next((e for e in entries if e["controller"] == "oracle"), entries[0])["controller"]
     floor_line = Line2D([], [], color="#b00020", linewidth=1.4, label="sensor-noise floor")
     figure, axes, height = _by_plant(entries, floor_line)
     for metric, unit, ax in zip(("ise", "itae"), ("ISE, OD² min", "ITAE, OD min²"), axes, strict=True):
         seen = np.array([e[key] for e in entries for key in (f"floor_{metric}", f"{metric}_mean")])
         ax.set_xlim(0.6 * seen[seen > NOISELESS].min(), 1.8 * seen.max())
         for e in entries:
-            y, (colour, marker) = height(e), _mark(e["controller"])
             low, high = e[f"{metric}_ci95"]
-            if np.isfinite(low):
-                ax.plot([max(low, 1e-12), high], [y, y], color=colour, linewidth=1.3)
-            ax.plot(e[f"{metric}_mean"], y, marker, color=colour, markersize=5)
+            _estimate(ax, e["controller"], height(e), e[f"{metric}_mean"], (max(low, LEAST), high))
             floor = e[f"floor_{metric}"]
             if e["controller"] == witness and floor > NOISELESS:
-                row = round(y)
+                row = round(height(e))
                 ax.plot([floor, floor], [row - 0.42, row + 0.42], color="#b00020", linewidth=1.4, zorder=1)
         _log_axis(ax)
         ax.set_xlabel(f"{unit}, sum over the windows (T = 1 min)")
@@ -200,22 +203,18 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
 def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
     """Paired difference of ISE and ITAE to one controller, in % of its mean: mean and 95 % interval per plant.
 
-    Args: entries: of `comparison.total_pairs`, all of one scenario; against: the controller at zero.
+    Args: entries: of `statistics.total_pairs`, all of one scenario; against: the controller at zero.
     """
     entries = [e for e in entries if e["controller"] != "hold"]
-    hollow = Line2D([], [], color="black", marker="o", markerfacecolor="white", linestyle="", label="interval holds 0")
-    figure, axes, height = _by_plant(entries, hollow)
+    open_mark = Line2D([], [], color="black", marker="o", mfc="white", linestyle="", label="interval holds 0")
+    figure, axes, height = _by_plant(entries, open_mark)
     for metric, ax in zip(("ise", "itae"), axes, strict=True):
         ax.axvline(0.0, color="black", linewidth=1.0)
         ax.set_xscale("symlog", linthresh=20.0)
         for e in (e for e in entries if e["metric"] == metric and np.isfinite(e["percent"])):
-            y, (colour, marker) = height(e), _mark(e["controller"])
             scale = e["percent"] / e["difference"] if e["difference"] else 0.0
-            low, high = (scale * v for v in e["ci95"])
-            if np.isfinite(low):
-                ax.plot([low, high], [y, y], color=colour, linewidth=1.3)
-            face = "white" if e["verdict"] == "no difference shown" else colour
-            ax.plot(e["percent"], y, marker, color=colour, markersize=5, markerfacecolor=face)
+            hollow = e["verdict"] == "no difference shown"
+            _estimate(ax, e["controller"], height(e), e["percent"], [scale * v for v in e["ci95"]], hollow)
         wide = ax.get_xlim()[1] > 200.0
         few, many = [-100, -20, 0, 20, 100, 1000, 10000], [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200]
         ax.xaxis.set_major_locator(FixedLocator(few if wide else many))
