@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
@@ -195,25 +194,19 @@ def table(rows: list[Row]) -> str:
 
 def figure(rows: list[Row]) -> Figure:
     """One point per seed: regret and steady error of the kept policy, and regret of the last iterate."""
-    from experiments.reporting.charts import COLOURS, new_figure
+    from experiments.reporting import charts
 
-    names = list(dict.fromkeys(row.ablation for row in rows))[::-1]
+    names = list(dict.fromkeys(row.ablation for row in rows))
     panels = (
         ("regret_pct", "regret of the kept policy, %", 0.5),
         ("regret_pct_last", "regret of the last iterate, %", 2.0),
         ("steady_abs_error", "steady error of the kept policy, OD", 0.003),
     )
-    canvas, axes = new_figure(11.0, 1.4 + 0.27 * len(names), 1, len(panels), sharey=True)
-    jitter = np.random.default_rng(0)
+    canvas, axes = charts.new_figure(11.0, 1.4 + 0.27 * len(names), 1, len(panels), sharey=True)
     for ax, (measure, label, limit) in zip(axes, panels, strict=True):
-        for k, name in enumerate(names):
-            values: NDArray[np.float64] = np.array([getattr(row, measure) for row in rows if row.ablation == name])
-            height = k + jitter.uniform(-0.22, 0.22, values.size)
-            ax.plot(np.maximum(values, 1e-4), height, ".", color=COLOURS[0], alpha=0.45, markersize=4)
-            ax.plot([np.median(values)] * 2, [k - 0.34, k + 0.34], color=COLOURS[1], linewidth=2)
-        ax.axvline(limit, color=COLOURS[6], linewidth=1, linestyle="--")
-        ax.set(xscale="log", xlabel=label)
-    axes[0].set_yticks(range(len(names)), names, fontsize=8)
+        own = {name: np.array([getattr(row, measure) for row in rows if row.ablation == name]) for name in names}
+        charts.seeds(ax, own, label)
+        ax.axvline(limit, color=charts.COLOURS[6], linewidth=1, linestyle="--")
     return canvas
 
 

@@ -5,9 +5,9 @@ Two measurements, on the same task and seeds:
 1. What the target copies do. The same agent is trained with rarer and more frequent copies of its target network, and
    every record compares its values with the optimum's: each copy is one sweep of value iteration, and looks one step
    further into the future.
-2. What the network can do when told the answers. The network is fitted to the optimum's Q values by plain regression,
-   with the inputs, output basis, gap and loss of each variant, and its greedy policy is scored. What is left has
-   nothing to do with bootstrapping.
+2. What the network can represent. It is fitted to the optimum's Q values by plain regression, with the inputs, output
+   basis, gap and loss of each variant, and its greedy policy is scored. The regret that is left does not come from
+   bootstrapping.
 """
 
 from __future__ import annotations
@@ -161,42 +161,28 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
         learner.fit(batch.s_tm1, batch.a_tm1, torch.from_numpy(target * agent.reward_scale).float())
     report = Evaluation(config.env, agent.gamma, report_grid(config.env))
     score = report(build.act_with(learner.online, learner.online.flat), config.n_agents)
-    log.info(
-        "%s, told the answers: regret %.2f %% (worst %.2f)", name, np.median(score.regret_pct), score.regret_pct.max()
-    )
+    log.info("%s, fitted to Q*: regret %.2f %% (worst %.2f)", name, np.median(score.regret_pct), score.regret_pct.max())
     return {"regret_pct": score.regret_pct, "steady_abs_error": score.steady_abs_error}
 
 
 def figure(rows: list[dict[str, float | str]], fitted: dict[str, dict[str, Any]]) -> Figure:
-    """Regret and value error during training; regret and steady error of the networks that were told the answers."""
-    from experiments.reporting.charts import COLOURS, new_figure
+    """Regret and value error during training; regret and steady error of the networks fitted to exact values."""
+    from experiments.reporting import charts
 
-    canvas, axes = new_figure(11.0, 7.0, 2, 2)
-    for k, name in enumerate(dict.fromkeys(str(row["variant"]) for row in rows)):
+    canvas, axes = charts.new_figure(11.0, 7.0, 2, 2)
+    regret, value, *fits = axes
+    for colour, name in zip(charts.COLOURS, dict.fromkeys(str(row["variant"]) for row in rows), strict=False):
         own = [row for row in rows if row["variant"] == name]
         step = [float(row["step"]) for row in own]
-        for ax, key in zip(axes[:2], ("regret_pct", "value_error"), strict=True):
-            ax.plot(step, [float(row[key]) for row in own], color=COLOURS[k], linewidth=1.4, label=name)
-        axes[0].plot(
-            step, [float(row["regret_pct_worst"]) for row in own], color=COLOURS[k], linewidth=0.7, linestyle=":"
-        )
-    axes[0].set(
-        yscale="log", xlabel="environment step", ylabel="regret, %: median, and worst seed (dotted)", ylim=(0.01, 300)
-    )
-    axes[1].set(yscale="log", xlabel="environment step", ylabel="rms of max Q − V*")
-    axes[0].legend(frameon=False, fontsize=8)
-    names = list(fitted)[::-1]
-    panels = (
-        ("regret_pct", "regret when told the answers, %"),
-        ("steady_abs_error", "steady error when told the answers, OD"),
-    )
-    for ax, (key, label) in zip(axes[2:], panels, strict=True):
-        for k, name in enumerate(names):
-            values = np.asarray(fitted[name][key])
-            ax.plot(values, np.full(values.size, k), "o", color=COLOURS[0], alpha=0.5, markersize=4)
-            ax.plot([np.median(values)] * 2, [k - 0.3, k + 0.3], color=COLOURS[1], linewidth=2)
-        ax.set(xscale="log", xlabel=label)
-        ax.set_yticks(range(len(names)), names, fontsize=8)
+        regret.plot(step, [float(row["regret_pct"]) for row in own], color=colour, linewidth=1.4, label=name)
+        regret.plot(step, [float(row["regret_pct_worst"]) for row in own], color=colour, linewidth=0.7, linestyle=":")
+        value.plot(step, [float(row["value_error"]) for row in own], color=colour, linewidth=1.4)
+    regret.set(yscale="log", xlabel="environment step", ylabel="regret, % (dotted: worst seed)", ylim=(0.01, 300))
+    value.set(yscale="log", xlabel="environment step", ylabel="rms of max Q − V*, OD²")
+    regret.legend()
+    panels = (("regret_pct", "regret when fitted to Q*, %"), ("steady_abs_error", "steady error when fitted to Q*, OD"))
+    for ax, (key, label) in zip(fits, panels, strict=True):
+        charts.seeds(ax, {name: np.asarray(score[key]) for name, score in fitted.items()}, label)
     return canvas
 
 

@@ -124,7 +124,7 @@ def _finish(record: Record, config: DeployConfig, outcome: str) -> None:
     switched = any(len(set(s.temperatures)) > 1 for s in schedules)
     temperature = record.series("temperature_degc").T if switched else None
     series = (minute.T, record.series("od").T, setpoint.T, record.series("pump_rate_ml_s").T)
-    figure = charts.culture(*series, record.names, temperature, f"{config.backend.kind}: {outcome}")
+    figure = charts.closed_loop(*series, record.names, temperature, f"{config.backend.kind}: {outcome}")
     path = charts.save(figure, folder / "figures", "closed_loop")
     record.events.figure("figures/closed_loop", figure, minute.shape[1])
     windows = windows_of(record, schedules)

@@ -1,4 +1,4 @@
-"""What `python -m experiments.benchmark` can be told: the typed schema behind conf/benchmark.yaml."""
+"""The typed schema behind conf/benchmark.yaml: what `python -m experiments.benchmark` can be given."""
 
 from __future__ import annotations
 

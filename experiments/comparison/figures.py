@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,11 +20,12 @@ __all__ = ["LONG_MIN", "bands", "differences", "plants", "published_and_ours"]
 
 Array = NDArray[np.float64]
 
-LONG_MIN = 360.0  # a schedule longer than this is drawn in blocks
+LONG_MIN = 360.0  # a scenario longer than this is drawn in blocks
 BLOCK = 10  # samples
-NOTHING = 1e-5  # scores below are those of a plant without noise
+LEAST = 1e-9  # where an interval that reaches zero ends on a logarithmic axis
+NOISELESS = 1e-5  # scores below are those of a plant without noise
 
-STYLE = {
+MARKS = {
     "dqn": (COLOURS[0], "o"),
     "dqn_paper": (COLOURS[4], "o"),
     "pi": (COLOURS[1], "s"),
@@ -37,8 +38,24 @@ STYLE = {
 }
 
 
-def _style(controller: str) -> tuple[str, str]:
-    return STYLE.get(controller, (COLOURS[0], "X"))
+def _mark(controller: str) -> tuple[str, str]:
+    """Colour and marker."""
+    return MARKS.get(controller, (COLOURS[0], "X"))
+
+
+def _handles(controllers: Sequence[str]) -> list[Line2D]:
+    """Their entries of a legend."""
+    return [Line2D([], [], color=_mark(c)[0], marker=_mark(c)[1], linestyle="", label=c) for c in controllers]
+
+
+def _estimate(
+    ax: Axes, controller: str, y: float, value: float, interval: Sequence[float], hollow: bool = False
+) -> None:
+    """A controller's mark with its 95 % interval, where it has one."""
+    colour, marker = _mark(controller)
+    if np.isfinite(interval[0]):
+        ax.plot(interval, [y, y], color=colour, linewidth=1.3)
+    ax.plot(value, y, marker, color=colour, markersize=5, markerfacecolor="white" if hollow else colour)
 
 
 def _band(ax: Axes, minute: Array, values: Array, colour: str) -> None:
@@ -51,7 +68,7 @@ def _band(ax: Axes, minute: Array, values: Array, colour: str) -> None:
 
 
 def _curves(trial: Trial) -> tuple[Array, Array, Array, Array]:
-    """Time, OD (N, K), pump rate and temperature as they are drawn: as they are, or in blocks and without noise."""
+    """Time (K,), OD, pump rate and temperature (N, K): as recorded, or block means without noise in a long scenario."""
     last = trial.minute.size - 1
     if trial.schedule.total_min <= LONG_MIN:
         return trial.minute[:last], trial.od[:, :last], trial.rate[:, :last], trial.temperature[:, :last]
@@ -74,7 +91,7 @@ def bands(trials: Sequence[Trial]) -> Figure:
     )
     for column, trial in enumerate(trials):
         top, middle = axes[column], axes[len(trials) + column]
-        colour, _ = _style(trial.controller)
+        colour, _ = _mark(trial.controller)
         edges = trial.schedule.edges
         goals = np.append(trial.schedule.setpoints, trial.schedule.setpoints[-1])
         top.step(edges, goals, where="post", color="black", linewidth=1.0, linestyle="--")
@@ -86,7 +103,7 @@ def bands(trials: Sequence[Trial]) -> Figure:
             _band(bottom, minute, temperature, colour)
             for ax in (top, middle, bottom):
                 ax.axvline(edges[1], color="#888888", linewidth=0.8, linestyle=":")
-        top.set_title(f"{trial.controller}, n = {trial.od.shape[0]}", fontsize=10)
+        top.set_title(f"{trial.controller}, n = {trial.od.shape[0]}")
         axes[(rows - 1) * len(trials) + column].set_xlabel("time, min")
     axes[0].set_ylabel("OD")
     axes[len(trials)].set(ylabel="pump rate, µL/s", ylim=(-0.8, 21.5))
@@ -102,38 +119,51 @@ def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
     figure, (left, right) = new_figure(9.6, 4.3, 1, 2, sharey=True)
     controllers = list(dict.fromkeys(p.controller for p in TABLE_2))
     for k, controller in enumerate(controllers):
-        colour, marker = _style(controller)
         for metric, ax in (("ise", left), ("itae", right)):
             for p in (p for p in TABLE_2 if p.controller == controller):
                 y = cells.index((p.scenario, p.window)) + 0.24 * (k - 1)
-                ax.plot(getattr(p, metric), y, marker, color=colour, markerfacecolor="white", markersize=6)
+                _estimate(ax, controller, y, getattr(p, metric), (np.nan, np.nan), hollow=True)
                 for r in rows:
                     if (r["controller"], r["scenario"], r["window"]) == (controller, p.scenario, p.window):
-                        mean, (low, high) = r[f"{metric}_mean"], r[f"{metric}_ci95"]
-                        if np.isfinite(low):
-                            ax.plot([max(low, 1e-9), high], [y, y], color=colour, linewidth=1.2)
-                        ax.plot(mean, y, marker, color=colour, markersize=6)
+                        low, high = r[f"{metric}_ci95"]
+                        _estimate(ax, controller, y, r[f"{metric}_mean"], (max(low, LEAST), high))
     low_ise = min([p.ise for p in TABLE_2] + [r["ise_mean"] for r in rows])
     left.set(xscale="log", xlabel="ISE (T = 1 min), OD² min", xlim=(0.6 * low_ise, None))
     left.set_yticks(range(len(cells)), names)
     left.invert_yaxis()
     right.set(xlabel="ITAE (T = 1 min), OD min²", xlim=(0.0, None))
-    handles = [Line2D([], [], color=_style(c)[0], marker=_style(c)[1], linestyle="", label=c) for c in controllers]
-    handles += [
+    handles = [
+        *_handles(controllers),
         Line2D([], [], color="black", marker="o", markerfacecolor="white", linestyle="", label="published (n = 3)"),
         Line2D([], [], color="black", marker="o", linestyle="-", label="this run"),
     ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=5, frameon=False, fontsize=9)
+    figure.legend(handles=handles, loc="outside upper center", ncols=5)
     return figure
 
 
-def _plants(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    return list(dict.fromkeys(str(e["plant"]) for e in entries))
+def _by_plant(
+    entries: Sequence[Mapping[str, Any]], extra: Line2D
+) -> tuple[Figure, list[Axes], Callable[[Mapping[str, Any]], float]]:
+    """An empty panel for ISE and one for ITAE with a striped row per plant; returns also the height of an entry.
 
+    Args: entries: of all plants and controllers that will be drawn. extra: last entry of the legend.
+    """
+    names = list(dict.fromkeys(str(e["plant"]) for e in entries))
+    controllers = list(dict.fromkeys(str(e["controller"]) for e in entries))
+    figure, axes = new_figure(10.4, 1.6 + 0.62 * len(names), 1, 2, sharey=True)
+    for ax in axes:
+        for row in range(0, len(names), 2):
+            ax.axhspan(row - 0.5, row + 0.5, color="#f3f5f7", zorder=0)
+        ax.grid(False, axis="y")
+        ax.set_ylim(len(names) - 0.5, -0.5)
+    axes[0].set_yticks(range(len(names)), names)
+    figure.legend(handles=[*_handles(controllers), extra], loc="outside upper center", ncols=5)
 
-def _legend(figure: Figure, controllers: Sequence[str], extra: Sequence[Line2D] = ()) -> None:
-    handles = [Line2D([], [], color=_style(c)[0], marker=_style(c)[1], linestyle="", label=c) for c in controllers]
-    figure.legend(handles=[*handles, *extra], loc="outside upper center", ncols=5, frameon=False, fontsize=9)
+    def height(entry: Mapping[str, Any]) -> float:
+        offset = (controllers.index(entry["controller"]) + 0.5) / len(controllers) - 0.5
+        return names.index(entry["plant"]) + 0.72 * offset
+
+    return figure, axes, height
 
 
 def _log_axis(ax: Axes) -> None:
@@ -148,75 +178,48 @@ def _log_axis(ax: Axes) -> None:
 def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
     """ISE and ITAE summed over the windows, a line per plant: mean and 95 % interval of every controller but `hold`.
 
-    Args: entries: of `comparison.totals`, all of one scenario.
+    Args: entries: of `statistics.totals`, all of one scenario.
     """
-    names = _plants(entries)
     entries = [e for e in entries if e["controller"] != "hold"]
-    controllers = list(dict.fromkeys(str(e["controller"]) for e in entries))
-    witness = "oracle" if "oracle" in controllers else controllers[0]  # whose run tells the floor; all nearly agree
-    figure, axes = new_figure(10.4, 1.6 + 0.62 * len(names), 1, 2, sharey=True)
-    for metric, ax in zip(("ise", "itae"), axes, strict=True):
-        seen = np.array([e[key] for e in entries for key in (f"floor_{metric}", f"{metric}_mean")])
-        ax.set_xlim(0.6 * seen[seen > NOTHING].min(), 1.8 * seen.max())
-        for y in range(len(names)):
-            if y % 2 == 0:
-                ax.axhspan(y - 0.5, y + 0.5, color="#f3f5f7", zorder=0)
-        for e in entries:
-            y = names.index(e["plant"])
-            colour, marker = _style(e["controller"])
-            offset = 0.72 * ((controllers.index(e["controller"]) + 0.5) / len(controllers) - 0.5)
-            low, high = e[f"{metric}_ci95"]
-            if np.isfinite(low):
-                ax.plot([max(low, 1e-12), high], [y + offset] * 2, color=colour, linewidth=1.3)
-            ax.plot(e[f"{metric}_mean"], y + offset, marker, color=colour, markersize=5)
-            floor = e[f"floor_{metric}"]
-            if e["controller"] == witness and floor > NOTHING:
-                ax.plot([floor, floor], [y - 0.42, y + 0.42], color="#b00020", linewidth=1.4, zorder=1)
-        _log_axis(ax)
-        unit = {"ise": "ISE, OD² min", "itae": "ITAE, OD min²"}[metric]
-        ax.set(xlabel=f"{unit}, sum over the windows (T = 1 min)", ylim=(len(names) - 0.5, -0.5))
-        ax.grid(False, axis="y")
-    axes[0].set_yticks(range(len(names)), names)
+    # Whose floor is drawn: all controllers met the same sensors, so their floors nearly agree.
+    witness = next((e for e in entries if e["controller"] == "oracle"), entries[0])["controller"]
     floor_line = Line2D([], [], color="#b00020", linewidth=1.4, label="sensor-noise floor")
-    _legend(figure, controllers, [floor_line])
+    figure, axes, height = _by_plant(entries, floor_line)
+    for metric, unit, ax in zip(("ise", "itae"), ("ISE, OD² min", "ITAE, OD min²"), axes, strict=True):
+        seen = np.array([e[key] for e in entries for key in (f"floor_{metric}", f"{metric}_mean")])
+        ax.set_xlim(0.6 * seen[seen > NOISELESS].min(), 1.8 * seen.max())
+        for e in entries:
+            low, high = e[f"{metric}_ci95"]
+            _estimate(ax, e["controller"], height(e), e[f"{metric}_mean"], (max(low, LEAST), high))
+            floor = e[f"floor_{metric}"]
+            if e["controller"] == witness and floor > NOISELESS:
+                row = round(height(e))
+                ax.plot([floor, floor], [row - 0.42, row + 0.42], color="#b00020", linewidth=1.4, zorder=1)
+        _log_axis(ax)
+        ax.set_xlabel(f"{unit}, sum over the windows (T = 1 min)")
     return figure
 
 
 def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
     """Paired difference of ISE and ITAE to one controller, in % of its mean: mean and 95 % interval per plant.
 
-    Args: entries: of `comparison.total_pairs`, all of one scenario; against: the controller at zero.
+    Args: entries: of `statistics.total_pairs`, all of one scenario; against: the controller at zero.
     """
-    names = _plants(entries)
-    shown = [e for e in entries if e["controller"] not in ("hold",)]
-    controllers = list(dict.fromkeys(str(e["controller"]) for e in shown))
-    figure, axes = new_figure(10.4, 1.6 + 0.62 * len(names), 1, 2, sharey=True)
+    entries = [e for e in entries if e["controller"] != "hold"]
+    open_mark = Line2D([], [], color="black", marker="o", mfc="white", linestyle="", label="interval holds 0")
+    figure, axes, height = _by_plant(entries, open_mark)
     for metric, ax in zip(("ise", "itae"), axes, strict=True):
-        for y in range(len(names)):
-            if y % 2 == 0:
-                ax.axhspan(y - 0.5, y + 0.5, color="#f3f5f7", zorder=0)
         ax.axvline(0.0, color="black", linewidth=1.0)
         ax.set_xscale("symlog", linthresh=20.0)
-        for e in (e for e in shown if e["metric"] == metric and np.isfinite(e["percent"])):
-            y = names.index(e["plant"])
-            colour, marker = _style(e["controller"])
-            offset = 0.72 * ((controllers.index(e["controller"]) + 0.5) / len(controllers) - 0.5)
+        for e in (e for e in entries if e["metric"] == metric and np.isfinite(e["percent"])):
             scale = e["percent"] / e["difference"] if e["difference"] else 0.0
-            low, high = (scale * v for v in e["ci95"])
-            if np.isfinite(low):
-                ax.plot([low, high], [y + offset] * 2, color=colour, linewidth=1.3)
-            certain = e["verdict"] != "no difference shown"
-            ax.plot(e["percent"], y + offset, marker, color=colour, markersize=5,
-                    markerfacecolor=colour if certain else "white")  # fmt: skip
+            hollow = e["verdict"] == "no difference shown"
+            _estimate(ax, e["controller"], height(e), e["percent"], [scale * v for v in e["ci95"]], hollow)
         wide = ax.get_xlim()[1] > 200.0
         few, many = [-100, -20, 0, 20, 100, 1000, 10000], [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200]
         ax.xaxis.set_major_locator(FixedLocator(few if wide else many))
         ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:+g}" if v else "0"))
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.tick_params(axis="x", labelsize=8)
-        ax.set(xlabel=f"{metric.upper()} minus that of {against}, %", ylim=(len(names) - 0.5, -0.5))
-        ax.grid(False, axis="y")
-    axes[0].set_yticks(range(len(names)), names)
-    hollow = Line2D([], [], color="black", marker="o", markerfacecolor="white", linestyle="", label="interval holds 0")
-    _legend(figure, controllers, [hollow])
+        ax.set_xlabel(f"{metric.upper()} minus that of {against}, %")
     return figure

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import html
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from experiments.comparison.published import TABLE_2, Published
-from experiments.report import Page, provenance
-from experiments.reporting.tables import Best, Cell, Table, number, plus_minus, typeset
+from experiments.comparison.published import TABLE_2
+from experiments.reporting.page import Page, provenance
+from experiments.reporting.tables import Best, Table, number, plus_minus
 
-__all__ = ["losses", "page", "table_2"]
+__all__ = ["losses", "of_benchmark", "published_losses", "table_2"]
 
 Row = Mapping[str, Any]
 METRICS = ("ise", "itae")
@@ -62,23 +62,22 @@ def _lowest(values: Mapping[str, float]) -> str:
     return min(values, key=lambda k: values[k]) if values else "–"
 
 
-def _mark(text: str, best: bool) -> Cell:
+def _mark(text: str, best: bool) -> str:
     return Best(text) if best else text
 
 
 def beside(summary: Row) -> list[Row]:
     """The rows that stand beside the paper's table."""
-    chosen = [tuple(sorted(b.items())) for b in summary["beside_paper"]]
     keys = ("controller", "plant", "scenario", "window")
-    return [r for r in summary["rows"] if tuple(sorted((k, r[k]) for k in keys)) in chosen]
+    chosen = [[b[k] for k in keys] for b in summary["beside_paper"]]
+    return [r for r in summary["rows"] if [r[k] for k in keys] in chosen]
 
 
 def table_2(rows: Sequence[Row], metric: str) -> Table:
-    """The paper's table for one metric beside this run's, the lowest of each side marked and named.
-
-    What the paper does not have follows out of competition.
+    """The paper's table for one metric beside this run's; the lowest of the paper's three controllers is marked and
+    named on each side. Controllers that the paper does not have follow in columns of their own, without a rank.
     """
-    body: list[tuple[Cell, ...]] = []
+    body: list[tuple[str, ...]] = []
     others = [c for c in dict.fromkeys(str(r["controller"]) for r in rows) if c not in PUBLISHED]
     for scenario, window in _windows(rows):
         theirs = {
@@ -87,7 +86,7 @@ def table_2(rows: Sequence[Row], metric: str) -> Table:
         found = {c: _find(rows, controller=c, scenario=scenario, window=window) for c in (*PUBLISHED, *others)}
         ours = {c: float(r[f"{metric}_mean"]) for c, r in found.items() if r is not None and c in PUBLISHED}
         low_theirs, low_ours = _lowest(theirs), _lowest(ours)
-        cells: list[Cell] = [name_of(scenario, window)]
+        cells = [name_of(scenario, window)]
         cells += [_mark(number(theirs.get(c), 4), c == low_theirs) for c in PUBLISHED]
         for c, r in found.items():
             text = "–" if r is None else plus_minus(r[f"{metric}_mean"], r[f"{metric}_sd"])
@@ -113,7 +112,7 @@ def cell_by_cell(rows: Sequence[Row]) -> Table:
         row = _find(rows, controller=p.controller, scenario=p.scenario, window=p.window)
         if row is None:
             continue
-        cells: list[Cell] = [f"{name_of(p.scenario, p.window)}, {p.controller}"]
+        cells = [f"{name_of(p.scenario, p.window)}, {p.controller}"]
         for metric in METRICS:
             published, ours = getattr(p, metric), row[f"{metric}_mean"]
             cells += [f"{number(published, 4)} ({number(published / 30.0)})", f"{number(ours)} ({number(ours / 30.0)})"]
@@ -130,30 +129,38 @@ def cell_by_cell(rows: Sequence[Row]) -> Table:
     )
 
 
-def losses(rows: Sequence[Row], paired: Sequence[Row], learned: str = "dqn") -> list[str]:
-    """A sentence for every cell in which the learned policy is not the lowest of the published three."""
+class Loss(NamedTuple):
+    """A published controller that is lower than the learned policy in one cell of the table, as a sentence."""
+
+    cell: str
+    certain: bool  # the 95 % interval of the paired difference excludes 0
+    sentence: str
+
+
+def losses(rows: Sequence[Row], paired: Sequence[Row], learned: str = "dqn") -> list[Loss]:
+    """Every published controller that is lower than the learned policy, cell by cell, the lowest first."""
     found = []
     for scenario, window in _windows(rows):
         for metric in METRICS:
             at = {c: _find(rows, controller=c, scenario=scenario, window=window) for c in (learned, *PUBLISHED[1:])}
             values = {c: float(r[f"{metric}_mean"]) for c, r in at.items() if r is not None}
             mine = at[learned]
-            if mine is None or len(values) < 2 or _lowest(values) == learned:
+            if mine is None:
                 continue
+            cell = f"{name_of(scenario, window)}, {metric.upper()}"
             for other in sorted((c for c in values if values[c] < values[learned]), key=lambda c: values[c]):
+                sentence = f"{cell}: {learned} {number(values[learned])} loses to {other} {number(values[other])}"
                 pair = _find(paired, controller=other, against=learned, plant=mine["plant"], scenario=scenario,
                              window=window, metric=metric)  # fmt: skip
-                certainty = ""
+                certain = False
                 if pair is not None and pair["ci95"][0] is not None:
                     low, high = pair["ci95"]
-                    certainty = (
+                    certain = pair["verdict"] != "no difference shown"
+                    sentence += (
                         f"; {other} minus {learned}: {number(pair['difference'])}, 95 % {number(low)} to {number(high)}"
-                        f"{'' if pair['verdict'] != 'no difference shown' else ', which holds 0'}"
+                        f"{'' if certain else ', which holds 0'}"
                     )
-                found.append(
-                    f"{name_of(scenario, window)}, {metric.upper()}: {learned} {number(values[learned])} loses to "
-                    f"{other} {number(values[other])}{certainty}."
-                )
+                found.append(Loss(cell, certain, f"{sentence}."))
     return found
 
 
@@ -162,35 +169,44 @@ def published_losses() -> list[str]:
     found = []
     for metric in METRICS:
         for scenario, window in dict.fromkeys((p.scenario, p.window) for p in TABLE_2):
-            cells: dict[str, Published] = {
-                p.controller: p for p in TABLE_2 if (p.scenario, p.window) == (scenario, window)
-            }
-            best = min(cells.values(), key=lambda p: getattr(p, metric))
+            best = min(
+                (p for p in TABLE_2 if (p.scenario, p.window) == (scenario, window)), key=lambda p: getattr(p, metric)
+            )
             if best.controller != "dqn":
                 found.append(f"{name_of(scenario, window)} {metric.upper()} ({best.controller})")
     return found
 
 
 def _matrix(
-    name: str, title: str, entries: Sequence[Row], value: Callable[[Row], float | None], text: Callable[[Row], str],
-    note: str, floor: str | None = None, lowest: bool = True, scale: float = 1.0,
+    name: str, title: str, entries: Sequence[Row], text: Callable[[Row], str], note: str,
+    ranked_by: str | None = None, floor: Callable[[Row], str] | None = None,
 ) -> Table:  # fmt: skip
-    """Plants down, controllers across; the lowest of a row is marked, the oracle out of competition."""
+    """Plants down, controllers across; the row's lowest `ranked_by` is marked, the oracle is not ranked.
+
+    Args: text: of a cell. floor: of the last column, the sensor's noise alone, from any controller's entry.
+    """
     controllers = list(dict.fromkeys(str(e["controller"]) for e in entries))
     body = []
     for plant in dict.fromkeys(str(e["plant"]) for e in entries):
-        at = {c: _find(entries, controller=c, plant=plant) for c in controllers}
-        values = {c: value(r) for c, r in at.items() if r is not None and c != "oracle"}
-        known = {c: v for c, v in values.items() if v is not None}
-        least = min(known.values()) if lowest and len(known) > 1 else None
-        best = {c for c, v in known.items() if least is not None and v <= least * (1.0 + 1e-9)}
-        cells: list[Cell] = [plant, *(_mark("–" if r is None else text(r), c in best) for c, r in at.items())]
+        at = {c: r for c in controllers if (r := _find(entries, controller=c, plant=plant)) is not None}
+        values = {c: r[ranked_by] for c, r in at.items() if ranked_by and c != "oracle" and r[ranked_by] is not None}
+        least = min(values.values()) * (1.0 + 1e-9) if len(values) > 1 else float("-inf")
+        cells = [plant]
+        cells += [_mark(text(at[c]), values.get(c, float("inf")) <= least) if c in at else "–" for c in controllers]
         if floor is not None:
-            told = at.get("oracle") or next(r for r in at.values() if r is not None)
-            cells.append(number(scale * told[floor]))
+            cells.append(floor(at.get("oracle") or next(iter(at.values()))))
         body.append(tuple(cells))
     columns = ("plant", *controllers, *(("sensor-noise floor",) if floor else ()))
     return Table(name, title, columns, tuple(body), note)
+
+
+def _mean_sd(row: Row, metric: str, scale: float) -> str:
+    sd = row[f"{metric}_sd"]
+    return plus_minus(scale * row[f"{metric}_mean"], None if sd is None else scale * sd)
+
+
+def _scaled(row: Row, key: str, scale: float = 1.0) -> str:
+    return number(None if row[key] is None else scale * row[key])
 
 
 def _percent(pair: Row) -> str:
@@ -208,21 +224,18 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
     totals = [e for e in summary["totals"] if e["scenario"] == scenario]
     pairs = [e for e in summary["paired_totals"] if e["scenario"] == scenario]
     n = totals[0]["n"]
-    out.add(f"<h3>{html.escape(scenario)}</h3>")
+    out.add("subheading", text=scenario)
     for metric, scale, unit in (("ise", 1000.0, "10⁻³ OD² min"), ("itae", 1.0, "OD min²")):
-
-        def text(r: Row, m: str = metric, k: float = scale) -> str:
-            return plus_minus(k * r[f"{m}_mean"], None if r[f"{m}_sd"] is None else k * r[f"{m}_sd"])
-
-        out.table(
-            _matrix(
-                f"{scenario}_{metric}",
-                f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
-                totals, lambda r, m=metric: r[f"{m}_mean"], text,  # type: ignore[misc]
-                f"Mean ± standard deviation, n = {n}. Marked: lowest; the oracle is out of competition.",
-                f"floor_{metric}", scale=scale,
-            )
-        )  # fmt: skip
+        table = _matrix(
+            f"{scenario}_{metric}",
+            f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
+            totals,
+            partial(_mean_sd, metric=metric, scale=scale),
+            f"Mean ± standard deviation, n = {n}. Marked: lowest; the oracle is out of competition.",
+            ranked_by=f"{metric}_mean",
+            floor=partial(_scaled, key=f"floor_{metric}", scale=scale),
+        )
+        out.table(table)
     for against, heading in (
         ("oracle", "Distance from the oracle"),
         ("dqn", "Paired difference to the learned policy"),
@@ -230,15 +243,15 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
         for metric in METRICS:
             chosen = [p for p in pairs if p["against"] == against and p["metric"] == metric]
             if chosen:
-                out.table(
-                    _matrix(
-                        f"{scenario}_{metric}_vs_{against}", f"{heading}, {metric.upper()}, %", chosen,
-                        lambda p: p["percent"], _percent,
-                        f"Mean paired difference in % of {against}'s mean, 95 % interval in brackets, n = {n}. Where "
-                        f"{against}'s mean is 0 the difference itself.", lowest=False,
-                    ),
-                    folded=f"{heading}, {metric.upper()}: {scenario}",
-                )  # fmt: skip
+                table = _matrix(
+                    f"{scenario}_{metric}_vs_{against}",
+                    f"{heading}, {metric.upper()}, %",
+                    chosen,
+                    _percent,
+                    f"Mean paired difference in % of {against}'s mean, 95 % interval in brackets, n = {n}. Where "
+                    f"{against}'s mean is 0 the difference itself.",
+                )
+                out.table(table, folded=f"{heading}, {metric.upper()}: {scenario}")
     extra = (
         ("clean_itae", "ITAE of the noise-free OD (OD min²), sum over the windows", True),
         ("clean_steady_abs_error", "Steady error of the noise-free OD", True),
@@ -247,10 +260,8 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
         ("held", "Samples on which the interlock allowed no dose, per vial", False),
     )
     for key, title, ranked in extra:
-        table = _matrix(
-            f"{scenario}_{key}", title, totals, lambda r, k=key: r[k],  # type: ignore[misc]
-            lambda r, k=key: number(r[k]), f"Mean, n = {n}.", lowest=ranked,  # type: ignore[misc]
-        )  # fmt: skip
+        ranking = key if ranked else None
+        table = _matrix(f"{scenario}_{key}", title, totals, partial(_scaled, key=key), f"Mean, n = {n}.", ranking)
         out.table(table, folded=f"{title}: {scenario}")
 
 
@@ -292,21 +303,20 @@ def _paper_section(out: Page, summary: Row) -> None:
     for metric in METRICS:
         out.table(table_2(rows, metric))
     lost, cells = losses(rows, summary["paired"]), 2 * len(_windows(rows))
-    cells_lost = len({(s.split(":")[0]) for s in lost})
-    certain = len({(s.split(":")[0]) for s in lost if "95 %" in s and "holds 0" not in s})
-    items = "".join(f"<li>{typeset(s)}</li>" for s in lost)
-    known = any(r["controller"] == "dqn" for r in rows)
-    verdict = (
-        f"Of {cells} cells here, the learned policy (dqn) loses {cells_lost}, {certain} of them with a 95 % interval "
-        "of the paired difference that excludes 0:"
-    ) if lost else (
-        f"The learned policy (dqn) is lowest in all {cells} cells here." if known else "No learned policy was run."
-    )  # fmt: skip
+    cells_lost = len({loss.cell for loss in lost})
+    certain = len({loss.cell for loss in lost if loss.certain})
+    if lost:
+        claim = (
+            f"Of {cells} cells here, the learned policy (dqn) loses {cells_lost}, {certain} of them with a 95 % "
+            "interval of the paired difference that excludes 0:"
+        )
+    elif any(r["controller"] == "dqn" for r in rows):
+        claim = f"The learned policy (dqn) is lowest in all {cells} cells here."
+    else:
+        claim = "No learned policy was run."
     theirs = published_losses()
-    out.add(
-        f'<div class="verdict"><p><b>{html.escape(verdict)}</b></p><ul>{items}</ul>'
-        f"<p>In the published table the DQN loses {len(theirs)} of 10: {html.escape(', '.join(theirs))}.</p></div>"
-    )
+    remark = f"In the published table the DQN loses {len(theirs)} of 10: {', '.join(theirs)}."
+    out.add("verdict", claim=claim, items=[loss.sentence for loss in lost], remark=remark)
     out.table(cell_by_cell(rows))
     bounded = _below_bound(summary)
     if bounded:
@@ -334,7 +344,7 @@ def _below_bound(summary: Row) -> str:
 
 def _settings(agents: Mapping[str, Row]) -> Table | None:
     """The hyper-parameters in which the agents trained here differ."""
-    trained = {name: told["agent"] for name, told in agents.items() if "agent" in told}
+    trained = {name: entry["agent"] for name, entry in agents.items() if "agent" in entry}
     if len(trained) < 2:
         return None
     keys = [k for k in next(iter(trained.values())) if len({str(agent[k]) for agent in trained.values()}) > 1]
@@ -361,8 +371,8 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
     settings = _settings(summary["agents"])
     if settings is not None:
         out.table(settings)
-    for name, told in summary["agents"].items():
-        regret = told["regret_pct"]
+    for name, entry in summary["agents"].items():
+        regret = entry["regret_pct"]
         shown = ", ".join(number(r) for r in regret) if isinstance(regret, list) else number(regret)
         out.text(f"{name}: regret against the optimum of the model, % per seed: {shown}.")
     for f in first:
@@ -370,7 +380,7 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
             out.figure(run / f["file"], f["title"], f["caption"])
 
 
-def page(run: Path) -> Page:
+def of_benchmark(run: Path) -> Page:
     """The page of a benchmark's run folder."""
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     out = Page(
@@ -399,17 +409,13 @@ def page(run: Path) -> Page:
     if wide:
         out.section("Every plant")
         out.text(
-            "Model-based controllers and the learned policy believe the model of the configuration (env) whatever the "
-            "plant is; what each plant is stands in the configuration above."
+            "Model-based controllers and the learned policy believe the model of the configuration (env) "
+            "whatever the plant is; what each plant is stands in the configuration above."
         )
         for scenario in wide:
             every_plant(out, summary, scenario)
     out.section("Definitions")
-    out.add(
-        "<dl>"
-        + "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in DEFINITIONS.items())
-        + "</dl>"
-    )
+    out.add("definitions", pairs=list(DEFINITIONS.items()))
     if summary["rows"]:
         out.section("All numbers")
         out.table(all_rows(summary), folded=f"{len(summary['rows'])} rows; also in tables/rows.csv")

@@ -11,11 +11,11 @@ from scipy.stats import t as student
 
 from experiments.comparison.trials import Trial, Window, windows
 
-__all__ = ["Spread", "details", "pairs", "row", "rows", "spread", "total_pairs", "totals"]
+__all__ = ["Spread", "details", "pairs", "row", "rows", "total_pairs", "totals"]
 
 Array = NDArray[np.float64]
 METRICS = ("ise", "itae")
-NEGLIGIBLE = 1e-6  # a mean below is nothing to take a percentage of
+NEGLIGIBLE = 1e-6  # a difference is not stated in percent of a mean below this
 
 
 class Spread:
@@ -35,14 +35,9 @@ class Spread:
 
     @property
     def sign(self) -> int:
-        """-1 or 1 where the interval excludes zero, else 0. A difference without any spread is taken at its word."""
+        """-1 or 1 where the interval excludes zero, else 0. Without any spread the sign of the mean counts."""
         low, high = self.ci95
         return -1 if high < 0.0 else 1 if low > 0.0 else 0
-
-
-def spread(values: Array) -> Spread:
-    """See `Spread`."""
-    return Spread(values)
 
 
 def _median_or_never(settling: Array) -> float:

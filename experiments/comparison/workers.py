@@ -19,11 +19,21 @@ from experiments.training import build
 if TYPE_CHECKING:
     from dqn.policy import Policy
 
-__all__ = ["Cell", "Loops", "run_cell"]
+__all__ = ["Cell", "Loops", "cells", "run_cell"]
 
 log = logging.getLogger(__name__)
 
 Cell = tuple[str, str, str]  # controller, plant, scenario
+
+
+def cells(config: BenchmarkConfig) -> list[Cell]:
+    """Every closed loop that some study needs, once, in the order in which they are asked for."""
+    wanted: dict[Cell, None] = {}
+    for study in config.studies.values():
+        for scenario in study.scenarios:
+            for plant in study.plants:
+                wanted.update(dict.fromkeys((controller, plant, scenario) for controller in study.controllers))
+    return list(wanted)
 
 
 def run_cell(config: BenchmarkConfig, cell: Cell, policy: Policy | None) -> Trial:

@@ -10,15 +10,15 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from experiments.reliability.case import Outcome
-from experiments.reporting.charts import new_figure
+from experiments.reporting.charts import COLOURS, new_figure
 
 __all__ = ["fault_map"]
 
 
 def fault_map(outcomes: Sequence[Outcome], moments: Sequence[str]) -> Figure:
-    """Fault by moment: time until it was told (number, min) over the largest OD error it caused (colour).
+    """Fault by moment: time until it was reported (number, min) over the largest OD error it caused (colour).
 
-    A dash means that it was not told; a frame, that the case did not go as declared.
+    A dash means that it was not reported; a frame, that the case did not go as declared.
     """
     names = list(dict.fromkeys(o.label for o in outcomes))
     error = np.full((len(names), len(moments)), np.nan)
@@ -31,11 +31,11 @@ def fault_map(outcomes: Sequence[Outcome], moments: Sequence[str]) -> Figure:
         dark = o.peak_error > 0.4
         ax.text(column, row, text, ha="center", va="center", fontsize=6, color="white" if dark else "black")
         if not o.ok:
-            ax.plot(column, row, marker="s", markersize=14, markerfacecolor="none", markeredgecolor="#d55e00")
+            ax.plot(column, row, marker="s", markersize=14, markerfacecolor="none", markeredgecolor=COLOURS[1])
     image = ax.imshow(error, norm=LogNorm(0.02, 2.0), cmap="cividis_r", aspect="auto")
     ax.set_xticks(range(len(moments)), list(moments), fontsize=8)
     ax.set_yticks(range(len(names)), names, fontsize=7)
-    ax.set_title("minutes until told (–: not told)", fontsize=9)
+    ax.set_title("minutes until reported (–: not reported)", fontsize=9)
     bar = figure.colorbar(image, ax=ax, shrink=0.4, extend="both")
     bar.set_label("largest OD error of the culture", fontsize=8)
     return figure

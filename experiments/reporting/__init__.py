@@ -1,3 +1,3 @@
 """What people look at: charts, tables, pages, TensorBoard. Arrays and dictionaries in, files out.
 
-Entered by everybody above; imports of ours only `experiments.cli`."""
+Entered by commands and by every room above; imports no other room of the experiments."""

@@ -1,4 +1,7 @@
-"""Figures from arrays. Each function returns a matplotlib Figure; `save` writes it as SVG and PNG."""
+"""The one style of all figures, and the figures of training, deployment and speed.
+
+Each function takes arrays and returns a matplotlib Figure; `save` writes it as SVG and PNG.
+"""
 
 from __future__ import annotations
 
@@ -9,33 +12,39 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-__all__ = ["COLOURS", "culture", "learning", "new_figure", "policy_map", "save", "scaling", "trajectories"]
+__all__ = ["COLOURS", "closed_loop", "learning", "new_figure", "policy_map", "save", "scaling", "seeds", "trajectories"]
 
 Array = NDArray[np.float64]
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f", "#000000")
 """Okabe and Ito's palette: distinguishable with any colour vision."""
 
-matplotlib.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "turbidostat-dqn"})
+matplotlib.rcParams.update(
+    {
+        "axes.axisbelow": True,
+        "axes.grid": True,
+        "axes.spines.right": False,
+        "axes.spines.top": False,
+        "axes.titlesize": 10,
+        "grid.color": "#e6e6e6",
+        "grid.linewidth": 0.6,
+        "legend.fontsize": 8,
+        "legend.frameon": False,
+        "svg.fonttype": "none",  # text stays text
+        "svg.hashsalt": "turbidostat-dqn",  # the same figure is the same file
+    }
+)
 
 
 def new_figure(
     width: float, height: float, rows: int = 1, columns: int = 1, **kwargs: Any
 ) -> tuple[Figure, list[Axes]]:
-    """A figure and its axes, row by row, in the house's look."""
+    """A figure and its axes, row by row; `kwargs` go to `Figure.subplots`."""
     figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(rows, columns, squeeze=False, **kwargs)
-    axes = list(grid.ravel())
-    for ax in axes:
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.grid(True, color="#e6e6e6", linewidth=0.6)
-        ax.set_axisbelow(True)
-    return figure, axes
+    return figure, list(figure.subplots(rows, columns, squeeze=False, **kwargs).flat)
 
 
 def save(figure: Figure, folder: Path, name: str) -> Path:
@@ -58,6 +67,20 @@ def _population(ax: Axes, x: Array, curves: Array, colour: str, label: str) -> N
     ax.plot(x, middle, color=colour, linewidth=1.4, label=f"{label}, median")
 
 
+def seeds(ax: Axes, values: Mapping[str, Array], label: str) -> None:
+    """A row per name on a logarithmic axis called `label`: one dot per seed, a bar at their median.
+
+    Args: values: name -> (S,), the first one on top.
+    """
+    jitter = np.random.default_rng(0)
+    for row, each in enumerate(values.values()):
+        height = row + jitter.uniform(-0.22, 0.22, each.size)
+        ax.plot(np.maximum(each, 1e-4), height, ".", color=COLOURS[0], alpha=0.45, markersize=5)
+        ax.plot([np.median(each)] * 2, [row - 0.34, row + 0.34], color=COLOURS[1], linewidth=2)
+    ax.set(xscale="log", xlabel=label, ylim=(len(values) - 0.5, -0.5))
+    ax.set_yticks(range(len(values)), list(values), fontsize=8)
+
+
 def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_step: Array) -> Figure:
     """Reward per episode (the paper's Fig. 2b) and regret of the greedy policy during training.
 
@@ -69,14 +92,14 @@ def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_st
     episodes = np.arange(1, episode_return.shape[0] + 1)
     _population(left, episodes, -episode_return, COLOURS[0], "exploring agent")
     left.set(xlabel="episode", ylabel="cost of the episode, sum of (x − setpoint)²", yscale="log")
-    left.set_title("Cost per training episode (minus the reward)", fontsize=10)
-    left.legend(frameon=False, fontsize=8)
+    left.set_title("Cost per training episode (minus the reward)")
+    left.legend()
     _population(right, eval_step, np.maximum(regret_pct, 1e-3), COLOURS[1], "greedy policy")
     if best_step.size == 1:
         right.axvline(best_step[0], color=COLOURS[2], linewidth=1, linestyle="--", label="policy kept")
     right.set(xlabel="environment step", ylabel="regret against the optimum, %", yscale="log")
-    right.set_title("Greedy policy on the selection grid", fontsize=10)
-    right.legend(frameon=False, fontsize=8)
+    right.set_title("Greedy policy on the selection grid")
+    right.legend()
     return figure
 
 
@@ -92,7 +115,7 @@ def policy_map(od: Array, setpoint: Array, learned: Array, optimal: Array) -> Fi
         mesh = ax.pcolormesh(od, setpoint, rate * 1000.0, cmap="viridis", vmin=0.0, vmax=20.0, rasterized=True)
         ax.plot([setpoint[0], setpoint[-1]], [setpoint[0], setpoint[-1]], color="white", linewidth=1, linestyle="--")
         ax.set(xlabel="OD x")
-        ax.set_title(title, fontsize=10)
+        ax.set_title(title)
         ax.grid(False)
     axes[0].set_ylabel("setpoint, OD")
     figure.colorbar(mesh, ax=axes, label="pump rate, µL/s")
@@ -120,15 +143,15 @@ def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates:
             bottom.step(
                 minutes[:-1], best_rates[:, g] * 1000.0, where="post", color="black", linewidth=0.8, linestyle=":"
             )
-        top.set_title(f"setpoint {goal:g}", fontsize=10)
+        top.set_title(f"setpoint {goal:g}")
         bottom.set(xlabel="time, min", ylim=(-0.5, 21.0))
-    axes[0].legend(frameon=False, fontsize=8)
+    axes[0].legend()
     axes[0].set_ylabel("OD")
     axes[goals.size].set_ylabel("pump rate, µL/s")
     return figure
 
 
-def culture(
+def closed_loop(
     minutes: Array,
     od: Array,
     setpoint: Array,
@@ -156,8 +179,8 @@ def culture(
         if temperature is not None:
             axes[2].plot(minutes[:, n], temperature[:, n], color=colour, linewidth=1.0)
     axes[0].set_ylabel("OD")
-    axes[0].set_title(title, fontsize=10)
-    axes[0].legend(frameon=False, fontsize=8, ncols=3)
+    axes[0].set_title(title)
+    axes[0].legend(ncols=3)
     axes[1].set(ylabel="pump rate, µL/s", ylim=(-0.5, 21.0))
     if temperature is not None:
         axes[2].set_ylabel("temperature, °C")
@@ -179,5 +202,5 @@ def scaling(costs: Mapping[str, tuple[NDArray[np.int64], Array]]) -> Figure:
         ax.set_title(title, fontsize=9)
         ax.set_xlabel(title.split(",")[0])
     axes[0].set_ylabel("time, s")
-    axes[0].legend(frameon=False, fontsize=8)
+    axes[0].legend()
     return figure

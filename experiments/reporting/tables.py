@@ -1,26 +1,21 @@
-"""A table once, as HTML, CSV and LaTeX."""
+"""A table once: its cells for a page, and the same as CSV and LaTeX."""
 
 from __future__ import annotations
 
 import csv
-import html
 import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Best", "Cell", "Table", "number", "plus_minus", "typeset", "write"]
+__all__ = ["Best", "Table", "number", "plus_minus", "typeset", "write"]
 
 
-@dataclass(frozen=True)
-class Best:
-    """A cell to stand out."""
+class Best(str):
+    """The text of a cell that stands out."""
 
-    text: str
-
-
-Cell = str | Best
+    __slots__ = ()
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -41,13 +36,14 @@ def plus_minus(mean: float | None, sd: float | None, digits: int = 3) -> str:
 
 
 def typeset(text: str) -> str:
-    """Escaped for HTML, with true minus signs before numbers."""
-    return re.sub(r"(?<![\w.])-(?=\d)", "−", html.escape(text))
+    """With true minus signs before numbers."""
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", text)
 
 
 @dataclass(frozen=True)
 class Table:
-    """name: of its files. title, note: around it. columns: headings. rows: cells, the first one names the row.
+    """name: of its files. title, note: around it. columns: headings. rows: cells, plain or `Best`; the first names
+    the row.
 
     Raises: ValueError for a row of another length than the headings.
     """
@@ -55,7 +51,7 @@ class Table:
     name: str
     title: str
     columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    rows: tuple[tuple[str, ...], ...]
     note: str = ""
 
     def __post_init__(self) -> None:
@@ -63,29 +59,12 @@ class Table:
             if len(row) != len(self.columns):
                 raise ValueError(f"table {self.name}: row of {len(row)} cells under {len(self.columns)} headings")
 
-    def html(self) -> str:
-        """A <figure> with caption, table and note."""
-        head = "".join(f"<th>{html.escape(c)}</th>" for c in self.columns)
-        body = "\n".join(f"<tr>{''.join(self._html_cell(c, k) for k, c in enumerate(row))}</tr>" for row in self.rows)
-        note = f'<p class="note">{html.escape(self.note)}</p>' if self.note else ""
-        return (
-            f'<figure class="table" id="{html.escape(self.name)}"><figcaption>{html.escape(self.title)}</figcaption>\n'
-            f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
-            f"<tbody>{body}</tbody></table></div>{note}</figure>"
-        )
-
-    @staticmethod
-    def _html_cell(cell: Cell, column: int) -> str:
-        tag = "th" if column == 0 else "td"
-        text = typeset(cell.text if isinstance(cell, Best) else cell)
-        return f'<{tag} class="best">{text}</{tag}>' if isinstance(cell, Best) else f"<{tag}>{text}</{tag}>"
-
     def csv(self) -> str:
         """Comma-separated values with the headings as first line."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(self.columns)
-        writer.writerows([c.text if isinstance(c, Best) else c for c in row] for row in self.rows)
+        writer.writerows(self.rows)
         return out.getvalue()
 
     def latex(self) -> str:
@@ -115,8 +94,8 @@ def _tex(text: str) -> str:
     return "".join(TEX.get(character, character) for character in text)
 
 
-def _tex_cell(cell: Cell) -> str:
-    return rf"\textbf{{{_tex(cell.text)}}}" if isinstance(cell, Best) else _tex(cell)
+def _tex_cell(cell: str) -> str:
+    return rf"\textbf{{{_tex(cell)}}}" if isinstance(cell, Best) else _tex(cell)
 
 
 def write(tables: Sequence[Table], folder: Path) -> None:

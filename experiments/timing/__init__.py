@@ -1,3 +1,3 @@
-"""How fast things are, each beside a named rival in the same run.
+"""How fast things are, each beside a named rival that does the same work in the same run.
 
 Entered by speed."""

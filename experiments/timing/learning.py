@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -14,11 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
-from experiments.timing.measurement import Measurement
+from experiments.timing.measurement import Measurement, seconds
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from dqn.agent import DQNAgent
 
 __all__ = ["environment", "scaling", "start_up", "training", "update"]
 
@@ -27,44 +28,44 @@ COPIES = 4096
 ENTRY_POINTS = ("train", "deploy", "calibrate", "benchmark", "report", "speed")
 
 
-def _train(agents: int, config: DQNConfig) -> None:
-    """The schedule from scratch, no evaluation, no files: what the rivals do, too."""
+def _one_thread(work: Callable[[], object], times: int = 1) -> None:
+    """Call `work` so often on one thread: the faster setting for networks of this size, for the rivals as for us."""
     import torch
 
+    torch.set_num_threads(1)
+    for _ in range(times):
+        work()
+
+
+def _train(agents: int, config: DQNConfig) -> None:
+    """The schedule from scratch, no evaluation, no files: what the rivals do, too."""
     from experiments.training import build
 
-    torch.set_num_threads(1)
-    for _ in build.population(EnvConfig(), config, range(agents)).run():
-        pass
+    def run() -> None:
+        for _ in build.population(EnvConfig(), config, range(agents)).run():
+            pass
+
+    _one_thread(run)
 
 
 def training() -> Iterator[Measurement]:
     """10 000 steps, 9 500 updates of batch 64, 64x64 units (agent=paper), beside other implementations."""
-    import torch
-
     from experiments.timing import rivals
 
     config = DQNConfig()
-
-    def alone(rival: Callable[[DQNConfig, int], object]) -> Callable[[], object]:
-        def run() -> object:
-            torch.set_num_threads(1)  # the faster setting for networks of this size, for them as for us
-            return rival(config, 0)
-
-        return run
-
     schedule = "10 000 steps, 9 500 updates"
     for name, rival in (
         ("Stable-Baselines3 DQN", rivals.stable_baselines_dqn),
         ("single-file loop as CleanRL's", rivals.single_file_dqn),
     ):
-        yield Measurement("training, one agent", schedule, name, lambda: _train(1, config), alone(rival))
+        work = partial(_one_thread, partial(rival, config, 0))
+        yield Measurement("training, one agent", schedule, name, partial(_train, 1, config), work)
     yield Measurement(
         f"training, {POPULATION} agents",
         f"{schedule} each",
         "one run of Stable-Baselines3 DQN",
-        lambda: _train(POPULATION, config),
-        alone(rivals.stable_baselines_dqn),
+        partial(_train, POPULATION, config),
+        partial(_one_thread, partial(rivals.stable_baselines_dqn, config, 0)),
     )
 
 
@@ -97,30 +98,17 @@ def _matrix_work(agents: int, batch: int, units: tuple[int, ...]) -> Callable[[]
 
 def update() -> Iterator[Measurement]:
     """One update beside the matrix products it cannot do without, at the rate this machine does them."""
-    import torch
-
     config = DQNConfig()
-    for agents in (1, POPULATION):
-        repeats = 2000 if agents == 1 else 200
-        learner = _warm_agent(agents, config)
+    for agents, repeats in ((1, 2000), (POPULATION, 200)):
         products = _matrix_work(agents, config.batch_size, (2, *config.hidden, 17))
-
-        def ours(learn: Callable[[], object] = learner.learn, n: int = repeats) -> None:
-            torch.set_num_threads(1)
-            for _ in range(n):
-                learn()
-
-        def theirs(work: Callable[[], object] = products, n: int = repeats) -> None:
-            torch.set_num_threads(1)
-            for _ in range(n):
-                work()
-
         yield Measurement(
-            f"update, {agents} agent(s)", "batch 64", "its matrix products alone", ours, theirs, "µs", 1e6, repeats
-        )
+            f"update, {agents} agent(s)", "batch 64", "its matrix products alone",
+            partial(_one_thread, _warm_agent(agents, config).learn, repeats), partial(_one_thread, products, repeats),
+            "µs", 1e6, repeats,
+        )  # fmt: skip
 
 
-def _warm_agent(agents: int, config: DQNConfig) -> Any:
+def _warm_agent(agents: int, config: DQNConfig) -> DQNAgent:
     """One group of agents whose replay memory is full."""
     from experiments.training import build
 
@@ -187,13 +175,7 @@ def scaling(runs: int) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]
 
     def timed(work: Callable[[], object], repeats: int) -> float:
         work()
-        seconds = []
-        for _ in range(runs):
-            start = time.perf_counter()
-            for _ in range(repeats):
-                work()
-            seconds.append((time.perf_counter() - start) / repeats)
-        return median(seconds)
+        return median(seconds(work, repeats) for _ in range(runs))
 
     config = DQNConfig()
     agents = np.array([1, 2, 4, 8, 16, 32, 64, 128])

@@ -1,4 +1,4 @@
-"""What speed is compared with: other ways to do the same work. Never imported by anything but `experiments.speed`.
+"""What speed is compared with: other ways to do the same work. Nothing but the measurements of learning imports it.
 
 The single-file loop has the structure of CleanRL's dqn.py: `torch.nn` layers, autograd, `torch.optim.Adam`, a NumPy
 ring buffer, Gymnasium's sync vector environment with one copy and episode statistics; without its logging to disk.
@@ -16,13 +16,12 @@ import torch
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-import envs
+import envs  # noqa: F401  (registers ENV_ID)
 from dqn.config import DQNConfig
 
 __all__ = ["Ring", "single_file_dqn", "stable_baselines_dqn", "sync_vector_env"]
 
 ENV_ID = "Bioreactor-v0"
-assert envs.__doc__  # imported for its registration
 
 
 class Ring:

@@ -16,12 +16,13 @@ from scipy import stats
 
 from dqn import policy as policies
 from envs.scenario import Scenario
-from experiments.benchmark import _schema, cells
+from experiments.benchmark import _schema
 from experiments.cli import frame
 from experiments.comparison import statistics as comparison
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.published import TABLE_2
 from experiments.comparison.trials import Trial, Window, run_trial, windows
+from experiments.comparison.workers import cells
 from experiments.training import build
 from tests.experiments.test_deploy import inverse_policy
 
@@ -206,7 +207,7 @@ def test_pairs_by_hand():
 
 
 def test_one_replicate_has_no_interval():
-    spread = comparison.spread(np.array([2.0]))
+    spread = comparison.Spread(np.array([2.0]))
     assert (spread.n, spread.mean) == (1, 2.0)
     assert np.isnan([spread.sd, *spread.ci95]).all()
     assert spread.sign == 0

@@ -19,9 +19,10 @@ from matplotlib.image import imread
 from dqn import policy as policies
 from experiments import report
 from experiments.cli import frame
-from experiments.comparison import page
+from experiments.comparison import page as comparison
 from experiments.comparison.published import TABLE_2
 from experiments.reporting import charts
+from experiments.reporting.page import Page
 from experiments.reporting.tables import Best, Table, number, plus_minus, typeset
 from tests.experiments.test_deploy import inverse_policy
 
@@ -96,7 +97,7 @@ def test_page_is_well_formed_and_points_to_nothing_outside(text):
 def test_page_holds_what_it_must(text, benchmark):
     summary = json.loads((benchmark / "summary.json").read_text())
     for figure in summary["figures"]:
-        assert figure["title"].replace("'", "&#x27;") in text
+        assert figure["title"].replace("'", "&#39;") in text
     assert text.count("<svg") == len(summary["figures"]) >= 6
     for word in ("What was run", "seed", "turbidostat-dqn", "overrides", "T = 1 min", "T = window",
                  "sensor-noise floor",
@@ -141,17 +142,21 @@ def test_every_lost_cell_is_said_and_no_other():
     rows = [row("dqn", 2.0), row("pi", 1.0), row("mpc", 1.5), row("dqn", 1.0, "0.5"), row("pi", 3.0, "0.5")]
     pair = {"controller": "pi", "against": "dqn", "plant": "p", "scenario": "setpoint_steps", "window": "0.8",
             "metric": "ise", "difference": -1.0, "ci95": [-2.5, 0.5], "verdict": "no difference shown"}  # fmt: skip
-    said = page.losses(rows, [pair])
+    lost = comparison.losses(rows, [pair])
+    said = [loss.sentence for loss in lost]
     assert len(said) == 4
     assert said[0] == "OD 0.8, ISE: dqn 2 loses to pi 1; pi minus dqn: -1, 95 % -2.5 to 0.5, which holds 0."
     assert said[1] == "OD 0.8, ISE: dqn 2 loses to mpc 1.5."
     assert all(s.startswith("OD 0.8, ITAE") for s in said[2:])
-    assert page.losses([row("dqn", 1.0), row("pi", 2.0)], []) == []
+    assert [loss.cell for loss in lost] == 2 * ["OD 0.8, ISE"] + 2 * ["OD 0.8, ITAE"]
+    assert not any(loss.certain for loss in lost)
+    assert comparison.losses(rows, [{**pair, "verdict": "lower", "ci95": [-2.5, -0.5]}])[0].certain
+    assert comparison.losses([row("dqn", 1.0), row("pi", 2.0)], []) == []
 
 
 def test_published_losses_are_the_papers():
     """The PI beats the published DQN in three of the four temperature numbers, the MPC in the other (Table 2)."""
-    said = page.published_losses()
+    said = comparison.published_losses()
     assert [s for s in said if "°C" in s] == ["37 °C ISE (mpc)", "30 °C ISE (pi)", "37 °C ITAE (pi)", "30 °C ITAE (pi)"]
     assert "OD 0.5 ISE" not in " ".join(said)
     assert "OD 0.5 ITAE" not in " ".join(said)
@@ -162,12 +167,33 @@ def test_numbers_are_readable():
     assert number(None) == number(float("nan")) == "–"
     assert plus_minus(0.5, 1e-16) == "0.5"
     assert plus_minus(9.81, 0.912) == "9.81 ± 0.91"
-    assert typeset("a-b -1 <2> [-3, 1e-5]") == "a-b −1 &lt;2&gt; [−3, 1e-5]"
+    assert typeset("a-b -1 <2> [-3, 1e-5]") == "a-b −1 <2> [−3, 1e-5]"
+
+
+def one_section() -> Page:
+    built = Page("A & B", "")
+    built.section("<first>")
+    return built
+
+
+def test_a_page_escapes_what_it_is_given():
+    built = one_section()
+    built.text("a-b -1 <2> [-3, 1e-5]")
+    built.add("verdict", claim="<b>", items=["-2 > -3"], remark="&")
+    text = built.html()
+    assert "<p>a-b −1 &lt;2&gt; [−3, 1e-5]</p>" in text
+    assert "<li>−2 &gt; −3</li>" in text
+    assert "<title>A &amp; B</title>" in text
+    assert "<h2>&lt;first&gt;</h2>" in text
+    assert "<b>&lt;b&gt;</b>" in text
 
 
 def test_a_table_escapes_what_each_format_reads_as_its_own():
     table = Table("t", "50 % & more_", ("a", "b"), (("x<y", Best("1,5")),))
-    assert "x&lt;y" in table.html()
+    built = one_section()
+    built.table(table)
+    assert "<th>x&lt;y</th>" in built.html()
+    assert '<td class="best">1,5</td>' in built.html()
     assert list(csv.reader(table.csv().splitlines())) == [["a", "b"], ["x<y", "1,5"]]
     assert r"50 \% \& more\_" in table.latex()
     assert r"x$<$y & \textbf{1,5} \\" in table.latex()

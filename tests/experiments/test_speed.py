@@ -6,7 +6,8 @@ from itertools import count
 import pytest
 
 from experiments.cli import frame
-from experiments.speed import GROUPS, Measurement, SpeedConfig, measure, table
+from experiments.speed import GROUPS, SpeedConfig, table
+from experiments.timing.measurement import Measurement, measure
 
 
 def test_the_ratio_is_the_rivals_time_over_ours():

@@ -1,0 +1,153 @@
+"""What a benchmark draws and counts: its closed loops, the calibration, the figures of its studies, summary.json."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from envs.identification.open_loop import OpenLoop, open_loop
+from envs.identification.screening import Series
+from envs.identification.window import IdentifyConfig, calibrate
+from experiments.comparison import figures, statistics
+from experiments.comparison.config import BenchmarkConfig
+from experiments.comparison.published import SETTLING_MIN, TABLE_2
+from experiments.comparison.trials import Trial
+from experiments.reporting.calibration_charts import fit_figure
+
+__all__ = ["Drawing", "calibration", "draw", "summarise"]
+
+CAPTIONS = {
+    "regulation": "Regulation at 0.5 (the paper's Fig. 2c)",
+    "setpoint_steps": "Three setpoints (the paper's Fig. 3a-b)",
+    "temperature_switch": "37 to 30 °C (the paper's Fig. 3c)",
+    "comparison": "Controllers side by side at 0.5 (the paper's Fig. 4)",
+}
+
+
+class Drawing(NamedTuple):
+    """A figure, the name of its file, and what stands above and below it on the page."""
+
+    name: str
+    figure: Figure
+    title: str
+    caption: str
+
+
+def calibration(config: BenchmarkConfig) -> tuple[dict[str, Any], Drawing]:
+    """The open-loop protocol on the training model with 1 % noise, and the fit to it.
+
+    Raises: ValueError where the recording cannot be fitted.
+    """
+    protocol = OpenLoop(mu=config.env.mu, tau=config.env.tau, control_min=config.env.control_min, seed=config.seed)
+    time, od, rate = open_loop(protocol, np.random.default_rng(config.seed))
+    raw = Series(time, od[0], rate[0], np.arange(time.size))
+    result = calibrate(raw, IdentifyConfig())
+    mu, tau = result.fit.mu, result.tau
+    found = {
+        "mu": {"value": mu.value, "ci95": [mu.low, mu.high], "truth": protocol.mu},
+        "tau": {"value": tau.value, "ci95": [tau.low, tau.high], "truth": protocol.tau},
+        "pmse_pct": result.fit.pmse_pct,
+        "n_used": result.fit.n_used,
+    }
+    return found, Drawing(
+        "fig2a_calibration",
+        fit_figure(raw, result, "open-loop recording and free-running model"),
+        "Calibration (the paper's Fig. 2a)",
+        f"One simulated open-loop recording of {protocol.hours:g} h, {100 * protocol.noise:g} % sensor noise, and the "
+        f"model fitted to it, run freely from one start. PMSE {result.fit.pmse_pct:.2g} % (paper: 6 % on a real "
+        "recording).",
+    )
+
+
+def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) -> Iterator[Drawing]:
+    """The figures of the studies, from the trials and from the numbers of `summarise`."""
+    yield from _closed_loops(config, trials)
+    if {"setpoint_steps", "temperature_switch"} & set(config.studies):
+        yield Drawing(
+            "table2",
+            figures.published_and_ours(_table_2_rows(summary["rows"], config)),
+            "The paper's Table 2 beside this run",
+            f"Hollow: published, real reactors, n = 3. Filled: this run, n = {config.replicates}; bar: 95 % interval "
+            "of the mean. Left is better.",
+        )
+    for scenario in dict.fromkeys(s for study in config.studies.values() for s in study.scenarios):
+        totals = [e for e in summary["totals"] if e["scenario"] == scenario]
+        if len({e["controller"] for e in totals}) < 5:
+            continue
+        yield Drawing(
+            f"plants_{scenario}",
+            figures.plants(totals),
+            f"Every plant, {scenario}",
+            f"ISE and ITAE of the measured OD, summed over the windows; mean and 95 % interval, n = "
+            f"{config.replicates}. Red: what the sensor's noise alone would score on a culture exactly on the "
+            "setpoint. `hold` is off the scale and left out.",
+        )
+        against = [e for e in summary["paired_totals"] if e["scenario"] == scenario and e["against"] == "dqn"]
+        if against:
+            yield Drawing(
+                f"differences_{scenario}",
+                figures.differences(against, "dqn"),
+                f"Difference to the learned policy, {scenario}",
+                f"Paired over {config.replicates} replicates with the same vials, pumps and noise: mean and 95 % "
+                "interval, in % of the learned policy's mean. Left of zero: better than the learned policy. "
+                "`hold` is off the scale and left out.",
+            )
+
+
+def _closed_loops(config: BenchmarkConfig, trials: list[Trial]) -> Iterator[Drawing]:
+    """OD and pump rate of every study that is the paper's, or holds a single scenario and plant."""
+    by_cell = {(t.controller, t.plant, t.scenario): t for t in trials}
+    for name, study in config.studies.items():
+        if not study.controllers or (name not in CAPTIONS and len(study.plants) * len(study.scenarios) > 1):
+            continue
+        for scenario in study.scenarios:
+            for plant in study.plants:
+                shown = [by_cell[c, plant, scenario] for c in study.controllers][:4]
+                long = config.scenarios[scenario].total_min > figures.LONG_MIN
+                what = "noise-free OD and pump rate in blocks of 10 min" if long else "measured OD and pump rate"
+                yield Drawing(
+                    name if name in CAPTIONS else f"{name}_{scenario}_{plant}",
+                    figures.bands(shown),
+                    CAPTIONS.get(name, f"{name}: {scenario} on {plant}"),
+                    f"Plant {plant}, {config.replicates} replicates. Line: mean of {what}; band: one standard "
+                    "deviation over replicates; dashed: setpoint.",
+                )
+
+
+def _table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[dict[str, Any]]:
+    """The rows that stand beside the paper's table: first plant of the studies named like its scenarios."""
+    shown = []
+    for name in ("setpoint_steps", "temperature_switch"):
+        if name in config.studies and config.studies[name].plants:
+            study = config.studies[name]
+            shown += [
+                r for r in rows
+                if r["scenario"] == name and r["plant"] == study.plants[0] and r["controller"] in study.controllers
+            ]  # fmt: skip
+    return shown
+
+
+def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
+    """All numbers of the closed loops, and the paper's."""
+    plants, controllers = list(config.plants), list(config.controllers)
+    ordered = sorted(trials, key=lambda t: (plants.index(t.plant), controllers.index(t.controller)))
+    names = {t.controller for t in trials}
+    against = [name for name in ("dqn", "oracle") if name in names]
+    rows = statistics.rows(trials)
+    return {
+        "rows": rows,
+        "paper": [p._asdict() for p in TABLE_2],
+        "paper_settling_min": SETTLING_MIN,
+        "beside_paper": [
+            {k: r[k] for k in ("controller", "plant", "scenario", "window")} for r in _table_2_rows(rows, config)
+        ],
+        "details": statistics.details(trials),
+        "totals": statistics.totals(ordered),
+        "paired": [p for name in against for p in statistics.pairs(trials, name)],
+        "paired_totals": [p for name in against for p in statistics.total_pairs(ordered, name)],
+        "replicates": config.replicates,
+        "seed": config.seed,
+    }
