@@ -142,7 +142,7 @@ def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any
         meter.samples += int(step.rows.sum())
         meter.alarms += sum(reason is not None for reason in step.reasons)
         for n in np.flatnonzero(step.rows & (step.elapsed % config.phase_min > 20.0)):
-            meter.errors.append(abs(float(r.device.benches[names[n]].plant.od[0]) - float(step.setpoint[n])))
+            meter.errors.append(abs(float(r.device.benches[names[n]].plant.culture.od[0]) - float(step.setpoint[n])))
         if r.clock.now() >= mark:
             _collect(r, doses, samples)
             days.append(meter.take(part))

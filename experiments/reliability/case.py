@@ -179,7 +179,7 @@ class _Watch:
             schedule = r.loop.schedules[0]
             elapsed = np.array([(now - r.spans[0][0]) / 60.0 - r.loop.began[0]])
             asked = schedule.setpoints[int(max(Scenario.phase(schedule, elapsed)[0], 0))]
-            od = float(r.device.benches[SICK].plant.od[0])
+            od = float(r.device.benches[SICK].plant.culture.od[0])
             falling = self._reference * math.exp((HEALTHY_MU - FULL_DILUTION) * minutes)
             self._reference = max(asked, od if math.isnan(self._reference) else falling)
             if now >= self.struck_s and elapsed[0] < schedule.total_min:

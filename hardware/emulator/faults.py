@@ -99,10 +99,18 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "stirrer_dead": ("vial", "0 or 1", "the stirrer does not turn"),
     "pump_gain_factor": ("plant", "factor >= 0", "feed flow: 0 blocked, 0.5 weak, 1 sound"),
     "waste_gain_factor": ("plant", "factor >= 0", "waste flow: 0 blocked, 1 sound"),
-    "guard_gain_factor": ("plant", "factor >= 0", "flow of the overflow guard: 0 blocked, 1 sound"),
+    "overflow_gain_factor": ("plant", "factor >= 0", "flow of the overflow pump: 0 blocked, 1 sound"),
     "back_leak_ml": ("plant", "mL >= 0", "siphons back after each feed pulse"),
     "media_left_ml": ("plant", "mL >= 0", "fresh medium left in the bottle; 0 = empty"),
     "mu_factor": ("plant", "factor >= 0", "growth rate relative to healthy"),
+}
+PLANT = {  # fault: part of the plant, its switch
+    "pump_gain_factor": ("feed", "gain_factor"),
+    "back_leak_ml": ("feed", "back_leak_ml"),
+    "media_left_ml": ("feed", "media_left_ml"),
+    "waste_gain_factor": ("vessel", "waste_gain_factor"),
+    "overflow_gain_factor": ("vessel", "overflow_gain_factor"),
+    "mu_factor": ("culture", "mu_factor"),
 }
 SIGNED = {"clock_step", "od_offset", "od_jump", "lost_request", "lost_reply", "reset_before", "reset_after"}
 SIGNED |= {"malformed", "truncated", "lying"}  # counts may be -1
@@ -133,7 +141,8 @@ def inject(device: ChiBioDevice, name: str, reactor: str = "all", value: float =
     else:
         for bench in (device.benches[m] for m in names):
             bench.sync(now)
-            getattr(bench.plant, name)[:] = value
+            part, switch = PLANT[name]
+            getattr(getattr(bench.plant, part), switch)[:] = value
 
 
 def _act(device: ChiBioDevice, name: str, names: tuple[str, ...], value: float) -> None:

@@ -283,7 +283,7 @@ def build(arguments: argparse.Namespace) -> ChiBioDevice:
     low, high = arguments.pump_start
     bench = BenchConfig(guard=arguments.guard, pump_start_low_s=low, pump_start_high_s=high)
     plant = PLANTS[arguments.plant]()
-    plant = replace(plant, pump=replace(plant.pump, guard_ml_s=arguments.guard_flow))
+    plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=arguments.guard_flow))
     return ChiBioDevice(
         tuple(arguments.reactors.split(",")),
         RealClock(arguments.speed),

@@ -12,7 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.plant.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig, ThermalConfig, VesselConfig
+from envs.plant.culture import GrowthConfig
+from envs.plant.plant import Plant, PlantConfig
+from envs.plant.pump import PumpConfig
+from envs.plant.sensor import SensorConfig
+from envs.plant.thermal import ThermalConfig
+from envs.plant.vessel import VesselConfig
 
 __all__ = ["PLANTS", "Bench", "BenchConfig", "Dose", "Sample", "VialFaults", "density"]
 
@@ -175,7 +180,7 @@ class Bench:
         self.doses: deque[Dose] = deque(maxlen=DOSES_KEPT)
         self.samples: deque[Sample] = deque(maxlen=DOSES_KEPT)
         self.on_s = dict.fromkeys((FEED, WASTE, *SPARE), 0.0)
-        self.peak_ml = float(plant.volume_ml[0])
+        self.peak_ml = float(plant.vessel.volume_ml[0])
         self.powered = True
         self.heat, self.stir = 0.0, 0.0
         self.settled_at = start - STIR_SETTLE_S
@@ -227,7 +232,7 @@ class Bench:
 
     def _book(self, before: dict[str, int], at: float) -> None:
         """Close and open dose records for the motors that changed from `before`."""
-        media = float(self.plant.media_ml[0])
+        media = float(self.plant.feed.delivered_ml[0])
         for pump, direction in before.items():
             now = self.motor(pump)
             if now == direction:
@@ -286,12 +291,14 @@ class Bench:
         thermal, plant = self.plant.config.thermal, self.plant
         heat = 1.0 if self.faults.heater_runaway and self.powered else self.heat
         minutes = seconds / 60.0
-        cooled = thermal.ambient_c + (plant.temperature - thermal.ambient_c) * np.exp(-minutes / thermal.cooling_min)
+        cooled = thermal.ambient_c + (plant.thermal.temperature - thermal.ambient_c) * np.exp(
+            -minutes / thermal.cooling_min
+        )
         still = self.stir == 0.0 and self._at + seconds - self._stirred_at > STIR_STOPPED_S
-        plant.stir_factor[:] = 0.0 if still else 1.0
+        plant.culture.stir_factor[:] = 0.0 if still else 1.0
         plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, guard)
         self._at += seconds
-        self.peak_ml = max(self.peak_ml, float(plant.volume_ml[0]))
+        self.peak_ml = max(self.peak_ml, float(plant.vessel.volume_ml[0]))
 
     # -- sensors ---------------------------------------------------------------------------------------------------
 
@@ -299,9 +306,9 @@ class Bench:
         """Reading of a thermometer, degC: IR (culture, 0.02 degC steps), Internal or External (air, 1/16 degC)."""
         self._nearly_sync(at)
         if which == "IR":
-            value = float(self.plant.read_temperature()[0]) + self._rng.normal(0.0, 0.05)
+            value = float(self.plant.thermal.read()[0]) + self._rng.normal(0.0, 0.05)
             return round(value / 0.02) * 0.02
-        warmed = 0.15 * (float(self.plant.temperature[0]) - self.config.air_c) if which == "Internal" else 0.0
+        warmed = 0.15 * (float(self.plant.thermal.temperature[0]) - self.config.air_c) if which == "Internal" else 0.0
         return round((self.config.air_c + warmed + self._rng.normal(0.0, 0.05)) * 16.0) / 16.0
 
     def counts(self, at: float, exposure_s: float) -> int:

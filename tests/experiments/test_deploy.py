@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from dqn import policy
-from envs.plant.plant import Plant, PlantConfig, SensorConfig
+from envs.plant.plant import Plant, PlantConfig
+from envs.plant.sensor import SensorConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
 from experiments.control.config import DeployConfig
@@ -174,7 +175,7 @@ def test_recovery_is_undiluted_and_each_reactor_has_its_own_clock():
 def test_a_reading_that_is_no_number_is_answered_with_no_dose():
     sensor = SensorConfig()
     plant = Plant(replace(PlantConfig(start_od=0.9), sensor=sensor), 1, np.random.default_rng(0))
-    plant.sensor_offset = np.array([np.nan])
+    plant.sensor.extra_offset[:] = np.nan
     reactors = SimulatedReactors(plant, SimulatedConfig())
     loop = ClosedLoop(reactors, LearnedController(inverse_policy()), Interlock(1), Scenario((0.5,), (5.0,), (37.0,)))
     loop.began[:] = 0.0

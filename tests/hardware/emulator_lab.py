@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from envs.plant.plant import GrowthConfig, PlantConfig, PumpConfig
+from envs.plant.culture import GrowthConfig
+from envs.plant.plant import PlantConfig
+from envs.plant.pump import PumpConfig
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions
 from hardware.emulator.vial import BenchConfig

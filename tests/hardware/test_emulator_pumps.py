@@ -230,7 +230,7 @@ def test_a_spare_pump_moves_liquid_only_if_it_has_a_tube(guard: str, level: floa
     lab.post("/SetOutputOn/Pump1/0/M0")
     assert lab.device.truth("M0")["motors"]["Pump3"] == 1
     assert lab.device.truth("M0")["volume_ml"] == pytest.approx(level)
-    inject(lab.device, "guard_gain_factor", "M0", 0.0)
+    inject(lab.device, "overflow_gain_factor", "M0", 0.0)
     set_pump(lab, "Pump1", 1.0 / 63.0)
     lab.wait(5.0)
     assert lab.device.truth("M0")["volume_ml"] == pytest.approx(level + 1.0 + BIAS_S)

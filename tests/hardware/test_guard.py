@@ -308,7 +308,7 @@ def test_a_feed_motor_stuck_at_full_power_needs_a_guard_that_is_the_stronger_pum
     """0.95 of the time at the feed pump's own 1 mL/s is less than the feed: the headroom is gone in minutes."""
     guard = GuardConfig("Pump3", 0.95, flow_ml_s)
     plant = healthy_plant()
-    plant = replace(plant, pump=replace(plant.pump, guard_ml_s=flow_ml_s))
+    plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=flow_ml_s))
     bed = Bed(options=DeviceOptions(bench=BenchConfig(guard="Pump3"), plant=plant), guard=guard)
     bed.reactors.begin()
     bed.run(3)
@@ -321,7 +321,7 @@ def test_a_feed_motor_stuck_at_full_power_needs_a_guard_that_is_the_stronger_pum
 def test_the_emulator_has_one_if_it_is_told_so() -> None:
     device = build(parser().parse_args(["--guard", "Pump4", "--guard-flow", "1.3", "--plant", "bench"]))
     assert device.benches["M0"].config.guard == "Pump4"
-    assert device.benches["M0"].plant.config.pump.guard_ml_s == 1.3
+    assert device.benches["M0"].plant.config.pump.overflow_ml_s == 1.3
     assert build(parser().parse_args([])).benches["M0"].config.guard == ""
     with pytest.raises(ValueError, match="bench.guard = Pump2: allowed Pump3, Pump4"):
         BenchConfig(guard="Pump2")
