@@ -191,11 +191,11 @@ def test_growth_follows_temperature_with_its_time_constant() -> None:
     g = GrowthConfig(temperature_law="cardinal", adaptation_min=10.0)
     p = plant(PlantConfig(growth=g, thermal=ThermalConfig(heating_c_per_min=10.0)))
     p.reset(0.5, temperature=30.0)
-    cold = p._adapted.copy()
+    cold = p.culture._adapted.copy()
     p.advance(1.0, np.zeros(1), temperature_target=37.0)
     for _ in range(10):
         p.advance(1.0, np.zeros(1))
-    share = (p._adapted - cold) / (1.0 - cold)
+    share = (p.culture._adapted - cold) / (1.0 - cold)
     assert share[0] == pytest.approx(1.0 - np.exp(-1.05), abs=0.02)  # the first minute counts half: it was on the way
 
 
@@ -276,9 +276,9 @@ def test_small_irregular_steps_give_the_same_plant() -> None:
         whole.advance(1.0, np.full(3, 60.0 * steps[:4].sum()), np.full(3, 10.0))
         for k, h in enumerate(steps):
             cut.advance(float(h), np.full(3, 60.0 * h if k < 4 else 0.0), np.full(3, 2.5 if k < 4 else 0.0))
-    np.testing.assert_allclose(cut.media_ml, whole.media_ml, rtol=1e-9)
-    np.testing.assert_allclose(cut.volume_ml, whole.volume_ml, rtol=1e-6)
-    np.testing.assert_allclose(cut.od, whole.od, rtol=2e-3)
+    np.testing.assert_allclose(cut.feed.delivered_ml, whole.feed.delivered_ml, rtol=1e-9)
+    np.testing.assert_allclose(cut.vessel.volume_ml, whole.vessel.volume_ml, rtol=1e-6)
+    np.testing.assert_allclose(cut.culture.od, whole.culture.od, rtol=2e-3)
     np.testing.assert_allclose(cut.read_od(), whole.read_od(), rtol=3e-3)
 
 

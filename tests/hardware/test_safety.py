@@ -462,7 +462,7 @@ def test_a_reason_that_is_only_reported_lets_the_dose_pass() -> None:
     config = SafetyConfig(responses=Responses(no_dilution="report"))
     sound = replace(bench_plant(), sensor=NOISY)
     vials = Plant(sound, 1, np.random.default_rng(0))
-    vials.pump_gain_factor[:] = 0.0
+    vials.feed.gain_factor[:] = 0.0
     drive = Drive(config)
     seen = False
     for _ in range(60):
