@@ -123,7 +123,7 @@ def run_device(r: Rehearsal) -> None:
 
 def vial_out(r: Rehearsal) -> None:
     """Nothing in the light path: more light than through clear medium."""
-    inject(r.device, "od_offset", SICK, -float(r.device.benches[SICK].plant.apparent_od[0]) - 0.05)
+    inject(r.device, "od_offset", SICK, -float(r.device.vials[SICK].plant.apparent_od[0]) - 0.05)
 
 
 def full_disk(r: Rehearsal) -> None:

@@ -8,22 +8,17 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.plant.culture import GrowthConfig
-from envs.plant.plant import Plant, PlantConfig
-from envs.plant.pump import PumpConfig
-from envs.plant.sensor import SensorConfig
-from envs.plant.thermal import ThermalConfig
-from envs.plant.vessel import VesselConfig
+from envs.plant.plant import Plant
+from envs.plant.sensor import density
 
-__all__ = ["PLANTS", "Bench", "BenchConfig", "Dose", "Sample", "VialFaults", "density"]
+__all__ = ["FEED", "SPARE", "Dose", "Sample", "Vial", "VialConfig", "VialFaults"]
 
 FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
-LINEAR, QUADRATIC = 1.833, 0.226  # OD = LINEAR R + QUADRATIC R^2, R = log10(zero / raw) (chibio.md section 4)
 FULL_SCALE = 65535
 DARK_COUNTS = 3.0  # what the spectrometer counts without light
 LONGEST_STEP_S = 60.0
@@ -33,43 +28,8 @@ STIR_STOPPED_S = 90.0  # a stirrer off for longer than any still phase has faile
 DOSES_KEPT = 5_000  # per reactor; a day of single-shot dosing is 2880
 
 
-def healthy_plant() -> PlantConfig:
-    """A sound reactor: pulses with their dead time, growth that follows temperature, all vials alike."""
-    return PlantConfig(
-        growth=GrowthConfig(mu=0.025, temperature_law="arrhenius", adaptation_min=2.0),
-        pump=PumpConfig(dosing="pulse", pulse_cv=0.05, dead_time_s=0.05, min_pulse_s=0.1),
-        thermal=ThermalConfig(ripple_c=0.1),
-    )
-
-
-def bench_plant() -> PlantConfig:
-    """As public logs show them: every vial has its own growth, pump, tube height and optics (biology.md section 9)."""
-    return PlantConfig(
-        growth=GrowthConfig(
-            mu=0.025, mu_cv=0.07, drift_sd_per_h=0.02, temperature_law="arrhenius", adaptation_min=2.0, yield_od=5.0
-        ),
-        pump=PumpConfig(
-            dosing="pulse",
-            gain_ml_s=1.11,
-            gain_cv=0.15,
-            pulse_cv=0.1,
-            dead_time_s=0.05,
-            min_pulse_s=0.1,
-            timing_error_s=0.02,
-            prime_low=0.3,
-            prime_high=0.7,
-        ),
-        sensor=SensorConfig(gain_cv=0.07, curvature=-0.1, blank_error=0.01, drift_per_h=0.002),
-        vessel=VesselConfig(volume_sd_ml=0.5, evaporation_ml_day=1.0),
-        thermal=ThermalConfig(ripple_c=0.15),
-    )
-
-
-PLANTS = {"bench": bench_plant, "healthy": healthy_plant}
-
-
 @dataclass(frozen=True)
-class BenchConfig:
+class VialConfig:
     """Optics and electronics of a reactor.
 
     blank_low, blank_high: range of the counts of clear medium, drawn once per reactor (chibio.md section 4).
@@ -83,7 +43,8 @@ class BenchConfig:
       drawn per start: what the thread's register writes take on the bus. 0.2 to 0.7 s is what the device's own software
       took on simulated electronics with bus time.
     air_c: air outside.
-    guard: pump whose tube is an overflow guard's (docs/chibio.md); "" = the spare pumps have no tubes.
+    overflow_pump: pump whose tube ends a little above the waste tube (docs/chibio.md); "" = the spare pumps have no
+      tubes.
     """
 
     blank_low: float = 11600.0
@@ -98,7 +59,7 @@ class BenchConfig:
     pump_start_low_s: float = 0.2
     pump_start_high_s: float = 0.7
     air_c: float = 24.0
-    guard: str = ""
+    overflow_pump: str = ""
 
     def __post_init__(self) -> None:
         ranges = {
@@ -118,9 +79,9 @@ class BenchConfig:
         for key, (low, high) in ranges.items():
             value = getattr(self, key)
             if not low <= value <= high:
-                raise ValueError(f"bench.{key} = {value}: allowed {low:g} to {high:g}; change it")
-        if self.guard not in ("", *SPARE):
-            raise ValueError(f"bench.guard = {self.guard}: allowed {', '.join(SPARE)}, or nothing")
+                raise ValueError(f"vial.{key} = {value}: allowed {low:g} to {high:g}; change it")
+        if self.overflow_pump not in ("", *SPARE):
+            raise ValueError(f"vial.overflow_pump = {self.overflow_pump}: allowed {', '.join(SPARE)}, or nothing")
 
 
 @dataclass
@@ -164,7 +125,7 @@ class Sample(NamedTuple):
     od: float
 
 
-class Bench:
+class Vial:
     """One reactor as the chips see it.
 
     Args:
@@ -173,7 +134,7 @@ class Bench:
     motors' total on-time, `peak_ml` the highest volume.
     """
 
-    def __init__(self, plant: Plant, config: BenchConfig, rng: np.random.Generator, start: float = 0.0) -> None:
+    def __init__(self, plant: Plant, config: VialConfig, rng: np.random.Generator, start: float = 0.0) -> None:
         self.plant, self.config, self.faults = plant, config, VialFaults()
         self._rng, self._at = rng, start
         self.blank = float(rng.uniform(config.blank_low, config.blank_high))
@@ -285,7 +246,8 @@ class Bench:
 
     def _step(self, seconds: float) -> None:
         feed, waste = (np.array([self.motor(pump) * seconds]) for pump in (FEED, WASTE))
-        guard = self.motor(self.config.guard) * seconds if self.config.guard else 0.0
+        pump = self.config.overflow_pump
+        overflow = self.motor(pump) * seconds if pump else 0.0
         for pump in self._motors:
             self.on_s[pump] += abs(self.motor(pump)) * seconds
         thermal, plant = self.plant.config.thermal, self.plant
@@ -296,7 +258,7 @@ class Bench:
         )
         still = self.stir == 0.0 and self._at + seconds - self._stirred_at > STIR_STOPPED_S
         plant.culture.stir_factor[:] = 0.0 if still else 1.0
-        plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, guard)
+        plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, overflow)
         self._at += seconds
         self.peak_ml = max(self.peak_ml, float(plant.vessel.volume_ml[0]))
 
@@ -331,7 +293,8 @@ class Bench:
             return 1
         if f.od_frozen and self._last_raw > 0:
             return self._last_raw
-        light = self.blank * 10.0 ** -density(float(self.plant.apparent_od[0]) + f.od_offset + self._jump)
+        shown = float(self.plant.apparent_od[0]) + f.od_offset + self._jump
+        light = self.blank * 10.0 ** -float(density(shown))
         if self.stir > 0.0 or at < self.settled_at:
             light *= max(c.stir_factor * (1.0 + rng.normal(0.0, c.stir_noise)), 0.01)
         light *= 1.0 + self._common + rng.normal(0.0, c.noise_fraction)
@@ -342,8 +305,23 @@ class Bench:
         )
         return self._last_raw
 
-
-def density(od: float) -> float:
-    """R of LINEAR R + QUADRATIC R^2 = OD; negative for a vial clearer than the blank, bounded where no root exists."""
-    half = LINEAR / (2.0 * QUADRATIC)
-    return float(np.sqrt(max(od / QUADRATIC + half * half, 0.0))) - half
+    def truth(self, at: float) -> dict[str, Any]:
+        """What no client can know of the reactor at device time `at`."""
+        self.sync(at)
+        plant = self.plant
+        return {
+            "od": float(plant.culture.od[0]),
+            "apparent_od": float(plant.apparent_od[0]),
+            "temperature": float(plant.thermal.temperature[0]),
+            "volume_ml": float(plant.vessel.volume_ml[0]),
+            "peak_ml": self.peak_ml,
+            "overflowed": bool(plant.vessel.overflowed[0]),
+            "feed_ml": float(plant.feed.delivered_ml[0]),
+            "media_left_ml": float(plant.feed.media_left_ml[0]),
+            "on_s": dict(self.on_s),
+            "motors": {pump: self.motor(pump) for pump in self.on_s},
+            "heat": self.heat,
+            "stir": self.stir,
+            "powered": self.powered,
+            "blank": self.blank,
+        }

@@ -248,7 +248,7 @@ def test_a_run_ends_although_an_absent_reactor_cannot_be_verified_off_and_says_s
     while bed.clock.now() < 300.0:
         next(steps)
     bed.fault("unplugged", 1.0, "M1")
-    while bed.device.alive:
+    while bed.device.supervisor.alive:
         next(steps)
     bed.fault("restart")
     reasons = [step.reasons[1] or "" for step in steps]  # comes to its end
@@ -260,4 +260,4 @@ def test_a_run_ends_although_an_absent_reactor_cannot_be_verified_off_and_says_s
     with pytest.raises(DeviceStateError, match=r"pumps not verified off: M1: .*absent.*by hand"):
         bed.reactors.stop()
     assert bed.motors_off()
-    assert bed.device.exits == 1
+    assert bed.device.supervisor.exits == 1
