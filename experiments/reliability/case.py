@@ -19,7 +19,8 @@ from experiments.reliability.faults import INF, SICK, Fault
 from experiments.reliability.rehearsal import Killed, Rehearsal
 from hardware.chibio.overflow_guard import GuardConfig
 from hardware.emulator.device import DeviceOptions
-from hardware.emulator.vial import Dose, Sample, VialConfig
+from hardware.emulator.vial import Dose, Sample
+from hardware.emulator.vial_config import VialConfig
 from hardware.errors import ReactorError
 from hardware.safety.config import Response, SafetyConfig
 from hardware.storage.journal import read_journal

@@ -23,7 +23,8 @@ from hardware.emulator.plants import plant_preset
 from hardware.emulator.reactor_app import ReactorApp
 from hardware.emulator.supervisor import Supervisor
 from hardware.emulator.sysdata import ALL_REACTORS
-from hardware.emulator.vial import FEED, Vial, VialConfig
+from hardware.emulator.vial import Vial
+from hardware.emulator.vial_config import FEED, VialConfig
 from hardware.emulator.worker import REQUEST
 
 __all__ = ["ChiBioDevice", "DeviceOptions"]
@@ -93,7 +94,7 @@ class ChiBioDevice:
             self.vials[name] = Vial(plant, o.vial, vial_stream, clock.now())
         self.supervisor = Supervisor(self.computer, self.vials, o.boot_s, o.request_s, o.worker_timeout_s)
         for name, vial in self.vials.items() if blanked else ():
-            self.apps[name].data["OD0"]["target"] = round(vial.blank)
+            self.apps[name].data["OD0"]["target"] = round(vial.spectrometer.blank)
 
     @property
     def apps(self) -> dict[str, ReactorApp]:

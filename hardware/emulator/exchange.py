@@ -14,8 +14,9 @@ Answer = tuple[int, bytes, dict[str, str]]  # status, body, headers
 class Exchange:
     """One request and what became of it.
 
-    `answer` is (status, body, headers); `fate` is "" while open or answered, else "refused" (nobody listens), "reset"
-    (connection broken) or "lost" (silence until the client's time-out). `cut` is how many body bytes to leave out.
+    `answer` is (status, body, headers). `fate` says how it ended without one: "refused" (nobody listens), "reset"
+    (connection broken) or "lost" (silence until the client's time-out), else "". `cut` is how many body bytes to leave
+    out.
     """
 
     method: str

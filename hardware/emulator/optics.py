@@ -25,7 +25,7 @@ class Optics:
     def expose(self, seconds: float) -> Generator[float, None, int]:
         """Laser on, one reading, laser off; counts. Another thread that measures at the same time spoils it."""
         yield from self._outputs.set_on("LASER650", 1)
-        self._position.hardware().begin_exposure(self._position.computer.now())
+        self._position.hardware().spectrometer.begin_exposure(self._position.computer.now())
         yield seconds
         raw = self._position.hardware().counts(self._position.computer.now(), seconds)
         yield from self._outputs.set_on("LASER650", 0)

@@ -48,15 +48,17 @@ class Outputs:
 
         Raises: AppError for an item that drives nothing; its flag is set by then.
         """
-        output = self._position.data[item]
+        output, now = self._position.data[item], self._position.computer.now()
         if item == "Stir":
             yield from self._stir()
         elif item == "Heat":
-            self._position.hardware().set_heat(float(output["target"] * output["ON"]), self._position.computer.now())
+            self._position.hardware().set_heat(float(output["target"] * output["ON"]), now)
         elif item in LIGHTS or item == "UV":
             self._position.hardware()
         elif item == "LASER650":
-            self._position.hardware().set_laser(output["target"] * output["ON"] > 0, self._position.computer.now())
+            self._position.hardware().spectrometer.set_laser(
+                output["target"] * output["ON"] > 0, self._position.computer.now()
+            )
         elif item == "Thermostat":
             self._start_thermostat()
         elif item in PUMPS:
@@ -90,7 +92,7 @@ class Outputs:
         vial, now = self._position.hardware(), self._position.computer.now()
         for pump in PUMPS:
             vial.drive(pump, 0, now)
-        vial.set_laser(False, now)
+        vial.spectrometer.set_laser(False, now)
         yield BUS_S
         for item in ("Stir", "Thermostat", "Heat", "UV", *PUMPS):
             yield from self.set_on(item, 0)

@@ -8,7 +8,7 @@ from hardware.emulator.computer import AppError
 from hardware.emulator.events import Steps
 from hardware.emulator.position import Position
 from hardware.emulator.sysdata import PUMPS
-from hardware.emulator.vial import VialConfig
+from hardware.emulator.vial_config import VialConfig
 
 __all__ = ["PERIOD_FACTOR", "PumpOutputs"]
 

@@ -1,7 +1,7 @@
 """What the device's software does for one reactor.
 
 Every activity that the device runs in a thread, or that makes a caller wait, is a generator that yields the seconds it
-sleeps; `device` runs them on device time. Races between threads of the real software are therefore the same races
+sleeps; `ChiBioDevice` runs them on device time. Races between threads of the real software are therefore the same races
 between generators. Source: chibio.md sections 2 to 6, checked against runs of the real software described there.
 """
 

@@ -30,7 +30,7 @@ from hardware.emulator.device import ChiBioDevice, DeviceOptions
 from hardware.emulator.exchange import Exchange
 from hardware.emulator.faults import FAULTS, inject
 from hardware.emulator.plants import plant_preset
-from hardware.emulator.vial import SPARE, VialConfig
+from hardware.emulator.vial_config import SPARE, VialConfig
 
 __all__ = ["EmulatorServer", "main"]
 
@@ -174,7 +174,7 @@ class _DevicePort(HTTPServer):
             connection.close()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A client that goes away is no business of the server."""
+        """A client that goes away is not an error of the server."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 

@@ -281,7 +281,7 @@ def test_zigzag_is_refused_with_the_remedy() -> None:
 
 def test_a_stored_blank_replaces_the_devices() -> None:
     bed = Bed(blanked=False)
-    rig = Rig(SOUND.feed, SOUND.waste, blank=bed.device.vials["M0"].blank)
+    rig = Rig(SOUND.feed, SOUND.waste, blank=bed.device.vials["M0"].spectrometer.blank)
     bed.reactors = ChiBioReactors(bed.wire, bed.clock, bed.config, [rig], bed.log)
     bed.reactors.begin()
     bed.run(3)

@@ -5,6 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from conf import schema
+from conf.presets import groups, load
+from envs.plant.plant import PlantConfig
+from hardware.chibio.config import EmulatorConfig
 from hardware.emulator.faults import inject
 from hardware.emulator.server import build, parser
 from tests.hardware.emulator_lab import BIAS_S, START_S, STOP_S, Lab, quiet
@@ -78,6 +82,14 @@ def test_the_delay_is_an_option_of_the_program() -> None:
     for arguments, expected in (([], (0.2, 0.7)), (["--pump-start", "0.1", "3"], (0.1, 3.0))):
         vial = build(parser().parse_args(arguments)).options.vial
         assert (vial.pump_start_low_s, vial.pump_start_high_s) == expected
+
+
+@pytest.mark.parametrize("name", groups()["plant"])
+def test_the_emulated_plant_is_the_preset_dosed_in_pulses(name: str) -> None:
+    preset = schema.build(PlantConfig(), load(f"plant/{name}"), "plant")
+    device = build(parser().parse_args(["--plant", name]))
+    assert device.vials["M0"].plant.config == replace(preset, pump=replace(preset.pump, dosing="pulse"))
+    assert EmulatorConfig(plant=name).plant == name
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.1, 0.7), (0.5, 0.2), (0.0, 9.0)])

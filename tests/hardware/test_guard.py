@@ -15,7 +15,7 @@ from hardware.chibio.resume import replay
 from hardware.emulator.device import DeviceOptions
 from hardware.emulator.plants import plant_preset
 from hardware.emulator.server import build, parser
-from hardware.emulator.vial import VialConfig
+from hardware.emulator.vial_config import VialConfig
 from hardware.errors import DeviceStateError
 from tests.hardware.driver_lab import Bed
 from tests.hardware.script import state
