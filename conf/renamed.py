@@ -1,25 +1,23 @@
-"""Keys of earlier versions: what they are called now, or why they are gone."""
+"""Names of keys and options that changed: whoever uses an old one is told the new one in a line."""
 
 from __future__ import annotations
 
 __all__ = ["REMOVED", "RENAMED"]
 
-RENAMED: dict[str, str] = {
+RENAMED: dict[str, str] = {  # old dotted key, or group=option, or key=choice -> the new one
     "agent.action_smoothness": "agent.output_basis_decay",
     "agent.relabel": "agent.hindsight_share",
     "agent.relabel_near": "agent.hindsight_near",
     "agent.relabel_width": "agent.hindsight_width",
+    "plant.pump.guard_ml_s": "plant.pump.overflow_ml_s",
+    "plant.vessel.guard_above_ml": "plant.vessel.overflow_above_ml",
 }
-"""Full dotted key -> full dotted key."""
-
-REMOVED: dict[str, str] = {
+REMOVED: dict[str, str] = {  # old dotted key -> why, and what to use instead
     "agent.adam_beta2": "it is the published 0.999",
     "agent.adam_eps": "it is the published 1e-8",
     "agent.average": "the last weights act",
     "agent.double": "the target is the plain maximum",
-    "agent.init_mirror": "every unit is drawn",
     "agent.learning_rate_decay": "the rate is constant",
     "agent.relabel_margin": "new goals lie between the task's lowest and highest setpoint",
     "agent.target_blend": "the target network is always a copy",
 }
-"""Full dotted key -> reason."""

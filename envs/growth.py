@@ -16,12 +16,11 @@ __all__ = [
     "REFERENCE_TEMPERATURE",
     "Arrhenius",
     "Cardinal",
-    "Culture",
+    "DilutedCulture",
     "Exponential",
     "GrowthLaw",
     "Monod",
-    "Ratkowsky",
-    "Thermal",
+    "relative_to_37",
 ]
 
 Array = NDArray[np.float64]
@@ -33,12 +32,11 @@ GAS_CONSTANT = 8.314462618e-3  # kJ/(mol K)
 class GrowthLaw(Protocol):
     """Specific growth rate of suspended cells; the interface shared by training model and plant."""
 
-    def specific_rate(self, substrate: Array, temperature: Array) -> Array:
+    def specific_rate(self, substrate: Array) -> Array:
         """mu in 1/min, shape (N,).
 
         Args:
           substrate: limiting substrate relative to fresh medium (1 = fresh, 0 = exhausted), shape (N,), >= 0.
-          temperature: culture temperature in degC, shape (N,).
         Raises: nothing; parameters are checked where they are set, so the hot path stays bare.
         """
         ...
@@ -54,8 +52,8 @@ class Exponential:
 
     mu: float | Array
 
-    def specific_rate(self, substrate: Array, temperature: Array) -> Array:
-        """mu, whatever substrate and temperature are; see `GrowthLaw.specific_rate`."""
+    def specific_rate(self, substrate: Array) -> Array:
+        """mu, whatever the substrate is; see `GrowthLaw.specific_rate`."""
         return np.broadcast_to(np.asarray(self.mu, dtype=np.float64), substrate.shape)
 
 
@@ -71,7 +69,7 @@ class Monod:
     mu_max: float | Array
     k_s: float | Array
 
-    def specific_rate(self, substrate: Array, temperature: Array) -> Array:
+    def specific_rate(self, substrate: Array) -> Array:
         """Monod's rate; see `GrowthLaw.specific_rate`."""
         return np.asarray(self.mu_max * substrate / (self.k_s + substrate))
 
@@ -89,26 +87,6 @@ class Arrhenius:
     def __call__(self, temperature: Array) -> Array:
         """phi(T), not normalised, shape of `temperature` (degC)."""
         return np.exp(-self.activation_kj_mol / (GAS_CONSTANT * (temperature + 273.15)))
-
-
-@dataclass(frozen=True)
-class Ratkowsky:
-    """phi(T) = [(T - t_min) (1 - exp(c (T - t_max)))]^2 between t_min and t_max, else 0 (Ratkowsky 1983).
-
-    Args:
-      t_min, t_max: degC at which growth stops.
-      c: 1/degC, steepness of the fall near t_max.
-    """
-
-    t_min: float = 6.5
-    t_max: float = 47.5
-    c: float = 0.3
-
-    def __call__(self, temperature: Array) -> Array:
-        """phi(T), not normalised, shape of `temperature` (degC)."""
-        bracket = 1.0 - np.exp(self.c * (temperature - self.t_max))
-        root = (temperature - self.t_min) * bracket
-        return np.where((temperature > self.t_min) & (temperature < self.t_max), root**2, 0.0)
 
 
 @dataclass(frozen=True)
@@ -135,30 +113,18 @@ class Cardinal:
         return np.where(inside, (t - self.t_max) * (t - self.t_min) ** 2 / (span * low), 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Thermal:
-    """Any growth law times the temperature response phi(T) / phi(37 degC).
-
-    Args:
-      law: growth law quoted at 37 degC.
-      response: phi(T), degC -> relative rate.
-    """
-
-    law: GrowthLaw
-    response: Callable[[Array], Array]
-
-    def specific_rate(self, substrate: Array, temperature: Array) -> Array:
-        """mu(s, 37) phi(T)/phi(37); see `GrowthLaw.specific_rate`."""
-        reference = self.response(np.asarray(REFERENCE_TEMPERATURE))
-        return self.law.specific_rate(substrate, temperature) * self.response(temperature) / reference
+def relative_to_37(response: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """phi(T) / phi(37 degC): a response by which a rate quoted at 37 degC may be multiplied."""
+    reference = response(np.asarray(REFERENCE_TEMPERATURE))
+    return lambda temperature: response(temperature) / reference
 
 
 @dataclass(frozen=True, eq=False)
-class Culture:
+class DilutedCulture:
     """Mass balances of a diluted culture with state [x, s]: OD and relative substrate.
 
-    x' = (mu(s, T) - u/tau) x
-    s' = (u/tau) (1 - s) - mu(s, T) x / yield_od
+    x' = (mu(s) - u/tau) x
+    s' = (u/tau) (1 - s) - mu(s) x / yield_od
 
     The first line with `Exponential` is equation (5) of the paper; the second is the chemostat's substrate
     balance (Monod 1950) in units of fresh medium.
@@ -173,16 +139,15 @@ class Culture:
     tau: float | Array
     yield_od: float | Array = np.inf
 
-    def derivative(self, state: Array, pump_rate: Array, temperature: Array) -> Array:
+    def derivative(self, state: Array, pump_rate: Array) -> Array:
         """d[x, s]/dt in 1/min.
 
         Args:
           state: [x, s], shape (N, 2).
           pump_rate: u, mL/s, shape (N,), >= 0.
-          temperature: degC, shape (N,).
         Returns: shape (N, 2). Raises: nothing.
         """
         x, s = state[:, 0], state[:, 1]
-        mu = self.law.specific_rate(s, temperature)
+        mu = self.law.specific_rate(s)
         dilution = pump_rate / self.tau
         return np.stack([(mu - dilution) * x, dilution * (1.0 - s) - mu * x / self.yield_od], axis=1)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.actions import MAX_PUMP_RATE, pump_rates
-from envs.growth import REFERENCE_TEMPERATURE, Culture, Exponential
+from envs.growth import DilutedCulture, Exponential
 from envs.integrators import INTEGRATORS
 
 __all__ = ["EnvConfig", "step_factors"]
@@ -81,9 +81,8 @@ def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
     """
     u = config.pump_rates() if rates is None else np.asarray(rates, dtype=np.float64)
     flat = u.reshape(-1)
-    culture = Culture(Exponential(config.mu), config.tau)
-    temperature = np.full(flat.shape, REFERENCE_TEMPERATURE)
+    culture = DilutedCulture(Exponential(config.mu), config.tau)
     unit = np.ones((flat.size, 2))
     advance = INTEGRATORS[config.integrator]
-    end = advance(lambda y: culture.derivative(y, flat, temperature), unit, config.control_min, config.substeps)
+    end = advance(lambda y: culture.derivative(y, flat), unit, config.control_min, config.substeps)
     return end[:, 0].reshape(u.shape)

@@ -142,7 +142,7 @@ def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any
         meter.samples += int(step.rows.sum())
         meter.alarms += sum(reason is not None for reason in step.reasons)
         for n in np.flatnonzero(step.rows & (step.elapsed % config.phase_min > 20.0)):
-            meter.errors.append(abs(float(r.device.benches[names[n]].plant.od[0]) - float(step.setpoint[n])))
+            meter.errors.append(abs(float(r.device.vials[names[n]].plant.culture.od[0]) - float(step.setpoint[n])))
         if r.clock.now() >= mark:
             _collect(r, doses, samples)
             days.append(meter.take(part))
@@ -159,11 +159,11 @@ def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any
 
 def _collect(r: Rehearsal, doses: Times, samples: Times) -> None:
     """Move out of the emulator what it would forget after 5000: when the feed pump began, when a sample was stored."""
-    for name, bench in r.device.benches.items():
-        doses[name].extend(dose.start_s for dose in bench.doses if dose.pump == "Pump1")
-        samples[name].extend(sample.stored_s for sample in bench.samples)
-        bench.doses.clear()
-        bench.samples.clear()
+    for name, vial in r.device.vials.items():
+        doses[name].extend(dose.start_s for dose in vial.doses if dose.pump == "Pump1")
+        samples[name].extend(sample.stored_s for sample in vial.samples)
+        vial.doses.clear()
+        vial.samples.clear()
 
 
 def _audit(r: Rehearsal, doses: Times, samples: Times) -> dict[str, Any]:

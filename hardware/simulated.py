@@ -71,7 +71,7 @@ class SimulatedReactors:
         return Measurement(
             time_s=np.full(self.plant.n, self.elapsed()),
             od=self.plant.read_od(),
-            temperature=self.plant.read_temperature(),
+            temperature=self.plant.thermal.read(),
             fresh=np.ones(self.plant.n, dtype=np.bool_),
         )
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.actions import MAX_PUMP_RATE, pump_rates
-from envs.growth import Culture, Exponential
+from envs.growth import DilutedCulture, Exponential
 from envs.integrators import rk4
 
 __all__ = ["OpenLoop", "open_loop"]
@@ -72,8 +72,8 @@ class OpenLoop:
 def open_loop(config: OpenLoop, rng: np.random.Generator, n: int = 1) -> tuple[Array, Array, Array]:
     """N recordings of the same experiment with their own noise and their own random pump rates.
 
-    The culture is `Culture(Exponential(mu), tau)` of envs.growth, integrated by RK4 in steps of 0.1 min (error below
-    1e-10, so that the truth is mu and tau and not an integrator's); decisions are taken on the noisy readings.
+    The culture is `DilutedCulture(Exponential(mu), tau)` of envs.growth, integrated by RK4 in steps of 0.1 min (error
+    below 1e-10, so that the truth is mu and tau and not an integrator's); decisions are taken on the noisy readings.
 
     Args:
       config: protocol, culture and sensor.
@@ -84,9 +84,8 @@ def open_loop(config: OpenLoop, rng: np.random.Generator, n: int = 1) -> tuple[A
     """
     rows = round(60.0 * config.hours / config.control_min) + 1
     time = config.control_min * np.arange(rows, dtype=np.float64)
-    culture = Culture(Exponential(config.mu), config.tau)
+    culture = DilutedCulture(Exponential(config.mu), config.tau)
     state = np.stack([np.full(n, config.start_od), np.ones(n)], axis=1)
-    temperature = np.full(n, 37.0)
     substeps = max(1, round(config.control_min / 0.1))
     measured, applied = np.empty((n, rows)), np.empty((n, rows))
     error = rng.standard_normal(n)
@@ -98,7 +97,7 @@ def open_loop(config: OpenLoop, rng: np.random.Generator, n: int = 1) -> tuple[A
         rate = applied[:, i] = protocol.decide(float(t), measured[:, i], rng)
 
         def derivative(y: Array, u: Array = rate) -> Array:
-            return culture.derivative(y, u, temperature)
+            return culture.derivative(y, u)
 
         state = rk4(derivative, state, config.control_min, substeps)
     return time, measured, applied

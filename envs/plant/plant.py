@@ -6,138 +6,22 @@ everything real is switched off (the defaults of `PlantConfig`). Units: min, mL,
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.growth import REFERENCE_TEMPERATURE, Arrhenius, Cardinal, Exponential, GrowthLaw, Monod, Ratkowsky
 from envs.integrators import INTEGRATORS
-from envs.plant.noise import Streams, Tape, check_ranges, spread, streams
+from envs.plant.culture import Culture, GrowthConfig
+from envs.plant.noise import Streams, Tape, check_ranges, streams
 from envs.plant.pump import FeedPump, PumpConfig
 from envs.plant.sensor import OdSensor, SensorConfig
+from envs.plant.thermal import Thermal, ThermalConfig
+from envs.plant.vessel import Vessel, VesselConfig
 
-__all__ = ["GrowthConfig", "Plant", "PlantConfig", "PumpConfig", "SensorConfig", "ThermalConfig", "VesselConfig"]
+__all__ = ["Plant", "PlantConfig"]
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-MIN_VOLUME_ML = 1.0  # mL, what no pump can take out of a vial; keeps concentrations finite
-SETTLED_FRACTION = 0.08  # of the OD lost from the light path when the stirrer stands still (docs/biology.md, Stirring)
-SETTLING_MIN = 1.5  # min, so that it is lost within about three readings (docs/biology.md, Stirring)
-UNSTIRRED_GROWTH = 0.5  # relative growth without stirring (docs/biology.md, Stirring)
-
-TEMPERATURE_LAWS = ("none", "arrhenius", "ratkowsky", "cardinal")
-
-GROWTH_RANGES = {
-    "mu": (0.0, 0.1, "1/min"),
-    "mu_cv": (0.0, 0.3, ""),
-    "drift_sd_per_h": (0.0, 0.2, "1/sqrt(h)"),
-    "ramp_per_h": (-0.5, 0.5, "1/h"),
-    "activation_kj_mol": (0.0, 150.0, "kJ/mol"),
-    "adaptation_min": (0.0, 120.0, "min"),
-    "yield_od": (0.5, np.inf, "OD"),
-    "k_s": (1e-4, 1.0, ""),
-    "wall_attach_per_min": (0.0, 1e-2, "1/min"),
-    "wall_growth_ratio": (0.0, 1.0, ""),
-    "wall_detach_per_min": (0.0, 0.1, "1/min"),
-    "wall_capacity_od": (1e-3, 10.0, "OD"),
-}
-
-
-@dataclass(frozen=True)
-class GrowthConfig:
-    """How cells grow; the defaults are the training model's.
-
-    mu, mu_cv: specific growth rate in fresh medium at 37 degC, 1/min, mean and spread between cultures.
-    drift_sd_per_h: sd after one hour of the random walk of ln mu.
-    ramp_per_h: relative change of mu per hour (burden, pH, oxygen).
-    temperature_law: none | arrhenius | ratkowsky | cardinal, all 1 at 37 degC; see envs/growth.py.
-    activation_kj_mol: Ea of the Arrhenius law, kJ/mol.
-    adaptation_min: time constant with which growth follows temperature, min; 0 = at once.
-    yield_od: OD that one fill of fresh medium can grow; inf = substrate never runs out.
-    k_s: relative substrate at half rate (Monod); used when yield_od is finite.
-    wall_attach_per_min, wall_detach_per_min: exchange of biomass with the wall, 1/min.
-    wall_growth_ratio: growth rate on the wall over that in suspension; wall_capacity_od: where it saturates.
-    """
-
-    mu: float = 0.03
-    mu_cv: float = 0.0
-    drift_sd_per_h: float = 0.0
-    ramp_per_h: float = 0.0
-    temperature_law: str = "none"
-    activation_kj_mol: float = 56.0
-    adaptation_min: float = 0.0
-    yield_od: float = float("inf")
-    k_s: float = 0.1
-    wall_attach_per_min: float = 0.0
-    wall_growth_ratio: float = 0.0
-    wall_detach_per_min: float = 0.0
-    wall_capacity_od: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "plant.growth", GROWTH_RANGES)
-        if self.temperature_law not in TEMPERATURE_LAWS:
-            raise ValueError(
-                f"plant.growth.temperature_law = {self.temperature_law}: allowed {', '.join(TEMPERATURE_LAWS)}"
-            )
-
-
-@dataclass(frozen=True)
-class VesselConfig:
-    """The vial and its bottle.
-
-    volume_ml, volume_sd_ml: culture up to the waste tube, mean and spread between vials.
-    guard_above_ml: an overflow guard's tube, if there is one, ends so far above the waste tube.
-    capacity_ml: where it overflows.
-    evaporation_ml_day: water lost.
-    media_ml: fresh medium in the bottle; inf = never empty.
-    """
-
-    volume_ml: float = 20.0
-    volume_sd_ml: float = 0.0
-    guard_above_ml: float = 2.0
-    capacity_ml: float = 30.0
-    evaporation_ml_day: float = 0.0
-    media_ml: float = float("inf")
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "volume_ml": (5.0, 50.0, "mL"),
-            "volume_sd_ml": (0.0, 1.5, "mL"),
-            "guard_above_ml": (0.0, 10.0, "mL"),
-            "capacity_ml": (self.volume_ml + 4.5, 200.0, "mL"),
-            "evaporation_ml_day": (0.0, 50.0, "mL/day"),
-            "media_ml": (0.0, np.inf, "mL"),
-        }
-        check_ranges(self, "plant.vessel", ranges)
-
-
-@dataclass(frozen=True)
-class ThermalConfig:
-    """Heater and surroundings: heating is active and fast, cooling passive and slow.
-
-    ambient_c: temperature the vial cools to; cooling_min: time constant of it, min.
-    heating_c_per_min: fastest rise of a heated vial; medium_c: temperature of fresh medium.
-    ripple_c: sd of the temperature reading.
-    """
-
-    ambient_c: float = 24.0
-    cooling_min: float = 39.0
-    heating_c_per_min: float = 2.0
-    medium_c: float = 24.0
-    ripple_c: float = 0.0
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "ambient_c": (0.0, 45.0, "degC"),
-            "cooling_min": (1.0, 600.0, "min"),
-            "heating_c_per_min": (0.1, 10.0, "degC/min"),
-            "medium_c": (0.0, 45.0, "degC"),
-            "ripple_c": (0.0, 2.0, "degC"),
-        }
-        check_ranges(self, "plant.thermal", ranges)
 
 
 @dataclass(frozen=True)
@@ -163,42 +47,16 @@ class PlantConfig:
             raise ValueError(f"plant.integrator = {self.integrator}: allowed {', '.join(INTEGRATORS)}")
 
 
-def _response(config: GrowthConfig) -> Callable[[Array], Array]:
-    """phi(T) / phi(37 degC) of the configured temperature law."""
-    laws: dict[str, Callable[[Array], Array]] = {
-        "none": np.ones_like,
-        "arrhenius": Arrhenius(config.activation_kj_mol),
-        "ratkowsky": Ratkowsky(),
-        "cardinal": Cardinal(),
-    }
-    phi = laws[config.temperature_law]
-    reference = phi(np.asarray(REFERENCE_TEMPERATURE))
-    return lambda temperature: phi(temperature) / reference
-
-
-def _moved(on_s: Array, flow: Array) -> Array:
-    """Volume a pump of `flow` mL/s could move, mL, shape (N,): nothing backwards, nothing if it is blocked."""
-    able = np.zeros_like(flow)  # a blocked pump moves nothing, however long it runs (0 times infinity is 0 here)
-    return np.multiply(np.maximum(on_s, 0.0), flow, out=able, where=flow > 0.0)
-
-
 class Plant:
-    """N vials, advanced together.
+    """N vials, advanced together: parts `culture`, `vessel`, `thermal`, `feed` (the pump) and `sensor`.
 
-    Suspended biomass x, relative substrate s and wall biomass w (both in OD or relative to fresh medium):
-
-      x' = (m - D) x - ka x + kd w        s' = D (1 - s) - m x / Y        w' = ka x + r m w (1 - w/W) - kd w
-      m  = mu(s) phi(T) (times drift, stirring and `mu_factor`),          D = fresh medium per minute / V
-
-    With `dosing = pulse` the dose enters at the start of an interval: x <- x F, s <- 1 - (1 - s) F, and D = 0 after it;
-    F = exp(-v/V) for what feed and waste pump exchange at constant volume, V/(V + v) for what stays in the vial.
-    Volume: the waste pump lowers V to its tube, never below; what it does not take raises V up to the rim, where
-    `overflowed` is set. An overflow guard is a second such outlet a little higher. Source of the terms and numbers:
-    docs/biology.md.
+    With `dosing = pulse` the dose enters at the start of an interval: x <- x F, s <- 1 - (1 - s) F, and the dilution
+    rate is 0 after it; F = exp(-v/V) for what feed and waste pump exchange at constant volume, V/(V + v) for what stays
+    in the vial. Source of the terms and numbers: docs/biology.md.
 
     What is drawn once (growth rate, pump flow, optics, tube height) is drawn here, recorded in `draws`, and stays over
     `reset`: a reset is a new culture in the same reactor. Process noise is drawn per minute of plant time and sensor
-    noise per reading, from one stream per vial, so neither depends on what the pumps are told, and vial i is the same
+    noise per reading, from one stream per vial. Neither depends on the pump commands, and vial i is the same
     whatever N is.
 
     Args:
@@ -207,12 +65,8 @@ class Plant:
       rng: a generator, from which one stream per vial is spawned, or a sequence of n generators.
     Raises: ValueError for n < 1 or a sequence of another length.
 
-    State, shape (N,): `od` (true suspended biomass), `substrate`, `wall`, `volume_ml`, `temperature`,
-    `temperature_target`, `media_ml` (fresh medium delivered since reset), `overflowed`; `minutes` since reset.
-    Fault switches, shape (N,), may be set at any time and stay until set again: `mu_factor`, `stir_factor` (1 turning,
-    0 stopped; for a stirrer that fails, not for the still phase of each cycle), `waste_gain_factor`,
-    `guard_gain_factor`, and through the parts `pump_gain_factor`, `back_leak_ml`, `media_left_ml`, `sensor_frozen`,
-    `sensor_offset`.
+    State and fault switches are arrays of shape (N,) in the parts. A switch may be set at any time and stays until it
+    is set again. `minutes` is the time since reset.
     """
 
     def __init__(self, config: PlantConfig, n: int, rng: np.random.Generator | Streams) -> None:
@@ -221,25 +75,20 @@ class Plant:
         self.config, self.n = config, n
         parts = [r.spawn(3) for r in streams(rng, n)]
         once, process, reading = ([p[k] for p in parts] for k in range(3))
-        mu = spread(once, config.growth.mu, config.growth.mu_cv)
-        self._tube_ml = spread(once, config.vessel.volume_ml, config.vessel.volume_sd_ml / config.vessel.volume_ml)
+        # The parts draw from the same streams: their order belongs to what a seed means.
+        self.culture = Culture(config.growth, once, INTEGRATORS[config.integrator], config.substep_min)
+        self.vessel = Vessel(config.vessel, config.pump, once)
         self.feed = FeedPump(config.pump, once)
         self.sensor = OdSensor(config.sensor, once, reading)
-        self.feed.media_left_ml = np.full(n, config.vessel.media_ml)
+        self.thermal = Thermal(config.thermal, n)
+        self.feed.media_left_ml[:] = config.vessel.media_ml
         self.draws: dict[str, Array] = {
-            "mu": mu,
-            "volume_ml": self._tube_ml,
+            **self.culture.draws,
+            **self.vessel.draws,
             **self.feed.draws,
             **self.sensor.draws,
         }
-        g = config.growth
-        # Quoted for fresh medium: Monod's rate at s = 1 is mu_max / (1 + k_s).
-        self._law: GrowthLaw = Exponential(mu) if np.isinf(g.yield_od) else Monod(mu * (1.0 + g.k_s), g.k_s)
-        self._phi = _response(g)
-        self._integrate = INTEGRATORS[config.integrator]
         self._tape = Tape(process, normals=3, uniforms=2)
-        self.mu_factor, self.stir_factor = np.ones(n), np.ones(n)
-        self.waste_gain_factor, self.guard_gain_factor = np.ones(n), np.ones(n)
         self.reset()
 
     def reset(self, od: Array | float | None = None, temperature: float = 37.0) -> None:
@@ -253,21 +102,13 @@ class Plant:
         start = np.asarray(self.config.start_od if od is None else od, dtype=np.float64)
         if not np.all(start >= 0.0):
             raise ValueError(f"start OD = {start}: allowed >= 0")
-        n = self.n
-        self.od: Array = np.broadcast_to(start, (n,)).copy()
-        self.substrate: Array = np.maximum(1.0 - self.od / self.config.growth.yield_od, 0.0)
-        self.wall: Array = np.zeros(n)
-        self.volume_ml: Array = self._tube_ml.copy()
-        self.temperature: Array = np.full(n, float(temperature))
-        self.temperature_target: Array = np.full(n, float(temperature))
-        self.media_ml: Array = np.zeros(n)
-        self.overflowed: Mask = np.zeros(n, dtype=bool)
-        self.minutes = 0.0
-        self._adapted = self._phi(self.temperature)
-        self._log_drift, self._settled, self._ripple = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._minute = -1
+        self.thermal.reset(temperature)
+        self.culture.reset(start, self.thermal.temperature)
+        self.vessel.reset()
         self.feed.reset()
         self.sensor.reset()
+        self.minutes = 0.0
+        self._minute = -1
 
     def advance(
         self,
@@ -275,7 +116,7 @@ class Plant:
         feed_s: Array,
         waste_s: Array | None = None,
         temperature_target: Array | float | None = None,
-        guard_s: Array | float = 0.0,
+        overflow_s: Array | float = 0.0,
     ) -> None:
         """Run pumps, growth and heater for an interval of any length; long ones are cut into minutes.
 
@@ -286,128 +127,53 @@ class Plant:
           waste_s: on-time of the waste pump, s, same shape, beside the feed; None = as much as is needed.
             Negative blows air and changes nothing.
           temperature_target: thermostat, degC, scalar or shape (N,); None or nan leaves it, 0 is off.
-          guard_s: on-time of the overflow guard's pump, s, as `waste_s`; 0 = there is none.
+          overflow_s: on-time of the overflow pump, s, as `waste_s`; 0 = there is none.
         Raises: ValueError for an interval not positive or an on-time not finite.
         """
         if not (minutes > 0.0 and np.isfinite(minutes)):
             raise ValueError(f"interval = {minutes} min: allowed > 0")
         feed = np.broadcast_to(np.asarray(feed_s, dtype=np.float64), (self.n,))
         waste = np.full(self.n, np.inf) if waste_s is None else np.broadcast_to(waste_s, (self.n,))
-        guard = np.broadcast_to(np.asarray(guard_s, dtype=np.float64), (self.n,))
-        if not np.all(np.isfinite(feed)) or np.any(np.isnan(waste + guard)):
-            raise ValueError(f"pump on-time = feed {feed} s, waste {waste} s, guard {guard} s: allowed finite numbers")
+        above = np.broadcast_to(np.asarray(overflow_s, dtype=np.float64), (self.n,))
+        if not np.all(np.isfinite(feed)) or np.any(np.isnan(waste + above)):
+            raise ValueError(
+                f"pump on-time = feed {feed} s, waste {waste} s, overflow {above} s: allowed finite numbers"
+            )
         if temperature_target is not None:
-            target = np.broadcast_to(np.asarray(temperature_target, dtype=np.float64), (self.n,))
-            self.temperature_target = np.where(np.isnan(target), self.temperature_target, target)
+            self.thermal.set_target(temperature_target)
         pieces = max(1, int(np.ceil(minutes - 1e-9)))
         continuous = self.config.pump.dosing == "continuous"
         for k in range(pieces):
             share = 1.0 / pieces if continuous else float(k == 0)
-            outlets = (waste * share, guard * share) if share else (np.zeros(self.n), np.zeros(self.n))
+            outlets = (waste * share, above * share) if share else (np.zeros(self.n), np.zeros(self.n))
             self._advance_piece(minutes / pieces, feed * share, *outlets)
 
-    def _advance_piece(self, minutes: float, feed_s: Array, waste_s: Array, guard_s: Array) -> None:
+    def _advance_piece(self, minutes: float, feed_s: Array, waste_s: Array, overflow_s: Array) -> None:
         """At most one minute: this minute's draws, doses, heat, growth, evaporation."""
-        self._catch_up()
+        self._draw_minutes()
+        volume = self.vessel.volume_ml
         fresh = self.feed.deliver(np.maximum(feed_s, 0.0), minutes, self.minutes)
-        self.media_ml = self.media_ml + fresh
-        volume = self.volume_ml
-        kept = self._exchange(fresh, waste_s, guard_s)
-        drawn = self.draws["pump_gain_ml_s"] * self.feed.gain_factor * np.maximum(-feed_s, 0.0)
-        self.volume_ml = np.maximum(self.volume_ml - drawn, MIN_VOLUME_ML)
+        kept = self.vessel.exchange(fresh, waste_s, overflow_s)
+        self.vessel.draw_out(self.feed.drawn_back(np.maximum(-feed_s, 0.0)))
         if self.config.pump.dosing == "pulse":
-            self.od, self.substrate = self.od * kept, 1.0 - (1.0 - self.substrate) * kept
+            self.culture.dilute(kept)
             dilution = np.zeros(self.n)
         else:
             dilution = fresh / volume / minutes
-        self._heat(minutes, kept)
-        self._grow(minutes, dilution)
-        lost = self.config.vessel.evaporation_ml_day * minutes / 1440.0
-        left = np.maximum(self.volume_ml - lost, MIN_VOLUME_ML)
-        concentrated = self.volume_ml / left
-        self.od, self.substrate, self.volume_ml = self.od * concentrated, self.substrate * concentrated, left
-        self._settled += (SETTLED_FRACTION * (1.0 - self.stir_factor) - self._settled) * -np.expm1(
-            -minutes / SETTLING_MIN
-        )
+        self.thermal.advance(minutes, kept)
+        self.culture.grow(minutes, dilution, self.thermal.mean, self.minutes)
+        self.culture.concentrate(self.vessel.evaporate(minutes))
+        self.culture.settle(minutes)
         self.minutes += minutes
 
-    def _catch_up(self) -> None:
+    def _draw_minutes(self) -> None:
         """Take the draws of every minute begun since the last call."""
-        per_minute = self.config.growth.drift_sd_per_h / np.sqrt(60.0)
         while self._minute < int(np.floor(self.minutes + 1e-6)):
             (z_pump, z_mu, z_ripple), (u_timing, u_prime) = self._tape.next()
             self.feed.new_minute(z_pump, u_timing, u_prime)
-            self._log_drift = self._log_drift + per_minute * z_mu
-            self._ripple = z_ripple
+            self.culture.new_minute(z_mu)
+            self.thermal.new_minute(z_ripple)
             self._minute += 1
-
-    def _exchange(self, fresh: Array, waste_s: Array, guard_s: Array) -> Array:
-        """Move liquid; returns F, the share of what was in the vial that its concentrations keep, shape (N,).
-
-        Fresh medium fills the vial up to an outlet's tube, is exchanged there for what its pump takes, and rises on.
-        """
-        pump = self.config.pump
-        guard_ml = self._tube_ml + self.config.vessel.guard_above_ml
-        outlets = [  # from below: level of the tube, mL the pump is able to move
-            [self._tube_ml, _moved(waste_s, pump.waste_ml_s * self.waste_gain_factor)],
-            [guard_ml, _moved(guard_s, pump.guard_ml_s * self.guard_gain_factor)],
-        ]
-        level, left, kept = self.volume_ml, fresh, np.ones(self.n)
-        for outlet in outlets:
-            tube, able = outlet
-            fill = np.minimum(left, np.maximum(tube - level, 0.0))
-            swapped = np.minimum(left - fill, able)
-            kept = kept * (level / (level + fill)) * np.exp(-swapped / (level + fill))
-            level, left, outlet[1] = level + fill, left - fill - swapped, able - swapped
-        kept = kept * (level / (level + left))
-        level = level + left
-        self.overflowed = self.overflowed | (level > self.config.vessel.capacity_ml)
-        for tube, able in outlets:
-            level = np.maximum(level - able, np.minimum(tube, level))
-        self.volume_ml = np.minimum(level, self.config.vessel.capacity_ml)
-        return np.asarray(kept)
-
-    def _heat(self, minutes: float, kept: Array) -> None:
-        """Mix in the medium's temperature, cool passively, heat towards the target without overshoot."""
-        t = self.config.thermal
-        mixed = t.medium_c + (self.temperature - t.medium_c) * kept
-        cooled = t.ambient_c + (mixed - t.ambient_c) * np.exp(-minutes / t.cooling_min)
-        heated = np.minimum(self.temperature_target, cooled + t.heating_c_per_min * minutes)
-        self.temperature = np.maximum(cooled, heated)
-        # The interval's mean: a vial that is warm again early spends only a share of it on the way.
-        rise = self.temperature - mixed
-        share = np.where(rise > 0.0, np.minimum(rise / (t.heating_c_per_min * minutes), 1.0), 1.0)
-        self._mean_temperature = self.temperature - 0.5 * rise * share
-
-    def _grow(self, minutes: float, dilution: Array) -> None:
-        """Integrate x, s, w over an interval in which temperature and dilution rate are constant."""
-        g = self.config.growth
-        response = self._phi(self._mean_temperature)
-        follow = 1.0 if g.adaptation_min == 0.0 else -np.expm1(-minutes / g.adaptation_min)
-        self._adapted = self._adapted + (response - self._adapted) * follow
-        relative = self._relative_growth()
-
-        def derivative(y: Array) -> Array:
-            x, s, w = y
-            rate = self._law.specific_rate(s, self._mean_temperature) * relative
-            exchange = g.wall_attach_per_min * x - g.wall_detach_per_min * w
-            return np.stack(
-                [
-                    (rate - dilution) * x - exchange,
-                    dilution * (1.0 - s) - rate * x / g.yield_od,
-                    exchange + g.wall_growth_ratio * rate * w * (1.0 - w / g.wall_capacity_od),
-                ]
-            )
-
-        substeps = max(1, int(np.ceil(minutes / self.config.substep_min - 1e-9)))
-        state = self._integrate(derivative, np.stack([self.od, self.substrate, self.wall]), minutes, substeps)
-        self.od, self.substrate, self.wall = np.maximum(state, 0.0)
-
-    def _relative_growth(self) -> Array:
-        """What temperature, drift, stirring and `mu_factor` now make of the growth law's rate, shape (N,)."""
-        drift = np.exp(self._log_drift) * max(1.0 + self.config.growth.ramp_per_h * self.minutes / 60.0, 0.0)
-        stirred = UNSTIRRED_GROWTH + (1.0 - UNSTIRRED_GROWTH) * self.stir_factor
-        return np.asarray(self._adapted * drift * stirred * self.mu_factor)
 
     def expected_od(self, minutes: float, feed_s: Array) -> Array:
         """Suspended biomass after an interval without surprises, OD, (A, N); changes nothing.
@@ -419,71 +185,19 @@ class Plant:
           minutes: length of the interval, min, at most 1.
           feed_s: on-times of the feed pump to compare, s, shape (A, N).
         """
-        rate = self._law.specific_rate(self.substrate, self.temperature) * self._relative_growth()
-        dose = self.feed.expected(feed_s, self.minutes) / self.volume_ml
-        steps = max(1, int(np.ceil(minutes / self.config.substep_min - 1e-9)))
+        rate = self.culture.specific_rate(self.minutes)
+        dose = self.feed.expected(feed_s, self.minutes) / self.vessel.volume_ml
+        steps = self.culture.substeps(minutes)
         continuous = self.config.pump.dosing == "continuous"
         change = (rate * minutes - (dose if continuous else 0.0)) / steps
         grown = (1.0 + change) ** steps if self.config.integrator == "euler" else np.exp(steps * change)
-        return np.asarray(self.od * grown * (1.0 if continuous else np.exp(-dose)))
+        return np.asarray(self.culture.od * grown * (1.0 if continuous else np.exp(-dose)))
 
     def read_od(self) -> Array:
         """One averaged reading of every sensor, with all that is configured or switched on, OD, shape (N,)."""
-        return self.sensor.read(self._in_light_path(), self.wall, self.minutes)
-
-    def read_temperature(self) -> Array:
-        """The thermometer's value, degC, shape (N,); its ripple changes every minute."""
-        return self.temperature + self.config.thermal.ripple_c * self._ripple
+        return self.sensor.read(self.culture.in_light_path, self.culture.wall, self.minutes)
 
     @property
     def apparent_od(self) -> Array:
         """What a noise-free sensor would show now, OD, shape (N,)."""
-        return self.sensor.apparent(self._in_light_path(), self.wall, self.minutes)
-
-    def _in_light_path(self) -> Array:
-        return self.od * (1.0 - self._settled)
-
-    @property
-    def pump_gain_factor(self) -> Array:
-        """Fault switch of the feed pump: 0 blocked, 0.5 weak, 1 sound, 1.5 strong; shape (N,)."""
-        return self.feed.gain_factor
-
-    @pump_gain_factor.setter
-    def pump_gain_factor(self, value: Array) -> None:
-        self.feed.gain_factor[:] = value
-
-    @property
-    def back_leak_ml(self) -> Array:
-        """Volume that siphons back after each pulse, mL, shape (N,)."""
-        return self.feed.back_leak_ml
-
-    @back_leak_ml.setter
-    def back_leak_ml(self, value: Array) -> None:
-        self.feed.back_leak_ml[:] = value
-
-    @property
-    def media_left_ml(self) -> Array:
-        """Fresh medium left in the bottle, mL, shape (N,)."""
-        return self.feed.media_left_ml
-
-    @media_left_ml.setter
-    def media_left_ml(self, value: Array) -> None:
-        self.feed.media_left_ml[:] = value
-
-    @property
-    def sensor_frozen(self) -> Mask:
-        """True where the sensor repeats its last value, shape (N,)."""
-        return self.sensor.frozen
-
-    @sensor_frozen.setter
-    def sensor_frozen(self, value: Mask) -> None:
-        self.sensor.frozen[:] = value
-
-    @property
-    def sensor_offset(self) -> Array:
-        """OD added to every reading, shape (N,)."""
-        return self.sensor.extra_offset
-
-    @sensor_offset.setter
-    def sensor_offset(self, value: Array) -> None:
-        self.sensor.extra_offset[:] = value
+        return self.sensor.apparent(self.culture.in_light_path, self.culture.wall, self.minutes)

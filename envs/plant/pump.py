@@ -26,7 +26,7 @@ RANGES = {
     "prime_low": (0.0, 1.0, ""),
     "prime_high": (0.0, 1.0, ""),
     "waste_ml_s": (0.05, 5.0, "mL/s"),
-    "guard_ml_s": (0.05, 5.0, "mL/s"),
+    "overflow_ml_s": (0.05, 5.0, "mL/s"),
     "back_leak_ml": (0.0, 1.0, "mL"),
 }
 
@@ -44,7 +44,7 @@ class PumpConfig:
     min_pulse_s: pulses shorter than this deliver nothing.
     timing_error_s: each pulse lasts longer by a uniform draw from 0 to this.
     prime_idle_min, prime_low, prime_high: after more idle minutes than this, a pulse delivers only a fraction between.
-    waste_ml_s, guard_ml_s: flow of the waste pump and of the overflow guard's pump at full power.
+    waste_ml_s, overflow_ml_s: flow of the waste pump and of the overflow pump at full power.
     back_leak_ml: volume that siphons back after each pulse.
     """
 
@@ -61,7 +61,7 @@ class PumpConfig:
     prime_low: float = 1.0
     prime_high: float = 1.0
     waste_ml_s: float = 1.0
-    guard_ml_s: float = 1.0
+    overflow_ml_s: float = 1.0
     back_leak_ml: float = 0.0
 
     def __post_init__(self) -> None:
@@ -91,7 +91,8 @@ class FeedPump:
 
     Args:
       config: what is wrong with them; rngs: one stream per vial.
-    `gain_factor` and `back_leak_ml`, shape (N,), are fault switches; `media_left_ml` is what the bottle still holds.
+    `gain_factor` and `back_leak_ml`, shape (N,), are fault switches; `media_left_ml` is what the bottle still
+    holds, `delivered_ml` the fresh medium delivered since reset.
     """
 
     def __init__(self, config: PumpConfig, rngs: Streams) -> None:
@@ -106,6 +107,7 @@ class FeedPump:
     def reset(self) -> None:
         """Primed and at rest."""
         n = self.gain_factor.size
+        self.delivered_ml: Array = np.zeros(n)
         self._idle_min = np.zeros(n)
         self._noise = np.zeros(n)
         self._timing, self._prime, self._pulse_prime = np.zeros(n), np.ones(n), np.ones(n)
@@ -159,6 +161,11 @@ class FeedPump:
         dose = np.where(pulsing, np.clip(dose, 0.0, self.media_left_ml), 0.0)
         self._dosed_ml = self._dosed_ml + dose
         self.media_left_ml -= dose
+        self.delivered_ml = self.delivered_ml + dose
         self._idle_min = np.where(pulsing, 0.0, self._idle_min + minutes)
         self._running = pulsing & (on_s >= 60.0 * minutes - 1e-9)
         return np.asarray(dose)
+
+    def drawn_back(self, on_s: Array) -> Array:
+        """Volume that running backward for `on_s` s, shape (N,), draws out of the vial, mL."""
+        return np.asarray(self.draws["pump_gain_ml_s"] * self.gain_factor * on_s)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from envs.plant.noise import Streams, Tape, check_ranges, spread, uniform
 
-__all__ = ["OdSensor", "SensorConfig", "counts_from_od", "od_from_counts"]
+__all__ = ["OdSensor", "SensorConfig", "counts_from_od", "density", "od_from_counts"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -77,15 +77,19 @@ class SensorConfig:
         check_ranges(self, "plant.sensor", RANGES)
 
 
+def density(od: Array | float) -> Array:
+    """R of LINEAR R + QUADRATIC R^2 = OD; negative for a vial clearer than the blank, bounded where no root exists."""
+    half = LINEAR / (2.0 * QUADRATIC)
+    return np.asarray(np.sqrt(np.maximum(np.asarray(od) / QUADRATIC + half * half, 0.0)) - half)
+
+
 def counts_from_od(od: Array, blank: Array | float) -> Array:
     """Raw count the device would show, its OD formula inverted; not rounded, >= 1 (docs/device.md, OD measurement).
 
     Args:
       od: device OD; blank: count of clear medium; broadcastable.
     """
-    half = LINEAR / (2.0 * QUADRATIC)
-    ratio = np.sqrt(np.maximum(od / QUADRATIC + half * half, 0.0)) - half
-    return np.clip(blank * 10.0**-ratio, 1.0, FULL_SCALE)
+    return np.clip(blank * 10.0 ** -density(od), 1.0, FULL_SCALE)
 
 
 def od_from_counts(raw: Array, blank: Array | float) -> Array:

@@ -136,9 +136,9 @@ def run_trial(
             "clean": plant.apparent_od,
             "rate": step.rate,
             "temperature": step.temperature,
-            "media_ml": plant.media_ml,
+            "media_ml": plant.feed.delivered_ml,
         }
         for key, values in seen.items():
             stored[key][row, column] = values[row]
         held[row] += step.response[row] >= Response.HOLD
-    return Trial(*names, schedule, minute, **stored, held=held, overflowed=plant.overflowed)
+    return Trial(*names, schedule, minute, **stored, held=held, overflowed=plant.vessel.overflowed)

@@ -112,7 +112,8 @@ def device_of(config: DeployConfig) -> Iterator[str]:
         yield backend.url
         return
     arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
-    arguments |= {"guard": backend.guard.pump, "guard-flow": backend.guard.flow_ml_s} if backend.guard.pump else {}
+    if backend.guard.pump:
+        arguments |= {"overflow-pump": backend.guard.pump, "overflow-flow": backend.guard.flow_ml_s}
     with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
         log.info("emulated device at %s, %g times real time; faults at %s", device.url, backend.speed, device.control)
         yield device.url

@@ -79,7 +79,7 @@ class Oracle:
         """See `Controller.act`; the reading itself is not looked at."""
         plant = self.plant
         after = plant.expected_od(self.model.control_min, self._on_s + np.zeros(plant.n))
-        seen = plant.sensor.apparent(after, plant.wall, plant.minutes)
+        seen = plant.sensor.apparent(after, plant.culture.wall, plant.minutes)
         ratio = np.log(np.maximum(seen, 1e-6) / setpoint)
         spacing = self._log_ratio[1] - self._log_ratio[0]
         place = np.clip((ratio - self._log_ratio[0]) / spacing, 0.0, self._log_ratio.size - 1.000001)

@@ -19,7 +19,8 @@ from experiments.reliability.faults import INF, SICK, Fault
 from experiments.reliability.rehearsal import Killed, Rehearsal
 from hardware.chibio.overflow_guard import GuardConfig
 from hardware.emulator.device import DeviceOptions
-from hardware.emulator.vial import BenchConfig, Dose, Sample
+from hardware.emulator.vial import Dose, Sample
+from hardware.emulator.vial_config import VialConfig
 from hardware.errors import ReactorError
 from hardware.safety.config import Response, SafetyConfig
 from hardware.storage.journal import read_journal
@@ -111,7 +112,7 @@ def audit_rows(
         doubled += int((np.diff(rows) <= 0.0).sum())
         over = bool(r.loop.done[n] or r.loop.stopped[n])
         end = rows[-1] if over and rows.size else INF
-        for sample in r.device.benches[name].samples if samples is None else samples[name]:
+        for sample in r.device.vials[name].samples if samples is None else samples[name]:
             at = sample.stored_s
             alive = any(start + 30.0 <= at <= stop - 5.0 for start, stop in r.spans)
             if not alive or at > end:
@@ -179,7 +180,7 @@ class _Watch:
             schedule = r.loop.schedules[0]
             elapsed = np.array([(now - r.spans[0][0]) / 60.0 - r.loop.began[0]])
             asked = schedule.setpoints[int(max(Scenario.phase(schedule, elapsed)[0], 0))]
-            od = float(r.device.benches[SICK].plant.od[0])
+            od = float(r.device.vials[SICK].plant.culture.od[0])
             falling = self._reference * math.exp((HEALTHY_MU - FULL_DILUTION) * minutes)
             self._reference = max(asked, od if math.isnan(self._reference) else falling)
             if now >= self.struck_s and elapsed[0] < schedule.total_min:
@@ -232,7 +233,7 @@ def _is_time(moment: str, r: Rehearsal) -> bool:
     if not elapsed >= 0.6 * first + 0.5 or moment == "steady":
         return elapsed >= 0.6 * first + 0.5
     r.device.run_until(r.clock.now())
-    return r.device.benches[SICK].motor("Pump1") != 0
+    return r.device.vials[SICK].motor("Pump1") != 0
 
 
 class Case:
@@ -260,7 +261,7 @@ class Case:
         self.fault, self.moment, self.names = fault, moment, tuple(names)
         self.schedule, self.safety, self.controller, self.seed = schedule, safety, controller, seed
         self.guard = guard or GuardConfig()
-        self.options = DeviceOptions(bench=BenchConfig(outlier_rate=outlier_rate))
+        self.options = DeviceOptions(vial=VialConfig(outlier_rate=outlier_rate))
         self.result = Outcome(fault.name if fault else "none", moment, bool(self.guard.pump))
         self._exits = 0  # of the device's software up to the fault, or its end
 
@@ -290,7 +291,7 @@ class Case:
         if self.fault is None:
             return
         r.device.run_until(r.clock.now())
-        self._exits = r.device.exits
+        self._exits = r.device.supervisor.exits
         if self.fault.end is not None and not self.fault.program and self.fault.minutes < INF:
             r.clock.at(r.clock.now() + 60.0 * self.fault.minutes, self._mend)
         self.fault.begin(r)
@@ -300,7 +301,7 @@ class Case:
         assert self.fault.end is not None
         self.r.device.run_until(self.r.clock.now())
         self.fault.end(self.r)
-        self._exits = self.r.device.exits
+        self._exits = self.r.device.supervisor.exits
 
     def _live(self) -> None:
         """Lives of the program, one after another, until the schedule is over."""
@@ -360,12 +361,12 @@ class Case:
             lasts = fault.minutes if fault.minutes < INF else 1e6
             dark = (self.watch.struck_s, self.watch.struck_s + 60.0 * (lasts + 6.0))
         out.rows_missed, out.rows_lost, out.rows_doubled = audit_rows(r, dark)
-        out.exits = r.device.exits - self._exits
+        out.exits = r.device.supervisor.exits - self._exits
         out.neighbours_lost = int((~r.loop.done[1:]).sum())
         journal, _ = read_journal(r.folder / "journal.jsonl")
         for name in r.names:
             if fault is None or not fault.rogue or (name != SICK and not fault.wide):
-                doubled, repeats = audit_doses(journal, r.device.benches[name].doses, name, r.spans[0][0])
+                doubled, repeats = audit_doses(journal, r.device.vials[name].doses, name, r.spans[0][0])
                 out.doses_doubled, out.repeats = out.doses_doubled + doubled, out.repeats + repeats
 
     def _judge(self) -> None:

@@ -123,7 +123,7 @@ def run_device(r: Rehearsal) -> None:
 
 def vial_out(r: Rehearsal) -> None:
     """Nothing in the light path: more light than through clear medium."""
-    inject(r.device, "od_offset", SICK, -float(r.device.benches[SICK].plant.apparent_od[0]) - 0.05)
+    inject(r.device, "od_offset", SICK, -float(r.device.vials[SICK].plant.apparent_od[0]) - 0.05)
 
 
 def full_disk(r: Rehearsal) -> None:
@@ -215,7 +215,7 @@ FAULTS: tuple[Fault, ...] = (
         why_not="the level is set by the height of the waste tube: it sucks air",
     ),
     Fault(
-        "guard blocked", "the overflow guard moves nothing", set_("guard_gain_factor", 0.0), guard=True,
+        "guard blocked", "the overflow guard moves nothing", set_("overflow_gain_factor", 0.0), guard=True,
         why_not="nothing flows there unless the level rises: its tube is checked daily, like the waste tube",
     ),
     # ---- sensor

@@ -68,9 +68,9 @@ class ScriptedClock(VirtualClock):
 
 def _plumbed(options: DeviceOptions, guard: GuardConfig) -> DeviceOptions:
     """The same device with a second waste tube on the guard's pump."""
-    pump = replace(options.plant.pump, guard_ml_s=guard.flow_ml_s)
-    bench = replace(options.bench, guard=guard.pump)
-    return replace(options, bench=bench, plant=replace(options.plant, pump=pump))
+    pump = replace(options.plant.pump, overflow_ml_s=guard.flow_ml_s)
+    vial = replace(options.vial, overflow_pump=guard.pump)
+    return replace(options, vial=vial, plant=replace(options.plant, pump=pump))
 
 
 class Rehearsal:

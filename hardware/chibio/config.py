@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from conf.presets import groups
 from hardware.chibio.dosing import DosingConfig
 from hardware.chibio.overflow_guard import GuardConfig
 from hardware.chibio.protocol import POSITIONS
@@ -101,7 +102,7 @@ class EmulatorConfig(ChiBioConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.plant not in ("healthy", "bench"):
-            raise ValueError(f"backend.plant = {self.plant}: allowed healthy, bench")
+        if self.plant not in groups()["plant"]:
+            raise ValueError(f"backend.plant = {self.plant}: allowed {', '.join(groups()['plant'])}")
         if not 0.0 <= self.od <= 4.0 or self.seed < 0:
             raise ValueError(f"backend.od = {self.od}, seed = {self.seed}: allowed 0 to 4, and at least 0")

@@ -2,54 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from hardware.emulator.device import ChiBioDevice
 
-if TYPE_CHECKING:
-    from hardware.emulator.device import ChiBioDevice
-
-__all__ = ["FAULTS", "LinkFaults", "inject"]
-
-
-@dataclass
-class LinkFaults:
-    """What is wrong with network, server or board; counters go down with every use, -1 = until set to 0.
-
-    slow_s: added to the way of every request. hang_s: the next request takes so long. lost_request: swallowed before
-    the server (half-open connection). lost_reply: acted on, then silence. reset_before, reset_after: connection reset
-    without or after acting. malformed, truncated: getSysdata answers broken JSON, or half its bytes under the full
-    length. lying: POST routes answer 204 and do nothing. bus_stuck: the bus lock is never released.
-    bus_stuck_when_pumping: it gets stuck as soon as a feed pump runs. disk_full: when a cycle writes its row.
-    foreign_selects: probability that somebody else's page selects another reactor before a request.
-    require_requested_with, terminal_as_list, terminal_named, extra_fields: variants seen in forks and newer apps
-    (docs/device.md, Variants).
-    """
-
-    slow_s: float = 0.0
-    hang_s: float = 0.0
-    lost_request: int = 0
-    lost_reply: int = 0
-    reset_before: int = 0
-    reset_after: int = 0
-    malformed: int = 0
-    truncated: int = 0
-    lying: int = 0
-    bus_stuck: bool = False
-    bus_stuck_when_pumping: bool = False
-    disk_full: bool = False
-    foreign_selects: float = 0.0
-    require_requested_with: bool = False
-    terminal_as_list: bool = False
-    terminal_named: bool = False
-    extra_fields: bool = False
-
-    def take(self, name: str) -> bool:
-        """Is this counted fault due? Counts it down."""
-        left: int = getattr(self, name)
-        if left > 0:
-            setattr(self, name, left - 1)
-        return left != 0
-
+__all__ = ["FAULTS", "inject"]
 
 # name: (kind, allowed values, what it does)
 #   board: no reactor needed; vial: a field of VialFaults; plant: a switch of the plant; act: done once
@@ -93,16 +48,24 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "spectrometer_dead": ("vial", "0 or 1", "raw = 1, OD reads 12 to 14"),
     "spectrometer_dark": ("vial", "0 or 1", "raw = 0, OD reads 0"),
     "spectrometer_glitch": ("vial", "probability", "a single reading fails (raw = 1)"),
-    "feed_stuck_open": ("vial", "0 or 1", "Pump1 runs at full power whatever it is told"),
-    "waste_stuck_open": ("vial", "0 or 1", "Pump2 runs at full power whatever it is told"),
-    "heater_runaway": ("vial", "0 or 1", "heater at full power whatever it is told"),
+    "feed_stuck_open": ("vial", "0 or 1", "Pump1 runs at full power whatever is commanded"),
+    "waste_stuck_open": ("vial", "0 or 1", "Pump2 runs at full power whatever is commanded"),
+    "heater_runaway": ("vial", "0 or 1", "heater at full power whatever is commanded"),
     "stirrer_dead": ("vial", "0 or 1", "the stirrer does not turn"),
     "pump_gain_factor": ("plant", "factor >= 0", "feed flow: 0 blocked, 0.5 weak, 1 sound"),
     "waste_gain_factor": ("plant", "factor >= 0", "waste flow: 0 blocked, 1 sound"),
-    "guard_gain_factor": ("plant", "factor >= 0", "flow of the overflow guard: 0 blocked, 1 sound"),
+    "overflow_gain_factor": ("plant", "factor >= 0", "flow of the overflow pump: 0 blocked, 1 sound"),
     "back_leak_ml": ("plant", "mL >= 0", "siphons back after each feed pulse"),
     "media_left_ml": ("plant", "mL >= 0", "fresh medium left in the bottle; 0 = empty"),
     "mu_factor": ("plant", "factor >= 0", "growth rate relative to healthy"),
+}
+PLANT = {  # fault: part of the plant, its switch
+    "pump_gain_factor": ("feed", "gain_factor"),
+    "back_leak_ml": ("feed", "back_leak_ml"),
+    "media_left_ml": ("feed", "media_left_ml"),
+    "waste_gain_factor": ("vessel", "waste_gain_factor"),
+    "overflow_gain_factor": ("vessel", "overflow_gain_factor"),
+    "mu_factor": ("culture", "mu_factor"),
 }
 SIGNED = {"clock_step", "od_offset", "od_jump", "lost_request", "lost_reply", "reset_before", "reset_after"}
 SIGNED |= {"malformed", "truncated", "lying"}  # counts may be -1
@@ -116,40 +79,41 @@ def inject(device: ChiBioDevice, name: str, reactor: str = "all", value: float =
     """
     if name not in FAULTS:
         raise ValueError(f"fault = {name}: allowed {', '.join(FAULTS)}")
-    if reactor != "all" and reactor not in device.benches:
-        raise ValueError(f"reactor = {reactor}: allowed all, {', '.join(device.benches)}")
+    if reactor != "all" and reactor not in device.vials:
+        raise ValueError(f"reactor = {reactor}: allowed all, {', '.join(device.vials)}")
     if value != value or (value < 0.0 and name not in SIGNED):
         raise ValueError(f"{name} = {value}: allowed {FAULTS[name][1]}")
     kind = FAULTS[name][0]
-    names = tuple(device.benches) if reactor == "all" else (reactor,)
-    now = device.now()
+    names = tuple(device.vials) if reactor == "all" else (reactor,)
+    now = device.computer.now()
     if kind == "act":
         _act(device, name, names, value)
     elif kind == "board":
         setattr(device.faults, name, type(getattr(device.faults, name))(value))
     elif kind == "vial":
-        for bench in (device.benches[m] for m in names):
-            bench.set_fault(name, type(getattr(bench.faults, name))(value), now)
+        for vial in (device.vials[m] for m in names):
+            vial.set_fault(name, type(getattr(vial.faults, name))(value), now)
     else:
-        for bench in (device.benches[m] for m in names):
-            bench.sync(now)
-            getattr(bench.plant, name)[:] = value
+        for vial in (device.vials[m] for m in names):
+            vial.sync(now)
+            part, switch = PLANT[name]
+            getattr(getattr(vial.plant, part), switch)[:] = value
 
 
 def _act(device: ChiBioDevice, name: str, names: tuple[str, ...], value: float) -> None:
     if name == "worker_wipe":
-        device.kill_worker()
+        device.supervisor.kill_worker()
     elif name == "crash":
-        device.crash()
+        device.supervisor.crash()
     elif name == "power_cut":
-        device.cut_power()
+        device.supervisor.cut_power()
     elif name == "marked_absent":
         for m in names:
             device.apps[m].data["present"] = 0
     elif name == "restart":
-        device.restart()
+        device.supervisor.restart()
     elif name == "clock_step":
-        device.step_clock(value)
+        device.computer.wall_offset_s += value
     else:
         for m in names:
             device.kill_thread(f"{m}/Experiment")

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-__all__ = ["AppError", "feed_duty", "zigzag"]
+from hardware.emulator.computer import AppError
 
-
-class AppError(Exception):
-    """An exception inside the device's software: a route answers 500, a thread ends."""
+__all__ = ["feed_duty", "zigzag"]
 
 
 def feed_duty(data: dict[str, Any]) -> float:
-    """Duty of the feed pump before clipping: P on ln(x / r) per minute, two integrators, noise guard.
+    """Duty of the feed pump before clipping: P on ln(x / r) per minute, two integrators, none after a jump up.
 
     `data` is sysData with at least two records and a volume; OD.Integral and OD.Integral2 are updated.
     """

@@ -4,142 +4,135 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 from urllib.parse import unquote
 
-from hardware.emulator.reactor_app import ReactorApp, Steps
+from hardware.emulator.events import Steps
+from hardware.emulator.exchange import Answer, Exchange
+from hardware.emulator.software import Software
 from hardware.emulator.sysdata import ALL_REACTORS, add_terminal, clear_terminal
 
-if TYPE_CHECKING:
-    from hardware.emulator.device import ChiBioDevice, Exchange
-
-__all__ = ["HTML", "Answer", "answer_request", "find_route"]
-
-Answer = tuple[int, bytes, dict[str, str]]  # status, body, headers
+__all__ = ["HTML", "answer_request", "find_route"]
 
 LONG_ROUTE_S = 1.9  # GetSpectrum, ExperimentReset
 HTML = {"Content-Type": "text/html; charset=utf-8"}
 
 
 class Route(NamedTuple):
-    """A path with one "*" per argument; `run(device, *arguments)` is the view."""
+    """A path with one "*" per argument; `run(software, *arguments)` is the view."""
 
     method: str
     path: str
     run: Callable[..., Steps]
 
 
-def _app(device: ChiBioDevice, name: str) -> ReactorApp:
-    return device.apps[device.selected if name == "0" else name]
-
-
-def _set_target(d: ChiBioDevice, item: str, m: str, value: str) -> Steps:
+def _set_target(s: Software, item: str, m: str, value: str) -> Steps:
     number = float(value)
-    yield from _app(d, m).set_target(item, number)
+    yield from s.app(m).outputs.set_target(item, number)
 
 
-def _set_on(d: ChiBioDevice, item: str, force: str, m: str) -> Steps:
+def _set_on(s: Software, item: str, force: str, m: str) -> Steps:
     number = int(force)
-    yield from _app(d, m).set_on(item, number)
+    yield from s.app(m).outputs.set_on(item, number)
 
 
-def _change(d: ChiBioDevice, m: str) -> Steps:
-    if d.apps[m].data["present"] == 1:
-        d.select(m)
+def _change(s: Software, m: str) -> Steps:
+    if s.apps[m].data["present"] == 1:
+        s.select(m)
     yield from ()
 
 
-def _scan(d: ChiBioDevice, which: str) -> Steps:
+def _scan(s: Software, which: str) -> Steps:
     for name in ALL_REACTORS if which == "all" else (which,):
-        app = d.apps[name]
-        d.bus(name)
+        app = s.apps[name]
+        s.computer.bus(name)
         app.data["present"] = int(app.answers)
         app.data["DeviceID"] = app.device_id if app.answers else ""
         yield 0.02
 
 
-def _direction(d: ChiBioDevice, item: str, m: str) -> Steps:
-    data = _app(d, m).data
+def _direction(s: Software, item: str, m: str) -> Steps:
+    data = s.app(m).data
     data[item]["target"] = -1.0 * data[item]["target"]
     if data["OD"]["ON"] == 1:
         data[item]["direction"] = -1.0 * data[item]["direction"]
     yield from ()
 
 
-def _measure_od(d: ChiBioDevice, m: str) -> Steps:
-    yield from _app(d, m).measure_od()
+def _measure_od(s: Software, m: str) -> Steps:
+    yield from s.app(m).optics.measure_od()
 
 
-def _calibrate(d: ChiBioDevice, item: str, m: str, raw: str, od: str) -> Steps:
-    _app(d, m).calibrate(item, float(raw), float(od))
+def _calibrate(s: Software, item: str, m: str, raw: str, od: str) -> Steps:
+    s.app(m).optics.calibrate(item, float(raw), float(od))
     yield from ()
 
 
-def _measure_temperature(d: ChiBioDevice, which: str, m: str) -> Steps:
-    _app(d, m).measure_temperature(which)
+def _measure_temperature(s: Software, which: str, m: str) -> Steps:
+    s.app(m).measure_temperature(which)
     yield 0.003
 
 
-def _measure_fp(d: ChiBioDevice, m: str) -> Steps:
-    yield from _app(d, m).measure_fluorescence()
+def _measure_fp(s: Software, m: str) -> Steps:
+    yield from s.app(m).optics.measure_fluorescence()
 
 
-def _spectrum(d: ChiBioDevice, gain: str, m: str) -> Steps:
+def _spectrum(s: Software, gain: str, m: str) -> Steps:
     int(gain[1:])
-    app = _app(d, m)
-    yield from app.expose(LONG_ROUTE_S / 2)
-    raw = yield from app.expose(LONG_ROUTE_S / 2)
+    app = s.app(m)
+    yield from app.optics.expose(LONG_ROUTE_S / 2)
+    raw = yield from app.optics.expose(LONG_ROUTE_S / 2)
     app.data["AS7341"]["spectrum"]["CLEAR"] = raw
 
 
-def _experiment(d: ChiBioDevice, value: str, m: str) -> Steps:
-    yield from _app(d, m).start_or_stop(int(value))
+def _experiment(s: Software, value: str, m: str) -> Steps:
+    yield from s.app(m).experiment.start_or_stop(int(value))
 
 
-def _reset(d: ChiBioDevice) -> Steps:
-    app = d.apps[d.selected]
-    app.initialise(d.selected)
+def _reset(s: Software) -> Steps:
+    app = s.apps[s.selected]
+    app.initialise(s.selected)
     if app.data["present"]:
-        yield from app.everything_off()
+        yield from app.outputs.everything_off()
         yield LONG_ROUTE_S
 
 
-def _clear(d: ChiBioDevice, m: str) -> Steps:
-    clear_terminal(_app(d, m).data, d.stamp())
+def _clear(s: Software, m: str) -> Steps:
+    clear_terminal(s.app(m).data, s.computer.stamp())
     yield from ()
 
 
-def _set_fp(d: ChiBioDevice, slot: str, led: str, base: str, emit1: str, emit2: str, gain: str) -> Steps:
-    data = d.apps[d.selected].data[slot]
+def _set_fp(s: Software, slot: str, led: str, base: str, emit1: str, emit2: str, gain: str) -> Steps:
+    data = s.apps[s.selected].data[slot]
     data["ON"] = int(data["ON"] != 1)
     if data["ON"]:
         data.update({"LED": led, "BaseBand": base, "Emit1Band": emit1, "Emit2Band": emit2, "Gain": gain})
     yield from ()
 
 
-def _set_custom(d: ChiBioDevice, program: str, status: str) -> Steps:
-    data = d.apps[d.selected].data["Custom"]
+def _set_custom(s: Software, program: str, status: str) -> Steps:
+    data = s.apps[s.selected].data["Custom"]
     data["ON"] = int(data["ON"] != 1)
     if data["ON"]:
         data.update({"Program": program, "Status": float(status), "param1": 0.0, "param2": 0.0, "param3": 0.0})
     yield from ()
 
 
-def _set_light(d: ChiBioDevice, led: str) -> Steps:
-    data = d.apps[d.selected].data["Light"]
+def _set_light(s: Software, led: str) -> Steps:
+    data = s.apps[s.selected].data["Light"]
     data["ON"] = int(data["ON"] != 1)
     if data["ON"]:
         data["Excite"] = led
     yield from ()
 
 
-def _characterise(d: ChiBioDevice, m: str, program: str) -> Steps:
+def _characterise(s: Software, m: str, program: str) -> Steps:
     """Its thread dies with a TypeError for M0 to M7; with 0 it would sweep LEDs for minutes."""
-    add_terminal(_app(d, m).data, d.stamp(), f"Characterisation {program} requested")
+    add_terminal(s.app(m).data, s.computer.stamp(), f"Characterisation {program} requested")
     yield from ()
 
 
-def _nothing(d: ChiBioDevice) -> Steps:
+def _nothing(s: Software) -> Steps:
     yield from ()
 
 
@@ -188,7 +181,7 @@ def find_route(method: str, path: str) -> tuple[Route | None, list[str], int]:
     return None, [], 404
 
 
-def answer_request(device: ChiBioDevice, exchange: Exchange) -> Generator[float, None, Answer]:
+def answer_request(software: Software, exchange: Exchange) -> Generator[float, None, Answer]:
     """Run one request to its answer. Raises: whatever the device's software raises on the way."""
     path = unquote(exchange.path.split("?", 1)[0])
     merged = re.sub("/+", "/", path)
@@ -199,18 +192,18 @@ def answer_request(device: ChiBioDevice, exchange: Exchange) -> Generator[float,
         slash = "" if merged != path else "/"
         location = {"Location": merged + slash} if code == 308 else {}
         return code, f"<!doctype html>\n<title>{code}</title>\n".encode(), HTML | location
-    headers = {key.lower() for key in exchange.headers}
-    if device.faults.require_requested_with and found.method == "POST" and "x-requested-with" not in headers:
+    faults, headers = software.computer.faults, {key.lower() for key in exchange.headers}
+    if faults.require_requested_with and found.method == "POST" and "x-requested-with" not in headers:
         return 403, b"<!doctype html>\n<title>403 Forbidden</title>\n", HTML
     if found.method == "POST":
-        if not device.faults.take("lying"):
-            yield from found.run(device, *arguments)
+        if not faults.take("lying"):
+            yield from found.run(software, *arguments)
         return 204, b"", HTML
     if found.path == "/":
         return 200, b"<!doctype html>\n<title>Chi.Bio emulator</title>\n", HTML
-    body = device.sysdata()
-    if device.faults.take("malformed"):
+    body = software.sysdata()
+    if faults.take("malformed"):
         body = body[: len(body) // 2] + b'}{"OD":' + body[len(body) // 2 :]
-    if device.faults.take("truncated"):
+    if faults.take("truncated"):
         exchange.cut = len(body) // 2
     return 200, body, {"Content-Type": "application/json"}

@@ -24,10 +24,13 @@ from types import FrameType
 
 import numpy as np
 
+from conf.presets import groups
 from hardware.clock import RealClock
-from hardware.emulator.device import ChiBioDevice, DeviceOptions, Exchange
+from hardware.emulator.device import ChiBioDevice, DeviceOptions
+from hardware.emulator.exchange import Exchange
 from hardware.emulator.faults import FAULTS, inject
-from hardware.emulator.vial import PLANTS, SPARE, BenchConfig
+from hardware.emulator.plants import plant_preset
+from hardware.emulator.vial_config import SPARE, VialConfig
 
 __all__ = ["EmulatorServer", "main"]
 
@@ -76,10 +79,10 @@ class EmulatorServer:
     def _turn(self) -> None:
         """Bring the device up to date; listen while its software lives; serve at most one request."""
         self.advance()
-        if not self.device.alive and self._web is not None:
+        if not self.device.supervisor.alive and self._web is not None:
             self._web.server_close()
             self._web = None
-        elif self.device.alive and self._web is None:
+        elif self.device.supervisor.alive and self._web is None:
             self._web = _DevicePort((self._host, self.port), self)
         if self._web is not None:
             self._web.handle_request()
@@ -114,9 +117,9 @@ class EmulatorServer:
                     inject(device, parts[1], reactor, float(value))
                     return 204, b""
                 if method == "GET" and parts == ["truth"]:
-                    return 200, _json({name: device.truth(name) for name in device.benches} | self._state())
-                if method == "GET" and parts[0] in ("doses", "samples") and parts[1:] in [[m] for m in device.benches]:
-                    return 200, _json([row._asdict() for row in getattr(device.benches[parts[1]], parts[0])])
+                    return 200, _json({name: device.truth(name) for name in device.vials} | self._state())
+                if method == "GET" and parts[0] in ("doses", "samples") and parts[1:] in [[m] for m in device.vials]:
+                    return 200, _json([row._asdict() for row in getattr(device.vials[parts[1]], parts[0])])
                 if method == "GET" and parts == ["faults"]:
                     return 200, _json({name: list(entry) for name, entry in FAULTS.items()})
             except ValueError as problem:
@@ -124,13 +127,13 @@ class EmulatorServer:
         return 404, b"allowed: POST fault/<name>/<M>/<value>, GET truth, doses/<M>, samples/<M>, faults\n"
 
     def _state(self) -> dict[str, object]:
-        d = self.device
+        s = self.device.supervisor
         return {
-            "alive": d.alive,
-            "restarts": d.restarts,
-            "exits": d.exits,
-            "selected": d.selected,
-            "errors": list(d.errors),
+            "alive": s.alive,
+            "restarts": s.restarts,
+            "exits": s.exits,
+            "selected": s.worker.software.selected,
+            "errors": list(self.device.computer.errors),
         }
 
 
@@ -171,7 +174,7 @@ class _DevicePort(HTTPServer):
             connection.close()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A client that goes away is no business of the server."""
+        """A client that goes away is not an error of the server."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
@@ -255,13 +258,16 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
     p.add_argument("--temperature", type=float, default=37.0, help="initial, degC (default %(default)s)")
     p.add_argument(
-        "--plant", choices=sorted(PLANTS), default="healthy", help="cultures and pumps (default %(default)s)"
+        "--plant",
+        choices=groups()["plant"],
+        default="healthy",
+        help="preset of cultures and pumps (default %(default)s)",
     )
     p.add_argument(
-        "--guard", choices=SPARE, default="", help="pump whose tube is an overflow guard's (default: there is none)"
+        "--overflow-pump", choices=SPARE, default="", help="pump that keeps a vial from overflowing (default: none)"
     )
-    p.add_argument("--guard-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
-    default = BenchConfig()
+    p.add_argument("--overflow-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
+    default = VialConfig()
     p.add_argument(
         "--pump-start",
         type=float,
@@ -281,14 +287,14 @@ def build(arguments: argparse.Namespace) -> ChiBioDevice:
     except ValueError:
         raise ValueError(f"od = {arguments.od}: allowed a number, or one per reactor, e.g. 0.3,0.4") from None
     low, high = arguments.pump_start
-    bench = BenchConfig(guard=arguments.guard, pump_start_low_s=low, pump_start_high_s=high)
-    plant = PLANTS[arguments.plant]()
-    plant = replace(plant, pump=replace(plant.pump, guard_ml_s=arguments.guard_flow))
+    vial = VialConfig(overflow_pump=arguments.overflow_pump, pump_start_low_s=low, pump_start_high_s=high)
+    plant = plant_preset(arguments.plant)
+    plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=arguments.overflow_flow))
     return ChiBioDevice(
         tuple(arguments.reactors.split(",")),
         RealClock(arguments.speed),
         np.random.default_rng(arguments.seed),
-        DeviceOptions(bench=bench, plant=plant),
+        DeviceOptions(vial=vial, plant=plant),
         od=ods[0] if len(ods) == 1 else ods,
         temperature=arguments.temperature,
         blanked=not arguments.unblanked,

@@ -5,15 +5,15 @@ from __future__ import annotations
 from hardware.clock import Clock
 from hardware.emulator.device import ChiBioDevice
 from hardware.errors import LinkError
-from hardware.link.transport import Reply
+from hardware.link.transport import Reply, Transport
 
 __all__ = ["EmulatorTransport"]
 
 HEADERS = {"X-Requested-With": "XMLHttpRequest"}
 
 
-class EmulatorTransport:
-    """A `Transport` whose other end is `device`; time passes on the device's clock.
+class EmulatorTransport(Transport):
+    """A link whose other end is `device`; time passes on the device's clock. Nothing to disarm, nothing to close.
 
     Like a client on a network it gives up after `timeout_s` while the server carries on with what it began, and every
     later request waits its turn behind that.
@@ -34,12 +34,6 @@ class EmulatorTransport:
     def post(self, path: str) -> Reply:
         """Raises: LinkError when no answer came; the device may have acted all the same."""
         return self._request("POST", path)
-
-    def disarm(self) -> None:
-        """No dead-man switch in between."""
-
-    def close(self) -> None:
-        """Nothing to release."""
 
     def _request(self, method: str, path: str) -> Reply:
         device, clock = self._device, self._clock

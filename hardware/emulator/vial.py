@@ -7,138 +7,21 @@ electronics (power, motors, faults) are here, because the device sees counts, no
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.plant.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig, ThermalConfig, VesselConfig
+from envs.plant.plant import Plant
+from hardware.emulator.spectrometer import Spectrometer
+from hardware.emulator.vial_config import FEED, SPARE, WASTE, VialConfig, VialFaults
 
-__all__ = ["PLANTS", "Bench", "BenchConfig", "Dose", "Sample", "VialFaults", "density"]
+__all__ = ["Dose", "Sample", "Vial"]
 
-FEED, WASTE = "Pump1", "Pump2"
-SPARE = ("Pump3", "Pump4")
-LINEAR, QUADRATIC = 1.833, 0.226  # OD = LINEAR R + QUADRATIC R^2, R = log10(zero/raw) (docs/device.md, OD measurement)
-FULL_SCALE = 65535
-DARK_COUNTS = 3.0  # what the spectrometer counts without light
 LONGEST_STEP_S = 60.0
 SENSOR_STEP_S = 2.0
 STIR_SETTLE_S = 2.0  # readings sooner after the stirrer stopped are still disturbed
 STIR_STOPPED_S = 90.0  # a stirrer off for longer than any still phase has failed: cells settle
 DOSES_KEPT = 5_000  # per reactor; a day of single-shot dosing is 2880
-
-
-def healthy_plant() -> PlantConfig:
-    """A sound reactor: pulses with their dead time, growth that follows temperature, all vials alike."""
-    return PlantConfig(
-        growth=GrowthConfig(mu=0.025, temperature_law="arrhenius", adaptation_min=2.0),
-        pump=PumpConfig(dosing="pulse", pulse_cv=0.05, dead_time_s=0.05, min_pulse_s=0.1),
-        thermal=ThermalConfig(ripple_c=0.1),
-    )
-
-
-def bench_plant() -> PlantConfig:
-    """As public logs show them: each vial has its own growth, pump, tube and optics (docs/biology.md, Presets)."""
-    return PlantConfig(
-        growth=GrowthConfig(
-            mu=0.025, mu_cv=0.07, drift_sd_per_h=0.02, temperature_law="arrhenius", adaptation_min=2.0, yield_od=5.0
-        ),
-        pump=PumpConfig(
-            dosing="pulse",
-            gain_ml_s=1.11,
-            gain_cv=0.15,
-            pulse_cv=0.1,
-            dead_time_s=0.05,
-            min_pulse_s=0.1,
-            timing_error_s=0.02,
-            prime_low=0.3,
-            prime_high=0.7,
-        ),
-        sensor=SensorConfig(gain_cv=0.07, curvature=-0.1, blank_error=0.01, drift_per_h=0.002),
-        vessel=VesselConfig(volume_sd_ml=0.5, evaporation_ml_day=1.0),
-        thermal=ThermalConfig(ripple_c=0.15),
-    )
-
-
-PLANTS = {"bench": bench_plant, "healthy": healthy_plant}
-
-
-@dataclass(frozen=True)
-class BenchConfig:
-    """Optics and electronics of a reactor.
-
-    blank_low, blank_high: range of the counts of clear medium, drawn once per reactor (docs/device.md, Blank).
-    noise_fraction: sd of one reading, as a fraction of raw.
-    common_fraction: sd that all readings of one measurement share, as a fraction of raw; with the defaults the mean of
-      four readings has sd 0.0036 at OD 0.5 (docs/biology.md, Sensor).
-    outlier_rate: probability per measurement of an isolated jump of more than 0.04 OD.
-    stir_factor, stir_noise: raw while stirring, relative to still, mean and spread.
-    on_time_bias_low_s, on_time_bias_high_s: how much longer than asked a pump runs (docs/device.md, Pumps).
-    pump_start_low_s, pump_start_high_s: range of the time from the answer to a pump command until the motor turns,
-      drawn per start: what the thread's register writes take on the bus. 0.2 to 0.7 s is what the device's own software
-      took on simulated electronics with bus time.
-    air_c: air outside.
-    guard: pump whose tube is an overflow guard's (docs/chibio.md); "" = the spare pumps have no tubes.
-    """
-
-    blank_low: float = 11600.0
-    blank_high: float = 15800.0
-    noise_fraction: float = 0.003
-    common_fraction: float = 0.004
-    outlier_rate: float = 0.006
-    stir_factor: float = 0.4
-    stir_noise: float = 0.05
-    on_time_bias_low_s: float = 0.02
-    on_time_bias_high_s: float = 0.2
-    pump_start_low_s: float = 0.2
-    pump_start_high_s: float = 0.7
-    air_c: float = 24.0
-    guard: str = ""
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "blank_low": (3000.0, 60000.0),
-            "blank_high": (self.blank_low, 60000.0),
-            "noise_fraction": (0.0, 0.2),
-            "common_fraction": (0.0, 0.2),
-            "outlier_rate": (0.0, 1.0),
-            "stir_factor": (0.05, 1.0),
-            "stir_noise": (0.0, 0.5),
-            "on_time_bias_low_s": (0.0, 1.0),
-            "on_time_bias_high_s": (self.on_time_bias_low_s, 1.0),
-            "pump_start_low_s": (0.0, 5.0),
-            "pump_start_high_s": (self.pump_start_low_s, 5.0),
-            "air_c": (0.0, 45.0),
-        }
-        for key, (low, high) in ranges.items():
-            value = getattr(self, key)
-            if not low <= value <= high:
-                raise ValueError(f"bench.{key} = {value}: allowed {low:g} to {high:g}; change it")
-        if self.guard not in ("", *SPARE):
-            raise ValueError(f"bench.guard = {self.guard}: allowed {', '.join(SPARE)}, or nothing")
-
-
-@dataclass
-class VialFaults:
-    """What is broken at one reactor; may be set at any time.
-
-    unplugged: cable out. od_frozen: the spectrometer repeats its last count. od_offset: OD added to every reading.
-    od_jump: OD added to the next measurement only. spectrometer_dead: raw = 1. spectrometer_dark: raw = 0.
-    spectrometer_glitch: probability that a single reading fails (raw = 1). feed_stuck_open, waste_stuck_open,
-    heater_runaway: at full power whatever they are told. stirrer_dead: does not turn.
-    """
-
-    unplugged: bool = False
-    od_frozen: bool = False
-    od_offset: float = 0.0
-    od_jump: float = 0.0
-    spectrometer_dead: bool = False
-    spectrometer_dark: bool = False
-    spectrometer_glitch: float = 0.0
-    feed_stuck_open: bool = False
-    waste_stuck_open: bool = False
-    heater_runaway: bool = False
-    stirrer_dead: bool = False
 
 
 class Dose(NamedTuple):
@@ -159,7 +42,7 @@ class Sample(NamedTuple):
     od: float
 
 
-class Bench:
+class Vial:
     """One reactor as the chips see it.
 
     Args:
@@ -168,24 +51,22 @@ class Bench:
     motors' total on-time, `peak_ml` the highest volume.
     """
 
-    def __init__(self, plant: Plant, config: BenchConfig, rng: np.random.Generator, start: float = 0.0) -> None:
+    def __init__(self, plant: Plant, config: VialConfig, rng: np.random.Generator, start: float = 0.0) -> None:
         self.plant, self.config, self.faults = plant, config, VialFaults()
         self._rng, self._at = rng, start
-        self.blank = float(rng.uniform(config.blank_low, config.blank_high))
+        self.spectrometer = Spectrometer(config, self.faults, rng)
         self.doses: deque[Dose] = deque(maxlen=DOSES_KEPT)
         self.samples: deque[Sample] = deque(maxlen=DOSES_KEPT)
         self.on_s = dict.fromkeys((FEED, WASTE, *SPARE), 0.0)
-        self.peak_ml = float(plant.volume_ml[0])
+        self.peak_ml = float(plant.vessel.volume_ml[0])
         self.powered = True
         self.heat, self.stir = 0.0, 0.0
-        self.settled_at = start - STIR_SETTLE_S
+        self._settled_at = start - STIR_SETTLE_S
         self._stirred_at = start
         self._motors = dict.fromkeys(self.on_s, 0)
         self._since: dict[str, tuple[float, float]] = {}
-        self._lit, self._lit_before, self._laser_since = 0.0, 0.0, np.nan
-        self._common, self._jump, self._measured_at, self._last_raw = 0.0, 0.0, -np.inf, 0
 
-    # -- motors, heater, stirrer, laser ----------------------------------------------------------------------------
+    # -- motors, heater, stirrer -----------------------------------------------------------------------------------
 
     def motor(self, pump: str) -> int:
         """What the motor really does: 1, -1 or 0."""
@@ -209,7 +90,7 @@ class Bench:
             self._motors = dict.fromkeys(self._motors, 0)
             self.heat = 0.0
             self.set_stirrer(0.0, at)
-            self.set_laser(False, at)
+            self.spectrometer.set_laser(False, at)
         self._book(before, at)
 
     def set_fault(self, name: str, value: bool | float, at: float) -> None:
@@ -227,7 +108,7 @@ class Bench:
 
     def _book(self, before: dict[str, int], at: float) -> None:
         """Close and open dose records for the motors that changed from `before`."""
-        media = float(self.plant.media_ml[0])
+        media = float(self.plant.feed.delivered_ml[0])
         for pump, direction in before.items():
             now = self.motor(pump)
             if now == direction:
@@ -248,23 +129,9 @@ class Bench:
     def set_stirrer(self, power: float, at: float) -> None:
         """Stirrer power, 0 to 1."""
         if self.stir > 0.0 and power == 0.0:
-            self.settled_at = at + STIR_SETTLE_S
+            self._settled_at = at + STIR_SETTLE_S
             self._stirred_at = at
         self.stir = power if self.powered and not self.faults.stirrer_dead else 0.0
-
-    def set_laser(self, on: bool, at: float) -> None:
-        """Laser on or off."""
-        if not np.isnan(self._laser_since):
-            self._lit += at - self._laser_since
-        self._laser_since = at if on else np.nan
-
-    def begin_exposure(self, at: float) -> None:
-        """The spectrometer starts integrating, and forgets what another thread had begun to integrate."""
-        self._lit_before = self._lit_s(at)
-
-    def _lit_s(self, at: float) -> float:
-        """Total time the laser has been on."""
-        return self._lit + (0.0 if np.isnan(self._laser_since) else at - self._laser_since)
 
     # -- the culture -----------------------------------------------------------------------------------------------
 
@@ -280,18 +147,21 @@ class Bench:
 
     def _step(self, seconds: float) -> None:
         feed, waste = (np.array([self.motor(pump) * seconds]) for pump in (FEED, WASTE))
-        guard = self.motor(self.config.guard) * seconds if self.config.guard else 0.0
+        pump = self.config.overflow_pump
+        overflow = self.motor(pump) * seconds if pump else 0.0
         for pump in self._motors:
             self.on_s[pump] += abs(self.motor(pump)) * seconds
         thermal, plant = self.plant.config.thermal, self.plant
         heat = 1.0 if self.faults.heater_runaway and self.powered else self.heat
         minutes = seconds / 60.0
-        cooled = thermal.ambient_c + (plant.temperature - thermal.ambient_c) * np.exp(-minutes / thermal.cooling_min)
+        cooled = thermal.ambient_c + (plant.thermal.temperature - thermal.ambient_c) * np.exp(
+            -minutes / thermal.cooling_min
+        )
         still = self.stir == 0.0 and self._at + seconds - self._stirred_at > STIR_STOPPED_S
-        plant.stir_factor[:] = 0.0 if still else 1.0
-        plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, guard)
+        plant.culture.stir_factor[:] = 0.0 if still else 1.0
+        plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, overflow)
         self._at += seconds
-        self.peak_ml = max(self.peak_ml, float(plant.volume_ml[0]))
+        self.peak_ml = max(self.peak_ml, float(plant.vessel.volume_ml[0]))
 
     # -- sensors ---------------------------------------------------------------------------------------------------
 
@@ -299,44 +169,34 @@ class Bench:
         """Reading of a thermometer, degC: IR (culture, 0.02 degC steps), Internal or External (air, 1/16 degC)."""
         self._nearly_sync(at)
         if which == "IR":
-            value = float(self.plant.read_temperature()[0]) + self._rng.normal(0.0, 0.05)
+            value = float(self.plant.thermal.read()[0]) + self._rng.normal(0.0, 0.05)
             return round(value / 0.02) * 0.02
-        warmed = 0.15 * (float(self.plant.temperature[0]) - self.config.air_c) if which == "Internal" else 0.0
+        warmed = 0.15 * (float(self.plant.thermal.temperature[0]) - self.config.air_c) if which == "Internal" else 0.0
         return round((self.config.air_c + warmed + self._rng.normal(0.0, 0.05)) * 16.0) / 16.0
 
     def counts(self, at: float, exposure_s: float) -> int:
-        """One spectrometer reading of the laser, 16-bit counts.
-
-        raw = blank 10^-R with LINEAR R + QUADRATIC R^2 = what a noise-free sensor would show; stirred or half-lit
-        readings are lower. Args: at: device s; exposure_s: how long it should have been lit since `begin_exposure`.
-        """
+        """One spectrometer reading, as `Spectrometer.counts`."""
         self._nearly_sync(at)
-        f, c, rng = self.faults, self.config, self._rng
-        if at - self._measured_at > 10.0:  # a new measurement: what its readings share is drawn again
-            self._common, self._jump = rng.normal(0.0, c.common_fraction), f.od_jump
-            f.od_jump = 0.0
-            if rng.random() < c.outlier_rate:
-                self._jump += (0.04 + rng.exponential(0.05)) * (1.0 if rng.random() < 0.54 else -1.0)
-        self._measured_at = at
-        if f.spectrometer_dark:
-            return 0
-        if f.spectrometer_dead or rng.random() < f.spectrometer_glitch:
-            return 1
-        if f.od_frozen and self._last_raw > 0:
-            return self._last_raw
-        light = self.blank * 10.0 ** -density(float(self.plant.apparent_od[0]) + f.od_offset + self._jump)
-        if self.stir > 0.0 or at < self.settled_at:
-            light *= max(c.stir_factor * (1.0 + rng.normal(0.0, c.stir_noise)), 0.01)
-        light *= 1.0 + self._common + rng.normal(0.0, c.noise_fraction)
-        self._last_raw = int(
-            np.clip(
-                round(DARK_COUNTS + light * min((self._lit_s(at) - self._lit_before) / exposure_s, 1.0)), 0, FULL_SCALE
-            )
-        )
-        return self._last_raw
+        moving = self.stir > 0.0 or at < self._settled_at
+        return self.spectrometer.counts(at, exposure_s, float(self.plant.apparent_od[0]), moving)
 
-
-def density(od: float) -> float:
-    """R of LINEAR R + QUADRATIC R^2 = OD; negative for a vial clearer than the blank, bounded where no root exists."""
-    half = LINEAR / (2.0 * QUADRATIC)
-    return float(np.sqrt(max(od / QUADRATIC + half * half, 0.0))) - half
+    def truth(self, at: float) -> dict[str, Any]:
+        """What no client can know of the reactor at device time `at`."""
+        self.sync(at)
+        plant = self.plant
+        return {
+            "od": float(plant.culture.od[0]),
+            "apparent_od": float(plant.apparent_od[0]),
+            "temperature": float(plant.thermal.temperature[0]),
+            "volume_ml": float(plant.vessel.volume_ml[0]),
+            "peak_ml": self.peak_ml,
+            "overflowed": bool(plant.vessel.overflowed[0]),
+            "feed_ml": float(plant.feed.delivered_ml[0]),
+            "media_left_ml": float(plant.feed.media_left_ml[0]),
+            "on_s": dict(self.on_s),
+            "motors": {pump: self.motor(pump) for pump in self.on_s},
+            "heat": self.heat,
+            "stir": self.stir,
+            "powered": self.powered,
+            "blank": self.spectrometer.blank,
+        }

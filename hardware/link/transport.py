@@ -58,11 +58,11 @@ class Transport(Protocol):
 
         The next request arms it again. Raises: nothing; an armed switch is the safe side.
         """
-        ...
+        return
 
     def close(self) -> None:
-        """Release the line. Idempotent."""
-        ...
+        """Release the line, if there is one. Idempotent."""
+        return
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from envs.growth import Arrhenius, Cardinal, Culture, Exponential, Monod, Ratkowsky, Thermal
+from envs.growth import Arrhenius, Cardinal, DilutedCulture, Exponential, Monod, relative_to_37
 from envs.integrators import INTEGRATORS, euler, rk4
-
-T37 = np.array([37.0])
 
 
 @pytest.mark.parametrize(("name", "order"), [("euler", 1.0), ("rk4", 4.0)])
@@ -15,13 +13,13 @@ def test_order_of_convergence_against_the_exact_solution(name, order):
     rng = np.random.default_rng(0)
     n = 64
     mu, u, x0 = rng.uniform(0.01, 0.04, n), rng.uniform(0.0, 0.02, n), rng.uniform(0.1, 1.0, n)
-    culture = Culture(Exponential(mu), tau=1.0 / 3.0)
+    culture = DilutedCulture(Exponential(mu), tau=1.0 / 3.0)
     exact = x0 * np.exp((mu - 3.0 * u) * 20.0)
     start = np.stack([x0, np.ones(n)], axis=1)
     errors = []
     steps = np.array([8, 16, 32, 64])
     for k in steps:
-        end = INTEGRATORS[name](lambda y: culture.derivative(y, u, np.full(n, 37.0)), start, 20.0, int(k))
+        end = INTEGRATORS[name](lambda y: culture.derivative(y, u), start, 20.0, int(k))
         errors.append(np.abs(end[:, 0] - exact).max())
     slope = np.polyfit(np.log(20.0 / steps), np.log(errors), 1)[0]
     assert slope == pytest.approx(order, abs=0.15)
@@ -32,9 +30,9 @@ def test_chemostat_reaches_its_steady_state():
     mu_max, k_s, tau, yield_od = 0.03, 0.1, 1.0 / 3.0, 3.0
     u = np.array([0.002, 0.005, 0.008])
     dilution = u / tau
-    culture = Culture(Monod(mu_max, k_s), tau, yield_od)
+    culture = DilutedCulture(Monod(mu_max, k_s), tau, yield_od)
     state = np.tile([0.5, 0.8], (3, 1))
-    state = rk4(lambda y: culture.derivative(y, u, np.full(3, 37.0)), state, 20_000.0, 40_000)
+    state = rk4(lambda y: culture.derivative(y, u), state, 20_000.0, 40_000)
     substrate = k_s * dilution / (mu_max - dilution)
     np.testing.assert_allclose(state[:, 1], substrate, rtol=1e-6)
     np.testing.assert_allclose(state[:, 0], yield_od * (1.0 - substrate), rtol=1e-6)
@@ -44,11 +42,11 @@ def test_batch_growth_follows_the_logistic_curve_when_substrate_is_everything():
     """With k_s much larger than s the rate is linear in s, and without flow x + Y s is conserved: logistic growth."""
     k_s, yield_od, x0 = 1e6, 2.0, 0.05
     rate = 0.03  # of mu_max / k_s
-    culture = Culture(Monod(rate * k_s, k_s), 1.0, yield_od)
+    culture = DilutedCulture(Monod(rate * k_s, k_s), 1.0, yield_od)
     capacity = x0 + yield_od
     growth = rate * capacity / yield_od
     state = np.array([[x0, 1.0]])
-    state = rk4(lambda y: culture.derivative(y, np.zeros(1), T37), state, 100.0, 1000)
+    state = rk4(lambda y: culture.derivative(y, np.zeros(1)), state, 100.0, 1000)
     expected = capacity / (1.0 + (capacity / x0 - 1.0) * np.exp(-growth * 100.0))
     assert state[0, 0] == pytest.approx(expected, rel=1e-5)
     assert state[0, 0] + yield_od * state[0, 1] == pytest.approx(capacity, rel=1e-12)
@@ -56,19 +54,17 @@ def test_batch_growth_follows_the_logistic_curve_when_substrate_is_everything():
 
 @pytest.mark.parametrize(
     ("response", "low", "high"),
-    [(Arrhenius(56.0), 0.59, 0.62), (Ratkowsky(c=2.0), 0.58, 0.61), (Cardinal(), 0.64, 0.67)],
+    [(Arrhenius(56.0), 0.59, 0.62), (Cardinal(), 0.64, 0.67)],
 )
 def test_thirty_degrees_against_thirty_seven(response, low, high):
     """Ratios of the literature (docs/biology.md, Temperature); the reference temperature changes nothing."""
-    law = Thermal(Exponential(0.03), response)
-    rate = law.specific_rate(np.ones(2), np.array([30.0, 37.0]))
+    rate = 0.03 * relative_to_37(response)(np.array([30.0, 37.0]))
     assert rate[1] == pytest.approx(0.03, rel=1e-12)
     assert low <= rate[0] / rate[1] <= high
 
 
-@pytest.mark.parametrize("response", [Ratkowsky(), Cardinal()])
-def test_no_growth_outside_the_cardinal_temperatures(response):
-    assert np.all(response(np.array([0.0, 4.0, 50.0, 80.0])) == 0.0)
+def test_no_growth_outside_the_cardinal_temperatures():
+    assert np.all(Cardinal()(np.array([0.0, 4.0, 50.0, 80.0])) == 0.0)
 
 
 def test_cardinal_model_peaks_at_its_optimum():
@@ -81,12 +77,9 @@ def test_cardinal_model_peaks_at_its_optimum():
 def test_a_batch_is_its_single_vials():
     rng = np.random.default_rng(1)
     mu, u, x = rng.uniform(0.01, 0.04, 64), rng.uniform(0, 0.02, 64), rng.uniform(0.1, 1, (64, 2))
-    culture = Culture(Thermal(Monod(mu, 0.1), Arrhenius()), 0.3, 3.0)
-    temperature = rng.uniform(25, 40, 64)
-    batch = euler(lambda y: culture.derivative(y, u, temperature), x, 10.0, 100)
+    culture = DilutedCulture(Monod(mu, 0.1), 0.3, 3.0)
+    batch = euler(lambda y: culture.derivative(y, u), x, 10.0, 100)
     for i in range(64):
-        one = Culture(Thermal(Monod(mu[i], 0.1), Arrhenius()), 0.3, 3.0)
-        alone = euler(
-            lambda y, i=i, one=one: one.derivative(y, u[i : i + 1], temperature[i : i + 1]), x[i : i + 1], 10.0, 100
-        )
+        one = DilutedCulture(Monod(mu[i], 0.1), 0.3, 3.0)
+        alone = euler(lambda y, i=i, one=one: one.derivative(y, u[i : i + 1]), x[i : i + 1], 10.0, 100)
         np.testing.assert_allclose(alone[0], batch[i], rtol=1e-13)

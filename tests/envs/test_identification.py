@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from envs.growth import Culture, Exponential
+from envs.growth import DilutedCulture, Exponential
 from envs.identification.fit import NotIdentifiable, _sum_variance, fit, pmse, trajectory
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series, noise_sd, pumped_volume, screen
@@ -44,12 +44,12 @@ def test_trajectory_agrees_with_the_integrated_growth_model() -> None:
     mu, tau, start = np.array([0.01, 0.02, 0.03]), np.array([0.25, 0.3, 0.4]), np.array([0.2, 0.5, 0.9])
     batch = trajectory(time, pump_rate, mu, tau, start)
     for k in range(3):
-        culture = Culture(Exponential(mu[k]), tau[k])
+        culture = DilutedCulture(Exponential(mu[k]), tau[k])
         state = np.array([[start[k], 1.0]])
         for i in range(39):
             assert batch[k, i] == pytest.approx(state[0, 0], rel=1e-9)
             u = pump_rate[k, i : i + 1]
-            state = rk4(lambda y, u=u, c=culture: c.derivative(y, u, np.array([37.0])), state, np.diff(time[k])[i], 20)
+            state = rk4(lambda y, u=u, c=culture: c.derivative(y, u), state, np.diff(time[k])[i], 20)
         single = trajectory(time[k], pump_rate[k], mu[k], tau[k], start[k])
         np.testing.assert_array_equal(batch[k], single)
 

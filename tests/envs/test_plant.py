@@ -11,9 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from envs.growth import Culture, Exponential
+from envs.growth import DilutedCulture, Exponential
 from envs.integrators import euler
-from envs.plant.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig, ThermalConfig, VesselConfig
+from envs.plant.culture import GrowthConfig
+from envs.plant.plant import Plant, PlantConfig
+from envs.plant.pump import PumpConfig
+from envs.plant.sensor import SensorConfig
+from envs.plant.thermal import ThermalConfig
+from envs.plant.vessel import VesselConfig
 from experiments.cli import frame
 
 Array = NDArray[np.float64]
@@ -35,15 +40,15 @@ def test_nominal_is_the_training_model() -> None:
     od = rng.uniform(0.1, 1.1, n)
     p = plant(preset("nominal"), n)
     p.reset(od)
-    model = Culture(Exponential(0.03), 1.0 / 3.0)
+    model = DilutedCulture(Exponential(0.03), 1.0 / 3.0)
     state = np.stack([od, np.ones(n)], axis=1)
     for _ in range(100):
         u = rng.choice(np.linspace(0.0, 0.02, 17), n)
         p.advance(1.0, 60.0 * u)
-        state = euler(lambda y, u=u: model.derivative(y, u, np.full(n, 37.0)), state, 1.0, 10)  # type: ignore[misc]
-        np.testing.assert_allclose(p.od, state[:, 0], rtol=1e-13)
-    np.testing.assert_array_equal(p.read_od(), p.od)
-    np.testing.assert_array_equal(p.volume_ml, 20.0)
+        state = euler(lambda y, u=u: model.derivative(y, u), state, 1.0, 10)  # type: ignore[misc]
+        np.testing.assert_allclose(p.culture.od, state[:, 0], rtol=1e-13)
+    np.testing.assert_array_equal(p.read_od(), p.culture.od)
+    np.testing.assert_array_equal(p.vessel.volume_ml, 20.0)
 
 
 def test_nominal_preset_equals_the_defaults() -> None:
@@ -53,72 +58,74 @@ def test_nominal_preset_equals_the_defaults() -> None:
 def test_a_pulse_dilutes_exactly_and_growth_follows_it() -> None:
     p = plant(PlantConfig(pump=PULSE, integrator="rk4"))
     p.advance(1.0, np.array([1.2]))
-    assert p.od[0] == pytest.approx(0.5 * np.exp(-1.2 / 20.0 + 0.03), rel=1e-9)
+    assert p.culture.od[0] == pytest.approx(0.5 * np.exp(-1.2 / 20.0 + 0.03), rel=1e-9)
 
 
 def test_without_waste_the_dose_stays_in_the_vial() -> None:
     p = plant(PlantConfig(pump=PULSE, growth=GrowthConfig(mu=0.0)))
     p.advance(1.0, np.array([2.0]), np.array([0.0]))
-    assert p.od[0] == pytest.approx(0.5 * 20.0 / 22.0)
-    assert p.volume_ml[0] == pytest.approx(22.0)
+    assert p.culture.od[0] == pytest.approx(0.5 * 20.0 / 22.0)
+    assert p.vessel.volume_ml[0] == pytest.approx(22.0)
     p.advance(1.0, np.array([0.0]), np.array([1.5]))  # the waste pump takes culture: OD unchanged
-    assert p.volume_ml[0] == pytest.approx(20.5)
+    assert p.vessel.volume_ml[0] == pytest.approx(20.5)
     p.advance(1.0, np.array([0.0]), np.array([60.0]))  # and never below its tube
-    assert p.volume_ml[0] == pytest.approx(20.0)
-    assert p.od[0] == pytest.approx(0.5 * 20.0 / 22.0)
+    assert p.vessel.volume_ml[0] == pytest.approx(20.0)
+    assert p.culture.od[0] == pytest.approx(0.5 * 20.0 / 22.0)
 
 
 def test_blocked_waste_overflows_after_the_minutes_the_rim_allows() -> None:
     p = plant(PlantConfig(pump=PULSE), 2)
-    p.waste_gain_factor[1] = 0.0
+    p.vessel.waste_gain_factor[1] = 0.0
     first = 0
     for minute in range(1, 13):
         p.advance(1.0, np.array([1.2, 1.2]))
-        if p.overflowed[1] and not first:
+        if p.vessel.overflowed[1] and not first:
             first = minute
     assert first == 9  # 10 mL of room at 1.2 mL per minute
-    np.testing.assert_array_equal(p.overflowed, [False, True])
-    assert p.volume_ml[1] == 30.0
+    np.testing.assert_array_equal(p.vessel.overflowed, [False, True])
+    assert p.vessel.volume_ml[1] == 30.0
 
 
 def test_an_overflow_guard_keeps_the_level_where_its_tube_ends() -> None:
     """Three vials with blocked waste: a guard that is on, one that is blocked, one that is too slow."""
     p = plant(PlantConfig(pump=PULSE, growth=GrowthConfig(mu=0.0)), 3)
-    p.waste_gain_factor[:] = 0.0
-    p.guard_gain_factor[:] = [1.0, 0.0, 0.1]
+    p.vessel.waste_gain_factor[:] = 0.0
+    p.vessel.overflow_gain_factor[:] = [1.0, 0.0, 0.1]
     for _ in range(8):
-        p.advance(1.0, np.full(3, 1.5), np.full(3, 15.0), guard_s=6.3)
-    assert p.volume_ml == pytest.approx([22.0, 30.0, 22.0 + 8 * (1.5 - 0.63) - (2.0 / 1.5) * (1.5 - 0.63)], abs=0.5)
-    np.testing.assert_array_equal(p.overflowed, [False, True, False])
+        p.advance(1.0, np.full(3, 1.5), np.full(3, 15.0), overflow_s=6.3)
+    assert p.vessel.volume_ml == pytest.approx(
+        [22.0, 30.0, 22.0 + 8 * (1.5 - 0.63) - (2.0 / 1.5) * (1.5 - 0.63)], abs=0.5
+    )
+    np.testing.assert_array_equal(p.vessel.overflowed, [False, True, False])
 
 
 def test_above_its_tube_the_guard_exchanges_what_is_fed_and_below_it_takes_nothing() -> None:
     p = plant(PlantConfig(pump=PULSE, growth=GrowthConfig(mu=0.0)))
-    p.advance(1.0, np.array([1.0]), np.array([0.0]), guard_s=60.0)  # from 20 to 21 mL: nothing to take yet
-    assert p.volume_ml[0] == pytest.approx(21.0)
-    assert p.od[0] == pytest.approx(0.5 * 20.0 / 21.0)
-    p.advance(1.0, np.array([3.0]), np.array([0.0]), guard_s=60.0)  # fills 1 mL to the tube, the rest is exchanged
-    assert p.volume_ml[0] == pytest.approx(22.0)
-    assert p.od[0] == pytest.approx(0.5 * 20.0 / 22.0 * np.exp(-2.0 / 22.0))
+    p.advance(1.0, np.array([1.0]), np.array([0.0]), overflow_s=60.0)  # from 20 to 21 mL: nothing to take yet
+    assert p.vessel.volume_ml[0] == pytest.approx(21.0)
+    assert p.culture.od[0] == pytest.approx(0.5 * 20.0 / 21.0)
+    p.advance(1.0, np.array([3.0]), np.array([0.0]), overflow_s=60.0)  # fills 1 mL to the tube, the rest is exchanged
+    assert p.vessel.volume_ml[0] == pytest.approx(22.0)
+    assert p.culture.od[0] == pytest.approx(0.5 * 20.0 / 22.0 * np.exp(-2.0 / 22.0))
     p.advance(1.0, np.array([4.0]), np.array([0.0]))  # without it the level rises
-    assert p.volume_ml[0] == pytest.approx(26.0)
-    od = p.od[0]
-    p.advance(1.0, np.array([0.0]), np.array([0.0]), guard_s=3.0)  # it takes culture: OD unchanged
-    assert (p.volume_ml[0], p.od[0]) == (pytest.approx(23.0), pytest.approx(od))
-    p.advance(1.0, np.array([0.0]), np.array([30.0]), guard_s=30.0)  # the waste tube is the lower one
-    assert p.volume_ml[0] == pytest.approx(20.0)
+    assert p.vessel.volume_ml[0] == pytest.approx(26.0)
+    od = p.culture.od[0]
+    p.advance(1.0, np.array([0.0]), np.array([0.0]), overflow_s=3.0)  # it takes culture: OD unchanged
+    assert (p.vessel.volume_ml[0], p.culture.od[0]) == (pytest.approx(23.0), pytest.approx(od))
+    p.advance(1.0, np.array([0.0]), np.array([30.0]), overflow_s=30.0)  # the waste tube is the lower one
+    assert p.vessel.volume_ml[0] == pytest.approx(20.0)
 
 
 def test_substrate_is_conserved_in_a_batch_and_exhausted_at_the_yield() -> None:
     config = PlantConfig(growth=GrowthConfig(yield_od=3.0, k_s=0.2))
     p = plant(config)
     p.reset(0.1)
-    total = p.od + 3.0 * p.substrate
+    total = p.culture.od + 3.0 * p.culture.substrate
     for _ in range(600):
         p.advance(1.0, np.zeros(1))
-        assert p.substrate[0] >= 0.0
-    np.testing.assert_allclose(p.od + 3.0 * p.substrate, total, rtol=1e-12)
-    assert p.od[0] == pytest.approx(3.0, rel=1e-3)
+        assert p.culture.substrate[0] >= 0.0
+    np.testing.assert_allclose(p.culture.od + 3.0 * p.culture.substrate, total, rtol=1e-12)
+    assert p.culture.od[0] == pytest.approx(3.0, rel=1e-3)
 
 
 def test_chemostat_settles_where_monod_says() -> None:
@@ -128,30 +135,30 @@ def test_chemostat_settles_where_monod_says() -> None:
         p.advance(1.0, np.array([0.4]))
     dilution = 0.4 / 20.0
     s = dilution * g.k_s / (g.mu * (1.0 + g.k_s) - dilution)  # mu_max = mu (1 + k_s)
-    assert p.substrate[0] == pytest.approx(s, rel=1e-6)
-    assert p.od[0] == pytest.approx(3.0 * (1.0 - s), rel=1e-6)
+    assert p.culture.substrate[0] == pytest.approx(s, rel=1e-6)
+    assert p.culture.od[0] == pytest.approx(3.0 * (1.0 - s), rel=1e-6)
 
 
 def test_cooling_is_passive_and_heating_fast() -> None:
     p = plant(PlantConfig())
     minutes = 0
-    while p.temperature[0] > 30.0:
+    while p.thermal.temperature[0] > 30.0:
         p.advance(1.0, np.zeros(1), temperature_target=30.0)
         minutes += 1
     assert minutes == int(np.ceil(39.0 * np.log(13.0 / 6.0)))  # 31; measured reactors took 29 and 33
     p.advance(30.0, np.zeros(1), temperature_target=float("nan"))
-    assert p.temperature[0] == 30.0  # nan leaves the target
+    assert p.thermal.temperature[0] == 30.0  # nan leaves the target
     p.advance(5.0, np.zeros(1), temperature_target=37.0)
-    assert p.temperature[0] == 37.0
+    assert p.thermal.temperature[0] == 37.0
     p.advance(600.0, np.zeros(1), temperature_target=0.0)
-    assert p.temperature[0] == pytest.approx(24.0, abs=1e-3)
+    assert p.thermal.temperature[0] == pytest.approx(24.0, abs=1e-3)
 
 
 def test_feed_halves_the_time_of_cooling() -> None:
     p = Plant(PlantConfig(), 3, np.random.default_rng(0))
     minutes = np.zeros(3)
-    while (p.temperature > 30.0).any():
-        minutes += p.temperature > 30.0
+    while (p.thermal.temperature > 30.0).any():
+        minutes += p.thermal.temperature > 30.0
         p.advance(1.0, 60.0 * np.array([0.0, 0.009, 0.02]), temperature_target=30.0)
     dilution = np.array([0.0, 0.027, 0.06])  # 60 u / 20 mL; T' = -(T - 24) (1/39 + D), from 13 to 6 degC over 24
     assert minutes.tolist() == np.ceil(np.log(13.0 / 6.0) / (1.0 / 39.0 + dilution)).tolist() == [31.0, 15.0, 10.0]
@@ -160,7 +167,7 @@ def test_feed_halves_the_time_of_cooling() -> None:
 def test_fresh_medium_cools_the_vial() -> None:
     p = plant(PlantConfig(pump=PULSE, thermal=ThermalConfig(medium_c=20.0, heating_c_per_min=0.1)))
     p.advance(1e-6, np.array([1.2]))
-    assert 37.0 - p.temperature[0] == pytest.approx(17.0 * (1.0 - np.exp(-0.06)), rel=1e-3)  # about 1 degC
+    assert 37.0 - p.thermal.temperature[0] == pytest.approx(17.0 * (1.0 - np.exp(-0.06)), rel=1e-3)  # about 1 degC
 
 
 @pytest.mark.parametrize(
@@ -170,9 +177,9 @@ def test_cold_switch_presets_slow_growth_as_named(name: str, ratio: float) -> No
     p = plant(preset(name))
 
     def rate() -> float:
-        before = p.od.copy()
+        before = p.culture.od.copy()
         p.advance(1.0, np.zeros(1))
-        return float(np.log(p.od / before)[0])
+        return float(np.log(p.culture.od / before)[0])
 
     warm = rate()
     p.advance(60.0, np.zeros(1), temperature_target=30.0)
@@ -184,11 +191,11 @@ def test_growth_follows_temperature_with_its_time_constant() -> None:
     g = GrowthConfig(temperature_law="cardinal", adaptation_min=10.0)
     p = plant(PlantConfig(growth=g, thermal=ThermalConfig(heating_c_per_min=10.0)))
     p.reset(0.5, temperature=30.0)
-    cold = p._adapted.copy()
+    cold = p.culture._adapted.copy()
     p.advance(1.0, np.zeros(1), temperature_target=37.0)
     for _ in range(10):
         p.advance(1.0, np.zeros(1))
-    share = (p._adapted - cold) / (1.0 - cold)
+    share = (p.culture._adapted - cold) / (1.0 - cold)
     assert share[0] == pytest.approx(1.0 - np.exp(-1.05), abs=0.02)  # the first minute counts half: it was on the way
 
 
@@ -197,25 +204,25 @@ def test_wall_biomass_saturates_and_lifts_the_reading() -> None:
     quiet = replace(config, sensor=SensorConfig(wall_gain=config.sensor.wall_gain))
     p = plant(quiet, 4)
     for _ in range(48 * 60):
-        p.advance(1.0, np.where(p.od > 0.5, 1.2, 0.0))
+        p.advance(1.0, np.where(p.culture.od > 0.5, 1.2, 0.0))
     capacity = config.growth.wall_capacity_od
-    assert np.all(p.wall > 0.5 * capacity)
-    assert np.all(p.wall < 1.05 * capacity)
-    np.testing.assert_allclose(p.apparent_od - p.od, config.sensor.wall_gain * p.wall)
+    assert np.all(p.culture.wall > 0.5 * capacity)
+    assert np.all(p.culture.wall < 1.05 * capacity)
+    np.testing.assert_allclose(p.apparent_od - p.culture.od, config.sensor.wall_gain * p.culture.wall)
 
 
 def test_evaporation_concentrates() -> None:
     p = plant(PlantConfig(growth=GrowthConfig(mu=0.0), vessel=VesselConfig(evaporation_ml_day=2.0)))
     p.advance(720.0, np.zeros(1))
-    assert p.volume_ml[0] == pytest.approx(19.0)
-    assert p.od[0] == pytest.approx(0.5 * 20.0 / 19.0)
+    assert p.vessel.volume_ml[0] == pytest.approx(19.0)
+    assert p.culture.od[0] == pytest.approx(0.5 * 20.0 / 19.0)
 
 
 def dose(config: PumpConfig, on_s: float, prepare: Callable[[Plant], None] = lambda p: None) -> float:
     p = plant(PlantConfig(pump=config))
     prepare(p)
     p.advance(1.0, np.array([on_s]))
-    return float(p.media_ml[0])
+    return float(p.feed.delivered_ml[0])
 
 
 def test_pump_delivers_gain_times_on_time_less_dead_time() -> None:
@@ -228,22 +235,22 @@ def test_pump_delivers_gain_times_on_time_less_dead_time() -> None:
 
 def test_fault_switches_of_the_pump() -> None:
     for factor in (0.0, 0.5, 1.5):
-        assert dose(PULSE, 1.0, lambda p, f=factor: p.pump_gain_factor.fill(f)) == pytest.approx(factor)  # type: ignore[misc]
-    assert dose(PULSE, 1.0, lambda p: p.back_leak_ml.fill(0.2)) == pytest.approx(0.8)
-    assert dose(PULSE, 1.0, lambda p: p.media_left_ml.fill(0.3)) == pytest.approx(0.3)
+        assert dose(PULSE, 1.0, lambda p, f=factor: p.feed.gain_factor.fill(f)) == pytest.approx(factor)  # type: ignore[misc]
+    assert dose(PULSE, 1.0, lambda p: p.feed.back_leak_ml.fill(0.2)) == pytest.approx(0.8)
+    assert dose(PULSE, 1.0, lambda p: p.feed.media_left_ml.fill(0.3)) == pytest.approx(0.3)
     p = plant(PlantConfig(pump=PULSE))
     p.advance(1.0, np.array([-2.0]))  # backwards: culture leaves, nothing is diluted
-    assert p.volume_ml[0] == pytest.approx(18.0)
-    assert p.od[0] > 0.5
+    assert p.vessel.volume_ml[0] == pytest.approx(18.0)
+    assert p.culture.od[0] > 0.5
 
 
 def test_priming_loses_part_of_the_first_pulse_after_a_rest() -> None:
     p = plant(PlantConfig(pump=replace(PULSE, prime_low=0.3, prime_high=0.7)), 200)
     p.advance(11.0, np.zeros(200))
     p.advance(1.0, np.ones(200))
-    first = p.media_ml.copy()
+    first = p.feed.delivered_ml.copy()
     p.advance(1.0, np.ones(200))
-    np.testing.assert_allclose(p.media_ml - first, 1.0)
+    np.testing.assert_allclose(p.feed.delivered_ml - first, 1.0)
     assert first.min() >= 0.3
     assert first.max() <= 0.7
     assert first.mean() == pytest.approx(0.5, abs=0.03)
@@ -253,9 +260,9 @@ def test_pulse_spread_and_its_memory() -> None:
     p = plant(PlantConfig(pump=replace(PULSE, pulse_cv=0.1, pulse_ar=0.5)), 400)
     doses = []
     for _ in range(60):
-        before = p.media_ml
+        before = p.feed.delivered_ml
         p.advance(1.0, np.ones(400))
-        doses.append(p.media_ml - before)
+        doses.append(p.feed.delivered_ml - before)
     d = np.array(doses)[5:] - 1.0
     assert d.std() == pytest.approx(0.1, rel=0.03)
     assert np.mean(d[1:] * d[:-1]) / d.var() == pytest.approx(0.5, abs=0.02)
@@ -269,9 +276,9 @@ def test_small_irregular_steps_give_the_same_plant() -> None:
         whole.advance(1.0, np.full(3, 60.0 * steps[:4].sum()), np.full(3, 10.0))
         for k, h in enumerate(steps):
             cut.advance(float(h), np.full(3, 60.0 * h if k < 4 else 0.0), np.full(3, 2.5 if k < 4 else 0.0))
-    np.testing.assert_allclose(cut.media_ml, whole.media_ml, rtol=1e-9)
-    np.testing.assert_allclose(cut.volume_ml, whole.volume_ml, rtol=1e-6)
-    np.testing.assert_allclose(cut.od, whole.od, rtol=2e-3)
+    np.testing.assert_allclose(cut.feed.delivered_ml, whole.feed.delivered_ml, rtol=1e-9)
+    np.testing.assert_allclose(cut.vessel.volume_ml, whole.vessel.volume_ml, rtol=1e-6)
+    np.testing.assert_allclose(cut.culture.od, whole.culture.od, rtol=2e-3)
     np.testing.assert_allclose(cut.read_od(), whole.read_od(), rtol=3e-3)
 
 
@@ -300,14 +307,14 @@ def test_noise_does_not_depend_on_what_the_pump_is_told() -> None:
         a.advance(1.0, 0.5)
         b.advance(1.0, 1.0 if minute % 7 == 0 else 0.0)
         np.testing.assert_allclose(a.read_od() - a.apparent_od, b.read_od() - b.apparent_od, atol=1e-12)
-    before = a.media_ml, b.media_ml
+    before = a.feed.delivered_ml, b.feed.delivered_ml
     a.advance(1.0, 0.7)
     b.advance(1.0, 0.7)
-    np.testing.assert_allclose(a.media_ml - before[0], b.media_ml - before[1], rtol=1e-9)
-    x = a.od.copy(), b.od.copy()
+    np.testing.assert_allclose(a.feed.delivered_ml - before[0], b.feed.delivered_ml - before[1], rtol=1e-9)
+    x = a.culture.od.copy(), b.culture.od.copy()
     a.advance(1.0, 0.0)
     b.advance(1.0, 0.0)
-    np.testing.assert_allclose(a.od / x[0], b.od / x[1], rtol=1e-12)  # growth drifted alike
+    np.testing.assert_allclose(a.culture.od / x[0], b.culture.od / x[1], rtol=1e-12)  # growth drifted alike
 
 
 def test_draws_have_the_configured_spread_and_seeds_differ() -> None:
@@ -325,12 +332,12 @@ def test_draws_have_the_configured_spread_and_seeds_differ() -> None:
 
 def test_growth_faults_and_stirrer() -> None:
     p = plant(PlantConfig(), 3)
-    p.mu_factor[1] = 0.6
-    p.stir_factor[2] = 0.0
+    p.culture.mu_factor[1] = 0.6
+    p.culture.stir_factor[2] = 0.0
     p.advance(5.0, 0.0)
-    rate = np.log(p.od / 0.5) / 5.0
+    rate = np.log(p.culture.od / 0.5) / 5.0
     np.testing.assert_allclose(rate / rate[0], [1.0, 0.6, 0.5], rtol=5e-3)
-    assert 0.05 < 1.0 - p.apparent_od[2] / p.od[2] < 0.10
+    assert 0.05 < 1.0 - p.apparent_od[2] / p.culture.od[2] < 0.10
 
 
 def test_reset_starts_a_new_culture_in_the_same_reactor() -> None:
@@ -338,9 +345,9 @@ def test_reset_starts_a_new_culture_in_the_same_reactor() -> None:
     mu = p.draws["mu"].copy()
     p.advance(30.0, 1.0)
     p.reset(0.8, temperature=30.0)
-    np.testing.assert_array_equal(p.od, 0.8)
-    np.testing.assert_array_equal(p.temperature, 30.0)
-    np.testing.assert_array_equal(p.media_ml, 0.0)
+    np.testing.assert_array_equal(p.culture.od, 0.8)
+    np.testing.assert_array_equal(p.thermal.temperature, 30.0)
+    np.testing.assert_array_equal(p.feed.delivered_ml, 0.0)
     np.testing.assert_array_equal(p.draws["mu"], mu)
     assert p.minutes == 0.0
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from envs.plant.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig
+from envs.plant.culture import GrowthConfig
+from envs.plant.plant import Plant, PlantConfig
+from envs.plant.pump import PumpConfig
+from envs.plant.sensor import SensorConfig
 from envs.task import EnvConfig
 from experiments.controllers.inverse import Inverse, InverseConfig
 
@@ -62,7 +65,7 @@ def test_it_learns_growth_and_pump_of_a_plant_it_was_not_told() -> None:
         reading = plant.read_od()
         plant.advance(1.0, 60.0 * inverse.act(reading, setpoint, np.full(n, float(minute)), np.ones(n, dtype=bool)))
         if minute >= 80:
-            errors.append(plant.od - 0.5)
+            errors.append(plant.culture.od - 0.5)
     seen = inverse.explain()
     assert seen["mu"].mean() == pytest.approx(0.02, abs=0.0015)
     assert seen["gain"].mean() == pytest.approx(0.75, abs=0.05)

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from dqn import policy
-from envs.plant.plant import Plant, PlantConfig, SensorConfig
+from envs.plant.plant import Plant, PlantConfig
+from envs.plant.sensor import SensorConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
 from experiments.control.config import DeployConfig
@@ -174,7 +175,7 @@ def test_recovery_is_undiluted_and_each_reactor_has_its_own_clock():
 def test_a_reading_that_is_no_number_is_answered_with_no_dose():
     sensor = SensorConfig()
     plant = Plant(replace(PlantConfig(start_od=0.9), sensor=sensor), 1, np.random.default_rng(0))
-    plant.sensor_offset = np.array([np.nan])
+    plant.sensor.extra_offset[:] = np.nan
     reactors = SimulatedReactors(plant, SimulatedConfig())
     loop = ClosedLoop(reactors, LearnedController(inverse_policy()), Interlock(1), Scenario((0.5,), (5.0,), (37.0,)))
     loop.began[:] = 0.0
@@ -247,7 +248,7 @@ def test_a_run_ends_although_an_absent_reactor_cannot_be_verified_off_and_says_s
     while bed.clock.now() < 300.0:
         next(steps)
     bed.fault("unplugged", 1.0, "M1")
-    while bed.device.alive:
+    while bed.device.supervisor.alive:
         next(steps)
     bed.fault("restart")
     reasons = [step.reasons[1] or "" for step in steps]  # comes to its end
@@ -259,4 +260,4 @@ def test_a_run_ends_although_an_absent_reactor_cannot_be_verified_off_and_says_s
     with pytest.raises(DeviceStateError, match=r"pumps not verified off: M1: .*absent.*by hand"):
         bed.reactors.stop()
     assert bed.motors_off()
-    assert bed.device.exits == 1
+    assert bed.device.supervisor.exits == 1

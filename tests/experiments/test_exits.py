@@ -160,7 +160,9 @@ def test_an_overflow_guard_runs_over_doses_and_a_kill_and_is_off_after_every_oth
             assert bench.client.poll() is None
             time.sleep(0.005)
 
-    with EmulatorProcess(["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5", "--guard", "Pump3"]) as device:
+    with EmulatorProcess(
+        ["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5", "--overflow-pump", "Pump3"]
+    ) as device:
         bench = Bench(device, folder, more=guard)
         until_fed(bench)
         bench.client.kill()

@@ -207,7 +207,7 @@ def test_giving_a_reactor_up_ends_its_regulation_too(tmp_path: Path) -> None:
     run.loop.interlock.latch(Response.STOP, np.array([True, False]))
     run.live(5)
     assert run.loop.stopped.tolist() == [True, False]
-    fed = run.device.benches["M0"].on_s["Pump1"]
+    fed = run.device.vials["M0"].on_s["Pump1"]
     assert run.data()["OD"]["ON"] == 0
     assert not run.reactors.handed_over.any()
     run.bury()
@@ -215,8 +215,8 @@ def test_giving_a_reactor_up_ends_its_regulation_too(tmp_path: Path) -> None:
     run.begin()
     run.live(10)
     assert run.data()["OD"]["ON"] == 0
-    assert run.device.benches["M0"].on_s["Pump1"] == fed
-    assert run.device.benches["M1"].on_s["Pump1"] > 0.0
+    assert run.device.vials["M0"].on_s["Pump1"] == fed
+    assert run.device.vials["M1"].on_s["Pump1"] > 0.0
 
 
 def test_a_run_of_an_earlier_version_hands_over_again(tmp_path: Path) -> None:

@@ -5,10 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from envs.plant.plant import GrowthConfig, PlantConfig, PumpConfig
+from envs.plant.culture import GrowthConfig
+from envs.plant.plant import PlantConfig
+from envs.plant.pump import PumpConfig
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions
-from hardware.emulator.vial import BenchConfig
+from hardware.emulator.vial_config import VialConfig
 
 BLANK = 14000.0
 BIAS_S = 0.1  # every pump run is longer than asked by this
@@ -16,7 +18,7 @@ START_S = 0.45  # from the answer to a pump command until the motor turns
 STOP_S = 0.09  # and until one that runs stands still
 
 
-def quiet(mu: float = 0.0, **bench: float) -> DeviceOptions:
+def quiet(mu: float = 0.0, **vial: float) -> DeviceOptions:
     """No noise, known blank, constant pump bias and delay, a culture that grows with mu (1/min)."""
     fixed = {
         "blank_low": BLANK,
@@ -29,9 +31,9 @@ def quiet(mu: float = 0.0, **bench: float) -> DeviceOptions:
         "on_time_bias_high_s": BIAS_S,
         "pump_start_low_s": START_S,
         "pump_start_high_s": START_S,
-    } | bench
+    } | vial
     plant = PlantConfig(growth=GrowthConfig(mu=mu), pump=PumpConfig(dosing="pulse"))
-    return DeviceOptions(bench=BenchConfig(**fixed), plant=plant)
+    return DeviceOptions(vial=VialConfig(**fixed), plant=plant)
 
 
 class Lab:
@@ -72,4 +74,4 @@ class Lab:
     def doses(self, reactor: str = "M0", pump: str = "Pump1") -> list[tuple[float, float]]:
         """(start, length) of what the pump's motor did, s."""
         self.device.run_until(self.clock.now())
-        return [(d.start_s, d.seconds) for d in self.device.benches[reactor].doses if d.pump == pump]
+        return [(d.start_s, d.seconds) for d in self.device.vials[reactor].doses if d.pump == pump]

@@ -20,7 +20,7 @@ from tests.hardware.emulator_lab import BIAS_S, START_S, quiet
 def doses(bed: Bed, name: str = "M0", pump: str = "Pump1") -> list[tuple[float, float]]:
     """(start, length) of every run of a motor, device s."""
     bed.device.run_until(bed.clock.now())
-    return [(d.start_s, d.seconds) for d in bed.device.benches[name].doses if d.pump == pump]
+    return [(d.start_s, d.seconds) for d in bed.device.vials[name].doses if d.pump == pump]
 
 
 def fixed(bed: Bed, rate: float) -> None:
@@ -281,7 +281,7 @@ def test_zigzag_is_refused_with_the_remedy() -> None:
 
 def test_a_stored_blank_replaces_the_devices() -> None:
     bed = Bed(blanked=False)
-    rig = Rig(SOUND.feed, SOUND.waste, blank=bed.device.benches["M0"].blank)
+    rig = Rig(SOUND.feed, SOUND.waste, blank=bed.device.vials["M0"].spectrometer.blank)
     bed.reactors = ChiBioReactors(bed.wire, bed.clock, bed.config, [rig], bed.log)
     bed.reactors.begin()
     bed.run(3)
@@ -455,7 +455,7 @@ def test_a_bus_that_hangs_while_pumping_is_ended_within_a_minute() -> None:
     bed.fault("bus_stuck_when_pumping")
     bed.run(5)
     assert max(length for _, length in doses(bed)) < 45.0
-    assert bed.device.restarts == 1
+    assert bed.device.supervisor.restarts == 1
     bed.run(5)
     assert bed.reactors.stations[0].fault is None
     assert bed.truth()["peak_ml"] < 25.0
@@ -532,7 +532,7 @@ def test_a_device_started_again_without_one_of_its_reactors_is_not_ended_by_this
     bed.fault("restart")
     before = bed.samples.copy()
     bed.run(10)
-    assert bed.device.alive
+    assert bed.device.supervisor.alive
     assert "absent" in bed.kinds()
     assert (bed.samples - before)[0] >= 8
     assert (bed.samples - before)[1] == 0

@@ -82,14 +82,14 @@ def test_touching_an_absent_reactor_ends_everything() -> None:
 def test_every_blocking_access_to_an_absent_reactor_is_deadly(path: str) -> None:
     c = Client()
     c.fails(lambda: c.link.post(path))
-    assert not c.device.alive
+    assert not c.device.supervisor.alive
 
 
 def test_a_pump_of_an_absent_reactor_is_deadly_a_moment_after_its_204() -> None:
     c = Client()
     assert c.link.post("/SetOutputOn/Pump1/0/M5").status == 204
     c.lab.wait(0.2)
-    assert not c.device.alive
+    assert not c.device.supervisor.alive
 
 
 @pytest.mark.parametrize("path", ["/SetOutputTarget/Pump1/M5/0.1", "/changeDevice/M5", "/scanDevices/M5"])
@@ -97,7 +97,7 @@ def test_harmless_calls_for_an_absent_reactor(path: str) -> None:
     c = Client()
     assert c.link.post(path).status == 204
     c.lab.wait(1.0)
-    assert c.device.alive
+    assert c.device.supervisor.alive
 
 
 def test_unplugging_a_running_reactor_takes_all_down() -> None:
@@ -107,7 +107,7 @@ def test_unplugging_a_running_reactor_takes_all_down() -> None:
     c.lab.wait(100.0)
     inject(c.device, "unplugged", "M1")
     c.lab.wait(60.0)
-    assert not c.device.alive
+    assert not c.device.supervisor.alive
     assert not c.device.truth("M0")["powered"]
     inject(c.device, "restart")
     c.lab.wait(20.0)
@@ -124,7 +124,7 @@ def test_a_scan_marks_an_unplugged_reactor_absent_and_then_its_threads_kill() ->
     state = c.state("M0")
     assert state["presentDevices"]["M1"] == 0
     c.lab.wait(60.0)
-    assert not c.device.alive
+    assert not c.device.supervisor.alive
 
 
 def test_a_slow_request_delays_everybody_and_is_answered_after_all() -> None:
@@ -149,7 +149,7 @@ def test_a_hang_beyond_30_s_costs_the_worker_and_its_memory() -> None:
     assert c.clock.now() - began == pytest.approx(30.0 + 8.0, abs=0.1)  # killed at 30 s, booted in 8
     assert wiped(c.state("M0"))
     assert wiped(c.state("M1"))
-    assert c.device.restarts == 1
+    assert c.device.supervisor.restarts == 1
 
 
 def test_a_client_that_waits_long_enough_sees_the_reset_of_the_killed_worker() -> None:
@@ -201,7 +201,7 @@ def test_a_reactor_marked_absent_by_a_glitch_is_killed_by_its_own_threads() -> N
     inject(c.device, "marked_absent", "M1")
     assert c.state("M0")["presentDevices"]["M1"] == 0
     c.lab.wait(60.0)
-    assert not c.device.alive
+    assert not c.device.supervisor.alive
 
 
 def test_after_a_power_cut_the_clock_starts_again_and_everything_is_off() -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from envs.plant.sensor import density
 from hardware.emulator.faults import inject
-from hardware.emulator.vial import density
 from tests.hardware.emulator_lab import BLANK, Lab, quiet
 
 A, B = 0.226, 1.833
@@ -130,7 +130,7 @@ def test_blanks_are_in_the_range_seen_on_real_devices() -> None:
         Lab(tuple(f"M{k}" for k in range(8)), seed=s, options=quiet(blank_low=11600.0, blank_high=15800.0))
         for s in range(5)
     ]
-    counts = [b.blank for lab in blanks for b in lab.device.benches.values()]
+    counts = [v.spectrometer.blank for lab in blanks for v in lab.device.vials.values()]
     assert min(counts) >= 11600.0
     assert max(counts) <= 15800.0
     assert np.std(counts) > 500.0

@@ -5,6 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from conf import schema
+from conf.presets import groups, load
+from envs.plant.plant import PlantConfig
+from hardware.chibio.config import EmulatorConfig
 from hardware.emulator.faults import inject
 from hardware.emulator.server import build, parser
 from tests.hardware.emulator_lab import BIAS_S, START_S, STOP_S, Lab, quiet
@@ -76,13 +80,21 @@ def test_the_motor_starts_after_a_delay_of_its_own_each_time() -> None:
 
 def test_the_delay_is_an_option_of_the_program() -> None:
     for arguments, expected in (([], (0.2, 0.7)), (["--pump-start", "0.1", "3"], (0.1, 3.0))):
-        bench = build(parser().parse_args(arguments)).options.bench
-        assert (bench.pump_start_low_s, bench.pump_start_high_s) == expected
+        vial = build(parser().parse_args(arguments)).options.vial
+        assert (vial.pump_start_low_s, vial.pump_start_high_s) == expected
+
+
+@pytest.mark.parametrize("name", groups()["plant"])
+def test_the_emulated_plant_is_the_preset_dosed_in_pulses(name: str) -> None:
+    preset = schema.build(PlantConfig(), load(f"plant/{name}"), "plant")
+    device = build(parser().parse_args(["--plant", name]))
+    assert device.vials["M0"].plant.config == replace(preset, pump=replace(preset.pump, dosing="pulse"))
+    assert EmulatorConfig(plant=name).plant == name
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.1, 0.7), (0.5, 0.2), (0.0, 9.0)])
 def test_a_delay_out_of_range_is_named(low: float, high: float) -> None:
-    with pytest.raises(ValueError, match=r"bench\.pump_start_(low|high)_s = .*allowed"):
+    with pytest.raises(ValueError, match=r"vial\.pump_start_(low|high)_s = .*allowed"):
         quiet(pump_start_low_s=low, pump_start_high_s=high)
 
 
@@ -123,7 +135,7 @@ def test_full_duty_is_continuous(target: float) -> None:
     lab = Lab()
     set_pump(lab, "Pump3", target)
     lab.wait(400.0)
-    assert lab.device.benches["M0"].motor("Pump3") == int(target)
+    assert lab.device.vials["M0"].motor("Pump3") == int(target)
     assert lab.doses(pump="Pump3") == []  # never switched off between periods
     lab.post("/SetOutputOn/Pump3/0/M0")
     lab.wait(1.0)
@@ -151,14 +163,14 @@ def test_nan_target_moves_nothing() -> None:
     set_pump(lab, "Pump1", float("nan"))
     lab.wait(200.0)
     assert lab.doses() == []
-    assert lab.device.benches["M0"].motor("Pump1") == 0
+    assert lab.device.vials["M0"].motor("Pump1") == 0
 
 
 def test_negative_target_runs_backwards_and_draws_culture_out() -> None:
     lab = Lab()
     set_pump(lab, "Pump1", -0.05)
     lab.wait(10.0)
-    assert [d.direction for d in lab.device.benches["M0"].doses] == [-1]
+    assert [d.direction for d in lab.device.vials["M0"].doses] == [-1]
     truth = lab.device.truth("M0")
     assert truth["feed_ml"] == 0.0
     assert truth["volume_ml"] == pytest.approx(20.0 - 3.15 - BIAS_S)
@@ -169,7 +181,7 @@ def test_direction_before_the_thread_reads_it_reverses_the_dose() -> None:
     set_pump(lab, "Pump1", 0.05)
     lab.post("/Direction/Pump1/M0")
     lab.wait(10.0)
-    assert [d.direction for d in lab.device.benches["M0"].doses] == [-1]
+    assert [d.direction for d in lab.device.vials["M0"].doses] == [-1]
 
 
 def test_set_output_on_returns_before_the_motor_turns() -> None:
@@ -178,11 +190,11 @@ def test_set_output_on_returns_before_the_motor_turns() -> None:
     before = lab.clock.now()
     lab.post("/SetOutputOn/Pump1/1/M0")
     assert lab.clock.now() - before < 0.02
-    assert lab.device.benches["M0"].motor("Pump1") == 0
+    assert lab.device.vials["M0"].motor("Pump1") == 0
     lab.wait(START_S - 0.02)
-    assert lab.device.benches["M0"].motor("Pump1") == 0
+    assert lab.device.vials["M0"].motor("Pump1") == 0
     lab.wait(0.04)
-    assert lab.device.benches["M0"].motor("Pump1") == 1
+    assert lab.device.vials["M0"].motor("Pump1") == 1
 
 
 def test_record_shows_a_pump_only_if_it_is_on_when_the_cycle_records() -> None:
@@ -220,17 +232,17 @@ def test_volume_balance_waste_level_and_overflow() -> None:
     assert truth["peak_ml"] == pytest.approx(30.0)
 
 
-@pytest.mark.parametrize(("guard", "level"), [("Pump3", 22.0), ("", 25.0 + BIAS_S)])
-def test_a_spare_pump_moves_liquid_only_if_it_has_a_tube(guard: str, level: float) -> None:
+@pytest.mark.parametrize(("overflow_pump", "level"), [("Pump3", 22.0), ("", 25.0 + BIAS_S)])
+def test_a_spare_pump_moves_liquid_only_if_it_has_a_tube(overflow_pump: str, level: float) -> None:
     options = quiet()
-    lab = Lab(options=replace(options, bench=replace(options.bench, guard=guard)))
+    lab = Lab(options=replace(options, vial=replace(options.vial, overflow_pump=overflow_pump)))
     set_pump(lab, "Pump3", 0.5)
     set_pump(lab, "Pump1", 5.0 / 63.0)
     lab.wait(8.0)
     lab.post("/SetOutputOn/Pump1/0/M0")
     assert lab.device.truth("M0")["motors"]["Pump3"] == 1
     assert lab.device.truth("M0")["volume_ml"] == pytest.approx(level)
-    inject(lab.device, "guard_gain_factor", "M0", 0.0)
+    inject(lab.device, "overflow_gain_factor", "M0", 0.0)
     set_pump(lab, "Pump1", 1.0 / 63.0)
     lab.wait(5.0)
     assert lab.device.truth("M0")["volume_ml"] == pytest.approx(level + 1.0 + BIAS_S)
@@ -286,12 +298,12 @@ def test_dose_log_agrees_with_on_time_and_volume() -> None:
         if rng.random() < 0.4:
             lab.post(f"/SetOutputOn/Pump1/{rng.integers(0, 2)}/{m}")
         lab.wait(float(rng.exponential(8.0)))
-    for m in lab.device.reactors:
+    for m in lab.device.vials:
         lab.post(f"/SetOutputOn/Pump1/0/{m}")
     lab.wait(1.0)
-    for m in lab.device.reactors:
+    for m in lab.device.vials:
         truth = lab.device.truth(m)
-        doses = [d for d in lab.device.benches[m].doses if d.pump == "Pump1"]
+        doses = [d for d in lab.device.vials[m].doses if d.pump == "Pump1"]
         assert sum(d.seconds for d in doses) == pytest.approx(truth["on_s"]["Pump1"])
         assert sum(d.feed_ml for d in doses) == pytest.approx(truth["feed_ml"])
         assert truth["feed_ml"] == pytest.approx(truth["on_s"]["Pump1"])

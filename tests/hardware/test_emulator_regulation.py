@@ -76,7 +76,7 @@ def test_a_jump_upwards_stops_the_feed_for_that_cycle() -> None:
     regulate(lab, 0.5)
     after_regulation(lab, 5)
     assert lab.peek()["Pump1"]["target"] > 0.0
-    lab.device.vial("M0").od_jump = 0.1
+    lab.device.vials["M0"].faults.od_jump = 0.1
     after_regulation(lab, 6)
     assert lab.peek()["Pump1"]["target"] == 0.0
 

@@ -79,7 +79,7 @@ def test_status_codes(method: str, path: str, status: int) -> None:
     lab = Lab()
     got, body = lab.device.handle(method, path)
     assert got == status
-    assert lab.device.alive
+    assert lab.device.supervisor.alive
     assert body == b"" if status == 204 else body
     if status == 500:
         assert b"html" in body  # no JSON errors exist
@@ -213,7 +213,7 @@ def test_stirrer_blocks_by_its_target_and_again_when_the_target_is_rewritten(tar
         before = lab.clock.now()
         lab.post(path)
         assert lab.clock.now() - before == pytest.approx(seconds, abs=0.02)
-    assert lab.device.benches["M0"].stir == target
+    assert lab.device.vials["M0"].stir == target
 
 
 def test_switching_regulation_either_way_turns_both_pumps_off() -> None:
@@ -317,7 +317,7 @@ def test_thousands_of_random_requests_leave_a_device_that_answers() -> None:
         status, _ = lab.device.handle("GET" if reads else "POST", path)
         seen.add(status)
         lab.wait(float(rng.exponential(2.0)))
-        assert lab.device.alive, lab.device.errors[-1]
+        assert lab.device.supervisor.alive, lab.device.computer.errors[-1]
     assert seen == {200, 204, 308, 404, 405, 500}
     for reactor in ("M0", "M1"):
         assert 0.0 < lab.device.truth(reactor)["volume_ml"] <= 30.0

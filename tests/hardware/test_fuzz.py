@@ -108,7 +108,7 @@ def test_no_traceback_and_no_overdose_on_mutilated_answers() -> None:
         truth = device.truth(name)
         assert not any(truth["motors"].values())
         assert not truth["overflowed"]
-        assert max((d.seconds for d in device.benches[name].doses if d.pump == "Pump1"), default=0.0) < 3.0
+        assert max((d.seconds for d in device.vials[name].doses if d.pump == "Pump1"), default=0.0) < 3.0
 
 
 def test_no_dose_is_begun_when_the_read_back_is_garbage() -> None:

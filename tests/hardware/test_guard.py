@@ -13,8 +13,9 @@ from hardware.chibio.overflow_guard import GuardConfig
 from hardware.chibio.protocol import parse_state
 from hardware.chibio.resume import replay
 from hardware.emulator.device import DeviceOptions
+from hardware.emulator.plants import plant_preset
 from hardware.emulator.server import build, parser
-from hardware.emulator.vial import BenchConfig, healthy_plant
+from hardware.emulator.vial_config import VialConfig
 from hardware.errors import DeviceStateError
 from tests.hardware.driver_lab import Bed
 from tests.hardware.script import state
@@ -24,7 +25,7 @@ GUARD = GuardConfig("Pump3", 0.5)
 
 def rig(guard: GuardConfig = GUARD, **config: Any) -> Bed:
     """Driver and emulated device with a second waste tube."""
-    options = DeviceOptions(bench=BenchConfig(guard=guard.pump), plant=healthy_plant())
+    options = DeviceOptions(vial=VialConfig(overflow_pump=guard.pump))
     return Bed(options=options, guard=guard, **config)
 
 
@@ -88,7 +89,7 @@ def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_t
     bed.run(20)
     assert len(bed.of("intent")) >= 15
     assert guard_posts(bed) == ["/SetOutputTarget/Pump3/M0/0.500000", "/SetOutputOn/Pump3/1/M0"]
-    starts = [d.start_s for d in bed.device.benches["M0"].doses if d.pump == "Pump3"]
+    starts = [d.start_s for d in bed.device.vials["M0"].doses if d.pump == "Pump3"]
     assert np.diff(starts) == pytest.approx(63.5, abs=0.5)  # the device's own period, never begun anew
     assert bed.of("fault") == []
     assert not [row for row in bed.of("note") if "guard" in row["note"]]
@@ -189,7 +190,7 @@ def test_a_run_does_not_begin_without_it_and_leaves_no_pump_on() -> None:
 
 
 def test_a_start_that_fails_at_one_reactor_leaves_no_guard_on_at_another() -> None:
-    options = DeviceOptions(bench=BenchConfig(guard="Pump3"))
+    options = DeviceOptions(vial=VialConfig(overflow_pump="Pump3"))
     bed = Bed(("M0", "M1"), options=options, guard=GUARD)
     bed.device.handle("POST", "/SetOutputOn/Zigzag/1/M1")
     with pytest.raises(DeviceStateError, match="Zigzag"):
@@ -270,7 +271,7 @@ def test_a_resumed_run_finds_it_on_and_does_not_interrupt_it() -> None:
     bed.run(5)
     assert guard_posts(bed) == before
     assert runs(bed)
-    starts = [d.start_s for d in bed.device.benches["M0"].doses if d.pump == "Pump3"]
+    starts = [d.start_s for d in bed.device.vials["M0"].doses if d.pump == "Pump3"]
     assert np.diff(starts) == pytest.approx(63.5, abs=0.5)
     bed.reactors.stop()
     assert bed.motors_off()
@@ -307,9 +308,9 @@ def test_a_feed_motor_stuck_at_full_power_needs_a_guard_that_is_the_stronger_pum
 ) -> None:
     """0.95 of the time at the feed pump's own 1 mL/s is less than the feed: the headroom is gone in minutes."""
     guard = GuardConfig("Pump3", 0.95, flow_ml_s)
-    plant = healthy_plant()
-    plant = replace(plant, pump=replace(plant.pump, guard_ml_s=flow_ml_s))
-    bed = Bed(options=DeviceOptions(bench=BenchConfig(guard="Pump3"), plant=plant), guard=guard)
+    plant = plant_preset("healthy")
+    plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=flow_ml_s))
+    bed = Bed(options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), guard=guard)
     bed.reactors.begin()
     bed.run(3)
     bed.fault("feed_stuck_open")
@@ -319,9 +320,9 @@ def test_a_feed_motor_stuck_at_full_power_needs_a_guard_that_is_the_stronger_pum
 
 
 def test_the_emulator_has_one_if_it_is_told_so() -> None:
-    device = build(parser().parse_args(["--guard", "Pump4", "--guard-flow", "1.3", "--plant", "bench"]))
-    assert device.benches["M0"].config.guard == "Pump4"
-    assert device.benches["M0"].plant.config.pump.guard_ml_s == 1.3
-    assert build(parser().parse_args([])).benches["M0"].config.guard == ""
-    with pytest.raises(ValueError, match="bench.guard = Pump2: allowed Pump3, Pump4"):
-        BenchConfig(guard="Pump2")
+    device = build(parser().parse_args(["--overflow-pump", "Pump4", "--overflow-flow", "1.3", "--plant", "bench"]))
+    assert device.vials["M0"].config.overflow_pump == "Pump4"
+    assert device.vials["M0"].plant.config.pump.overflow_ml_s == 1.3
+    assert build(parser().parse_args([])).vials["M0"].config.overflow_pump == ""
+    with pytest.raises(ValueError, match="vial.overflow_pump = Pump2: allowed Pump3, Pump4"):
+        VialConfig(overflow_pump="Pump2")

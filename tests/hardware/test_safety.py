@@ -10,7 +10,7 @@ import pytest
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
 from experiments.cli import frame
-from hardware.emulator.vial import bench_plant
+from hardware.emulator.plants import plant_preset
 from hardware.reactor import Fault, Measurement, Receipt, Vitals
 from hardware.safety.config import REMEDIES, Response, Responses, SafetyConfig, check_setpoints
 from hardware.safety.interlock import Interlock, Verdict
@@ -279,10 +279,10 @@ def cultivate(
     verdicts = []
     for k in range(minutes):
         if spoil is not None and k == spoil[0]:
-            getattr(vials, spoil[1])[:] = spoil[2]
+            getattr(vials.feed, spoil[1])[:] = spoil[2]
         target = np.full(n, setpoint if setpoint is not None else (0.8, 0.65, 0.5, 0.3)[k // 60 % 4])
         od = vials.read_od()
-        m = Measurement(np.full(n, 60.0 * k), od, vials.read_temperature(), np.ones(n, bool))
+        m = Measurement(np.full(n, 60.0 * k), od, vials.thermal.read(), np.ones(n, bool))
         wish = (0.025 + 0.8 * np.log(np.maximum(od, 1e-3) / target)) / 3.0
         rate = LEVELS[np.clip(np.round(np.nan_to_num(wish) / 0.00125), 0, 16).astype(int)]
         verdict = interlock.check(m, rate, target, np.full(n, 37.0), 60.0 * k)
@@ -300,7 +300,7 @@ def count(verdicts: list[Verdict], kind: str) -> int:
 @pytest.mark.parametrize("mu", [0.014, 0.025, 0.031])
 def test_thirty_healthy_reactors_for_a_day_are_left_alone(mu: float) -> None:
     """Only outliers and bubbles are held back: 1.5 % of the minutes at most, nothing latches, no flow alarm."""
-    healthy = replace(bench_plant(), sensor=NOISY)
+    healthy = replace(plant_preset("bench"), sensor=NOISY)
     healthy = replace(healthy, growth=replace(healthy.growth, mu=mu))
     interlock, verdicts, _ = cultivate(healthy, 30, 1440)
     held = np.array([v.response > Response.PASS for v in verdicts]).mean()
@@ -314,9 +314,9 @@ def test_thirty_healthy_reactors_for_a_day_are_left_alone(mu: float) -> None:
 
 
 @pytest.mark.parametrize("mu", [0.014, 0.025])
-@pytest.mark.parametrize("spoilt", ["pump_gain_factor", "media_left_ml"])
+@pytest.mark.parametrize("spoilt", ["gain_factor", "media_left_ml"])
 def test_a_blocked_pump_or_an_empty_bottle_is_found_within_25_min_in_every_reactor(mu: float, spoilt: str) -> None:
-    sound = replace(bench_plant(), sensor=NOISY)
+    sound = replace(plant_preset("bench"), sensor=NOISY)
     sound = replace(sound, growth=replace(sound.growth, mu=mu))
     _, verdicts, _ = cultivate(sound, 30, 145, (120, spoilt, 0.0), 0.5)
     found = np.zeros(30, dtype=bool)
@@ -326,7 +326,7 @@ def test_a_blocked_pump_or_an_empty_bottle_is_found_within_25_min_in_every_react
 
 
 def test_a_pump_at_a_third_is_found_when_the_culture_outgrows_it() -> None:
-    _, verdicts, _ = cultivate(replace(bench_plant(), sensor=NOISY), 20, 220, (120, "pump_gain_factor", 0.3), 0.5)
+    _, verdicts, _ = cultivate(replace(plant_preset("bench"), sensor=NOISY), 20, 220, (120, "gain_factor", 0.3), 0.5)
     found = np.zeros(20, dtype=bool)
     for verdict in verdicts[120:]:
         found |= ["cannot_hold" in kinds or "no_dilution" in kinds for kinds in verdict.kinds]
@@ -460,9 +460,9 @@ def test_words_and_ranges_are_checked() -> None:
 
 def test_a_reason_that_is_only_reported_lets_the_dose_pass() -> None:
     config = SafetyConfig(responses=Responses(no_dilution="report"))
-    sound = replace(bench_plant(), sensor=NOISY)
+    sound = replace(plant_preset("bench"), sensor=NOISY)
     vials = Plant(sound, 1, np.random.default_rng(0))
-    vials.pump_gain_factor[:] = 0.0
+    vials.feed.gain_factor[:] = 0.0
     drive = Drive(config)
     seen = False
     for _ in range(60):

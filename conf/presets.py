@@ -1,0 +1,55 @@
+"""The presets of conf/ as plain values, for readers that do without Hydra."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+
+__all__ = ["groups", "load"]
+
+ROOT = Path(str(resources.files("conf")))
+
+
+def groups() -> dict[str, list[str]]:
+    """Config groups and their presets: {"env": ["sim"], ...}."""
+    found: dict[str, list[str]] = {}
+    for path in sorted(ROOT.rglob("*.yaml")):
+        group = path.parent.relative_to(ROOT).as_posix()
+        if group != ".":
+            found.setdefault(group, []).append(path.stem)
+    return found
+
+
+def load(name: str) -> dict[str, Any]:
+    """What a preset changes, together with the presets of its group that it starts from.
+
+    Args:
+      name: group and option, "plant/bench".
+    Raises: ValueError naming the presets of the group.
+    """
+    group, _, option = name.rpartition("/")
+    known = groups().get(group, [])
+    if option not in known:
+        raise ValueError(f"{group} = {option}: allowed {', '.join(known)}")
+    own = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
+    found: dict[str, Any] = {}
+    for entry in own.pop("defaults", []):
+        if isinstance(entry, Mapping):  # a group inside this one
+            for inner, chosen in entry.items():
+                _merge(found, {inner: load(f"{group}/{inner}/{chosen}")})
+        elif entry != "_self_":
+            _merge(found, load(f"{group}/{entry}"))
+    _merge(found, own)
+    return found
+
+
+def _merge(into: dict[str, Any], values: Mapping[str, Any]) -> None:
+    for key, value in values.items():
+        if isinstance(value, Mapping) and isinstance(into.get(key), dict):
+            _merge(into[key], value)
+        else:
+            into[key] = value

@@ -1,0 +1,243 @@
+"""How a config dataclass states its values once: default, meaning, unit and range stand in the field.
+
+    mu: float = value(0.03, "specific growth rate", "1/min", above=0.0, at_most=0.1)
+
+`check` refuses what is out of range, `build` makes a config from plain values, and the command line's help and
+docs/configuration.md are written from the same fields.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import types
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+from conf.renamed import REMOVED, RENAMED
+
+__all__ = ["Meaning", "build", "check", "meaning", "old_name", "part", "require", "value"]
+
+T = TypeVar("T")
+
+GROUPED = ("agents", "plants", "scenarios", "controllers")  # name -> part of the same kind
+VARIANTS = ("ablations", "trained", "fitted")  # name -> values of the agent
+TRUE, FALSE = ("true", "yes", "on", "1", "y", "t"), ("false", "no", "off", "0", "n", "f")
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What a field is and which values it takes. Bounds of a tuple hold for each of its entries.
+
+    interval: a pair [low, high], rising. some: a tuple that may not be empty.
+    """
+
+    what: str
+    unit: str = ""
+    above: float | None = None
+    at_least: float | None = None
+    below: float | None = None
+    at_most: float | None = None
+    choices: tuple[str, ...] = ()
+    interval: bool = False
+    some: bool = False
+    note: str = ""
+
+    def holds(self, given: Any) -> bool:
+        """Whether a value is in range; nan is in none."""
+        if given is None:
+            return True
+        if isinstance(given, Sequence) and not isinstance(given, str):
+            if self.interval and not (len(given) == 2 and given[0] <= given[1]):
+                return False
+            return (len(given) > 0 or not self.some) and all(self.holds(entry) for entry in given)
+        if self.choices:
+            return given in self.choices
+        return (
+            (self.above is None or given > self.above)
+            and (self.at_least is None or given >= self.at_least)
+            and (self.below is None or given < self.below)
+            and (self.at_most is None or given <= self.at_most)
+        )
+
+    def allowed(self, key: str, many: bool = False, optional: bool = False) -> str:
+        """The range in words, "" if every value of the type is allowed.
+
+        Args:
+          key: name of the field; many: it is a tuple; optional: it may be null.
+        """
+        words = self._interval() if self.interval else self._range((self.unit or "value") if many else key)
+        if words and many and not self.interval:
+            words = f"each {words}"
+        if self.some:
+            words = f"one or more, {words}" if words else "one or more"
+        if words and optional:
+            words += ", or null"
+        return words + (f" ({self.note})" if words and self.note else "")
+
+    def _range(self, name: str) -> str:
+        if self.choices:
+            named = ", ".join(choice for choice in self.choices if choice)
+            return f"{named}, or '' for none" if "" in self.choices else named
+        low = self.above if self.at_least is None else self.at_least
+        high = self.below if self.at_most is None else self.at_most
+        if low is None and high is None:
+            return ""
+        if high is None:
+            return f"{'greater than' if self.at_least is None else 'at least'} {low:g}"
+        if low is None:
+            return f"{'less than' if self.at_most is None else 'at most'} {high:g}"
+        if math.isinf(high) and self.at_most is None:
+            return f"a finite number {'greater than' if self.at_least is None else 'of at least'} {low:g}"
+        if self.above is None and self.below is None:
+            return f"{low:g} to {high:g}"
+        return (
+            f"{low:g} {'<' if self.at_least is None else '<='} {name} {'<' if self.at_most is None else '<='} {high:g}"
+        )
+
+    def _interval(self) -> str:
+        low = self.above if self.at_least is None else self.at_least
+        high = self.below if self.at_most is None else self.at_most
+        left = "" if low is None else f"{low:g} {'<' if self.at_least is None else '<='} "
+        right = "" if high is None else f" {'<' if self.at_most is None else '<='} {high:g}"
+        return f"[low, high] with {left}low <= high{right}"
+
+
+def value(
+    default: T,
+    what: str,
+    unit: str = "",
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    below: float | None = None,
+    at_most: float | None = None,
+    choices: Sequence[str] = (),
+    interval: bool = False,
+    some: bool = False,
+    note: str = "",
+) -> T:
+    """A field of a config dataclass; the arguments are those of `Meaning`."""
+    said = Meaning(what, unit, above, at_least, below, at_most, tuple(choices), interval, some, note)
+    if isinstance(default, dict | list):
+        return field(default_factory=lambda: copy.copy(default), metadata={"meaning": said})
+    return field(default=default, metadata={"meaning": said})
+
+
+def part(factory: Callable[[], T], what: str) -> T:
+    """A field that holds a config dataclass of its own."""
+    return field(default_factory=factory, metadata={"meaning": Meaning(what)})
+
+
+def meaning(of: Field[Any]) -> Meaning:
+    """What was said about a field; nothing, for one that was made without `value` or `part`."""
+    return cast(Meaning, of.metadata.get("meaning", Meaning("")))
+
+
+def require(holds: bool, key: str, given: object, allowed: str) -> None:
+    """A rule of its own, such as one that joins several fields. Raises: ValueError with the checker's words."""
+    if not holds:
+        raise ValueError(f"{key} = {list(given) if isinstance(given, tuple) else given}: allowed {allowed}")
+
+
+def check(config: Any, prefix: str = "") -> None:
+    """Check every field of a config dataclass against its own range; called by `__post_init__`.
+
+    Args:
+      prefix: where the config stands, "plant.pump"; "" for that of a command.
+    Raises: ValueError `prefix.key = value unit: allowed RANGE`.
+    """
+    for of in fields(config):
+        said, given = meaning(of), getattr(config, of.name)
+        if said.holds(given):
+            continue
+        key = f"{prefix}.{of.name}" if prefix else of.name
+        now = old_name(f"{key}={given}")
+        if now:
+            raise ValueError(now)
+        many = isinstance(given, list | tuple)
+        shown = list(given) if many else f"{given} {said.unit}".rstrip()
+        require(False, key, shown, said.allowed(of.name, many, "None" in str(of.type)))
+
+
+def old_name(key: str) -> str | None:
+    """The line about an old name, None for a name that never was one.
+
+    Args:
+      key: dotted key, or group=option, or key=choice. A part that stands under a name of the user's
+        (plants.NAME.pump, ablations.NAME.gamma) is known by what it is (plant.pump, agent.gamma).
+    """
+    first, *rest = key.split(".")
+    known = key
+    if rest and (first in GROUPED or first in VARIANTS):
+        known = ".".join([first[:-1] if first in GROUPED else "agent", *rest[1:]])
+    if known in RENAMED:
+        return f"{key}: renamed, now {RENAMED[known]}"
+    if known in REMOVED:
+        return f"{key}: removed; {REMOVED[known]}"
+    return None
+
+
+def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
+    """A config dataclass with some of its values replaced; parts are given as nested mappings.
+
+    Numbers may be given as text and lists stand for tuples, as YAML and command lines have them.
+
+    Args:
+      default: an instance; what `values` leaves out stays as it is there.
+      prefix: where the config stands, for messages.
+    Raises: ValueError naming a key that does not exist (or its new name), or key, value and what is allowed.
+    """
+    of = {f.name: f for f in fields(cast(Any, default))}
+    hints = get_type_hints(type(default))
+    given = {}
+    for name, entry in values.items():
+        key = f"{prefix}.{name}" if prefix else str(name)
+        if name not in of:
+            where = f"under {prefix}" if prefix else "here"
+            raise ValueError(old_name(key) or f"{key}: no such key; allowed {where}: {', '.join(of)}")
+        given[name] = _converted(entry, hints[name], getattr(default, name), key)
+    return replace(cast(Any, default), **given)  # type: ignore[no-any-return]
+
+
+def _converted(given: Any, hint: Any, default: Any, key: str) -> Any:
+    """A plain value as the type of its field. Raises: ValueError naming the key."""
+    if get_origin(hint) in (Union, types.UnionType):
+        if given is None:
+            return None
+        hint = next(h for h in get_args(hint) if h is not types.NoneType)
+    if is_dataclass(default) or is_dataclass(hint):
+        require(isinstance(given, Mapping), key, given, f"keys and values, as {key}.NAME=VALUE")
+        return build(default if is_dataclass(default) else hint(), given, key)
+    origin, inner = get_origin(hint) or hint, get_args(hint)
+    if origin is dict:
+        require(isinstance(given, Mapping), key, given, f"keys and values, as {key}.NAME=VALUE")
+        of = inner[1] if inner else Any
+        own = default if isinstance(default, dict) else {}
+        return own | {str(k): _converted(v, of, own.get(k), f"{key}.{k}") for k, v in given.items()}
+    if origin in (tuple, list):
+        require(isinstance(given, list | tuple), key, given, "a list, as [1,2]")
+        of = inner[0] if inner else Any
+        return origin(_converted(v, of, None, f"{key}[{i}]") for i, v in enumerate(given))
+    return _scalar(given, hint, key)
+
+
+def _scalar(given: Any, hint: Any, key: str) -> Any:
+    """A number, text or switch as the type of its field."""
+    if hint is bool:
+        word = str(given).lower()
+        require(word in (*TRUE, *FALSE), key, given, "true or false")
+        return word in TRUE
+    if hint in (int, float):
+        number = isinstance(given, str | int) or (hint is float and isinstance(given, float))
+        try:
+            if number and not isinstance(given, bool):
+                return hint(given)
+        except ValueError:
+            pass
+        require(False, key, given, "a whole number" if hint is int else "a number")
+    if hint is str:
+        require(given is not None and not isinstance(given, Mapping | list | tuple), key, given, "text")
+        return str(given)
+    return given

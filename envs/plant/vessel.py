@@ -1,0 +1,121 @@
+"""The vial as a vessel: what flows in and out, where the level ends, what evaporates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.plant.noise import Streams, check_ranges, spread
+from envs.plant.pump import PumpConfig
+
+__all__ = ["Vessel", "VesselConfig"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MIN_VOLUME_ML = 1.0  # mL, what no pump can take out of a vial; keeps concentrations finite
+
+
+@dataclass(frozen=True)
+class VesselConfig:
+    """The vial and its bottle.
+
+    volume_ml, volume_sd_ml: culture up to the waste tube, mean and spread between vials.
+    overflow_above_ml: the overflow pump's tube, if there is one, ends so far above the waste tube.
+    capacity_ml: where it overflows.
+    evaporation_ml_day: water lost.
+    media_ml: fresh medium in the bottle; inf = never empty.
+    """
+
+    volume_ml: float = 20.0
+    volume_sd_ml: float = 0.0
+    overflow_above_ml: float = 2.0
+    capacity_ml: float = 30.0
+    evaporation_ml_day: float = 0.0
+    media_ml: float = float("inf")
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "volume_ml": (5.0, 50.0, "mL"),
+            "volume_sd_ml": (0.0, 1.5, "mL"),
+            "overflow_above_ml": (0.0, 10.0, "mL"),
+            "capacity_ml": (self.volume_ml + 4.5, 200.0, "mL"),
+            "evaporation_ml_day": (0.0, 50.0, "mL/day"),
+            "media_ml": (0.0, np.inf, "mL"),
+        }
+        check_ranges(self, "plant.vessel", ranges)
+
+
+class Vessel:
+    """N vials that liquid leaves through outlets at a height.
+
+    The waste pump lowers the level to its tube, never below; what it does not take raises the level up to the rim,
+    where `overflowed` is set. An overflow pump is a second such outlet a little higher.
+
+    Args:
+      config: heights and evaporation; pump: flows of the waste pump and of the overflow pump.
+      rngs: one stream per vial, for the height of its tube.
+    State, shape (N,): `volume_ml`, `overflowed`. Fault switches, shape (N,): `waste_gain_factor` and
+    `overflow_gain_factor`, 0 blocked, 1 sound.
+    """
+
+    def __init__(self, config: VesselConfig, pump: PumpConfig, rngs: Streams) -> None:
+        self.config, self._pump = config, pump
+        self._tube_ml = spread(rngs, config.volume_ml, config.volume_sd_ml / config.volume_ml)
+        self.draws: dict[str, Array] = {"volume_ml": self._tube_ml}
+        self.waste_gain_factor, self.overflow_gain_factor = np.ones(len(rngs)), np.ones(len(rngs))
+        self.reset()
+
+    def reset(self) -> None:
+        """Filled to the waste tube."""
+        self.volume_ml: Array = self._tube_ml.copy()
+        self.overflowed: Mask = np.zeros(self._tube_ml.size, dtype=bool)
+
+    def exchange(self, fresh: Array, waste_s: Array, overflow_s: Array) -> Array:
+        """Move liquid; returns F, the share of what was in the vial that its concentrations keep, shape (N,).
+
+        Fresh medium fills the vial up to an outlet's tube, is exchanged there for what its pump takes, and rises on.
+
+        Args:
+          fresh: fresh medium, mL, shape (N,). waste_s, overflow_s: on-times of the two pumps, s, shape (N,).
+        """
+        pump = self._pump
+        outlets = [  # from below: level of the tube, mL the pump is able to move
+            [self._tube_ml, _moved(waste_s, pump.waste_ml_s * self.waste_gain_factor)],
+            [
+                self._tube_ml + self.config.overflow_above_ml,
+                _moved(overflow_s, pump.overflow_ml_s * self.overflow_gain_factor),
+            ],
+        ]
+        level, left, kept = self.volume_ml, fresh, np.ones(fresh.size)
+        for outlet in outlets:
+            tube, able = outlet
+            fill = np.minimum(left, np.maximum(tube - level, 0.0))
+            swapped = np.minimum(left - fill, able)
+            kept = kept * (level / (level + fill)) * np.exp(-swapped / (level + fill))
+            level, left, outlet[1] = level + fill, left - fill - swapped, able - swapped
+        kept = kept * (level / (level + left))
+        level = level + left
+        self.overflowed = self.overflowed | (level > self.config.capacity_ml)
+        for tube, able in outlets:
+            level = np.maximum(level - able, np.minimum(tube, level))
+        self.volume_ml = np.minimum(level, self.config.capacity_ml)
+        return np.asarray(kept)
+
+    def draw_out(self, volume_ml: Array) -> None:
+        """Take culture out from below, mL, shape (N,)."""
+        self.volume_ml = np.maximum(self.volume_ml - volume_ml, MIN_VOLUME_ML)
+
+    def evaporate(self, minutes: float) -> Array:
+        """Lose water; returns by how much that concentrates the culture, >= 1, shape (N,)."""
+        before = self.volume_ml
+        self.draw_out(np.asarray(self.config.evaporation_ml_day * minutes / 1440.0))
+        return np.asarray(before / self.volume_ml)
+
+
+def _moved(on_s: Array, flow: Array) -> Array:
+    """Volume a pump of `flow` mL/s could move, mL, shape (N,): nothing backwards, nothing if it is blocked."""
+    able = np.zeros_like(flow)  # a blocked pump moves nothing, however long it runs (0 times infinity is 0 here)
+    return np.multiply(np.maximum(on_s, 0.0), flow, out=able, where=flow > 0.0)

@@ -1,0 +1,67 @@
+"""Optical measurement: laser and spectrometer, OD from counts, the zero."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+
+from hardware.emulator.computer import AppError
+from hardware.emulator.events import Steps
+from hardware.emulator.outputs import Outputs
+from hardware.emulator.position import Position
+from hardware.emulator.sysdata import SLOTS
+
+__all__ = ["Optics"]
+
+EXPOSURE_S = 0.97  # one spectrometer reading
+
+
+class Optics:
+    """Measurements of one reactor by light."""
+
+    def __init__(self, position: Position, outputs: Outputs) -> None:
+        self._position, self._outputs = position, outputs
+
+    def expose(self, seconds: float) -> Generator[float, None, int]:
+        """Laser on, one reading, laser off; counts. Another thread that measures at the same time spoils it."""
+        yield from self._outputs.set_on("LASER650", 1)
+        self._position.hardware().spectrometer.begin_exposure(self._position.computer.now())
+        yield seconds
+        raw = self._position.hardware().counts(self._position.computer.now(), seconds)
+        yield from self._outputs.set_on("LASER650", 0)
+        self._position.data["AS7341"]["current"]["ADC0"] = raw
+        return raw
+
+    def measure_od(self) -> Steps:
+        """`MeasureOD`: OD = b r + a r^2 with r = log10(zero / raw); 0 if raw is 0. Raises: AppError for a zero of 0."""
+        raw = yield from self.expose(EXPOSURE_S)
+        zero, od = self._position.data["OD0"], self._position.data["OD"]
+        zero["raw"] = float(raw)
+        if abs(raw) <= 0.001:
+            od["current"] = 0
+            return
+        if not zero["target"] > 0.0:
+            raise AppError("logarithm of a zero of 0")
+        r = math.log10(zero["target"] / raw)
+        od["current"] = r * zero["LASERb"] + r * r * zero["LASERa"]
+
+    def measure_fluorescence(self) -> Steps:
+        """`MeasureFP`: about a second per enabled slot; the emulated cultures do not fluoresce."""
+        for slot in SLOTS:
+            if self._position.data[slot]["ON"] == 1:
+                self._position.hardware()
+                yield 1.0
+                self._position.data[slot].update({"Base": 120.0, "Emit1": 0.0, "Emit2": 0.0})
+
+    def calibrate(self, item: str, raw: float, od: float) -> None:
+        """`CalibrateOD`: the zero with which `raw` reads as `od` (docs/device.md, OD measurement)."""
+        od0 = self._position.data["OD0"]
+        a, b = od0["LASERa"], od0["LASERb"]
+        od = 0 if od < 0 else od
+        zero = raw * 10.0 ** (math.sqrt(od / a + (b / (2 * a)) ** 2) - b / (2 * a))
+        output = self._position.data[item]
+        if zero < output["min"]:
+            zero = output["min"]
+        if zero > output["max"]:
+            zero = output["max"]
+        output["target"] = zero

@@ -1,0 +1,69 @@
+"""The device's software between two starts: one app per position, and which of them the web page shows."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+
+from hardware.emulator.computer import Computer
+from hardware.emulator.reactor_app import ReactorApp
+from hardware.emulator.sysdata import ALL_REACTORS
+from hardware.emulator.vial import Vial
+
+__all__ = ["Software"]
+
+
+class Software:
+    """Memory of one process, with every position as after `initialise()`.
+
+    Args: computer: it runs on; vials: by position, those that hang on a cable.
+    """
+
+    def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:
+        self.computer, self.selected = computer, "M0"
+        self._reactors = tuple(vials)
+        self.apps = {
+            name: ReactorApp(name, computer, vials.get(name), device_id(name), self.selected) for name in ALL_REACTORS
+        }
+
+    def app(self, name: str) -> ReactorApp:
+        """The app of a position as routes name it; "0" is the selected one. Raises: KeyError."""
+        return self.apps[self.selected if name == "0" else name]
+
+    def select(self, name: str) -> None:
+        """Select a reactor for everybody."""
+        self.selected = name
+        for app in self.apps.values():
+            app.data["UIDevice"] = name
+
+    def foreign_select(self) -> None:
+        """Somebody else's page selects another reactor, as often as that fault is switched on."""
+        rng, faults = self.computer.rng, self.computer.faults
+        if len(self._reactors) > 1 and rng.random() < faults.foreign_selects:
+            self.select(str(rng.choice([m for m in self._reactors if m != self.selected])))
+
+    def sysdata(self) -> bytes:
+        """Body of getSysdata: the selected reactor, sorted keys, NaN as the bare token."""
+        data, faults = self.apps[self.selected].data, self.computer.faults
+        data["presentDevices"] = {name: app.data["present"] for name, app in self.apps.items()}
+        if faults.terminal_as_list or faults.terminal_named or faults.extra_fields:
+            data = dict(data)
+        if faults.terminal_named:
+            text = re.sub(
+                r" - (Experiment|Terminal|Cycle \d+) (St|C)",
+                rf" - \1 on {self.selected} ({data['DeviceID']}) \2",
+                data["Terminal"]["text"],
+            )
+            data["Terminal"] = {"text": text}
+        if faults.terminal_as_list:
+            data["Terminal"] = {"text": [line for line in data["Terminal"]["text"].split("</br>") if line]}
+        if faults.extra_fields:
+            data |= {"DeviceName": "", "Pump5": {"ON": 0, "target": 0.0}}
+        return json.dumps(data, sort_keys=True, separators=(",", ":")).encode() + b"\n"
+
+
+def device_id(name: str) -> str:
+    """Four ID words of the IR thermometer at a position, decimal strings joined."""
+    k = int(name[1])
+    return f"{1000 + k}{2000 + 7 * k}{3000 + 11 * k}{4000 + 13 * k}"

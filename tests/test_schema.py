@@ -1,0 +1,134 @@
+"""A config states default, meaning, unit and range in one place, and everything else follows from there."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from conf import presets, renamed, schema
+from conf.schema import build, check, part, value
+from envs.plant.plant import PlantConfig
+from experiments.cli import frame
+
+PRESETS = [f"{group}/{option}" for group, found in presets.groups().items() for option in found]
+PRESETS = [name for name in PRESETS if not name.startswith("experiment/")]  # recipes are for the command line
+
+
+@dataclass(frozen=True)
+class Inner:
+    rate: float = value(0.5, "a rate", "mL/s", above=0.0, at_most=1.0)
+    law: str = value("none", "a law", choices=("none", "cubic"))
+    spare: str = value("", "a pump", choices=("Pump3", "Pump4", ""))
+    span: tuple[float, float] = value((0.1, 1.1), "a range", "OD", above=0.0, at_most=4.0, interval=True)
+
+    def __post_init__(self) -> None:
+        check(self, "outer.inner")
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner = part(Inner, "a part")
+    goals: tuple[float, ...] = value((0.5,), "goals", "OD", above=0.0, at_most=1.5, some=True)
+    count: int | None = value(None, "how many", at_least=1)
+    on: bool = value(True, "a switch")
+    budget: float = value(1.0, "a budget", "mL", above=0.0, below=float("inf"))
+    named: dict[str, Inner] = value({}, "parts by name")
+    free: dict[str, Any] = value({}, "anything")
+    whatever: Any = part(Inner, "a part of any kind")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+def test_fields_keep_their_defaults_and_mutable_ones_are_not_shared():
+    assert Outer() == Outer(inner=Inner(), goals=(0.5,), count=None)
+    assert Outer().named is not Outer().named
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"inner": {"rate": 0}}, "outer.inner.rate = 0.0 mL/s: allowed 0 < rate <= 1"),
+        ({"inner": {"rate": "nan"}}, "outer.inner.rate = nan mL/s: allowed 0 < rate <= 1"),
+        ({"inner": {"rate": "fast"}}, "inner.rate = fast: allowed a number"),
+        ({"inner": {"rate": True}}, "inner.rate = True: allowed a number"),
+        ({"inner": {"law": "square"}}, "outer.inner.law = square: allowed none, cubic"),
+        ({"inner": {"spare": "Pump1"}}, "outer.inner.spare = Pump1: allowed Pump3, Pump4, or '' for none"),
+        ({"inner": {"span": [2, 1]}}, "outer.inner.span = [2.0, 1.0]: allowed [low, high] with 0 < low <= high <= 4"),
+        ({"inner": {"span": [2]}}, "outer.inner.span = [2.0]: allowed [low, high] with 0 < low <= high <= 4"),
+        ({"inner": {"law": None}}, "inner.law = None: allowed text"),
+        ({"inner": 3}, "inner = 3: allowed keys and values, as inner.NAME=VALUE"),
+        ({"inner": {"ratte": 1}}, "inner.ratte: no such key; allowed under inner: rate, law, spare, span"),
+        ({"goals": [0.5, 2]}, "goals = [0.5, 2.0]: allowed one or more, each 0 < OD <= 1.5"),
+        ({"goals": []}, "goals = []: allowed one or more, each 0 < OD <= 1.5"),
+        ({"goals": 0.5}, "goals = 0.5: allowed a list, as [1,2]"),
+        ({"goals": [0.5, "x"]}, "goals[1] = x: allowed a number"),
+        ({"count": 0}, "count = 0: allowed at least 1, or null"),
+        ({"count": 1.5}, "count = 1.5: allowed a whole number"),
+        ({"on": "perhaps"}, "on = perhaps: allowed true or false"),
+        ({"budget": "inf"}, "budget = inf mL: allowed a finite number greater than 0"),
+        ({"named": {"a": {"rate": 2}}}, "outer.inner.rate = 2.0 mL/s: allowed 0 < rate <= 1"),
+        ({"nois": 1}, "nois: no such key; allowed here: inner, goals, count, on, budget, named, free, whatever"),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_key_value_and_range(values, message):
+    with pytest.raises(ValueError, match=r".") as caught:
+        build(Outer(), values)
+    assert str(caught.value) == message
+
+
+def test_plain_values_become_the_types_of_their_fields():
+    given = {
+        "inner": {"rate": "1e-3", "span": [1, 2]},
+        "goals": [1],
+        "count": "3",
+        "on": "no",
+        "named": {"a": {"law": "cubic"}},
+        "free": {"M0": {"minutes": [90]}},
+        "whatever": {"rate": 1},
+    }
+    assert build(Outer(), given) == Outer(
+        inner=Inner(rate=0.001, span=(1.0, 2.0)),
+        goals=(1.0,),
+        count=3,
+        on=False,
+        named={"a": Inner(law="cubic")},
+        free={"M0": {"minutes": [90]}},
+        whatever=Inner(rate=1.0),
+    )
+    assert build(Outer(count=3), {"count": None}).count is None
+    assert build(Outer(named={"a": Inner(rate=0.1)}), {"named": {"a": {"law": "cubic"}, "b": {}}}).named == {
+        "a": Inner(rate=0.1, law="cubic"),
+        "b": Inner(),
+    }
+
+
+def test_an_old_name_gives_the_new_one(monkeypatch):
+    monkeypatch.setitem(renamed.RENAMED, "agent.relabel", "agent.hindsight_share")
+    monkeypatch.setitem(renamed.RENAMED, "inner.flow", "inner.rate")
+    monkeypatch.setitem(renamed.RENAMED, "outer.inner.law=square", "cubic")
+    monkeypatch.setitem(renamed.REMOVED, "inner.noise", "the sensor has it: use plant.sensor")
+    for key in ("agent.relabel", "agents.dqn.relabel", "ablations.mine.relabel"):
+        assert schema.old_name(key) == f"{key}: renamed, now agent.hindsight_share"
+    with pytest.raises(ValueError, match=r"^inner\.flow: renamed, now inner\.rate$"):
+        build(Outer(), {"inner": {"flow": 1}})
+    with pytest.raises(ValueError, match=r"^inner\.noise: removed; the sensor has it: use plant\.sensor$"):
+        build(Outer(), {"inner": {"noise": 1}})
+    with pytest.raises(ValueError, match=r"^outer\.inner\.law=square: renamed, now cubic$"):
+        Inner(law="square")
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_read_without_hydra_is_what_hydra_composes(name):
+    composed = OmegaConf.to_container(frame.compose(name, []), resolve=True)
+    for key in name.split("/")[:-1]:
+        composed = composed.get(key, {})
+    assert presets.load(name) == composed
+
+
+def test_a_plant_is_built_from_its_preset():
+    bench = build(PlantConfig(), presets.load("plant/bench"))
+    assert (bench.growth.mu, bench.pump.dosing, bench.sensor.noise_factor_sd) == (0.025, "pulse", 0.6)
+    with pytest.raises(ValueError, match=r"plant = sick: allowed bad_optics, bench"):
+        presets.load("plant/sick")
