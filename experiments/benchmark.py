@@ -14,7 +14,8 @@ from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.comparison.config import BenchmarkConfig, StudyConfig
-from experiments.control.config import TrainConfig, controller_config
+from experiments.controllers import registry
+from experiments.training.config import TrainConfig
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -96,8 +97,8 @@ def learned(config: BenchmarkConfig, wanted: set[str], figures: Figures) -> tupl
     import json
 
     from dqn import policy as policies
-    from experiments.deploy import load_policy
-    from experiments.train import train
+    from experiments.control.policies import load_policy
+    from experiments.training.run import train
 
     found: dict[str, Policy] = {}
     told: dict[str, Any] = {}
@@ -276,7 +277,7 @@ def _schema(cfg: DictConfig) -> BenchmarkConfig:
         agents=named("agents", DQNConfig()),
         plants=named("plants", PlantConfig()),
         scenarios=named("scenarios", Scenario()),
-        controllers={str(name): controller_config(str(c.kind)) for name, c in cfg.controllers.items()},
+        controllers={str(name): registry.config(str(c.kind)) for name, c in cfg.controllers.items()},
         studies=named("studies", StudyConfig()),
     )
 

@@ -17,8 +17,11 @@ from typing import Any
 
 from envs.scenario import Scenario
 from experiments.cli import frame
-from experiments.reliability.case import MOMENTS, Case, Outcome
-from experiments.reliability.faults import SICK, Fault, by_name
+from experiments.controllers.registry import STANDALONE
+from experiments.reliability.case import MOMENTS, FaultCase
+from experiments.reliability.faults import FAULTY, Fault, by_name
+from experiments.reliability.outcome import Outcome
+from experiments.reliability.rehearsal import rehearsed
 from hardware.chibio.overflow_guard import GuardConfig
 from hardware.safety.config import SafetyConfig
 
@@ -26,14 +29,12 @@ __all__ = ["FaultMatrixConfig", "fault_matrix", "table"]
 
 log = logging.getLogger(__name__)
 
-WITHOUT_POLICY = ("pi", "pi_tuned", "mpc", "inverse", "threshold", "hold")
-
 
 @dataclass(frozen=True)
 class FaultMatrixConfig:
     """Values of `conf/fault_matrix.yaml`. Raises: ValueError naming key, value and allowed range.
 
-    reactors: the first one falls sick. faults: their names; empty for all. moments: of `fault_case.MOMENTS`.
+    reactors: the first one falls sick. faults: their names; empty for all. moments: of `case.MOMENTS`.
     guard: overflow guard of the rig; faults that overflow without one are run on a rig without as well. Without a pump
       everything is run on that rig, and faults of the guard are left out.
     controls: healthy runs without sensor outliers; every word of the interlock there is a false alarm.
@@ -45,7 +46,7 @@ class FaultMatrixConfig:
         default_factory=lambda: Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8)
     )
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    controller_kind: str = "inverse"
+    controller_kind: str = "adaptive_inverse"
     guard: GuardConfig = field(default_factory=lambda: GuardConfig("Pump3", 0.95, 1.2))
     faults: tuple[str, ...] = ()
     moments: tuple[str, ...] = MOMENTS
@@ -58,13 +59,13 @@ class FaultMatrixConfig:
         by_name(self.faults)
         unknown = [m for m in self.moments if m not in MOMENTS]
         checks = (
-            ("reactors", self.reactors, self.reactors[0] == SICK, f"{SICK} first, it is the one that falls sick"),
+            ("reactors", self.reactors, self.reactors[0] == FAULTY, f"{FAULTY} first, it is the one that falls sick"),
             ("moments", self.moments, bool(self.moments) and not unknown, ", ".join(MOMENTS)),
             (
                 "controller_kind",
                 self.controller_kind,
-                self.controller_kind in WITHOUT_POLICY,
-                ", ".join(WITHOUT_POLICY),
+                self.controller_kind in STANDALONE,
+                ", ".join(STANDALONE),
             ),
             ("controls", self.controls, 0 <= self.controls <= 1000, "0 to 1000"),
             ("seed", self.seed, self.seed >= 0, "at least 0"),
@@ -79,8 +80,9 @@ class FaultMatrixConfig:
 def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int, guarded: bool) -> Outcome:
     """One case, in whatever process. Args: name: of the fault, "" for a healthy run. guarded: the rig has a guard."""
     fault = by_name((name,))[0] if name else None
-    what = (config.reactors, config.scenario, config.safety, config.controller_kind, seed)
-    return Case(fault, moment, *what, config.guard if guarded else GuardConfig()).run()
+    guard = config.guard if guarded else GuardConfig()
+    run = rehearsed(config.reactors, config.scenario, config.safety, config.controller_kind, guard)
+    return FaultCase(fault, moment, run, seed).run()
 
 
 def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
@@ -122,6 +124,12 @@ def _span(values: Sequence[float], form: str) -> str:
     return low if low == high else f"{low} – {high}"
 
 
+def _times(minutes: Sequence[float], cases: int) -> str:
+    """When a fault was detected, min, and in how many of its cases if not in all."""
+    some = f" ({len(minutes)} of {cases})" if len(minutes) < cases else ""
+    return _span(minutes, ".1f") + some if minutes else "–"
+
+
 def table(outcomes: Sequence[Outcome]) -> str:
     """Markdown: one row per fault over all moments; single cases are in cases.csv."""
     head = (
@@ -131,10 +139,9 @@ def table(outcomes: Sequence[Outcome]) -> str:
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for name in dict.fromkeys(o.label for o in outcomes):
         mine = [o for o in outcomes if o.label == name]
-        told = [o.detected_s / 60.0 for o in mine if o.reason]
         cells = [
             name if mine[0].fault != "none" else f"{name} ({len(mine)} healthy runs)",
-            (_span(told, ".1f") + (f" ({len(told)} of {len(mine)})" if len(told) < len(mine) else "")) if told else "–",
+            _times([o.detected_s / 60.0 for o in mine if o.reason], len(mine)),
             ", ".join(dict.fromkeys(o.reason for o in mine if o.reason)) or "–",
             ", ".join(dict.fromkeys(o.response for o in mine if o.response)) or "–",
             _span([o.peak_ml for o in mine], ".1f"),
@@ -205,7 +212,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     from tqdm import tqdm
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    from experiments.reliability import chart as charts_faults
+    from experiments.reliability.chart import fault_map
     from experiments.reporting import charts
 
     began = time.monotonic()
@@ -226,9 +233,9 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     heads = (f"With an overflow guard ({config.guard.pump} at {config.guard.duty:g})", "Without")
     parts = [f"## {head}\n\n{table(rig)}" for head, rig in zip(heads, rigs, strict=True) if rig]
     (folder / "table.md").write_text("\n".join([*parts, declared(faults)]), encoding="utf-8")
-    sick = [o for o in outcomes if o.fault != "none"]
-    if sick:
-        charts.save(charts_faults.fault_map(sick, config.moments), folder / "figures", "fault_matrix")
+    struck = [o for o in outcomes if o.fault != "none"]
+    if struck:
+        charts.save(fault_map(struck, config.moments), folder / "figures", "fault_matrix")
     total = totals(outcomes)
     seconds = {"wall_s": round(time.monotonic() - began, 1)}
     frame.write_json(folder / "summary.json", {**total, **seconds, "cases_list": [o.as_dict() for o in outcomes]})

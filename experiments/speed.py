@@ -52,9 +52,8 @@ def controllers() -> Iterator[Measurement]:
     from envs.scenario import Scenario
     from envs.task import EnvConfig
     from experiments.comparison.trials import run_trial
-    from experiments.control.config import controller_config
+    from experiments.controllers import registry
     from experiments.controllers.base import Controller
-    from experiments.training import build
 
     model = EnvConfig()
     plant = frame.load(frame.compose("plant/nominal_noise", []).plant, PlantConfig())
@@ -63,7 +62,7 @@ def controllers() -> Iterator[Measurement]:
 
     def loop(config: Any, replicates: int, seed: int) -> None:
         def make(vials: Plant) -> Controller:
-            return build.controller(config, model, policy, vials)
+            return registry.build(config, model, policy, vials)
 
         run_trial((config.kind, "nominal_noise", "setpoint_steps"), plant, schedule, make, model, replicates, seed)
 
@@ -71,8 +70,8 @@ def controllers() -> Iterator[Measurement]:
         for seed in np.arange(REPLICATES):
             loop(config, 1, int(seed))
 
-    for kind in ("pi", "dqn", "inverse"):
-        chosen = controller_config(kind)
+    for kind in ("pi", "dqn", "adaptive_inverse"):
+        chosen = registry.config(kind)
         yield Measurement(
             f"closed loop, {kind}",
             f"{REPLICATES} vials x 90 min after recovery",
@@ -81,7 +80,7 @@ def controllers() -> Iterator[Measurement]:
             partial(one_by_one, chosen),
             limit=1.0,
         )
-    swarm = controller_config("mpc")
+    swarm = registry.config("mpc")
     gradient = replace(swarm, solver="gradient")
     yield Measurement(
         "closed loop, mpc",
