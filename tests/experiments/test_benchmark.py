@@ -80,7 +80,7 @@ def test_model_based_controllers_reach_the_oracle_where_their_model_is_true(cont
 
 
 def test_oracle_knows_each_vial_and_gains_by_it():
-    """On `bench`, where every vial is another, noise-free ITAE; `adaptive_inverse`, which learns them, comes nearest."""
+    """Noise-free ITAE on `bench`, where every vial is another; `adaptive_inverse` learns them and comes nearest."""
     best = total_clean("oracle")
     for controller in FEEDBACK:
         assert total_clean(controller) > 1.2 * best

@@ -44,8 +44,8 @@ class Bench:
         self.device, self.folder = device, folder
         program = ["-c", code] if code else ["-m", "experiments.deploy"]
         scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]"]
-        backend = ["controller=adaptive_inverse", "backend=chibio", f"backend.url={device.url}", f"backend.speed={SPEED}", "backend.reactors=[M0,M1]"]
-        new = [*scenario, *backend, *more, f"hydra.run.dir={folder}"]
+        backend = ["backend=chibio", f"backend.url={device.url}", f"backend.speed={SPEED}", "backend.reactors=[M0,M1]"]
+        new = ["controller=adaptive_inverse", *scenario, *backend, *more, f"hydra.run.dir={folder}"]
         command = [sys.executable, *program, *([f"resume={folder}"] if resume else new)]
         self.client = subprocess.Popen(
             command, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
