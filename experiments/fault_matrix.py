@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 class FaultMatrixConfig:
     """Values of `conf/fault_matrix.yaml`. Raises: ValueError naming key, value and allowed range.
 
-    reactors: the first one falls sick. faults: their names; empty for all. moments: of `case.MOMENTS`.
+    reactors: faults strike the first one. faults: their names; empty for all. moments: of `case.MOMENTS`.
     guard: overflow guard of the rig; faults that overflow without one are run on a rig without as well. Without a pump
       everything is run on that rig, and faults of the guard are left out.
     controls: healthy runs without sensor outliers; every word of the interlock there is a false alarm.
