@@ -101,10 +101,10 @@ def learned(config: BenchmarkConfig, wanted: set[str], figures: Figures) -> tupl
     from experiments.training.run import train
 
     found: dict[str, Policy] = {}
-    told: dict[str, Any] = {}
+    origin: dict[str, Any] = {}
     if config.policy is not None and "dqn" in wanted:
         found["dqn"] = load_policy(config.policy, config.env.control_min, config.env.max_pump_rate)
-        told["dqn"] = {"policy": config.policy, "regret_pct": found["dqn"].metadata.get("regret_pct")}
+        origin["dqn"] = {"policy": config.policy, "regret_pct": found["dqn"].metadata.get("regret_pct")}
     for name in sorted(wanted - set(found)):
         if name not in config.agents:
             raise frame.UserError(f"controller {name}: learned, and agents holds only {', '.join(config.agents)}")
@@ -117,8 +117,8 @@ def learned(config: BenchmarkConfig, wanted: set[str], figures: Figures) -> tupl
         found[name] = policies.load(folder / "policy.npz")
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         keys = ("seeds", "env_steps", "updates", "regret_pct", "steady_abs_error", "policy_seed", "config_hash")
-        told[name] = {"policy": f"training/{name}/policy.npz", **{key: summary[key] for key in keys}}
-        told[name]["agent"] = asdict(config.agents[name])
+        origin[name] = {"policy": f"training/{name}/policy.npz", **{key: summary[key] for key in keys}}
+        origin[name]["agent"] = asdict(config.agents[name])
         at = summary["seeds"].index(summary["policy_seed"])
         figures.refer(
             f"training/{name}/figures/learning.svg",
@@ -127,7 +127,7 @@ def learned(config: BenchmarkConfig, wanted: set[str], figures: Figures) -> tupl
             f"Bands over seeds: range and middle half. The policy used here is that of seed {summary['policy_seed']}, "
             f"best on the selection grid: regret {summary['regret_pct'][at]:.2f} % on the reported grid.",
         )
-    return found, told
+    return found, origin
 
 
 CAPTIONS = {
@@ -253,12 +253,12 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     names = {c for c, _, _ in wanted if config.controllers[c].kind == "dqn"}
     with Loops(config) as loops:
         loops.start([cell for cell in wanted if cell[0] not in names])  # they run while the agents are trained
-        policies, told = learned(config, names | (set(config.agents) if config.training else set()), figures)
+        policies, origin = learned(config, names | (set(config.agents) if config.training else set()), figures)
         for name in sorted(names):
             loops.start([cell for cell in wanted if cell[0] == name], policies[name])
         found = loops.results()
     trials = [found[cell] for cell in wanted]
-    summary = summarise(config, trials) | {"calibration": fitted, "agents": told}
+    summary = summarise(config, trials) | {"calibration": fitted, "agents": origin}
     draw(config, trials, summary, figures)
     summary["figures"] = figures.shown
     _store(trials, folder)

@@ -40,11 +40,11 @@ def row_of(step: Step, n: int) -> Row:
 
 
 class Rows:
-    """All rows of one reactor's recording; the numbers by column, of the interlock's words only how many there are."""
+    """All rows of one reactor's recording: the numbers by column, and in how many rows the interlock spoke."""
 
     def __init__(self) -> None:
         self.columns = {key: array("d") for key in NUMBERS}
-        self.alarms = 0  # rows in which the interlock had something to say
+        self.alarms = 0  # rows in which the interlock spoke
 
     def __len__(self) -> int:
         return len(self.columns["time_min"])
