@@ -63,7 +63,7 @@ class Record:
         """Journal every decision of a step before anything is dosed, with how the controller came to it."""
         for n in range(len(self.names)):
             if step.rows[n]:
-                why = {key: float(value[n]) for key, value in step.explanation.items()}
+                why = {key: value[n] for key, value in step.explanation.items()}  # a number, or an MPC's plan
                 fields = {"reactor": self.names[n], "row": row_of(step, n), "why": why}
                 self.journal.append("decision", fields)
             elif step.reasons[n] is not None:
@@ -76,7 +76,7 @@ class Record:
             minute = self._points = max(self._points, round(float(step.minute[n])))
             curves = {"od": step.od, "setpoint": step.setpoint, "pump_rate_ml_s": step.rate}
             for tag, value in {**curves, "temperature_degc": step.temperature, **step.explanation}.items():
-                if np.isfinite(value[n]):
+                if value.ndim == 1 and np.isfinite(value[n]):
                     self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
         try:
             if self._fsync:

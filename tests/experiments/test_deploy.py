@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
 from experiments.control.console import ChangeLog
 from experiments.control.loop import ClosedLoop
+from experiments.control.record import Record
+from experiments.controllers import registry
 from experiments.controllers.learned import LearnedController
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.resume import replay
@@ -26,6 +29,7 @@ from hardware.errors import DeviceStateError
 from hardware.safety.config import Responses, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
+from hardware.storage.journal import read_journal
 from hardware.storage.recorder import read_recording
 from tests.hardware.driver_lab import Bed
 
@@ -144,6 +148,20 @@ def test_another_control_period_is_refused_with_both_values(tmp_path):
     assert done.returncode == 1
     assert "2.0 min" in done.stderr
     assert "1.0 min" in done.stderr
+
+
+@pytest.mark.parametrize("kind", [*registry.STANDALONE, "oracle"])
+def test_every_controller_runs_and_is_recorded(kind, tmp_path):
+    config = DeployConfig(scenario=Scenario((0.3,), (3.0,), (37.0,)), controller=registry.config(kind), fsync=False)
+    with closing(Record(tmp_path, config.backend.reactors, config.fsync)) as record:
+        with assemble.opened(assemble.unpack(config, tmp_path), record) as loop:
+            for step in loop.run():
+                record.done(step, loop.state())
+        assert [len(rows) for rows in record.rows] == [4]
+    decisions = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "decision"]
+    assert len(decisions) == 4
+    if kind == "mpc":
+        assert len(decisions[0]["why"]["planned_rate"]) == registry.config(kind).horizon
 
 
 def test_the_perfect_plant_is_the_training_model():
