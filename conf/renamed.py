@@ -9,6 +9,9 @@ RENAMED: dict[str, str] = {  # old dotted key, or group=option, or key=choice ->
     "agent.relabel": "agent.hindsight_share",
     "agent.relabel_near": "agent.hindsight_near",
     "agent.relabel_width": "agent.hindsight_width",
+    "controller=inverse": "controller=adaptive_inverse",
+    "controller_kind=inverse": "controller_kind=adaptive_inverse",
+    "controllers.inverse": "controllers.adaptive_inverse",
     "plant.pump.guard_ml_s": "plant.pump.overflow_ml_s",
     "plant.vessel.guard_above_ml": "plant.vessel.overflow_above_ml",
 }

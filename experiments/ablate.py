@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import logging
 import re
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +19,13 @@ import numpy as np
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
 from experiments.cli import frame
-from experiments.control.config import TrainConfig
+from experiments.training.config import TrainConfig
+from experiments.training.variants import variant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["AblateConfig", "Row", "main", "summarise", "variant"]
+__all__ = ["AblateConfig", "Row", "main", "summarise"]
 
 log = logging.getLogger(__name__)
 
@@ -75,26 +76,6 @@ class AblateConfig:
         )
 
 
-def _frozen(value: Any) -> Any:
-    """Lists from YAML as the tuples a config holds."""
-    return tuple(_frozen(v) for v in value) if isinstance(value, list | tuple) else value
-
-
-def variant(agent: DQNConfig, name: str, values: dict[str, Any]) -> DQNConfig:
-    """`agent` with some values replaced.
-
-    Raises: ValueError naming the variant and the key that does not exist or is out of range.
-    """
-    known = [f.name for f in fields(DQNConfig)]
-    for key in values:
-        if key not in known:
-            raise ValueError(f"ablations.{name}.{key}: no such key; allowed: {', '.join(known)}")
-    try:
-        return replace(agent, **{key: _frozen(value) for key, value in values.items()})
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"ablations.{name}: {error}") from None
-
-
 @dataclass(frozen=True)
 class Row:
     """One agent of one variant: measures on the reported grid, kept policy and last iterate."""
@@ -131,8 +112,6 @@ def _write(path: Path, rows: list[Row]) -> None:
 
 def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
     """Train one variant and score it on the reported grid."""
-    from experiments.training import build
-    from experiments.training.evaluation import Evaluation, report_grid
     from experiments.training.session import Session
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -141,10 +120,7 @@ def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
         session.run()
     finally:
         session.writer.close()
-    agents = session.agents
-    report = Evaluation(config.env, config.agent.gamma, report_grid(config.env))
-    kept = report(build.act_with(agents.network, session.best.weights), agents.n_agents)
-    last = report(build.act_with(agents.network, agents.weights()), agents.n_agents)
+    _, kept, last = session.report()
     return [
         Row(
             ablation=name,

@@ -14,7 +14,8 @@ from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.comparison.config import BenchmarkConfig, StudyConfig
-from experiments.control.config import TrainConfig, controller_config
+from experiments.controllers import registry
+from experiments.training.config import TrainConfig
 
 if TYPE_CHECKING:
     from dqn.policy import Policy
@@ -30,8 +31,8 @@ def learned(
     import json
 
     from dqn import policy as policies
-    from experiments.deploy import load_policy
-    from experiments.train import train
+    from experiments.control.policies import load_policy
+    from experiments.training.run import train
 
     found: dict[str, Policy] = {}
     agents: dict[str, Any] = {}
@@ -133,7 +134,7 @@ def _schema(cfg: DictConfig) -> BenchmarkConfig:
         agents=named("agents", DQNConfig()),
         plants=named("plants", PlantConfig()),
         scenarios=named("scenarios", Scenario()),
-        controllers={str(name): controller_config(str(c.kind)) for name, c in cfg.controllers.items()},
+        controllers={str(name): registry.config(str(c.kind)) for name, c in cfg.controllers.items()},
         studies=named("studies", StudyConfig()),
     )
 

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import logging
-from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
 
 from experiments.cli import frame
+from experiments.control.device import linked
 from experiments.control.rig_files import save
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.procedures import measure_blanks
 from hardware.chibio.reactors import ChiBioReactors
-from hardware.clock import RealClock
 from hardware.errors import ReactorError
-from hardware.link.transport import open_transport
 
 __all__ = ["BlankConfig", "blank"]
 
@@ -40,8 +38,8 @@ def blank(config: BlankConfig, folder: Path) -> None:
     backend = config.backend
     log.info("clear medium in %s; this takes %d minutes", ", ".join(backend.reactors), config.samples + 1)
     try:
-        with closing(open_transport(backend.transport, backend.url, backend.speed)) as transport:
-            reactors = ChiBioReactors(transport, RealClock(backend.speed), backend)
+        with linked(backend) as (transport, clock):
+            reactors = ChiBioReactors(transport, clock, backend)
             try:
                 reactors.begin()
                 found = measure_blanks(reactors, config.samples)

@@ -7,7 +7,6 @@ import logging
 import math
 import sys
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -15,15 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from experiments.cli import frame
+from experiments.control.device import linked
 from experiments.control.rig_files import save
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Unit, no_log
 from hardware.chibio.dosing import PumpFit, fit_pump
 from hardware.chibio.procedures import dose_series
 from hardware.chibio.protocol import FEED, PERIOD_S, WASTE
-from hardware.clock import RealClock
 from hardware.errors import ReactorError
-from hardware.link.transport import open_transport
 
 __all__ = ["CalibratePumpConfig", "Series", "calibrate", "read_weighings"]
 
@@ -105,8 +103,8 @@ def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tup
     Args: ask: puts a question and returns the answer.
     Raises: ReactorError.
     """
-    clock, backend, found = RealClock(config.backend.speed), config.backend, []
-    with closing(open_transport(backend.transport, backend.url, backend.speed)) as transport:
+    found = []
+    with linked(config.backend) as (transport, clock):
         unit = Unit(config.reactor, [config.reactor], transport, clock, no_log)
         identity = unit.read().device_id
         print(

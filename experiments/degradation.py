@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from dqn.config import DQNConfig
 from envs.optimum import OptimalPolicy, solve
 from envs.task import EnvConfig
-from experiments.ablate import variant
 from experiments.cli import frame
+from experiments.training.variants import variant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -2,38 +2,37 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import logging
-import math
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from envs.scenario import Scenario
 from experiments.cli import frame
-from experiments.reliability.case import MOMENTS, Case, Outcome
-from experiments.reliability.faults import SICK, Fault, by_name
+from experiments.controllers.registry import STANDALONE
+from experiments.reliability.case import MOMENTS, FaultCase
+from experiments.reliability.faults import FAULTY, by_name
+from experiments.reliability.outcome import Outcome
+from experiments.reliability.rehearsal import rehearsed
+from experiments.reliability.tables import declared, table, totals, write_cases
 from hardware.chibio.overflow_guard import GuardConfig
 from hardware.safety.config import SafetyConfig
 
-__all__ = ["FaultMatrixConfig", "fault_matrix", "table"]
+__all__ = ["FaultMatrixConfig", "fault_matrix"]
 
 log = logging.getLogger(__name__)
-
-WITHOUT_POLICY = ("pi", "pi_tuned", "mpc", "inverse", "threshold", "hold")
 
 
 @dataclass(frozen=True)
 class FaultMatrixConfig:
     """Values of `conf/fault_matrix.yaml`. Raises: ValueError naming key, value and allowed range.
 
-    reactors: the first one falls sick. faults: their names; empty for all. moments: of `fault_case.MOMENTS`.
+    reactors: faults strike the first one. faults: their names; empty for all. moments: of `case.MOMENTS`.
     guard: overflow guard of the rig; faults that overflow without one are run on a rig without as well. Without a pump
       everything is run on that rig, and faults of the guard are left out.
     controls: healthy runs without sensor outliers; every word of the interlock there is a false alarm.
@@ -45,7 +44,7 @@ class FaultMatrixConfig:
         default_factory=lambda: Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8)
     )
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    controller_kind: str = "inverse"
+    controller_kind: str = "adaptive_inverse"
     guard: GuardConfig = field(default_factory=lambda: GuardConfig("Pump3", 0.95, 1.2))
     faults: tuple[str, ...] = ()
     moments: tuple[str, ...] = MOMENTS
@@ -58,13 +57,13 @@ class FaultMatrixConfig:
         by_name(self.faults)
         unknown = [m for m in self.moments if m not in MOMENTS]
         checks = (
-            ("reactors", self.reactors, self.reactors[0] == SICK, f"{SICK} first, it is the one that falls sick"),
+            ("reactors", self.reactors, self.reactors[0] == FAULTY, f"{FAULTY} first, it is the one that falls sick"),
             ("moments", self.moments, bool(self.moments) and not unknown, ", ".join(MOMENTS)),
             (
                 "controller_kind",
                 self.controller_kind,
-                self.controller_kind in WITHOUT_POLICY,
-                ", ".join(WITHOUT_POLICY),
+                self.controller_kind in STANDALONE,
+                ", ".join(STANDALONE),
             ),
             ("controls", self.controls, 0 <= self.controls <= 1000, "0 to 1000"),
             ("seed", self.seed, self.seed >= 0, "at least 0"),
@@ -79,8 +78,9 @@ class FaultMatrixConfig:
 def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int, guarded: bool) -> Outcome:
     """One case, in whatever process. Args: name: of the fault, "" for a healthy run. guarded: the rig has a guard."""
     fault = by_name((name,))[0] if name else None
-    what = (config.reactors, config.scenario, config.safety, config.controller_kind, seed)
-    return Case(fault, moment, *what, config.guard if guarded else GuardConfig()).run()
+    guard = config.guard if guarded else GuardConfig()
+    run = rehearsed(config.reactors, config.scenario, config.safety, config.controller_kind, guard)
+    return FaultCase(fault, moment, run, seed).run()
 
 
 def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
@@ -112,100 +112,12 @@ def run_all(config: FaultMatrixConfig, tick: Callable[[], object]) -> list[Outco
         return [future.result() for future in futures]
 
 
-def _number(value: float, form: str) -> str:
-    return format(value, form) if math.isfinite(value) else "–"
-
-
-def _span(values: Sequence[float], form: str) -> str:
-    """Smallest to largest, one number if they look the same."""
-    low, high = _number(min(values), form), _number(max(values), form)
-    return low if low == high else f"{low} – {high}"
-
-
-def table(outcomes: Sequence[Outcome]) -> str:
-    """Markdown: one row per fault over all moments; single cases are in cases.csv."""
-    head = (
-        "fault", "told after, min", "by", "response", "peak mL", "peak OD error", "rows missed", "rows lost",
-        "doses doubled", "pumps off", "as declared",
-    )  # fmt: skip
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for name in dict.fromkeys(o.label for o in outcomes):
-        mine = [o for o in outcomes if o.label == name]
-        told = [o.detected_s / 60.0 for o in mine if o.reason]
-        cells = [
-            name if mine[0].fault != "none" else f"{name} ({len(mine)} healthy runs)",
-            (_span(told, ".1f") + (f" ({len(told)} of {len(mine)})" if len(told) < len(mine) else "")) if told else "–",
-            ", ".join(dict.fromkeys(o.reason for o in mine if o.reason)) or "–",
-            ", ".join(dict.fromkeys(o.response for o in mine if o.response)) or "–",
-            _span([o.peak_ml for o in mine], ".1f"),
-            _span([o.peak_error for o in mine], ".2f"),
-            str(sum(o.rows_missed for o in mine)),
-            str(sum(o.rows_lost + o.rows_doubled for o in mine)),
-            str(sum(o.doses_doubled for o in mine)),
-            f"{sum(o.pumps_off for o in mine)} of {len(mine)}",
-            "yes"
-            if all(o.ok for o in mine)
-            else "**no**: " + ", ".join(dict.fromkeys(w for o in mine for w in o.wrong)),
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def declared(faults: Sequence[Fault]) -> str:
-    """Markdown: what is not detected, or overflows without a guard, and why."""
-    lines = [
-        "| fault | what happens | not detected because | without a guard it overflows because |",
-        "|---|---|---|---|",
-    ]
-    for f in faults:
-        if f.why_not or f.overflow:
-            lines.append(f"| {f.name} | {f.what} | {f.why_not or '(detected)'} | {f.overflow or '–'} |")
-    return "\n".join(lines) + "\n"
-
-
-def totals(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """The sums by which the matrix passes or fails."""
-    healthy = [o for o in outcomes if o.fault == "none"]
-    bare = [o for o in outcomes if not o.guarded]
-    return {
-        "cases": len(outcomes),
-        "faults": len({o.fault for o in outcomes} - {"none"}),
-        "overflows": sum(o.overflowed for o in outcomes if o.guarded),
-        "cases_without_guard": len(bare),
-        "overflows_without_guard": sum(o.overflowed for o in bare),
-        "rows_lost": sum(o.rows_lost for o in outcomes),
-        "rows_doubled": sum(o.rows_doubled for o in outcomes),
-        "doses_doubled": sum(o.doses_doubled for o in outcomes),
-        "doses_repeated_by_the_device": sum(o.repeats for o in outcomes),
-        "undetected": sum("not detected" in o.wrong for o in outcomes),
-        "software_ended": sum(o.exits for o in outcomes),
-        "neighbours_lost": sum(o.neighbours_lost for o in outcomes),
-        "pumps_not_off": sum("pumps not off" in o.wrong for o in outcomes),
-        "false_alarms": sum(o.early_alarms + o.neighbour_alarms for o in outcomes)
-        + sum(sum(o.kinds.values()) for o in healthy),
-        "healthy_runs": len(healthy),
-        "healthy_peak_error": max((o.peak_error for o in healthy), default=math.nan),
-        "not_as_declared": sum(not o.ok for o in outcomes),
-    }
-
-
-def write_cases(path: Path, outcomes: Sequence[Outcome]) -> None:
-    """cases.csv: one row per case."""
-    rows = [o.as_dict() for o in outcomes]
-    with open(path, "w", newline="", encoding="utf-8") as f:
-        writer = csv.DictWriter(f, list(rows[0]))
-        writer.writeheader()
-        for row in rows:
-            counts = {k: " ".join(f"{name} x{n}" for name, n in row[k].items()) for k in ("kinds", "notes")}
-            writer.writerow({**row, **counts, "wrong": ", ".join(row["wrong"])})
-
-
 def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     """Run the matrix, write cases.csv, table.md, summary.json and the figure. Raises: UserError if it fails."""
     from tqdm import tqdm
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    from experiments.reliability import chart as charts_faults
+    from experiments.reliability.chart import fault_map
     from experiments.reporting import charts
 
     began = time.monotonic()
@@ -226,9 +138,9 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     heads = (f"With an overflow guard ({config.guard.pump} at {config.guard.duty:g})", "Without")
     parts = [f"## {head}\n\n{table(rig)}" for head, rig in zip(heads, rigs, strict=True) if rig]
     (folder / "table.md").write_text("\n".join([*parts, declared(faults)]), encoding="utf-8")
-    sick = [o for o in outcomes if o.fault != "none"]
-    if sick:
-        charts.save(charts_faults.fault_map(sick, config.moments), folder / "figures", "fault_matrix")
+    struck = [o for o in outcomes if o.fault != "none"]
+    if struck:
+        charts.save(fault_map(struck, config.moments), folder / "figures", "fault_matrix")
     total = totals(outcomes)
     seconds = {"wall_s": round(time.monotonic() - began, 1)}
     frame.write_json(folder / "summary.json", {**total, **seconds, "cases_list": [o.as_dict() for o in outcomes]})

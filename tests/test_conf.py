@@ -6,7 +6,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from experiments.cli import frame
-from experiments.control.config import TrainConfig, deploy_schema
+from experiments.control.config import deploy_schema
+from experiments.training.config import TrainConfig
 
 CONF = Path(__file__).parents[1] / "conf"
 

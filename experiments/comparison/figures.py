@@ -31,7 +31,7 @@ MARKS = {
     "pi": (COLOURS[1], "s"),
     "mpc": (COLOURS[2], "^"),
     "pi_tuned": (COLOURS[5], "s"),
-    "inverse": (COLOURS[3], "D"),
+    "adaptive_inverse": (COLOURS[3], "D"),
     "threshold": (COLOURS[6], "v"),
     "hold": ("#b0a080", "P"),
     "oracle": (COLOURS[7], "*"),

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from envs.plant.plant import Plant
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.trials import Trial, run_trial
+from experiments.controllers import registry
 from experiments.controllers.base import Controller
-from experiments.training import build
 
 if TYPE_CHECKING:
     from dqn.policy import Policy
@@ -41,7 +41,7 @@ def run_cell(config: BenchmarkConfig, cell: Cell, policy: Policy | None) -> Tria
     name, plant, scenario = cell
 
     def make(vials: Plant) -> Controller:
-        return build.controller(config.controllers[name], config.env, policy, vials)
+        return registry.build(config.controllers[name], config.env, policy, vials)
 
     return run_trial(
         cell, config.plants[plant], config.scenarios[scenario], make, config.env, config.replicates, config.seed

@@ -1,159 +1,132 @@
-"""From a deploy config to reactors: simulated vials, a Chi.Bio, or an emulator that is started for the run."""
+"""From a deploy config to a closed loop: everything that the config names is read here, once, and put together.
+
+A rehearsal is assembled here too, with a clock and a transport of its own.
+"""
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from dqn.policy import Policy
 from envs.plant.plant import Plant, PlantConfig
+from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame
 from experiments.control.config import DeployConfig
+from experiments.control.device import check, linked
 from experiments.control.loop import ClosedLoop
+from experiments.control.policies import run_policy
 from experiments.control.record import Record
+from experiments.control.recovery import continue_loop
 from experiments.control.rig_files import load_rigs
-from experiments.controllers.base import Controller
-from experiments.training import build
-from hardware.chibio.dosing import Rig
-from hardware.chibio.preflight import preflight
+from experiments.controllers import registry
+from experiments.training.model_file import read_env_file
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
-from hardware.clock import RealClock
-from hardware.emulator.process import EmulatorProcess
 from hardware.errors import RecordingError
-from hardware.link.transport import Transport, open_transport
 from hardware.reactor import Reactor
-from hardware.safety.config import Response
+from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedReactors
 
-__all__ = ["continue_loop", "controller_of", "model_of", "opened", "plant_of", "run_preflight"]
-
-log = logging.getLogger(__name__)
-EMULATED = ("speed", "seed", "od", "plant")  # values of backend=emulator that its process is started with
+__all__ = ["Setup", "close_loop", "opened", "run_preflight", "unpack"]
 
 
-def plant_of(config: DeployConfig) -> PlantConfig:
-    """The simulated plant, carrying the calibrated model if one is given. Raises: UserError for a bad env_file."""
-    plant = config.plant
-    if config.env_file is None:
-        return plant
-    from experiments.train import read_env_file
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What a deploy config comes to.
 
-    model = read_env_file(config.env_file)
-    gain = plant.vessel.volume_ml / (60.0 * model.tau)  # tau = V / (60 g)
-    growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
-    return replace(plant, growth=growth, pump=pump)
+    scenarios: one per reactor. plant: of the simulated vials; with an `env_file` it grows and is fed as calibrated.
+    model: growth model that model-based controllers are given: the calibrated one, else the nominal one.
+    policy: of controller=dqn. resumed: an earlier life of the run is continued.
+    """
+
+    config: DeployConfig
+    scenarios: list[Scenario]
+    plant: PlantConfig
+    model: EnvConfig
+    policy: Policy | None
+    resumed: bool
 
 
-def model_of(config: DeployConfig) -> EnvConfig:
-    """The growth model that model-based controllers are given: the calibrated one, else the nominal one."""
-    model = EnvConfig()
+def unpack(config: DeployConfig, folder: Path) -> Setup:
+    """Everything that a config names, read and checked; the run folder gets a copy of the policy.
+
+    Raises: UserError naming what cannot be read or does not fit.
+    """
+    backend, resumed = config.backend, config.resume is not None
+    try:
+        scenarios = config.schedules()
+    except ValueError as error:
+        raise frame.UserError(str(error)) from None
+    if resumed and backend.kind == "sim":
+        raise frame.UserError(f"resume={config.resume}: a simulated run takes a second; run it again")
+    plant, model = config.plant, EnvConfig()
     if config.env_file is not None:
-        from experiments.train import read_env_file
-
         model = read_env_file(config.env_file)
-    return replace(model, control_min=config.backend.control_min)
+        gain = plant.vessel.volume_ml / (60.0 * model.tau)  # tau = V / (60 g)
+        growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
+        plant = replace(plant, growth=growth, pump=pump)
+    model = replace(model, control_min=backend.control_min)
+    policy = None
+    if config.controller.kind == "dqn":
+        policy = run_policy(config.policy, folder, resumed, backend.control_min, config.safety.max_rate)
+    return Setup(config, scenarios, plant, model, policy, resumed)
 
 
-def controller_of(config: DeployConfig, model: EnvConfig, policy: Policy | None, reactors: Reactor) -> Controller:
-    """The configured controller. Raises: UserError naming what it needs and does not have here."""
+def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
+    """Controller, interlock and scenarios around reactors that are ready; a resumed loop stands where it was.
+
+    Raises: UserError naming what the controller needs and does not have here; RecordingError for a state that is
+      damaged or does not fit.
+    """
     plant, flow = None, 1.0
     if isinstance(reactors, SimulatedReactors):
         plant, flow = reactors.plant, reactors.config.pump_ml_s
     try:
-        return build.controller(config.controller, model, policy, plant, flow)
+        controller = registry.build(setup.config.controller, setup.model, setup.policy, plant, flow)
     except ValueError as error:
         raise frame.UserError(str(error)) from None
+    interlock = Interlock(len(reactors.names), setup.config.safety)
+    loop = ClosedLoop(reactors, controller, interlock, setup.scenarios, record.decided)
+    if setup.resumed:
+        continue_loop(loop, record.journal, record.state_path)
+    return loop
 
 
 @contextmanager
-def opened(config: DeployConfig, plant: PlantConfig, record: Record) -> Iterator[Reactor]:
-    """The reactors, ready for the loop; released afterwards. Raises: ReactorError."""
-    backend = config.backend
+def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
+    """The loop around the configured reactors, which are released afterwards. Raises: ReactorError, UserError."""
+    backend, earlier = setup.config.backend, record.journal.rows
     if backend.kind == "sim":
-        vials = Plant(plant, len(backend.reactors), np.random.default_rng(backend.seed))
-        yield SimulatedReactors(vials, backend)
+        vials = Plant(setup.plant, len(backend.reactors), np.random.default_rng(backend.seed))
+        yield close_loop(setup, SimulatedReactors(vials, backend), record)
         return
-    with ExitStack() as stack:
-        url = stack.enter_context(device_of(config))
-        transport = open_transport(backend.transport, url, backend.speed)
-        stack.callback(transport.close)
-        clock = RealClock(backend.speed)
+    with linked(backend) as (transport, clock):
         rigs = load_rigs(Path(backend.calibration), backend.reactors)
-        earlier = record.journal.rows
-        if config.resume is not None and not earlier:
+        if setup.resumed and not earlier:
             raise RecordingError(f"journal {record.journal.path}: missing or empty; put it back, or start a new run")
         if not earlier:
-            _check(transport, clock, config, rigs, record.folder)
+            check(backend, transport, clock, rigs, record.folder)
         reactors = ChiBioReactors(transport, clock, backend, rigs, record.journal.append)
-        if earlier:
-            reactors.begin(replay(earlier), (time.time() - float(earlier[0]["wall"])) * backend.speed)
-        else:
-            reactors.begin()
+        elapsed_s = (time.time() - float(earlier[0]["wall"])) * backend.speed if earlier else 0.0
+        reactors.begin(replay(earlier), elapsed_s)
         try:
-            yield reactors
-        except BaseException:  # before the loop, which ends with the same by itself: a guard runs already
+            yield close_loop(setup, reactors, record)
+        except BaseException:  # before the loop, which ends with the same by itself: an overflow guard runs already
             reactors.stop()
             raise
 
 
-@contextmanager
-def device_of(config: DeployConfig) -> Iterator[str]:
-    """Address of the device; `backend=emulator` starts one for as long as the run lasts. Raises: LinkError."""
-    backend = config.backend
-    if backend.kind != "emulator":
-        yield backend.url
-        return
-    arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
-    if backend.guard.pump:
-        arguments |= {"overflow-pump": backend.guard.pump, "overflow-flow": backend.guard.flow_ml_s}
-    with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
-        log.info("emulated device at %s, %g times real time; faults at %s", device.url, backend.speed, device.control)
-        yield device.url
-
-
-def _check(transport: Transport, clock: RealClock, config: DeployConfig, rigs: list[Rig], folder: Path) -> None:
-    """Log the preflight line by line. Raises: UserError if a required check failed."""
-    checks = preflight(transport, clock, config.backend, rigs, folder)
-    for check in checks:
-        log.log(logging.INFO if check.ok else logging.WARNING, "%s", check)
-    failed = [check for check in checks if check.required and not check.ok]
-    if failed:
-        raise frame.UserError(f"preflight: {len(failed)} of {len(checks)} checks failed, the first: {failed[0]}")
-
-
-def run_preflight(config: DeployConfig, folder: Path) -> None:
+def run_preflight(setup: Setup, folder: Path) -> None:
     """`preflight_only=true`: every check a line with pass or the remedy. Raises: UserError if one failed."""
-    backend = config.backend
+    backend = setup.config.backend
     if backend.kind == "sim":
         raise frame.UserError("preflight_only=true: a simulated reactor needs no preflight; use backend=chibio")
-    with ExitStack() as stack:
-        url = stack.enter_context(device_of(config))
-        transport = open_transport(backend.transport, url, backend.speed)
-        stack.callback(transport.close)
-        rigs = load_rigs(Path(backend.calibration), backend.reactors)
-        _check(transport, RealClock(backend.speed), config, rigs, folder)
-
-
-def continue_loop(loop: ClosedLoop, record: Record) -> None:
-    """Put the loop where its state was saved, and book the doses and hand-overs begun after that.
-
-    Raises: RecordingError for a state that is damaged or does not fit.
-    """
-    state, doses = record.load_state()
-    try:
-        loop.load_state_dict(state)
-    except ValueError as error:
-        raise record.no_state(str(error)) from None
-    loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
-    now = loop.reactors.elapsed()
-    for receipt in doses:
-        loop.interlock.confirm(receipt, now)
-    log.info("resumed at minute %.1f; %d dose(s) booked from the journal", now / 60.0, len(doses))
+    with linked(backend) as (transport, clock):
+        check(backend, transport, clock, load_rigs(Path(backend.calibration), backend.reactors), folder)

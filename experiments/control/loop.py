@@ -1,12 +1,12 @@
-"""The closed loop, the same for simulation, emulator and bench: measure, decide, guard, actuate.
+"""The closed loop, the same for simulation, emulator and device: measure, decide, check, actuate.
 
-It is a generator of what happened; clocks and wires are the reactors', files and screens are the caller's.
+It is a generator of what happened. Clocks and wires belong to the reactors, files and screens to the caller.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -126,14 +126,12 @@ class ClosedLoop:
         verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
         explanation = self.controller.explain() if isinstance(self.controller, Explains) else {}
 
-        def told(volume_ml: Array, notes: Sequence[str]) -> Step:
-            return Step(
-                now, rows, minute, elapsed, phase, m.od, m.temperature, setpoint, proposed, verdict.rate, volume_ml,
-                verdict.reasons, verdict.response, notes, explanation, self.done.copy(),
-            )  # fmt: skip
-
+        decision = Step(
+            now, rows, minute, elapsed, phase, m.od, m.temperature, setpoint, proposed, verdict.rate,
+            np.full(len(self.done), np.nan), verdict.reasons, verdict.response, (), explanation, self.done.copy(),
+        )  # fmt: skip
         if self._before_dose is not None:
-            self._before_dose(told(np.full(len(self.done), np.nan), ()))
+            self._before_dose(decision)
         faults = m.vitals.faults if m.vitals is not None else (None,) * len(self.done)
         absent = np.array([fault is not None and fault.kind == "absent" for fault in faults])
         self.gone = absent & (verdict.response == Response.STOP)
@@ -141,7 +139,7 @@ class ClosedLoop:
         heat = np.where(verdict.heat_off, np.nan, temperature)
         receipt = self.reactors.actuate(Command(rows, verdict.rate, heat))
         self.interlock.confirm(receipt, now)
-        return told(receipt.volume_ml, (*failures, *receipt.notes))
+        return replace(decision, volume_ml=receipt.volume_ml, notes=(*failures, *receipt.notes))
 
     def _respond(self, verdict: Verdict) -> list[str]:
         """Carry out what the interlock demands beyond not dosing; returns what failed (it is tried again next time)."""
@@ -164,7 +162,7 @@ class ClosedLoop:
         """Reactors that a list of failures speaks of."""
         return np.array([any(line.startswith(f"{name}:") for line in failures) for name in self.reactors.names])
 
-    def state_dict(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """Where each reactor's schedule and the interlock stand; plain numbers and lists."""
         return {
             "began": self.began.tolist(),
@@ -173,7 +171,7 @@ class ClosedLoop:
             "interlock": self.interlock.state(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def restore(self, state: dict[str, Any]) -> None:
         """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit."""
         for key, kinds, what in (
             ("began", (int, float, type(None)), "numbers"),

@@ -60,6 +60,8 @@ def window_metrics(minute: Array, od: Array, setpoint: float, start: float, end:
       setpoint: of the window. start, end: of the window, min.
     """
     tolerance = 1e-6
+    if not minute.size:
+        minute = od = np.full((len(minute), 1), np.nan)
     valid = (minute >= start - tolerance) & (minute <= end + tolerance) & np.isfinite(od)
     enough = valid.sum(axis=1) >= 2
     t = _carry_forward(np.where(valid, minute - start, 0.0), valid)

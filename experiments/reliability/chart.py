@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from experiments.reliability.case import Outcome
+from experiments.reliability.outcome import Outcome
 from experiments.reporting.charts import COLOURS, new_figure
 
 __all__ = ["fault_map"]

@@ -18,10 +18,10 @@ from experiments.controllers.base import Array, Mask
 from experiments.reliability.rehearsal import Rehearsal
 from hardware.emulator.faults import inject
 
-__all__ = ["FAULTS", "SICK", "Fault", "by_name"]
+__all__ = ["FAULTS", "FAULTY", "Fault", "by_name"]
 
-SICK = "M0"
-"""The reactor that a fault of one reactor befalls; the others are its healthy neighbours."""
+FAULTY = "M0"
+"""The reactor that a fault of one reactor strikes; the others are its healthy neighbours."""
 
 Act = Callable[[Rehearsal], None]
 
@@ -34,7 +34,7 @@ class Fault:
     by: it must be told by one of these: a reason of the interlock, or `note:TEXT`, `end:TEXT`, `repair:TEXT` for words
       in a note of the driver, in the run's outcome or among the repairs of a resumed run.
     why_not: why it need not, or cannot, be detected; empty if it must be.
-    wide: it befalls the whole board or program, not only the reactor `SICK`.
+    wide: it strikes the whole board or program, not only the reactor `FAULTY`.
     blind: samples made meanwhile cannot be read, or none are made.
     program: the program ends; it is resumed after `minutes`.
     rogue: something else than this program moves the feed pump, so its runs say nothing about doubled doses.
@@ -68,12 +68,12 @@ class Fault:
 
 def guard_off(r: Rehearsal) -> None:
     """Another client switches the overflow guard's pump off."""
-    post(f"/SetOutputOn/{r.backend.guard.pump}/0/{SICK}")(r)
+    post(f"/SetOutputOn/{r.config.backend.guard.pump}/0/{FAULTY}")(r)
 
 
 def set_(name: str, value: float = 1.0) -> Act:
-    """Switch of the emulator (docs/emulator.md), at the sick reactor where it belongs to one."""
-    return lambda r: inject(r.device, name, SICK, value)
+    """Switch of the emulator (docs/emulator.md), at the faulty reactor where it belongs to one."""
+    return lambda r: inject(r.device, name, FAULTY, value)
 
 
 def post(*paths: str) -> Act:
@@ -112,7 +112,7 @@ def both(*acts: Act) -> Act:
 
 def sticks(r: Rehearsal) -> None:
     """The feed pump's switch sticks for 8 s."""
-    inject(r.device, "feed_stuck_open", SICK, 1.0)
+    inject(r.device, "feed_stuck_open", FAULTY, 1.0)
     r.clock.at(r.clock.now() + 8.0, lambda: both(run_device, set_("feed_stuck_open", 0.0))(r))
 
 
@@ -123,7 +123,7 @@ def run_device(r: Rehearsal) -> None:
 
 def vial_out(r: Rehearsal) -> None:
     """Nothing in the light path: more light than through clear medium."""
-    inject(r.device, "od_offset", SICK, -float(r.device.vials[SICK].plant.apparent_od[0]) - 0.05)
+    inject(r.device, "od_offset", FAULTY, -float(r.device.vials[FAULTY].plant.apparent_od[0]) - 0.05)
 
 
 def full_disk(r: Rehearsal) -> None:
@@ -140,7 +140,7 @@ def free_disk(r: Rehearsal) -> None:
 
 def torn(r: Rehearsal) -> None:
     """What a power cut leaves: the last rows of journal and recording end in the middle."""
-    for path in (r.folder / "journal.jsonl", r.folder / "recordings" / f"{SICK}.csv"):
+    for path in (r.folder / "journal.jsonl", r.folder / "recordings" / f"{FAULTY}.csv"):
         os.truncate(path, os.path.getsize(path) - 7)
 
 
@@ -153,7 +153,7 @@ class _Typo(Scenario):
 
 
 def typo(r: Rehearsal) -> None:
-    """From now on the schedule of the sick reactor asks for OD 5.0."""
+    """From now on the schedule of the faulty reactor asks for OD 5.0."""
     s = r.loop.schedules[0]
     bad = _Typo(s.setpoints, s.minutes, s.temperatures, s.recovery_od, s.recovery_limit_min)
     r.loop.schedules = [bad, *r.loop.schedules[1:]]
@@ -303,25 +303,25 @@ FAULTS: tuple[Fault, ...] = (
           why_not="a read is believed only if it names its reactor, and repeated until it does"),
     Fault("reactors never selected", "another page selects all the time, 10 min", set_("foreign_selects", 1.0),
           ("selection",), set_("foreign_selects", 0.0), 10.0, wide=True, blind=True),
-    Fault("foreign regulation", "on-board regulation switched on", post(f"/SetOutputOn/OD/1/{SICK}"), ("mode",),
-          post(f"/SetOutputOn/OD/0/{SICK}"), 10.0, rogue=True),
-    Fault("foreign chemostat", "a mode that pumps is switched on", post(f"/SetOutputOn/Chemostat/1/{SICK}"), ("mode",),
-          post(f"/SetOutputOn/Chemostat/0/{SICK}"), 10.0),
-    Fault("foreign blank", "the zero is set anew", post(f"/CalibrateOD/OD0/{SICK}/20000/0"), ("blank",), blind=True),
+    Fault("foreign regulation", "on-board regulation switched on", post(f"/SetOutputOn/OD/1/{FAULTY}"), ("mode",),
+          post(f"/SetOutputOn/OD/0/{FAULTY}"), 10.0, rogue=True),
+    Fault("foreign chemostat", "a mode that pumps is switched on", post(f"/SetOutputOn/Chemostat/1/{FAULTY}"),
+          ("mode",), post(f"/SetOutputOn/Chemostat/0/{FAULTY}"), 10.0),
+    Fault("foreign blank", "the zero is set anew", post(f"/CalibrateOD/OD0/{FAULTY}/20000/0"), ("blank",), blind=True),
     Fault("foreign pump", "the feed pump is switched on twice, 0.5 mL every 63 s",
-          again(post(f"/SetOutputTarget/Pump1/{SICK}/0.008", f"/SetOutputOn/Pump1/1/{SICK}"), 95.0),
+          again(post(f"/SetOutputTarget/Pump1/{FAULTY}/0.008", f"/SetOutputOn/Pump1/1/{FAULTY}"), 95.0),
           ("pump", "note:pumps on", "mode"), rogue=True),
     Fault("foreign guard off", "the overflow guard's pump is switched off", guard_off, ("note:overflow guard",),
           guard=True),
-    Fault("foreign stop", "the experiment is stopped; started again after 10 min", post(f"/Experiment/0/{SICK}"),
-          ("stopped",), post(f"/Experiment/1/{SICK}"), 10.0, blind=True),
-    Fault("foreign thermostat off", "heating switched off", post(f"/SetOutputOn/Thermostat/0/{SICK}"),
+    Fault("foreign stop", "the experiment is stopped; started again after 10 min", post(f"/Experiment/0/{FAULTY}"),
+          ("stopped",), post(f"/Experiment/1/{FAULTY}"), 10.0, blind=True),
+    Fault("foreign thermostat off", "heating switched off", post(f"/SetOutputOn/Thermostat/0/{FAULTY}"),
           ("note:Thermostat",)),
-    Fault("foreign temperature", "thermostat set to 30 degC", post(f"/SetOutputTarget/Thermostat/{SICK}/30"),
+    Fault("foreign temperature", "thermostat set to 30 degC", post(f"/SetOutputTarget/Thermostat/{FAULTY}/30"),
           ("note:Thermostat",)),
-    Fault("foreign stirrer off", "stirrer switched off", post(f"/SetOutputOn/Stir/0/{SICK}"),
+    Fault("foreign stirrer off", "stirrer switched off", post(f"/SetOutputOn/Stir/0/{FAULTY}"),
           why_not="the device's next cycle switches it on again"),
-    Fault("foreign stirring", "stirrer set to 0.1", post(f"/SetOutputTarget/Stir/{SICK}/0.1"), ("note:Stir",)),
+    Fault("foreign stirring", "stirrer set to 0.1", post(f"/SetOutputTarget/Stir/{FAULTY}/0.1"), ("note:Stir",)),
     # ---- culture and temperature
     Fault("temperature run-away", "heater at full power whatever it is told", set_("heater_runaway"), ("hot",)),
     Fault("stirrer dead", "does not turn", set_("stirrer_dead"),

@@ -1,7 +1,7 @@
 """The whole stack in one process and in virtual time: emulated device, driver, interlock, loop, record.
 
 What a run would be in days takes seconds, everything about the culture is known, and the program can be killed at any
-moment and resumed: `experiments.fault_matrix` and `experiments.soak` run on it.
+moment and resumed.
 """
 
 from __future__ import annotations
@@ -16,13 +16,11 @@ from typing import Any
 import numpy as np
 
 from envs.scenario import Scenario
-from envs.task import EnvConfig
-from experiments.control.assemble import continue_loop
-from experiments.control.config import controller_config
+from experiments.control import assemble
+from experiments.control.config import DeployConfig
 from experiments.control.loop import ClosedLoop, Step
 from experiments.control.record import Record
-from experiments.controllers.base import Controller
-from experiments.training import build
+from experiments.controllers import registry
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import PumpCalibration, Rig
 from hardware.chibio.overflow_guard import GuardConfig
@@ -32,9 +30,8 @@ from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions
 from hardware.emulator.transport import EmulatorTransport
 from hardware.safety.config import SafetyConfig
-from hardware.safety.interlock import Interlock
 
-__all__ = ["SOUND", "Killed", "Rehearsal", "ScriptedClock"]
+__all__ = ["SOUND", "Killed", "Rehearsal", "ScriptedClock", "rehearsed"]
 
 SOUND = Rig(PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01"))
 """As weighing the emulator's healthy pumps gives: they run 0.11 s longer than asked, 0.05 s deliver nothing."""
@@ -73,38 +70,38 @@ def _plumbed(options: DeviceOptions, guard: GuardConfig) -> DeviceOptions:
     return replace(options, vial=vial, plant=replace(options.plant, pump=pump))
 
 
+def rehearsed(
+    names: Sequence[str],
+    scenario: Scenario,
+    safety: SafetyConfig | None = None,
+    controller: str = "adaptive_inverse",
+    guard: GuardConfig | None = None,
+) -> DeployConfig:
+    """The config of a run that is to be rehearsed: reactors at `names`, all with one scenario."""
+    backend = ChiBioConfig(reactors=tuple(names), guard=guard or GuardConfig())
+    law = registry.config(controller)
+    return DeployConfig(backend, safety=safety or SafetyConfig(), scenario=scenario, controller=law, fsync=False)
+
+
 class Rehearsal:
     """A run of `experiments.deploy` against the emulated device, in virtual time.
 
     Args:
-      folder: run folder, must exist.
-      names: positions of the reactors. schedules: one for each.
-      safety, backend: as of deploy. controller: kind of controller; `dqn` is not among them (it needs a policy file).
-      options: of the device. od: at the start. seed: of all noise. guard: against overflow, of rig and driver.
-    Attributes: clock, device; record, reactors, loop of the present life of the program; lives; killed_s, when the
-      program was killed; spans, clock times during which the program lived.
+      folder: run folder, must exist. config: as of deploy, e.g. by `rehearsed`.
+      options: of the device; an overflow guard of the config is plumbed in. od: at the start. seed: of all noise.
+    Attributes: clock, device; record, reactors, loop of the present life of the program; lives; spans, clock times
+      during which the program lived.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        names: Sequence[str],
-        schedules: Sequence[Scenario],
-        safety: SafetyConfig | None = None,
-        controller: str = "inverse",
-        options: DeviceOptions | None = None,
-        od: float = 0.5,
-        seed: int = 0,
-        guard: GuardConfig | None = None,
+        self, folder: Path, config: DeployConfig, options: DeviceOptions | None = None, od: float = 0.5, seed: int = 0
     ) -> None:
-        self.folder, self.names, self.schedules = folder, tuple(names), list(schedules)
-        self.safety, self._kind = safety or SafetyConfig(), controller
+        self.folder, self.config = folder, config
+        self.names: tuple[str, ...] = config.backend.reactors
         self.clock = ScriptedClock()
         rng = np.random.default_rng(seed)
-        guard = guard or GuardConfig()
-        plumbed = _plumbed(options or DeviceOptions(), guard)
+        plumbed = _plumbed(options or DeviceOptions(), config.backend.guard)
         self.device = ChiBioDevice(self.names, self.clock, rng, plumbed, od=od, temperature=37.0, blanked=True)
-        self.backend = ChiBioConfig(reactors=self.names, guard=guard)
         self.spans: list[list[float]] = []
         self.lives = 0
         self._dead = False
@@ -121,31 +118,20 @@ class Rehearsal:
         """Start the program, or start it again with `resume=`, as after a kill. Raises: ReactorError."""
         self._dead = False
         self.lives += 1
-        resumed = self.lives > 1
-        self.record = Record(self.folder, self.names, fsync=False)
+        resume = str(self.folder) if self.lives > 1 else None
+        setup = assemble.unpack(replace(self.config, resume=resume), self.folder)
+        self.record = Record(self.folder, self.names, setup.config.fsync)
         self.spans.append([self.clock.now(), np.inf])
-        transport = EmulatorTransport(self.device)
-        rigs = [SOUND] * len(self.names)
-        self.reactors = ChiBioReactors(transport, self.clock, self.backend, rigs, self._log)
-        earlier = self.record.journal.rows
-        self.reactors.begin(replay(earlier), self.clock.now() - self.spans[0][0])
-        self.loop = ClosedLoop(
-            self.reactors, self._controller(), Interlock(len(self.names), self.safety), self.schedules, self._decided
-        )
-        if resumed:
-            continue_loop(self.loop, self.record)
-
-    def _controller(self) -> Controller:
-        return build.controller(controller_config(self._kind), EnvConfig())
-
-    def _decided(self, step: Step) -> None:
-        self.record.decided(step)
+        transport, rigs = EmulatorTransport(self.device), [SOUND] * len(self.names)
+        self.reactors = ChiBioReactors(transport, self.clock, self.config.backend, rigs, self._log)
+        self.reactors.begin(replay(self.record.journal.rows), self.clock.now() - self.spans[0][0])
+        self.loop = assemble.close_loop(setup, self.reactors, self.record)
 
     def run(self, until_s: float = np.inf) -> Iterator[Step]:
         """Steps of the loop up to its end or a clock time. Raises: ReactorError, Killed."""
         while not self.loop.over and self.clock.now() < until_s:
             step = self.loop.step()
-            self.record.done(step, self.loop.state_dict())
+            self.record.done(step, self.loop.state())
             yield step
 
     def kill(self) -> None:
@@ -153,8 +139,8 @@ class Rehearsal:
         self._dead = True
         raise Killed
 
-    def bury(self) -> None:
-        """What the kernel does for a process that is gone: its files are closed. `begin` starts the next life."""
+    def close(self) -> None:
+        """Close the files of the program that has ended; `begin` starts the next one."""
         self.spans[-1][1] = self.clock.now()
         self.record.close()
 

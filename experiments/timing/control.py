@@ -15,7 +15,7 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame
-from experiments.control.config import controller_config
+from experiments.controllers import registry
 from experiments.controllers.base import Array, Controller
 from experiments.timing.measurement import Measurement
 
@@ -28,7 +28,6 @@ STATES = 64  # of the MPC's problem
 def loops() -> Iterator[Measurement]:
     """Closed loops of 90 min on `nominal_noise`: 64 vials as a batch beside the same 64 one after another."""
     from experiments.comparison.trials import run_trial
-    from experiments.training import build
 
     model = EnvConfig()
     plant = frame.load(frame.compose("plant/nominal_noise", []).plant, PlantConfig())
@@ -37,7 +36,7 @@ def loops() -> Iterator[Measurement]:
 
     def loop(config: Any, replicates: int, seed: int) -> None:
         def make(vials: Plant) -> Controller:
-            return build.controller(config, model, policy, vials)
+            return registry.build(config, model, policy, vials)
 
         run_trial((config.kind, "nominal_noise", "setpoint_steps"), plant, scenario, make, model, replicates, seed)
 
@@ -45,8 +44,8 @@ def loops() -> Iterator[Measurement]:
         for seed in np.arange(REPLICATES):
             loop(config, 1, int(seed))
 
-    for kind in ("pi", "dqn", "inverse"):
-        chosen = controller_config(kind)
+    for kind in ("pi", "dqn", "adaptive_inverse"):
+        chosen = registry.config(kind)
         yield Measurement(
             f"closed loop, {kind}",
             f"{REPLICATES} vials x 90 min after recovery",
@@ -55,7 +54,7 @@ def loops() -> Iterator[Measurement]:
             partial(one_by_one, chosen),
             limit=1.0,
         )
-    swarm = controller_config("mpc")
+    swarm = registry.config("mpc")
     gradient = replace(swarm, solver="gradient")
     yield Measurement(
         "closed loop, mpc",

@@ -17,10 +17,10 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from dqn import checkpoint
 from dqn.trainer import TrainRecord
-from experiments.control.config import TrainConfig
 from experiments.reporting.tensorboard import PopulationWriter
 from experiments.training import build
-from experiments.training.evaluation import Evaluation, Score, selection_grid
+from experiments.training.config import TrainConfig
+from experiments.training.evaluation import Evaluation, Score, report_grid, selection_grid
 
 __all__ = ["Best", "Session", "merit"]
 
@@ -119,6 +119,15 @@ class Session:
         )
         self.writer.flush()
         return score
+
+    def report(self) -> tuple[Evaluation, Score, Score]:
+        """The reported grid with the scores of the kept policies and of the last iterates on it."""
+        report = Evaluation(self.config.env, self.config.agent.gamma, report_grid(self.config.env))
+        kept, last = (
+            report(build.act_with(self.agents.network, weights), self.agents.n_agents)
+            for weights in (self.best.weights, self.agents.weights())
+        )
+        return report, kept, last
 
     def _log(self, record: TrainRecord) -> None:
         self.returns.append(record.episode_return.tolist())

@@ -23,12 +23,12 @@ from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.published import TABLE_2
 from experiments.comparison.trials import Trial, Window, run_trial, windows
 from experiments.comparison.workers import cells
-from experiments.training import build
+from experiments.controllers import registry
 from tests.experiments.test_deploy import inverse_policy
 
 ROOT = Path(__file__).parents[2]
-EVERY = ("dqn", "pi", "pi_tuned", "mpc", "inverse", "threshold", "hold", "oracle")
-FEEDBACK = ("dqn", "pi_tuned", "mpc", "inverse")
+EVERY = ("dqn", "pi", "pi_tuned", "mpc", "adaptive_inverse", "threshold", "hold", "oracle")
+FEEDBACK = ("dqn", "pi_tuned", "mpc", "adaptive_inverse")
 ROW_KEYS = {
     "controller", "plant", "scenario", "window", "setpoint", "n", "ise_mean", "ise_sd", "itae_mean", "itae_sd",
     "ise_ci95", "itae_ci95", "settling_min", "steady_abs_error", "media_ml",
@@ -52,7 +52,7 @@ def trial(controller: str, plant: str, scenario: str, replicates: int, seed: int
         (controller, plant, scenario),
         c.plants[plant],
         c.scenarios[scenario],
-        lambda vials: build.controller(c.controllers[controller], c.env, inverse_policy(), vials),
+        lambda vials: registry.build(c.controllers[controller], c.env, inverse_policy(), vials),
         c.env,
         replicates,
         seed,
@@ -73,7 +73,7 @@ def test_nothing_beats_the_oracle_on_the_training_model(controller):
     assert total(trial(controller, "nominal", "regulation", 1), "ise") >= bound * (1.0 - 5e-5)
 
 
-@pytest.mark.parametrize("controller", ["mpc", "inverse", "pi_tuned"])
+@pytest.mark.parametrize("controller", ["mpc", "adaptive_inverse", "pi_tuned"])
 def test_model_based_controllers_reach_the_oracle_where_their_model_is_true(controller):
     for scenario in ("regulation", "setpoint_steps"):
         bound = total(trial("oracle", "nominal", scenario, 1), "ise")
@@ -81,7 +81,7 @@ def test_model_based_controllers_reach_the_oracle_where_their_model_is_true(cont
 
 
 def test_oracle_knows_each_vial_and_gains_by_it():
-    """On `bench`, where every vial is another, noise-free ITAE; `inverse`, whose filter learns them, comes nearest."""
+    """Noise-free ITAE on `bench`, where every vial is another; `adaptive_inverse` learns them and comes nearest."""
     best = total_clean("oracle")
     for controller in FEEDBACK:
         assert total_clean(controller) > 1.2 * best
@@ -119,7 +119,7 @@ def test_no_feedback_loses_to_feedback():
 def test_threshold_loses_to_graded_feedback():
     """It pumps fully or not at all. On ITAE it may still beat the device's own PI, whose gain is too low by four."""
     lost = total(trial("threshold", "nominal_noise", "setpoint_steps", 8), "itae")
-    for controller in ("mpc", "inverse", "pi_tuned"):
+    for controller in ("mpc", "adaptive_inverse", "pi_tuned"):
         assert lost > 1.5 * total(trial(controller, "nominal_noise", "setpoint_steps", 8), "itae")
 
 
@@ -213,7 +213,7 @@ def test_one_replicate_has_no_interval():
     assert spread.sign == 0
 
 
-@pytest.mark.parametrize(("controller", "limit"), [("pi", 1.0), ("dqn", 1.0), ("inverse", 1.0), ("mpc", 20.0)])
+@pytest.mark.parametrize(("controller", "limit"), [("pi", 1.0), ("dqn", 1.0), ("adaptive_inverse", 1.0), ("mpc", 20.0)])
 def test_sixty_four_loops_of_ninety_minutes_are_quick(controller, limit):
     start = time.process_time()
     assert trial(controller, "nominal_noise", "setpoint_steps", 64, seed=5).od.shape == (64, 91)

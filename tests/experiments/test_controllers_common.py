@@ -11,9 +11,9 @@ import pytest
 
 from envs.task import EnvConfig
 from experiments.cli import frame
+from experiments.controllers.adaptive_inverse import AdaptiveInverse, AdaptiveInverseConfig
 from experiments.controllers.base import Controller, Explains
 from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
-from experiments.controllers.inverse import Inverse, InverseConfig
 from experiments.controllers.mpc import Mpc, MpcConfig
 from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 from experiments.controllers.pso import SwarmConfig
@@ -23,7 +23,7 @@ QUICK = SwarmConfig(particles=6, iterations=8)
 MAKERS: dict[str, Callable[[], Controller]] = {
     "pi": lambda: ChiBioPI(ChiBioPIConfig()),
     "pi_tuned": lambda: TunedPI(TunedPIConfig(), MODEL),
-    "inverse": lambda: Inverse(InverseConfig(), MODEL),
+    "adaptive_inverse": lambda: AdaptiveInverse(AdaptiveInverseConfig(), MODEL),
     "mpc": lambda: Mpc(MpcConfig(swarm=QUICK), MODEL),
     "threshold": lambda: Threshold(ThresholdConfig(hysteresis=0.02)),
     "hold": lambda: Hold(HoldConfig(), MODEL),
@@ -31,7 +31,7 @@ MAKERS: dict[str, Callable[[], Controller]] = {
 CONFIGS = {
     "pi": ChiBioPIConfig(),
     "pi_tuned": TunedPIConfig(),
-    "inverse": InverseConfig(),
+    "adaptive_inverse": AdaptiveInverseConfig(),
     "mpc": MpcConfig(),
     "threshold": ThresholdConfig(),
     "hold": HoldConfig(),
@@ -87,7 +87,7 @@ def test_reset_forgets(name: str) -> None:
     assert run() == run()
 
 
-@pytest.mark.parametrize("name", ["pi", "pi_tuned", "inverse", "mpc"])
+@pytest.mark.parametrize("name", ["pi", "pi_tuned", "adaptive_inverse", "mpc"])
 def test_explanations_have_one_row_per_reactor(name: str) -> None:
     controller = MAKERS[name]()
     controller.reset(5)
@@ -120,7 +120,7 @@ def test_threshold_and_hold_by_hand() -> None:
         ThresholdConfig(hysteresis=-0.1)
 
 
-@pytest.mark.parametrize("name", ["pi", "pi_tuned", "inverse"])
+@pytest.mark.parametrize("name", ["pi", "pi_tuned", "adaptive_inverse"])
 def test_ninety_minutes_of_64_replicates_in_well_under_a_second(name: str) -> None:
     controller = MAKERS[name]()
     controller.reset(64)

@@ -16,9 +16,10 @@ from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.cli.frame import UserError, save_config
 from experiments.control.config import DeployConfig
+from experiments.control.policies import load_policy
 from experiments.control.record import Record
-from experiments.deploy import _schema, load_policy
-from experiments.reliability.rehearsal import Rehearsal
+from experiments.deploy import _schema
+from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import RecordingError
 from tests.experiments.test_deploy import ENVIRONMENT, inverse_policy
@@ -30,11 +31,11 @@ HOLD = Scenario((0.4,), (600.0,), (37.0,))
 @pytest.fixture(scope="module")
 def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Rehearsal:
     """A run that was killed after ten minutes."""
-    run = Rehearsal(tmp_path_factory.mktemp("run"), ("M0",), [HOLD])
+    run = Rehearsal(tmp_path_factory.mktemp("run"), rehearsed(("M0",), HOLD))
     run.begin()
     for _ in run.run(600.0):
         pass
-    run.bury()
+    run.close()
     return run
 
 

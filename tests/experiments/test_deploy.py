@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,15 +17,20 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
+from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
+from experiments.control.console import ChangeLog
 from experiments.control.loop import ClosedLoop
+from experiments.control.record import Record
+from experiments.controllers import registry
 from experiments.controllers.learned import LearnedController
-from experiments.deploy import Announcer, policy_of
+from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError
 from hardware.safety.config import Responses, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
+from hardware.storage.journal import read_journal
 from hardware.storage.recorder import read_recording
 from tests.hardware.driver_lab import Bed
 
@@ -145,6 +151,20 @@ def test_another_control_period_is_refused_with_both_values(tmp_path):
     assert "1.0 min" in done.stderr
 
 
+@pytest.mark.parametrize("kind", [*registry.STANDALONE, "oracle"])
+def test_every_controller_runs_and_is_recorded(kind, tmp_path):
+    config = DeployConfig(scenario=Scenario((0.3,), (3.0,), (37.0,)), controller=registry.config(kind), fsync=False)
+    with closing(Record(tmp_path, config.backend.reactors, config.fsync)) as record:
+        with assemble.opened(assemble.unpack(config, tmp_path), record) as loop:
+            for step in loop.run():
+                record.done(step, loop.state())
+        assert [len(rows) for rows in record.rows] == [4]
+    decisions = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "decision"]
+    assert len(decisions) == 4
+    if kind == "mpc":
+        assert len(decisions[0]["why"]["planned_rate"]) == registry.config(kind).horizon
+
+
 def test_the_perfect_plant_is_the_training_model():
     """Closed loop on the `nominal` plant against x <- f(u) x, step for step."""
     reactors = SimulatedReactors(Plant(PlantConfig(start_od=0.9), 1, np.random.default_rng(0)), SimulatedConfig())
@@ -197,11 +217,11 @@ def test_a_reactor_left_to_the_on_board_regulation_is_so_again_after_a_resume():
         loop.step()
     assert loop.handed_over.all()
     assert bed.device.apps["M0"].data["OD"]["ON"] == 1
-    state = json.loads(json.dumps(loop.state_dict()))
+    state = json.loads(json.dumps(loop.state()))
     bed.client()
     bed.reactors.begin(replay(json.loads(json.dumps(bed.rows))), bed.clock.now())
     again = handing_over(bed)
-    again.load_state_dict(state)
+    again.restore(state)
     while bed.clock.now() < 3600.0:
         again.step()
     assert bed.device.apps["M0"].data["OD"]["ON"] == 1
@@ -212,10 +232,10 @@ def test_a_lasting_reason_is_told_once(caplog):
     bed = Bed(("M0", "M1"), od=0.55)
     bed.reactors.begin()
     loop = handing_over(bed)
-    announce = Announcer(loop)
+    log_changes = ChangeLog(loop)
     with caplog.at_level("WARNING"):
         while bed.clock.now() < 1800.0:
-            announce(loop.step())
+            log_changes(loop.step())
     assert loop.handed_over.all()
     assert len([r for r in caplog.records if "budget" in r.message]) == 2
     assert len(caplog.records) <= 4
@@ -227,15 +247,45 @@ def test_a_resumed_run_goes_on_with_its_own_policy(tmp_path):
     folder.mkdir()
     policy.save(source, inverse_policy())
     config = DeployConfig(policy=str(source))
-    first = policy_of(config, folder)
+
+    def flown(name: str | None = None) -> policy.Policy:
+        backend = ChiBioConfig() if name else config.backend
+        found = assemble.unpack(replace(config, backend=backend, resume=name), folder).policy
+        assert found is not None
+        return found
+
+    first = flown()
     other = replace(first, biases=(first.biases[0] + 1.0, *first.biases[1:]))
     policy.save(source, other)
-    resumed = policy_of(replace(config, resume=str(folder)), folder)
-    np.testing.assert_array_equal(resumed.biases[0], first.biases[0])
+    np.testing.assert_array_equal(flown(str(folder)).biases[0], first.biases[0])
     source.unlink()
-    policy_of(replace(config, resume=str(folder)), folder)
+    flown(str(folder))
     policy.save(source, other)
-    np.testing.assert_array_equal(policy_of(config, folder).biases[0], other.biases[0])
+    np.testing.assert_array_equal(flown().biases[0], other.biases[0])
+
+
+def test_a_training_that_ends_while_the_latest_policy_is_taken_swaps_nothing(tmp_path, monkeypatch):
+    """What a resume flies is what the run began with, although `latest` is another file by the time it is copied."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("old", "new", "run"):
+        Path("runs/train", name).mkdir(parents=True)
+    older = inverse_policy()
+    newer = replace(older, biases=(older.biases[0] + 1.0, *older.biases[1:]))
+    policy.save(Path("runs/train/old/policy.npz"), older)
+    read = policy.load
+
+    def read_while_a_training_ends(path: Path) -> policy.Policy:
+        found = read(path)
+        policy.save(Path("runs/train/new/policy.npz"), newer)
+        return found
+
+    monkeypatch.setattr(policy, "load", read_while_a_training_ends)
+    flown = policies.run_policy("latest", tmp_path, False, 1.0, 0.02)
+    monkeypatch.setattr(policy, "load", read)
+    assert policies.find_policy("latest") == Path("runs/train/new/policy.npz")
+    resumed = policies.run_policy("latest", tmp_path, True, 1.0, 0.02)
+    for own in (flown, resumed):
+        np.testing.assert_array_equal(own.biases[0], older.biases[0])
 
 
 def test_a_run_ends_although_an_absent_reactor_cannot_be_verified_off_and_says_so():

@@ -22,15 +22,15 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 SPEED = 30.0
 BROKEN = """
 import experiments.deploy
-from experiments.controllers.inverse import Inverse
-whole = Inverse.act
+from experiments.controllers.adaptive_inverse import AdaptiveInverse
+whole = AdaptiveInverse.act
 calls = []
 def act(self, *arguments):
     calls.append(0)
     if len(calls) > 8:
         raise RuntimeError("the controller failed")
     return whole(self, *arguments)
-Inverse.act = act
+AdaptiveInverse.act = act
 experiments.deploy.main()
 """
 
@@ -43,9 +43,9 @@ class Bench:
     ) -> None:
         self.device, self.folder = device, folder
         program = ["-c", code] if code else ["-m", "experiments.deploy"]
-        scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]", "controller=inverse"]
+        scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]"]
         backend = ["backend=chibio", f"backend.url={device.url}", f"backend.speed={SPEED}", "backend.reactors=[M0,M1]"]
-        new = [*scenario, *backend, *more, f"hydra.run.dir={folder}"]
+        new = ["controller=adaptive_inverse", *scenario, *backend, *more, f"hydra.run.dir={folder}"]
         command = [sys.executable, *program, *([f"resume={folder}"] if resume else new)]
         self.client = subprocess.Popen(
             command, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT

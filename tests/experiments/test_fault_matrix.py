@@ -11,10 +11,13 @@ import pytest
 
 from envs.scenario import Scenario
 from experiments.cli import frame
-from experiments.fault_matrix import FaultMatrixConfig, all_cases, declared, table, totals
-from experiments.reliability.case import Case, Outcome, audit_doses
+from experiments.fault_matrix import FaultMatrixConfig, all_cases
+from experiments.reliability.audit import audit_doses
+from experiments.reliability.case import FaultCase
 from experiments.reliability.faults import FAULTS, Fault, both, by_name, post, run_device, set_
-from experiments.reliability.rehearsal import Rehearsal
+from experiments.reliability.outcome import Outcome
+from experiments.reliability.rehearsal import Rehearsal, rehearsed
+from experiments.reliability.tables import declared, table, totals
 from hardware.chibio.overflow_guard import GuardConfig
 from hardware.emulator.vial import Dose
 from hardware.safety.config import SafetyConfig
@@ -29,7 +32,7 @@ def run(
     safety: SafetyConfig | None = None,
     guard: GuardConfig | None = None,
 ) -> Outcome:
-    return Case(fault, moment, ("M0", "M1"), SCHEDULE, safety or SafetyConfig(), "inverse", 3, guard).run()
+    return FaultCase(fault, moment, rehearsed(("M0", "M1"), SCHEDULE, safety, guard=guard), 3).run()
 
 
 def test_a_healthy_run_says_nothing_and_holds_the_setpoints() -> None:
@@ -122,17 +125,17 @@ def test_faults_of_the_guard_itself(name: str) -> None:
 def test_a_resumed_run_does_not_speak_of_lost_reactors_before_they_had_their_chance(
     tmp_path: Path, minutes: float
 ) -> None:
-    r = Rehearsal(tmp_path, ("M0", "M1", "M2"), [SCHEDULE] * 3)
+    r = Rehearsal(tmp_path, rehearsed(("M0", "M1", "M2"), SCHEDULE))
     r.begin()
     for _ in r.run(600.0):
         pass
-    r.bury()
+    r.close()
     r.wait(60.0 * minutes)
     r.begin()
     words = [reason for step in r.run(r.clock.now() + 600.0) for reason in step.reasons if reason]
     assert [word for word in words if word.startswith(("stale", "lost", "silent"))] == []
     r.reactors.stop()
-    r.bury()
+    r.close()
 
 
 def test_rigs_with_and_without_guard_are_counted_apart() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from envs.scenario import Scenario
 from experiments.controllers.base import Array, Controller, Mask
-from experiments.reliability.rehearsal import Killed, Rehearsal
+from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.emulator.faults import inject
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import DeviceStateError
@@ -22,14 +22,14 @@ from tests.experiments.test_exits import SPEED, Bench
 LOST = """
 import experiments.deploy
 import numpy as np
-from experiments.controllers.inverse import Inverse
-whole = Inverse.act
+from experiments.controllers.adaptive_inverse import AdaptiveInverse
+whole = AdaptiveInverse.act
 calls = []
 def act(self, *arguments):
     calls.append(0)
     rate = whole(self, *arguments)
     return np.where([len(calls) > 2, False], np.nan, rate)
-Inverse.act = act
+AdaptiveInverse.act = act
 experiments.deploy.main()
 """
 
@@ -53,13 +53,14 @@ class Losable(Rehearsal):
     """Two reactors of which the first loses its controller; the program dies at the n-th request after that."""
 
     def __init__(self, folder: Path, dies_at: int | None = None) -> None:
-        super().__init__(folder, ("M0", "M1"), [Scenario((0.5,), (600.0,), (37.0,))] * 2, seed=3)
+        super().__init__(folder, rehearsed(("M0", "M1"), Scenario((0.5,), (600.0,), (37.0,))), seed=3)
         self.sound, self.unusable, self.requests, self.dies_at = False, 0, 0, dies_at
         self._submit = self.device.submit
         self.device.submit = self._counted  # type: ignore[method-assign]
 
-    def _controller(self) -> Controller:
-        return Losing(super()._controller(), self)
+    def begin(self) -> None:
+        super().begin()
+        self.loop.controller = Losing(self.loop.controller, self)
 
     def _counted(self, method: str, path: str, *rest: Any) -> Any:
         exchange = self._submit(method, path, *rest)
@@ -88,7 +89,7 @@ def handed_over(folder: Path, dead_s: float = 300.0) -> Losable:
     run.begin()
     run.live(20)
     assert run.reactors.handed_over.tolist() == [True, False]
-    run.bury()
+    run.close()
     run.wait(dead_s)
     return run
 
@@ -169,7 +170,7 @@ def test_killed_in_the_middle_of_handing_over_it_is_dosed_or_regulated(tmp_path:
     run.begin()
     with pytest.raises(Killed):
         run.live(20)
-    run.bury()
+    run.close()
     run.wait(200.0)
     run.sound = True
     run.begin()
@@ -210,7 +211,7 @@ def test_giving_a_reactor_up_ends_its_regulation_too(tmp_path: Path) -> None:
     fed = run.device.vials["M0"].on_s["Pump1"]
     assert run.data()["OD"]["ON"] == 0
     assert not run.reactors.handed_over.any()
-    run.bury()
+    run.close()
     run.sound = True
     run.begin()
     run.live(10)

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from experiments.cli import frame
-from experiments.kill_campaign import KillConfig, kill_campaign
+from experiments.kill_campaign import kill_campaign
+from experiments.reliability.kills import KillConfig
 from hardware.storage.journal import read_journal
 
 

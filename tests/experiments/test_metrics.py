@@ -59,3 +59,9 @@ def test_a_batch_is_its_single_rows_and_empty_rows_are_nan():
             np.testing.assert_array_equal(getattr(one, key)[0], getattr(batch, key)[i])
     assert np.isnan(batch.ise[5])
     assert np.isnan(batch.steady_abs_error[5])
+
+
+def test_a_run_without_a_sample_has_no_metrics():
+    metrics = window_metrics(np.empty((2, 0)), np.empty((2, 0)), 0.5, 0.0, 30.0)
+    for key in ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error"):
+        np.testing.assert_array_equal(getattr(metrics, key), [np.nan, np.nan])

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.control.record import COLUMNS, Record
+from experiments.control.record import Record
+from experiments.control.recovery import load_state
+from experiments.control.rows import COLUMNS
 from hardware.errors import RecordingError
 
 
@@ -40,7 +42,7 @@ def test_a_decided_row_is_completed_with_the_dose_of_its_intent(tmp_path: Path) 
     record = Record(tmp_path, ("M0",), fsync=False)
     record.close()
     assert [(r["time_min"], r["volume_ml"], r["elapsed_min"]) for r in rows(tmp_path)] == [("2.0", "0.7", "1.0")]
-    assert record.lengths == [1]
+    assert [len(own) for own in record.rows] == [1]
     assert len(record.repairs) == 1
     Record(tmp_path, ("M0",), fsync=False).close()
     assert len(rows(tmp_path)) == 1
@@ -73,4 +75,4 @@ def test_state_that_cannot_be_written_ends_the_run_with_the_remedy(tmp_path: Pat
         record.save({})
     record.close()
     with pytest.raises(RecordingError, match="no state to resume from"):
-        Record(tmp_path / "recordings", (), fsync=False).load_state()
+        load_state(tmp_path / "recordings" / "state.json")

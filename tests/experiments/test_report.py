@@ -40,7 +40,8 @@ def benchmark(tmp_path_factory):
         [
             sys.executable, "-m", "experiments.benchmark", "+experiment=beyond", "replicates=4", "workers=1",
             "calibration=true", f"policy={folder / 'policy.npz'}", f"hydra.run.dir={folder / 'run'}",
-            "studies.beyond.plants=[nominal,bench]", "studies.beyond.controllers=[dqn,pi,inverse,threshold,oracle]",
+            "studies.beyond.plants=[nominal,bench]",
+            "studies.beyond.controllers=[dqn,pi,adaptive_inverse,threshold,oracle]",
             "+studies.setpoint_steps={scenarios:[setpoint_steps],plants:[nominal_noise],controllers:[dqn,pi,mpc]}",
             "studies.long.controllers=[]",
         ],

@@ -36,7 +36,7 @@ def test_the_line_is_unplugged_for_three_minutes(
 ) -> None:
     line, device = cable
     folder = tmp_path / "run"
-    scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]", "controller=inverse"]
+    scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]", "controller=adaptive_inverse"]
     link = ["backend=chibio", "backend/transport=serial", f"backend.transport.port={line.pc}"]
     numbers = [f"backend.speed={SPEED}", "backend.reactors=[M0,M1]", f"hydra.run.dir={folder}"]
     command = [sys.executable, "-m", "experiments.deploy", *scenario, *link, *numbers]

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from experiments.cli import frame
-from experiments.soak import Day, SoakConfig, soak, soak_run
+from experiments.reliability.endurance import Day, SoakConfig, soak_run
+from experiments.soak import soak
 from hardware.storage.recorder import read_recording
 
 

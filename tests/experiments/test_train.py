@@ -15,8 +15,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from dqn import checkpoint, policy
 from envs.task import EnvConfig
-from experiments.control.config import TrainConfig
 from experiments.training import build
+from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Evaluation, report_grid, selection_grid
 from experiments.training.session import Session
 

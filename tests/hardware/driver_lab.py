@@ -1,11 +1,15 @@
-"""Driver, interlock and a simple controller in front of the emulated device, on a virtual clock."""
+"""The program's closed loop with a simple controller around the emulated device, on a virtual clock."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from envs.scenario import Scenario
+from experiments.control.loop import ClosedLoop, Step
+from experiments.controllers.base import Array, Mask
 from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import Log
 from hardware.chibio.dosing import PumpCalibration, Rig
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import VirtualClock
@@ -13,9 +17,8 @@ from hardware.emulator.device import ChiBioDevice, DeviceOptions
 from hardware.emulator.faults import inject
 from hardware.emulator.transport import EmulatorTransport
 from hardware.link.transport import Reply
-from hardware.reactor import Command, Measurement
-from hardware.safety.config import Response, SafetyConfig
-from hardware.safety.interlock import Interlock, Verdict
+from hardware.safety.config import SafetyConfig
+from hardware.safety.interlock import Interlock
 
 # what weighing the emulator's healthy pumps gives: on-time bias 0.11 s, of which 0.05 s deliver nothing
 SOUND = Rig(PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01"))
@@ -42,8 +45,27 @@ class Spy:
         self.inner.close()
 
 
+class Law:
+    """A controller that knows growth and pump of the emulator's healthy culture, or asks for a fixed rate."""
+
+    rate: float | None = None  # the fixed rate, mL/s
+
+    def reset(self, n: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
+        if self.rate is not None:
+            return np.full(od.shape, self.rate)
+        error = np.log(np.maximum(od, 1e-3) / setpoint)
+        return np.clip((0.025 + 0.5 * error) * 20.0 / 60.0, 0.0, 0.02)
+
+
 class Bed:
-    """A test bed: `run` loops measure, decide, check, actuate, confirm, respond, as a deployment does."""
+    """A test bed: the program's closed loop around driver and emulated device.
+
+    Attributes: law, the controller; steps, what the loop yielded; rows, what the driver logged; samples, fed: number of
+      samples and mL asked of the pumps, shape (N,).
+    """
 
     def __init__(
         self,
@@ -53,6 +75,7 @@ class Bed:
         options: DeviceOptions | None = None,
         blanked: bool = True,
         safety: SafetyConfig | None = None,
+        scenario: Scenario | None = None,
         **config: Any,
     ) -> None:
         self.names = names
@@ -62,55 +85,49 @@ class Bed:
         )
         self.wire = Spy(EmulatorTransport(self.device), self.clock)
         self.config = ChiBioConfig(reactors=names, **config)
+        self.safety = safety
+        self.scenario = scenario or Scenario((od,), (100_000.0,), (37.0,))
+        self.law = Law()
         self.rows: list[dict[str, Any]] = []
-        self.interlock = Interlock(len(names), safety)
-        self.setpoint = np.full(len(names), od)
-        self.target_c = np.full(len(names), 37.0)
-        self.controller: Callable[[Measurement], np.ndarray] = self.inverse_law
-        self.measurements: list[Measurement] = []
-        self.verdicts: list[Verdict] = []
+        self.steps: list[Step] = []
         self.samples = np.zeros(len(names), dtype=int)
         self.fed = np.zeros(len(names))
+        self._state: dict[str, Any] = {}  # of the loop after its last step
         self.client()
 
-    def client(self) -> None:
-        """A new driver on the same device, as after a restart of the program."""
-        self.reactors = ChiBioReactors(self.wire, self.clock, self.config, [SOUND] * len(self.names), self.log)
+    def client(self, rigs: Sequence[Rig] | None = None, log: Log | None = None) -> None:
+        """A new driver and loop on the same device, as after a restart of the program."""
+        rigs = rigs or [SOUND] * len(self.names)
+        self.reactors = ChiBioReactors(self.wire, self.clock, self.config, rigs, log or self.log)
+        interlock = Interlock(len(self.names), self.safety)
+        self.loop = ClosedLoop(self.reactors, self.law, interlock, self.scenario)
+        if self._state:
+            self.loop.restore(self._state)
 
     def log(self, kind: str, fields: Mapping[str, Any]) -> None:
         self.rows.append({"kind": kind, **fields})
 
-    def inverse_law(self, m: Measurement) -> np.ndarray:
-        error = np.log(np.maximum(m.od, 1e-3) / self.setpoint)
-        return np.clip((0.025 + 0.5 * error) * 20.0 / 60.0, 0.0, 0.02)
-
     def fault(self, name: str, value: float = 1.0, reactor: str = "all") -> None:
         inject(self.device, name, reactor, value)
 
-    def step(self) -> Measurement:
-        m = self.reactors.measure()
-        now = self.reactors.elapsed()
-        verdict = self.interlock.check(m, self.controller(m), self.setpoint, self.target_c, now)
-        receipt = self.reactors.actuate(Command(m.fresh, verdict.rate, self.target_c))
-        self.interlock.confirm(receipt, now)
-        off = (verdict.response == Response.PUMPS_OFF) | (verdict.response == Response.STOP)
-        self.reactors.pumps_off(off)
-        self.reactors.heat_off(verdict.heat_off)
-        self.reactors.regulate(verdict.response == Response.REGULATE, verdict.setpoint)
-        self.samples += m.fresh
-        self.fed += receipt.volume_ml
-        self.measurements.append(m)
-        self.verdicts.append(verdict)
-        return m
+    def step(self) -> Step:
+        step = self.loop.step()
+        self._state = self.loop.state()
+        self.samples += step.rows
+        self.fed += step.volume_ml
+        self.steps.append(step)
+        return step
 
     def run(self, minutes: float) -> None:
+        """Go on for so long, or until every reactor was given up."""
         end = self.clock.now() + 60.0 * minutes
-        while self.clock.now() < end:
+        while self.clock.now() < end and not self.loop.over:
             self.step()
 
     def kinds(self) -> set[str]:
-        """Every reason the interlock gave so far."""
-        return {kind for verdict in self.verdicts for kinds in verdict.kinds for kind in kinds}
+        """Every kind of reason that the interlock gave so far."""
+        texts = [text for step in self.steps for text in step.reasons if text]
+        return {reason.split(":")[0] for text in texts for reason in text.split(" | ")}
 
     def of(self, kind: str) -> list[dict[str, Any]]:
         return [row for row in self.rows if row["kind"] == kind]

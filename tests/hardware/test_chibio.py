@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs.scenario import Scenario
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import Rig
-from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError, RecordingError
 from hardware.reactor import Command
@@ -24,7 +24,7 @@ def doses(bed: Bed, name: str = "M0", pump: str = "Pump1") -> list[tuple[float, 
 
 
 def fixed(bed: Bed, rate: float) -> None:
-    bed.controller = lambda m: np.full(len(bed.names), rate)
+    bed.law.rate = rate
 
 
 # -- a healthy run ---------------------------------------------------------------------------------------------------
@@ -36,7 +36,7 @@ def test_three_reactors_are_held_for_two_hours_without_a_missed_or_doubled_minut
     bed.run(120)
     bed.reactors.stop()
     assert np.all(bed.samples >= 118)
-    od = np.array([m.od for m in bed.measurements[-180:]])
+    od = np.array([step.od for step in bed.steps[-180:]])
     assert np.abs(od - 0.5).mean() < 0.01
     for i, name in enumerate(bed.names):
         starts = [t for t, _ in doses(bed, name)]
@@ -183,7 +183,7 @@ def test_a_running_experiment_is_adopted_not_started_again() -> None:
     bed.reactors.begin()
     assert not [p for _, p in bed.wire.posts if p.startswith("/Experiment")]
     first = bed.step()
-    assert first.fresh[0]
+    assert first.rows[0]
     assert bed.of("sample")[0]["sample"][0] > 180.0  # the one that was there already is not delivered
 
 
@@ -281,11 +281,11 @@ def test_zigzag_is_refused_with_the_remedy() -> None:
 
 def test_a_stored_blank_replaces_the_devices() -> None:
     bed = Bed(blanked=False)
-    rig = Rig(SOUND.feed, SOUND.waste, blank=bed.device.vials["M0"].spectrometer.blank)
-    bed.reactors = ChiBioReactors(bed.wire, bed.clock, bed.config, [rig], bed.log)
+    rig = Rig(SOUND.feed, SOUND.waste, blank=bed.device.vials["M0"].blank)
+    bed.client([rig])
     bed.reactors.begin()
     bed.run(3)
-    assert bed.measurements[-1].od[0] == pytest.approx(0.5, abs=0.06)
+    assert bed.steps[-1].od[0] == pytest.approx(0.5, abs=0.06)
 
 
 # -- samples ---------------------------------------------------------------------------------------------------------
@@ -381,11 +381,11 @@ def test_a_link_that_dies_in_a_dose_is_told_within_a_time_out() -> None:
     bed.reactors.begin()
     bed.run(3)
     fixed(bed, 0.02)
-    while not bed.step().fresh[0]:
+    while not bed.step().rows[0]:
         pass
     bed.fault("lost_request", -1)
     began = bed.clock.now()
-    while "link" not in bed.verdicts[-1].kinds[0]:
+    while "link" not in (bed.steps[-1].reasons[0] or ""):
         bed.step()
     assert bed.clock.now() - began < 60.0
     bed.fault("lost_request", 0)
@@ -437,7 +437,7 @@ def test_a_pump_that_no_command_reaches_is_reported() -> None:
     bed = Bed(stop_s=10.0)
     fixed(bed, 0.02)
     bed.reactors.begin()
-    while not bed.step().fresh.any():
+    while not bed.step().rows.any():
         pass
     bed.fault("lying", -1)
     bed.run(3)
@@ -502,11 +502,10 @@ def test_exchanged_reactors_end_control_of_both() -> None:
 
 
 def test_a_device_that_lost_its_memory_is_restored() -> None:
-    bed = Bed(("M0", "M1"))
+    bed = Bed(("M0", "M1"), scenario=Scenario((0.5, 0.5), (10.0, 600.0), (37.0, 34.0)))
     bed.reactors.begin()
     bed.run(10)
     blanks = [bed.device.apps[n].data["OD0"]["target"] for n in bed.names]
-    bed.target_c[:] = 34.0
     bed.run(3)
     bed.fault("worker_wipe")
     bed.run(10)
@@ -589,7 +588,7 @@ def test_stop_in_the_middle_of_a_dose_is_verified_and_idempotent(after_s: float,
     fixed(bed, 0.02)
     bed.reactors.begin()
     bed.run(2)
-    while not bed.step().fresh.any():
+    while not bed.step().rows.any():
         pass
     bed.clock.sleep(after_s)
     assert not bed.motors_off()
@@ -625,7 +624,7 @@ def test_an_intent_that_cannot_be_written_prevents_the_dose() -> None:
         if kind == "intent":
             raise RecordingError("journal: No space left on device")
 
-    bed.reactors = ChiBioReactors(bed.wire, bed.clock, bed.config, [SOUND], full)
+    bed.client(log=full)
     bed.reactors.begin()
     m = bed.reactors.measure()
     with pytest.raises(RecordingError):

@@ -103,10 +103,10 @@ def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_t
 
 def test_a_trip_switches_the_others_off_and_leaves_it_on() -> None:
     bed = rig()
-    bed.controller = lambda m: np.full(1, 0.02)
+    bed.law.rate = 0.02
     bed.reactors.begin()
     bed.run(3)
-    while not bed.step().fresh[0]:
+    while not bed.step().rows[0]:
         pass
     bed.clock.sleep(0.5)
     assert bed.truth()["motors"]["Pump2"] == 1
@@ -138,7 +138,7 @@ def test_another_client_that_changes_it_is_told_of_and_set_right(path: str, foun
 
 def test_a_pump_beside_it_that_someone_switches_on_is_still_found() -> None:
     bed = rig()
-    bed.controller = lambda m: np.zeros(1)
+    bed.law.rate = 0.0
     bed.reactors.begin()
     bed.run(3)
     for path in ("/SetOutputTarget/Pump4/M0/0.1", "/SetOutputOn/Pump4/1/M0"):
@@ -151,15 +151,15 @@ def test_a_pump_beside_it_that_someone_switches_on_is_still_found() -> None:
 
 def test_one_that_cannot_be_verified_on_is_an_alarm_with_a_remedy_and_no_dose_is_given() -> None:
     bed = rig()
-    bed.controller = lambda m: np.zeros(1)
+    bed.law.rate = 0.0
     bed.reactors.begin()
     bed.run(3)
     bed.device.handle("POST", "/SetOutputOn/Pump3/0/M0")
     bed.fault("lying", -1)
-    bed.controller = lambda m: np.full(1, 0.01)
+    bed.law.rate = 0.01
     before, given = bed.samples[0], len(bed.of("intent"))
     bed.run(5)
-    told = [v.reasons[0] or "" for v in bed.verdicts if "guard" in v.kinds[0]]
+    told = [text for step in bed.steps if "guard:" in (text := step.reasons[0] or "")]
     assert "the overflow guard, Pump3, is off after it was set to 0.5 and on" in told[0]
     assert "no dose" in told[0]
     assert "restart the device" in told[0]
@@ -294,7 +294,7 @@ def test_a_resumed_run_tells_that_it_was_off_meanwhile() -> None:
 @pytest.mark.parametrize(("guard", "peak"), [(GuardConfig("Pump4", 0.1), 23.5), (GuardConfig(), 30.0)])
 def test_a_blocked_waste_tube_at_the_largest_feed(guard: GuardConfig, peak: float) -> None:
     bed = rig(guard)
-    bed.controller = lambda m: np.full(1, 0.02)
+    bed.law.rate = 0.02
     bed.reactors.begin()
     bed.fault("waste_gain_factor", 0.0)
     bed.run(30)

@@ -1,4 +1,4 @@
-"""The inverse controller: its filter against least squares on all data at once, and what it learns in a loop."""
+"""Adaptive inverse control: its filter against least squares on all data at once, and what it learns in a loop."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from envs.task import EnvConfig
-from experiments.controllers.inverse import Inverse, InverseConfig
+from experiments.controllers.adaptive_inverse import AdaptiveInverse, AdaptiveInverseConfig
 
 ONE = np.ones(1, dtype=bool)
 
 
 def test_filter_equals_least_squares_on_all_data() -> None:
     """Without walks the estimate is the weighted least-squares fit of ln x0, mu, g with their priors."""
-    config = InverseConfig(mu_walk=0.0, gain_walk=0.0, pulse_cv=0.0, growth_cv=0.0, gate_sigma=20.0)
+    config = AdaptiveInverseConfig(mu_walk=0.0, gain_walk=0.0, pulse_cv=0.0, growth_cv=0.0, gate_sigma=20.0)
     model = EnvConfig()
     rng = np.random.default_rng(1)
-    inverse = Inverse(config, model)
+    inverse = AdaptiveInverse(config, model)
     inverse.reset(1)
     log_x, dosed, minute = np.log(0.6), 0.0, 0.0
     rows, values, weights = [], [], []
@@ -57,7 +57,7 @@ def test_it_learns_growth_and_pump_of_a_plant_it_was_not_told() -> None:
         np.random.default_rng(0),
     )
     plant.reset(0.8)
-    inverse = Inverse(InverseConfig(), EnvConfig(mu=0.03))
+    inverse = AdaptiveInverse(AdaptiveInverseConfig(), EnvConfig(mu=0.03))
     inverse.reset(n)
     errors = []
     for minute in range(90):
@@ -73,13 +73,13 @@ def test_it_learns_growth_and_pump_of_a_plant_it_was_not_told() -> None:
     assert abs(np.mean(errors)) < 0.002
 
 
-def steady(inverse: Inverse, minutes: int) -> None:
+def steady(inverse: AdaptiveInverse, minutes: int) -> None:
     for k in range(minutes):
         inverse.act(np.array([0.5]), np.array([0.5]), np.array([float(k)]), ONE)
 
 
 def test_an_outlier_changes_nothing_and_a_lasting_jump_is_believed() -> None:
-    inverse = Inverse(InverseConfig(), EnvConfig())
+    inverse = AdaptiveInverse(AdaptiveInverseConfig(), EnvConfig())
     inverse.reset(1)
     steady(inverse, 30)
     before = inverse.explain()
@@ -96,7 +96,7 @@ def test_an_outlier_changes_nothing_and_a_lasting_jump_is_believed() -> None:
 def test_the_law_inverts_the_model() -> None:
     """With the truth known exactly the next OD is the setpoint, or the pump is at a bound."""
     model = EnvConfig(mu=0.025, tau=0.3)
-    inverse = Inverse(InverseConfig(mu_sd=1e-5, gain_sd=0.0, gain_walk=0.0, mu_walk=0.0), model)
+    inverse = AdaptiveInverse(AdaptiveInverseConfig(mu_sd=1e-5, gain_sd=0.0, gain_walk=0.0, mu_walk=0.0), model)
     od = np.array([0.51, 0.49, 0.9, 0.2])
     inverse.reset(4)
     u = inverse.act(od, np.full(4, 0.5), np.zeros(4), np.ones(4, dtype=bool))
@@ -106,4 +106,4 @@ def test_the_law_inverts_the_model() -> None:
 
 def test_ranges() -> None:
     with pytest.raises(ValueError, match=r"controller.noise_floor = 0.0 OD: allowed 0.0001 to 0.1"):
-        InverseConfig(noise_floor=0.0)
+        AdaptiveInverseConfig(noise_floor=0.0)

@@ -10,14 +10,14 @@ from envs.plant.noise import check_ranges
 from envs.task import EnvConfig
 from experiments.controllers.base import Array, Mask, usable
 
-__all__ = ["Inverse", "InverseConfig"]
+__all__ = ["AdaptiveInverse", "AdaptiveInverseConfig"]
 
 LOWEST_OD = 0.005  # below it the logarithm of a reading says nothing
 GAIN_RANGE = (0.2, 3.0)  # of the relative pump gain; a head outside is broken, not slow
 
 
 @dataclass(frozen=True)
-class InverseConfig:
+class AdaptiveInverseConfig:
     """What the filter believes about sensor and plant.
 
     noise_floor, noise_relative: sd of a reading = hypot(floor, relative * OD).
@@ -27,7 +27,7 @@ class InverseConfig:
     gate_sigma: readings further than this from the prediction are outliers, unless gate_max of them come in a row.
     """
 
-    kind: str = "inverse"
+    kind: str = "adaptive_inverse"
     noise_floor: float = 0.005
     noise_relative: float = 0.003
     mu_sd: float = 0.008
@@ -55,7 +55,7 @@ class InverseConfig:
         check_ranges(self, "controller", ranges)
 
 
-class Inverse:
+class AdaptiveInverse:
     """Certainty-equivalent inverse control.
 
     State s = [ln x, mu, g] with the relative pump gain g; dt minutes after a dose of u over one control period h
@@ -70,7 +70,7 @@ class Inverse:
       config: the filter's beliefs; model: mu, tau, control period and largest pump rate of the calibrated model.
     """
 
-    def __init__(self, config: InverseConfig, model: EnvConfig) -> None:
+    def __init__(self, config: AdaptiveInverseConfig, model: EnvConfig) -> None:
         self.config, self.model = config, model
         self.reset(1)
 

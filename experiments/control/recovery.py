@@ -1,0 +1,147 @@
+"""What a resumed run takes over from its earlier life: recorded rows, rows that were never written, the loop's state.
+
+The journal is written before everything else, so whatever the other files lack can be had from it.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.control.loop import ClosedLoop
+from experiments.control.rows import COLUMNS, NUMBERS, Row, Rows
+from hardware.errors import RecordingError
+from hardware.reactor import Receipt
+from hardware.safety.config import Response
+from hardware.storage.journal import REMEDY, Journal
+
+__all__ = ["REBUILD", "complete", "continue_loop", "load_state", "read_rows"]
+
+log = logging.getLogger(__name__)
+
+REBUILD = "move it away and resume again: it is written anew from the last 20 MB of the journal"
+
+
+def read_rows(path: Path) -> Rows:
+    """The rows of a recording. Raises: RecordingError for a row that was damaged."""
+    found = Rows()
+    with open(path, newline="", encoding="utf-8") as f:
+        rows = csv.DictReader(f)
+        try:
+            for raw in rows:
+                if raw.keys() != set(COLUMNS) or None in raw.values() or not math.isfinite(float(raw["time_min"])):
+                    raise ValueError("a row without a time, or not with a cell for every column")
+                found.append({key: value if key == "interlock" else value or "nan" for key, value in raw.items()})
+        except (ValueError, csv.Error) as error:
+            raise RecordingError(f"{path}: damaged near line {max(rows.line_num, 1)} ({error}); {REBUILD}") from None
+    return found
+
+
+def complete(journal: Journal, name: str, rows: Rows, write: Callable[[Row], None]) -> list[str]:
+    """Write the rows of reactor `name` that are in the journal and that a kill kept from being written.
+
+    Args: rows: those already written, into which `write` takes each new one.
+    Returns: one line per row. Raises: RecordingError for a row of the journal that was damaged.
+    """
+    repairs = []
+    try:
+        for row in _unwritten(journal.rows, name, rows):
+            write(row)
+            repairs.append(f"{name}: the row of minute {row['time_min']} was completed from the journal")
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        what = f"a row of {name} is damaged ({type(error).__name__}: {error})"
+        raise RecordingError(f"journal {journal.path}: {what}; {REMEDY}") from None
+    return repairs
+
+
+def _unwritten(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Iterator[Row]:
+    last = rows.last().get("time_min", -math.inf)
+    kinds = ("sample", "decision", "intent")
+    mine = [r for r in journal if r.get("reactor") == name and r["kind"] in kinds]
+    around = zip([{}, *mine], mine, [*mine[1:], {}], strict=False)
+    for earlier, this, following in around:
+        if this["kind"] == "decision":
+            row: Row = {c: math.nan if this["row"][c] is None else this["row"][c] for c in COLUMNS}
+            row["volume_ml"] = float(following["feed_ml"]) if following.get("kind") == "intent" else 0.0
+        elif this["kind"] == "sample" and not following and earlier.get("kind") != "sample":
+            row = _undecided(this, rows.last())
+        else:
+            continue
+        if float(row["time_min"] or 0.0) > last + 1e-3:
+            yield row
+
+
+def _undecided(sample: Mapping[str, Any], before: Mapping[str, float]) -> Row:
+    """The row of a sample after which the program was killed before it decided: no dose.
+
+    Args: before: the row before it; empty if there is none.
+    """
+    time = round(float(sample["time_s"]) / 60.0, 4)
+    row: Row = dict.fromkeys(NUMBERS, math.nan)
+    if before:
+        elapsed = round(before["elapsed_min"] + time - before["time_min"], 4)
+        row |= {"phase": int(before["phase"]), "setpoint": before["setpoint"], "elapsed_min": elapsed}
+    reading = {"od": sample["od"], "temperature_degc": sample["temperature"]}
+    row |= {"time_min": time, **{k: math.nan if v is None else float(v) for k, v in reading.items()}}
+    nothing = {"pump_rate_ml_s": 0.0, "proposed_ml_s": 0.0, "volume_ml": 0.0}
+    return {**row, **nothing, "interlock": "the program ended before it decided"}
+
+
+def load_state(path: Path) -> dict[str, Any]:
+    """The content of state.json; `journal_row` is the first row of the journal that it does not know of.
+
+    Raises: RecordingError where there is none to resume from.
+    """
+    try:
+        state = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise _no_state(path, error.strerror or str(error)) from None
+    except (ValueError, RecursionError) as error:
+        raise _no_state(path, f"not JSON: {error}") from None
+    if not isinstance(state, dict):
+        raise _no_state(path, f"it holds {str(state)[:40]}, expected keys and values")
+    known = state.get("journal_row", "missing")
+    if type(known) is not int or known < 0:
+        raise _no_state(path, f"journal_row: {str(known)[:40]}, expected the number of a row")
+    return state
+
+
+def _no_state(path: Path, why: str) -> RecordingError:
+    remedy = "journal and recordings are kept; start a new run, or put back the file as the run wrote it"
+    return RecordingError(f"{path}: no state to resume from ({why}); {remedy}")
+
+
+def _doses(journal: Journal, since: int, names: Sequence[str]) -> list[Receipt]:
+    """The doses begun from row `since` of the journal on."""
+    receipts = []
+    for row in journal.rows:
+        if row.get("kind") == "intent" and row["n"] >= since:
+            mine = np.array([name == row["reactor"] for name in names])
+            receipts.append(Receipt(np.where(mine, row["feed_ml"], 0.0), (), np.where(mine, row["waste_ml"], 0.0)))
+    return receipts
+
+
+def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
+    """Put the loop where its state was saved, and book the doses and hand-overs begun after that.
+
+    Args: journal: of the run. path: of state.json.
+    Raises: RecordingError for a state that is damaged or does not fit.
+    """
+    state = load_state(path)
+    doses = _doses(journal, state["journal_row"], loop.reactors.names)
+    try:
+        loop.restore(state)
+    except ValueError as error:
+        raise _no_state(path, str(error)) from None
+    loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
+    now = loop.reactors.elapsed()
+    for receipt in doses:
+        loop.interlock.confirm(receipt, now)
+    log.info("resumed at minute %.1f; %d dose(s) booked from the journal", now / 60.0, len(doses))

@@ -1,0 +1,65 @@
+"""Every kind of controller: its config, its class, and what the class is built from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from dqn.policy import Policy
+from envs.plant.plant import Plant
+from envs.task import EnvConfig
+from experiments.controllers.adaptive_inverse import AdaptiveInverse, AdaptiveInverseConfig
+from experiments.controllers.base import Controller
+from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
+from experiments.controllers.learned import LearnedConfig, LearnedController
+from experiments.controllers.mpc import Mpc, MpcConfig
+from experiments.controllers.oracle import Oracle, OracleConfig
+from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
+
+__all__ = ["STANDALONE", "build", "config"]
+
+KINDS: dict[str, tuple[type[Any], Callable[..., Controller], tuple[str, ...]]] = {
+    "dqn": (LearnedConfig, LearnedController, ("policy",)),
+    "pi": (ChiBioPIConfig, ChiBioPI, ("config",)),
+    "pi_tuned": (TunedPIConfig, TunedPI, ("config", "model")),
+    "mpc": (MpcConfig, Mpc, ("config", "model")),
+    "adaptive_inverse": (AdaptiveInverseConfig, AdaptiveInverse, ("config", "model")),
+    "threshold": (ThresholdConfig, Threshold, ("config",)),
+    "hold": (HoldConfig, Hold, ("config", "model")),
+    "oracle": (OracleConfig, Oracle, ("config", "plant", "model", "flow_ml_s")),
+}
+MISSING = {
+    "policy": "needs a policy; give policy=RUN/policy.npz",
+    "plant": "knows a simulated plant; allowed with backend=sim only",
+}
+STANDALONE = tuple(kind for kind, (_, _, parts) in KINDS.items() if not MISSING.keys() & set(parts))
+"""Kinds that run anywhere: they need neither a policy file nor a simulated plant."""
+
+
+def config(kind: str) -> Any:
+    """The default config of this kind of controller. Raises: ValueError naming the kinds there are."""
+    if kind not in KINDS:
+        raise ValueError(f"controller.kind = {kind}: allowed {', '.join(KINDS)}")
+    return KINDS[kind][0]()
+
+
+def build(
+    config: Any, model: EnvConfig, policy: Policy | None = None, plant: Plant | None = None, flow_ml_s: float = 1.0
+) -> Controller:
+    """The controller that a config describes.
+
+    Args:
+      config: as `config` gives it; `kind` names the controller.
+      model: the calibrated growth model, control period and largest pump rate, for those that use a model.
+      policy: what `dqn` follows. plant: the vials that `oracle` knows; only a simulation has it.
+      flow_ml_s: what the backend believes its pumps deliver (the oracle must know what a rate becomes).
+    Raises: ValueError naming what is missing for this kind of controller.
+    """
+    if config.kind not in KINDS:
+        raise ValueError(f"controller.kind = {config.kind}: no such controller")
+    _, make, parts = KINDS[config.kind]
+    given = {"config": config, "model": model, "policy": policy, "plant": plant, "flow_ml_s": flow_ml_s}
+    for part in parts:
+        if given[part] is None:
+            raise ValueError(f"controller = {config.kind}: {MISSING[part]}")
+    return make(**{part: given[part] for part in parts})

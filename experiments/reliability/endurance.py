@@ -1,0 +1,198 @@
+"""Days of a run with all reactors in virtual time: what they cost, and whether anything was lost or drifted."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import math
+import time
+from array import array
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envs.scenario import Scenario
+from experiments.reliability.audit import audit_doses, audit_rows
+from experiments.reliability.rehearsal import Rehearsal, rehearsed
+from hardware.chibio.protocol import POSITIONS
+from hardware.emulator.vial import Dose, Sample
+from hardware.safety.config import SafetyConfig
+from hardware.storage.journal import read_journal
+
+__all__ = ["Day", "SoakConfig", "growth", "soak_run"]
+
+log = logging.getLogger(__name__)
+
+MB = 1024.0 * 1024.0
+Times = dict[str, "array[float]"]  # per reactor, device s; a week of them must not look like a leak
+
+
+@dataclass(frozen=True)
+class SoakConfig:
+    """Values of `conf/soak.yaml`. Raises: ValueError naming key, value and allowed range.
+
+    reactors: how many. days: how long. setpoints: OD, in turn. phase_min: for so long each, min.
+    """
+
+    reactors: int = 8
+    days: float = 7.0
+    setpoints: tuple[float, ...] = (0.5, 0.4, 0.6)
+    phase_min: float = 240.0
+    controller_kind: str = "adaptive_inverse"
+    safety: SafetyConfig = field(default_factory=lambda: SafetyConfig(bottle_ml=1e6, ml_per_run=1e6))
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check every range once, where the value enters."""
+        checks = (
+            ("reactors", self.reactors, 1 <= self.reactors <= 8, "1 to 8"),
+            ("days", self.days, 0.01 <= self.days <= 100.0, "0.01 to 100"),
+            ("setpoints", self.setpoints, len(self.setpoints) >= 1, "one or more OD"),
+            ("phase_min", self.phase_min, 10.0 <= self.phase_min <= 1e5, "10 to 100000 min"),
+            ("seed", self.seed, self.seed >= 0, "at least 0"),
+        )
+        for key, value, ok, allowed in checks:
+            if not ok:
+                raise ValueError(f"{key} = {value}: allowed {allowed}")
+
+    def schedule(self) -> Scenario:
+        """The setpoints in turn until the days are over."""
+        phases = max(int(np.ceil(self.days * 1440.0 / self.phase_min)), 1)
+        setpoints = tuple(self.setpoints[k % len(self.setpoints)] for k in range(phases))
+        return Scenario(setpoints, (self.phase_min,) * phases, (37.0,) * phases)
+
+
+@dataclass(frozen=True)
+class Day:
+    """What one part of the run, a day as a rule, cost. Memory is the process's, sizes are of the run folder.
+
+    error: mean distance of the true OD from the setpoint, phases' first 20 min left out.
+    """
+
+    days: float
+    samples: int
+    memory_mb: float
+    journal_mb: float
+    csv_mb: float
+    events_mb: float
+    state_kb: float
+    wall_s: float
+    error: float
+    alarms: int
+
+
+def _memory_mb() -> float:
+    """Resident memory of this process, MB."""
+    with open("/proc/self/statm", encoding="ascii") as f:
+        return int(f.read().split()[1]) * 4096 / MB
+
+
+def _size_mb(folder: Path, pattern: str) -> float:
+    return sum(p.stat().st_size for p in folder.glob(pattern)) / MB
+
+
+class _Meter:
+    """Adds up a part of the run."""
+
+    def __init__(self, rehearsal: Rehearsal) -> None:
+        self.r, self.days = rehearsal, 0.0
+        self._reset()
+
+    def _reset(self) -> None:
+        self.samples = self.alarms = 0
+        self.errors: list[float] = []
+        self._began = time.perf_counter()
+
+    def take(self, part_days: float) -> Day:
+        """Close this part. Args: part_days: its length."""
+        gc.collect()
+        self.days += part_days
+        folder = self.r.folder
+        day = Day(
+            days=round(self.days, 3),
+            samples=self.samples,
+            memory_mb=round(_memory_mb(), 1),
+            journal_mb=round(_size_mb(folder, "journal.jsonl"), 2),
+            csv_mb=round(_size_mb(folder, "recordings/*.csv"), 2),
+            events_mb=round(_size_mb(folder, "events*"), 2),
+            state_kb=round(_size_mb(folder, "state.json") * 1024.0, 1),
+            wall_s=round(time.perf_counter() - self._began, 1),
+            error=round(float(np.mean(self.errors)) if self.errors else np.nan, 4),
+            alarms=self.alarms,
+        )
+        self._reset()
+        return day
+
+
+def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any]:
+    """The run; appends to `days` as they pass; returns what the audit found. Raises: ReactorError."""
+    names = POSITIONS[: config.reactors]
+    run = rehearsed(names, config.schedule(), config.safety, config.controller_kind)
+    r = Rehearsal(folder, run, seed=config.seed)
+    doses, samples = ({name: array("d") for name in names} for _ in range(2))
+    r.begin()
+    meter, part = _Meter(r), min(1.0, config.days)
+    end = r.clock.now() + 86400.0 * config.days
+    mark = r.clock.now() + 86400.0 * part
+    for step in r.run(end):
+        meter.samples += int(step.rows.sum())
+        meter.alarms += sum(reason is not None for reason in step.reasons)
+        for n in np.flatnonzero(step.rows & (step.elapsed % config.phase_min > 20.0)):
+            meter.errors.append(abs(float(r.device.vials[names[n]].plant.culture.od[0]) - float(step.setpoint[n])))
+        if r.clock.now() >= mark:
+            _collect(r, doses, samples)
+            days.append(meter.take(part))
+            log.info("%s", "  ".join(f"{k} {v}" for k, v in asdict(days[-1]).items()))
+            mark += 86400.0 * part
+    if meter.samples:
+        _collect(r, doses, samples)
+        days.append(meter.take((r.clock.now() - mark) / 86400.0 + part))
+    r.reactors.stop()
+    off = not any(any(r.truth(name)["motors"].values()) for name in names)
+    r.close()
+    return {**_audit(r, doses, samples), "pumps_off": off}
+
+
+def _collect(r: Rehearsal, doses: Times, samples: Times) -> None:
+    """Move out of the emulator what it would forget after 5000: when the feed pump began, when a sample was stored."""
+    for name, bench in r.device.vials.items():
+        doses[name].extend(dose.start_s for dose in bench.doses if dose.pump == "Pump1")
+        samples[name].extend(sample.stored_s for sample in bench.samples)
+        bench.doses.clear()
+        bench.samples.clear()
+
+
+def _audit(r: Rehearsal, doses: Times, samples: Times) -> dict[str, Any]:
+    """Minutes, doses and volumes: what the run believes against what the plant knows, per reactor."""
+    journal, _ = read_journal(r.folder / "journal.jsonl")
+    ledger, fed = r.loop.interlock.volume_ml, r.loop.interlock.fed_ml
+    reactors = {}
+    for n, name in enumerate(r.names):
+        truth = r.truth(name)
+        runs = [Dose("Pump1", start, math.nan, 1, math.nan) for start in doses[name]]
+        doubled, repeats = audit_doses(journal, runs, name, r.spans[0][0])
+        reactors[name] = {
+            "doses": len(runs),
+            "doses_doubled": doubled + repeats,
+            "booked_ml": float(fed[n]),
+            "fed_ml": truth["feed_ml"],
+            "fed_error_pct": 100.0 * (float(fed[n]) / truth["feed_ml"] - 1.0),
+            "ledger_ml": float(ledger[n]),
+            "volume_ml": truth["volume_ml"],
+            "peak_ml": truth["peak_ml"],
+        }
+    made = {name: [Sample(at, math.nan, math.nan) for at in times] for name, times in samples.items()}
+    missed, lost, twice = audit_rows(r, None, made)
+    return {"rows_lost": missed + lost, "rows_doubled": twice, "reactors": reactors}
+
+
+def growth(days: Sequence[Day], key: str) -> float:
+    """Increase per day over the second half of the run, in the unit of `key`."""
+    late = days[len(days) // 2 :]
+    if len(late) < 2:
+        return 0.0
+    slope = np.polyfit([d.days for d in late], [getattr(d, key) for d in late], 1)[0]
+    return float(slope)
