@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 
 from experiments.cli import frame
 from hardware.chibio.dosing import PumpCalibration, Rig
+from hardware.storage import atomic
 
 __all__ = ["load_rigs", "save"]
 
@@ -28,9 +28,7 @@ def save(folder: Path, reactor: str, part: str, values: Mapping[str, Any]) -> Pa
     path = folder / f"{reactor}_{part}.yaml"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".part")
-        OmegaConf.save(OmegaConf.create(dict(values)), temporary)
-        os.replace(temporary, path)
+        atomic.write(path, OmegaConf.to_yaml(OmegaConf.create(dict(values))), fsync=False)
     except OSError as error:
         raise frame.UserError(f"calibration {path}: {error.strerror or error}; give another folder") from None
     return path

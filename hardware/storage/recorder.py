@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hardware.errors import RecordingError
+from hardware.storage.atomic import sync_folder
 
 __all__ = ["Recorder", "Recording", "read_recording"]
 
@@ -113,7 +114,8 @@ class Recorder:
             self.repaired = f"{self.path}: cut a torn last line of {len(torn)} bytes"
         if not whole:
             self._append(header)
-            self._sync_folder()
+            if self._fsync:
+                sync_folder(self.path.parent)
         elif (found := whole[: whole.index(b"\n") + 1]) != header:
             raise RecordingError(
                 f"{self.path}: has the header {found.decode(errors='replace').strip()!r}, "
@@ -131,15 +133,6 @@ class Recorder:
                 os.fsync(self._fd)
         except OSError as error:
             raise RecordingError(f"{self.path}: row not written: {error.strerror}") from None
-
-    def _sync_folder(self) -> None:
-        """The new file's name is on the disk only once its folder is."""
-        if self._fsync:
-            folder = os.open(self.path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
 
 
 def _cell(value: Value) -> str:
