@@ -7,7 +7,7 @@ import pytest
 
 from experiments.cli import frame
 from experiments.soak import Day, SoakConfig, soak, soak_run
-from hardware.storage.recorder import read_recording
+from hardware.storage.recording_reader import read_recording
 
 
 def test_hours_of_two_reactors(tmp_path: Path) -> None:
