@@ -15,7 +15,7 @@ from hardware.chibio.procedures import measure_blanks
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import RealClock
 from hardware.errors import ReactorError
-from hardware.link.transport import open_transport
+from hardware.link.open import open_transport
 
 __all__ = ["BlankConfig", "blank"]
 

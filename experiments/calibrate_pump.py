@@ -23,7 +23,7 @@ from hardware.chibio.procedures import dose_series
 from hardware.chibio.protocol import FEED, PERIOD_S, WASTE
 from hardware.clock import RealClock
 from hardware.errors import ReactorError
-from hardware.link.transport import open_transport
+from hardware.link.open import open_transport
 
 __all__ = ["CalibratePumpConfig", "Series", "calibrate", "read_weighings"]
 

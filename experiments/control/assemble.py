@@ -28,7 +28,8 @@ from hardware.chibio.resume import replay
 from hardware.clock import RealClock
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import RecordingError
-from hardware.link.transport import Transport, open_transport
+from hardware.link.open import open_transport
+from hardware.link.transport import Transport
 from hardware.reactor import Reactor
 from hardware.safety.config import Response
 from hardware.simulated import SimulatedReactors

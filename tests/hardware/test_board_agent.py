@@ -26,7 +26,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hardware.board import board_agent
-from hardware.board.board_agent import Agent, Device, decode_request, encode_reply, encode_request, reduce_sysdata
+from hardware.board.board_agent import Agent, Device, decode_request, encode_reply, reduce_sysdata
+from hardware.link.frames import decode_header, encode_request
 from tests.hardware.emulator_lab import Lab
 from tests.hardware.test_emulator_server import Process
 
@@ -87,6 +88,17 @@ def test_frames_survive_the_way_and_noise_before_them(number: int, method: str, 
     line = encode_request(number, method, path)[:-1]
     assert decode_request(line) == (number, method, path)
     assert decode_request(noise.replace(b"\n", b"") + line) == (number, method, path)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 599), st.binary(max_size=60), st.binary(max_size=20))
+def test_a_reply_of_the_agent_is_read_by_the_driver(number: int, status: int, body: bytes, noise: bytes) -> None:
+    line, _, rest = encode_reply(number, status, body).partition(b"\n")
+    header = decode_header(noise.replace(b"\n", b"") + line)
+    assert header is not None
+    assert (header.number, header.status, header.length) == (number, status, len(body))
+    assert rest == body + b"\n"
+    assert header.fits(body)
+    assert not header.fits(body + b"x")
 
 
 @settings(max_examples=3000)

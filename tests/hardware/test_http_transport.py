@@ -25,7 +25,9 @@ from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import RealClock, VirtualClock
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
-from hardware.link.transport import HttpTransport, Reply, TransportConfig, open_transport
+from hardware.link.http import HttpTransport
+from hardware.link.open import open_transport
+from hardware.link.transport import Reply, TransportConfig
 from hardware.reactor import Command
 from tests.hardware.driver_lab import Bed
 from tests.hardware.script import answer, state

@@ -15,7 +15,8 @@ import pytest
 
 from hardware.chibio.protocol import parse_state
 from hardware.errors import LinkError
-from hardware.link.transport import SerialTransport, TransportConfig
+from hardware.link.serial import SerialTransport
+from hardware.link.transport import TransportConfig
 from tests.hardware.test_board_agent import PYTHON, SOURCE, Rig
 from tests.hardware.test_emulator_server import Process
 
