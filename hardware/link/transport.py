@@ -11,7 +11,7 @@ from typing import Protocol
 __all__ = ["MAX_BODY", "Reply", "Transport", "TransportConfig"]
 
 MAX_BODY = 262_144
-"""Bytes of the longest answer; a full state is 36 KB (chibio.md section 2), the board agent carries no more than that."""
+"""Bytes of the longest answer; a full state is 36 KB (chibio.md section 2), the board agent carries at most this."""
 
 
 @dataclass(frozen=True)

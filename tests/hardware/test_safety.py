@@ -121,7 +121,7 @@ def test_the_hour_rolls() -> None:
 def test_feed_without_waste_stops_before_the_vial_is_full() -> None:
     drive = Drive()
     verdicts = [drive(od=0.5 + 0.001 * (k % 7), rate=0.02, waste_ml=np.zeros(1)) for k in range(20)]
-    assert drive.interlock.volume_ml[0] <= 25.0
+    assert drive.interlock.budget.volume_ml[0] <= 25.0
     assert "overflow" in only(verdicts[-1])
     assert verdicts[-1].response[0] == Response.PUMPS_OFF
 
@@ -310,7 +310,7 @@ def test_thirty_healthy_reactors_for_a_day_are_left_alone(mu: float) -> None:
     assert count(verdicts, "jump") > 30  # the outliers are there
     if mu < 0.03:  # the fastest ones outgrow a weak pump head now and then, and that is true
         assert count(verdicts, "cannot_hold") == 0
-    assert np.all(interlock.volume_ml <= 20.0)
+    assert np.all(interlock.budget.volume_ml <= 20.0)
 
 
 @pytest.mark.parametrize("mu", [0.014, 0.025])
