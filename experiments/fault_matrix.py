@@ -19,7 +19,7 @@ from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.reliability.case import MOMENTS, Case, Outcome
 from experiments.reliability.faults import SICK, Fault, by_name
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.safety.config import SafetyConfig
 
 __all__ = ["FaultMatrixConfig", "fault_matrix", "table"]
@@ -34,7 +34,7 @@ class FaultMatrixConfig:
     """Values of `conf/fault_matrix.yaml`. Raises: ValueError naming key, value and allowed range.
 
     reactors: the first one falls sick. faults: their names; empty for all. moments: of `fault_case.MOMENTS`.
-    guard: overflow guard of the rig; faults that overflow without one are run on a rig without as well. Without a pump
+    overflow_pump: of the rig; faults that overflow without one are run on a rig without as well. Without a pump
       everything is run on that rig, and faults of the guard are left out.
     controls: healthy runs without sensor outliers; every word of the interlock there is a false alarm.
     seed: of the first case. workers: processes; 0 = one per core.
@@ -46,7 +46,7 @@ class FaultMatrixConfig:
     )
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     controller_kind: str = "inverse"
-    guard: GuardConfig = field(default_factory=lambda: GuardConfig("Pump3", 0.95, 1.2))
+    overflow_pump: OverflowPumpConfig = field(default_factory=lambda: OverflowPumpConfig("Pump3", 0.95, 1.2))
     faults: tuple[str, ...] = ()
     moments: tuple[str, ...] = MOMENTS
     controls: int = 10
@@ -80,12 +80,12 @@ def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int, guard
     """One case, in whatever process. Args: name: of the fault, "" for a healthy run. guarded: the rig has a guard."""
     fault = by_name((name,))[0] if name else None
     what = (config.reactors, config.scenario, config.safety, config.controller_kind, seed)
-    return Case(fault, moment, *what, config.guard if guarded else GuardConfig()).run()
+    return Case(fault, moment, *what, config.overflow_pump if guarded else OverflowPumpConfig()).run()
 
 
 def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
     """(fault, moment, seed, rig with guard) of every case; controls first, the rig without guard last."""
-    there = bool(config.guard.pump)
+    there = bool(config.overflow_pump.pump)
     faults = by_name(config.faults)
     rigs = [(f.name, there) for f in faults if there or not f.guard]
     rigs += [(f.name, False) for f in faults if there and f.overflow]
@@ -209,7 +209,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     from experiments.reporting import charts
 
     began = time.monotonic()
-    faults = [f for f in by_name(config.faults) if config.guard.pump or not f.guard]
+    faults = [f for f in by_name(config.faults) if config.overflow_pump.pump or not f.guard]
     total_cases, over = len(all_cases(config)), itertools.count(1)
     with logging_redirect_tqdm(), tqdm(total=total_cases, disable=None, unit="case") as bar:
 
@@ -223,7 +223,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
         raise frame.UserError("nothing to run: give faults or controls")
     write_cases(folder / "cases.csv", outcomes)
     rigs = [[o for o in outcomes if o.guarded], [o for o in outcomes if not o.guarded]]
-    heads = (f"With an overflow guard ({config.guard.pump} at {config.guard.duty:g})", "Without")
+    heads = (f"With an overflow guard ({config.overflow_pump.pump} at {config.overflow_pump.duty:g})", "Without")
     parts = [f"## {head}\n\n{table(rig)}" for head, rig in zip(heads, rigs, strict=True) if rig]
     (folder / "table.md").write_text("\n".join([*parts, declared(faults)]), encoding="utf-8")
     sick = [o for o in outcomes if o.fault != "none"]

@@ -277,7 +277,7 @@ class Campaign:
 
 def one_run(config: KillConfig, folder: Path, run: int) -> Findings:
     """One recording with its share of the kills."""
-    from experiments.control.rig_files import save
+    from experiments.control.calibration_files import save
     from experiments.reliability.rehearsal import SOUND
 
     for name in config.reactors:

@@ -15,13 +15,13 @@ from dqn.policy import Policy
 from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
 from experiments.cli import frame
+from experiments.control.calibration_files import load_calibrations
 from experiments.control.config import DeployConfig
 from experiments.control.loop import ClosedLoop
 from experiments.control.record import Record
-from experiments.control.rig_files import load_rigs
 from experiments.controllers.base import Controller
 from experiments.training import build
-from hardware.chibio.dosing import Rig
+from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.preflight import preflight
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
@@ -87,13 +87,13 @@ def opened(config: DeployConfig, plant: PlantConfig, record: Record) -> Iterator
         transport = open_transport(backend.transport, url, backend.speed)
         stack.callback(transport.close)
         clock = RealClock(backend.speed)
-        rigs = load_rigs(Path(backend.calibration), backend.reactors)
+        calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
         earlier = record.journal.rows
         if config.resume is not None and not earlier:
             raise RecordingError(f"journal {record.journal.path}: missing or empty; put it back, or start a new run")
         if not earlier:
-            _check(transport, clock, config, rigs, record.folder)
-        reactors = ChiBioReactors(transport, clock, backend, rigs, record.journal.append)
+            _check(transport, clock, config, calibrations, record.folder)
+        reactors = ChiBioReactors(transport, clock, backend, calibrations, record.journal.append)
         if earlier:
             reactors.begin(replay(earlier), (time.time() - float(earlier[0]["wall"])) * backend.speed)
         else:
@@ -113,15 +113,18 @@ def device_of(config: DeployConfig) -> Iterator[str]:
         yield backend.url
         return
     arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
-    arguments |= {"guard": backend.guard.pump, "guard-flow": backend.guard.flow_ml_s} if backend.guard.pump else {}
+    if (overflow := backend.overflow_pump).pump:
+        arguments |= {"guard": overflow.pump, "guard-flow": overflow.flow_ml_s}
     with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
         log.info("emulated device at %s, %g times real time; faults at %s", device.url, backend.speed, device.control)
         yield device.url
 
 
-def _check(transport: Transport, clock: RealClock, config: DeployConfig, rigs: list[Rig], folder: Path) -> None:
+def _check(
+    transport: Transport, clock: RealClock, config: DeployConfig, calibrations: list[ReactorCalibration], folder: Path
+) -> None:
     """Log the preflight line by line. Raises: UserError if a required check failed."""
-    checks = preflight(transport, clock, config.backend, rigs, folder)
+    checks = preflight(transport, clock, config.backend, calibrations, folder)
     for check in checks:
         log.log(logging.INFO if check.ok else logging.WARNING, "%s", check)
     failed = [check for check in checks if check.required and not check.ok]
@@ -138,8 +141,8 @@ def run_preflight(config: DeployConfig, folder: Path) -> None:
         url = stack.enter_context(device_of(config))
         transport = open_transport(backend.transport, url, backend.speed)
         stack.callback(transport.close)
-        rigs = load_rigs(Path(backend.calibration), backend.reactors)
-        _check(transport, RealClock(backend.speed), config, rigs, folder)
+        calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
+        _check(transport, RealClock(backend.speed), config, calibrations, folder)
 
 
 def continue_loop(loop: ClosedLoop, record: Record) -> None:

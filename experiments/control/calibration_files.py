@@ -12,10 +12,10 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 from experiments.cli import frame
-from hardware.chibio.dosing import PumpCalibration, Rig
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.storage import atomic
 
-__all__ = ["load_rigs", "save"]
+__all__ = ["load_calibrations", "save"]
 
 PARTS = ("feed", "waste", "blank")
 
@@ -48,12 +48,12 @@ def _read(path: Path) -> dict[str, Any]:
     return {str(k): v for k, v in content.items()}
 
 
-def load_rigs(folder: Path, reactors: Sequence[str]) -> list[Rig]:
+def load_calibrations(folder: Path, reactors: Sequence[str]) -> list[ReactorCalibration]:
     """Pumps and blanks of `reactors`; what was never measured is nominal, and its blank is nan (the device's own).
 
     Raises: UserError naming the file and what is wrong with it.
     """
-    rigs = []
+    calibrations = []
     for name in reactors:
         feed, waste, blank = (_read(folder / f"{name}_{part}.yaml") for part in PARTS)
         try:
@@ -63,5 +63,5 @@ def load_rigs(folder: Path, reactors: Sequence[str]) -> list[Rig]:
                 raise ValueError(f"blank = {counts}: allowed 3000 to 60000 counts")
         except (TypeError, ValueError) as error:
             raise frame.UserError(f"calibration of {name} in {folder}: {error}") from None
-        rigs.append(Rig(pumps[0], pumps[1], counts))
-    return rigs
+        calibrations.append(ReactorCalibration(pumps[0], pumps[1], counts))
+    return calibrations

@@ -17,7 +17,7 @@ from envs.scenario import Scenario
 from experiments.control.loop import Step
 from experiments.reliability.faults import INF, SICK, Fault
 from experiments.reliability.rehearsal import Killed, Rehearsal
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.emulator.device import DeviceOptions
 from hardware.emulator.vial import BenchConfig, Dose, Sample
 from hardware.errors import ReactorError
@@ -241,7 +241,7 @@ class Case:
     Args:
       fault: None for a healthy control run. moment: of `MOMENTS`. names: of the reactors, `SICK` first.
       schedule, safety, controller: as of deploy. seed: of all noise.
-      guard: of the rig; an overflow may be declared only where there is none.
+      overflow_pump: of the rig; an overflow may be declared only where there is none.
       outlier_rate: share of readings that jump for no reason; 0 keeps them from being taken for the fault.
     """
 
@@ -254,14 +254,14 @@ class Case:
         safety: SafetyConfig,
         controller: str,
         seed: int,
-        guard: GuardConfig | None = None,
+        overflow_pump: OverflowPumpConfig | None = None,
         outlier_rate: float = 0.0,
     ) -> None:
         self.fault, self.moment, self.names = fault, moment, tuple(names)
         self.schedule, self.safety, self.controller, self.seed = schedule, safety, controller, seed
-        self.guard = guard or GuardConfig()
+        self.overflow_pump = overflow_pump or OverflowPumpConfig()
         self.options = DeviceOptions(bench=BenchConfig(outlier_rate=outlier_rate))
-        self.result = Outcome(fault.name if fault else "none", moment, bool(self.guard.pump))
+        self.result = Outcome(fault.name if fault else "none", moment, bool(self.overflow_pump.pump))
         self._exits = 0  # of the device's software up to the fault, or its end
 
     def run(self) -> Outcome:
@@ -270,7 +270,7 @@ class Case:
             schedules = [self.schedule] * len(self.names)
             self.r = Rehearsal(
                 Path(folder), self.names, schedules, self.safety, self.controller, self.options, seed=self.seed,
-                guard=self.guard,
+                overflow_pump=self.overflow_pump,
             )  # fmt: skip
             self.watch = _Watch(self.fault, self.r, self.result)
             self.r.clock.at(1.0, self._wait_for_it)
@@ -343,7 +343,7 @@ class Case:
         gone = [SICK] if self.fault is not None and self.fault.gone else []
         if [name for name in self.names if f"{name}: " in unverified] != gone:
             return False
-        handed_over = [math.isfinite(s.handed_over) for s in self.r.reactors.stations]
+        handed_over = self.r.reactors.handed_over
         return all(
             regulated or not any(self.r.truth(name)["motors"].values())
             for name, regulated in zip(self.names, handed_over, strict=True)

@@ -24,8 +24,8 @@ from experiments.control.record import Record
 from experiments.controllers.base import Controller
 from experiments.training import build
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.dosing import PumpCalibration, Rig
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
 from hardware.clock import VirtualClock
@@ -36,7 +36,9 @@ from hardware.safety.interlock import Interlock
 
 __all__ = ["SOUND", "Killed", "Rehearsal", "ScriptedClock"]
 
-SOUND = Rig(PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01"))
+SOUND = ReactorCalibration(
+    PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01")
+)
 """As weighing the emulator's healthy pumps gives: they run 0.11 s longer than asked, 0.05 s deliver nothing."""
 
 
@@ -66,10 +68,10 @@ class ScriptedClock(VirtualClock):
         super().sleep(end - self.now())
 
 
-def _plumbed(options: DeviceOptions, guard: GuardConfig) -> DeviceOptions:
-    """The same device with a second waste tube on the guard's pump."""
-    pump = replace(options.plant.pump, guard_ml_s=guard.flow_ml_s)
-    bench = replace(options.bench, guard=guard.pump)
+def _plumbed(options: DeviceOptions, overflow: OverflowPumpConfig) -> DeviceOptions:
+    """The same device with a second waste tube on the overflow pump."""
+    pump = replace(options.plant.pump, guard_ml_s=overflow.flow_ml_s)
+    bench = replace(options.bench, guard=overflow.pump)
     return replace(options, bench=bench, plant=replace(options.plant, pump=pump))
 
 
@@ -80,7 +82,7 @@ class Rehearsal:
       folder: run folder, must exist.
       names: positions of the reactors. schedules: one for each.
       safety, backend: as of deploy. controller: kind of controller; `dqn` is not among them (it needs a policy file).
-      options: of the device. od: at the start. seed: of all noise. guard: against overflow, of rig and driver.
+      options: of the device. od: at the start. seed: of all noise. overflow_pump: of rig and driver.
     Attributes: clock, device; record, reactors, loop of the present life of the program; lives; killed_s, when the
       program was killed; spans, clock times during which the program lived.
     """
@@ -95,16 +97,16 @@ class Rehearsal:
         options: DeviceOptions | None = None,
         od: float = 0.5,
         seed: int = 0,
-        guard: GuardConfig | None = None,
+        overflow_pump: OverflowPumpConfig | None = None,
     ) -> None:
         self.folder, self.names, self.schedules = folder, tuple(names), list(schedules)
         self.safety, self._kind = safety or SafetyConfig(), controller
         self.clock = ScriptedClock()
         rng = np.random.default_rng(seed)
-        guard = guard or GuardConfig()
-        plumbed = _plumbed(options or DeviceOptions(), guard)
+        overflow_pump = overflow_pump or OverflowPumpConfig()
+        plumbed = _plumbed(options or DeviceOptions(), overflow_pump)
         self.device = ChiBioDevice(self.names, self.clock, rng, plumbed, od=od, temperature=37.0, blanked=True)
-        self.backend = ChiBioConfig(reactors=self.names, guard=guard)
+        self.backend = ChiBioConfig(reactors=self.names, overflow_pump=overflow_pump)
         self.spans: list[list[float]] = []
         self.lives = 0
         self._dead = False
@@ -125,8 +127,8 @@ class Rehearsal:
         self.record = Record(self.folder, self.names, fsync=False)
         self.spans.append([self.clock.now(), np.inf])
         transport = EmulatorTransport(self.device)
-        rigs = [SOUND] * len(self.names)
-        self.reactors = ChiBioReactors(transport, self.clock, self.backend, rigs, self._log)
+        calibrations = [SOUND] * len(self.names)
+        self.reactors = ChiBioReactors(transport, self.clock, self.backend, calibrations, self._log)
         earlier = self.record.journal.rows
         self.reactors.begin(replay(earlier), self.clock.now() - self.spans[0][0])
         self.loop = ClosedLoop(

@@ -126,7 +126,10 @@ class SerialTransport:
         seconds = self._config.timeout(
             self._config.read_s if method in ("GET", "POST") else self._config.connect_s, self._speed
         )
-        garbage, last_try = 0, time.monotonic() + 1.5 * seconds  # many damaged replies, but no third full time-out
+        garbage, last_try = (
+            0,
+            time.monotonic() + 1.5 * seconds,
+        )  # however many replies are damaged, no third full time-out
         try:
             for attempt in range(self._attempts):
                 if attempt:

@@ -70,8 +70,8 @@ SENSOR_REASONS = ("impossible", "spectrometer", "frozen", "jump", "no_dilution",
 class Responses:
     """The declared response to every reason: report | hold | pumps_off | regulate | stop.
 
-    link to guard are the kinds of `reactor.Fault`. A reason that means the sensor cannot be believed may not regulate:
-    the device would pump by the same reading.
+    link to overflow_pump are the kinds of `reactor.Fault`. A reason that means the sensor cannot be believed may not
+    regulate: the device would pump by the same reading.
     """
 
     setpoint: str = "hold"
@@ -104,7 +104,7 @@ class Responses:
     mode: str = "hold"
     blank: str = "hold"
     pump: str = "pumps_off"
-    guard: str = "hold"
+    overflow_pump: str = "hold"
 
     def __post_init__(self) -> None:
         for f in fields(self):

@@ -26,7 +26,7 @@ class Recorder:
     """Append-only CSV writer: what `write` returned from is on the disk.
 
     Each row is one `write` on an O_APPEND descriptor, then fsync. An existing file is continued: a last line torn by a
-    crash is cut off and told in `repaired`.
+    crash is cut off and reported in `repaired`.
 
     Args:
       path: of the CSV; its folder must exist.

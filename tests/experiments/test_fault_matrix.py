@@ -15,7 +15,7 @@ from experiments.fault_matrix import FaultMatrixConfig, all_cases, declared, tab
 from experiments.reliability.case import Case, Outcome, audit_doses
 from experiments.reliability.faults import FAULTS, Fault, both, by_name, post, run_device, set_
 from experiments.reliability.rehearsal import Rehearsal
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.emulator.vial import Dose
 from hardware.safety.config import SafetyConfig
 
@@ -27,9 +27,9 @@ def run(
     fault: Fault | None,
     moment: str = "steady",
     safety: SafetyConfig | None = None,
-    guard: GuardConfig | None = None,
+    pump: OverflowPumpConfig | None = None,
 ) -> Outcome:
-    return Case(fault, moment, ("M0", "M1"), SCHEDULE, safety or SafetyConfig(), "inverse", 3, guard).run()
+    return Case(fault, moment, ("M0", "M1"), SCHEDULE, safety or SafetyConfig(), "inverse", 3, pump).run()
 
 
 def test_a_healthy_run_says_nothing_and_holds_the_setpoints() -> None:
@@ -101,20 +101,20 @@ def test_what_overflows_on_the_standard_rig_does_not_with_a_guard(name: str) -> 
     without = run(fault)
     assert without.ok, without
     assert (without.overflowed, without.label) == (True, f"{name}, no guard")
-    guarded = run(fault, guard=FaultMatrixConfig().guard)
+    guarded = run(fault, pump=FaultMatrixConfig().overflow_pump)
     assert guarded.ok, guarded
     assert (guarded.overflowed, guarded.label) == (False, name)
     assert guarded.peak_ml < 27.0
 
 
 def test_an_overflow_beside_a_guard_is_never_as_declared() -> None:
-    too_weak = GuardConfig("Pump3", 0.95, 0.9)
-    assert run(by_name(("feed stuck open",))[0], guard=too_weak).wrong == ["overflow"]
+    too_weak = OverflowPumpConfig("Pump3", 0.95, 0.9)
+    assert run(by_name(("feed stuck open",))[0], pump=too_weak).wrong == ["overflow"]
 
 
 @pytest.mark.parametrize("name", ["guard blocked", "foreign guard off"])
 def test_faults_of_the_guard_itself(name: str) -> None:
-    outcome = run(by_name((name,))[0], guard=FaultMatrixConfig().guard)
+    outcome = run(by_name((name,))[0], pump=FaultMatrixConfig().overflow_pump)
     assert outcome.ok, outcome
 
 
@@ -141,7 +141,7 @@ def test_rigs_with_and_without_guard_are_counted_apart() -> None:
     assert [(name, guarded) for name, _, _, guarded in all_cases(config)] == [
         ("", True), ("waste blocked", True), ("guard blocked", True), ("feed blocked", True), ("waste blocked", False),
     ]  # fmt: skip
-    bare = replace(config, guard=GuardConfig())
+    bare = replace(config, overflow_pump=OverflowPumpConfig())
     assert [(name, guarded) for name, _, _, guarded in all_cases(bare)] == [
         ("", False), ("waste blocked", False), ("feed blocked", False),
     ]  # fmt: skip

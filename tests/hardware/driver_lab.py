@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.dosing import PumpCalibration, Rig
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions
@@ -18,7 +18,9 @@ from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock, Verdict
 
 # what weighing the emulator's healthy pumps gives: on-time bias 0.11 s, of which 0.05 s deliver nothing
-SOUND = Rig(PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01"))
+SOUND = ReactorCalibration(
+    PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01")
+)
 
 
 class Spy:
