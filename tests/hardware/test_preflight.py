@@ -25,7 +25,7 @@ def test_a_sound_device_passes_and_nothing_is_switched() -> None:
     assert str(found["M0 modes"]) == "pass  M0 modes: none active"
 
 
-def test_without_an_overflow_guard_a_note_says_what_may_happen_and_nothing_else_is_wrong() -> None:
+def test_without_an_overflow_pump_a_note_says_what_may_happen_and_nothing_else_is_wrong() -> None:
     found = checks(Bed())
     assert [check.name for check in found.values() if not check.ok] == ["overflow pump"]
     assert str(found["overflow pump"]) == (
