@@ -33,16 +33,6 @@ class Expected:
 
 def diagnose(state: DeviceState, expected: Expected, age_s: float, config: ChiBioConfig) -> Fault | None:
     """The gravest fault that a verified state shows; `age_s` is the age of the newest sample, s."""
-    return (
-        _experiment_fault(state, expected)
-        or _pump_fault(state, expected, config)
-        or _mode_fault(state, expected)
-        or _stalled(state, age_s, config)
-        or _overflow_fault(expected)
-    )
-
-
-def _experiment_fault(state: DeviceState, expected: Expected) -> Fault | None:
     if state.start_time != expected.start_time or not state.started:
         return Fault(
             "restarted",
@@ -57,40 +47,24 @@ def _experiment_fault(state: DeviceState, expected: Expected) -> Fault | None:
             f"the blank was changed from {expected.blank:.1f} to {state.blank:.1f}",
             f"set it back (raw {expected.blank:.1f}, OD 0) or start a new run",
         )
-    return None
-
-
-def _pump_fault(state: DeviceState, expected: Expected, config: ChiBioConfig) -> Fault | None:
     if expected.stuck:
         return Fault("pump", expected.stuck, "switch the pump board off by hand")
-    running = config.overflow_pump.others_on(state)
-    if running and not expected.dosing and not math.isfinite(expected.setpoint):
-        return Fault("pump", f"pumps on: {running}, not by this program", "close the device's web page everywhere")
-    return None
-
-
-def _mode_fault(state: DeviceState, expected: Expected) -> Fault | None:
     handed_over = math.isfinite(expected.setpoint)
-    wrong = not regulates(state, expected.setpoint) if handed_over else state.regulating
-    if not (state.pumping_modes or wrong):
-        return None
-    what = ", ".join(state.pumping_modes) or describe(state)
-    return Fault("mode", f"{what}: not as this program left it", "set it back in the device's web page")
-
-
-def _stalled(state: DeviceState, age_s: float, config: ChiBioConfig) -> Fault | None:
-    if age_s <= config.stale_s:
-        return None
-    return Fault(
-        "stalled",
-        f"no new sample for {age_s:.0f} s, cycles {state.cycles}",
-        f"after {config.lost_s:.0f} s its experiment is restarted; look at the device's terminal",
-    )
-
-
-def _overflow_fault(expected: Expected) -> Fault | None:
-    remedy = "close the device's web page everywhere; restart the device"
-    return Fault("overflow_pump", expected.overflow_trouble, remedy) if expected.overflow_trouble else None
+    on = config.overflow_pump.others_on(state)
+    if on and not expected.dosing and not handed_over:
+        return Fault("pump", f"pumps on: {on}, not by this program", "close the device's web page everywhere")
+    if state.pumping_modes or (not regulates(state, expected.setpoint) if handed_over else state.regulating):
+        what = ", ".join(state.pumping_modes) or describe(state)
+        return Fault("mode", f"{what}: not as this program left it", "set it back in the device's web page")
+    if age_s > config.stale_s:
+        return Fault(
+            "stalled",
+            f"no new sample for {age_s:.0f} s, cycles {state.cycles}",
+            f"after {config.lost_s:.0f} s its experiment is restarted; look at the device's terminal",
+        )
+    if trouble := expected.overflow_trouble:
+        return Fault("overflow_pump", trouble, "close the device's web page everywhere; restart the device")
+    return None
 
 
 def fault_of(error: ReactorError, present: bool) -> Fault:

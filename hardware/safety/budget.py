@@ -93,15 +93,11 @@ class FeedBudget:
     def state(self) -> dict[str, Array]:
         """What it remembers."""
         return {
-            "volume_ml": self.volume_ml,
-            "fed_ml": self.fed_ml,
-            "_hour": self._hour,
-            "_minute": self._minute,
-            "_dose_s": self._dose_s,
-            "_dose_ml": self._dose_ml,
-            "_owed_ml": self._owed_ml,
-            "_unusable": self._unusable,
-        }
+            "volume_ml": self.volume_ml, "fed_ml": self.fed_ml,
+            "_hour": self._hour, "_minute": self._minute,
+            "_dose_s": self._dose_s, "_dose_ml": self._dose_ml,
+            "_owed_ml": self._owed_ml, "_unusable": self._unusable,
+        }  # fmt: skip
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Continue as saved; a dose without a time (nan) was never given."""

@@ -67,14 +67,10 @@ class Heat:
     def state(self) -> dict[str, Array]:
         """What it remembers."""
         return {
-            "_target_c": self._target_c,
-            "_relief_c": self._relief_c,
-            "_thermo_s": self._thermo_s,
-            "_hot": self._hot,
-            "_too_hot": self._too_hot,
-            "_nonsense": self._nonsense,
+            "_target_c": self._target_c, "_relief_c": self._relief_c, "_thermo_s": self._thermo_s,
+            "_hot": self._hot, "_too_hot": self._too_hot, "_nonsense": self._nonsense,
             "_heat_off": self._off,
-        }
+        }  # fmt: skip
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Continue as saved."""

@@ -126,18 +126,12 @@ class UnexplainedChange:
     def state(self) -> dict[str, Array]:
         """What it remembers."""
         return {
-            "_od": self._od,
-            "_at": self._at,
-            "_since_ml": self._since_ml,
-            "_suspect": self._suspect,
-            "_suspect_at": self._suspect_at,
-            "_suspects": self._suspects,
-            "_mu": self._mu,
-            "_excess": self._excess,
-            "_deficit": self._deficit,
-            "_futile": self._futile,
+            "_od": self._od, "_at": self._at, "_since_ml": self._since_ml,
+            "_suspect": self._suspect, "_suspect_at": self._suspect_at,
+            "_suspects": self._suspects, "_mu": self._mu,
+            "_excess": self._excess, "_deficit": self._deficit, "_futile": self._futile,
             "_over": self._over,
-        }
+        }  # fmt: skip
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Continue as saved."""
