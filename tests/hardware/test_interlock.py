@@ -383,6 +383,19 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> N
     assert fed.sum() > 10.0
 
 
+def test_the_saved_state_has_the_fields_that_earlier_runs_wrote() -> None:
+    state = json.loads(json.dumps(Interlock(2).state()))
+    assert set(state) == {
+        "volume_ml", "fed_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_unusable",
+        "_fresh_s", "_seen", "_repeats",
+        "_od", "_at", "_since_ml", "_suspect", "_suspect_at", "_suspects", "_mu",
+        "_excess", "_deficit", "_futile", "_over",
+        "_target_c", "_relief_c", "_thermo_s", "_hot", "_too_hot", "_nonsense", "_heat_off",
+        "_hold_until_s", "_hold_kind", "_latched",
+    }  # fmt: skip
+    assert all(len(values) == 2 for values in state.values())
+
+
 def test_one_reactor_of_eight_is_the_same_as_one_alone() -> None:
     rng = np.random.default_rng(3)
     od = 0.5 + 0.02 * rng.standard_normal((200, 8))
