@@ -29,23 +29,14 @@ class SerialTransport:
       speed: device seconds per real second.
       config: line rate and time-outs.
       attempts: times one request line is sent before the link counts as lost.
-      rng: draws the first request ID of a session.
     Raises: LinkError when the line cannot be opened or nothing comes back, ProtocolError when only garbage does.
     """
 
-    def __init__(
-        self,
-        port: str,
-        speed: float = 1.0,
-        config: TransportConfig | None = None,
-        attempts: int = 5,
-        rng: random.Random | None = None,
-    ) -> None:
+    def __init__(self, port: str, speed: float = 1.0, config: TransportConfig | None = None, attempts: int = 5) -> None:
         self.port = port
         self._config = config or TransportConfig(kind="serial")
         self._speed = speed
         self._attempts = attempts
-        self._rng = rng or random.Random()  # repetition of an ID is all that matters, so system entropy is right
         self._line: serial.Serial | None = None
         self._id = 0
         self.hello: dict[str, Any] = {}
@@ -81,7 +72,7 @@ class SerialTransport:
             raise LinkError(
                 f"serial port {self.port}: {error}; check cable and port name, close other programs"
             ) from error
-        self._id = self._rng.randrange(1, 2**31)
+        self._id = random.SystemRandom().randrange(1, 2**31)  # so that no request repeats an ID of an earlier session
         try:
             self.hello = self._parse_hello(self._exchange("HELLO", "/"))
         except BaseException:
@@ -126,10 +117,8 @@ class SerialTransport:
         seconds = self._config.timeout(
             self._config.read_s if method in ("GET", "POST") else self._config.connect_s, self._speed
         )
-        garbage, last_try = (
-            0,
-            time.monotonic() + 1.5 * seconds,
-        )  # however many replies are damaged, no third full time-out
+        garbage = 0
+        last_try = time.monotonic() + 1.5 * seconds  # however many replies are damaged, no third full time-out
         try:
             for attempt in range(self._attempts):
                 if attempt:
