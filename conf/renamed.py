@@ -12,8 +12,17 @@ RENAMED: dict[str, str] = {  # old dotted key, or group=option, or key=choice ->
     "controller=inverse": "controller=adaptive_inverse",
     "controller_kind=inverse": "controller_kind=adaptive_inverse",
     "controllers.inverse": "controllers.adaptive_inverse",
+    "backend.guard": "backend.overflow_pump",
+    "backend.guard.duty": "backend.overflow_pump.duty",
+    "backend.guard.flow_ml_s": "backend.overflow_pump.flow_ml_s",
+    "backend.guard.pump": "backend.overflow_pump.pump",
+    "guard": "overflow_pump",  # of the fault matrix
+    "guard.duty": "overflow_pump.duty",
+    "guard.flow_ml_s": "overflow_pump.flow_ml_s",
+    "guard.pump": "overflow_pump.pump",
     "plant.pump.guard_ml_s": "plant.pump.overflow_ml_s",
     "plant.vessel.guard_above_ml": "plant.vessel.overflow_above_ml",
+    "safety.responses.guard": "safety.responses.overflow_pump",
 }
 REMOVED: dict[str, str] = {  # old dotted key -> why, and what to use instead
     "agent.adam_beta2": "it is the published 0.999",

@@ -8,6 +8,7 @@ figure, and one sub-folder per variant with its TensorBoard curves. A stopped ru
 from __future__ import annotations
 
 import csv
+import io
 import logging
 import re
 from dataclasses import dataclass, field, fields
@@ -21,6 +22,7 @@ from envs.task import EnvConfig
 from experiments.cli import frame
 from experiments.training.config import TrainConfig
 from experiments.training.variants import variant
+from hardware.storage import atomic
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,12 +104,11 @@ def _read(path: Path) -> list[Row]:
 
 def _write(path: Path, rows: list[Row]) -> None:
     """All rows so far, atomically."""
-    temporary = path.with_suffix(".part")
-    with open(temporary, "w", newline="", encoding="utf-8") as f:
-        writer = csv.writer(f)
-        writer.writerow([k.name for k in fields(Row)])
-        writer.writerows([getattr(row, k.name) for k in fields(Row)] for row in rows)
-    temporary.replace(path)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow([k.name for k in fields(Row)])
+    writer.writerows([getattr(row, k.name) for k in fields(Row)] for row in rows)
+    atomic.write(path, text.getvalue(), fsync=False)
 
 
 def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:

@@ -8,8 +8,8 @@ from datetime import date
 from pathlib import Path
 
 from experiments.cli import frame
+from experiments.control.calibration_files import save
 from experiments.control.device import linked
-from experiments.control.rig_files import save
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.procedures import measure_blanks
 from hardware.chibio.reactors import ChiBioReactors
@@ -43,7 +43,7 @@ def blank(config: BlankConfig, folder: Path) -> None:
             try:
                 reactors.begin()
                 found = measure_blanks(reactors, config.samples)
-                stored = [s.unit.device_id for s in reactors.stations]
+                stored = [s.connection.device_id for s in reactors.stations]
                 reactors.end()
             except BaseException:
                 reactors.stop()

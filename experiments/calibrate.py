@@ -19,7 +19,8 @@ from envs.identification.screening import Series, row_spans
 from envs.identification.window import Calibration, Drift, IdentifyConfig, calibrate
 from experiments.cli import frame
 from hardware.errors import RecordingError
-from hardware.storage.recorder import Recorder, Recording, read_recording
+from hardware.storage.recorder import Recorder
+from hardware.storage.recording_reader import Recording, read_recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

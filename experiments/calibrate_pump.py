@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from experiments.cli import frame
+from experiments.control.calibration_files import save
 from experiments.control.device import linked
-from experiments.control.rig_files import save
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Unit, no_log
+from hardware.chibio.connection import Connection, no_log
 from hardware.chibio.dosing import PumpFit, fit_pump
 from hardware.chibio.procedures import dose_series
 from hardware.chibio.protocol import FEED, PERIOD_S, WASTE
@@ -105,15 +105,15 @@ def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tup
     """
     found = []
     with linked(config.backend) as (transport, clock):
-        unit = Unit(config.reactor, [config.reactor], transport, clock, no_log)
-        identity = unit.read().device_id
+        connection = Connection(config.reactor, [config.reactor], transport, clock, no_log)
+        identity = connection.read().device_id
         print(
             f"{config.reactor} {config.pump} pump, unit {identity}. Put its inlet into water, prime the tube, and let"
         )
         print("its outlet drip into a beaker on a balance, the tube not touching the beaker.")
         for duty in config.duties:
             ask(f"\n{config.doses} doses of {PERIOD_S * duty:.2f} s: tare the balance, then press Enter ")
-            for given in dose_series(unit, clock, PUMP_OF[config.pump], duty, config.doses):
+            for given in dose_series(connection, clock, PUMP_OF[config.pump], duty, config.doses):
                 print(f"\r  dose {given} of {config.doses}", end="", flush=True)
             found.append(Series(duty, config.doses, _number(ask, "\n  grams on the balance: ")))
         transport.disarm()

@@ -20,7 +20,7 @@ from experiments.reliability.faults import FAULTY, by_name
 from experiments.reliability.outcome import Outcome
 from experiments.reliability.rehearsal import rehearsed
 from experiments.reliability.tables import declared, table, totals, write_cases
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.safety.config import SafetyConfig
 
 __all__ = ["FaultMatrixConfig", "fault_matrix"]
@@ -33,7 +33,7 @@ class FaultMatrixConfig:
     """Values of `conf/fault_matrix.yaml`. Raises: ValueError naming key, value and allowed range.
 
     reactors: faults strike the first one. faults: their names; empty for all. moments: of `case.MOMENTS`.
-    guard: overflow guard of the rig; faults that overflow without one are run on a rig without as well. Without a pump
+    overflow_pump: of the rig; faults that overflow without one are run on a rig without as well. Without a pump
       everything is run on that rig, and faults of the guard are left out.
     controls: healthy runs without sensor outliers; every word of the interlock there is a false alarm.
     seed: of the first case. workers: processes; 0 = one per core.
@@ -45,7 +45,7 @@ class FaultMatrixConfig:
     )
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     controller_kind: str = "adaptive_inverse"
-    guard: GuardConfig = field(default_factory=lambda: GuardConfig("Pump3", 0.95, 1.2))
+    overflow_pump: OverflowPumpConfig = field(default_factory=lambda: OverflowPumpConfig("Pump3", 0.95, 1.2))
     faults: tuple[str, ...] = ()
     moments: tuple[str, ...] = MOMENTS
     controls: int = 10
@@ -78,14 +78,14 @@ class FaultMatrixConfig:
 def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int, guarded: bool) -> Outcome:
     """One case, in whatever process. Args: name: of the fault, "" for a healthy run. guarded: the rig has a guard."""
     fault = by_name((name,))[0] if name else None
-    guard = config.guard if guarded else GuardConfig()
-    run = rehearsed(config.reactors, config.scenario, config.safety, config.controller_kind, guard)
+    pump = config.overflow_pump if guarded else OverflowPumpConfig()
+    run = rehearsed(config.reactors, config.scenario, config.safety, config.controller_kind, pump)
     return FaultCase(fault, moment, run, seed).run()
 
 
 def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
     """(fault, moment, seed, rig with guard) of every case; controls first, the rig without guard last."""
-    there = bool(config.guard.pump)
+    there = bool(config.overflow_pump.pump)
     faults = by_name(config.faults)
     rigs = [(f.name, there) for f in faults if there or not f.guard]
     rigs += [(f.name, False) for f in faults if there and f.overflow]
@@ -121,7 +121,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     from experiments.reporting import charts
 
     began = time.monotonic()
-    faults = [f for f in by_name(config.faults) if config.guard.pump or not f.guard]
+    faults = [f for f in by_name(config.faults) if config.overflow_pump.pump or not f.guard]
     total_cases, over = len(all_cases(config)), itertools.count(1)
     with logging_redirect_tqdm(), tqdm(total=total_cases, disable=None, unit="case") as bar:
 
@@ -135,7 +135,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
         raise frame.UserError("nothing to run: give faults or controls")
     write_cases(folder / "cases.csv", outcomes)
     rigs = [[o for o in outcomes if o.guarded], [o for o in outcomes if not o.guarded]]
-    heads = (f"With an overflow guard ({config.guard.pump} at {config.guard.duty:g})", "Without")
+    heads = (f"With an overflow guard ({config.overflow_pump.pump} at {config.overflow_pump.duty:g})", "Without")
     parts = [f"## {head}\n\n{table(rig)}" for head, rig in zip(heads, rigs, strict=True) if rig]
     (folder / "table.md").write_text("\n".join([*parts, declared(faults)]), encoding="utf-8")
     struck = [o for o in outcomes if o.fault != "none"]

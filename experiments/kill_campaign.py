@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.cli import frame
-from experiments.control.rig_files import save
+from experiments.control.calibration_files import save
 from experiments.reliability.kills import Findings, KillConfig, killed_run
 from experiments.reliability.rehearsal import SOUND
 

@@ -6,14 +6,12 @@ Every message names the thing, its value with unit, the allowed range and the re
 from __future__ import annotations
 
 __all__ = [
-    "DeviceRestarted",
     "DeviceStateError",
     "IdentityError",
     "LinkError",
     "ProtocolError",
     "ReactorError",
     "RecordingError",
-    "SafetyTrip",
     "SensorError",
 ]
 
@@ -38,16 +36,8 @@ class IdentityError(DeviceStateError):
     """A reactor answered with another identity than the one pinned at the start."""
 
 
-class DeviceRestarted(DeviceStateError):
-    """The device lost its memory (worker restart, power cut): blank, targets and records are gone."""
-
-
 class SensorError(ReactorError):
     """A reading that no culture can cause: frozen, impossible, broken spectrometer."""
-
-
-class SafetyTrip(ReactorError):
-    """The interlock ended the run; the message names reason, action taken and remedy."""
 
 
 class RecordingError(ReactorError):

@@ -25,7 +25,7 @@ class Fault:
     kind: link (no or no readable answer), selection (another client keeps choosing reactors), identity, absent,
       restarted (the device lost its memory), stopped (its experiment was ended), stalled (it answers, its experiment
       does not go on), mode (something else acts on its pumps), blank (its zero was changed), pump (not verified off),
-      guard (not verified on).
+      overflow_pump (not verified on).
     """
 
     kind: str

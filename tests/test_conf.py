@@ -59,12 +59,12 @@ def test_every_plant_composes(option):
     assert load_deploy(f"plant={option}").plant.growth.mu > 0
 
 
-def test_the_overflow_guard_of_the_device_is_off_and_its_values_are_checked():
-    assert load_deploy("backend=chibio").backend.guard.pump == ""
-    assert load_deploy("backend=emulator", "backend.guard.pump=Pump4").backend.guard.pump == "Pump4"
+def test_the_overflow_pump_of_the_device_is_off_and_its_values_are_checked():
+    assert load_deploy("backend=chibio").backend.overflow_pump.pump == ""
+    assert load_deploy("backend=emulator", "backend.overflow_pump.pump=Pump4").backend.overflow_pump.pump == "Pump4"
     for override in ("pump=Pump2", "duty=1.0", "duty=much", "tube=22"):
-        with pytest.raises(frame.UserError, match=rf"guard\.{override.split('=')[0]}"):
-            load_deploy("backend=chibio", f"backend.guard.{override}")
+        with pytest.raises(frame.UserError, match=rf"overflow_pump\.{override.split('=')[0]}"):
+            load_deploy("backend=chibio", f"backend.overflow_pump.{override}")
 
 
 def test_the_papers_schedule():

@@ -26,6 +26,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
+from hardware.storage import atomic
+
 __all__ = ["UserError", "compose", "load", "normalise", "run", "save_config", "write_json"]
 
 T = TypeVar("T")
@@ -172,13 +174,7 @@ def write_json(path: Path, content: Mapping[str, Any], fsync: bool = True, inden
             return None
         return value
 
-    temporary = path.with_suffix(path.suffix + ".part")
-    with open(temporary, "w", encoding="utf-8") as f:
-        f.write(json.dumps(clean(content), indent=indent) + "\n")
-        f.flush()
-        if fsync:
-            os.fsync(f.fileno())
-    os.replace(temporary, path)
+    atomic.write(path, json.dumps(clean(content), indent=indent) + "\n", fsync)
 
 
 def _stored(path: Path, resume: str, fitting: Callable[[DictConfig], T]) -> T:

@@ -18,13 +18,13 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame
+from experiments.control.calibration_files import load_calibrations
 from experiments.control.config import DeployConfig
 from experiments.control.device import check, linked
 from experiments.control.loop import ClosedLoop
 from experiments.control.policies import run_policy
 from experiments.control.record import Record
 from experiments.control.recovery import continue_loop
-from experiments.control.rig_files import load_rigs
 from experiments.controllers import registry
 from experiments.training.model_file import read_env_file
 from hardware.chibio.reactors import ChiBioReactors
@@ -108,7 +108,7 @@ def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
         yield close_loop(setup, SimulatedReactors(vials, backend), record)
         return
     with linked(backend) as (transport, clock):
-        rigs = load_rigs(Path(backend.calibration), backend.reactors)
+        rigs = load_calibrations(Path(backend.calibration), backend.reactors)
         if setup.resumed and not earlier:
             raise RecordingError(f"journal {record.journal.path}: missing or empty; put it back, or start a new run")
         if not earlier:
@@ -129,4 +129,4 @@ def run_preflight(setup: Setup, folder: Path) -> None:
     if backend.kind == "sim":
         raise frame.UserError("preflight_only=true: a simulated reactor needs no preflight; use backend=chibio")
     with linked(backend) as (transport, clock):
-        check(backend, transport, clock, load_rigs(Path(backend.calibration), backend.reactors), folder)
+        check(backend, transport, clock, load_calibrations(Path(backend.calibration), backend.reactors), folder)

@@ -9,11 +9,12 @@ from pathlib import Path
 
 from experiments.cli import frame
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
-from hardware.chibio.dosing import Rig
+from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.preflight import preflight
 from hardware.clock import RealClock
 from hardware.emulator.process import EmulatorProcess
-from hardware.link.transport import Transport, open_transport
+from hardware.link.open import open_transport
+from hardware.link.transport import Transport
 
 __all__ = ["check", "linked"]
 
@@ -39,15 +40,16 @@ def _running(backend: ChiBioConfig) -> Iterator[str]:
         yield backend.url
         return
     arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
-    arguments |= (
-        {"overflow-pump": backend.guard.pump, "overflow-flow": backend.guard.flow_ml_s} if backend.guard.pump else {}
-    )
+    if (overflow := backend.overflow_pump).pump:
+        arguments |= {"overflow-pump": overflow.pump, "overflow-flow": overflow.flow_ml_s}
     with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
         log.info("emulated device at %s, %g times real time; faults at %s", device.url, backend.speed, device.control)
         yield device.url
 
 
-def check(backend: ChiBioConfig, transport: Transport, clock: RealClock, rigs: list[Rig], folder: Path) -> None:
+def check(
+    backend: ChiBioConfig, transport: Transport, clock: RealClock, rigs: list[ReactorCalibration], folder: Path
+) -> None:
     """Log the preflight line by line. Raises: UserError if a required check failed."""
     checks = preflight(transport, clock, backend, rigs, folder)
     for one in checks:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 from pathlib import Path
 
@@ -51,7 +50,7 @@ class FaultCase:
 
     def __init__(self, fault: Fault | None, moment: str, config: DeployConfig, seed: int) -> None:
         self.fault, self.moment, self.config, self.seed = fault, moment, config, seed
-        self.result = Outcome(fault.name if fault else "none", moment, bool(config.backend.guard.pump))
+        self.result = Outcome(fault.name if fault else "none", moment, bool(config.backend.overflow_pump.pump))
         self._exits = 0  # of the device's software up to the fault, or its end
 
     def run(self) -> Outcome:
@@ -130,7 +129,7 @@ class FaultCase:
         gone = [FAULTY] if self.fault is not None and self.fault.gone else []
         if [name for name in self.r.names if f"{name}: " in unverified] != gone:
             return False
-        handed_over = [math.isfinite(s.handed_over) for s in self.r.reactors.stations]
+        handed_over = self.r.reactors.handed_over
         return all(
             regulated or not any(self.r.truth(name)["motors"].values())
             for name, regulated in zip(self.r.names, handed_over, strict=True)

@@ -168,7 +168,7 @@ def _collect(r: Rehearsal, doses: Times, samples: Times) -> None:
 def _audit(r: Rehearsal, doses: Times, samples: Times) -> dict[str, Any]:
     """Minutes, doses and volumes: what the run believes against what the plant knows, per reactor."""
     journal, _ = read_journal(r.folder / "journal.jsonl")
-    ledger, fed = r.loop.interlock.volume_ml, r.loop.interlock.fed_ml
+    ledger, fed = r.loop.interlock.budget.volume_ml, r.loop.interlock.budget.fed_ml
     reactors = {}
     for n, name in enumerate(r.names):
         truth = r.truth(name)

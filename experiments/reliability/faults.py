@@ -68,7 +68,7 @@ class Fault:
 
 def guard_off(r: Rehearsal) -> None:
     """Another client switches the overflow guard's pump off."""
-    post(f"/SetOutputOn/{r.config.backend.guard.pump}/0/{FAULTY}")(r)
+    post(f"/SetOutputOn/{r.config.backend.overflow_pump.pump}/0/{FAULTY}")(r)
 
 
 def set_(name: str, value: float = 1.0) -> Act:
@@ -311,7 +311,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("foreign pump", "the feed pump is switched on twice, 0.5 mL every 63 s",
           again(post(f"/SetOutputTarget/Pump1/{FAULTY}/0.008", f"/SetOutputOn/Pump1/1/{FAULTY}"), 95.0),
           ("pump", "note:pumps on", "mode"), rogue=True),
-    Fault("foreign guard off", "the overflow guard's pump is switched off", guard_off, ("note:overflow guard",),
+    Fault("foreign guard off", "the overflow guard's pump is switched off", guard_off, ("note:overflow pump",),
           guard=True),
     Fault("foreign stop", "the experiment is stopped; started again after 10 min", post(f"/Experiment/0/{FAULTY}"),
           ("stopped",), post(f"/Experiment/1/{FAULTY}"), 10.0, blind=True),

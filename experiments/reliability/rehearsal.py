@@ -22,8 +22,8 @@ from experiments.control.loop import ClosedLoop, Step
 from experiments.control.record import Record
 from experiments.controllers import registry
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.dosing import PumpCalibration, Rig
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
 from hardware.clock import VirtualClock
@@ -33,7 +33,9 @@ from hardware.safety.config import SafetyConfig
 
 __all__ = ["SOUND", "Killed", "Rehearsal", "ScriptedClock", "rehearsed"]
 
-SOUND = Rig(PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01"))
+SOUND = ReactorCalibration(
+    PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01")
+)
 """As weighing the emulator's healthy pumps gives: they run 0.11 s longer than asked, 0.05 s deliver nothing."""
 
 
@@ -63,10 +65,10 @@ class ScriptedClock(VirtualClock):
         super().sleep(end - self.now())
 
 
-def _plumbed(options: DeviceOptions, guard: GuardConfig) -> DeviceOptions:
-    """The same device with a second waste tube on the guard's pump."""
-    pump = replace(options.plant.pump, overflow_ml_s=guard.flow_ml_s)
-    vial = replace(options.vial, overflow_pump=guard.pump)
+def _plumbed(options: DeviceOptions, overflow: OverflowPumpConfig) -> DeviceOptions:
+    """The same device with a second waste tube on the overflow pump."""
+    pump = replace(options.plant.pump, overflow_ml_s=overflow.flow_ml_s)
+    vial = replace(options.vial, overflow_pump=overflow.pump)
     return replace(options, vial=vial, plant=replace(options.plant, pump=pump))
 
 
@@ -75,10 +77,10 @@ def rehearsed(
     scenario: Scenario,
     safety: SafetyConfig | None = None,
     controller: str = "adaptive_inverse",
-    guard: GuardConfig | None = None,
+    overflow_pump: OverflowPumpConfig | None = None,
 ) -> DeployConfig:
     """The config of a run that is to be rehearsed: reactors at `names`, all with one scenario."""
-    backend = ChiBioConfig(reactors=tuple(names), guard=guard or GuardConfig())
+    backend = ChiBioConfig(reactors=tuple(names), overflow_pump=overflow_pump or OverflowPumpConfig())
     law = registry.config(controller)
     return DeployConfig(backend, safety=safety or SafetyConfig(), scenario=scenario, controller=law, fsync=False)
 
@@ -88,7 +90,7 @@ class Rehearsal:
 
     Args:
       folder: run folder, must exist. config: as of deploy, e.g. by `rehearsed`.
-      options: of the device; an overflow guard of the config is plumbed in. od: at the start. seed: of all noise.
+      options: of the device; the overflow pump of the config is plumbed in. od: at the start. seed: of all noise.
     Attributes: clock, device; record, reactors, loop of the present life of the program; lives; spans, clock times
       during which the program lived.
     """
@@ -100,7 +102,7 @@ class Rehearsal:
         self.names: tuple[str, ...] = config.backend.reactors
         self.clock = ScriptedClock()
         rng = np.random.default_rng(seed)
-        plumbed = _plumbed(options or DeviceOptions(), config.backend.guard)
+        plumbed = _plumbed(options or DeviceOptions(), config.backend.overflow_pump)
         self.device = ChiBioDevice(self.names, self.clock, rng, plumbed, od=od, temperature=37.0, blanked=True)
         self.spans: list[list[float]] = []
         self.lives = 0

@@ -101,12 +101,6 @@ log = logging.getLogger("board_agent")
 # -- frames --------------------------------------------------------------------------------------------------------
 
 
-def encode_request(number: int, method: str, path: str) -> bytes:
-    """A request line, as the PC sends it."""
-    head = f">{number} {method} {path}".encode("ascii")
-    return head + b" %08x\n" % zlib.crc32(head)
-
-
 def decode_request(line: bytes) -> tuple[int, str, str] | None:
     """(ID, METHOD, PATH) of a line without its newline; None if it is not a valid request. Never raises."""
     start = line.rfind(b">")

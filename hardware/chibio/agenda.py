@@ -30,8 +30,11 @@ class Agenda:
         heapq.heappush(self._queue, (self._clock.now() + delay_s, next(self._order), task))
 
     def run_due(self, until: float | None = None) -> None:
-        """Run every step that is due at clock time `until`, by default now. Raises: what a step raises; call again for
-        the rest, with the same `until`: what becomes due meanwhile has to wait, or slow steps would go on for ever."""
+        """Run every step that is due at clock time `until`, by default now.
+
+        What becomes due meanwhile waits for the next call, or slow steps would never end.
+        Raises: what a step raises; call again with the same `until` for the rest.
+        """
         until = self._clock.now() if until is None else until
         while self._queue and self._queue[0][0] <= until:
             _, _, task = heapq.heappop(self._queue)

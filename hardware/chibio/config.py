@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from conf.presets import groups
 from hardware.chibio.dosing import DosingConfig
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import POSITIONS
 from hardware.link.transport import TransportConfig
 
@@ -25,7 +25,7 @@ class ChiBioConfig:
     temperature: thermostat target at the start, degC.
     stir: stirrer target, 0 to 1.
     volume_ml: culture volume, mL (only told to the device's own regulator).
-    dosing: how a rate becomes a dose. guard: a second waste line against overflow, none as a rule.
+    dosing: how a rate becomes a dose. overflow_pump: of a second waste tube, none as a rule.
     stale_s, lost_s: age of the newest sample that marks a reactor stale, and that starts its recovery.
     poll_s: pause between two looks for a sample that is due, s.
     window_s: a dose must end this long after its sample appeared, s (the next measurement begins 47 s after).
@@ -46,7 +46,7 @@ class ChiBioConfig:
     stir: float = 0.5
     volume_ml: float = 20.0
     dosing: DosingConfig = field(default_factory=DosingConfig)
-    guard: GuardConfig = field(default_factory=GuardConfig)
+    overflow_pump: OverflowPumpConfig = field(default_factory=OverflowPumpConfig)
     stale_s: float = 100.0
     lost_s: float = 180.0
     poll_s: float = 2.0

@@ -1,4 +1,4 @@
-"""One reactor position: every request to it, verified. No schedule, no policy, no safety rules."""
+"""The connection to one reactor: every request verified. No schedule, no policy, no safety rules."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from hardware.clock import Clock
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
 from hardware.link.transport import Transport
 
-__all__ = ["Log", "Unit", "no_log"]
+__all__ = ["Connection", "Log", "no_log"]
 
 SEEN_S = 1.0
-"""Who was seen so lately is still there: a device that ended takes longer to listen again. What it is sent while it
-starts it carries out afterwards, whoever is absent by then."""
+"""For so long after an answer a reactor counts as present: a server that ended needs more time before it listens again.
+Later the next command looks first, because a server that starts carries out what it was sent meanwhile, even to a
+reactor that is absent by then."""
 SETTLE_S = 0.3
 """A pump command is answered before its thread has written to the bus (docs/device.md, Pumps)."""
 
@@ -27,7 +28,7 @@ def no_log(kind: str, fields: Mapping[str, Any]) -> None:
     """Keeps nothing."""
 
 
-class Unit:
+class Connection:
     """The verified conversation with one reactor.
 
     The device shows one selected reactor to everybody, so a read is changeDevice and GET as a pair, believed only if
@@ -40,12 +41,12 @@ class Unit:
       name: position, M0 to M7.
       reactors: all positions this client owns.
       transport, clock: how requests travel, how time passes.
-      log: told of every command and its answer.
-      guard: pump of the overflow guard, which may be switched on; "" if there is none.
+      log: takes every command and its answer.
+      overflow_pump: spare pump that may be switched on; "" if there is none.
     """
 
     def __init__(
-        self, name: str, reactors: Sequence[str], transport: Transport, clock: Clock, log: Log, guard: str = ""
+        self, name: str, reactors: Sequence[str], transport: Transport, clock: Clock, log: Log, overflow_pump: str = ""
     ) -> None:
         self.name = name
         self.device_id = ""  # pinned at the first read
@@ -57,7 +58,7 @@ class Unit:
         self._transport = transport
         self._clock = clock
         self._log = log
-        self._guard = guard
+        self._overflow_pump = overflow_pump
 
     def read(self, tries: int = 3) -> DeviceState:
         """The reactor's state, certainly its own.
@@ -95,7 +96,7 @@ class Unit:
         reply = self._transport.get("/getSysdata/")
         if reply.status != 200:
             raise ProtocolError(f"GET /getSysdata/: status {reply.status}, expected 200")
-        self._unsure = before  # whoever answers 200 is the server, even if its words are garbled
+        self._unsure = before  # only the server answers 200, even if the body is garbled
         state = parse_state(reply.body)
         self._unsure = False
         if self.name not in state.present:
@@ -105,7 +106,7 @@ class Unit:
         return state
 
     def post(self, path: str) -> None:
-        """Send one command of `wire.check_command`.
+        """Send one command of `protocol.check_command`.
 
         Raises: LinkError (it may have been carried out), ProtocolError for a status other than 204, DeviceStateError
           if the command is not allowed or the reactor was not present when it was last looked at.
@@ -118,7 +119,7 @@ class Unit:
         self._seen_s = self._clock.now()
 
     def _post(self, path: str, quiet: bool = False) -> None:
-        check_command(path, self._reactors, self._guard)
+        check_command(path, self._reactors, self._overflow_pump)
         start = self._clock.now()
         answer: int | str = ""
         before, self._unsure = self._unsure, True
@@ -149,8 +150,12 @@ class Unit:
         """Switch `item`; never a toggle. Raises: as `post`."""
         self.post(f"/SetOutputOn/{item}/{int(on)}/{self.name}")
 
+    def set_blank(self, raw: float) -> None:
+        """Make `raw` counts read as OD 0. Raises: as `post`, also for counts outside 3000 to 60000."""
+        self.post(f"/CalibrateOD/OD0/{self.name}/{raw:.6f}/0")
+
     def pumps_off(self, tries: int = 3, pumps: Sequence[str] = PUMPS) -> None:
-        """These pumps off, verified. Every one is tried even if another one fails, unless nobody answers at all.
+        """These pumps off, verified. Each one is tried even if another one fails, unless nothing answers at all.
 
         Read-back alone proves nothing, for the flags are intent: with the bus hung they say off while the motor runs.
         So a blocking call touches the bus in between. It is quick if all is well; on a hung bus it outlasts the
@@ -165,7 +170,7 @@ class Unit:
             error = None
             if self.state is None:
                 self.read()  # presence first
-            silent = 0  # time-outs are long: after feed and waste went unanswered, say so instead of going on
+            silent = 0  # time-outs are long: after two in a row, fail instead of trying the other pumps
             for pump in pumps:
                 try:
                     self.switch(pump, False)
@@ -192,3 +197,11 @@ class Unit:
     def probe(self) -> None:
         """Touch the bus with a blocking call. Raises: LinkError if it hangs."""
         self.post(f"/MeasureTemp/IR/{self.name}")
+
+    def escalate(self) -> None:
+        """A pump stays on: end the experiment, which switches everything off, then touch the bus."""
+        for path in (f"/Experiment/0/{self.name}", f"/MeasureTemp/IR/{self.name}"):
+            try:
+                self.post(path)
+            except ReactorError as error:
+                self._log("escalation", {"reactor": self.name, "path": path, "error": str(error)})

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from hardware.chibio.protocol import PERIOD_S
 
-__all__ = ["DosePlan", "DosingConfig", "PumpCalibration", "PumpFit", "Rig", "fit_pump", "plan_dose"]
+__all__ = ["DosePlan", "DosingConfig", "PumpCalibration", "PumpFit", "ReactorCalibration", "fit_pump", "plan_dose"]
 
 Array = NDArray[np.float64]
 
-MAX_FEED_DUTY = 0.05  # docs/device.md, Client rules; the lowest layer (`wire.check_command`) refuses more
+MAX_FEED_DUTY = 0.05  # docs/device.md, Preflight lessons.1; the lowest layer (`protocol.check_command`) refuses more
 MAX_WASTE_DUTY = 0.5  # 63 s * duty must end before the next measurement
 
 
@@ -79,8 +79,8 @@ class PumpCalibration:
 
 
 @dataclass(frozen=True)
-class Rig:
-    """What belongs to one reactor position: its two calibrated pumps, its blank, the unit they were measured on.
+class ReactorCalibration:
+    """What was measured of one reactor on the bench: its two pumps and its blank.
 
     blank: raw counts of clear medium under run conditions; nan = take what the device holds.
     """
@@ -152,7 +152,9 @@ class DosePlan:
         return PERIOD_S * self.waste_duty
 
 
-def plan_dose(rate: float, carry_ml: float, doses: int, rig: Rig, config: DosingConfig) -> DosePlan:
+def plan_dose(
+    rate: float, carry_ml: float, doses: int, calibration: ReactorCalibration, config: DosingConfig
+) -> DosePlan:
     """The dose that brings `rate` over one control period, together with what earlier periods left over.
 
     feed duty = (v / q - bias) / 63 with v = rate * period + carry; nothing is dosed while v is below the smallest dose,
@@ -163,22 +165,23 @@ def plan_dose(rate: float, carry_ml: float, doses: int, rig: Rig, config: Dosing
       rate: mean feed rate, mL/s, >= 0.
       carry_ml: `carry_ml` of the previous plan, mL.
       doses: number of feed doses given so far; every `clear_every`-th clears the waste tube.
-      rig: calibrated pumps of this reactor.
+      calibration: pumps of this reactor.
       config: period and waste law.
     Raises: ValueError if the rate is negative or not finite.
     """
     if not (math.isfinite(rate) and rate >= 0.0):
         raise ValueError(f"pump rate = {rate} mL/s: allowed a finite number >= 0")
+    feed, waste = calibration.feed, calibration.waste
     volume = rate * config.period_s + carry_ml
-    # a period that asks for nothing doses nothing: left-overs wait for the controller to want fluid again
-    if rate == 0.0 or volume < rig.feed.min_dose_ml or volume == 0.0:
-        return DosePlan(carry_ml=min(volume, rig.feed.min_dose_ml))
-    duty = math.floor(rig.feed.on_time(volume) / PERIOD_S * 1e6) / 1e6  # what the URL carries
+    # a rate of 0 doses nothing: what was carried waits until the controller asks for fluid again
+    if rate == 0.0 or volume < feed.min_dose_ml or volume == 0.0:
+        return DosePlan(carry_ml=min(volume, feed.min_dose_ml))
+    duty = math.floor(feed.on_time(volume) / PERIOD_S * 1e6) / 1e6  # what the URL carries
     feed_duty = min(duty, MAX_FEED_DUTY)
     feed_s = PERIOD_S * feed_duty
-    feed_ml = rig.feed.volume(feed_s)
+    feed_ml = feed.volume(feed_s)
     # the law of the tubes in seconds, and never less than 1.5 times the fed volume if the waste pump is the weaker
-    waste_s = max(config.waste_factor * feed_s + config.waste_extra_s, rig.waste.on_time(1.5 * feed_ml))
+    waste_s = max(config.waste_factor * feed_s + config.waste_extra_s, waste.on_time(1.5 * feed_ml))
     if (doses + 1) % config.clear_every == 0:
         waste_s = max(waste_s, PERIOD_S * config.clear_duty)
     waste_duty = min(math.ceil(waste_s / PERIOD_S * 1e6) / 1e6, MAX_WASTE_DUTY)
@@ -187,7 +190,7 @@ def plan_dose(rate: float, carry_ml: float, doses: int, rig: Rig, config: Dosing
         feed_duty=feed_duty,
         waste_duty=waste_duty,
         feed_ml=feed_ml,
-        waste_ml=rig.waste.volume(PERIOD_S * waste_duty),
+        waste_ml=waste.volume(PERIOD_S * waste_duty),
         shortfall_ml=left if duty > feed_duty else 0.0,
     )
 

@@ -1,4 +1,4 @@
-"""Before a run: one line per check, passed or with the remedy. Looks, touches nothing but the selected reactor."""
+"""Before a run: one line per check, passed or with the remedy. Changes only which reactor is selected."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from email.utils import parsedate_to_datetime
 from pathlib import Path
 
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Unit, no_log
-from hardware.chibio.dosing import MAX_FEED_DUTY, Rig
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.connection import Connection, no_log
+from hardware.chibio.dosing import MAX_FEED_DUTY, ReactorCalibration
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import PERIOD_S, UNSET_BLANK, DeviceState
 from hardware.clock import Clock
 from hardware.errors import ReactorError
@@ -20,8 +20,8 @@ from hardware.link.transport import Transport
 
 __all__ = ["Check", "preflight"]
 
-SURE = 1.1  # times the feed, for what pumps differ from their calibration
-VIAL_ML = 30.0  # up to its rim (docs/biology.md, Volume)
+MARGIN = 1.1  # over the feed pump's flow: pumps differ from their calibration
+VIAL_ML = 30.0  # up to its rim (docs/biology.md, Stirring)
 FREE_MB = 1000.0  # a week of eight reactors writes about 240 MB (docs/faults.md)
 
 
@@ -41,28 +41,32 @@ class Check:
 
 
 def preflight(
-    transport: Transport, clock: Clock, config: ChiBioConfig, rigs: list[Rig], folder: Path | None = None
+    transport: Transport,
+    clock: Clock,
+    config: ChiBioConfig,
+    calibrations: list[ReactorCalibration],
+    folder: Path | None = None,
 ) -> list[Check]:
-    """Disk, guard, connection, clock, and per reactor presence, identity, blank, modes, sensors, pump calibration.
+    """Disk, overflow pump, connection, clock; per reactor presence, identity, blank, modes, sensors, pump calibration.
 
     Args:
-      transport, clock, config, rigs: as for `ChiBioReactors`.
+      transport, clock, config, calibrations: as for `ChiBioReactors`.
       folder: where the run will write; its disk is checked.
     Raises: nothing about the device; a check that cannot be made has failed.
     """
     checks = [_disk(folder)] if folder is not None else []
-    checks.append(_guard(config, rigs))
+    checks.append(_overflow_pump(config, calibrations))
     try:
         checks += [_link(transport, clock), _board_clock(transport, clock, config)]
     except ReactorError as error:
         return [*checks, Check("connection", False, str(error), "check cable, address and that the server runs")]
-    for name, rig in zip(config.reactors, rigs, strict=True):
-        unit = Unit(name, config.reactors, transport, clock, no_log)
+    for name, calibration in zip(config.reactors, calibrations, strict=True):
+        connection = Connection(name, config.reactors, transport, clock, no_log)
         try:
-            state = unit.read()
+            state = connection.read()
             if not state.running:
-                unit.probe()  # a device that never ran an experiment shows no temperature yet
-                state = unit.read()
+                connection.probe()  # a device that never ran an experiment shows no temperature yet
+                state = connection.read()
         except ReactorError as error:
             checks.append(
                 Check(f"{name} present", False, str(error), "plug it in with the server stopped, or leave it out")
@@ -71,7 +75,7 @@ def preflight(
         checks.append(
             Check(f"{name} present", True, f"identity {state.device_id}, software {state.version or 'unnamed'}")
         )
-        checks += _reactor(name, state, rig, config.guard)
+        checks += _reactor(name, state, calibration, config.overflow_pump)
     return checks
 
 
@@ -105,32 +109,34 @@ def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Ch
     )
 
 
-def _guard(config: ChiBioConfig, rigs: list[Rig]) -> Check:
-    """What the overflow guard covers; without one, what then cannot be prevented."""
-    guard, feed = config.guard, max(rig.feed.flow_ml_s for rig in rigs)
-    if not guard.pump:
+def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration]) -> Check:
+    """What the overflow pump covers; without one, what cannot be prevented."""
+    pump, feed = config.overflow_pump, max(calibration.feed.flow_ml_s for calibration in calibrations)
+    if not pump.pump:
         return Check(
-            "overflow guard",
+            "overflow pump",
             False,
             f"none: with a blocked waste tube a vial overflows after about {VIAL_ML - config.volume_ml:.0f} mL of feed",
-            "a second waste tube on Pump3, backend.guard.pump=Pump3 (docs/chibio.md)",
+            "a second waste tube on Pump3, backend.overflow_pump.pump=Pump3 (docs/chibio.md)",
             required=False,
         )
-    covers = "a blocked waste tube" + " and a feed motor stuck on" * (guard.removes_ml_s > SURE * feed)
+    covers = "a blocked waste tube" + " and a feed motor stuck on" * (pump.removes_ml_s > MARGIN * feed)
     return Check(
-        "overflow guard",
-        guard.removes_ml_s > MAX_FEED_DUTY * feed,
-        f"{guard.pump} at duty {guard.duty:g} takes {guard.removes_ml_s:.2f} mL/s, feed pump {feed:.2f} mL/s at full "
+        "overflow pump",
+        pump.removes_ml_s > MAX_FEED_DUTY * feed,
+        f"{pump.pump} at duty {pump.duty:g} takes {pump.removes_ml_s:.2f} mL/s, feed pump {feed:.2f} mL/s at full "
         f"power: covers {covers}; verified on when the run starts",
-        "less than the largest feed: raise backend.guard.duty",
+        "less than the largest feed: raise backend.overflow_pump.duty",
         required=False,
     )
 
 
-def _reactor(name: str, state: DeviceState, rig: Rig, guard: GuardConfig) -> Iterator[Check]:
+def _reactor(
+    name: str, state: DeviceState, calibration: ReactorCalibration, overflow_pump: OverflowPumpConfig
+) -> Iterator[Check]:
     """Checks of one reactor's state."""
-    blank = rig.blank if math.isfinite(rig.blank) else state.blank
-    source = "stored" if math.isfinite(rig.blank) else "of the device"
+    blank = calibration.blank if math.isfinite(calibration.blank) else state.blank
+    source = "stored" if math.isfinite(calibration.blank) else "of the device"
     yield Check(
         f"{name} blank",
         3000.0 <= blank <= 60000.0 and blank != UNSET_BLANK,
@@ -156,23 +162,24 @@ def _reactor(name: str, state: DeviceState, rig: Rig, guard: GuardConfig) -> Ite
         f"raw {state.raw:.0f} after {state.cycles} cycles",
         "check the spectrometer; restart the device",
     )
-    same = all(not p.device_id or p.device_id == state.device_id for p in (rig.feed, rig.waste))
-    dates = f"feed {rig.feed.date or 'never weighed'}, waste {rig.waste.date or 'never weighed'}"
+    feed, waste = calibration.feed, calibration.waste
+    same = all(not p.device_id or p.device_id == state.device_id for p in (feed, waste))
+    dates = f"feed {feed.date or 'never weighed'}, waste {waste.date or 'never weighed'}"
     yield Check(
         f"{name} pump calibration",
-        rig.calibrated and same,
+        calibration.calibrated and same,
         dates + ("" if same else ", on another unit"),
-        f"python -m experiments.calibrate_pump reactor={name}; until then {rig.feed.flow_ml_s:g} mL/s is assumed",
+        f"python -m experiments.calibrate_pump reactor={name}; until then {feed.flow_ml_s:g} mL/s is assumed",
         required=False,
     )
-    stronger = 4.0 * rig.waste.flow_ml_s / rig.feed.flow_ml_s
+    stronger = 4.0 * waste.flow_ml_s / feed.flow_ml_s
     yield Check(
         f"{name} waste over feed",
         stronger >= 1.5,
         f"waste moves {stronger:.1f} times the feed in its on-time",
         "exchange or repair the waste pump",
     )
-    on = ", ".join(p for p in state.running_pumps if p in guard.others)
+    on = overflow_pump.others_on(state)
     yield Check(
         f"{name} pumps",
         not on,

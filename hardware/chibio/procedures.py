@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hardware.chibio.connection import Unit
+from hardware.chibio.connection import Connection
 from hardware.chibio.protocol import PERIOD_S
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import Clock
@@ -22,26 +22,26 @@ PAUSE_S = 2.0  # between two doses, so that the fluid comes to rest
 LATE_S = 2.0  # a pump starts a little after the answer, and later on a busy bus; its dose must not be cut short
 
 
-def dose_series(unit: Unit, clock: Clock, pump: str, duty: float, doses: int) -> Iterator[int]:
+def dose_series(connection: Connection, clock: Clock, pump: str, duty: float, doses: int) -> Iterator[int]:
     """Give `doses` single-shot doses of 63 s * `duty`, one per step; yields how many have been given.
 
     The pump is verified off after every dose and when the generator is closed.
     Raises: DeviceStateError if an experiment runs or a dose did not begin; LinkError, ProtocolError.
     """
-    state = unit.read()
+    state = connection.read()
     if state.running:
-        raise DeviceStateError(f"{unit.name}: an experiment is running; stop it before pumps are weighed")
+        raise DeviceStateError(f"{connection.name}: an experiment is running; stop it before pumps are weighed")
     try:
-        unit.pumps_off()
-        unit.target(pump, duty)
+        connection.pumps_off()
+        connection.target(pump, duty)
         for given in range(1, doses + 1):
-            unit.switch(pump, True)
+            connection.switch(pump, True)
             clock.sleep(PERIOD_S * duty + LATE_S)
-            unit.pumps_off()
+            connection.pumps_off()
             yield given
             clock.sleep(PAUSE_S)
     finally:
-        unit.pumps_off()
+        connection.pumps_off()
 
 
 @dataclass(frozen=True)

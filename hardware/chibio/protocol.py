@@ -16,7 +16,7 @@ from hardware.errors import DeviceStateError, ProtocolError
 
 __all__ = [
     "FEED",
-    "MAX_GUARD_DUTY",
+    "MAX_OVERFLOW_DUTY",
     "PERIOD_S",
     "POSITIONS",
     "PUMPS",
@@ -32,9 +32,9 @@ POSITIONS = tuple(f"M{k}" for k in range(8))
 PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")
 FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
-"""Without tubes on a standard reactor; one of them may drive an overflow guard (`overflow_guard.py`)."""
-MAX_GUARD_DUTY = 0.95
-"""Never 1: the device does not switch such a pump off between its periods (docs/device.md, Pumps)."""
+"""Without tubes on a standard reactor; one of them may be an overflow pump (`overflow_pump.py`)."""
+MAX_OVERFLOW_DUTY = 0.95
+"""Never 1: the device does not switch such a pump off between its periods (docs/device.md, Pumps.1 and 12.1)."""
 PERIOD_S = 63.0
 """A pump that is ON runs at full power for PERIOD_S * target seconds of every PERIOD_S (docs/device.md, Pumps)."""
 UNSET_BLANK = 65000.0
@@ -52,6 +52,7 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     "Volume": (10.0, 30.0),
 }
 _SWITCHES = (*PUMPS, "OD", "Stir", "Thermostat", "Heat")
+PUMPING_MODES = ("Zigzag", "Custom", "Chemostat")
 _MAY_GO_ON = ("Pump1", "Pump2", "OD", "Stir", "Thermostat")
 
 
@@ -94,6 +95,11 @@ class DeviceState:
     def running_pumps(self) -> tuple[str, ...]:
         """Names of the pumps that are on."""
         return tuple(p for p, is_on in zip(PUMPS, self.pumps_on, strict=True) if is_on)
+
+    @property
+    def pumping_modes(self) -> tuple[str, ...]:
+        """Modes that are on and switch pumps on their own."""
+        return tuple(m for m in self.modes if m in PUMPING_MODES)
 
     @property
     def ended(self) -> bool:
@@ -218,25 +224,25 @@ def parse_state(body: bytes) -> DeviceState:
     )
 
 
-def check_command(path: str, reactors: Sequence[str], guard: str = "") -> None:
+def check_command(path: str, reactors: Sequence[str], overflow_pump: str = "") -> None:
     """The last gate before the wire: only these POSTs, only for these reactors, only within these limits.
 
-    Args: guard: which of the spare pumps drives an overflow guard; "" if none does.
+    Args: overflow_pump: which of the spare pumps is one; "" if none is.
 
     Allowed are changeDevice; SetOutputTarget of feed (at most 0.05), waste (0.5), Stir, Thermostat (42 degC), OD,
-    Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; both for the guard's
+    Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; both for the overflow
     pump (at most 0.95); CalibrateOD to a blank; MeasureTemp/IR; Experiment. Everything else the device understands
     wipes, toggles or kills something (docs/device.md, Routes and Client rules).
 
     Raises: DeviceStateError if the command is not one of them.
     """
     verb, *args = path.removeprefix("/").split("/")
-    spare = guard if guard in SPARE else None
+    spare = overflow_pump if overflow_pump in SPARE else None
     match verb, args:
         case "changeDevice", [_]:
             allowed = True
         case "SetOutputTarget", [item, _, value] if item in _LIMITS and re.fullmatch(_NUMBER, value):
-            low, high = (0.0, MAX_GUARD_DUTY) if item == spare else _LIMITS[item]
+            low, high = (0.0, MAX_OVERFLOW_DUTY) if item == spare else _LIMITS[item]
             allowed = low <= float(value) <= high
         case "SetOutputOn", [item, force, _] if item in _SWITCHES:
             allowed = force == "0" or (force == "1" and item in (*_MAY_GO_ON, spare))

@@ -8,7 +8,6 @@ carried out even when other requests fail.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -16,9 +15,10 @@ import numpy as np
 
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Log, Unit, no_log
-from hardware.chibio.dosing import Rig
-from hardware.chibio.resume import Saved
+from hardware.chibio.connection import Connection, Log, no_log
+from hardware.chibio.dosing import ReactorCalibration
+from hardware.chibio.logbook import Logbook
+from hardware.chibio.resume import ReactorHistory
 from hardware.chibio.station import Station
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, ReactorError
@@ -38,8 +38,8 @@ class ChiBioReactors:
       transport: the link; this object is its only user.
       clock: device time.
       config: checked values.
-      rigs: calibrations, one per reactor of `config.reactors`; nominal ones if left out.
-      log: told of samples, intents, doses, commands, faults and notes, e.g. `Journal.append`. An intent is written
+      calibrations: one per reactor of `config.reactors`; nominal ones if left out.
+      log: takes samples, intents, doses, commands, faults and notes, e.g. `Journal.append`. An intent is written
         before its dose, so a log that raises there prevents the dose; elsewhere its error is raised by `measure`.
     """
 
@@ -48,12 +48,12 @@ class ChiBioReactors:
         transport: Transport,
         clock: Clock,
         config: ChiBioConfig,
-        rigs: Sequence[Rig] | None = None,
+        calibrations: Sequence[ReactorCalibration] | None = None,
         log: Log = no_log,
     ) -> None:
-        rigs = list(rigs) if rigs is not None else [Rig() for _ in config.reactors]
-        if len(rigs) != len(config.reactors):
-            raise ValueError(f"calibrations for {len(rigs)} reactors, reactors = {list(config.reactors)}")
+        calibrations = calibrations if calibrations is not None else [ReactorCalibration()] * len(config.reactors)
+        if len(calibrations) != len(config.reactors):
+            raise ValueError(f"calibrations for {len(calibrations)} reactors, reactors = {list(config.reactors)}")
         self.config = config
         self._transport = transport
         self._clock = clock
@@ -63,15 +63,14 @@ class ChiBioReactors:
         self._zero = clock.now()
         self.stations = tuple(
             Station(
-                Unit(m, config.reactors, transport, clock, self._note_down, config.guard.pump),
-                rig,
+                Connection(m, config.reactors, transport, clock, self._note_down, config.overflow_pump.pump),
+                calibration,
                 config,
                 self._agenda,
                 clock,
-                self._note_down,
-                self._write,
+                Logbook(m, self._note_down, self._write, self.elapsed),
             )
-            for m, rig in zip(config.reactors, rigs, strict=True)
+            for m, calibration in zip(config.reactors, calibrations, strict=True)
         )
 
     @property
@@ -82,41 +81,42 @@ class ChiBioReactors:
     @property
     def handed_over(self) -> Mask:
         """Reactors that were handed over to the on-board regulation, shape (N,)."""
-        return np.array([math.isfinite(station.handed_over) for station in self.stations])
+        return np.array([station.regulation.active for station in self.stations])
 
     def elapsed(self) -> float:
-        """Run time, s: counted from `begin`, or from what it was told."""
+        """Run time, s: counted from `begin`, together with what had passed before."""
         return self._clock.now() - self._zero
 
-    def begin(self, saved: Mapping[str, Saved] | None = None, elapsed_s: float = 0.0) -> None:
+    def begin(self, histories: Mapping[str, ReactorHistory] | None = None, elapsed_s: float = 0.0) -> None:
         """Sweep the pumps off, pin identities and blanks, start what does not run yet, staggered inside the minute.
 
-        An overflow guard is verified on before the first dose, and off again if the start fails.
+        An overflow pump is verified on before the first dose, and off again if the start fails.
 
         An experiment that already runs is adopted, never started again (a second start would stop it); its next new
         sample is the first one delivered. So is a reactor that was handed over to the on-board regulation: it stays so.
 
         Args:
-          saved: `replay` of the journal of the run that is resumed.
+          histories: `replay` of the journal of the run that is resumed.
           elapsed_s: run time that has passed since that run began.
         Raises: ReactorError if a reactor cannot be brought into its running state.
         """
         self._zero = self._clock.now() - elapsed_s
         try:
-            self._bring_up(saved or {})
+            self._bring_up(histories or {})
         except (ReactorError, KeyboardInterrupt) as error:
-            guarded = np.array([station.guard.was_on or station.guard.tried for station in self.stations])
-            if failed := self._each(guarded & ~self.handed_over, lambda station: station.unit.pumps_off(tries=1)):
-                raise DeviceStateError(f"{error}; overflow guard not verified off: {'; '.join(failed)}") from error
+            switched = np.array([s.overflow_pump.was_on or s.overflow_pump.tried for s in self.stations])
+            if failed := self._each(
+                switched & ~self.handed_over, lambda station: station.connection.pumps_off(tries=1)
+            ):
+                raise DeviceStateError(f"{error}; overflow pump not verified off: {'; '.join(failed)}") from error
             raise
 
-    def _bring_up(self, saved: Mapping[str, Saved]) -> None:
+    def _bring_up(self, histories: Mapping[str, ReactorHistory]) -> None:
         for station in self.stations:
-            station.zero = self._zero
-            station.restore(saved.get(station.name, Saved()))
+            station.restore(histories.get(station.name, ReactorHistory()))
         slot = 0
         for station in self.stations:
-            running = station.unit.read().running
+            running = station.connection.read().running
             station.busy = True
             self._agenda.add(station.bring_up(), 0.0 if running else slot * 60.0 / len(self.stations))
             slot += not running
@@ -124,8 +124,8 @@ class ChiBioReactors:
             self._agenda.run_due()
             self._clock.sleep(min(self._agenda.next_due() - self._clock.now(), 1.0))
         for station in self.stations:
-            if station.guard.trouble:
-                raise DeviceStateError(f"{station.name}: {station.guard.trouble}; run the preflight")
+            if station.overflow_pump.trouble:
+                raise DeviceStateError(f"{station.name}: {station.overflow_pump.trouble}; run the preflight")
 
     def measure(self) -> Measurement:
         """The newest samples; waits for one, working through the agenda.
@@ -134,32 +134,32 @@ class ChiBioReactors:
         `stale_s` (again every 20 s while that lasts): `vitals` then says what is wrong.
         Raises: what the log raised; nothing for trouble with device or link.
         """
-        last = max(station.arrived_s for station in self.stations)
+        last = max(station.sampling.arrived_s for station in self.stations)
         deadline = max(last + self.config.stale_s, self._clock.now() + 20.0)
         fresh = np.zeros(len(self.stations), dtype=np.bool_)
         while True:
             self._work()
             for i, station in enumerate(self.stations):
-                if self._clock.now() >= station.next_poll:
+                if self._clock.now() >= station.sampling.next_poll:
                     fresh[i] = station.poll()
                     self._work()
             if self._log_error is not None:
                 error, self._log_error = self._log_error, None
                 raise error
             now = self._clock.now()
-            if fresh.any() or now >= deadline or any(station.news for station in self.stations):
+            if fresh.any() or now >= deadline or any(station.book.news for station in self.stations):
                 return self._measurement(fresh)
-            due = min([deadline, self._agenda.next_due(), *(station.next_poll for station in self.stations)])
+            due = min([deadline, self._agenda.next_due(), *(station.sampling.next_poll for station in self.stations)])
             self._clock.sleep(max(due - now, 0.01))
 
     def _measurement(self, fresh: Mask) -> Measurement:
         def column(key: str) -> Array:
-            return np.array([getattr(station, key) for station in self.stations], dtype=np.float64)
+            return np.array([getattr(station.sampling, key) for station in self.stations], dtype=np.float64)
 
         for station in self.stations:
-            station.news = False
+            station.book.news = False
         age = self._clock.now() - column("arrived_s")
-        vitals = Vitals(age, column("raw"), tuple(station.fault for station in self.stations))
+        vitals = Vitals(age, column("raw"), tuple(station.book.fault for station in self.stations))
         return Measurement(column("time_s"), column("od"), column("temperature"), fresh, vitals)
 
     def _work(self) -> None:
@@ -184,16 +184,16 @@ class ChiBioReactors:
                 plan = station.dose(float(command.pump_rate[i]))
                 volume[i], waste[i] = plan.feed_ml, plan.waste_ml
                 self._work()
-            volume[i] += station.repeated_ml
-            waste[i] += station.repeated_waste_ml
-            station.repeated_ml = station.repeated_waste_ml = 0.0
-        notes = tuple(f"{station.name}: {note}" for station in self.stations for note in station.notes)
+            volume[i] += station.doses.repeated_ml
+            waste[i] += station.doses.repeated_waste_ml
+            station.doses.repeated_ml = station.doses.repeated_waste_ml = 0.0
+        notes = tuple(f"{station.name}: {note}" for station in self.stations for note in station.book.notes)
         for station in self.stations:
-            station.notes.clear()
+            station.book.notes.clear()
         return Receipt(volume, notes, waste)
 
     def pumps_off(self, rows: Mask) -> list[str]:
-        """All pumps of `rows` off, verified, but for an overflow guard; returns what failed, one line per reactor."""
+        """All pumps of `rows` off, verified, but for an overflow pump; returns what failed, one line per reactor."""
         return self._each(rows, lambda station: station.pumps_off(tries=1))
 
     def give_up(self, rows: Mask) -> list[str]:
@@ -210,7 +210,7 @@ class ChiBioReactors:
         The reactor then feeds itself, at most 0.02 of full power; commands for it are refused from here on.
         """
         targets = dict(zip(self.names, setpoint, strict=True))
-        return self._each(rows, lambda station: station.regulate(float(targets[station.name])))
+        return self._each(rows, lambda station: station.regulation.hand_over(float(targets[station.name])))
 
     def _each(self, rows: Mask, action: Callable[[Station], None]) -> list[str]:
         failed = []
@@ -223,10 +223,10 @@ class ChiBioReactors:
         return failed
 
     def stop(self) -> None:
-        """All pumps of all reactors off, guards too, verified; tried for `stop_s`, then escalated. Idempotent.
+        """All pumps of all reactors off, overflow pumps too, verified; tried for `stop_s`, then escalated. Idempotent.
 
         Experiments go on (stirred, heated, measured). A reactor handed over to the on-board regulation is left to it,
-        with its guard.
+        with its overflow pump.
         Raises: DeviceStateError naming every reactor whose pumps could not be verified off, and what to do.
         """
         pending = [s for s, regulated in zip(self.stations, self.handed_over, strict=True) if not regulated]
@@ -239,7 +239,7 @@ class ChiBioReactors:
             self._clock.sleep(min(self.config.retry_s, 2.0))
         self._agenda.clear()
         for station in pending:
-            station.escalate()
+            station.connection.escalate()
         pending = [s for s in pending if not self._silence(s, errors)]
         self._note_down("stop", {"reactors": self.names, "not_verified": [s.name for s in pending]})
         if pending:
@@ -250,19 +250,19 @@ class ChiBioReactors:
     @staticmethod
     def _silence(station: Station, errors: dict[str, ReactorError]) -> bool:
         try:
-            station.unit.pumps_off(tries=1)
+            station.connection.pumps_off(tries=1)
         except ReactorError as error:
             errors[station.name] = error
             return False
-        station.dosing = False
+        station.doses.running = False
         return True
 
     def end(self) -> None:
         """`stop`, then end every experiment. Raises: ReactorError if one goes on."""
         self.stop()
         for station in self.stations:
-            station.unit.post(f"/Experiment/0/{station.name}")
-            if station.unit.read().running:
+            station.connection.post(f"/Experiment/0/{station.name}")
+            if station.connection.read().running:
                 raise DeviceStateError(f"{station.name}: the experiment does not end; stop it in the web page")
 
     def _write(self, kind: str, fields: Mapping[str, Any]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from hardware.errors import RecordingError
 from hardware.storage.journal import REMEDY
 
-__all__ = ["Saved", "replay"]
+__all__ = ["ReactorHistory", "replay"]
 
 KEYS: Mapping[str, Callable[[Any], Any]] = {
     "device_id": str, "blank": float, "carry_ml": float, "doses": int, "temperature": float, "feed_ml": float,
@@ -19,10 +19,10 @@ KEYS: Mapping[str, Callable[[Any], Any]] = {
 
 
 @dataclass(frozen=True)
-class Saved:
+class ReactorHistory:
     """What a run must remember of one reactor across a restart of this program.
 
-    guarded: its overflow guard was verified on. handed_over: OD at which it was handed over to the on-board regulation.
+    overflow_pump_on: it was verified on. handed_over: OD at which it was handed over to the on-board regulation.
     sample: (record time, cycles) of the last sample a dose was decided for. open: a dose was begun and its end was
     never recorded; then feed_ml, waste_ml are its volumes and on_s the run time at which it began, s.
     """
@@ -33,7 +33,7 @@ class Saved:
     carry_ml: float = 0.0
     doses: int = 0
     temperature: float = math.nan
-    guarded: bool = False
+    overflow_pump_on: bool = False
     handed_over: float = math.nan
     open: bool = False
     feed_ml: float = 0.0
@@ -50,13 +50,13 @@ def _take(entry: dict[str, Any], row: Mapping[str, Any]) -> None:
     elif row["kind"] == "dose_end":
         entry["open"] = False
     elif row["kind"] == "guard":
-        entry["guarded"] = True
+        entry["overflow_pump_on"] = True
     elif row["kind"] == "regulate":
         setpoint = math.nan if row["setpoint"] is None else float(row["setpoint"])  # None: control was taken back
         entry.update(handed_over=setpoint, open=False)  # its pumps were verified off before
 
 
-def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, Saved]:
+def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, ReactorHistory]:
     """What the journal of a run says of each reactor: identity, blank, last sample acted on, a dose left open.
 
     Args:
@@ -72,4 +72,4 @@ def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, Saved]:
         except (IndexError, KeyError, TypeError, ValueError) as error:
             what = f"row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error})"
             raise RecordingError(f"journal.jsonl: {what}; {REMEDY}") from None
-    return {name: Saved(**entry) for name, entry in known.items()}
+    return {name: ReactorHistory(**entry) for name, entry in known.items()}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 
-__all__ = ["DONE", "REMEDIES", "WORDS", "Response", "Responses", "SafetyConfig", "check_setpoints"]
+__all__ = ["DONE", "REMEDIES", "WORDS", "Response", "Responses", "SafetyConfig"]
 
 
 class Response(IntEnum):
@@ -70,8 +69,8 @@ SENSOR_REASONS = ("impossible", "spectrometer", "frozen", "jump", "no_dilution",
 class Responses:
     """The declared response to every reason: report | hold | pumps_off | regulate | stop.
 
-    link to guard are the kinds of `reactor.Fault`. A reason that means the sensor cannot be believed may not regulate:
-    the device would pump by the same reading.
+    link to overflow_pump are the kinds of `reactor.Fault`. A reason that means the sensor cannot be believed may not
+    regulate: the device would pump by the same reading.
     """
 
     setpoint: str = "hold"
@@ -104,7 +103,7 @@ class Responses:
     mode: str = "hold"
     blank: str = "hold"
     pump: str = "pumps_off"
-    guard: str = "hold"
+    overflow_pump: str = "hold"
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -205,10 +204,3 @@ class SafetyConfig:
         for key in ("ml_per_minute", "ml_per_hour", "ml_per_run", "bottle_ml", "jump", "cooldown", "silent", "cooling"):
             if not 0.0 < getattr(self, key) < math.inf:
                 raise ValueError(f"safety.{key} = {getattr(self, key)}: allowed a finite number over 0")
-
-
-def check_setpoints(setpoints: Sequence[float], config: SafetyConfig) -> None:
-    """Refuse a schedule with a typing error before it runs. Raises: ValueError naming the first bad setpoint."""
-    for value in setpoints:
-        if not 0.0 < value <= config.max_setpoint:
-            raise ValueError(f"setpoint = {value}: allowed over 0 and at most {config.max_setpoint} (OD); correct it")

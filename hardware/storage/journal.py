@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hardware.errors import RecordingError
+from hardware.storage.atomic import sync_folder
 
 __all__ = ["REMEDY", "Journal", "read_journal"]
 
@@ -98,9 +99,7 @@ class Journal:
             if self.cut:
                 os.ftruncate(self._file, kept)
             os.fsync(self._file)
-            folder = os.open(path.parent, os.O_RDONLY)  # the name of a new file must be on disk, too
-            os.fsync(folder)
-            os.close(folder)
+            sync_folder(path.parent)
         except OSError as error:
             raise RecordingError(f"journal {path}: {error.strerror or error}; check folder, rights and disk") from error
         try:

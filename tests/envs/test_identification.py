@@ -12,7 +12,7 @@ from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series, noise_sd, pumped_volume, screen
 from envs.identification.window import Calibration, IdentifyConfig, calibrate
 from envs.integrators import rk4
-from hardware.storage.recorder import read_recording
+from hardware.storage.recording_reader import read_recording
 from tests.real_recording import DITHER, needs_dither
 
 

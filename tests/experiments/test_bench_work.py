@@ -12,7 +12,7 @@ import pytest
 from experiments.blank import BlankConfig, blank
 from experiments.calibrate_pump import CalibratePumpConfig, Series, calibrate, report, weigh
 from experiments.cli import frame
-from experiments.control.rig_files import load_rigs, save
+from experiments.control.calibration_files import load_calibrations, save
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import fit_pump
 from hardware.chibio.protocol import PERIOD_S
@@ -68,7 +68,7 @@ def test_from_a_file_on_the_command_line(tmp_path: Path) -> None:
     command += ["duties=[0.1,0.2]", f"backend.calibration={tmp_path}/c", f"hydra.run.dir={tmp_path}/run"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
-    [rig] = load_rigs(tmp_path / "c", ["M2"])
+    [rig] = load_calibrations(tmp_path / "c", ["M2"])
     assert rig.waste.flow_ml_s == pytest.approx(0.9, rel=1e-3)
     assert rig.waste.bias_s == pytest.approx(0.1, abs=1e-3)
     assert rig.waste.date
@@ -137,7 +137,7 @@ def test_the_blank_of_clear_medium_is_found_stored_and_restored(tmp_path: Path) 
         )
         blank(BlankConfig(backend, samples=4), tmp_path)
         real = truth(emulator)["blank"]
-    rigs = load_rigs(tmp_path / "c", ["M0", "M1"])
+    rigs = load_calibrations(tmp_path / "c", ["M0", "M1"])
     assert rigs[0].blank == pytest.approx(real, rel=0.01)
     assert rigs[1].blank != rigs[0].blank
     assert json.loads((tmp_path / "summary.json").read_text())["M0"]["samples"] == 4
@@ -162,15 +162,15 @@ def test_a_culture_is_no_blank(tmp_path: Path) -> None:
 def test_a_broken_calibration_file_is_named(tmp_path: Path, content: str, words: str) -> None:
     (tmp_path / "M0_feed.yaml").write_text(content)
     with pytest.raises(frame.UserError, match=words):
-        load_rigs(tmp_path, ["M0"])
+        load_calibrations(tmp_path, ["M0"])
 
 
 def test_what_was_stored_is_loaded(tmp_path: Path) -> None:
     save(tmp_path, "M3", "blank", {"blank": 13000.0})
-    assert load_rigs(tmp_path, ["M3"])[0].blank == 13000.0
+    assert load_calibrations(tmp_path, ["M3"])[0].blank == 13000.0
     save(tmp_path, "M3", "blank", {"blank": 13.0})
     with pytest.raises(frame.UserError, match="blank = 13"):
-        load_rigs(tmp_path, ["M3"])
+        load_calibrations(tmp_path, ["M3"])
 
 
 def test_the_operator_is_not_shown_every_request(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from envs.identification.screening import Series
 from envs.identification.window import calibrate
 from experiments.calibrate import CalibrateConfig, environment_yaml
 from experiments.cli import frame
-from hardware.storage.recorder import read_recording
+from hardware.storage.recording_reader import read_recording
 from tests.real_recording import DITHER, needs_dither
 
 ROOT = Path(__file__).parents[2]

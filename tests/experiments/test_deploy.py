@@ -31,7 +31,7 @@ from hardware.safety.config import Responses, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
-from hardware.storage.recorder import read_recording
+from hardware.storage.recording_reader import read_recording
 from tests.hardware.driver_lab import Bed
 
 ROOT = Path(__file__).parents[2]

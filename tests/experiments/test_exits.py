@@ -147,13 +147,13 @@ def test_an_exception_in_the_controller(tmp_path: Path) -> None:
         bench.check("failed: RuntimeError: the controller failed")
 
 
-def test_an_overflow_guard_runs_over_doses_and_a_kill_and_is_off_after_every_other_end(tmp_path: Path) -> None:
-    guard = ["backend.guard.pump=Pump3", "backend.guard.duty=0.95"]
+def test_an_overflow_pump_runs_over_doses_and_a_kill_and_is_off_after_every_other_end(tmp_path: Path) -> None:
+    pump = ["backend.overflow_pump.pump=Pump3", "backend.overflow_pump.duty=0.95"]
     folder = tmp_path / "run"
     state = folder / "state.json"
 
     def until_fed(bench: Bench) -> None:
-        """Until a dose is given beside a running guard."""
+        """Until a dose is given beside a running overflow pump."""
         deadline = time.monotonic() + 60.0
         while not (state.exists() and any({f"{m}/Pump1", f"{m}/Pump3"} <= set(bench.motors()) for m in ("M0", "M1"))):
             assert time.monotonic() < deadline
@@ -163,10 +163,10 @@ def test_an_overflow_guard_runs_over_doses_and_a_kill_and_is_off_after_every_oth
     with EmulatorProcess(
         ["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5", "--overflow-pump", "Pump3"]
     ) as device:
-        bench = Bench(device, folder, more=guard)
+        bench = Bench(device, folder, more=pump)
         until_fed(bench)
         bench.client.kill()
-        assert "overflow guard: Pump3 at duty 0.95" in bench.end()[1]
+        assert "overflow pump: Pump3 at duty 0.95" in bench.end()[1]
         whole = state.read_text()
         state.write_text("{")  # a resumed run that fails between the reactors' start and the loop
         bench = Bench(device, folder, resume=True)
@@ -183,5 +183,5 @@ def test_an_overflow_guard_runs_over_doses_and_a_kill_and_is_off_after_every_oth
         assert status == 0, said
         assert "pumps verified off" in said
         notes = [row["note"] for row in read_journal(folder / "journal.jsonl")[0] if row["kind"] == "note"]
-        assert sum("the overflow guard was found off" in note for note in notes) == 2
+        assert sum("the overflow pump was found off" in note for note in notes) == 2
         bench.check("stopped by the operator")

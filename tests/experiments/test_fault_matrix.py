@@ -18,7 +18,7 @@ from experiments.reliability.faults import FAULTS, Fault, both, by_name, post, r
 from experiments.reliability.outcome import Outcome
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from experiments.reliability.tables import declared, table, totals
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.emulator.vial import Dose
 from hardware.safety.config import SafetyConfig
 
@@ -30,9 +30,9 @@ def run(
     fault: Fault | None,
     moment: str = "steady",
     safety: SafetyConfig | None = None,
-    guard: GuardConfig | None = None,
+    pump: OverflowPumpConfig | None = None,
 ) -> Outcome:
-    return FaultCase(fault, moment, rehearsed(("M0", "M1"), SCHEDULE, safety, guard=guard), 3).run()
+    return FaultCase(fault, moment, rehearsed(("M0", "M1"), SCHEDULE, safety, overflow_pump=pump), 3).run()
 
 
 def test_a_healthy_run_says_nothing_and_holds_the_setpoints() -> None:
@@ -104,20 +104,20 @@ def test_what_overflows_on_the_standard_rig_does_not_with_a_guard(name: str) -> 
     without = run(fault)
     assert without.ok, without
     assert (without.overflowed, without.label) == (True, f"{name}, no guard")
-    guarded = run(fault, guard=FaultMatrixConfig().guard)
+    guarded = run(fault, pump=FaultMatrixConfig().overflow_pump)
     assert guarded.ok, guarded
     assert (guarded.overflowed, guarded.label) == (False, name)
     assert guarded.peak_ml < 27.0
 
 
 def test_an_overflow_beside_a_guard_is_never_as_declared() -> None:
-    too_weak = GuardConfig("Pump3", 0.95, 0.9)
-    assert run(by_name(("feed stuck open",))[0], guard=too_weak).wrong == ["overflow"]
+    too_weak = OverflowPumpConfig("Pump3", 0.95, 0.9)
+    assert run(by_name(("feed stuck open",))[0], pump=too_weak).wrong == ["overflow"]
 
 
 @pytest.mark.parametrize("name", ["guard blocked", "foreign guard off"])
 def test_faults_of_the_guard_itself(name: str) -> None:
-    outcome = run(by_name((name,))[0], guard=FaultMatrixConfig().guard)
+    outcome = run(by_name((name,))[0], pump=FaultMatrixConfig().overflow_pump)
     assert outcome.ok, outcome
 
 
@@ -144,7 +144,7 @@ def test_rigs_with_and_without_guard_are_counted_apart() -> None:
     assert [(name, guarded) for name, _, _, guarded in all_cases(config)] == [
         ("", True), ("waste blocked", True), ("guard blocked", True), ("feed blocked", True), ("waste blocked", False),
     ]  # fmt: skip
-    bare = replace(config, guard=GuardConfig())
+    bare = replace(config, overflow_pump=OverflowPumpConfig())
     assert [(name, guarded) for name, _, _, guarded in all_cases(bare)] == [
         ("", False), ("waste blocked", False), ("feed blocked", False),
     ]  # fmt: skip

@@ -101,7 +101,7 @@ def regulated_at(run: Losable, target: float = 0.5) -> None:
     data = run.data()
     assert (data["OD"]["ON"], data["OD"]["target"]) == (1, target)
     assert run.reactors.handed_over.tolist() == [True, False]
-    assert run.reactors.stations[0].fault is None
+    assert run.reactors.stations[0].book.fault is None
     assert not run.journaled("intent", since)
     assert all("handed over" in row["row"]["interlock"] for row in run.journaled("decision", since))
     assert run.truth("M0")["od"] == pytest.approx(0.5, abs=0.1)

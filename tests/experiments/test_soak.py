@@ -8,7 +8,7 @@ import pytest
 from experiments.cli import frame
 from experiments.reliability.endurance import Day, SoakConfig, soak_run
 from experiments.soak import soak
-from hardware.storage.recorder import read_recording
+from hardware.storage.recording_reader import read_recording
 
 
 def test_hours_of_two_reactors(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from experiments.control.loop import ClosedLoop, Step
 from experiments.controllers.base import Array, Mask
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Log
-from hardware.chibio.dosing import PumpCalibration, Rig
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions
@@ -21,7 +21,9 @@ from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
 
 # what weighing the emulator's healthy pumps gives: on-time bias 0.11 s, of which 0.05 s deliver nothing
-SOUND = Rig(PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01"))
+SOUND = ReactorCalibration(
+    PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01")
+)
 
 
 class Spy:
@@ -95,7 +97,7 @@ class Bed:
         self._state: dict[str, Any] = {}  # of the loop after its last step
         self.client()
 
-    def client(self, rigs: Sequence[Rig] | None = None, log: Log | None = None) -> None:
+    def client(self, rigs: Sequence[ReactorCalibration] | None = None, log: Log | None = None) -> None:
         """A new driver and loop on the same device, as after a restart of the program."""
         rigs = rigs or [SOUND] * len(self.names)
         self.reactors = ChiBioReactors(self.wire, self.clock, self.config, rigs, log or self.log)

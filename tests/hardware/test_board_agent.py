@@ -26,7 +26,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hardware.board import board_agent
-from hardware.board.board_agent import Agent, Device, decode_request, encode_reply, encode_request, reduce_sysdata
+from hardware.board.board_agent import Agent, Device, decode_request, encode_reply, reduce_sysdata
+from hardware.link.frames import decode_header, encode_request
 from tests.hardware.emulator_lab import Lab
 from tests.hardware.test_emulator_server import Process
 
@@ -87,6 +88,17 @@ def test_frames_survive_the_way_and_noise_before_them(number: int, method: str, 
     line = encode_request(number, method, path)[:-1]
     assert decode_request(line) == (number, method, path)
     assert decode_request(noise.replace(b"\n", b"") + line) == (number, method, path)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 599), st.binary(max_size=60), st.binary(max_size=20))
+def test_a_reply_of_the_agent_is_read_by_the_driver(number: int, status: int, body: bytes, noise: bytes) -> None:
+    line, _, rest = encode_reply(number, status, body).partition(b"\n")
+    header = decode_header(noise.replace(b"\n", b"") + line)
+    assert header is not None
+    assert (header.number, header.status, header.length) == (number, status, len(body))
+    assert rest == body + b"\n"
+    assert header.fits(body)
+    assert not header.fits(body + b"x")
 
 
 @settings(max_examples=3000)
@@ -208,7 +220,7 @@ def test_reduction_of_anything_else_leaves_it_alone_or_reduces_it(body: bytes) -
 # -- the process -----------------------------------------------------------------------------------------------------
 
 
-class Rig:
+class AgentLab:
     """Emulator, agent and a pty between the agent and this test; `link` is where the agent finds its line."""
 
     def __init__(self, folder: Path, *arguments: str, tty_line: bool = True, speed: int = 60) -> None:
@@ -294,93 +306,93 @@ class Rig:
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    one = Rig(tmp_path, "--deadman", "60", "--http-timeout", "2")
+def lab(tmp_path: Path) -> Iterator[AgentLab]:
+    one = AgentLab(tmp_path, "--deadman", "60", "--http-timeout", "2")
     yield one
     one.end()
 
 
-def test_conversation(rig: Rig) -> None:
-    status, body = rig.ask("HELLO", "/")
+def test_conversation(lab: AgentLab) -> None:
+    status, body = lab.ask("HELLO", "/")
     hello = json.loads(body)
     assert status == 200
     assert (hello["agent"], hello["protocol"], hello["deadman_s"], hello["trips"]) == ("board_agent", 1, 60.0, 0)
-    assert rig.ask("PING", "/")[0] == 200
-    assert rig.ask("POST", "/changeDevice/M1") == (204, b"")
-    status, body = rig.ask("GET", "/getSysdata/")
+    assert lab.ask("PING", "/")[0] == 200
+    assert lab.ask("POST", "/changeDevice/M1") == (204, b"")
+    status, body = lab.ask("GET", "/getSysdata/")
     assert (status, json.loads(body)["UIDevice"]) == (200, "M1")
     assert len(body) < 1024
-    status, whole = rig.ask("RAW", "/getSysdata/")
+    status, whole = lab.ask("RAW", "/getSysdata/")
     assert "AS7341" in json.loads(whole)
-    assert rig.ask("POST", "/changeDevice/M9")[0] == 500
-    assert rig.ask("POST", "/nonsense")[0] == 404
-    assert rig.ask("GET", "/getSysdata")[0] == 308
+    assert lab.ask("POST", "/changeDevice/M9")[0] == 500
+    assert lab.ask("POST", "/nonsense")[0] == 404
+    assert lab.ask("GET", "/getSysdata")[0] == 308
 
 
-def test_resynchronises_after_garbage_and_executes_nothing_of_it(rig: Rig) -> None:
+def test_resynchronises_after_garbage_and_executes_nothing_of_it(lab: AgentLab) -> None:
     good = encode_request(7, "POST", "/SetOutputTarget/Stir/M0/0.7")
     bad = good[:-4] + b"0" + good[-3:] if good[-4:-3] != b"0" else good[:-4] + b"1" + good[-3:]
-    rig.send(b"debian login: \r\nlast message repeated\n\x00\xff\xfe")
-    rig.send(bad.replace(b"0.7", b"0.9"))
-    assert rig.receive()[:2] == (0, 20)
-    rig.send(b"x" * 5000 + b"\n" + good)
-    assert rig.receive()[:2] == (7, 204)
-    rig.send(good[:10])
+    lab.send(b"debian login: \r\nlast message repeated\n\x00\xff\xfe")
+    lab.send(bad.replace(b"0.7", b"0.9"))
+    assert lab.receive()[:2] == (0, 20)
+    lab.send(b"x" * 5000 + b"\n" + good)
+    assert lab.receive()[:2] == (7, 204)
+    lab.send(good[:10])
     time.sleep(0.2)
-    rig.send(good[10:])
-    assert rig.receive()[:2] == (7, 204)
-    assert json.loads(rig.ask("GET", "/getSysdata/")[1])["Stir"]["target"] == 0.7
+    lab.send(good[10:])
+    assert lab.receive()[:2] == (7, 204)
+    assert json.loads(lab.ask("GET", "/getSysdata/")[1])["Stir"]["target"] == 0.7
 
 
-def test_a_repeated_toggle_toggles_once(rig: Rig) -> None:
-    rig.pump("Pump3", "M0")
+def test_a_repeated_toggle_toggles_once(lab: AgentLab) -> None:
+    lab.pump("Pump3", "M0")
     toggle = encode_request(5, "POST", "/SetOutputOn/Pump3/2/M0")
     for _ in range(3):
-        rig.send(toggle)
-        assert rig.receive()[:2] == (5, 204)
-    assert json.loads(rig.ask("GET", "/getSysdata/")[1])["Pump3"]["ON"] == 0
+        lab.send(toggle)
+        assert lab.receive()[:2] == (5, 204)
+    assert json.loads(lab.ask("GET", "/getSysdata/")[1])["Pump3"]["ON"] == 0
 
 
-def test_a_large_answer_arrives_whole(rig: Rig) -> None:
+def test_a_large_answer_arrives_whole(lab: AgentLab) -> None:
     for _ in range(3):
-        assert rig.ask("POST", "/Experiment/1/M0")[0] == 204
-    status, body = rig.ask("RAW", "/getSysdata/")
+        assert lab.ask("POST", "/Experiment/1/M0")[0] == 204
+    status, body = lab.ask("RAW", "/getSysdata/")
     assert status == 200
     assert len(body) > 4500
     assert json.loads(body)["UIDevice"] == "M0"
 
 
-def test_what_became_of_a_request_without_answer(rig: Rig) -> None:
-    rig.emulator.fault("reset_after/all/1")
-    status, body = rig.ask("POST", "/SetOutputTarget/Stir/M0/0.7")
+def test_what_became_of_a_request_without_answer(lab: AgentLab) -> None:
+    lab.emulator.fault("reset_after/all/1")
+    status, body = lab.ask("POST", "/SetOutputTarget/Stir/M0/0.7")
     assert status == 11
     assert b"/SetOutputTarget/Stir" in body
-    rig.emulator.fault("truncated/all/1")
-    assert rig.ask("RAW", "/getSysdata/")[0] == 11
-    rig.emulator.fault("lost_reply/all/1")
+    lab.emulator.fault("truncated/all/1")
+    assert lab.ask("RAW", "/getSysdata/")[0] == 11
+    lab.emulator.fault("lost_reply/all/1")
     began = time.monotonic()
-    assert rig.ask("POST", "/changeDevice/M1")[0] == 11
+    assert lab.ask("POST", "/changeDevice/M1")[0] == 11
     assert time.monotonic() - began == pytest.approx(2.0, abs=0.5)
-    rig.emulator.fault("malformed/all/1")
-    status, body = rig.ask("GET", "/getSysdata/")
+    lab.emulator.fault("malformed/all/1")
+    status, body = lab.ask("GET", "/getSysdata/")
     assert status == 200  # passed on as it is: judging is the client's task
     with pytest.raises(json.JSONDecodeError):
         json.loads(body)
-    rig.emulator.fault("crash")
+    lab.emulator.fault("crash")
     time.sleep(0.2)
-    assert rig.ask("GET", "/getSysdata/")[0] == 10
+    assert lab.ask("GET", "/getSysdata/")[0] == 10
 
 
-def test_line_pulled_and_plugged_again(rig: Rig) -> None:
-    assert rig.ask("PING", "/")[0] == 200
+def test_line_pulled_and_plugged_again(lab: AgentLab) -> None:
+    assert lab.ask("PING", "/")[0] == 200
     for _ in range(2):
-        rig.unplug()
+        lab.unplug()
         time.sleep(0.3)
-        seen = rig.log.read_text().count("open")
-        rig.plug()
-        rig.until(lambda n=seen: rig.log.read_text().count("open") > n)  # type: ignore[misc]
-        assert rig.ask("HELLO", "/")[0] == 200
-        assert json.loads(rig.ask("GET", "/getSysdata/")[1])["UIDevice"] == "M0"
+        seen = lab.log.read_text().count("open")
+        lab.plug()
+        lab.until(lambda n=seen: lab.log.read_text().count("open") > n)  # type: ignore[misc]
+        assert lab.ask("HELLO", "/")[0] == 200
+        assert json.loads(lab.ask("GET", "/getSysdata/")[1])["UIDevice"] == "M0"
 
 
 def test_a_line_nobody_reads_does_not_stop_the_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -401,13 +413,13 @@ def test_a_line_nobody_reads_does_not_stop_the_agent(tmp_path: Path, monkeypatch
 
 
 @pytest.fixture
-def short(tmp_path: Path) -> Iterator[Rig]:
-    one = Rig(tmp_path, "--deadman", "1", "--http-timeout", "2")
+def short(tmp_path: Path) -> Iterator[AgentLab]:
+    one = AgentLab(tmp_path, "--deadman", "1", "--http-timeout", "2")
     yield one
     one.end()
 
 
-def test_silence_switches_all_pumps_of_all_present_reactors_off(short: Rig) -> None:
+def test_silence_switches_all_pumps_of_all_present_reactors_off(short: AgentLab) -> None:
     running = {("Pump1", "M0"), ("Pump2", "M0"), ("Pump3", "M1"), ("Pump4", "M1")}
     for pump, reactor in running:
         short.pump(pump, reactor, 1.0)
@@ -425,7 +437,7 @@ def test_silence_switches_all_pumps_of_all_present_reactors_off(short: Rig) -> N
     assert short.emulator.truth()["alive"] is True  # the absent reactors were not touched
 
 
-def test_regulating_reactor_is_left_alone_the_other_is_not(short: Rig) -> None:
+def test_regulating_reactor_is_left_alone_the_other_is_not(short: AgentLab) -> None:
     short.ask("POST", "/Experiment/1/M0")
     short.ask("POST", "/SetOutputTarget/OD/M0/0.1")
     short.ask("POST", "/SetOutputOn/OD/1/M0")
@@ -436,7 +448,7 @@ def test_regulating_reactor_is_left_alone_the_other_is_not(short: Rig) -> None:
     assert "M0 regulates on its own" in short.log.read_text()
 
 
-def test_bye_disarms_and_the_next_request_arms_again(short: Rig) -> None:
+def test_bye_disarms_and_the_next_request_arms_again(short: AgentLab) -> None:
     short.pump("Pump3", "M0", 1.0)
     assert json.loads(short.ask("BYE", "/")[1])["armed"] is False
     time.sleep(1.6)
@@ -445,7 +457,7 @@ def test_bye_disarms_and_the_next_request_arms_again(short: Rig) -> None:
     short.until(lambda: not short.motors())
 
 
-def test_dead_bus_is_unmasked_and_ends_with_everything_off(short: Rig) -> None:
+def test_dead_bus_is_unmasked_and_ends_with_everything_off(short: AgentLab) -> None:
     short.emulator.fault("bus_stuck_when_pumping")
     short.pump("Pump1", "M0", 0.9)
     short.until(lambda: short.motors() == {"M0/Pump1"})
@@ -455,7 +467,7 @@ def test_dead_bus_is_unmasked_and_ends_with_everything_off(short: Rig) -> None:
     short.until(lambda: "pumps verified off" in short.log.read_text(), timeout=12.0)
 
 
-def test_switching_off_is_repeated_until_it_can_be_verified(short: Rig) -> None:
+def test_switching_off_is_repeated_until_it_can_be_verified(short: AgentLab) -> None:
     short.pump("Pump1", "M0", 1.0)
     short.emulator.fault("lying/all/-1")
     short.until(lambda: "still on: Pump1" in short.log.read_text())
@@ -464,7 +476,7 @@ def test_switching_off_is_repeated_until_it_can_be_verified(short: Rig) -> None:
     short.until(lambda: "pumps verified off" in short.log.read_text())
 
 
-def test_a_stopped_agent_leaves_no_pump_running(short: Rig) -> None:
+def test_a_stopped_agent_leaves_no_pump_running(short: AgentLab) -> None:
     short.pump("Pump1", "M1", 1.0)
     short.until(lambda: short.motors() == {"M1/Pump1"})
     short.agent.send_signal(signal.SIGTERM)
@@ -473,7 +485,7 @@ def test_a_stopped_agent_leaves_no_pump_running(short: Rig) -> None:
 
 
 def test_armed_from_the_start(tmp_path: Path) -> None:
-    one = Rig(tmp_path, "--deadman", "1")
+    one = AgentLab(tmp_path, "--deadman", "1")
     try:
         one.emulator.ask("POST", "/SetOutputTarget/Pump1/M0/1")
         one.emulator.ask("POST", "/SetOutputOn/Pump1/1/M0")
@@ -487,7 +499,7 @@ def test_armed_from_the_start(tmp_path: Path) -> None:
 
 
 def test_http_mode(tmp_path: Path) -> None:
-    one = Rig(tmp_path, "--deadman", "1", "--http-timeout", "1", "--http", "127.0.0.1:0", tty_line=False)
+    one = AgentLab(tmp_path, "--deadman", "1", "--http-timeout", "1", "--http", "127.0.0.1:0", tty_line=False)
     port = int(one.log.read_text().rsplit("127.0.0.1:", 1)[1].split(",")[0])
 
     def ask(method: str, path: str) -> tuple[int, bytes]:

@@ -20,7 +20,7 @@ from hardware.emulator.transport import EmulatorTransport
 from hardware.errors import RecordingError
 from hardware.link.transport import Reply
 from hardware.reactor import Command
-from hardware.storage.recorder import read_recording
+from hardware.storage.recording_reader import read_recording
 
 CASES = int(os.environ.get("FUZZ_CASES", "300"))
 STRANGE: tuple[Any, ...] = (None, "", "x", -1, 0, 1, 2, 1e308, float("nan"), float("inf"), True, [], {}, [[]], "M7")

@@ -18,14 +18,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Unit, no_log
-from hardware.chibio.dosing import Rig
+from hardware.chibio.connection import Connection, no_log
+from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.preflight import preflight
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import RealClock, VirtualClock
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
-from hardware.link.transport import HttpTransport, Reply, TransportConfig, open_transport
+from hardware.link.http import HttpTransport
+from hardware.link.open import open_transport
+from hardware.link.transport import Reply, TransportConfig
 from hardware.reactor import Command
 from tests.hardware.driver_lab import Bed
 from tests.hardware.script import answer, state
@@ -213,9 +215,9 @@ def test_fuzz_whatever_comes_back_ends_in_an_answer_or_an_error_of_ours(
     fuzzed.behave = lambda c, request: c.sendall(OK if request.startswith(b"POST /changeDevice") else garbage)
     fuzzed.requests.clear()
     with link(fuzzed.url) as transport:
-        unit = Unit("M0", ("M0",), transport, VirtualClock(), no_log)
+        connection = Connection("M0", ("M0",), transport, VirtualClock(), no_log)
         with contextlib.suppress(ReactorError):
-            assert unit.read().selected == "M0"
+            assert connection.read().selected == "M0"
     assert all(r.startswith((b"GET", b"POST /changeDevice")) for r in fuzzed.requests)
 
 
@@ -261,7 +263,7 @@ def test_three_reactors_over_http_at_speed_60() -> None:
     with EmulatorProcess(["--reactors", ",".join(names), "--speed", "60", "--od", "0.5"]) as emulator:
         config = ChiBioConfig(url=emulator.url, speed=60.0, reactors=names)
         transport, clock = open_transport(config.transport, config.url, config.speed), RealClock(config.speed)
-        checks = preflight(transport, clock, config, [Rig()] * 3)
+        checks = preflight(transport, clock, config, [ReactorCalibration()] * 3)
         assert all(check.ok or not check.required for check in checks), "\n".join(map(str, checks))
         rows: list[dict[str, object]] = []
         reactors = ChiBioReactors(transport, clock, config, log=lambda k, f: rows.append({"kind": k, **f}))

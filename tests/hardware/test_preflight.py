@@ -5,19 +5,19 @@ from pathlib import Path
 
 import pytest
 
-from hardware.chibio.dosing import PumpCalibration, Rig
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.preflight import Check, preflight
 from tests.hardware.driver_lab import SOUND, Bed
 
 
-def checks(bed: Bed, rig: Rig = SOUND) -> dict[str, Check]:
+def checks(bed: Bed, rig: ReactorCalibration = SOUND) -> dict[str, Check]:
     found = preflight(bed.wire, bed.clock, bed.config, [rig] * len(bed.names), Path("."))
     return {check.name: check for check in found}
 
 
 def test_a_sound_device_passes_and_nothing_is_switched() -> None:
-    bed = Bed(("M0", "M1"), guard=GuardConfig("Pump3"))
+    bed = Bed(("M0", "M1"), overflow_pump=OverflowPumpConfig("Pump3"))
     found = checks(bed)
     assert all(check.ok for check in found.values()), "\n".join(map(str, found.values()))
     assert {"disk", "connection", "board clock", "M0 present", "M1 blank", "M1 pump calibration"} <= set(found)
@@ -25,33 +25,35 @@ def test_a_sound_device_passes_and_nothing_is_switched() -> None:
     assert str(found["M0 modes"]) == "pass  M0 modes: none active"
 
 
-def test_without_an_overflow_guard_a_note_says_what_may_happen_and_nothing_else_is_wrong() -> None:
+def test_without_an_overflow_pump_a_note_says_what_may_happen_and_nothing_else_is_wrong() -> None:
     found = checks(Bed())
-    assert [check.name for check in found.values() if not check.ok] == ["overflow guard"]
-    assert str(found["overflow guard"]) == (
-        "note  overflow guard: none: with a blocked waste tube a vial overflows after about 10 mL of feed -> a second "
-        "waste tube on Pump3, backend.guard.pump=Pump3 (docs/chibio.md)"
+    assert [check.name for check in found.values() if not check.ok] == ["overflow pump"]
+    assert str(found["overflow pump"]) == (
+        "note  overflow pump: none: with a blocked waste tube a vial overflows after about 10 mL of feed -> a second "
+        "waste tube on Pump3, backend.overflow_pump.pump=Pump3 (docs/chibio.md)"
     )
 
 
 @pytest.mark.parametrize(
-    ("guard", "feed_ml_s", "ok", "covers"),
+    ("pump", "feed_ml_s", "ok", "covers"),
     [
-        (GuardConfig("Pump3", 0.1), 1.0, True, "covers a blocked waste tube;"),
-        (GuardConfig("Pump3", 0.95), 1.0, True, "covers a blocked waste tube;"),
-        (GuardConfig("Pump4", 0.95, 1.2), 1.0, True, "covers a blocked waste tube and a feed motor stuck on;"),
-        (GuardConfig("Pump3", 0.1, 0.5), 1.5, False, "0.05 mL/s"),
+        (OverflowPumpConfig("Pump3", 0.1), 1.0, True, "covers a blocked waste tube;"),
+        (OverflowPumpConfig("Pump3", 0.95), 1.0, True, "covers a blocked waste tube;"),
+        (OverflowPumpConfig("Pump4", 0.95, 1.2), 1.0, True, "covers a blocked waste tube and a feed motor stuck on;"),
+        (OverflowPumpConfig("Pump3", 0.1, 0.5), 1.5, False, "0.05 mL/s"),
     ],
 )
-def test_what_an_overflow_guard_covers(guard: GuardConfig, feed_ml_s: float, ok: bool, covers: str) -> None:
-    found = checks(Bed(guard=guard), Rig(PumpCalibration(flow_ml_s=feed_ml_s), SOUND.waste))["overflow guard"]
+def test_what_an_overflow_pump_covers(pump: OverflowPumpConfig, feed_ml_s: float, ok: bool, covers: str) -> None:
+    found = checks(Bed(overflow_pump=pump), ReactorCalibration(PumpCalibration(flow_ml_s=feed_ml_s), SOUND.waste))[
+        "overflow pump"
+    ]
     assert (found.ok, found.required) == (ok, False)
     assert covers in found.detail
     assert "verified on when the run starts" in found.detail
 
 
 def test_a_guard_that_runs_already_is_no_pump_left_on() -> None:
-    bed = Bed(guard=GuardConfig("Pump3"))
+    bed = Bed(overflow_pump=OverflowPumpConfig("Pump3"))
     for path in ("/SetOutputTarget/Pump3/M0/0.1", "/SetOutputOn/Pump3/1/M0"):
         bed.device.handle("POST", path)
     assert checks(bed)["M0 pumps"].ok
@@ -81,16 +83,20 @@ def test_an_uncalibrated_device_and_a_stored_blank() -> None:
     bed = Bed(blanked=False)
     assert not checks(bed)["M0 blank"].ok
     assert "experiments.blank" in checks(bed)["M0 blank"].remedy
-    assert checks(bed, Rig(SOUND.feed, SOUND.waste, 14000.0))["M0 blank"].ok
+    assert checks(bed, ReactorCalibration(SOUND.feed, SOUND.waste, 14000.0))["M0 blank"].ok
 
 
 def test_pumps_never_weighed_weighed_elsewhere_or_too_weak() -> None:
     bed = Bed()
-    never = checks(bed, Rig())["M0 pump calibration"]
+    never = checks(bed, ReactorCalibration())["M0 pump calibration"]
     assert (never.ok, never.required) == (False, False)
-    elsewhere = Rig(PumpCalibration(date="2026-01-01", device_id="other"), PumpCalibration(date="2026-01-01"))
+    elsewhere = ReactorCalibration(
+        PumpCalibration(date="2026-01-01", device_id="other"), PumpCalibration(date="2026-01-01")
+    )
     assert "another unit" in checks(bed, elsewhere)["M0 pump calibration"].detail
-    weak = checks(bed, Rig(PumpCalibration(flow_ml_s=1.5), PumpCalibration(flow_ml_s=0.3)))["M0 waste over feed"]
+    weak = checks(bed, ReactorCalibration(PumpCalibration(flow_ml_s=1.5), PumpCalibration(flow_ml_s=0.3)))[
+        "M0 waste over feed"
+    ]
     assert (weak.ok, weak.required) == (False, True)
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from hardware.errors import RecordingError
-from hardware.storage.recorder import Recorder, read_recording
+from hardware.storage.recorder import Recorder
+from hardware.storage.recording_reader import read_recording
 from tests.real_recording import DITHER, needs_dither
 
 COLUMNS = ("time_min", "od", "pump_rate_ml_s")

@@ -15,8 +15,9 @@ import pytest
 
 from hardware.chibio.protocol import parse_state
 from hardware.errors import LinkError
-from hardware.link.transport import SerialTransport, TransportConfig
-from tests.hardware.test_board_agent import PYTHON, SOURCE, Rig
+from hardware.link.serial import SerialTransport
+from hardware.link.transport import TransportConfig
+from tests.hardware.test_board_agent import PYTHON, SOURCE, AgentLab
 from tests.hardware.test_emulator_server import Process
 
 
@@ -75,7 +76,7 @@ class Link:
         log = folder / "log"
         with log.open("w") as stderr:
             self.agent = subprocess.Popen([*command, "--url", f"http://127.0.0.1:{self.emulator.port}"], stderr=stderr)
-        Rig.until(lambda: "open" in log.read_text())
+        AgentLab.until(lambda: "open" in log.read_text())
         config = TransportConfig(kind="serial", port=str(folder / "pc"), connect_s=0.5, read_s=1.5, floor_s=0.1)
         self.transport = SerialTransport(str(folder / "pc"), 1.0, config, attempts=8)
 
@@ -126,4 +127,4 @@ def test_pulled_and_plugged_again(link: Link) -> None:
             except LinkError:
                 return False
 
-        Rig.until(answers, timeout=15.0)
+        AgentLab.until(answers, timeout=15.0)

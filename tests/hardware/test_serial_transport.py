@@ -22,7 +22,9 @@ from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import RealClock
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import LinkError, ProtocolError
-from hardware.link.transport import Reply, SerialTransport, TransportConfig, open_transport
+from hardware.link.open import open_transport
+from hardware.link.serial import SerialTransport
+from hardware.link.transport import Reply, TransportConfig
 from hardware.reactor import Command
 
 AGENT = Path(__file__).parents[2] / "hardware" / "board" / "board_agent.py"

@@ -192,7 +192,7 @@ def test_refused(path: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "guard", "allowed"),
+    ("path", "pump", "allowed"),
     [
         ("/SetOutputTarget/Pump3/M0/0.950000", "Pump3", True),
         ("/SetOutputTarget/Pump4/M0/0.1", "Pump4", True),
@@ -211,12 +211,12 @@ def test_refused(path: str) -> None:
         ("/SetOutputOn/Heat/1/M0", "Heat", False),
     ],
 )
-def test_a_guards_pump_has_limits_of_its_own_and_loosens_no_other(path: str, guard: str, allowed: bool) -> None:
+def test_an_overflow_pump_has_limits_of_its_own_and_loosens_no_other(path: str, pump: str, allowed: bool) -> None:
     if allowed:
-        check_command(path, ["M0"], guard)
+        check_command(path, ["M0"], pump)
         return
     with pytest.raises(DeviceStateError, match="refused"):
-        check_command(path, ["M0"], guard)
+        check_command(path, ["M0"], pump)
 
 
 ITEMS = ["SetOutputTarget", "SetOutputOn", "Experiment", "changeDevice", "CalibrateOD", "Pump1", "Pump2", "Pump3"]
@@ -227,17 +227,17 @@ WORDS = st.sampled_from(
 
 @settings(max_examples=2000)
 @given(st.lists(WORDS, max_size=6), st.sampled_from(["", "Pump1", "Pump3"]))
-def test_no_combination_of_words_pumps_too_much_or_reaches_another_reactor(words: list[str], guard: str) -> None:
+def test_no_combination_of_words_pumps_too_much_or_reaches_another_reactor(words: list[str], pump: str) -> None:
     path = "/" + "/".join(words)
     try:
-        check_command(path, ["M0"], guard)
+        check_command(path, ["M0"], pump)
     except DeviceStateError:
         return
     verb, args = words[0], words[1:]
     assert "M1" not in args
     assert args.count("M0") == 1
     if verb == "SetOutputTarget" and args[0] in PUMPS:
-        limits = {"Pump1": 0.05, "Pump2": 0.5, "Pump3": 0.95 if guard == "Pump3" else 0.0, "Pump4": 0.0}
+        limits = {"Pump1": 0.05, "Pump2": 0.5, "Pump3": 0.95 if pump == "Pump3" else 0.0, "Pump4": 0.0}
         assert 0.0 <= float(args[2]) <= limits[args[0]]
     if verb == "SetOutputOn":
         assert args[0] in (*PUMPS, "OD", "Stir", "Thermostat", "Heat")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware.chibio.dosing import DosingConfig, PumpCalibration, Rig, fit_pump, plan_dose
+from hardware.chibio.dosing import DosingConfig, PumpCalibration, ReactorCalibration, fit_pump, plan_dose
 from hardware.chibio.protocol import PERIOD_S
 
 CONFIG = DosingConfig()
@@ -20,21 +20,21 @@ def test_volume_and_on_time_by_hand() -> None:
 
 
 def test_the_fastest_rate_of_the_paper_is_a_duty_of_0_019() -> None:
-    plan = plan_dose(0.02, 0.0, 0, Rig(), CONFIG)
+    plan = plan_dose(0.02, 0.0, 0, ReactorCalibration(), CONFIG)
     assert plan.feed_duty == pytest.approx(1.2 / 63.0, abs=1e-6)
     assert plan.waste_s == pytest.approx(4.0 * 1.2 + 4.4, abs=1e-3)
     assert plan.feed_ml == pytest.approx(1.2, abs=1e-4)
 
 
 def test_every_fifth_dose_clears_the_waste_tube() -> None:
-    duties = [plan_dose(0.01, 0.0, k, Rig(), CONFIG).waste_duty for k in range(10)]
+    duties = [plan_dose(0.01, 0.0, k, ReactorCalibration(), CONFIG).waste_duty for k in range(10)]
     assert [d == pytest.approx(0.25) for d in duties] == [k % 5 == 4 for k in range(10)]
 
 
 def test_small_doses_are_saved_up_and_the_mean_rate_is_right() -> None:
     rate, carry, given_ml, doses = 0.00125, 0.0, 0.0, 0
     for _ in range(1000):
-        plan = plan_dose(rate, carry, doses, Rig(), CONFIG)
+        plan = plan_dose(rate, carry, doses, ReactorCalibration(), CONFIG)
         carry = plan.carry_ml
         given_ml += plan.feed_ml
         doses += plan.feed_duty > 0.0
@@ -44,12 +44,12 @@ def test_small_doses_are_saved_up_and_the_mean_rate_is_right() -> None:
 
 
 def test_no_rate_means_no_dose_and_keeps_what_was_saved_up() -> None:
-    plan = plan_dose(0.0, 0.2, 0, Rig(), CONFIG)
+    plan = plan_dose(0.0, 0.2, 0, ReactorCalibration(), CONFIG)
     assert (plan.feed_duty, plan.waste_duty, plan.carry_ml) == (0.0, 0.0, 0.2)
 
 
 def test_a_weak_pump_hits_the_feed_limit_and_says_what_is_missing() -> None:
-    plan = plan_dose(0.02, 0.0, 0, Rig(PumpCalibration(flow_ml_s=0.2), PumpCalibration()), CONFIG)
+    plan = plan_dose(0.02, 0.0, 0, ReactorCalibration(PumpCalibration(flow_ml_s=0.2), PumpCalibration()), CONFIG)
     assert plan.feed_duty == 0.05
     assert plan.feed_ml == pytest.approx(0.63)
     assert plan.shortfall_ml == pytest.approx(0.57)
@@ -59,7 +59,7 @@ def test_a_weak_pump_hits_the_feed_limit_and_says_what_is_missing() -> None:
 @pytest.mark.parametrize("rate", [-0.001, np.nan, np.inf])
 def test_a_rate_that_is_none_is_an_error(rate: float) -> None:
     with pytest.raises(ValueError, match="pump rate"):
-        plan_dose(rate, 0.0, 0, Rig(), CONFIG)
+        plan_dose(rate, 0.0, 0, ReactorCalibration(), CONFIG)
 
 
 @settings(max_examples=500)
@@ -72,7 +72,7 @@ def test_a_rate_that_is_none_is_an_error(rate: float) -> None:
     st.floats(-0.2, 0.3),
 )
 def test_no_plan_breaks_a_limit(rate: float, carry: float, doses: int, q1: float, q2: float, bias: float) -> None:
-    rig = Rig(PumpCalibration(q1, bias), PumpCalibration(q2, bias))
+    rig = ReactorCalibration(PumpCalibration(q1, bias), PumpCalibration(q2, bias))
     plan = plan_dose(rate, carry, doses, rig, CONFIG)
     assert 0.0 <= plan.feed_duty <= 0.05
     assert 0.0 <= plan.waste_duty <= 0.5

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,10 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 from experiments.cli import frame
-from hardware.chibio.dosing import PumpCalibration, Rig
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
+from hardware.storage import atomic
 
-__all__ = ["load_rigs", "save"]
+__all__ = ["load_calibrations", "save"]
 
 PARTS = ("feed", "waste", "blank")
 
@@ -28,9 +28,7 @@ def save(folder: Path, reactor: str, part: str, values: Mapping[str, Any]) -> Pa
     path = folder / f"{reactor}_{part}.yaml"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".part")
-        OmegaConf.save(OmegaConf.create(dict(values)), temporary)
-        os.replace(temporary, path)
+        atomic.write(path, OmegaConf.to_yaml(OmegaConf.create(dict(values))), fsync=False)
     except OSError as error:
         raise frame.UserError(f"calibration {path}: {error.strerror or error}; give another folder") from None
     return path
@@ -50,12 +48,12 @@ def _read(path: Path) -> dict[str, Any]:
     return {str(k): v for k, v in content.items()}
 
 
-def load_rigs(folder: Path, reactors: Sequence[str]) -> list[Rig]:
+def load_calibrations(folder: Path, reactors: Sequence[str]) -> list[ReactorCalibration]:
     """Pumps and blanks of `reactors`; what was never measured is nominal, and its blank is nan (the device's own).
 
     Raises: UserError naming the file and what is wrong with it.
     """
-    rigs = []
+    calibrations = []
     for name in reactors:
         feed, waste, blank = (_read(folder / f"{name}_{part}.yaml") for part in PARTS)
         try:
@@ -65,5 +63,5 @@ def load_rigs(folder: Path, reactors: Sequence[str]) -> list[Rig]:
                 raise ValueError(f"blank = {counts}: allowed 3000 to 60000 counts")
         except (TypeError, ValueError) as error:
             raise frame.UserError(f"calibration of {name} in {folder}: {error}") from None
-        rigs.append(Rig(pumps[0], pumps[1], counts))
-    return rigs
+        calibrations.append(ReactorCalibration(pumps[0], pumps[1], counts))
+    return calibrations

@@ -1,4 +1,4 @@
-"""The overflow guard: on with its duty from the first dose to the end of the run, whatever happens in between."""
+"""The overflow pump: on with its duty from the first dose to the end of the run, whatever happens in between."""
 
 import json
 import math
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.overflow_guard import GuardConfig
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import parse_state
 from hardware.chibio.resume import replay
 from hardware.emulator.device import DeviceOptions
@@ -20,52 +20,52 @@ from hardware.errors import DeviceStateError
 from tests.hardware.driver_lab import Bed
 from tests.hardware.script import state
 
-GUARD = GuardConfig("Pump3", 0.5)
+PUMP = OverflowPumpConfig("Pump3", 0.5)
 
 
-def rig(guard: GuardConfig = GUARD, **config: Any) -> Bed:
+def plumbed(pump: OverflowPumpConfig = PUMP, **config: Any) -> Bed:
     """Driver and emulated device with a second waste tube."""
-    options = DeviceOptions(vial=VialConfig(overflow_pump=guard.pump))
-    return Bed(options=options, guard=guard, **config)
+    options = DeviceOptions(vial=VialConfig(overflow_pump=pump.pump))
+    return Bed(options=options, overflow_pump=pump, **config)
 
 
-def guard_posts(bed: Bed) -> list[str]:
+def posts(bed: Bed) -> list[str]:
     return [path for _, path in bed.wire.posts if "/Pump3/" in path]
 
 
 def runs(bed: Bed) -> bool:
-    """What the device holds of the guard's pump is what was configured."""
+    """What the device holds of the overflow pump is what was configured."""
     pump = bed.device.apps["M0"].data["Pump3"]
-    return bool(pump["ON"] == 1 and pump["target"] == GUARD.duty)
+    return bool(pump["ON"] == 1 and pump["target"] == PUMP.duty)
 
 
 # -- configuration ---------------------------------------------------------------------------------------------------
 
 
 def test_there_is_none_by_default() -> None:
-    assert ChiBioConfig().guard == GuardConfig()
-    assert not GuardConfig().pump
+    assert ChiBioConfig().overflow_pump == OverflowPumpConfig()
+    assert not OverflowPumpConfig().pump
     bed = Bed()
     bed.reactors.begin()
     bed.run(3)
     bed.reactors.stop()
-    assert set(guard_posts(bed)) == {"/SetOutputOn/Pump3/0/M0"}
+    assert set(posts(bed)) == {"/SetOutputOn/Pump3/0/M0"}
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"pump": "Pump2"}, "guard.pump = Pump2: allowed Pump3, Pump4, or '' for none"),
-        ({"pump": "3"}, "guard.pump = 3: allowed"),
-        ({"pump": "Pump3", "duty": 1.0}, "guard.duty = 1.0: allowed 0.1 to 0.95"),
-        ({"duty": 0.05}, "guard.duty = 0.05: allowed"),
-        ({"duty": math.nan}, "guard.duty = nan: allowed"),
-        ({"flow_ml_s": 0.0}, "guard.flow_ml_s = 0.0: allowed"),
+        ({"pump": "Pump2"}, "overflow_pump.pump = Pump2: allowed Pump3, Pump4, or '' for none"),
+        ({"pump": "3"}, "overflow_pump.pump = 3: allowed"),
+        ({"pump": "Pump3", "duty": 1.0}, "overflow_pump.duty = 1.0: allowed 0.1 to 0.95"),
+        ({"duty": 0.05}, "overflow_pump.duty = 0.05: allowed"),
+        ({"duty": math.nan}, "overflow_pump.duty = nan: allowed"),
+        ({"flow_ml_s": 0.0}, "overflow_pump.flow_ml_s = 0.0: allowed"),
     ],
 )
 def test_values_out_of_range_name_key_value_and_range(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        GuardConfig(**values)
+        OverflowPumpConfig(**values)
 
 
 @pytest.mark.parametrize(
@@ -73,26 +73,26 @@ def test_values_out_of_range_name_key_value_and_range(values: dict[str, Any], me
 )
 def test_what_a_read_shows_of_it(on: int, target: float, seen: str) -> None:
     found = parse_state(json.dumps(state(Pump3__ON=on, Pump3__target=target)).encode())
-    assert GUARD.astray(found).startswith(seen)
-    assert bool(GUARD.astray(found)) == bool(seen)
-    assert not GuardConfig().astray(found)
+    assert PUMP.wrong(found).startswith(seen)
+    assert bool(PUMP.wrong(found)) == bool(seen)
+    assert not OverflowPumpConfig().wrong(found)
 
 
 # -- a run -----------------------------------------------------------------------------------------------------------
 
 
 def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_the_end() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.reactors.begin()
     assert runs(bed)
     assert [(row["pump"], row["duty"], row["found"]) for row in bed.of("guard")] == [("Pump3", 0.5, "off")]
     bed.run(20)
     assert len(bed.of("intent")) >= 15
-    assert guard_posts(bed) == ["/SetOutputTarget/Pump3/M0/0.500000", "/SetOutputOn/Pump3/1/M0"]
+    assert posts(bed) == ["/SetOutputTarget/Pump3/M0/0.500000", "/SetOutputOn/Pump3/1/M0"]
     starts = [d.start_s for d in bed.device.vials["M0"].doses if d.pump == "Pump3"]
     assert np.diff(starts) == pytest.approx(63.5, abs=0.5)  # the device's own period, never begun anew
     assert bed.of("fault") == []
-    assert not [row for row in bed.of("note") if "guard" in row["note"]]
+    assert not [row for row in bed.of("note") if "overflow pump" in row["note"]]
     bed.reactors.stop()
     assert bed.motors_off()
     assert bed.device.apps["M0"].data["Pump3"]["ON"] == 0
@@ -102,7 +102,7 @@ def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_t
 
 
 def test_a_trip_switches_the_others_off_and_leaves_it_on() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.law.rate = 0.02
     bed.reactors.begin()
     bed.run(3)
@@ -123,13 +123,13 @@ def test_a_trip_switches_the_others_off_and_leaves_it_on() -> None:
     ("path", "found"), [("/SetOutputOn/Pump3/0/M0", "found off"), ("/SetOutputTarget/Pump3/M0/0.1", "a duty of 0.1")]
 )
 def test_another_client_that_changes_it_is_told_of_and_set_right(path: str, found: str) -> None:
-    bed = rig()
+    bed = plumbed()
     bed.reactors.begin()
     bed.run(3)
     bed.device.handle("POST", path)
     bed.run(2)
     assert runs(bed)
-    notes = [row["note"] for row in bed.of("note") if "overflow guard" in row["note"]]
+    notes = [row["note"] for row in bed.of("note") if "overflow pump" in row["note"]]
     assert len(notes) == 1
     assert found in notes[0]
     assert bed.kinds() == set()
@@ -137,7 +137,7 @@ def test_another_client_that_changes_it_is_told_of_and_set_right(path: str, foun
 
 
 def test_a_pump_beside_it_that_someone_switches_on_is_still_found() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.law.rate = 0.0
     bed.reactors.begin()
     bed.run(3)
@@ -150,7 +150,7 @@ def test_a_pump_beside_it_that_someone_switches_on_is_still_found() -> None:
 
 
 def test_one_that_cannot_be_verified_on_is_an_alarm_with_a_remedy_and_no_dose_is_given() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.law.rate = 0.0
     bed.reactors.begin()
     bed.run(3)
@@ -159,8 +159,8 @@ def test_one_that_cannot_be_verified_on_is_an_alarm_with_a_remedy_and_no_dose_is
     bed.law.rate = 0.01
     before, given = bed.samples[0], len(bed.of("intent"))
     bed.run(5)
-    told = [text for step in bed.steps if "guard:" in (text := step.reasons[0] or "")]
-    assert "the overflow guard, Pump3, is off after it was set to 0.5 and on" in told[0]
+    told = [text for step in bed.steps if "overflow_pump:" in (text := step.reasons[0] or "")]
+    assert "the overflow pump, Pump3, is off after it was set to 0.5 and on" in told[0]
     assert "no dose" in told[0]
     assert "restart the device" in told[0]
     assert len(bed.of("intent")) == given
@@ -168,12 +168,12 @@ def test_one_that_cannot_be_verified_on_is_an_alarm_with_a_remedy_and_no_dose_is
     bed.fault("lying", 0)
     bed.run(3)
     assert runs(bed)
-    assert bed.reactors.stations[0].fault is None
+    assert bed.reactors.stations[0].book.fault is None
     assert len(bed.of("intent")) > given
 
 
 def test_a_run_does_not_begin_without_it_and_leaves_no_pump_on() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.device.handle("POST", "/Experiment/1/M0")
     bed.clock.sleep(90.0)
     inner = bed.wire.inner
@@ -191,7 +191,7 @@ def test_a_run_does_not_begin_without_it_and_leaves_no_pump_on() -> None:
 
 def test_a_start_that_fails_at_one_reactor_leaves_no_guard_on_at_another() -> None:
     options = DeviceOptions(vial=VialConfig(overflow_pump="Pump3"))
-    bed = Bed(("M0", "M1"), options=options, guard=GUARD)
+    bed = Bed(("M0", "M1"), options=options, overflow_pump=PUMP)
     bed.device.handle("POST", "/SetOutputOn/Zigzag/1/M1")
     with pytest.raises(DeviceStateError, match="Zigzag"):
         bed.reactors.begin()
@@ -200,7 +200,7 @@ def test_a_start_that_fails_at_one_reactor_leaves_no_guard_on_at_another() -> No
 
 
 def test_a_start_that_fails_and_cannot_switch_it_off_again_says_so() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.device.handle("POST", "/Experiment/1/M0")
     bed.clock.sleep(90.0)
     inner = bed.wire.inner
@@ -213,23 +213,23 @@ def test_a_start_that_fails_and_cannot_switch_it_off_again_says_so() -> None:
         return reply
 
     inner.post = dying  # type: ignore[method-assign]
-    with pytest.raises(DeviceStateError, match="reset; overflow guard not verified off: M0: .*reset"):
+    with pytest.raises(DeviceStateError, match="reset; overflow pump not verified off: M0: .*reset"):
         bed.reactors.begin()
 
 
 def test_a_device_that_lost_its_memory_gets_it_back() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.reactors.begin()
     bed.run(5)
     bed.fault("worker_wipe")
     bed.run(4)
     assert "restarted" in bed.kinds()
     assert runs(bed)
-    assert bed.reactors.stations[0].fault is None
+    assert bed.reactors.stations[0].book.fault is None
 
 
 def test_a_stopped_experiment_keeps_it() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.reactors.begin()
     bed.run(3)
     bed.device.handle("POST", "/Experiment/0/M0")
@@ -239,13 +239,13 @@ def test_a_stopped_experiment_keeps_it() -> None:
 
 
 def test_a_reactor_handed_over_to_its_own_regulation_keeps_it_beyond_the_end_of_the_run() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.reactors.begin()
     bed.run(5)
     assert bed.reactors.regulate(np.array([True]), np.array([0.5])) == []
     bed.run(10)
     assert runs(bed)
-    assert bed.reactors.stations[0].fault is None
+    assert bed.reactors.stations[0].book.fault is None
     bed.reactors.stop()
     bed.clock.sleep(600.0)
     assert runs(bed)
@@ -263,13 +263,13 @@ def resume(bed: Bed, dead_s: float) -> None:
 
 
 def test_a_resumed_run_finds_it_on_and_does_not_interrupt_it() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.reactors.begin()
     bed.run(3)
-    before = guard_posts(bed)
+    before = posts(bed)
     resume(bed, 500.0)
     bed.run(5)
-    assert guard_posts(bed) == before
+    assert posts(bed) == before
     assert runs(bed)
     starts = [d.start_s for d in bed.device.vials["M0"].doses if d.pump == "Pump3"]
     assert np.diff(starts) == pytest.approx(63.5, abs=0.5)
@@ -278,39 +278,39 @@ def test_a_resumed_run_finds_it_on_and_does_not_interrupt_it() -> None:
 
 
 def test_a_resumed_run_tells_that_it_was_off_meanwhile() -> None:
-    bed = rig()
+    bed = plumbed()
     bed.reactors.begin()
     bed.run(3)
     for k in (1, 2, 3, 4):  # what the board agent does when nobody asks for two minutes
         bed.device.handle("POST", f"/SetOutputOn/Pump{k}/0/M0")
     resume(bed, 300.0)
     assert runs(bed)
-    assert ["the overflow guard was found off" in row["note"] for row in bed.of("note")][-1]
+    assert ["the overflow pump was found off" in row["note"] for row in bed.of("note")][-1]
 
 
 # -- what it prevents ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("guard", "peak"), [(GuardConfig("Pump4", 0.1), 23.5), (GuardConfig(), 30.0)])
-def test_a_blocked_waste_tube_at_the_largest_feed(guard: GuardConfig, peak: float) -> None:
-    bed = rig(guard)
+@pytest.mark.parametrize(("pump", "peak"), [(OverflowPumpConfig("Pump4", 0.1), 23.5), (OverflowPumpConfig(), 30.0)])
+def test_a_blocked_waste_tube_at_the_largest_feed(pump: OverflowPumpConfig, peak: float) -> None:
+    bed = plumbed(pump)
     bed.law.rate = 0.02
     bed.reactors.begin()
     bed.fault("waste_gain_factor", 0.0)
     bed.run(30)
     assert bed.truth()["peak_ml"] == pytest.approx(peak, abs=1.0)
-    assert bed.truth()["overflowed"] == (not guard.pump)
+    assert bed.truth()["overflowed"] == (not pump.pump)
 
 
 @pytest.mark.parametrize(("flow_ml_s", "overflows"), [(1.0, True), (1.2, False)])
-def test_a_feed_motor_stuck_at_full_power_needs_a_guard_that_is_the_stronger_pump(
+def test_a_feed_motor_stuck_at_full_power_needs_one_that_is_the_stronger_pump(
     flow_ml_s: float, overflows: bool
 ) -> None:
     """0.95 of the time at the feed pump's own 1 mL/s is less than the feed: the headroom is gone in minutes."""
-    guard = GuardConfig("Pump3", 0.95, flow_ml_s)
+    pump = OverflowPumpConfig("Pump3", 0.95, flow_ml_s)
     plant = plant_preset("healthy")
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=flow_ml_s))
-    bed = Bed(options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), guard=guard)
+    bed = Bed(options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), overflow_pump=pump)
     bed.reactors.begin()
     bed.run(3)
     bed.fault("feed_stuck_open")

@@ -9,7 +9,7 @@ import pytest
 
 from envs.scenario import Scenario
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.dosing import Rig
+from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError, RecordingError
 from hardware.reactor import Command
@@ -189,7 +189,7 @@ def test_a_running_experiment_is_adopted_not_started_again() -> None:
 
 def test_a_start_whose_answer_is_lost_is_not_repeated_before_the_state_was_read() -> None:
     bed = Bed()
-    bed.reactors.stations[0].unit.read()
+    bed.reactors.stations[0].connection.read()
     inner = bed.wire.inner
     real = inner.post
 
@@ -281,7 +281,7 @@ def test_zigzag_is_refused_with_the_remedy() -> None:
 
 def test_a_stored_blank_replaces_the_devices() -> None:
     bed = Bed(blanked=False)
-    rig = Rig(SOUND.feed, SOUND.waste, blank=bed.device.vials["M0"].blank)
+    rig = ReactorCalibration(SOUND.feed, SOUND.waste, blank=bed.device.vials["M0"].blank)
     bed.client([rig])
     bed.reactors.begin()
     bed.run(3)
@@ -417,7 +417,7 @@ def test_a_pump_that_someone_switches_on_is_told_and_switched_off() -> None:
     assert "pump" in bed.kinds()
     assert len(doses(bed)) <= 2
     assert bed.motors_off()
-    assert bed.reactors.stations[0].fault is None
+    assert bed.reactors.stations[0].book.fault is None
 
 
 def test_no_dose_when_the_device_lies() -> None:
@@ -457,7 +457,7 @@ def test_a_bus_that_hangs_while_pumping_is_ended_within_a_minute() -> None:
     assert max(length for _, length in doses(bed)) < 45.0
     assert bed.device.supervisor.restarts == 1
     bed.run(5)
-    assert bed.reactors.stations[0].fault is None
+    assert bed.reactors.stations[0].book.fault is None
     assert bed.truth()["peak_ml"] < 25.0
 
 
@@ -575,7 +575,7 @@ def test_handing_over_leaves_a_culture_that_regulates_itself() -> None:
     data = bed.device.apps["M0"].data
     assert data["OD"]["ON"] == 1
     assert bed.truth()["od"] == pytest.approx(0.5, abs=0.1)
-    assert bed.reactors.stations[0].fault is None
+    assert bed.reactors.stations[0].book.fault is None
 
 
 # -- end and resume --------------------------------------------------------------------------------------------------

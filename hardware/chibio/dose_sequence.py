@@ -1,0 +1,200 @@
+"""One dose from intent to verified off, what is carried to the next, and what the device may have repeated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hardware.chibio.agenda import Agenda, Task
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import Connection
+from hardware.chibio.diagnosis import fault_of
+from hardware.chibio.dosing import DosePlan, ReactorCalibration, plan_dose
+from hardware.chibio.logbook import Logbook
+from hardware.chibio.protocol import FEED, PERIOD_S, WASTE, DeviceState
+from hardware.chibio.resume import ReactorHistory
+from hardware.clock import Clock
+from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
+
+__all__ = ["DoseSequence"]
+
+DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
+WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: fluid must not come before it is taken off
+
+
+class DoseSequence:
+    """The doses of one reactor, one at a time, at most one per sample.
+
+    A dose is planned, written down, set, read back and switched on; its ends are tasks on the agenda. A pump that is ON
+    repeats its dose every 63 s until it is switched off, so a late end means that more was dosed than planned.
+
+    Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
+      not be verified off; repeated_ml, repeated_waste_ml, what the device may have dosed again, not booked yet.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        calibration: ReactorCalibration,
+        config: ChiBioConfig,
+        agenda: Agenda,
+        clock: Clock,
+        book: Logbook,
+    ) -> None:
+        self._connection, self._calibration, self._config = connection, calibration, config
+        self._agenda, self._clock, self._book = agenda, clock, book
+        self.running = False
+        self.stuck = ""
+        self.repeated_ml = self.repeated_waste_ml = 0.0
+        self._acted: tuple[float, int] | None = None  # newest sample a dose was decided for
+        self._carry_ml, self._doses = 0.0, 0
+
+    def restore(self, history: ReactorHistory, state: DeviceState) -> None:
+        """Continue as an earlier life of the run left it; the pumps were verified off after `state` was read.
+
+        The device repeats a dose that was left open every 63 s, whatever becomes of the program.
+        """
+        self._acted, self._carry_ml, self._doses = history.sample, history.carry_ml, history.doses
+        if not history.open:
+            return
+        times = max(math.floor((self._book.elapsed() - history.on_s) / PERIOD_S), 0)
+        self.repeated_ml = history.feed_ml * times * state.pumps_on[0]
+        self.repeated_waste_ml = history.waste_ml * times * state.pumps_on[1]
+        followed = f"{self.repeated_ml:.2f} mL may have followed"
+        if times > 0 and not state.pumps_on[0]:
+            followed = "repeated every 63 s until something else switched the pump off: unknown, not booked"
+        self._book.tell(f"a dose of {history.feed_ml:.2f} mL was left open; {followed}")
+        self._book.log("dose_end", verified_off=True, repeated_ml=self.repeated_ml)
+
+    def forget_sample(self) -> None:
+        """The device's records begin anew: no dose was decided for any sample in them."""
+        self._acted = None
+
+    def begin(self, rate: float, sample: tuple[float, int] | None, appeared_s: float, refusal: str) -> DosePlan:
+        """Begin the dose for `sample`; returns what was, or may have been, begun.
+
+        Nothing is begun, and a note says why, if that sample was acted on already, is too old for a dose to end
+        before the next measurement, or the reactor may not be dosed at all.
+
+        Args:
+          rate: mean feed rate, mL/s.
+          sample: its key, None if there is none; appeared_s: clock time at which it appeared, -inf if unknown.
+          refusal: why the reactor may not be dosed, "" if it may.
+        Raises: ValueError for a rate that is negative or not finite; what the intent's log raises.
+        """
+        plan = plan_dose(rate, self._carry_ml, self._doses, self._calibration, self._config.dosing)
+        if reason := refusal or self._obstacle(sample, appeared_s, plan.waste_s):
+            self._book.tell(f"no dose: {reason}")
+            return DosePlan()
+        self._acted, self._carry_ml = sample, plan.carry_ml
+        self._doses += plan.feed_duty > 0.0
+        if plan.carry_ml > 0.0 and rate > 0.0:
+            self._book.tell(f"{plan.carry_ml:.3f} mL is less than the pump can deliver: kept for the next dose")
+        if plan.shortfall_ml > 0.0:
+            self._book.tell(f"the dose was cut by {plan.shortfall_ml:.3f} mL to the feed limit")
+        self._intend(plan, rate)
+        return plan if plan.feed_duty > 0.0 and self._switch_on(plan, appeared_s) else DosePlan()
+
+    def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> str:
+        """Why no dose may be given for this sample now; "" if nothing stands against it."""
+        if sample is None or sample == self._acted:
+            return "no new sample"
+        if self.running:
+            return "the previous dose has not ended"
+        past = self._clock.now() - appeared_s
+        if math.isinf(past):
+            return "its sample is of unknown age, the next one is waited for"
+        if past + waste_s > self._config.window_s:
+            return f"{past:.0f} s after its sample appeared it would not end before the next measurement"
+        return ""
+
+    def _intend(self, plan: DosePlan, rate: float) -> None:
+        """Write down what is about to be done. Only then may it be done: a resumed run acts once per sample."""
+        self._book.intend(
+            sample=self._acted,
+            rate=rate,
+            feed_duty=plan.feed_duty,
+            waste_duty=plan.waste_duty,
+            feed_ml=plan.feed_ml,
+            waste_ml=plan.waste_ml,
+            carry_ml=plan.carry_ml,
+            doses=self._doses,
+            on_s=self._book.elapsed(),
+        )
+
+    def _switch_on(self, plan: DosePlan, appeared_s: float) -> bool:
+        """Targets, read back, then on; True if the pumps run or may run. The end is planned before anything is on."""
+        try:
+            self._set_targets(plan, appeared_s)
+        except ReactorError as error:
+            self._book.tell(f"no dose: {error}")
+            self._agenda.add(self._finish(DosePlan()))
+            return False
+        self.running = True
+        self._agenda.add(self._feed_off(), WASTE_FIRST_S + plan.feed_s + DOSE_OFF_S)
+        self._agenda.add(self._finish(plan), plan.waste_s + DOSE_OFF_S)
+        try:
+            self._connection.switch(WASTE, True)
+            self._clock.sleep(WASTE_FIRST_S)
+            self._connection.switch(FEED, True)
+        except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
+            self._book.tell(f"the answer to a pump command was lost, counted as dosed: {error}")
+        return True
+
+    def _set_targets(self, plan: DosePlan, appeared_s: float) -> None:
+        """Set both duties and read them back. Raises: ReactorError if the device is not ready for this dose in time."""
+        connection = self._connection
+        connection.target(WASTE, plan.waste_duty)
+        connection.target(FEED, plan.feed_duty)
+        state = connection.read()
+        as_set = np.allclose(state.pump_targets[:2], (plan.feed_duty, plan.waste_duty), rtol=0.0, atol=1e-5)
+        on = self._config.overflow_pump.others_on(state)
+        if not as_set or on or not state.running or state.regulating:
+            raise DeviceStateError(f"targets {state.pump_targets[:2]}, pumps on: {on or 'none'}: not as set")
+        past = self._clock.now() - appeared_s
+        if past + plan.waste_s > self._config.window_s:
+            raise DeviceStateError(f"the device answers too slowly ({past:.0f} s after the sample)")
+
+    def _feed_off(self) -> Task:
+        """Task: feed pump off, again and again until the device has heard it."""
+        while self.running:
+            try:
+                self._connection.switch(FEED, False)
+                return
+            except (LinkError, ProtocolError) as error:
+                self._book.report(fault_of(error, present=True))
+            except ReactorError:
+                pass
+            yield min(self._config.retry_s, 2.0)
+
+    def _finish(self, plan: DosePlan) -> Task:
+        """Task: the pumps off, verified, however long it takes; then the dose is on record as ended."""
+        due = self._clock.now()  # the moment the dose should be over
+        self.running = True
+        for refusals in range(10**9):
+            pause = min(self._config.retry_s, 2.0)
+            try:
+                self._connection.pumps_off(1, self._config.overflow_pump.others)
+                break
+            except (LinkError, ProtocolError) as error:
+                self._book.report(fault_of(error, present=True))
+            except DeviceStateError as error:
+                if self._connection.state is None:
+                    pause = 30.0  # absent or exchanged: nothing may be sent to it
+                else:
+                    self.stuck = str(error)
+                    if refusals == 3:
+                        self._connection.escalate()
+            yield pause
+        self.stuck = ""
+        self._end(plan, math.floor((self._clock.now() - due) / PERIOD_S))
+
+    def _end(self, plan: DosePlan, repeats: int) -> None:
+        """The pumps are off; the device may have repeated the dose so often before."""
+        if repeats > 0 and plan.feed_ml > 0.0:
+            self.repeated_ml += repeats * plan.feed_ml
+            self.repeated_waste_ml += repeats * plan.waste_ml
+            self._book.tell(f"the pumps were verified off late: the dose may have been repeated {repeats} times")
+        self.running = False
+        self._book.log("dose_end", verified_off=True, repeated_ml=repeats * plan.feed_ml)

@@ -1,0 +1,109 @@
+"""The overflow pump: a second waste tube a little above the first, on a spare pump that the device runs by itself.
+
+It sucks air unless the level rises, so it may run all the time: `target` = duty and ON, and the pump repeats that every
+63 s without a client (docs/device.md, Pumps), whatever becomes of doses, trips and this program. The experiment cycle
+does not look at Pump3 and Pump4 (section 3); a start or end of an experiment and a restart of the device switch them
+off. Nothing relies on it: the interlock's ledger does not know of it. Plumbing: docs/chibio.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hardware.chibio.connection import Connection
+from hardware.chibio.logbook import Logbook
+from hardware.chibio.protocol import MAX_OVERFLOW_DUTY, PUMPS, SPARE, DeviceState
+from hardware.chibio.resume import ReactorHistory
+
+__all__ = ["OverflowPump", "OverflowPumpConfig"]
+
+MIN_DUTY = 0.1  # with a pump of 1 mL/s twice as much as the feed pump may ever be told to deliver
+
+
+@dataclass(frozen=True)
+class OverflowPumpConfig:
+    """Values of `backend.overflow_pump`.
+
+    pump: Pump3 or Pump4; "" = there is none.
+    duty: share of every 63 s in which it runs, 0.1 to 0.95.
+    flow_ml_s: its flow at full power, mL/s, as weighed; only for what the preflight says of it.
+
+    Raises: ValueError naming key, value and allowed range.
+    """
+
+    pump: str = ""
+    duty: float = 0.1
+    flow_ml_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.pump not in ("", *SPARE):
+            raise ValueError(f"overflow_pump.pump = {self.pump}: allowed {', '.join(SPARE)}, or '' for none")
+        for key, low, high in (("duty", MIN_DUTY, MAX_OVERFLOW_DUTY), ("flow_ml_s", 0.05, 5.0)):
+            if not low <= getattr(self, key) <= high:
+                raise ValueError(f"overflow_pump.{key} = {getattr(self, key)}: allowed {low:g} to {high:g}")
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """All pumps but this one: what is switched off wherever a run goes on."""
+        return tuple(p for p in PUMPS if p != self.pump)
+
+    def others_on(self, state: DeviceState) -> str:
+        """Names of the other pumps that are on."""
+        return ", ".join(p for p in state.running_pumps if p in self.others)
+
+    @property
+    def removes_ml_s(self) -> float:
+        """Mean flow it can take off above its tube, mL/s; 0 if there is none."""
+        return self.duty * self.flow_ml_s if self.pump else 0.0
+
+    def wrong(self, state: DeviceState) -> str:
+        """What a read shows of it that is not as it must be; "" if all is well, or there is none."""
+        if not self.pump:
+            return ""
+        k = PUMPS.index(self.pump)
+        if not state.pumps_on[k]:
+            return "off"
+        if abs(state.pump_targets[k] - self.duty) <= 1e-5:  # not nan
+            return ""
+        return f"at a duty of {state.pump_targets[k]:g}"
+
+
+class OverflowPump:
+    """The overflow pump of one reactor: looked at with every read, put right, read back.
+
+    Attributes: trouble, why it could not be verified on, "" if it was; was_on, whether it was known to be on; tried,
+      whether it may have been switched on here.
+    """
+
+    def __init__(self, connection: Connection, config: OverflowPumpConfig, book: Logbook) -> None:
+        self.trouble, self.was_on, self.tried = "", False, False
+        self._connection, self._config, self._book = connection, config, book
+
+    def restore(self, history: ReactorHistory) -> None:
+        """Continue as an earlier life of the run left it."""
+        self.was_on = history.overflow_pump_on
+
+    def keep_on(self, state: DeviceState) -> DeviceState:
+        """Have it on with its duty; the reactor's state then. What cannot be had becomes `trouble`.
+
+        Args: state: just read. Raises: as `Connection.post` and `Connection.read`.
+        """
+        config, connection = self._config, self._connection
+        if not (found := config.wrong(state)):
+            self.trouble, self.was_on = "", self.was_on or bool(config.pump)
+            return state
+        self.tried = True
+        if found != "off" or state.pump_targets[PUMPS.index(config.pump)] != config.duty:
+            connection.target(config.pump, config.duty)
+        if found == "off":
+            connection.switch(config.pump, True)
+        state = connection.read()
+        if still := config.wrong(state):
+            self.trouble = f"the overflow pump, {config.pump}, is {still} after it was set to {config.duty:g} and on"
+            return state
+        known, self.trouble, self.was_on = self.was_on, "", True
+        # "guard" is the journal's word, kept so that journals of earlier versions can be resumed
+        self._book.log("guard", pump=config.pump, duty=config.duty, found=found)
+        if known:
+            self._book.tell(f"the overflow pump was found {found} and put right: {config.pump} at {config.duty:g}")
+        return state

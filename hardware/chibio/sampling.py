@@ -1,0 +1,106 @@
+"""What a sample of the device is: whether it is new, when it appeared, and when to look for the next one."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.protocol import DeviceState
+from hardware.clock import Clock
+
+__all__ = ["Sampling"]
+
+CYCLE_S = 60.07  # median of 3275 real cycles (docs/device.md, Cycle)
+FIRST_SAMPLE_S = 13.5  # from a cycle's start until its sample is on record
+
+
+class Sampling:
+    """The newest sample of one reactor.
+
+    The device does not say when a sample appeared, only the time at which its cycle began, on a clock of its own. A
+    sample that was waited for appeared when it was seen. The smallest offset between the two clocks among such samples
+    shows how late any other one was seen.
+
+    Attributes: key, (record time, cycles) of the newest sample, None before the first; od, temperature, raw, time_s
+      (run time) of it, nan before the first; arrived_s, the clock time at which it was seen; late_s, how long after it
+      appeared that was; next_poll, the clock time of the next look.
+    """
+
+    def __init__(self, config: ChiBioConfig, clock: Clock) -> None:
+        self._config, self._clock = config, clock
+        self.key: tuple[float, int] | None = None
+        self.od = self.temperature = self.raw = self.time_s = math.nan
+        self.arrived_s = self.next_poll = clock.now()
+        self.late_s = 0.0
+        self._offsets: deque[float] = deque(maxlen=3)  # arrival minus the device's own time, samples seen at once
+        self._looked = False  # the last look found nothing new, so the next sample will be seen when it appears
+
+    @property
+    def appeared_s(self) -> float:
+        """Clock time at which the newest sample appeared; -inf if it was there already at the first look."""
+        return self.arrived_s - self.late_s
+
+    def pass_over(self, state: DeviceState) -> None:
+        """Deliver the next new sample only: the one on record is of unknown age."""
+        if math.isfinite(state.sample_s):
+            self.key = (state.sample_s, state.cycles)
+        self._offsets.clear()
+
+    def expect_first(self) -> None:
+        """The device's own time begins now, and so does its first cycle."""
+        self._offsets.append(self._clock.now() + FIRST_SAMPLE_S)
+
+    def wait_from_now(self) -> None:
+        """Count the age of the newest sample from now on, and look at once."""
+        self.arrived_s = self.next_poll = self._clock.now()
+
+    def forget(self) -> None:
+        """The device's records begin anew: any sample is a new one."""
+        self.key = None
+
+    def retry_later(self) -> None:
+        """Plan the look after one that fails."""
+        self.next_poll = self._clock.now() + self._config.retry_s
+
+    def look(self, state: DeviceState, now: float) -> bool:
+        """Whether `state` brings a new sample; plans the look after one that brings none.
+
+        `cycles` counts cycles begun: a sample that was seen late may carry the number of the next one already.
+        """
+        self.next_poll = now + self._config.poll_s
+        return math.isfinite(state.sample_s) and (
+            self.key is None or (state.sample_s != self.key[0] and state.cycles >= self.key[1])
+        )
+
+    def not_taken(self, is_new: bool) -> None:
+        """A look ended without a sample to act on: there was none, or a new one that a fault forbids to use."""
+        self._looked = not is_new
+
+    def take(self, state: DeviceState, now: float, time_s: float) -> str:
+        """Make a new sample the newest one; returns what it shows of the board's clock, "" if nothing.
+
+        Args: now: clock time at which it was seen. time_s: run time then.
+        """
+        self.key = (state.sample_s, state.cycles)
+        self.arrived_s, self.time_s = now, time_s
+        self.od, self.temperature, self.raw = state.sample_od, state.sample_temperature, state.raw
+        note = self._measure_lateness(now - state.sample_s)
+        self.next_poll = now + CYCLE_S - (2.5 if self._looked else 20.0)
+        self._looked = False
+        return note
+
+    def _measure_lateness(self, offset: float) -> str:
+        """How much later than possible this sample was seen: its offset against the smallest of recent ones.
+
+        Only samples that were waited for are a measure, so after three of them a step of the board's clock, which
+        looks the same, is forgotten.
+        """
+        note = ""
+        if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:
+            note = f"the board's clock moved by {min(self._offsets) - offset:.0f} s against this computer's"
+            self._offsets.clear()
+        if self._looked or (self._offsets and offset < min(self._offsets)):
+            self._offsets.append(offset)
+        self.late_s = offset - min(self._offsets) if self._offsets else math.inf
+        return note

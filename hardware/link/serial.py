@@ -1,0 +1,182 @@
+"""The serial line to the board agent, which carries the requests to the device's server."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import time
+from typing import TYPE_CHECKING, Any
+
+from hardware.errors import LinkError, ProtocolError
+from hardware.link.frames import MAX_REQUEST, decode_header, encode_request
+from hardware.link.transport import MAX_BODY, Reply, TransportConfig
+
+if TYPE_CHECKING:
+    import serial
+
+__all__ = ["SerialTransport"]
+
+
+class SerialTransport:
+    """Framed requests over a serial line to `board_agent.py`; a line that was unplugged is reopened on the next call.
+
+    The very same request line is repeated when its reply is lost or damaged: the agent answers a repeated ID from
+    memory, so nothing is carried out twice. Opened exclusively, so that no second client can speak in between.
+
+    Args:
+      port: serial device or pyserial URL.
+      speed: device seconds per real second.
+      config: line rate and time-outs.
+      attempts: times one request line is sent before the link counts as lost.
+    Raises: LinkError when the line cannot be opened or nothing comes back, ProtocolError when only garbage does.
+    """
+
+    def __init__(self, port: str, speed: float = 1.0, config: TransportConfig | None = None, attempts: int = 5) -> None:
+        self.port = port
+        self._config = config or TransportConfig(kind="serial")
+        self._speed = speed
+        self._attempts = attempts
+        self._line: serial.Serial | None = None
+        self._id = 0
+        self.hello: dict[str, Any] = {}
+        self._open()
+
+    def get(self, path: str) -> Reply:
+        """GET `path`; /getSysdata/ comes reduced (see `board_agent.py`). Raises: LinkError, ProtocolError."""
+        return self._request("GET", path)
+
+    def post(self, path: str) -> Reply:
+        """POST `path`. Raises: LinkError (the device may have acted), ProtocolError."""
+        return self._request("POST", path)
+
+    def disarm(self) -> None:
+        """BYE to the agent, whose switch then rests until the next request."""
+        if self._line is not None:
+            with contextlib.suppress(LinkError, ProtocolError):
+                self._exchange("BYE", "/")
+
+    def close(self) -> None:
+        """Release the port; the agent's switch stays as it is. Idempotent."""
+        self._drop()
+
+    def _open(self) -> None:
+        import serial  # only users of the serial link need pyserial
+
+        connect_s = self._config.timeout(self._config.connect_s, self._speed)
+        try:
+            self._line = serial.serial_for_url(
+                self.port, baudrate=self._config.baud, timeout=connect_s, write_timeout=connect_s, exclusive=True
+            )
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise LinkError(
+                f"serial port {self.port}: {error}; check cable and port name, close other programs"
+            ) from error
+        self._id = random.SystemRandom().randrange(1, 2**31)  # so that no request repeats an ID of an earlier session
+        try:
+            self.hello = self._parse_hello(self._exchange("HELLO", "/"))
+        except BaseException:
+            self._drop()
+            raise
+
+    @staticmethod
+    def _parse_hello(reply: Reply) -> dict[str, Any]:
+        try:
+            hello = json.loads(reply.body)
+            protocol = hello["protocol"]
+        except (ValueError, RecursionError, KeyError, TypeError) as error:
+            raise ProtocolError(f"the board agent's greeting is not readable: {reply.body[:80]!r}") from error
+        if protocol != 1:
+            raise ProtocolError(f"the board agent speaks protocol {protocol}, this driver 1: install the same version")
+        return dict(hello)
+
+    def _drop(self) -> None:
+        if self._line is not None:
+            with contextlib.suppress(OSError):  # the device may be gone already
+                self._line.close()
+            self._line = None
+
+    def _request(self, method: str, path: str) -> Reply:
+        if self._line is None:
+            self._open()
+        reply = self._exchange(method, path)
+        if reply.status >= 100:
+            return reply
+        text = reply.body[:120].decode("ascii", "replace")
+        if reply.status in (10, 11):
+            raise LinkError(f"{method} {path}: the board agent cannot reach the device ({text})")
+        raise ProtocolError(f"{method} {path}: the board agent reports status {reply.status} ({text})")
+
+    def _exchange(self, method: str, path: str) -> Reply:
+        """One request, repeated under the same ID until a whole reply came. Raises: LinkError, ProtocolError."""
+        assert self._line is not None
+        self._id = self._id % 4294967295 + 1
+        frame = encode_request(self._id, method, path)
+        if len(frame) > MAX_REQUEST:
+            raise ProtocolError(f"{method} {path[:40]}...: request of {len(frame)} bytes, allowed {MAX_REQUEST}")
+        seconds = self._config.timeout(
+            self._config.read_s if method in ("GET", "POST") else self._config.connect_s, self._speed
+        )
+        garbage = 0
+        last_try = time.monotonic() + 1.5 * seconds  # however many replies are damaged, no third full time-out
+        try:
+            for attempt in range(self._attempts):
+                if attempt:
+                    self._line.reset_input_buffer()
+                    if time.monotonic() > last_try:
+                        break
+                self._line.write(frame)
+                reply, seen = self._await(time.monotonic() + seconds)
+                garbage += seen
+                if reply is not None:
+                    return reply
+        except OSError as error:
+            self._drop()
+            raise LinkError(f"serial port {self.port} was lost ({error}); reopened at the next request") from error
+        self._drop()  # a fresh session cannot be answered by stale replies
+        if garbage:
+            raise ProtocolError(
+                f"{method} {path}: {garbage} damaged frames on {self.port}, none whole in {self._attempts} tries"
+            )
+        raise LinkError(f"{method} {path}: no reply on {self.port} in {self._attempts} tries; is the agent running?")
+
+    def _await(self, deadline: float) -> tuple[Reply | None, int]:
+        """The reply to the request in flight, or None when it must be repeated, and how many frames were damaged."""
+        damaged = 0
+        while (line := self._until_newline(deadline)) is not None:
+            header = decode_header(line)
+            if header is None:
+                if b"<" in line:  # perhaps our reply, damaged: asking again is safe and quicker than waiting
+                    return None, damaged + 1
+                continue
+            body = self._read(header.length, deadline) if header.length <= MAX_BODY else None
+            if body is None or not header.fits(body):
+                return None, damaged + 1
+            if header.number == 0:
+                return None, damaged + 1  # the agent could not read the request
+            if header.number == self._id:
+                return Reply(header.status, body), damaged
+        return None, damaged
+
+    def _until_newline(self, deadline: float) -> bytes | None:
+        line = bytearray()
+        while len(line) < 4096:
+            byte = self._read(1, deadline)
+            if byte is None:
+                return None
+            if byte == b"\n":
+                return bytes(line)
+            line += byte
+        return bytes(line)
+
+    def _read(self, count: int, deadline: float) -> bytes | None:
+        """Exactly `count` bytes, or None at the deadline."""
+        assert self._line is not None
+        data = bytearray()
+        while len(data) < count:
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return None
+            self._line.timeout = left
+            data += self._line.read(count - len(data))
+        return bytes(data)

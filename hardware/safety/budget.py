@@ -1,0 +1,108 @@
+"""What may be fed: the ledger of feed and level, and the limits on a proposal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from hardware.reactor import Array, Mask
+from hardware.safety.config import SafetyConfig
+from hardware.safety.finding import Finding
+
+__all__ = ["FeedBudget"]
+
+
+class FeedBudget:
+    """Feed of N reactors over the last minute, the last hour and the run, and the volume it leaves in the vial.
+
+    Attributes: fed_ml, since the run began; volume_ml, in the vial by this ledger; both of shape (N,).
+    """
+
+    def __init__(self, n: int, config: SafetyConfig) -> None:
+        self._config = config
+        self.volume_ml = np.full(n, config.volume_ml)
+        self.fed_ml = np.zeros(n)
+        self._hour = np.zeros((n, 60))  # feed per minute of the hour
+        self._minute = np.full(n, -1.0)  # minute of the newest entry of _hour
+        self._dose_s, self._dose_ml = np.full((n, 4), -math.inf), np.zeros((n, 4))  # the newest four doses
+        self._owed_ml = np.zeros(n)  # allowed but not dosed since the last dose
+        self._unusable = np.zeros(n)  # proposals in a row that were no rate
+
+    def check(self, rate: Array, fresh: Mask, now: float) -> tuple[Array, list[Finding]]:
+        """What of the proposed feed rates passes, mL/s, shape (N,), and what is wrong with them."""
+        c = self._config
+        unusable = fresh & ~(np.isfinite(rate) & (rate >= 0.0))
+        self._unusable = np.where(fresh, np.where(unusable, self._unusable + 1, 0), self._unusable)
+        lost = unusable & (self._unusable >= c.controller_patience)
+        wanted = np.where(fresh & ~unusable, rate, 0.0)
+        undosed = fresh & (self._owed_ml > 2.0 * c.max_rate * c.period_s)
+        in_a_row, owed = self._unusable, self._owed_ml
+        findings = [
+            Finding("controller", unusable & ~lost, lambda i: f"proposed {rate[i]:g} mL/s"),
+            Finding("controller_lost", lost, lambda i: f"{in_a_row[i]:.0f} unusable proposals in a row"),
+            Finding("limit", wanted > c.max_rate * (1.0 + 1e-9), lambda i: f"{wanted[i]:g} mL/s cut to {c.max_rate:g}"),
+            Finding("undosed", undosed, lambda i: f"{owed[i]:.2f} mL were allowed, nothing was dosed"),
+        ]
+        allowed = np.minimum(wanted, c.max_rate)
+        for kind, room in self._room(now).items():
+            asked = allowed * c.period_s
+            over = asked > room + 1e-9
+            texts = [f"{max(r, 0.0):.2f} mL left, {a:.2f} asked" for r, a in zip(room, asked, strict=True)]
+            findings.append(Finding(kind, over, texts.__getitem__))
+            allowed = np.where(over, 0.0, allowed)
+        return allowed, findings
+
+    def _room(self, now: float) -> dict[str, Array]:
+        """mL that may still be fed, by what limits them, shape (N,) each."""
+        c = self._config
+        self._roll(now)
+        recent = np.where(now - self._dose_s < 60.0, self._dose_ml, 0.0).sum(axis=1)
+        left = [c.ml_per_minute - recent, c.ml_per_hour - self._hour.sum(axis=1), c.ml_per_run - self.fed_ml]
+        return {
+            "budget": np.minimum.reduce(left),
+            "bottle": c.bottle_ml - self.fed_ml,
+            "overflow": c.max_volume_ml - self.volume_ml,
+        }
+
+    def _roll(self, now: float) -> None:
+        """Forget feed of more than an hour ago: entry k of the ring belongs to the minutes with k = minute mod 60."""
+        minute = np.floor(now / 60.0)
+        ages = (minute - np.arange(60)) % 60  # how long ago each entry was last current, if the ring is up to date
+        stale = ages[None, :] < np.minimum(minute - self._minute, 60)[:, None]
+        self._hour = np.where(stale, 0.0, self._hour)
+        self._minute = np.full_like(self._minute, minute)
+
+    def grant(self, rate: Array) -> None:
+        """Remember what is allowed now, mL/s, shape (N,), until it is dosed."""
+        self._owed_ml = self._owed_ml + rate * self._config.period_s
+
+    def book(self, feed: Array, waste: Array, now: float) -> None:
+        """Book what was dosed, mL, shape (N,): V <- max(V_tube, V + feed - waste), and V + feed where waste is 0."""
+        self._roll(now)
+        self._hour[:, int(now // 60.0) % 60] += feed
+        self.fed_ml = self.fed_ml + feed
+        dosed = feed > 0.0
+        for mine, new in ((self._dose_s, np.full(len(feed), now)), (self._dose_ml, feed)):
+            mine[dosed] = np.column_stack([mine[dosed, 1:], new[dosed]])
+        self._owed_ml = np.where(dosed, 0.0, self._owed_ml)
+        level = np.maximum(self.volume_ml + feed - waste, self._config.volume_ml)
+        self.volume_ml = np.where(waste > 0.0, level, self.volume_ml + feed)
+
+    def state(self) -> dict[str, Array]:
+        """What it remembers."""
+        return {
+            "volume_ml": self.volume_ml, "fed_ml": self.fed_ml,
+            "_hour": self._hour, "_minute": self._minute,
+            "_dose_s": self._dose_s, "_dose_ml": self._dose_ml,
+            "_owed_ml": self._owed_ml, "_unusable": self._unusable,
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        """Continue as saved; a dose without a time (nan) was never given."""
+        self.volume_ml, self.fed_ml = state["volume_ml"], state["fed_ml"]
+        self._hour, self._minute = state["_hour"], state["_minute"]
+        self._dose_s = np.where(np.isnan(state["_dose_s"]), -math.inf, state["_dose_s"])
+        self._dose_ml = state["_dose_ml"]
+        self._owed_ml, self._unusable = state["_owed_ml"], state["_unusable"]

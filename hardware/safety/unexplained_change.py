@@ -1,0 +1,142 @@
+"""Changes of the OD that growth, doses and noise do not explain: steps at once, drifts by a cumulated sum."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from hardware.reactor import Array, Mask
+from hardware.safety.config import SafetyConfig
+from hardware.safety.finding import Finding
+
+__all__ = ["UnexplainedChange"]
+
+
+class UnexplainedChange:
+    """The newest believed reading of N reactors, what was dosed since, and what of the changes nothing explains.
+
+    A step is no culture's, and is believed only if enough later readings agree with it: a bubble goes, a vial that was
+    moved stays. What is small enough to be growth or dilution goes into three one-sided cumulated sums (CUSUM):
+    `excess` (ln OD rises more than the doses allow), `deficit` (it falls more than they explain) and `futile` (it does
+    not fall at full feed).
+    """
+
+    def __init__(self, n: int, config: SafetyConfig) -> None:
+        self._config = config
+        self._od, self._at = np.full(n, math.nan), np.full(n, math.nan)  # newest believed reading and its minute
+        self._since_ml = np.zeros(n)  # dosed since then
+        self._suspect, self._suspect_at = np.full(n, math.nan), np.full(n, math.nan)  # newest reading after a step
+        self._suspects = np.zeros(n)  # readings in a row that agree with one another, not with the believed one
+        self._mu = np.full(n, config.mu_max)  # slow estimate of the growth rate
+        self._excess, self._deficit, self._futile = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._over = np.zeros((n, 3))  # samples in a row for which each of the three was over its limit
+
+    def check(self, reading: Array, time_s: Array, believed: Mask) -> list[Finding]:
+        """Judge the readings of the `believed` rows.
+
+        Args: reading: OD, shape (N,). time_s: when it was taken, s, shape (N,).
+        """
+        c = self._config
+        od, t, before = np.where(believed, reading, math.nan), time_s / 60.0, self._od
+        first = believed & np.isnan(before)
+        with np.errstate(invalid="ignore"):
+            low, high = self._band(before, t - self._at)
+            step = believed & ~first & ~((od >= low) & (od <= high))
+            near_low, near_high = self._band(self._suspect, t - self._suspect_at)
+            consistent = (od >= near_low) & (od <= near_high)
+            down = od < low
+        suspects = np.where(step, np.where(consistent, self._suspects + 1, 1), np.where(believed, 0, self._suspects))
+        self._suspect, self._suspect_at = np.where(step, od, self._suspect), np.where(step, t, self._suspect_at)
+        settled = step & (suspects >= np.where(down, c.accept_down, c.accept_up))
+        usual = believed & ~step & ~first
+        findings = [
+            Finding("jump", step & ~down, lambda i: f"OD {before[i]:.3f} to {od[i]:.3f}: growth cannot do that"),
+            Finding(
+                "falls", step & down, lambda i: f"OD {before[i]:.3f} to {od[i]:.3f}: no dose explains that",
+                cool=settled & down,
+            ),
+            *self._accumulate(od, t, usual),
+        ]  # fmt: skip
+        taken = first | usual | settled
+        self._excess, self._deficit = (np.where(settled, 0.0, s) for s in (self._excess, self._deficit))
+        self._suspects = np.where(settled, 0, suspects)
+        self._od, self._at = np.where(taken, od, before), np.where(taken, t, self._at)
+        self._since_ml = np.where(taken, 0.0, self._since_ml)
+        return findings
+
+    def _band(self, od: Array, minutes: Array) -> tuple[Array, Array]:
+        """Lowest and highest reading that growth, the doses since the believed one, and noise can make of `od`."""
+        c = self._config
+        tolerance = np.maximum(c.jump, c.jump_fraction * np.abs(od))
+        base = np.maximum(od, 0.0)
+        low = base * np.exp(-c.gain_max * self._since_ml / c.volume_ml - c.death * minutes) - tolerance
+        high = base * np.exp(np.minimum(c.mu_max * minutes, 5.0)) + tolerance
+        return low, high
+
+    def _accumulate(self, od: Array, t: Array, usual: Mask) -> list[Finding]:
+        """Cumulated sums of what ln OD did beyond the best and the worst explanation.
+
+        With d = dosed / volume and x the change of ln OD in dt minutes, a sound pump gives x <= mu dt - gain_min d,
+        and no culture gives x < -gain_max d - death dt. mu is a slow estimate (60 min) plus 0.01 1/min. At full feed
+        (0.8 of the largest rate and more) x must be below -0.004 dt, or the culture outgrows the pump.
+        """
+        c = self._config
+        with np.errstate(invalid="ignore", divide="ignore"):
+            usual = usual & (od > 0.05) & (self._od > 0.05)
+            dt = np.where(usual, np.maximum(t - self._at, 1e-3), 1.0)
+            x = np.where(usual, np.log(np.where(usual, od / self._od, 1.0)), 0.0)
+        d = self._since_ml / c.volume_ml
+        cap = np.minimum(c.mu_max, self._mu + 0.01)
+        rise = np.where(d > 0.0, x - cap * dt + c.gain_min * d, np.minimum(x - c.mu_max * dt, 0.0))
+        fall = -x - c.gain_max * d - c.death * dt
+        full = d / dt >= 0.8 * c.max_rate * 60.0 / c.volume_ml
+        excess = np.where(usual, np.maximum(self._excess + rise, 0.0), self._excess)
+        deficit = np.where(usual, np.maximum(self._deficit + fall, 0.0), self._deficit)
+        futile = np.where(full, np.maximum(self._futile + x + 0.004 * dt, 0.0), 0.0)
+        futile = np.where(usual, futile, self._futile)
+        weight = np.where(usual, 1.0 - np.exp(-dt / 60.0), 0.0)
+        self._mu = self._mu + weight * (np.clip((x + d) / dt, 0.0, c.mu_max) - self._mu)
+        level = np.where(usual, od, 1.0)
+        limit = c.drift + 6.0 * np.hypot(c.noise_od, c.noise_fraction * level) / level
+        sums = np.stack([excess, deficit, futile], axis=1)
+        over = np.where(sums > limit[:, None], self._over + 1, 0)  # an outlier is over it once only
+        self._over = np.where(usual[:, None], over, self._over)
+        rising, falling, futile_now = (self._over >= c.persistence).T & usual
+        helpless = futile_now & ~rising
+        self._excess, self._deficit = np.where(rising, 0.0, excess), np.where(falling, 0.0, deficit)
+        self._futile = np.where(helpless | rising, 0.0, futile)
+        return [
+            Finding(
+                "no_dilution", rising, lambda i: f"the pump ran, ln OD is {excess[i]:.2f} above what it must be",
+                cool=rising,
+            ),
+            Finding(
+                "falls", falling, lambda i: f"ln OD is {deficit[i]:.2f} below what growth and doses explain",
+                cool=falling,
+            ),
+            Finding("cannot_hold", helpless, lambda i: f"at full feed OD {od[i]:.3f} does not fall"),
+        ]  # fmt: skip
+
+    def dosed(self, feed_ml: Array) -> None:
+        """Book what was dosed, mL, shape (N,)."""
+        self._since_ml = self._since_ml + feed_ml
+
+    def state(self) -> dict[str, Array]:
+        """What it remembers."""
+        return {
+            "_od": self._od, "_at": self._at, "_since_ml": self._since_ml,
+            "_suspect": self._suspect, "_suspect_at": self._suspect_at,
+            "_suspects": self._suspects, "_mu": self._mu,
+            "_excess": self._excess, "_deficit": self._deficit, "_futile": self._futile,
+            "_over": self._over,
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        """Continue as saved."""
+        self._od, self._at, self._since_ml = state["_od"], state["_at"], state["_since_ml"]
+        self._suspect, self._suspect_at = state["_suspect"], state["_suspect_at"]
+        self._suspects, self._mu = state["_suspects"], state["_mu"]
+        self._excess, self._deficit, self._futile = state["_excess"], state["_deficit"], state["_futile"]
+        self._over = state["_over"]

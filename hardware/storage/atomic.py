@@ -1,0 +1,37 @@
+"""A file that is either whole or as it was before."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+__all__ = ["sync_folder", "write"]
+
+
+def write(path: Path, data: bytes | str, fsync: bool = True) -> None:
+    """Replace the content of `path` in one step: nobody ever reads half a file. Text is written as UTF-8.
+
+    The data go into `path` + ".part", which then takes the place of `path`.
+
+    Args:
+      fsync: file and folder are on the disk when this returns; False leaves that to the operating system.
+    Raises: OSError where the disk refuses; `path` is then as it was.
+    """
+    temporary = path.with_name(path.name + ".part")
+    with open(temporary, "wb") as f:
+        f.write(data.encode() if isinstance(data, str) else data)
+        if fsync:
+            f.flush()
+            os.fsync(f.fileno())
+    os.replace(temporary, path)
+    if fsync:
+        sync_folder(path.parent)
+
+
+def sync_folder(path: Path) -> None:
+    """Put the names in a folder on the disk: a new file can be found after a power cut only then."""
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

@@ -1,0 +1,70 @@
+"""What a state that was read means: one list of checks, the gravest first, without a device."""
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.diagnosis import Expected, diagnose, fault_of
+from hardware.chibio.protocol import DeviceState, parse_state
+from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
+from tests.hardware.script import state
+
+CONFIG = ChiBioConfig()
+
+
+def read(**values: Any) -> DeviceState:
+    return parse_state(json.dumps(state(**values)).encode())
+
+
+SOUND = replace(read(), running=True, cycles=5, blank=15000.0)
+EXPECTED = Expected(SOUND.start_time, 15000.0, math.nan, dosing=False, stuck="", overflow_trouble="")
+ON = (True, False, False, False)
+
+
+@pytest.mark.parametrize(
+    ("found", "expected", "age_s", "kind"),
+    [
+        ({}, {}, 0.0, None),
+        ({}, {"start_time": "earlier"}, 0.0, "restarted"),
+        ({"running": False}, {}, 0.0, "stopped"),
+        ({"blank": 65000.0}, {}, 0.0, "blank"),
+        ({}, {"stuck": "Pump1 still on"}, 0.0, "pump"),
+        ({"pumps_on": ON}, {}, 0.0, "pump"),
+        ({"pumps_on": ON}, {"dosing": True}, 0.0, None),
+        ({"modes": ("Chemostat",)}, {}, 0.0, "mode"),
+        ({"modes": ("Light",)}, {}, 0.0, None),
+        ({"regulating": True}, {}, 0.0, "mode"),
+        ({"regulating": True, "regulation_target": 0.5, "pumps_on": ON}, {"setpoint": 0.5}, 0.0, None),
+        ({"regulating": True, "regulation_target": 0.6}, {"setpoint": 0.5}, 0.0, "mode"),
+        ({"regulating": False}, {"setpoint": 0.5}, 0.0, "mode"),
+        ({}, {}, CONFIG.stale_s, None),
+        ({}, {}, CONFIG.stale_s + 0.1, "stalled"),
+        ({}, {"overflow_trouble": "is off"}, 0.0, "overflow_pump"),
+        ({"running": False, "blank": 65000.0}, {"stuck": "on"}, 999.0, "stopped"),
+    ],
+)
+def test_each_fault_by_itself_and_the_gravest_first(
+    found: dict[str, Any], expected: dict[str, Any], age_s: float, kind: str | None
+) -> None:
+    fault = diagnose(replace(SOUND, **found), replace(EXPECTED, **expected), age_s, CONFIG)
+    assert (fault.kind if fault else None) == kind
+    assert fault is None or (fault.detail and fault.remedy)
+
+
+@pytest.mark.parametrize(
+    ("error", "present", "kind"),
+    [
+        (LinkError("no answer"), True, "link"),
+        (ProtocolError("garbage"), False, "link"),
+        (IdentityError("another"), False, "identity"),
+        (DeviceStateError("shows M1"), True, "selection"),
+        (DeviceStateError("absent"), False, "absent"),
+    ],
+)
+def test_what_an_error_of_a_read_means(error: ReactorError, present: bool, kind: str) -> None:
+    fault = fault_of(error, present)
+    assert (fault.kind, fault.detail) == (kind, str(error))

@@ -1,0 +1,76 @@
+"""A sample by itself: new or not, how late it was seen, when to look again."""
+
+import json
+import math
+from dataclasses import replace
+
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.protocol import DeviceState, parse_state
+from hardware.chibio.sampling import CYCLE_S, FIRST_SAMPLE_S, Sampling
+from hardware.clock import VirtualClock
+from tests.hardware.script import state
+
+CONFIG = ChiBioConfig()
+STATE = parse_state(json.dumps(state()).encode())
+
+
+def sample(time_s: float, cycles: int) -> DeviceState:
+    return replace(STATE, sample_s=time_s, cycles=cycles, sample_od=0.4)
+
+
+def take(sampling: Sampling, clock: VirtualClock, seen: DeviceState) -> str:
+    assert sampling.look(seen, clock.now())
+    return sampling.take(seen, clock.now(), clock.now())
+
+
+def test_a_sample_is_new_once_and_never_goes_back() -> None:
+    clock = VirtualClock()
+    sampling = Sampling(CONFIG, clock)
+    assert not sampling.look(sample(math.nan, 0), 0.0)
+    take(sampling, clock, sample(60.0, 2))
+    assert not sampling.look(sample(60.0, 2), 0.0)
+    assert not sampling.look(sample(60.0, 3), 0.0)  # cycles counts cycles begun
+    assert not sampling.look(sample(0.0, 1), 0.0)
+    assert sampling.look(sample(120.0, 3), 0.0)
+    sampling.forget()
+    assert sampling.look(sample(0.0, 1), 0.0)
+    sampling.pass_over(sample(0.0, 1))
+    assert not sampling.look(sample(0.0, 1), 0.0)
+
+
+def test_only_a_sample_that_was_waited_for_has_a_known_age() -> None:
+    clock = VirtualClock(1000.0)
+    sampling = Sampling(CONFIG, clock)
+    take(sampling, clock, sample(0.0, 1))
+    assert sampling.appeared_s == -math.inf
+    assert sampling.next_poll == clock.now() + CYCLE_S - 20.0  # it may have waited long: look early
+    clock.sleep(50.0)
+    sampling.not_taken(is_new=False)
+    clock.sleep(2.0)
+    take(sampling, clock, sample(60.0, 2))
+    assert sampling.appeared_s == clock.now()
+    assert sampling.next_poll == clock.now() + CYCLE_S - 2.5
+    clock.sleep(70.0)  # ten seconds later than possible
+    take(sampling, clock, sample(120.0, 3))
+    assert sampling.late_s == 10.0
+    assert sampling.appeared_s == clock.now() - 10.0
+
+
+def test_the_first_sample_of_an_experiment_just_started_has_a_known_age_too() -> None:
+    clock = VirtualClock(1000.0)
+    sampling = Sampling(CONFIG, clock)
+    sampling.expect_first()
+    clock.sleep(FIRST_SAMPLE_S + 1.5)
+    take(sampling, clock, sample(0.0, 1))
+    assert sampling.late_s == 1.5
+
+
+def test_a_step_of_the_boards_clock_is_noted_and_forgotten() -> None:
+    clock = VirtualClock(1000.0)
+    sampling = Sampling(CONFIG, clock)
+    sampling.expect_first()
+    clock.sleep(FIRST_SAMPLE_S)
+    assert take(sampling, clock, sample(0.0, 1)) == ""
+    clock.sleep(60.0)
+    assert take(sampling, clock, sample(360.0, 2)) == "the board's clock moved by 300 s against this computer's"
+    assert sampling.appeared_s == -math.inf
