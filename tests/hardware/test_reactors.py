@@ -281,7 +281,7 @@ def test_zigzag_is_refused_with_the_remedy() -> None:
 
 def test_a_stored_blank_replaces_the_devices() -> None:
     bed = Bed(blanked=False)
-    rig = ReactorCalibration(SOUND.feed, SOUND.waste, blank=bed.device.vials["M0"].blank)
+    rig = ReactorCalibration(SOUND.feed, SOUND.waste, blank=bed.device.vials["M0"].spectrometer.blank)
     bed.client([rig])
     bed.reactors.begin()
     bed.run(3)
