@@ -124,8 +124,8 @@ def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration])
     return Check(
         "overflow pump",
         overflow.removes_ml_s > MAX_FEED_DUTY * feed,
-        f"{overflow.pump} at duty {overflow.duty:g} takes {overflow.removes_ml_s:.2f} mL/s, feed pump {feed:.2f} mL/s at "
-        f"full power: covers {covers}; verified on when the run starts",
+        f"{overflow.pump} at duty {overflow.duty:g} takes {overflow.removes_ml_s:.2f} mL/s, feed pump {feed:.2f} mL/s "
+        f"at full power: covers {covers}; verified on when the run starts",
         "less than the largest feed: raise backend.overflow_pump.duty",
         required=False,
     )
