@@ -17,7 +17,6 @@ REMOVED: dict[str, str] = {
     "agent.adam_eps": "it is the published 1e-8",
     "agent.average": "the last weights act",
     "agent.double": "the target is the plain maximum",
-    "agent.init_mirror": "every unit is drawn",
     "agent.learning_rate_decay": "the rate is constant",
     "agent.relabel_margin": "new goals lie between the task's lowest and highest setpoint",
     "agent.target_blend": "the target network is always a copy",
