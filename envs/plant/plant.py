@@ -6,15 +6,17 @@ everything real is switched off (the defaults of `PlantConfig`). Units: min, mL,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.schema import check, part, require, setting
 from envs.growth import REFERENCE_TEMPERATURE, Arrhenius, Cardinal, Exponential, GrowthLaw, Monod, Ratkowsky
 from envs.integrators import INTEGRATORS
-from envs.plant.noise import Streams, Tape, check_ranges, spread, streams
+from envs.plant.noise import Streams, Tape, spread, streams
 from envs.plant.pump import FeedPump, PumpConfig
 from envs.plant.sensor import OdSensor, SensorConfig
 
@@ -30,137 +32,98 @@ UNSTIRRED_GROWTH = 0.5  # relative growth without stirring (biology.md section 3
 
 TEMPERATURE_LAWS = ("none", "arrhenius", "ratkowsky", "cardinal")
 
-GROWTH_RANGES = {
-    "mu": (0.0, 0.1, "1/min"),
-    "mu_cv": (0.0, 0.3, ""),
-    "drift_sd_per_h": (0.0, 0.2, "1/sqrt(h)"),
-    "ramp_per_h": (-0.5, 0.5, "1/h"),
-    "activation_kj_mol": (0.0, 150.0, "kJ/mol"),
-    "adaptation_min": (0.0, 120.0, "min"),
-    "yield_od": (0.5, np.inf, "OD"),
-    "k_s": (1e-4, 1.0, ""),
-    "wall_attach_per_min": (0.0, 1e-2, "1/min"),
-    "wall_growth_ratio": (0.0, 1.0, ""),
-    "wall_detach_per_min": (0.0, 0.1, "1/min"),
-    "wall_capacity_od": (1e-3, 10.0, "OD"),
-}
-
 
 @dataclass(frozen=True)
 class GrowthConfig:
-    """How cells grow; the defaults are the training model's.
+    """How cells grow; the defaults are the training model's. Every temperature law is 1 at 37 degC (envs/growth.py)."""
 
-    mu, mu_cv: specific growth rate in fresh medium at 37 degC, 1/min, mean and spread between cultures.
-    drift_sd_per_h: sd after one hour of the random walk of ln mu.
-    ramp_per_h: relative change of mu per hour (burden, pH, oxygen).
-    temperature_law: none | arrhenius | ratkowsky | cardinal, all 1 at 37 degC; see envs/growth.py.
-    activation_kj_mol: Ea of the Arrhenius law, kJ/mol.
-    adaptation_min: time constant with which growth follows temperature, min; 0 = at once.
-    yield_od: OD that one fill of fresh medium can grow; inf = substrate never runs out.
-    k_s: relative substrate at half rate (Monod); used when yield_od is finite.
-    wall_attach_per_min, wall_detach_per_min: exchange of biomass with the wall, 1/min.
-    wall_growth_ratio: growth rate on the wall over that in suspension; wall_capacity_od: where it saturates.
-    """
-
-    mu: float = 0.03
-    mu_cv: float = 0.0
-    drift_sd_per_h: float = 0.0
-    ramp_per_h: float = 0.0
-    temperature_law: str = "none"
-    activation_kj_mol: float = 56.0
-    adaptation_min: float = 0.0
-    yield_od: float = float("inf")
-    k_s: float = 0.1
-    wall_attach_per_min: float = 0.0
-    wall_growth_ratio: float = 0.0
-    wall_detach_per_min: float = 0.0
-    wall_capacity_od: float = 1.0
+    mu: float = setting(0.03, "mean specific growth rate in fresh medium at 37 degC", "1/min", within=(0, 0.1))
+    mu_cv: float = setting(0.0, "its relative spread between cultures", within=(0, 0.3))
+    drift_sd_per_h: float = setting(0.0, "random walk of ln mu: sd after 1 h", "1/sqrt(h)", within=(0, 0.2))
+    ramp_per_h: float = setting(0.0, "relative change of mu per hour (burden, pH, oxygen)", "1/h", within=(-0.5, 0.5))
+    temperature_law: str = setting("none", "how mu follows temperature", choices=TEMPERATURE_LAWS)
+    activation_kj_mol: float = setting(
+        56.0,
+        "Ea of the Arrhenius law; 54 to 59 (Ingraham & Marr, BioNumbers 105003); mu(30)/mu(37) = 0.606",
+        "kJ/mol",
+        within=(0, 150),
+    )
+    adaptation_min: float = setting(
+        0.0,
+        "time constant with which growth follows temperature; at once within 21 to 37 degC (Ng et al. 1962)",
+        "min",
+        within=(0, 120),
+    )
+    yield_od: float = setting(
+        math.inf, "OD grown from one fill of fresh medium; inf: substrate never runs out", "OD", within=(0.5, math.inf)
+    )
+    k_s: float = setting(
+        0.1, "relative substrate at half rate (Monod), 0.02 to 0.2; used when yield_od is finite", within=(1e-4, 1)
+    )
+    wall_attach_per_min: float = setting(0.0, "biomass that settles on the wall", "1/min", within=(0, 1e-2))
+    wall_growth_ratio: float = setting(0.0, "growth on the wall over growth in suspension", within=(0, 1))
+    wall_detach_per_min: float = setting(0.0, "biomass that leaves the wall", "1/min", within=(0, 0.1))
+    wall_capacity_od: float = setting(1.0, "OD-equivalent at which the wall is full", "OD", within=(1e-3, 10))
 
     def __post_init__(self) -> None:
-        check_ranges(self, "plant.growth", GROWTH_RANGES)
-        if self.temperature_law not in TEMPERATURE_LAWS:
-            raise ValueError(
-                f"plant.growth.temperature_law = {self.temperature_law}: allowed {', '.join(TEMPERATURE_LAWS)}"
-            )
+        check(self, "plant.growth")
 
 
 @dataclass(frozen=True)
 class VesselConfig:
-    """The vial and its bottle.
+    """The vial and its bottle."""
 
-    volume_ml, volume_sd_ml: culture up to the waste tube, mean and spread between vials.
-    guard_above_ml: an overflow guard's tube, if there is one, ends so far above the waste tube.
-    capacity_ml: where it overflows.
-    evaporation_ml_day: water lost.
-    media_ml: fresh medium in the bottle; inf = never empty.
-    """
-
-    volume_ml: float = 20.0
-    volume_sd_ml: float = 0.0
-    guard_above_ml: float = 2.0
-    capacity_ml: float = 30.0
-    evaporation_ml_day: float = 0.0
-    media_ml: float = float("inf")
+    volume_ml: float = setting(20.0, "mean culture up to the waste tube (Steel 2020)", "mL", within=(5, 50))
+    volume_sd_ml: float = setting(0.0, "spread of the tube's height between vials", "mL", within=(0, 1.5))
+    guard_above_ml: float = setting(
+        2.0, "an overflow guard's tube ends so far above the waste tube", "mL", within=(0, 10)
+    )
+    capacity_ml: float = setting(
+        30.0, "overflows above; 4.5 mL over volume_ml or more (30 mL vial)", "mL", at_most=200.0
+    )
+    evaporation_ml_day: float = setting(0.0, "water lost", "mL/day", within=(0, 50))
+    media_ml: float = setting(math.inf, "fresh medium in the bottle; inf: never empty", "mL", within=(0, math.inf))
 
     def __post_init__(self) -> None:
-        ranges = {
-            "volume_ml": (5.0, 50.0, "mL"),
-            "volume_sd_ml": (0.0, 1.5, "mL"),
-            "guard_above_ml": (0.0, 10.0, "mL"),
-            "capacity_ml": (self.volume_ml + 4.5, 200.0, "mL"),
-            "evaporation_ml_day": (0.0, 50.0, "mL/day"),
-            "media_ml": (0.0, np.inf, "mL"),
-        }
-        check_ranges(self, "plant.vessel", ranges)
+        check(self, "plant.vessel")
+        lowest = self.volume_ml + 4.5
+        require(self.capacity_ml >= lowest, "plant.vessel.capacity_ml", f"{self.capacity_ml} mL", f"{lowest:g} to 200")
 
 
 @dataclass(frozen=True)
 class ThermalConfig:
     """Heater and surroundings: heating is active and fast, cooling passive and slow.
 
-    ambient_c: temperature the vial cools to; cooling_min: time constant of it, min.
-    heating_c_per_min: fastest rise of a heated vial; medium_c: temperature of fresh medium.
-    ripple_c: sd of the temperature reading.
+    Public Chi.Bio logs give ambient 21.4 and 25.7 degC, cooling 30 and 53 min, heating 2.3 to 2.5 degC/min at its peak.
     """
 
-    ambient_c: float = 24.0
-    cooling_min: float = 39.0
-    heating_c_per_min: float = 2.0
-    medium_c: float = 24.0
-    ripple_c: float = 0.0
+    ambient_c: float = setting(24.0, "temperature an unheated vial cools to", "degC", within=(0, 45))
+    cooling_min: float = setting(39.0, "time constant of passive cooling", "min", within=(1, 600))
+    heating_c_per_min: float = setting(2.0, "fastest rise of a heated vial", "degC/min", within=(0.1, 10))
+    medium_c: float = setting(24.0, "temperature of fresh medium", "degC", within=(0, 45))
+    ripple_c: float = setting(0.0, "sd of the temperature reading", "degC", within=(0, 2))
 
     def __post_init__(self) -> None:
-        ranges = {
-            "ambient_c": (0.0, 45.0, "degC"),
-            "cooling_min": (1.0, 600.0, "min"),
-            "heating_c_per_min": (0.1, 10.0, "degC/min"),
-            "medium_c": (0.0, 45.0, "degC"),
-            "ripple_c": (0.0, 2.0, "degC"),
-        }
-        check_ranges(self, "plant.thermal", ranges)
+        check(self, "plant.thermal")
 
 
 @dataclass(frozen=True)
 class PlantConfig:
-    """Everything about a plant; the defaults are the preset `nominal`, the training model and nothing else.
+    """Everything about a plant; the defaults are the preset `nominal`, the training model and nothing else."""
 
-    start_od: suspended biomass at reset, OD.
-    integrator: euler | rk4; substep_min: longest integration step, min.
-    """
-
-    growth: GrowthConfig = field(default_factory=GrowthConfig)
-    pump: PumpConfig = field(default_factory=PumpConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    vessel: VesselConfig = field(default_factory=VesselConfig)
-    thermal: ThermalConfig = field(default_factory=ThermalConfig)
-    start_od: float = 0.5
-    integrator: str = "euler"
-    substep_min: float = 0.1
+    growth: GrowthConfig = part(GrowthConfig, "how cells grow")
+    pump: PumpConfig = part(PumpConfig, "how a pump turns on-time into volume")
+    sensor: SensorConfig = part(SensorConfig, "what an averaged OD reading adds to the truth")
+    vessel: VesselConfig = part(VesselConfig, "the vial and its bottle")
+    thermal: ThermalConfig = part(ThermalConfig, "heater and surroundings")
+    start_od: float = setting(
+        0.5, "suspended biomass at reset unless the scenario says otherwise", "OD", within=(0, 10)
+    )
+    integrator: str = setting("euler", "scheme of the mass balances", choices=tuple(INTEGRATORS))
+    substep_min: float = setting(0.1, "longest integration step (paper)", "min", within=(1e-3, 1))
 
     def __post_init__(self) -> None:
-        check_ranges(self, "plant", {"start_od": (0.0, 10.0, "OD"), "substep_min": (1e-3, 1.0, "min")})
-        if self.integrator not in INTEGRATORS:
-            raise ValueError(f"plant.integrator = {self.integrator}: allowed {', '.join(INTEGRATORS)}")
+        check(self, "plant")
 
 
 def _response(config: GrowthConfig) -> Callable[[Array], Array]:

@@ -12,13 +12,14 @@ import math
 import re
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import format_datetime
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from conf.schema import check, part, setting
 from envs.plant.plant import Plant, PlantConfig
 from hardware.clock import Clock
 from hardware.emulator.faults import LinkFaults
@@ -37,23 +38,16 @@ ERROR_PAGE = b"<!doctype html>\n<title>500 Internal Server Error</title>\n<h1>In
 
 @dataclass(frozen=True)
 class DeviceOptions:
-    """How the emulated device is built.
+    """How the emulated device is built."""
 
-    worker_timeout_s: gunicorn kills a worker whose request takes longer. boot_s: from a dead worker to a serving one.
-    request_s: what any request takes. bench: optics and electronics; plant: the culture, with pulse dosing.
-    """
-
-    worker_timeout_s: float = 30.0
-    boot_s: float = 8.0
-    request_s: float = 0.005
-    bench: BenchConfig = field(default_factory=BenchConfig)
-    plant: PlantConfig = field(default_factory=healthy_plant)
+    worker_timeout_s: float = setting(30.0, "gunicorn kills a worker whose request takes longer", "s", within=(1, 3600))
+    boot_s: float = setting(8.0, "from a dead worker to a serving one", "s", within=(0, 600))
+    request_s: float = setting(0.005, "what any request takes", "s", within=(0, 5))
+    bench: BenchConfig = part(BenchConfig, "optics and electronics")
+    plant: PlantConfig = part(healthy_plant, "the culture, with pulse dosing")
 
     def __post_init__(self) -> None:
-        for key, low, high in (("worker_timeout_s", 1.0, 3600.0), ("boot_s", 0.0, 600.0), ("request_s", 0.0, 5.0)):
-            value = getattr(self, key)
-            if not low <= value <= high:
-                raise ValueError(f"emulator.{key} = {value} s: allowed {low:g} to {high:g}; change it")
+        check(self, "emulator")
         if self.plant.pump.dosing != "pulse":
             raise ValueError("emulator.plant.pump.dosing = continuous: allowed pulse, as the device's pumps work")
 
