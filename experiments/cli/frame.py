@@ -58,7 +58,7 @@ def normalise(argv: Sequence[str]) -> list[str]:
                 if re.fullmatch(r"[\w./-]+", option) and option != "null" and option not in known[match[1]]:
                     now = old_name(f"{match[1]}={option}")
                     raise UserError(now or f"{arg}: no such option; allowed: {', '.join(known[match[1]])}")
-        elif re.split("[@=]", arg)[0] not in known and not arg.startswith("hydra."):
+        elif re.split("[@=]", arg.lstrip("+"))[0] not in known and not arg.startswith("hydra."):
             arg = re.sub(r"^\+*(?=\w+[^=]*=)", "++", arg)
         out.append(arg)
     resumed = _resumed(argv)

@@ -9,6 +9,7 @@ import re
 import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
+from itertools import takewhile
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]
@@ -16,7 +17,7 @@ import yaml  # type: ignore[import-untyped]
 from conf.presets import ROOT, groups
 from conf.schema import Meaning, meaning
 
-__all__ = ["Entry", "chosen", "entries", "opening", "shown", "text"]
+__all__ = ["Entry", "chosen", "entries", "opening", "sentence", "shown", "text"]
 
 WIDTH = 118
 LEFT = 44  # columns of `key = value`
@@ -62,6 +63,12 @@ def opening(name: str) -> list[str]:
     return [line[1:].removeprefix(" ") for line in lines[:first] if not line.startswith("# @package")]
 
 
+def sentence(name: str) -> str:
+    """The first sentence of the comment at the top of a file of conf/, without the file's own name before it."""
+    first = " ".join(takewhile(str.strip, opening(name))).removeprefix(f"{name.rpartition('/')[2]}: ")
+    return re.split(r"(?<=\.)\s(?=[A-Z`])", first)[0]
+
+
 def chosen(name: str) -> dict[str, str | None]:
     """The groups that a command composes, in the place they have by themselves, and the option each starts with."""
     root = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
@@ -79,8 +86,7 @@ def _choices(name: str) -> Iterator[str]:
     for group, start in chosen(name).items():
         yield f"  {group}=" + (f"    (by itself {start})" if start else "")
         for option in groups()[group]:
-            said = re.sub(rf"^{option}: ", "", (opening(f"{group}/{option}") or [""])[0])
-            yield from _line(f"    {option}", said, 26)
+            yield from _line(f"    {option}", sentence(f"{group}/{option}"), 26)
         yield ""
 
 
@@ -99,10 +105,11 @@ def _values(config: Any, prefix: str) -> Iterator[str]:
         key = f"{prefix}{entry.name}"
         if is_dataclass(entry.value):
             parts.append((key, entry.said.what, entry.value))
-        elif isinstance(entry.value, dict) and any(is_dataclass(v) for v in entry.value.values()):
+        elif isinstance(entry.value, dict) and entry.value:
             yield from _line(f"  {key}.NAME", f"{entry.said.what}: {', '.join(entry.value)}", LEFT)
-            first = next(iter(entry.value.values()))
-            parts.append((f"{key}.NAME", f"the values of {next(iter(entry.value))}", first))
+            name, first = next(iter(entry.value.items()))
+            if is_dataclass(first):
+                parts.append((f"{key}.NAME", f"here the values of {name}", first))
         else:
             right = " ".join(filter(None, (entry.said.unit and f"{entry.said.unit}:", entry.said.what)))
             right += f" (allowed: {entry.allowed})" if entry.allowed else ""

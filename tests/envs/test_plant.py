@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from conf import presets
+from conf.schema import build
 from envs.growth import Culture, Exponential
 from envs.integrators import euler
 from envs.plant.plant import GrowthConfig, Plant, PlantConfig, PumpConfig, SensorConfig, ThermalConfig, VesselConfig
-from experiments.cli import frame
 
 Array = NDArray[np.float64]
 
@@ -23,7 +24,7 @@ PULSE = PumpConfig(dosing="pulse")
 
 
 def preset(name: str) -> PlantConfig:
-    return frame.load(frame.compose(f"plant/{name}", []).plant, PlantConfig())
+    return build(PlantConfig(), presets.load(f"plant/{name}"))
 
 
 def plant(config: PlantConfig, n: int = 1, seed: int = 0) -> Plant:
