@@ -9,15 +9,23 @@ import importlib
 import re
 from collections.abc import Iterator
 from dataclasses import is_dataclass
-from typing import Any
+from typing import Any, cast, get_args, get_type_hints
 
 import yaml  # type: ignore[import-untyped]
 
 from conf.presets import ROOT, groups
 from experiments.cli.frame import Command
-from experiments.cli.help_page import chosen, entries, sentence, shown
+from experiments.cli.help_page import Entry, chosen, entries, sentence, shown
 
 __all__ = ["page"]
+
+SINGULAR = {
+    "agents": "agent",
+    "plants": "plant",
+    "scenarios": "scenario",
+    "controllers": "controller",
+    "studies": "study",
+}
 
 HEAD = """# Configuration
 
@@ -50,7 +58,7 @@ def page() -> str:
         lines += [f"### {name}", "", said, "", *_table(kind(), parts), ""]
     lines += ["## Presets", "", "Each with the values that differ from the defaults above.", ""]
     for group, options in groups().items():
-        lines += [f"### {group}=", "", "| preset | what it is | what it changes |", "|---|---|---|"]
+        lines += [f"### Presets of {group}", "", "| preset | what it is | what it changes |", "|---|---|---|"]
         for preset in (f"{group}/{option}" for option in options):
             lines.append(f"| `{preset.rpartition('/')[2]}` | {sentence(preset)} | {_changes(preset)} |")
         lines.append("")
@@ -59,7 +67,7 @@ def page() -> str:
 
 def _groups(name: str) -> Iterator[str]:
     """The groups a command has."""
-    taken = [f"[`{group}`](#{_anchor(f'{group}=')})" for group in chosen(name)]
+    taken = [f"[`{group}`](#{_anchor(f'presets of {group}')})" for group in chosen(name)]
     if taken:
         yield f"Groups: {', '.join(taken)}."
         yield ""
@@ -83,20 +91,30 @@ def _variants(command: Command[Any]) -> Iterator[Any]:
 def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:
     """Every part below a config with the name it is first met by."""
     for entry in entries(config):
-        inner = entry.value if isinstance(entry.value, dict) else {"": entry.value}
-        for key, value in inner.items():
+        named = isinstance(entry.value, dict)
+        name = f"{prefix}{SINGULAR.get(entry.name, entry.name)}"
+        of = _part(config, entry)
+        for value in (*(entry.value.values() if named else [entry.value]), *([of()] if named and of else [])):
             if is_dataclass(value):
-                name = f"{prefix}{entry.name.removesuffix('s') if key else entry.name}"
                 kind = getattr(value, "kind", "")
-                parts.setdefault(type(value), f"{name} ({kind})" if kind else name)
+                parts.setdefault(cast(type[Any], type(value)), f"{name} ({kind})" if kind else name)
                 _collect(value, f"{name}.", parts)
+
+
+def _part(config: Any, entry: Entry) -> type[Any] | None:
+    """What kind of part a field holds, itself or by name."""
+    of: Any = type(entry.value)
+    if of is dict:
+        of = get_args(get_type_hints(type(config))[entry.name])[1]
+    return cast(type[Any], of) if is_dataclass(of) else None
 
 
 def _table(config: Any, parts: dict[type[Any], str]) -> Iterator[str]:
     """A row per field; a part has a table of its own."""
     rows = []
     for entry in entries(config):
-        own = parts.get(type(entry.value))
+        of = _part(config, entry)
+        own = parts[of] if of else ""
         default = f"[{own}](#{_anchor(own)})" if own else f"`{shown(entry.value)}`"
         cells = (f"`{entry.name}`", default, entry.said.unit, entry.allowed, entry.said.what)
         rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
