@@ -123,7 +123,7 @@ def test_a_preset_holds_only_what_differs_from_the_dataclass(name):
     own.pop("defaults", None)
     if name in STATED:
         assert build(STATED[name], own) == STATED[name]
-    elif name != "agent/tuned":  # TEMP
+    else:
         assert repeated(own, ROOTS[group]()) == []
 
 
@@ -176,7 +176,7 @@ def test_help_shows_the_values_that_the_rest_of_the_line_gives(capsys, monkeypat
     monkeypatch.setattr(sys, "argv", ["deploy", "backend=chibio", "--help", "backend.stir=0.7"])
     command()
     page = capsys.readouterr().out
-    assert re.search(r"^  backend\.stir = 0\.7 +stirrer \(allowed: 0 to 1\)$", page, re.MULTILINE)
+    assert re.search(r"^  backend\.stir = 0\.7 +stirrer \(allowed: 0 to 1; default: 0\.5\)$", page, re.MULTILINE)
     assert "backend.control_min" not in page
 
 

@@ -101,6 +101,7 @@ def _line(left: str, right: str, at: int) -> list[str]:
 def _values(config: Any, prefix: str) -> Iterator[str]:
     """The plain values of a config, then its parts, each below a line of its own."""
     parts: list[tuple[str, str, Any]] = []
+    default = type(config)()
     for entry in entries(config):
         key = f"{prefix}{entry.name}"
         if is_dataclass(entry.value):
@@ -112,7 +113,10 @@ def _values(config: Any, prefix: str) -> Iterator[str]:
                 parts.append((f"{key}.NAME", f"here the values of {name}", first))
         else:
             right = " ".join(filter(None, (entry.said.unit and f"{entry.said.unit}:", entry.said.what)))
-            right += f" (allowed: {entry.allowed})" if entry.allowed else ""
+            notes = [f"allowed: {entry.allowed}"] if entry.allowed else []
+            if entry.value != getattr(default, entry.name):
+                notes.append(f"default: {shown(getattr(default, entry.name))}")
+            right += f" ({'; '.join(notes)})" if notes else ""
             yield from _line(f"  {key} = {shown(entry.value)}", right, LEFT)
     for key, what, inner in parts:
         yield ""
