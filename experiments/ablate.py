@@ -10,16 +10,17 @@ from __future__ import annotations
 import csv
 import logging
 import re
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.schema import build, check, part, setting
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.control.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -34,21 +35,24 @@ MEASURES = ("regret_pct", "steady_abs_error", "regret_pct_last", "steady_abs_err
 
 @dataclass(frozen=True)
 class AblateConfig:
-    """Keys of conf/ablate.yaml. Raises: ValueError naming key, value and allowed range."""
+    """Which variants of an agent to train. Raises: ValueError naming key, value and allowed range."""
 
-    env: EnvConfig = field(default_factory=EnvConfig)
-    agent: DQNConfig = field(default_factory=DQNConfig)
-    ablations: dict[str, dict[str, Any]] = field(default_factory=dict)  # name -> values that differ from `agent`
-    only: list[str] = field(default_factory=list)  # names to train; empty means all
-    seed: int = 0
-    n_agents: int = 32
-    device: str = "cpu"
-    threads: int | None = None
-    eval_every: int = 250
-    resume: str | None = None
+    env: EnvConfig = part(EnvConfig, "the training model and its episodes")
+    agent: DQNConfig = part(DQNConfig, "the agent that the variants change")
+    ablations: dict[str, dict[str, Any]] = setting({}, "variants by name: values of the agent that differ")
+    only: list[str] = setting([], "names to train; empty: all")
+    seed: int = setting(0, "of the first agent", at_least=0)
+    n_agents: int = setting(32, "seeds of each variant", within=(1, 100_000))
+    device: str = setting("cpu", "where networks are trained", choices=("cpu", "cuda"))
+    threads: int | None = setting(
+        None, "groups of 16 agents trained at the same time; null: one per core. No effect on results", at_least=1
+    )
+    eval_every: int = setting(250, "between evaluations on the selection grid", "steps", at_least=1)
+    resume: str | None = setting(None, "a run folder to continue")
 
     def __post_init__(self) -> None:
         """Check every variant before the first one trains."""
+        check(self)
         unknown = [name for name in self.only if name not in self.ablations]
         if unknown:
             raise ValueError(f"only = {unknown[0]}: allowed {', '.join(self.ablations)}")
@@ -76,24 +80,16 @@ class AblateConfig:
         )
 
 
-def _frozen(value: Any) -> Any:
-    """Lists from YAML as the tuples a config holds."""
-    return tuple(_frozen(v) for v in value) if isinstance(value, list | tuple) else value
-
-
 def variant(agent: DQNConfig, name: str, values: dict[str, Any]) -> DQNConfig:
     """`agent` with some values replaced.
 
     Raises: ValueError naming the variant and the key that does not exist or is out of range.
     """
-    known = [f.name for f in fields(DQNConfig)]
-    for key in values:
-        if key not in known:
-            raise ValueError(f"ablations.{name}.{key}: no such key; allowed: {', '.join(known)}")
+    where = f"ablations.{name}"
     try:
-        return replace(agent, **{key: _frozen(value) for key, value in values.items()})
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"ablations.{name}: {error}") from None
+        return build(agent, values, where)
+    except ValueError as error:
+        raise ValueError(str(error) if str(error).startswith(where) else f"{where}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -241,16 +237,14 @@ def ablate(config: AblateConfig, folder: Path) -> float:
             entry["train_seconds"],
         )  # fmt: skip
     summary = summarise(rows)
-    frame.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
+    files.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
     (folder / "table.md").write_text(table(rows), encoding="utf-8")
     save(figure(rows), folder / "figures", "ablation")
     log.info("table %s, figure %s", folder / "table.md", folder / "figures" / "ablation.png")
     return float(summary[config.names[0]]["regret_pct"]["median"])
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("ablate", AblateConfig(), ablate)
+main = frame.Command("ablate", AblateConfig(), ablate)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
-from dqn.config import DQNConfig
-from envs.plant.plant import PlantConfig
-from envs.scenario import Scenario
-from experiments.cli import frame
-from experiments.comparison.config import BenchmarkConfig, StudyConfig
+from experiments.cli import files, frame
+from experiments.comparison.config import BenchmarkConfig
 from experiments.control.config import TrainConfig, controller_config
 
 if TYPE_CHECKING:
@@ -261,29 +258,19 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     draw(config, trials, summary, figures)
     summary["figures"] = figures.shown
     _store(trials, folder)
-    frame.write_json(folder / "summary.json", summary)
+    files.write_json(folder / "summary.json", summary)
     page = report.write(folder)
     log.info("%d closed loops of %d replicates; report %s", len(trials), config.replicates, page)
 
 
 def _schema(cfg: DictConfig) -> BenchmarkConfig:
-    """Every name that the config holds, with the defaults of its type; a controller's is that of its kind."""
-
-    def named(key: str, default: Any) -> dict[str, Any]:
-        return {str(name): default for name in cfg[key]}
-
+    """A controller's config is that of its kind."""
     return BenchmarkConfig(
-        agents=named("agents", DQNConfig()),
-        plants=named("plants", PlantConfig()),
-        scenarios=named("scenarios", Scenario()),
-        controllers={str(name): controller_config(str(c.kind)) for name, c in cfg.controllers.items()},
-        studies=named("studies", StudyConfig()),
+        controllers={str(name): controller_config(str(c.kind)) for name, c in cfg.controllers.items()}
     )
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("benchmark", BenchmarkConfig(), benchmark, choose=_schema)
+main = frame.Command("benchmark", BenchmarkConfig(), benchmark, _schema)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.control.config import DeployConfig, deploy_schema
 
 if TYPE_CHECKING:
@@ -146,7 +146,7 @@ def _finish(record: Record, config: DeployConfig, outcome: str) -> None:
         "repairs": record.repairs,
         "figure": str(path),
     }
-    frame.write_json(folder / "summary.json", summary)
+    files.write_json(folder / "summary.json", summary)
     log.info("%s after %.0f min, %.1f mL of fresh medium", outcome, summary["minutes"], summary["volume_ml"])
     heads = ("reactor", "setpoint", "ISE", "ITAE", "ISE/T", "ITAE/T", "settled", "steady")
     header = f"{heads[0]:8} " + " ".join(f"{h:>8}" for h in heads[1:])
@@ -299,9 +299,7 @@ def _schema(cfg: DictConfig) -> DeployConfig:
     return deploy_schema(str(cfg.backend.kind), str(cfg.controller.kind))
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("deploy", DeployConfig(), deploy, choose=_schema)
+main = frame.Command("deploy", DeployConfig(), deploy, _schema)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from conf.schema import setting
 from experiments.cli import frame
 from experiments.reporting import tables
 from experiments.reporting.tables import Table, number, typeset
@@ -61,9 +62,9 @@ dt { font-weight: 600; margin-top: .7rem; } dd { margin: 0 0 0 1.2rem; max-width
 
 @dataclass(frozen=True)
 class ReportConfig:
-    """run: a run folder, or `latest`: the newest one below runs/."""
+    """What to report on."""
 
-    run: str = "latest"
+    run: str = setting("latest", "a run folder, a folder of run folders, or `latest`: the newest run below runs/")
 
 
 @dataclass
@@ -270,9 +271,7 @@ def report(config: ReportConfig, folder: Path) -> None:
     log.info("report %s", write(find(config.run)))
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("report", ReportConfig(), report)
+main = frame.Command("report", ReportConfig(), report)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from experiments.cli import frame
+from conf.schema import check, setting
+from experiments.cli import files, frame
 from experiments.timing import learning
 from experiments.timing.measurement import Measurement, measure
 
@@ -30,24 +31,31 @@ STATES = 64  # of the MPC's problem
 
 @dataclass(frozen=True)
 class SpeedConfig:
-    """groups: which measurements; runs: pairs of each."""
+    """What to time."""
 
-    groups: tuple[str, ...] = ("training", "update", "environment", "start_up", "controllers", "mpc")
-    runs: int = 5
-    scaling: bool = True  # also the figure of cost over sizes
+    groups: tuple[str, ...] = setting(
+        ("training", "update", "environment", "start_up", "controllers", "mpc"), "which measurements"
+    )
+    runs: int = setting(
+        5,
+        "pairs per measurement, after one that is thrown away",
+        within=(5, 1000),
+        note="a median of fewer says little",
+    )
+    scaling: bool = setting(True, "also the figure of cost over population, batch, copies and episodes")
 
     def __post_init__(self) -> None:
+        check(self)
         unknown = [g for g in self.groups if g not in GROUPS]
         if unknown:
             raise ValueError(f"groups = {unknown[0]}: allowed {', '.join(GROUPS)}")
-        if not 5 <= self.runs <= 1000:
-            raise ValueError(f"runs = {self.runs}: allowed 5 to 1000 (a median of fewer says little)")
 
 
 def controllers() -> Iterator[Measurement]:
     """Closed loops of 90 min on `nominal_noise`: 64 vials as a batch beside the same 64 one after another."""
     import numpy as np
 
+    from conf import presets, schema
     from envs.plant.plant import Plant, PlantConfig
     from envs.scenario import Scenario
     from envs.task import EnvConfig
@@ -57,7 +65,7 @@ def controllers() -> Iterator[Measurement]:
     from experiments.training import build
 
     model = EnvConfig()
-    plant = frame.load(frame.compose("plant/nominal_noise", []).plant, PlantConfig())
+    plant = schema.build(PlantConfig(), presets.load("plant/nominal_noise"))
     schedule = Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), recovery_od=0.8)
     policy = _untrained_policy(model)
 
@@ -179,7 +187,7 @@ def speed(config: SpeedConfig, folder: Path) -> None:
         log.info("scaling of updates, environment and training")
         charts.save(charts.scaling(learning.scaling(config.runs)), folder / "figures", "scaling")
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
-    frame.write_json(folder / "summary.json", {"machine": machine, "measurements": found})
+    files.write_json(folder / "summary.json", {"machine": machine, "measurements": found})
     tables.write([table(found, config.runs, machine)], folder / "tables")
     log.info("report %s", report.write(folder))
 
@@ -201,9 +209,7 @@ def table(found: list[dict[str, Any]], runs: int, machine: str) -> Any:
     return Table("speed", f"Speed, medians of {runs} paired runs", columns, rows, machine)
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("speed", SpeedConfig(), speed)
+main = frame.Command("speed", SpeedConfig(), speed)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig, OmegaConf
 
 from envs.task import EnvConfig
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.control.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def read_env_file(path: str) -> EnvConfig:
     if not isinstance(content, DictConfig):
         raise frame.UserError(f"env_file={path}: holds no key: value pairs; {remedy}")
     try:
-        return frame.load(content, EnvConfig())
+        return frame.load(content, EnvConfig(), "env")
     except frame.UserError as error:
         raise frame.UserError(f"env_file={path}: {error}") from None
 
@@ -143,7 +143,7 @@ def _finish(session: Session) -> None:
         "policy_seed": session.seeds[int(best.merit.argmin())],
         "config_hash": _fingerprint(c),
     }
-    frame.write_json(session.folder / "summary.json", summary)
+    files.write_json(session.folder / "summary.json", summary)
     numbers = {
         k: v for k, v in {**asdict(c.agent), "mu": c.env.mu, "tau": c.env.tau}.items() if isinstance(v, int | float)
     }
@@ -184,9 +184,7 @@ def train(config: TrainConfig, folder: Path) -> float:
     return float(np.median(session.best.regret))
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("train", TrainConfig(), train)
+main = frame.Command("train", TrainConfig(), train)
 
 
 if __name__ == "__main__":

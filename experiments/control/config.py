@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
@@ -21,35 +22,23 @@ __all__ = ["BACKENDS", "DeployConfig", "TrainConfig", "controller_config", "depl
 class TrainConfig:
     """`python -m experiments.train`. Raises: ValueError naming key, value and allowed range."""
 
-    env: EnvConfig = field(default_factory=EnvConfig)
-    agent: DQNConfig = field(default_factory=DQNConfig)
-    env_file: str | None = None  # a calibrated.yaml; replaces `env`
-    seed: int = 0  # of the first agent
-    n_agents: int = 1  # agents with seeds seed, seed + 1, ... trained in one process
-    device: str = "cpu"  # cpu | cuda
-    threads: int | None = None  # groups of 16 agents trained at the same time; None: one per core; no effect on results
-    eval_every: int = 250  # steps between evaluations of the greedy policy
-    checkpoint_every: int = 1000  # steps between checkpoints
-    resume: str | None = None  # a run folder to continue
+    env: EnvConfig = part(EnvConfig, "the training model and its episodes")
+    agent: DQNConfig = part(DQNConfig, "the agent's hyper-parameters")
+    env_file: str | None = setting(None, "a calibrated.yaml; replaces env")
+    seed: int = setting(0, "of the first agent", at_least=0)
+    n_agents: int = setting(1, "with seeds seed, seed + 1, ... in one process", within=(1, 100_000))
+    device: str = setting("cpu", "where networks are trained", choices=("cpu", "cuda"))
+    threads: int | None = setting(
+        None, "groups of 16 agents trained at the same time; null: one per core. No effect on results", at_least=1
+    )
+    eval_every: int = setting(
+        250, "between evaluations of the greedy policy on the selection grid", "steps", at_least=1
+    )
+    checkpoint_every: int = setting(1000, "between checkpoints", "steps", at_least=1)
+    resume: str | None = setting(None, "a run folder to continue")
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
-        checks = (
-            ("seed", self.seed, self.seed >= 0, "at least 0"),
-            ("n_agents", self.n_agents, 1 <= self.n_agents <= 100_000, "1 to 100000"),
-            ("device", self.device, self.device in ("cpu", "cuda"), "cpu or cuda"),
-            (
-                "threads",
-                self.threads,
-                self.threads is None or self.threads >= 1,
-                "at least 1, or null",
-            ),
-            ("eval_every", self.eval_every, self.eval_every >= 1, "at least 1 step"),
-            ("checkpoint_every", self.checkpoint_every, self.checkpoint_every >= 1, "at least 1 step"),
-        )
-        for key, value, ok, allowed in checks:
-            if not ok:
-                raise ValueError(f"{key} = {value}: allowed {allowed}")
+        check(self)
 
 
 BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig, "chibio": ChiBioConfig, "emulator": EmulatorConfig}
@@ -59,17 +48,21 @@ BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig, "chibio": ChiBioConfig
 class DeployConfig:
     """`python -m experiments.deploy`."""
 
-    backend: Any = field(default_factory=SimulatedConfig)  # one of BACKENDS
-    plant: PlantConfig = field(default_factory=PlantConfig)  # of a simulated backend
-    safety: SafetyConfig = field(default_factory=SafetyConfig)
-    scenario: Scenario = field(default_factory=Scenario)
-    each: dict[str, Any] = field(default_factory=dict)  # reactor -> what differs from `scenario`, and its `role`
-    controller: Any = field(default_factory=LearnedConfig)  # one of `controller_config`
-    policy: str = "latest"  # of controller=dqn: a policy.npz, a run folder, or `latest`
-    env_file: str | None = None  # a calibrated.yaml; its model becomes the simulated plant's
-    fsync: bool = True  # every row on the disk before the next command
-    preflight_only: bool = False  # check the device and stop
-    resume: str | None = None  # a run folder to continue
+    backend: Any = part(SimulatedConfig, "what is controlled")
+    plant: PlantConfig = part(PlantConfig, "what the vials of a simulated backend are")
+    safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
+    scenario: Scenario = part(Scenario, "what the culture is asked to do")
+    each: dict[str, Any] = setting(
+        {}, "what differs for single reactors: each.M1.setpoints=[0.5] each.M1.minutes=[60] each.M1.role=control"
+    )
+    controller: Any = part(LearnedConfig, "what decides the pump rate")
+    policy: str = setting(
+        "latest", "of controller=dqn: a policy.npz, a run folder, or `latest`: of the newest training run under runs/"
+    )
+    env_file: str | None = setting(None, "a calibrated.yaml whose model the simulated plant takes")
+    fsync: bool = setting(True, "every row on the disk before the next command")
+    preflight_only: bool = setting(False, "check the device and stop")
+    resume: str | None = setting(None, "a run folder to continue after a crash")
 
     def schedules(self) -> list[Scenario]:
         """One schedule per reactor. Raises: ValueError naming reactor, key and what is allowed."""

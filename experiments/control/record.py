@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.cli import frame
+from experiments.cli import files
 from experiments.control.loop import Step
 from experiments.reporting.tensorboard import Events
 from hardware.errors import RecordingError
@@ -188,7 +188,7 @@ class Record:
     def save(self, state: Mapping[str, Any]) -> None:
         """Replace state.json; it says up to which row of the journal it knows everything."""
         content = {"journal_row": self.journal.next_row, **state}
-        frame.write_json(self.folder / "state.json", content, self._fsync, indent=None)
+        files.write_json(self.folder / "state.json", content, self._fsync, indent=None)
 
     def load_state(self) -> tuple[dict[str, Any], list[Receipt]]:
         """The saved state and the doses begun after it was written. Raises: RecordingError where there is none."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from conf.schema import check, setting
 from hardware.chibio.connection import Log, Unit
 from hardware.chibio.protocol import MAX_GUARD_DUTY, PUMPS, SPARE, DeviceState
 
@@ -21,25 +22,19 @@ MIN_DUTY = 0.1  # with a pump of 1 mL/s twice as much as the feed pump may ever 
 
 @dataclass(frozen=True)
 class GuardConfig:
-    """Values of `backend.guard`.
-
-    pump: Pump3 or Pump4; "" = there is no guard.
-    duty: share of every 63 s in which it runs, 0.1 to 0.95.
-    flow_ml_s: its flow at full power, mL/s, as weighed; only for what the preflight says of it.
+    """A second waste line that keeps a vial from overflowing (docs/chibio.md); none as a rule.
 
     Raises: ValueError naming key, value and allowed range.
     """
 
-    pump: str = ""
-    duty: float = 0.1
-    flow_ml_s: float = 1.0
+    pump: str = setting("", "of the second line; '': there is none, the standard hardware", choices=(*SPARE, ""))
+    duty: float = setting(0.1, "share of every 63 s in which it runs", within=(MIN_DUTY, MAX_GUARD_DUTY))
+    flow_ml_s: float = setting(
+        1.0, "at full power, as weighed; only for what the preflight says", "mL/s", within=(0.05, 5)
+    )
 
     def __post_init__(self) -> None:
-        if self.pump not in ("", *SPARE):
-            raise ValueError(f"guard.pump = {self.pump}: allowed {', '.join(SPARE)}, or '' for none")
-        for key, low, high in (("duty", MIN_DUTY, MAX_GUARD_DUTY), ("flow_ml_s", 0.05, 5.0)):
-            if not low <= getattr(self, key) <= high:
-                raise ValueError(f"guard.{key} = {getattr(self, key)}: allowed {low:g} to {high:g}")
+        check(self, "guard")
 
     @property
     def others(self) -> tuple[str, ...]:
