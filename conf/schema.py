@@ -1,6 +1,6 @@
 """How a config dataclass states its values once: default, meaning, unit and range stand in the field.
 
-    mu: float = value(0.03, "specific growth rate", "1/min", above=0.0, at_most=0.1)
+    mu: float = setting(0.03, "specific growth rate", "1/min", above=0.0, at_most=0.1)
 
 `check` refuses what is out of range, `build` makes a config from plain values, and the command line's help and
 docs/configuration.md are written from the same fields.
@@ -17,7 +17,7 @@ from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hin
 
 from conf.renamed import REMOVED, RENAMED
 
-__all__ = ["Meaning", "build", "check", "meaning", "old_name", "part", "require", "value"]
+__all__ = ["Meaning", "build", "check", "meaning", "old_name", "part", "require", "setting"]
 
 T = TypeVar("T")
 
@@ -69,7 +69,7 @@ class Meaning:
         """
         words = self._interval() if self.interval else self._range((self.unit or "value") if many else key)
         if words and many and not self.interval:
-            words = f"each {words}"
+            words = f"each {'one of ' if self.choices else ''}{words}"
         if self.some:
             words = f"one or more, {words}" if words else "one or more"
         if words and optional:
@@ -104,11 +104,12 @@ class Meaning:
         return f"[low, high] with {left}low <= high{right}"
 
 
-def value(
+def setting(
     default: T,
     what: str,
     unit: str = "",
     *,
+    within: tuple[float, float] | None = None,
     above: float | None = None,
     at_least: float | None = None,
     below: float | None = None,
@@ -118,7 +119,9 @@ def value(
     some: bool = False,
     note: str = "",
 ) -> T:
-    """A field of a config dataclass; the arguments are those of `Meaning`."""
+    """A field of a config dataclass; the arguments are those of `Meaning`, and within=(low, high) gives both bounds."""
+    if within:
+        at_least, at_most = within
     said = Meaning(what, unit, above, at_least, below, at_most, tuple(choices), interval, some, note)
     if isinstance(default, dict | list):
         return field(default_factory=lambda: copy.copy(default), metadata={"meaning": said})
@@ -131,7 +134,7 @@ def part(factory: Callable[[], T], what: str) -> T:
 
 
 def meaning(of: Field[Any]) -> Meaning:
-    """What was said about a field; nothing, for one that was made without `value` or `part`."""
+    """What was said about a field; nothing, for one that was made without `setting` or `part`."""
     return cast(Meaning, of.metadata.get("meaning", Meaning("")))
 
 
@@ -219,7 +222,11 @@ def _converted(given: Any, hint: Any, default: Any, key: str) -> Any:
     if origin in (tuple, list):
         require(isinstance(given, list | tuple), key, given, "a list, as [1,2]")
         of = inner[0] if inner else Any
-        return origin(_converted(v, of, None, f"{key}[{i}]") for i, v in enumerate(given))
+        rows = of is float  # a matrix may be given row by row
+        return origin(
+            _converted(v, hint if rows and isinstance(v, list | tuple) else of, None, f"{key}[{i}]")
+            for i, v in enumerate(given)
+        )
     return _scalar(given, hint, key)
 
 

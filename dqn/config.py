@@ -4,72 +4,60 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from conf.schema import check, require, setting
+
 __all__ = ["DQNConfig"]
 
 
 @dataclass(frozen=True)
 class DQNConfig:
-    """Everything that shapes learning; the values, their sources and reasons are in conf/agent/*.yaml.
+    """Everything that shapes learning; the defaults are a plain DQN, and conf/agent/*.yaml give values and reasons.
 
     Steps are control steps of one environment; updates are gradient steps.
     Raises: ValueError naming key, value and allowed range.
     """
 
-    hidden: tuple[int, ...] = (64, 64)  # units of the ReLU layers
-    gamma: float = 0.99  # discount per step
-    learning_rate: float = 1e-3  # Adam's
-    total_steps: int = 10_000  # length of training
-    epsilon_start: float = 1.0  # exploration rate at step 0
-    epsilon_end: float = 0.05  # and from step epsilon_steps on
-    epsilon_steps: int = 5_000  # steps over which it falls linearly
-    replay_size: int = 10_000  # transitions kept
-    learn_start: int = 500  # steps before the first update
-    batch_size: int = 64
-    updates_per_step: int = 1
-    target_period: int = 500  # updates between copies of the online network to the target network
-    action_gap: float = 0.0  # alpha of advantage learning, which makes action gaps 1 / (1 - alpha) times as wide
-    output_basis_decay: float = 0.0  # rows of the output basis fall as (1 + degree)^-decay; 0: no basis
-    huber: float = 0.0  # TD errors beyond this are clipped in the gradient; 0 means squared error
-    reward_scale: float = 1.0  # rewards are multiplied by this inside the agent
-    hindsight_share: float = 0.0  # share of each minibatch that is given another goal
-    hindsight_near: float = 0.0  # share of those whose new goal lies close to the state reached
-    hindsight_width: tuple[float, float] = (1e-3, 0.8)  # range of that distance, drawn log-uniformly
-    input_matrix: tuple[float, ...] = ()  # features = M observation + c, M row by row; () means identity
-    input_offset: tuple[float, ...] = ()  # c, one number per feature
-    init_mirror: tuple[int, ...] = ()  # -1 or 1 per feature: half of the units start as mirror images; () = none
-    init_zero_output: bool = False  # the last layer starts at zero
+    hidden: tuple[int, ...] = setting((64, 64), "of the ReLU layers", "units", at_least=1, some=True)
+    gamma: float = setting(0.99, "discount per step", at_least=0.0, below=1.0)
+    learning_rate: float = setting(1e-3, "Adam's", above=0.0, at_most=1.0)
+    total_steps: int = setting(10_000, "length of training", "steps", at_least=1)
+    epsilon_start: float = setting(1.0, "exploration rate at step 0", within=(0, 1))
+    epsilon_end: float = setting(0.05, "and from step epsilon_steps on", within=(0, 1))
+    epsilon_steps: int = setting(5_000, "over which it falls linearly", "steps", at_least=0)
+    replay_size: int = setting(10_000, "kept", "transitions", at_least=1)
+    learn_start: int = setting(
+        500, "before the first update", "steps", at_least=1, note="there must be something to replay"
+    )
+    batch_size: int = setting(64, "of a minibatch", "transitions", at_least=1)
+    updates_per_step: int = setting(1, "gradient steps per control step", "updates", at_least=1)
+    target_period: int = setting(
+        500, "between copies of the online network to the target network", "updates", at_least=1
+    )
+    action_gap: float = setting(
+        0.0,
+        "alpha of advantage learning, which makes action gaps 1 / (1 - alpha) times as wide",
+        at_least=0.0,
+        below=1.0,
+    )
+    output_basis_decay: float = setting(
+        0.0, "rows of the output basis fall as (1 + degree)^-decay; 0: no basis", at_least=0.0
+    )
+    huber: float = setting(0.0, "TD errors beyond this are clipped in the gradient; 0: squared error", at_least=0.0)
+    reward_scale: float = setting(1.0, "rewards are multiplied by this inside the agent", above=0.0)
+    hindsight_share: float = setting(0.0, "share of each minibatch that is given another goal", within=(0, 1))
+    hindsight_near: float = setting(0.0, "share of those whose new goal lies close to the state reached", within=(0, 1))
+    hindsight_width: tuple[float, float] = setting(
+        (1e-3, 0.8), "range of that distance, drawn log-uniformly", "OD", above=0.0, interval=True
+    )
+    input_matrix: tuple[float, ...] = setting((), "features = M observation + c, M row by row; []: identity")
+    input_offset: tuple[float, ...] = setting((), "c, one number per feature")
+    init_mirror: tuple[int, ...] = setting(
+        (), "-1 or 1 per feature: half of the units start as mirror images; []: none"
+    )
+    init_zero_output: bool = setting(False, "the last layer starts at zero")
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
-        checks = (
-            ("hidden", self.hidden, len(self.hidden) > 0 and min(self.hidden) >= 1, "one or more layer sizes >= 1"),
-            ("gamma", self.gamma, 0.0 <= self.gamma < 1.0, "0 <= gamma < 1"),
-            ("learning_rate", self.learning_rate, 0.0 < self.learning_rate <= 1.0, "0 < rate <= 1"),
-            ("total_steps", self.total_steps, self.total_steps >= 1, "at least 1"),
-            ("epsilon_start", self.epsilon_start, 0.0 <= self.epsilon_start <= 1.0, "0 to 1"),
-            ("epsilon_end", self.epsilon_end, 0.0 <= self.epsilon_end <= 1.0, "0 to 1"),
-            ("epsilon_steps", self.epsilon_steps, self.epsilon_steps >= 0, "at least 0"),
-            ("replay_size", self.replay_size, self.replay_size >= 1, "at least 1"),
-            ("learn_start", self.learn_start, self.learn_start >= 1, "at least 1 (there must be something to replay)"),
-            ("batch_size", self.batch_size, self.batch_size >= 1, "at least 1"),
-            ("updates_per_step", self.updates_per_step, self.updates_per_step >= 1, "at least 1"),
-            ("target_period", self.target_period, self.target_period >= 1, "at least 1 update"),
-            ("action_gap", self.action_gap, 0.0 <= self.action_gap < 1.0, "0 <= alpha < 1"),
-            ("output_basis_decay", self.output_basis_decay, self.output_basis_decay >= 0.0, "at least 0 (0 = off)"),
-            ("huber", self.huber, self.huber >= 0.0, "at least 0 (0 = squared error)"),
-            ("reward_scale", self.reward_scale, self.reward_scale > 0.0, "greater than 0"),
-            ("hindsight_share", self.hindsight_share, 0.0 <= self.hindsight_share <= 1.0, "0 to 1"),
-            ("hindsight_near", self.hindsight_near, 0.0 <= self.hindsight_near <= 1.0, "0 to 1"),
-            (
-                "hindsight_width",
-                self.hindsight_width,
-                len(self.hindsight_width) == 2 and 0.0 < self.hindsight_width[0] <= self.hindsight_width[1],
-                "[low, high] with 0 < low <= high",
-            ),
-        )
-        for key, value, ok, allowed in checks:
-            if not ok:
-                raise ValueError(f"agent.{key} = {value}: allowed {allowed}")
+        check(self, "agent")
         if bool(self.input_matrix) != bool(self.input_offset) or (
             self.input_offset and len(self.input_matrix) % len(self.input_offset)
         ):
@@ -78,13 +66,14 @@ class DQNConfig:
                 f"{len(self.input_offset)}: allowed one row of the matrix per value of the offset, or neither"
             )
         mirror = self.init_mirror
-        if mirror and (len(mirror) != len(self.input_offset) or set(mirror) - {-1, 1}):
-            raise ValueError(
-                f"agent.init_mirror = {list(mirror)}: allowed -1 or 1 for each of the {len(self.input_offset)} values "
-                "of agent.input_offset, or []"
-            )
-        if mirror and any(units % 2 for units in self.hidden):
-            raise ValueError(f"agent.hidden = {list(self.hidden)}: allowed even sizes with agent.init_mirror, or []")
+        require(
+            not mirror or (len(mirror) == len(self.input_offset) and set(mirror) <= {-1, 1}),
+            "agent.init_mirror",
+            mirror,
+            f"-1 or 1 for each of the {len(self.input_offset)} values of agent.input_offset, or []",
+        )
+        even = not mirror or not any(units % 2 for units in self.hidden)
+        require(even, "agent.hidden", self.hidden, "even sizes with agent.init_mirror, or []")
 
     def epsilon(self, step: int) -> float:
         """Probability of a random action at an environment step: linear in the step, then constant."""

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.schema import check, require, setting
+
 __all__ = ["Scenario"]
 
 Array = NDArray[np.float64]
@@ -16,37 +18,27 @@ Array = NDArray[np.float64]
 class Scenario:
     """Phases one after another, counted from the end of the recovery.
 
-    setpoints: OD of each phase. minutes: its length. temperatures: degC.
-    recovery_od: before the first phase the culture grows undiluted until its OD first reaches this; 0 skips it.
-    recovery_limit_min: how long that may take.
     Raises: ValueError naming key, value and allowed range.
     """
 
-    setpoints: tuple[float, ...] = (0.5,)
-    minutes: tuple[float, ...] = (60.0,)
-    temperatures: tuple[float, ...] = (37.0,)
-    recovery_od: float = 0.0
-    recovery_limit_min: float = 600.0
+    setpoints: tuple[float, ...] = setting((0.5,), "one of each phase", "OD", above=0.0, at_most=1.5)
+    minutes: tuple[float, ...] = setting((60.0,), "length of each phase", "min", above=0.0, at_most=100_000.0)
+    temperatures: tuple[float, ...] = setting((37.0,), "thermostat in each phase", "degC", within=(15, 42))
+    recovery_od: float = setting(
+        0.0, "before the first phase the culture grows undiluted to here; 0: no recovery", "OD", within=(0, 1.5)
+    )
+    recovery_limit_min: float = setting(600.0, "how long that may take", "min", above=0.0)
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
-        lengths = {len(self.setpoints), len(self.minutes), len(self.temperatures)}
-        checks = (
-            (
-                "setpoints, minutes, temperatures",
-                (self.setpoints, self.minutes, self.temperatures),
-                len(lengths) == 1 and lengths != {0},
-                "three lists of the same length, one entry per phase",
-            ),
-            ("setpoints", self.setpoints, all(0.0 < s <= 1.5 for s in self.setpoints), "each 0 < OD <= 1.5"),
-            ("minutes", self.minutes, all(0.0 < m <= 100_000.0 for m in self.minutes), "each > 0 min"),
-            ("temperatures", self.temperatures, all(15.0 <= t <= 42.0 for t in self.temperatures), "15 to 42 degC"),
-            ("recovery_od", self.recovery_od, 0.0 <= self.recovery_od <= 1.5, "0 (none) to 1.5 OD"),
-            ("recovery_limit_min", self.recovery_limit_min, self.recovery_limit_min > 0.0, "> 0 min"),
+        lists = (self.setpoints, self.minutes, self.temperatures)
+        lengths = {len(phases) for phases in lists}
+        require(
+            len(lengths) == 1 and lengths != {0},
+            "scenario.setpoints, minutes, temperatures",
+            lists,
+            "three lists of the same length, one entry per phase",
         )
-        for key, value, ok, allowed in checks:
-            if not ok:
-                raise ValueError(f"scenario.{key} = {value}: allowed {allowed}")
+        check(self, "scenario")
 
     @property
     def total_min(self) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.schema import check, setting
 from envs.actions import MAX_PUMP_RATE, pump_rates
 from envs.growth import DilutedCulture, Exponential
 from envs.integrators import INTEGRATORS
@@ -18,51 +19,53 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Training model x' = (mu - u/tau) x and the episode built on it; values and their sources in conf/env/sim.yaml.
+    """Training model x' = (mu - u/tau) x, equation (5) of the paper, and the episode built on it.
 
+    The paper reports neither mu nor tau. The nominal ones are E. coli in rich medium at 37 degC with a plasmid
+    (0.020 to 0.031 1/min in the literature), and a vial of 20 mL fed by 1 mL/s at full power (tau = V/60).
     Raises: ValueError naming key, value and allowed range.
     """
 
-    mu: float = 0.03  # specific growth rate, 1/min
-    tau: float = 1.0 / 3.0  # u/tau is the dilution rate, 1/min for u in mL/s
-    control_min: float = 1.0  # control period, min
-    integrator: str = "euler"
-    substeps: int = 10  # integration steps per control period
-    n_actions: int = 17
-    max_pump_rate: float = MAX_PUMP_RATE  # mL/s
-    episode_steps: int = 100
-    setpoints: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-    start_od: tuple[float, float] = (0.1, 1.1)
-    final_reward_weight: float = 1.0  # weight of the last step's reward (final reward of equation 4)
+    mu: float = setting(
+        0.03, "specific growth rate", "1/min", above=0.0, at_most=0.1, note="E. coli at 37 degC: 0.01 to 0.032"
+    )
+    tau: float = setting(
+        1.0 / 3.0,
+        "u/tau is the dilution rate in 1/min for a pump rate u in mL/s",
+        at_least=0.01,
+        at_most=100.0,
+        note="20 mL and a 1 mL/s pump: 0.333",
+    )
+    control_min: float = setting(1.0, "control period (paper)", "min", above=0.0, at_most=60.0)
+    integrator: str = setting("euler", "the paper names no scheme", choices=tuple(INTEGRATORS))
+    substeps: int = setting(10, "integration steps per control period (paper: 0.1 min)", within=(1, 10_000))
+    n_actions: int = setting(17, "pump rates, equally spaced on [0, max_pump_rate] (paper)", within=(2, 1001))
+    max_pump_rate: float = setting(MAX_PUMP_RATE, "largest pump rate (paper)", "mL/s", above=0.0, at_most=0.05)
+    episode_steps: int = setting(100, "control steps per episode, ended by truncation (paper)", at_least=1)
+    setpoints: tuple[float, ...] = setting(
+        (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+        "one is drawn per episode (paper)",
+        "OD",
+        above=0.0,
+        at_most=1.5,
+        some=True,
+    )
+    start_od: tuple[float, float] = setting(
+        (0.1, 1.1),
+        "uniform range of starts; not in the paper: a little wider than the setpoints on both sides",
+        "OD",
+        above=0.0,
+        at_most=4.0,
+        interval=True,
+    )
+    final_reward_weight: float = setting(
+        1.0,
+        "weight of the final reward of equation (4); the paper gives no form, so the last state counts as every other",
+        at_least=0.0,
+    )
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
-        checks = (
-            ("mu", self.mu, 0.0 < self.mu <= 0.1, "0 < mu <= 0.1 1/min (E. coli at 37 degC: 0.01 to 0.032)"),
-            ("tau", self.tau, 0.01 <= self.tau <= 100.0, "0.01 to 100 (20 mL and a 1 mL/s pump: 0.333)"),
-            ("control_min", self.control_min, 0.0 < self.control_min <= 60.0, "0 < control_min <= 60 min"),
-            ("integrator", self.integrator, self.integrator in INTEGRATORS, " or ".join(INTEGRATORS)),
-            ("substeps", self.substeps, 1 <= self.substeps <= 10_000, "1 to 10000"),
-            ("n_actions", self.n_actions, 2 <= self.n_actions <= 1001, "2 to 1001 pump rates"),
-            ("max_pump_rate", self.max_pump_rate, 0.0 < self.max_pump_rate <= 0.05, "0 < rate <= 0.05 mL/s"),
-            ("episode_steps", self.episode_steps, self.episode_steps >= 1, "at least 1"),
-            (
-                "setpoints",
-                self.setpoints,
-                len(self.setpoints) > 0 and all(0.0 < s <= 1.5 for s in self.setpoints),
-                "one or more OD values, each 0 < setpoint <= 1.5",
-            ),
-            (
-                "start_od",
-                self.start_od,
-                len(self.start_od) == 2 and 0.0 < self.start_od[0] <= self.start_od[1] <= 4.0,
-                "[low, high] with 0 < low <= high <= 4 OD",
-            ),
-            ("final_reward_weight", self.final_reward_weight, self.final_reward_weight >= 0.0, ">= 0"),
-        )
-        for key, value, ok, allowed in checks:
-            if not ok:
-                raise ValueError(f"env.{key} = {value}: allowed {allowed}")
+        check(self, "env")
 
     def pump_rates(self) -> Array:
         """The action grid in mL/s, shape (A,)."""

@@ -11,15 +11,16 @@ import csv
 import io
 import logging
 import re
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.training.config import TrainConfig
 from experiments.training.variants import variant
 from hardware.storage import atomic
@@ -36,21 +37,24 @@ MEASURES = ("regret_pct", "steady_abs_error", "regret_pct_last", "steady_abs_err
 
 @dataclass(frozen=True)
 class AblateConfig:
-    """Keys of conf/ablate.yaml. Raises: ValueError naming key, value and allowed range."""
+    """Which variants of an agent to train. Raises: ValueError naming key, value and allowed range."""
 
-    env: EnvConfig = field(default_factory=EnvConfig)
-    agent: DQNConfig = field(default_factory=DQNConfig)
-    ablations: dict[str, dict[str, Any]] = field(default_factory=dict)  # name -> values that differ from `agent`
-    only: list[str] = field(default_factory=list)  # names to train; empty means all
-    seed: int = 0
-    n_agents: int = 32
-    device: str = "cpu"
-    threads: int | None = None
-    eval_every: int = 250
-    resume: str | None = None
+    env: EnvConfig = part(EnvConfig, "the training model and its episodes")
+    agent: DQNConfig = part(DQNConfig, "the agent that the variants change")
+    ablations: dict[str, dict[str, Any]] = setting({}, "variants by name: values of the agent that differ")
+    only: list[str] = setting([], "names to train; empty: all")
+    seed: int = setting(0, "of the first agent", at_least=0)
+    n_agents: int = setting(32, "seeds of each variant", within=(1, 100_000))
+    device: str = setting("cpu", "where networks are trained", choices=("cpu", "cuda"))
+    threads: int | None = setting(
+        None, "groups of 16 agents trained at the same time; null: one per core. No effect on results", at_least=1
+    )
+    eval_every: int = setting(250, "between evaluations on the selection grid", "steps", at_least=1)
+    resume: str | None = setting(None, "a run folder to continue")
 
     def __post_init__(self) -> None:
         """Check every variant before the first one trains."""
+        check(self)
         unknown = [name for name in self.only if name not in self.ablations]
         if unknown:
             raise ValueError(f"only = {unknown[0]}: allowed {', '.join(self.ablations)}")
@@ -211,16 +215,14 @@ def ablate(config: AblateConfig, folder: Path) -> float:
             entry["train_seconds"],
         )  # fmt: skip
     summary = summarise(rows)
-    frame.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
+    files.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
     (folder / "table.md").write_text(table(rows), encoding="utf-8")
     save(figure(rows), folder / "figures", "ablation")
     log.info("table %s, figure %s", folder / "table.md", folder / "figures" / "ablation.png")
     return float(summary[config.names[0]]["regret_pct"]["median"])
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("ablate", AblateConfig(), ablate)
+main = frame.Command("ablate", AblateConfig(), ablate)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
-from dqn.config import DQNConfig
-from envs.plant.plant import PlantConfig
-from envs.scenario import Scenario
-from experiments.cli import frame
-from experiments.comparison.config import BenchmarkConfig, StudyConfig
+from experiments.cli import files, frame
+from experiments.comparison.config import BenchmarkConfig
 from experiments.controllers import registry
 from experiments.training.config import TrainConfig
 
@@ -119,29 +116,17 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     for drawing in studies.draw(config, trials, summary):
         keep(drawing)
     _store(trials, folder)
-    frame.write_json(folder / "summary.json", summary | {"figures": shown})
+    files.write_json(folder / "summary.json", summary | {"figures": shown})
     report = page.save(pages.of_benchmark(folder), folder)
     log.info("%d closed loops of %d replicates; report %s", len(trials), config.replicates, report)
 
 
 def _schema(cfg: DictConfig) -> BenchmarkConfig:
-    """Every name that the config holds, with the defaults of its type; a controller's is that of its kind."""
-
-    def named(key: str, default: Any) -> dict[str, Any]:
-        return {str(name): default for name in cfg[key]}
-
-    return BenchmarkConfig(
-        agents=named("agents", DQNConfig()),
-        plants=named("plants", PlantConfig()),
-        scenarios=named("scenarios", Scenario()),
-        controllers={str(name): registry.config(str(c.kind)) for name, c in cfg.controllers.items()},
-        studies=named("studies", StudyConfig()),
-    )
+    """A controller's config is that of its kind."""
+    return BenchmarkConfig(controllers={str(name): registry.config(str(c.kind)) for name, c in cfg.controllers.items()})
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("benchmark", BenchmarkConfig(), benchmark, choose=_schema)
+main = frame.Command("benchmark", BenchmarkConfig(), benchmark, _schema)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
-from experiments.cli import frame
+from conf.schema import check, part, setting
+from experiments.cli import files, frame
 from experiments.control.calibration_files import save
 from experiments.control.device import linked
 from hardware.chibio.config import ChiBioConfig
@@ -22,15 +23,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BlankConfig:
-    """Values of `conf/blank.yaml`. Raises: ValueError naming key, value and allowed range."""
+    """Which reactors to measure, and for how long. Raises: ValueError naming key, value and allowed range."""
 
-    backend: ChiBioConfig = field(default_factory=ChiBioConfig)
-    samples: int = 6  # minutes to average, one reading each
+    backend: ChiBioConfig = part(ChiBioConfig, "the device and its reactors")
+    samples: int = setting(6, "to average, one reading each", "min", within=(3, 60), note="one a minute")
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
-        if not 3 <= self.samples <= 60:
-            raise ValueError(f"samples = {self.samples}: allowed 3 to 60 (one a minute)")
+        check(self)
 
 
 def blank(config: BlankConfig, folder: Path) -> None:
@@ -57,12 +56,10 @@ def blank(config: BlankConfig, folder: Path) -> None:
         path = save(Path(backend.calibration), name, "blank", values)
         rows[name] = {**values, "file": str(path)}
         log.info("%s: blank %.0f +- %.0f counts, stored in %s", name, raw, sd, path)
-    frame.write_json(folder / "summary.json", rows)
+    files.write_json(folder / "summary.json", rows)
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("blank", BlankConfig(), blank)
+main = frame.Command("blank", BlankConfig(), blank)
 
 
 if __name__ == "__main__":

@@ -6,18 +6,20 @@ Also the generator of the paper's open-loop protocol (generate=true) and the cov
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from conf.schema import check, meaning, part, require, setting
 from envs.identification.fit import Parameter
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series, row_spans
 from envs.identification.window import Calibration, Drift, IdentifyConfig, calibrate
-from experiments.cli import frame
+from envs.task import EnvConfig
+from experiments.cli import files, frame
 from hardware.errors import RecordingError
 from hardware.storage.recorder import Recorder
 from hardware.storage.recording_reader import Recording, read_recording
@@ -33,34 +35,36 @@ PMSE_FORMULA = "100 * sum (od - model)^2 / sum od^2 over the fitted readings, mo
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    """Keys of conf/calibrate.yaml; see the comments there."""
+    """A recording and how it is fitted; or the generator of recordings; or the study of the intervals' coverage."""
 
-    data: str | None = None
-    rows: str | None = None
-    run: int | None = None
-    reactor: str | None = None
-    pump_ml_s: float = 1.0
-    name: str = "calibrated"
-    identify: IdentifyConfig = field(default_factory=IdentifyConfig)
-    generate: bool = False
-    out: str | None = None
-    coverage: int = 0
-    protocol: OpenLoop = field(default_factory=OpenLoop)
+    data: str | None = setting(None, "recording (CSV); null: the synthetic one that the project ships")
+    rows: str | None = setting(None, "FIRST:END, data rows counted from 0, END excluded; null: all")
+    run: int | None = setting(None, "which of several concatenated runs, from 0; null: the longest")
+    reactor: str | None = setting(None, "which reactor of a file with a column `reactor`; null: the first")
+    pump_ml_s: float = setting(
+        1.0,
+        "flow of the Chi.Bio's feed pump at full power (its own CSV holds duties, not flows)",
+        "mL/s",
+        above=0.0,
+        at_most=10.0,
+    )
+    name: str = setting("calibrated", "the environment file is RUN/<name>.yaml")
+    identify: IdentifyConfig = part(IdentifyConfig, "how the window is chosen and what is reported")
+    generate: bool = setting(False, "simulate the paper's open-loop protocol and write it as a recording")
+    out: str | None = setting(None, "where to; null: RUN/open_loop.csv")
+    coverage: int = setting(
+        0,
+        "simulate so many recordings and count how often the 95 % intervals hold the truth; 0: no study",
+        within=(0, 10000),
+    )
+    protocol: OpenLoop = part(OpenLoop, "protocol, culture and sensor of a simulated recording")
 
     def __post_init__(self) -> None:
-        if not 0 <= self.coverage <= 10000:
-            raise ValueError(f"coverage = {self.coverage}: allowed 0 (no study) to 10000 recordings")
-        if not re.fullmatch(r"[\w-]+", self.name):
-            raise ValueError(f"name = {self.name}: allowed letters, digits, _ and - (it names a file)")
-        if not 0.0 < self.pump_ml_s <= 10.0:
-            raise ValueError(f"pump_ml_s = {self.pump_ml_s}: allowed > 0 to 10 mL/s")
-        if self.rows is not None and not re.fullmatch(r"\d*:\d*", self.rows):
-            raise ValueError(f"rows = {self.rows}: allowed FIRST:END, e.g. 0:700 (data rows from 0, END excluded)")
-
-
-def main() -> None:
-    """Command line."""
-    frame.run("calibrate", CalibrateConfig(), body)
+        check(self)
+        named = re.fullmatch(r"[\w-]+", self.name)
+        require(bool(named), "name", self.name, "letters, digits, _ and - (it names a file)")
+        spans = self.rows is None or re.fullmatch(r"\d*:\d*", self.rows)
+        require(bool(spans), "rows", self.rows, "FIRST:END, e.g. 0:700 (data rows from 0, END excluded)")
 
 
 def body(config: CalibrateConfig, folder: Path) -> float | None:
@@ -103,7 +107,7 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     environment = folder / f"{config.name}.yaml"
     environment.write_text(environment_yaml(result, name), encoding="utf-8")
     content = summary(result, recording, raw)
-    frame.write_json(folder / "summary.json", {**content, "data": source, "env_file": str(environment)})
+    files.write_json(folder / "summary.json", {**content, "data": source, "env_file": str(environment)})
     _events(folder, result, figures)
     print(report(result, recording, content))
     print(f"\n  files       {environment}\n              {folder}/{{summary.json, figures/}}")
@@ -194,24 +198,21 @@ def _drift(d: Drift | None) -> dict[str, Any] | None:
 
 
 def environment_yaml(result: Calibration, source: str) -> str:
-    """conf/env/sim.yaml with the fitted mu and tau and where they come from in place of its opening comment."""
-    text = (resources.files("conf") / "env" / "sim.yaml").read_text(encoding="utf-8")
-    body = re.sub(r"\A(?:#.*\n|\s*\n)+", "", text)
+    """The environment with the fitted mu and tau, every value with its meaning, and where the two come from."""
     mu, tau = result.fit.mu, result.tau
     first, end = result.window_rows
-    head = [
+    lines = [
         "# Training model x' = (mu - u/tau) x, equation (5) of the paper, fitted to a recording by calibrate.",
         f"# Recording {source}, rows {first}:{end}, {result.fit.n_used} readings, PMSE {result.fit.pmse_pct:.3g} %.",
         f"# 95 % intervals: mu {mu.low:.6g} to {mu.high:.6g} 1/min, tau {tau.low:.6g} to {tau.high:.6g}.",
         *(f"# Warning: {w}." for w in result.warnings),
     ]
-    for key, value, comment in (
-        ("mu", mu.value, "specific growth rate, 1/min"),
-        ("tau", tau.value, "u/tau is the dilution rate in 1/min for a pump rate u in mL/s"),
-    ):
-        body, n = re.subn(rf"^{key}:.*$", f"{key}: {value!r} # {comment}", body, flags=re.MULTILINE)
-        assert n == 1, f"conf/env/sim.yaml holds {n} lines for {key}"
-    return "\n".join(head) + "\n" + body
+    env = EnvConfig(mu=mu.value, tau=tau.value)
+    for f in fields(env):
+        given, said = getattr(env, f.name), meaning(f)
+        comment = ", ".join(filter(None, (said.what, said.unit)))
+        lines.append(f"{f.name}: {list(given) if isinstance(given, tuple) else given} # {comment}")
+    return "\n".join(lines) + "\n"
 
 
 def _events(folder: Path, result: Calibration, figures: dict[str, Figure]) -> None:
@@ -278,7 +279,7 @@ def _generate(config: CalibrateConfig, folder: Path) -> None:
                 recorder.write({"time_min": round(float(t), 4), "od": round(float(y), 5), "pump_rate_ml_s": float(u)})
     except RecordingError as error:
         raise frame.UserError(str(error)) from None
-    frame.write_json(
+    files.write_json(
         folder / "summary.json", {"file": str(path), "rows": len(time), "mu": protocol.mu, "tau": protocol.tau}
     )
     print(f"{len(time)} rows of the open-loop protocol (mu {protocol.mu:g}, tau {protocol.tau:g}) in {path}")
@@ -305,7 +306,7 @@ def _coverage(config: CalibrateConfig, folder: Path) -> float:
     from experiments.reporting.charts import save
 
     save(coverage_figure(mu, tau, truth, title), folder / "figures", "coverage")
-    frame.write_json(
+    files.write_json(
         folder / "summary.json",
         {
             "recordings": n,
@@ -325,6 +326,9 @@ def _share(values: np.ndarray[Any, np.dtype[np.float64]], truth: float) -> float
 
 def _half_width(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
     return 50.0 * float(np.median((values[:, 2] - values[:, 1]) / values[:, 0]))
+
+
+main = frame.Command("calibrate", CalibrateConfig(), body)
 
 
 if __name__ == "__main__":

@@ -7,20 +7,21 @@ import logging
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
 import numpy as np
 
-from experiments.cli import frame
+from conf.schema import check, part, require, setting
+from experiments.cli import files, frame
 from experiments.control.calibration_files import save
 from experiments.control.device import linked
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection, no_log
 from hardware.chibio.dosing import PumpFit, fit_pump
 from hardware.chibio.procedures import dose_series
-from hardware.chibio.protocol import FEED, PERIOD_S, WASTE
+from hardware.chibio.protocol import FEED, PERIOD_S, POSITIONS, WASTE
 from hardware.errors import ReactorError
 
 __all__ = ["CalibratePumpConfig", "Series", "calibrate", "read_weighings"]
@@ -42,26 +43,23 @@ class Series:
 
 @dataclass(frozen=True)
 class CalibratePumpConfig:
-    """Values of `conf/calibrate_pump.yaml`. Raises: ValueError naming key, value and allowed range."""
+    """What to weigh. Raises: ValueError naming key, value and allowed range."""
 
-    backend: ChiBioConfig = field(default_factory=ChiBioConfig)
-    reactor: str = "M0"
-    pump: str = "feed"
-    duties: tuple[float, ...] = (0.006, 0.01, 0.02, 0.04)
-    doses: int = 20
-    csv: str | None = None  # weighings already made: columns duty, doses, grams
+    backend: ChiBioConfig = part(ChiBioConfig, "the device")
+    reactor: str = setting("M0", "position", choices=POSITIONS)
+    pump: str = setting("feed", "which pump", choices=tuple(PUMP_OF))
+    duties: tuple[float, ...] = setting(
+        (0.006, 0.01, 0.02, 0.04),
+        "of 63 s at full power; weigh doses of the sizes that will be used; two or more, 0.003 to 0.05 (feed) or 0.5",
+    )
+    doses: int = setting(20, "per weighing", within=(3, 200))
+    csv: str | None = setting(None, "weighings already made, columns duty,doses,grams; nothing is pumped then")
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
-        if self.pump not in PUMP_OF:
-            raise ValueError(f"pump = {self.pump}: allowed feed, waste")
-        if self.reactor not in (f"M{k}" for k in range(8)):
-            raise ValueError(f"reactor = {self.reactor}: allowed M0 to M7")
+        check(self)
         limit = LIMITS[self.pump]
-        if len(set(self.duties)) < 2 or not all(0.003 <= d <= limit for d in self.duties):
-            raise ValueError(f"duties = {list(self.duties)}: allowed at least two different ones from 0.003 to {limit}")
-        if not 3 <= self.doses <= 200:
-            raise ValueError(f"doses = {self.doses}: allowed 3 to 200 per weighing")
+        usable = len(set(self.duties)) >= 2 and all(0.003 <= d <= limit for d in self.duties)
+        require(usable, "duties", self.duties, f"at least two different ones from 0.003 to {limit}")
 
 
 def read_weighings(path: Path) -> list[Series]:
@@ -160,13 +158,11 @@ def calibrate(config: CalibratePumpConfig, folder: Path) -> None:
     uncertainty = {"flow_se": fit.flow_se, "bias_se": fit.bias_se}
     values = {**fit.calibration.as_dict(), **uncertainty, "weighings": weighings}
     path = save(Path(config.backend.calibration), config.reactor, config.pump, values)
-    frame.write_json(folder / "summary.json", {**values, "file": str(path)})
+    files.write_json(folder / "summary.json", {**values, "file": str(path)})
     log.info("%s %s pump\n%s\nstored in %s", config.reactor, config.pump, report(fit, found), path)
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("calibrate_pump", CalibratePumpConfig(), calibrate)
+main = frame.Command("calibrate_pump", CalibratePumpConfig(), calibrate)
 
 
 if __name__ == "__main__":

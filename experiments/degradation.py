@@ -14,17 +14,18 @@ from __future__ import annotations
 
 import csv
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.optimum import OptimalPolicy, solve
 from envs.task import EnvConfig
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.training.variants import variant
 
 if TYPE_CHECKING:
@@ -39,23 +40,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DegradationConfig:
-    """Keys of conf/degradation.yaml. Raises: ValueError naming key, value and allowed range."""
+    """The agent under study and its variants. Raises: ValueError naming key, value and allowed range."""
 
-    env: EnvConfig = field(default_factory=EnvConfig)
-    agent: DQNConfig = field(default_factory=DQNConfig)
-    trained: dict[str, dict[str, Any]] = field(default_factory=dict)  # name -> values that differ from `agent`
-    fitted: dict[str, dict[str, Any]] = field(default_factory=dict)  # the same, for the regression
-    seed: int = 0
-    n_agents: int = 8
-    eval_every: int = 500
+    env: EnvConfig = part(EnvConfig, "the training model and its episodes")
+    agent: DQNConfig = part(DQNConfig, "the agent that the variants change")
+    trained: dict[str, dict[str, Any]] = setting({}, "variants by name: values of the agent that differ")
+    fitted: dict[str, dict[str, Any]] = setting({}, "the same, for the regression")
+    seed: int = setting(0, "of the first agent", at_least=0)
+    n_agents: int = setting(8, "seeds of each variant", at_least=1)
+    eval_every: int = setting(500, "between evaluations", "steps", at_least=1)
 
     def __post_init__(self) -> None:
         """Check every variant before the first one trains."""
-        if not (self.n_agents >= 1 and self.eval_every >= 1 and self.seed >= 0):
-            raise ValueError(
-                f"n_agents = {self.n_agents}, eval_every = {self.eval_every}: allowed at least 1; "
-                f"seed = {self.seed}: allowed at least 0"
-            )
+        check(self)
         for group in (self.trained, self.fitted):
             for name, values in group.items():
                 variant(self.agent, name, values)
@@ -204,15 +201,13 @@ def degradation(config: DegradationConfig, folder: Path) -> float:
     gap = action_gap(solve(config.env, config.agent.gamma))
     log.info("one level beside the best action costs %.1e at the setpoint", gap)
     ends = {name: [r for r in rows if r["variant"] == name][-1] for name in config.trained}
-    frame.write_json(folder / "summary.json", {"action_gap": gap, "trained": ends, "fitted": fitted})
+    files.write_json(folder / "summary.json", {"action_gap": gap, "trained": ends, "fitted": fitted})
     save(figure(rows, fitted), folder / "figures", "degradation")
     log.info("curves %s, figure %s", folder / "curves.csv", folder / "figures" / "degradation.png")
     return float(rows[-1]["regret_pct"])
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("degradation", DegradationConfig(), degradation)
+main = frame.Command("degradation", DegradationConfig(), degradation)
 
 
 if __name__ == "__main__":

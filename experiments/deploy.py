@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.control.config import DeployConfig, deploy_schema
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
         record.events.figure("figures/closed_loop", figure, record.series("time_min").shape[1])
         roles = [config.role(name) for name in record.names]
         summary = {**summarise(record, setup.scenarios, roles, outcome), "figure": str(path)}
-        frame.write_json(folder / "summary.json", summary)
+        files.write_json(folder / "summary.json", summary)
     except OSError as error:
         why = f"figure and summary not written ({error.strerror or error})"
         return f"failed: {outcome.removeprefix('failed: ')}; {why}"
@@ -111,9 +111,7 @@ def _schema(cfg: DictConfig) -> DeployConfig:
     return deploy_schema(str(cfg.backend.kind), str(cfg.controller.kind))
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("deploy", DeployConfig(), deploy, choose=_schema)
+main = frame.Command("deploy", DeployConfig(), deploy, _schema)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,12 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
+from conf.schema import check, part, require, setting
 from envs.scenario import Scenario
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.controllers.registry import STANDALONE
 from experiments.reliability.case import MOMENTS, FaultCase
 from experiments.reliability.faults import FAULTY, by_name
@@ -30,49 +31,37 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class FaultMatrixConfig:
-    """Values of `conf/fault_matrix.yaml`. Raises: ValueError naming key, value and allowed range.
+    """Which faults to try, and when. Raises: ValueError naming key, value and allowed range.
 
-    reactors: faults strike the first one. faults: their names; empty for all. moments: of `case.MOMENTS`.
-    overflow_pump: of the rig; faults that overflow without one are run on a rig without as well. Without a pump
-      everything is run on that rig, and faults of the guard are left out.
-    controls: healthy runs without sensor outliers; every word of the interlock there is a false alarm.
-    seed: of the first case. workers: processes; 0 = one per core.
+    Faults that overflow without an overflow pump are run on a rig without as well. Without a pump everything is run on
+    that rig, and faults of the guard are left out. Healthy runs have no sensor outliers.
     """
 
-    reactors: tuple[str, ...] = ("M0", "M1")
-    scenario: Scenario = field(
-        default_factory=lambda: Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8)
+    reactors: tuple[str, ...] = setting(("M0", "M1"), "the first falls sick, the others are its neighbours", some=True)
+    scenario: Scenario = part(
+        lambda: Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8), "of every run"
     )
-    safety: SafetyConfig = field(default_factory=SafetyConfig)
-    controller_kind: str = "adaptive_inverse"
-    overflow_pump: OverflowPumpConfig = field(default_factory=lambda: OverflowPumpConfig("Pump3", 0.95, 1.2))
-    faults: tuple[str, ...] = ()
-    moments: tuple[str, ...] = MOMENTS
-    controls: int = 10
-    seed: int = 0
-    workers: int = 0
+    safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
+    controller_kind: str = setting("adaptive_inverse", "what decides the pump rate", choices=STANDALONE)
+    overflow_pump: OverflowPumpConfig = part(lambda: OverflowPumpConfig("Pump3", 0.95, 1.2), "of the rig")
+    faults: tuple[str, ...] = setting((), "names, as in docs/faults.md; empty: all")
+    moments: tuple[str, ...] = setting(
+        MOMENTS,
+        "recovery; steady at the first setpoint; after the step; feed pump running",
+        choices=MOMENTS,
+        some=True,
+    )
+    controls: int = setting(10, "healthy runs: whatever the interlock says there is a false alarm", within=(0, 1000))
+    seed: int = setting(0, "of all noise", at_least=0)
+    workers: int = setting(0, "processes; 0: one per core", within=(0, 64))
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
+        check(self)
         by_name(self.faults)
-        unknown = [m for m in self.moments if m not in MOMENTS]
-        checks = (
-            ("reactors", self.reactors, self.reactors[0] == FAULTY, f"{FAULTY} first, it is the one that falls sick"),
-            ("moments", self.moments, bool(self.moments) and not unknown, ", ".join(MOMENTS)),
-            (
-                "controller_kind",
-                self.controller_kind,
-                self.controller_kind in STANDALONE,
-                ", ".join(STANDALONE),
-            ),
-            ("controls", self.controls, 0 <= self.controls <= 1000, "0 to 1000"),
-            ("seed", self.seed, self.seed >= 0, "at least 0"),
-            ("workers", self.workers, 0 <= self.workers <= 64, "0 (one per core) to 64"),
-            ("scenario.setpoints", self.scenario.setpoints, len(self.scenario.setpoints) >= 2, "two phases or more"),
-        )
-        for key, value, ok, allowed in checks:
-            if not ok:
-                raise ValueError(f"{key} = {value}: allowed {allowed}")
+        sick = f"{FAULTY} first, it is the one that falls sick"
+        require(self.reactors[0] == FAULTY, "reactors", self.reactors, sick)
+        setpoints = self.scenario.setpoints
+        require(len(setpoints) >= 2, "scenario.setpoints", setpoints, "two phases or more")
 
 
 def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int, guarded: bool) -> Outcome:
@@ -143,7 +132,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
         charts.save(fault_map(struck, config.moments), folder / "figures", "fault_matrix")
     total = totals(outcomes)
     seconds = {"wall_s": round(time.monotonic() - began, 1)}
-    frame.write_json(folder / "summary.json", {**total, **seconds, "cases_list": [o.as_dict() for o in outcomes]})
+    files.write_json(folder / "summary.json", {**total, **seconds, "cases_list": [o.as_dict() for o in outcomes]})
     for o in outcomes:
         if not o.ok:
             log.warning("%s, %s: %s (%s)", o.label, o.moment, ", ".join(o.wrong), o.outcome)
@@ -155,9 +144,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
         )
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("fault_matrix", FaultMatrixConfig(), fault_matrix)
+main = frame.Command("fault_matrix", FaultMatrixConfig(), fault_matrix)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.control.calibration_files import save
 from experiments.reliability.kills import Findings, KillConfig, killed_run
 from experiments.reliability.rehearsal import SOUND
@@ -45,7 +45,7 @@ def kill_campaign(config: KillConfig, folder: Path) -> None:
     total["schedule_error_s"] = max(f.schedule_error_s for f in found)
     total |= {"pumps_off": all(f.pumps_off for f in found), "overflowed": any(f.overflowed for f in found)}
     total["wall_s"] = round(time.monotonic() - began, 1)
-    frame.write_json(folder / "summary.json", {**total, "runs": [asdict(f) for f in found]})
+    files.write_json(folder / "summary.json", {**total, "runs": [asdict(f) for f in found]})
     for f in found:
         for line in f.trouble:
             log.warning("%s", line)
@@ -54,9 +54,7 @@ def kill_campaign(config: KillConfig, folder: Path) -> None:
         raise frame.UserError("something was lost or doubled; see summary.json and the logs beside the runs")
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("kill_campaign", KillConfig(), kill_campaign)
+main = frame.Command("kill_campaign", KillConfig(), kill_campaign)
 
 
 if __name__ == "__main__":

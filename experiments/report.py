@@ -7,6 +7,7 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
+from conf.schema import setting
 from experiments.cli import frame
 
 __all__ = ["ReportConfig", "find", "main", "write"]
@@ -16,9 +17,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ReportConfig:
-    """run: a run folder, or `latest`: the newest one below runs/."""
+    """What to report on."""
 
-    run: str = "latest"
+    run: str = setting("latest", "a run folder, a folder of run folders, or `latest`: the newest run below runs/")
 
 
 def write(folder: Path) -> Path:
@@ -57,9 +58,7 @@ def report(config: ReportConfig, folder: Path) -> None:
     log.info("report %s", write(find(config.run)))
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("report", ReportConfig(), report)
+main = frame.Command("report", ReportConfig(), report)
 
 
 if __name__ == "__main__":

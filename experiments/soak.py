@@ -7,7 +7,7 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.reliability.endurance import Day, SoakConfig, growth, soak_run
 
 __all__ = ["soak"]
@@ -23,7 +23,7 @@ def soak(config: SoakConfig, folder: Path) -> None:
     slopes = {key: round(growth(days, key), 2) for key in ("memory_mb", "journal_mb", "csv_mb", "events_mb")}
     wall = round(time.monotonic() - began, 1)
     summary = {**found, "growth_per_day": slopes, "wall_s": wall, "days": [asdict(d) for d in days]}
-    frame.write_json(folder / "summary.json", summary)
+    files.write_json(folder / "summary.json", summary)
     head = list(asdict(days[0]))
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     lines += ["| " + " | ".join(str(v) for v in asdict(d).values()) + " |" for d in days]
@@ -45,9 +45,7 @@ def soak(config: SoakConfig, folder: Path) -> None:
         raise frame.UserError("; ".join(name for name, is_bad in bad.items() if is_bad))
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("soak", SoakConfig(), soak)
+main = frame.Command("soak", SoakConfig(), soak)
 
 
 if __name__ == "__main__":

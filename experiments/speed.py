@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.cli import frame
+from conf.schema import check, setting
+from experiments.cli import files, frame
 from experiments.reporting import tables
 from experiments.reporting.tables import Table, number
 from experiments.timing import control, learning
@@ -27,18 +28,24 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SpeedConfig:
-    """groups: which measurements; runs: pairs of each."""
+    """What to time."""
 
-    groups: tuple[str, ...] = ("training", "update", "environment", "start_up", "controllers", "mpc")
-    runs: int = 5
-    scaling: bool = True  # also the figure of cost over sizes
+    groups: tuple[str, ...] = setting(
+        ("training", "update", "environment", "start_up", "controllers", "mpc"), "which measurements"
+    )
+    runs: int = setting(
+        5,
+        "pairs per measurement, after one that is thrown away",
+        within=(5, 1000),
+        note="a median of fewer says little",
+    )
+    scaling: bool = setting(True, "also the figure of cost over population, batch, copies and episodes")
 
     def __post_init__(self) -> None:
+        check(self)
         unknown = [g for g in self.groups if g not in GROUPS]
         if unknown:
             raise ValueError(f"groups = {unknown[0]}: allowed {', '.join(GROUPS)}")
-        if not 5 <= self.runs <= 1000:
-            raise ValueError(f"runs = {self.runs}: allowed 5 to 1000 (a median of fewer says little)")
 
 
 GROUPS: dict[str, Callable[[], Iterator[Measurement]]] = {
@@ -69,7 +76,7 @@ def speed(config: SpeedConfig, folder: Path) -> None:
         log.info("scaling of updates, environment and training")
         charts.save(charts.scaling(learning.scaling(config.runs)), folder / "figures", "scaling")
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
-    frame.write_json(folder / "summary.json", {"machine": machine, "measurements": found})
+    files.write_json(folder / "summary.json", {"machine": machine, "measurements": found})
     tables.write([table(found, config.runs, machine)], folder / "tables")
     log.info("report %s", page.save(page.of_runs(folder, [folder]), folder))
 
@@ -89,9 +96,7 @@ def table(found: list[dict[str, Any]], runs: int, machine: str) -> Table:
     return Table("speed", f"Speed, medians of {runs} paired runs", columns, rows, machine)
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("speed", SpeedConfig(), speed)
+main = frame.Command("speed", SpeedConfig(), speed)
 
 
 if __name__ == "__main__":

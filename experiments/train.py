@@ -15,9 +15,7 @@ def train(config: TrainConfig, folder: Path) -> float:
     return run.train(config, folder)
 
 
-def main() -> None:
-    """Entry point."""
-    frame.run("train", TrainConfig(), train)
+main = frame.Command("train", TrainConfig(), train)
 
 
 if __name__ == "__main__":

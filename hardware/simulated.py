@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from conf.schema import check, require, setting
 from envs.plant.plant import Plant
 from hardware.clock import Clock, VirtualClock
 from hardware.reactor import Array, Command, Mask, Measurement, Receipt
@@ -15,25 +16,21 @@ __all__ = ["SimulatedConfig", "SimulatedReactors"]
 
 @dataclass(frozen=True)
 class SimulatedConfig:
-    """`backend=sim`. Raises: ValueError naming key, value and allowed range."""
+    """`backend=sim`: simulated vials in this process, in virtual time.
 
-    kind: str = "sim"
-    reactors: tuple[str, ...] = ("M0",)  # one simulated vial each
-    control_min: float = 1.0  # min between samples
-    pump_ml_s: float = 1.0  # believed flow of the feed pump at full power, mL/s
-    seed: int = 0  # of what the plant draws
+    Raises: ValueError naming key, value and allowed range.
+    """
+
+    kind: str = setting("sim", "which backend")
+    reactors: tuple[str, ...] = setting(("M0",), "one simulated vial each", some=True)
+    control_min: float = setting(1.0, "between samples", "min", above=0.0, at_most=60.0)
+    pump_ml_s: float = setting(1.0, "believed flow of the feed pump at full power", "mL/s", above=0.0, at_most=10.0)
+    seed: int = setting(0, "of everything the plant draws", at_least=0)
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
-        checks = (
-            ("reactors", self.reactors, len(set(self.reactors)) == len(self.reactors) >= 1, "one or more unique names"),
-            ("control_min", self.control_min, 0.0 < self.control_min <= 60.0, "0 < control_min <= 60 min"),
-            ("pump_ml_s", self.pump_ml_s, 0.0 < self.pump_ml_s <= 10.0, "0 < flow <= 10 mL/s"),
-            ("seed", self.seed, self.seed >= 0, "at least 0"),
-        )
-        for key, value, ok, allowed in checks:
-            if not ok:
-                raise ValueError(f"backend.{key} = {value}: allowed {allowed}")
+        check(self, "backend")
+        unique = len(set(self.reactors)) == len(self.reactors)
+        require(unique, "backend.reactors", self.reactors, "one or more unique names")
 
 
 class SimulatedReactors:

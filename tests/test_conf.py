@@ -1,13 +1,30 @@
 """Every YAML composes and passes its schema; every wrong word on a command line ends in one clear line."""
 
+import importlib
+import re
+import sys
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
+import yaml
 
-from experiments.cli import frame
+from conf.renamed import REMOVED, RENAMED
+from conf.schema import build
+from dqn.config import DQNConfig
+from envs.plant.plant import PlantConfig
+from envs.scenario import Scenario
+from envs.task import EnvConfig
+from experiments.cli import frame, help_page, reference
 from experiments.control.config import deploy_schema
 from experiments.training.config import TrainConfig
+from experiments.training.model_file import read_env_file
+from experiments.training.variants import variant
+from hardware.chibio.config import ChiBioConfig, EmulatorConfig
+from hardware.link.transport import TransportConfig
+from hardware.safety.config import SafetyConfig
+from hardware.simulated import SimulatedConfig
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -73,13 +90,151 @@ def test_the_papers_schedule():
     assert list(scenario.minutes) == [30, 30, 30]
 
 
-def test_yaml_and_dataclass_defaults_are_the_same():
-    """A value stands in YAML with its source; the dataclass must not quietly hold another."""
-    shown = OmegaConf.to_container(frame.compose("train", []), resolve=True)
-    default = OmegaConf.to_container(OmegaConf.create(OmegaConf.to_container(OmegaConf.structured(TrainConfig()))))
-    shown.pop("agent")  # a choice of the defaults list
-    default.pop("agent")
-    assert shown == default
+STATED = {
+    "env/sim": EnvConfig(),
+    "agent/paper": DQNConfig(),
+}  # say what the paper leaves open, though it is the default
+ROOTS = {
+    "agent": DQNConfig,
+    "env": EnvConfig,
+    "plant": PlantConfig,
+    "safety": SafetyConfig,
+    "scenario": Scenario,
+    "backend/transport": TransportConfig,
+}
+
+
+def repeated(values: dict[str, Any], default: Any, prefix: str = "") -> list[str]:
+    """Keys whose value is the default."""
+    found = []
+    for key, value in values.items():
+        own = getattr(default, key)
+        if isinstance(value, dict):
+            found += repeated(value, own, f"{prefix}{key}.")
+        elif key != "kind" and value == (list(own) if isinstance(own, tuple) else own):
+            found.append(f"{prefix}{key}")
+    return found
+
+
+@pytest.mark.parametrize("name", [f"{group}/{option}" for group in ROOTS for option in options(group)])
+def test_a_preset_holds_only_what_differs_from_the_dataclass(name):
+    group = name.rpartition("/")[0]
+    own = yaml.safe_load((CONF / f"{name}.yaml").read_text()) or {}
+    own.pop("defaults", None)
+    if name in STATED:
+        assert build(STATED[name], own) == STATED[name]
+    else:
+        assert repeated(own, ROOTS[group]()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "config"),
+    [("backend/sim", SimulatedConfig()), ("backend/chibio", ChiBioConfig()), ("backend/emulator", EmulatorConfig())],
+)
+def test_a_backend_holds_only_what_differs_from_the_dataclass(name, config):
+    own = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+    own.pop("defaults", None)
+    assert repeated(own, config) == []
+    assert own["kind"] == config.kind
+
+
+COMMANDS = sorted(p.stem for p in CONF.glob("*.yaml") if p.stem != "base")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_field_of_every_command_says_what_it_is(name):
+    def silent(config: Any, prefix: str = "") -> list[str]:
+        found = []
+        for entry in help_page.entries(config):
+            found += [] if entry.said.what else [f"{prefix}{entry.name}"]
+            inner = entry.value if isinstance(entry.value, dict) else {entry.name: entry.value}
+            for key, value in inner.items():
+                found += silent(value, f"{prefix}{key}.") if is_dataclass(value) else []
+        return found
+
+    command = importlib.import_module(f"experiments.{name}").main
+    assert silent(command.config()) == []
+    root = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+    root.pop("defaults")
+    assert repeated({k: v for k, v in root.items() if not isinstance(v, dict)}, command.schema) == []
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_shows_usage_and_every_value(name, capsys, monkeypatch):
+    command = importlib.import_module(f"experiments.{name}").main
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    command()
+    page = capsys.readouterr().out
+    assert f"python -m experiments.{name}" in page
+    for entry in help_page.entries(command.schema):
+        assert re.search(rf"^(  )?{entry.name}\b", page, re.MULTILINE), entry.name
+    assert max(len(line) for line in page.splitlines()) <= 122
+
+
+def test_help_shows_the_values_that_the_rest_of_the_line_gives(capsys, monkeypatch):
+    command = importlib.import_module("experiments.deploy").main
+    monkeypatch.setattr(sys, "argv", ["deploy", "backend=chibio", "--help", "backend.stir=0.7"])
+    command()
+    page = capsys.readouterr().out
+    assert re.search(r"^  backend\.stir = 0\.7 +stirrer \(allowed: 0 to 1; default: 0\.5\)$", page, re.MULTILINE)
+    assert "backend.control_min" not in page
+
+
+def test_the_configuration_page_is_that_of_the_code():
+    """Written anew by `python -m experiments.cli.reference > docs/configuration.md`."""
+    assert (CONF.parent / "docs" / "configuration.md").read_text(encoding="utf-8") == reference.page()
+
+
+@pytest.mark.parametrize("override", ["agent.relabelled=0.5", "++agent.relabelled=0.5", "+agent.relabelled=0.5"])
+def test_an_old_key_on_the_command_line_gives_the_new_one(override, monkeypatch):
+    monkeypatch.setitem(RENAMED, "agent.relabelled", "agent.hindsight_share")
+    with pytest.raises(frame.UserError, match=r"^agent\.relabelled: renamed, now agent\.hindsight_share$"):
+        load_train(override)
+
+
+def test_an_old_option_of_a_group_gives_the_new_one(monkeypatch):
+    monkeypatch.setitem(RENAMED, "controller=turbidostat", "controller=threshold")
+    with pytest.raises(frame.UserError, match=r"^controller=turbidostat: renamed, now controller=threshold$"):
+        load_deploy("controller=turbidostat")
+
+
+def test_an_old_key_in_a_file_gives_the_new_one(monkeypatch, tmp_path):
+    monkeypatch.setitem(RENAMED, "env.growth_rate", "env.mu")
+    monkeypatch.setitem(REMOVED, "agent.noisy", "exploration is epsilon-greedy; use agent.epsilon_end")
+    path = tmp_path / "model.yaml"
+    path.write_text("growth_rate: 0.02\n")
+    with pytest.raises(frame.UserError, match=r"env\.growth_rate: renamed, now env\.mu$"):
+        read_env_file(str(path))
+    stored = tmp_path / "config.yaml"
+    stored.write_text("agent: {noisy: true}\n")
+    with pytest.raises(frame.UserError, match=r"agent\.noisy: removed; exploration is epsilon-greedy; use agent\."):
+        frame._stored(stored, "RUN", lambda _: TrainConfig())
+    with pytest.raises(ValueError, match=r"ablations\.mine\.noisy: removed; exploration is"):
+        variant(DQNConfig(), "mine", {"noisy": True})
+
+
+@pytest.mark.parametrize(
+    ("given", "understood"),
+    [
+        ("env.mu=0.02", "++env.mu=0.02"),
+        ("+env=sim", "env=sim"),
+        ("env=sim", "env=sim"),
+        ("backend/transport=serial", "backend/transport=serial"),
+        ("backend.reactors=[M0,M1]", "++backend.reactors=[M0,M1]"),
+        ("each.M0.minutes=[90]", "++each.M0.minutes=[90]"),
+        ("+each.M0.role=control", "++each.M0.role=control"),
+        ("++seed=1", "++seed=1"),
+        ("seed=range(0,4)", "++seed=range(0,4)"),
+        ("+ablations.mine={double: false}", "++ablations.mine={double: false}"),
+        ("hydra.run.dir=x", "hydra.run.dir=x"),
+        ("plant@plants.own=bench", "plant@plants.own=bench"),
+        ("+plant@plants.own=bench", "+plant@plants.own=bench"),
+        ("~experiment", "~experiment"),
+        ("-m", "-m"),
+    ],
+)
+def test_every_argument_has_the_form_that_hydra_takes(given, understood):
+    assert frame.normalise([given]) == [understood]
 
 
 @pytest.mark.parametrize(
@@ -99,7 +254,7 @@ def test_yaml_and_dataclass_defaults_are_the_same():
         ("agent.init_zero_output=perhaps", ["agent.init_zero_output", "perhaps", "true or false"]),
         ("agent.gamma=1", ["agent.gamma", "1.0", "0 <= gamma < 1"]),
         ("agent.hidden=[64,x]", ["agent.hidden[1]", "x", "a whole number"]),
-        ("device=tpu", ["device", "tpu", "cpu or cuda"]),
+        ("device=tpu", ["device", "tpu", "cpu, cuda"]),
         ("env=null", ["group"]),
         ("agent.hidden=[", ["["]),
     ],

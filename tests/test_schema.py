@@ -7,7 +7,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from conf import presets, renamed, schema
-from conf.schema import build, check, part, value
+from conf.schema import build, check, part, setting
 from envs.plant.plant import PlantConfig
 from experiments.cli import frame
 
@@ -17,10 +17,10 @@ PRESETS = [name for name in PRESETS if not name.startswith("experiment/")]  # re
 
 @dataclass(frozen=True)
 class Inner:
-    rate: float = value(0.5, "a rate", "mL/s", above=0.0, at_most=1.0)
-    law: str = value("none", "a law", choices=("none", "cubic"))
-    spare: str = value("", "a pump", choices=("Pump3", "Pump4", ""))
-    span: tuple[float, float] = value((0.1, 1.1), "a range", "OD", above=0.0, at_most=4.0, interval=True)
+    rate: float = setting(0.5, "a rate", "mL/s", above=0.0, at_most=1.0)
+    law: str = setting("none", "a law", choices=("none", "cubic"))
+    spare: str = setting("", "a pump", choices=("Pump3", "Pump4", ""))
+    span: tuple[float, float] = setting((0.1, 1.1), "a range", "OD", above=0.0, at_most=4.0, interval=True)
 
     def __post_init__(self) -> None:
         check(self, "outer.inner")
@@ -29,12 +29,13 @@ class Inner:
 @dataclass(frozen=True)
 class Outer:
     inner: Inner = part(Inner, "a part")
-    goals: tuple[float, ...] = value((0.5,), "goals", "OD", above=0.0, at_most=1.5, some=True)
-    count: int | None = value(None, "how many", at_least=1)
-    on: bool = value(True, "a switch")
-    budget: float = value(1.0, "a budget", "mL", above=0.0, below=float("inf"))
-    named: dict[str, Inner] = value({}, "parts by name")
-    free: dict[str, Any] = value({}, "anything")
+    share: float = setting(0.5, "a share", within=(0, 1))
+    goals: tuple[float, ...] = setting((0.5,), "goals", "OD", above=0.0, at_most=1.5, some=True)
+    count: int | None = setting(None, "how many", at_least=1)
+    on: bool = setting(True, "a switch")
+    budget: float = setting(1.0, "a budget", "mL", above=0.0, below=float("inf"))
+    named: dict[str, Inner] = setting({}, "parts by name")
+    free: dict[str, Any] = setting({}, "anything")
     whatever: Any = part(Inner, "a part of any kind")
 
     def __post_init__(self) -> None:
@@ -60,6 +61,7 @@ def test_fields_keep_their_defaults_and_mutable_ones_are_not_shared():
         ({"inner": {"law": None}}, "inner.law = None: allowed text"),
         ({"inner": 3}, "inner = 3: allowed keys and values, as inner.NAME=VALUE"),
         ({"inner": {"ratte": 1}}, "inner.ratte: no such key; allowed under inner: rate, law, spare, span"),
+        ({"share": 2}, "share = 2.0: allowed 0 to 1"),
         ({"goals": [0.5, 2]}, "goals = [0.5, 2.0]: allowed one or more, each 0 < OD <= 1.5"),
         ({"goals": []}, "goals = []: allowed one or more, each 0 < OD <= 1.5"),
         ({"goals": 0.5}, "goals = 0.5: allowed a list, as [1,2]"),
@@ -69,7 +71,7 @@ def test_fields_keep_their_defaults_and_mutable_ones_are_not_shared():
         ({"on": "perhaps"}, "on = perhaps: allowed true or false"),
         ({"budget": "inf"}, "budget = inf mL: allowed a finite number greater than 0"),
         ({"named": {"a": {"rate": 2}}}, "outer.inner.rate = 2.0 mL/s: allowed 0 < rate <= 1"),
-        ({"nois": 1}, "nois: no such key; allowed here: inner, goals, count, on, budget, named, free, whatever"),
+        ({"nois": 1}, "nois: no such key; allowed here: inner, share, goals, count, on, budget, named, free, whatever"),
     ],
 )
 def test_what_is_wrong_is_one_line_with_key_value_and_range(values, message):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.schema import check, require, setting
 from envs.actions import MAX_PUMP_RATE, pump_rates
 from envs.growth import DilutedCulture, Exponential
 from envs.integrators import rk4
@@ -23,45 +24,39 @@ class OpenLoop:
     The paper (section 4): 60 min of growth, dilution at the maximum until OD < 0.3, then a random pump rate every
     30 min. Rates are drawn from the agent's 17. What the paper does not say: outside `keep_od` a new rate is drawn at
     once, from the half of the rates that leads back, as an experimenter would, so that no draw washes the culture out.
-
-    mu: 1/min. tau: u/tau is the dilution rate in 1/min for u in mL/s. start_od: OD.
-    hours: length; one row per `control_min`.
-    noise: sd of a reading relative to the OD. noise_correlation: of the noise from one row to the next; 0.12 is the
-      median of public Chi.Bio logs (docs/biology.md, Sensor).
     """
 
-    mu: float = 0.028
-    tau: float = 0.31
-    start_od: float = 0.12
-    hours: float = 6.0
-    control_min: float = 1.0
-    growth_min: float = 60.0
-    dilute_to: float = 0.3
-    hold_min: float = 30.0
-    keep_od: tuple[float, float] = (0.08, 1.2)
-    noise: float = 0.01
-    noise_correlation: float = 0.12
-    seed: int = 1
+    mu: float = setting(0.028, "specific growth rate", "1/min", above=0.0, at_most=0.1)
+    tau: float = setting(
+        0.31,
+        "u/tau is the dilution rate in 1/min; below 0.02/mu, so that the pump outruns growth",
+        above=0.0,
+    )
+    start_od: float = setting(0.12, "at the start", "OD", above=0.0, at_most=2.0)
+    hours: float = setting(6.0, "length of the recording", "h", within=(2, 100))
+    control_min: float = setting(1.0, "between rows", "min", within=(0.1, 10))
+    growth_min: float = setting(60.0, "growth without feed (paper)", "min", at_least=0.0)
+    dilute_to: float = setting(0.3, "then the pump at its maximum until the OD is below (paper)", "OD", above=0.0)
+    hold_min: float = setting(
+        30.0, "then a random pump rate for so long, again and again (paper); control_min or more", "min"
+    )
+    keep_od: tuple[float, float] = setting(
+        (0.08, 1.2),
+        "outside, a new rate is drawn at once from the half that leads back (not in the paper)",
+        "OD",
+        above=0.0,
+        interval=True,
+    )
+    noise: float = setting(0.01, "sd of a reading relative to the OD", within=(0, 0.2))
+    noise_correlation: float = setting(0.12, "from row to row; median of public Chi.Bio logs", within=(0, 0.95))
+    seed: int = setting(1, "of rates and noise", at_least=0)
 
     def __post_init__(self) -> None:
-        low, high = self.keep_od
-        for key, value, allowed, holds in (
-            ("mu", self.mu, "> 0 to 0.1 1/min", 0.0 < self.mu <= 0.1),
-            ("tau", self.tau, "> 0 and below 0.02/mu, so that the pump can outrun growth", self.tau < self.fastest),
-            ("tau", self.tau, "> 0", self.tau > 0.0),
-            ("start_od", self.start_od, "> 0 to 2", 0.0 < self.start_od <= 2.0),
-            ("hours", self.hours, "2 to 100", 2.0 <= self.hours <= 100.0),
-            ("control_min", self.control_min, "0.1 to 10 min", 0.1 <= self.control_min <= 10.0),
-            ("growth_min", self.growth_min, ">= 0 min", self.growth_min >= 0.0),
-            ("dilute_to", self.dilute_to, "> 0", self.dilute_to > 0.0),
-            ("hold_min", self.hold_min, f">= {self.control_min} min", self.hold_min >= self.control_min),
-            ("keep_od", self.keep_od, "0 < low < high", 0.0 < low < high),
-            ("noise", self.noise, "0 to 0.2", 0.0 <= self.noise <= 0.2),
-            ("noise_correlation", self.noise_correlation, "0 to 0.95", 0.0 <= self.noise_correlation <= 0.95),
-            ("seed", self.seed, ">= 0", self.seed >= 0),
-        ):
-            if not holds:
-                raise ValueError(f"protocol.{key} = {value}: allowed {allowed}")
+        check(self, "protocol")
+        outrun = "> 0 and below 0.02/mu, so that the pump can outrun growth"
+        require(self.tau < self.fastest, "protocol.tau", self.tau, outrun)
+        require(self.hold_min >= self.control_min, "protocol.hold_min", self.hold_min, f">= {self.control_min} min")
+        require(self.keep_od[0] < self.keep_od[1], "protocol.keep_od", self.keep_od, "0 < low < high")
 
     @property
     def fastest(self) -> float:

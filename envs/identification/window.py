@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.schema import check, setting
 from envs.identification.fit import (
     Fit,
     NotIdentifiable,
@@ -42,26 +43,21 @@ PLAUSIBLE_TAU = (0.05, 2.0)
 class IdentifyConfig:
     """How the window is chosen and what is reported.
 
-    window: "auto" takes the longest stretch whose free-running fit stays below the limit and whose segments do not
-      drift; "all" takes all rows.
-    pmse_limit: of a window, %; raised to three times the PMSE of the sensor's noise where that is larger.
-    segment_min: length of the segments of the drift report, min.
-    horizon_min: over which the pair is tested outside its window, each time from a fresh start, min.
+    "auto" takes the longest stretch whose free-running fit stays below the limit and whose segments do not drift;
+    "all" takes all rows. The limit is raised to three times the PMSE of the sensor's noise where that is larger.
     """
 
-    window: str = "auto"
-    pmse_limit: float = 0.5
-    segment_min: float = 120.0
-    horizon_min: float = 60.0
+    window: str = setting("auto", "rows to fit", choices=("auto", "all"))
+    pmse_limit: float = setting(
+        0.5, "of the window (the paper's model reached 6 %)", "%", above=0.0, at_most=100.0, note="default 0.5"
+    )
+    segment_min: float = setting(120.0, "length of the segments of the drift report", "min", within=(20, 1440))
+    horizon_min: float = setting(
+        60.0, "of the predictions outside the window, each from a fresh start", "min", within=(20, 1440)
+    )
 
     def __post_init__(self) -> None:
-        if self.window not in ("auto", "all"):
-            raise ValueError(f"identify.window = {self.window}: allowed auto, all")
-        if not 0.0 < self.pmse_limit <= 100.0:
-            raise ValueError(f"identify.pmse_limit = {self.pmse_limit} %: allowed > 0 to 100 (default 0.5)")
-        for key, value in (("segment_min", self.segment_min), ("horizon_min", self.horizon_min)):
-            if not 20.0 <= value <= 1440.0:
-                raise ValueError(f"identify.{key} = {value} min: allowed 20 to 1440")
+        check(self, "identify")
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.schema import check, setting
 from envs.growth import Arrhenius, Cardinal, Exponential, GrowthLaw, Monod, relative_to_37
 from envs.integrators import Integrator
-from envs.plant.noise import Streams, check_ranges, spread
+from envs.plant.noise import Streams, spread
 
 __all__ = ["Culture", "GrowthConfig"]
 
@@ -22,58 +24,41 @@ UNSTIRRED_GROWTH = 0.5  # relative growth without stirring (docs/biology.md, Sti
 
 TEMPERATURE_LAWS = ("none", "arrhenius", "cardinal")
 
-GROWTH_RANGES = {
-    "mu": (0.0, 0.1, "1/min"),
-    "mu_cv": (0.0, 0.3, ""),
-    "drift_sd_per_h": (0.0, 0.2, "1/sqrt(h)"),
-    "ramp_per_h": (-0.5, 0.5, "1/h"),
-    "activation_kj_mol": (0.0, 150.0, "kJ/mol"),
-    "adaptation_min": (0.0, 120.0, "min"),
-    "yield_od": (0.5, np.inf, "OD"),
-    "k_s": (1e-4, 1.0, ""),
-    "wall_attach_per_min": (0.0, 1e-2, "1/min"),
-    "wall_growth_ratio": (0.0, 1.0, ""),
-    "wall_detach_per_min": (0.0, 0.1, "1/min"),
-    "wall_capacity_od": (1e-3, 10.0, "OD"),
-}
-
 
 @dataclass(frozen=True)
 class GrowthConfig:
-    """How cells grow; the defaults are the training model's.
+    """How cells grow; the defaults are the training model's. Every temperature law is 1 at 37 degC (envs/growth.py)."""
 
-    mu, mu_cv: specific growth rate in fresh medium at 37 degC, 1/min, mean and spread between cultures.
-    drift_sd_per_h: sd after one hour of the random walk of ln mu.
-    ramp_per_h: relative change of mu per hour (burden, pH, oxygen).
-    temperature_law: none | arrhenius | cardinal, all 1 at 37 degC; see envs/growth.py.
-    activation_kj_mol: Ea of the Arrhenius law, kJ/mol.
-    adaptation_min: time constant with which growth follows temperature, min; 0 = at once.
-    yield_od: OD that one fill of fresh medium can grow; inf = substrate never runs out.
-    k_s: relative substrate at half rate (Monod); used when yield_od is finite.
-    wall_attach_per_min, wall_detach_per_min: exchange of biomass with the wall, 1/min.
-    wall_growth_ratio: growth rate on the wall over that in suspension; wall_capacity_od: where it saturates.
-    """
-
-    mu: float = 0.03
-    mu_cv: float = 0.0
-    drift_sd_per_h: float = 0.0
-    ramp_per_h: float = 0.0
-    temperature_law: str = "none"
-    activation_kj_mol: float = 56.0
-    adaptation_min: float = 0.0
-    yield_od: float = float("inf")
-    k_s: float = 0.1
-    wall_attach_per_min: float = 0.0
-    wall_growth_ratio: float = 0.0
-    wall_detach_per_min: float = 0.0
-    wall_capacity_od: float = 1.0
+    mu: float = setting(0.03, "mean specific growth rate in fresh medium at 37 degC", "1/min", within=(0, 0.1))
+    mu_cv: float = setting(0.0, "its relative spread between cultures", within=(0, 0.3))
+    drift_sd_per_h: float = setting(0.0, "random walk of ln mu: sd after 1 h", "1/sqrt(h)", within=(0, 0.2))
+    ramp_per_h: float = setting(0.0, "relative change of mu per hour (burden, pH, oxygen)", "1/h", within=(-0.5, 0.5))
+    temperature_law: str = setting("none", "how mu follows temperature", choices=TEMPERATURE_LAWS)
+    activation_kj_mol: float = setting(
+        56.0,
+        "Ea of the Arrhenius law; 54 to 59 (Ingraham & Marr, BioNumbers 105003); mu(30)/mu(37) = 0.606",
+        "kJ/mol",
+        within=(0, 150),
+    )
+    adaptation_min: float = setting(
+        0.0,
+        "time constant with which growth follows temperature; at once within 21 to 37 degC (Ng et al. 1962)",
+        "min",
+        within=(0, 120),
+    )
+    yield_od: float = setting(
+        math.inf, "OD grown from one fill of fresh medium; inf: substrate never runs out", "OD", within=(0.5, math.inf)
+    )
+    k_s: float = setting(
+        0.1, "relative substrate at half rate (Monod), 0.02 to 0.2; used when yield_od is finite", within=(1e-4, 1)
+    )
+    wall_attach_per_min: float = setting(0.0, "biomass that settles on the wall", "1/min", within=(0, 1e-2))
+    wall_growth_ratio: float = setting(0.0, "growth on the wall over growth in suspension", within=(0, 1))
+    wall_detach_per_min: float = setting(0.0, "biomass that leaves the wall", "1/min", within=(0, 0.1))
+    wall_capacity_od: float = setting(1.0, "OD-equivalent at which the wall is full", "OD", within=(1e-3, 10))
 
     def __post_init__(self) -> None:
-        check_ranges(self, "plant.growth", GROWTH_RANGES)
-        if self.temperature_law not in TEMPERATURE_LAWS:
-            raise ValueError(
-                f"plant.growth.temperature_law = {self.temperature_law}: allowed {', '.join(TEMPERATURE_LAWS)}"
-            )
+        check(self, "plant.growth")
 
 
 def _response(config: GrowthConfig) -> Callable[[Array], Array]:

@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Tape", "check_ranges", "spread", "streams", "uniform"]
+__all__ = ["Tape", "spread", "streams", "uniform"]
 
 Array = NDArray[np.float64]
 Streams = Sequence[np.random.Generator]
-
-
-def check_ranges(owner: object, name: str, ranges: Mapping[str, tuple[float, float, str]]) -> None:
-    """Check numbers of a config dataclass against {key: (lowest, highest, unit)}.
-
-    Raises: ValueError naming the key, its value with unit, and the allowed range; nan is never allowed.
-    """
-    for key, (low, high, unit) in ranges.items():
-        value = getattr(owner, key)
-        if not low <= value <= high:
-            raise ValueError(f"{name}.{key} = {value} {unit}".rstrip() + f": allowed {low:g} to {high:g}; change it")
 
 
 def streams(rng: np.random.Generator | Streams, n: int) -> list[np.random.Generator]:

@@ -6,14 +6,15 @@ everything real is switched off (the defaults of `PlantConfig`). Units: min, mL,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.schema import check, part, setting
 from envs.integrators import INTEGRATORS
 from envs.plant.culture import Culture, GrowthConfig
-from envs.plant.noise import Streams, Tape, check_ranges, streams
+from envs.plant.noise import Streams, Tape, streams
 from envs.plant.pump import FeedPump, PumpConfig
 from envs.plant.sensor import OdSensor, SensorConfig
 from envs.plant.thermal import Thermal, ThermalConfig
@@ -26,25 +27,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlantConfig:
-    """Everything about a plant; the defaults are the preset `nominal`, the training model and nothing else.
+    """Everything about a plant; the defaults are the preset `nominal`, the training model and nothing else."""
 
-    start_od: suspended biomass at reset, OD.
-    integrator: euler | rk4; substep_min: longest integration step, min.
-    """
-
-    growth: GrowthConfig = field(default_factory=GrowthConfig)
-    pump: PumpConfig = field(default_factory=PumpConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    vessel: VesselConfig = field(default_factory=VesselConfig)
-    thermal: ThermalConfig = field(default_factory=ThermalConfig)
-    start_od: float = 0.5
-    integrator: str = "euler"
-    substep_min: float = 0.1
+    growth: GrowthConfig = part(GrowthConfig, "how cells grow")
+    pump: PumpConfig = part(PumpConfig, "how a pump turns on-time into volume")
+    sensor: SensorConfig = part(SensorConfig, "what an averaged OD reading adds to the truth")
+    vessel: VesselConfig = part(VesselConfig, "the vial and its bottle")
+    thermal: ThermalConfig = part(ThermalConfig, "heater and surroundings")
+    start_od: float = setting(
+        0.5, "suspended biomass at reset unless the scenario says otherwise", "OD", within=(0, 10)
+    )
+    integrator: str = setting("euler", "scheme of the mass balances", choices=tuple(INTEGRATORS))
+    substep_min: float = setting(0.1, "longest integration step (paper)", "min", within=(1e-3, 1))
 
     def __post_init__(self) -> None:
-        check_ranges(self, "plant", {"start_od": (0.0, 10.0, "OD"), "substep_min": (1e-3, 1.0, "min")})
-        if self.integrator not in INTEGRATORS:
-            raise ValueError(f"plant.integrator = {self.integrator}: allowed {', '.join(INTEGRATORS)}")
+        check(self, "plant")
 
 
 class Plant:

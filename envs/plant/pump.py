@@ -7,77 +7,56 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.plant.noise import Streams, check_ranges, spread
+from conf.schema import check, require, setting
+from envs.plant.noise import Streams, spread
 
 __all__ = ["FeedPump", "PumpConfig"]
 
 Array = NDArray[np.float64]
-
-RANGES = {
-    "gain_ml_s": (0.05, 5.0, "mL/s"),
-    "gain_cv": (0.0, 0.3, ""),
-    "gain_drift_per_h": (-0.2, 0.2, "1/h"),
-    "pulse_cv": (0.0, 0.5, ""),
-    "pulse_ar": (0.0, 0.95, ""),
-    "dead_time_s": (0.0, 0.5, "s"),
-    "min_pulse_s": (0.0, 1.0, "s"),
-    "timing_error_s": (0.0, 0.5, "s"),
-    "prime_idle_min": (0.0, 1440.0, "min"),
-    "prime_low": (0.0, 1.0, ""),
-    "prime_high": (0.0, 1.0, ""),
-    "waste_ml_s": (0.05, 5.0, "mL/s"),
-    "overflow_ml_s": (0.05, 5.0, "mL/s"),
-    "back_leak_ml": (0.0, 1.0, "mL"),
-}
 
 
 @dataclass(frozen=True)
 class PumpConfig:
     """How a pump turns on-time into volume; the defaults are a perfect pump of 1 mL/s.
 
-    dosing: `pulse` (the whole dose at the start of the interval, as the device does) or `continuous` (spread evenly
-      over the interval, as the training model assumes).
-    gain_ml_s, gain_cv: flow at full power, mean and spread between heads.
-    gain_drift_per_h: relative change of the flow per hour (tube wear).
-    pulse_cv, pulse_ar: spread of a minute's dose and its correlation with the minute before.
-    dead_time_s: on-time that delivers nothing at the start of each pulse.
-    min_pulse_s: pulses shorter than this deliver nothing.
-    timing_error_s: each pulse lasts longer by a uniform draw from 0 to this.
-    prime_idle_min, prime_low, prime_high: after more idle minutes than this, a pulse delivers only a fraction between.
-    waste_ml_s, overflow_ml_s: flow of the waste pump and of the overflow pump at full power.
-    back_leak_ml: volume that siphons back after each pulse.
+    `pulse` gives the whole dose at the start of the interval, as the device does; `continuous` spreads it evenly over
+    the interval, as the training model assumes. tau = 20 mL / (60 s * gain).
     """
 
-    dosing: str = "continuous"
-    gain_ml_s: float = 1.0
-    gain_cv: float = 0.0
-    gain_drift_per_h: float = 0.0
-    pulse_cv: float = 0.0
-    pulse_ar: float = 0.0
-    dead_time_s: float = 0.0
-    min_pulse_s: float = 0.0
-    timing_error_s: float = 0.0
-    prime_idle_min: float = 10.0
-    prime_low: float = 1.0
-    prime_high: float = 1.0
-    waste_ml_s: float = 1.0
-    overflow_ml_s: float = 1.0
-    back_leak_ml: float = 0.0
+    dosing: str = setting("continuous", "when the dose of an interval flows", choices=("continuous", "pulse"))
+    gain_ml_s: float = setting(1.0, "mean flow at full power (vendor: up to 1)", "mL/s", within=(0.05, 5))
+    gain_cv: float = setting(0.0, "its relative spread between heads", within=(0, 0.3))
+    gain_drift_per_h: float = setting(0.0, "relative change of the flow (tube wear)", "1/h", within=(-0.2, 0.2))
+    pulse_cv: float = setting(0.0, "relative spread of a minute's dose", within=(0, 0.5))
+    pulse_ar: float = setting(0.0, "its correlation with the minute before", within=(0, 0.95))
+    dead_time_s: float = setting(0.0, "start of each pulse that delivers nothing", "s", within=(0, 0.5))
+    min_pulse_s: float = setting(0.0, "pulses shorter than this deliver nothing", "s", within=(0, 1))
+    timing_error_s: float = setting(
+        0.0, "each pulse lasts longer by a uniform draw from 0 to this", "s", within=(0, 0.5)
+    )
+    prime_idle_min: float = setting(10.0, "rest after which the line must be primed", "min", within=(0, 1440))
+    prime_low: float = setting(1.0, "fraction that the priming pulse delivers, lowest", within=(0, 1))
+    prime_high: float = setting(1.0, "and highest", within=(0, 1))
+    waste_ml_s: float = setting(1.0, "flow of the waste pump at full power (vendor)", "mL/s", within=(0.05, 5))
+    overflow_ml_s: float = setting(
+        1.0, "flow of the overflow pump at full power, if there is one (vendor)", "mL/s", within=(0.05, 5)
+    )
+    back_leak_ml: float = setting(
+        0.0, "siphoned back after each pulse, 0.02 to 0.2 on a leaking head", "mL", within=(0, 1)
+    )
 
     def __post_init__(self) -> None:
-        check_ranges(self, "plant.pump", RANGES)
-        if self.dosing not in ("pulse", "continuous"):
-            raise ValueError(f"plant.pump.dosing = {self.dosing}: allowed continuous, pulse")
-        if self.prime_low > self.prime_high:
-            raise ValueError(
-                f"plant.pump.prime_low = {self.prime_low}: allowed 0 to prime_high = {self.prime_high}; lower it"
-            )
+        check(self, "plant.pump")
+        highest = f"0 to prime_high = {self.prime_high}; lower it"
+        require(self.prime_low <= self.prime_high, "plant.pump.prime_low", self.prime_low, highest)
         per_pulse = self.dead_time_s + self.min_pulse_s + self.timing_error_s + self.back_leak_ml
-        if self.dosing == "continuous" and (per_pulse > 0.0 or self.prime_low < 1.0):
-            raise ValueError(
-                "plant.pump.dosing = continuous: allowed only with dead_time_s, min_pulse_s, timing_error_s and "
-                "back_leak_ml 0 and prime_low 1, which are properties of a pulse; set dosing=pulse"
-            )
+        require(
+            self.dosing == "pulse" or (per_pulse == 0.0 and self.prime_low == 1.0),
+            "plant.pump.dosing",
+            self.dosing,
+            "only with dead_time_s, min_pulse_s, timing_error_s and back_leak_ml 0 and prime_low 1, which are "
+            "properties of a pulse; set dosing=pulse",
+        )
 
 
 class FeedPump:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.plant.noise import Streams, Tape, check_ranges, spread, uniform
+from conf.schema import check, setting
+from envs.plant.noise import Streams, Tape, spread, uniform
 
 __all__ = ["OdSensor", "SensorConfig", "counts_from_od", "density", "od_from_counts"]
 
@@ -17,64 +18,36 @@ Mask = NDArray[np.bool_]
 LINEAR, QUADRATIC = 1.833, 0.226  # OD = 1.833 R + 0.226 R^2, R = log10(blank / raw) (docs/device.md, OD measurement)
 FULL_SCALE = 65535.0  # counts of the 16-bit converter
 
-RANGES = {
-    "noise_floor": (0.0, 0.1, "OD"),
-    "noise_relative": (0.0, 0.1, ""),
-    "noise_factor_sd": (0.0, 1.0, ""),
-    "lag1": (0.0, 0.95, ""),
-    "gain_cv": (0.0, 0.3, ""),
-    "curvature": (-0.3, 0.0, "1/OD"),
-    "blank_error": (0.0, 0.2, "OD"),
-    "drift_per_h": (-0.05, 0.05, "OD/h"),
-    "wall_gain": (0.0, 1.0, ""),
-    "outlier_rate": (0.0, 0.2, ""),
-    "bubble_rate": (0.0, 0.2, ""),
-    "zero_rate": (0.0, 0.2, ""),
-    "freeze_rate": (0.0, 0.2, ""),
-    "blank_counts": (3000.0, 60000.0, "counts"),
-    "blank_cv": (0.0, 0.25, ""),
-}
-
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """What the averaged reading of one minute adds to the truth; the defaults are a perfect sensor.
+    """What the averaged reading of one minute adds to the truth; the defaults are a perfect sensor."""
 
-    noise_floor, noise_relative: sd of a reading = hypot(noise_floor, noise_relative * OD).
-    noise_factor_sd: sd of the logarithm of a reactor's own noise factor (median 1).
-    lag1: correlation of neighbouring readings' noise.
-    gain_cv: spread between reactors of the slope k in y = k (x + c x^2).
-    curvature: c is drawn uniformly between this and 0, 1/OD.
-    blank_error: offset drawn uniformly in +- this, OD.
-    drift_per_h: rise of the offset, OD/h.
-    wall_gain: OD seen per OD-equivalent of wall biomass.
-    outlier_rate: probability per reading of an isolated jump of more than 0.04, 54 % upward.
-    bubble_rate: probability per reading that a bubble adds 0.05 to 0.3 for 1 to 5 readings.
-    zero_rate: probability per reading of an exact zero.
-    freeze_rate: probability per reading that the value repeats for the next 5 to 30 readings.
-    quantised: round to whole counts of the converter.
-    blank_counts, blank_cv: counts of clear medium, mean and spread between reactors.
-    """
-
-    noise_floor: float = 0.0
-    noise_relative: float = 0.0
-    noise_factor_sd: float = 0.0
-    lag1: float = 0.0
-    gain_cv: float = 0.0
-    curvature: float = 0.0
-    blank_error: float = 0.0
-    drift_per_h: float = 0.0
-    wall_gain: float = 0.0
-    outlier_rate: float = 0.0
-    bubble_rate: float = 0.0
-    zero_rate: float = 0.0
-    freeze_rate: float = 0.0
-    quantised: bool = False
-    blank_counts: float = 14000.0
-    blank_cv: float = 0.0
+    noise_floor: float = setting(
+        0.0, "sd of a reading = hypot(noise_floor, noise_relative * OD)", "OD", within=(0, 0.1)
+    )
+    noise_relative: float = setting(0.0, "see noise_floor", within=(0, 0.1))
+    noise_factor_sd: float = setting(
+        0.0, "sd of the logarithm of a reactor's own noise factor (median 1)", within=(0, 1)
+    )
+    lag1: float = setting(0.0, "correlation of neighbouring readings' noise", within=(0, 0.95))
+    gain_cv: float = setting(0.0, "spread between reactors of the slope k in y = k (x + c x^2)", within=(0, 0.3))
+    curvature: float = setting(0.0, "c is drawn uniformly between this and 0", "1/OD", within=(-0.3, 0))
+    blank_error: float = setting(0.0, "offset, uniform in +- this", "OD", within=(0, 0.2))
+    drift_per_h: float = setting(0.0, "rise of the offset", "OD/h", within=(-0.05, 0.05))
+    wall_gain: float = setting(0.0, "OD seen per OD-equivalent on the wall", within=(0, 1))
+    outlier_rate: float = setting(0.0, "per reading: an isolated jump of more than 0.04, 54 % upward", within=(0, 0.2))
+    bubble_rate: float = setting(0.0, "per reading: a bubble adds 0.05 to 0.3 for 1 to 5 readings", within=(0, 0.2))
+    zero_rate: float = setting(0.0, "per reading: an exact zero", within=(0, 0.2))
+    freeze_rate: float = setting(0.0, "per reading: it repeats for the next 5 to 30", within=(0, 0.2))
+    quantised: bool = setting(False, "round to whole counts of the 16-bit converter")
+    blank_counts: float = setting(
+        14000.0, "mean counts of clear medium, 10 to 25 thousand in public logs", "counts", within=(3000, 60000)
+    )
+    blank_cv: float = setting(0.0, "its relative spread between reactors", within=(0, 0.25))
 
     def __post_init__(self) -> None:
-        check_ranges(self, "plant.sensor", RANGES)
+        check(self, "plant.sensor")
 
 
 def density(od: Array | float) -> Array:

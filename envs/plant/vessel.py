@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.plant.noise import Streams, check_ranges, spread
+from conf.schema import check, require, setting
+from envs.plant.noise import Streams, spread
 from envs.plant.pump import PumpConfig
 
 __all__ = ["Vessel", "VesselConfig"]
@@ -20,32 +22,23 @@ MIN_VOLUME_ML = 1.0  # mL, what no pump can take out of a vial; keeps concentrat
 
 @dataclass(frozen=True)
 class VesselConfig:
-    """The vial and its bottle.
+    """The vial and its bottle."""
 
-    volume_ml, volume_sd_ml: culture up to the waste tube, mean and spread between vials.
-    overflow_above_ml: the overflow pump's tube, if there is one, ends so far above the waste tube.
-    capacity_ml: where it overflows.
-    evaporation_ml_day: water lost.
-    media_ml: fresh medium in the bottle; inf = never empty.
-    """
-
-    volume_ml: float = 20.0
-    volume_sd_ml: float = 0.0
-    overflow_above_ml: float = 2.0
-    capacity_ml: float = 30.0
-    evaporation_ml_day: float = 0.0
-    media_ml: float = float("inf")
+    volume_ml: float = setting(20.0, "mean culture up to the waste tube (Steel 2020)", "mL", within=(5, 50))
+    volume_sd_ml: float = setting(0.0, "spread of the tube's height between vials", "mL", within=(0, 1.5))
+    overflow_above_ml: float = setting(
+        2.0, "the overflow pump's tube ends so far above the waste tube", "mL", within=(0, 10)
+    )
+    capacity_ml: float = setting(
+        30.0, "overflows above; 4.5 mL over volume_ml or more (30 mL vial)", "mL", at_most=200.0
+    )
+    evaporation_ml_day: float = setting(0.0, "water lost", "mL/day", within=(0, 50))
+    media_ml: float = setting(math.inf, "fresh medium in the bottle; inf: never empty", "mL", within=(0, math.inf))
 
     def __post_init__(self) -> None:
-        ranges = {
-            "volume_ml": (5.0, 50.0, "mL"),
-            "volume_sd_ml": (0.0, 1.5, "mL"),
-            "overflow_above_ml": (0.0, 10.0, "mL"),
-            "capacity_ml": (self.volume_ml + 4.5, 200.0, "mL"),
-            "evaporation_ml_day": (0.0, 50.0, "mL/day"),
-            "media_ml": (0.0, np.inf, "mL"),
-        }
-        check_ranges(self, "plant.vessel", ranges)
+        check(self, "plant.vessel")
+        lowest = self.volume_ml + 4.5
+        require(self.capacity_ml >= lowest, "plant.vessel.capacity_ml", f"{self.capacity_ml} mL", f"{lowest:g} to 200")
 
 
 class Vessel:

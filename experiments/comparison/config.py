@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
+from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
@@ -17,40 +18,39 @@ __all__ = ["BenchmarkConfig", "StudyConfig"]
 class StudyConfig:
     """Every controller on every plant in every scenario; the names are keys of the config's groups."""
 
-    scenarios: tuple[str, ...] = ("setpoint_steps",)
-    plants: tuple[str, ...] = ("nominal_noise",)
-    controllers: tuple[str, ...] = ("dqn", "pi", "mpc")
+    scenarios: tuple[str, ...] = setting(("setpoint_steps",), "names of scenarios")
+    plants: tuple[str, ...] = setting(("nominal_noise",), "names of plants")
+    controllers: tuple[str, ...] = setting(("dqn", "pi", "mpc"), "names of controllers")
 
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
     """The closed loops to compare. Raises: ValueError naming key, value and what is allowed."""
 
-    replicates: int = 3  # vials per controller, plant and scenario, run as one batch
-    seed: int = 0  # of plants, noise, training and calibration; every controller meets the same draws
-    env: EnvConfig = field(default_factory=EnvConfig)  # what model-based controllers believe, and agents are trained on
-    agents: dict[str, DQNConfig] = field(default_factory=dict)  # learned controllers by name
-    train_seeds: int = 4  # seeds each agent is trained with; the best on the selection grid controls
-    workers: int = 0  # processes for the closed loops; 0 = one per core, 1 = none but this one
-    policy: str | None = None  # a policy.npz or run folder for `dqn` in place of training
-    calibration: bool = False  # simulate the open-loop protocol and fit it (Fig. 2a)
-    training: bool = False  # train all agents even if no study needs them (Fig. 2b)
-    plants: dict[str, PlantConfig] = field(default_factory=dict)
-    scenarios: dict[str, Scenario] = field(default_factory=dict)
-    controllers: dict[str, Any] = field(default_factory=dict)
-    studies: dict[str, StudyConfig] = field(default_factory=dict)
+    replicates: int = setting(
+        3, "vials per controller, plant and scenario (paper: 3), run as one batch", within=(1, 10_000)
+    )
+    seed: int = setting(
+        0, "of plants, noise, training and calibration; every controller meets the same draws", at_least=0
+    )
+    env: EnvConfig = part(EnvConfig, "what model-based controllers believe, and agents are trained on")
+    agents: dict[str, DQNConfig] = setting({}, "learned controllers by name")
+    train_seeds: int = setting(
+        4, "seeds an agent is trained with; the best policy on the selection grid controls", within=(1, 1000)
+    )
+    workers: int = setting(
+        0, "processes for the closed loops; 0: one per core, 1: this one only. No effect on results", within=(0, 256)
+    )
+    policy: str | None = setting(None, "a policy.npz or a training's run folder for `dqn`, in place of training here")
+    calibration: bool = setting(False, "simulate the open-loop protocol and fit it (Fig. 2a)")
+    training: bool = setting(False, "train all agents even if no study needs them (Fig. 2b)")
+    plants: dict[str, PlantConfig] = setting({}, "plants by name")
+    scenarios: dict[str, Scenario] = setting({}, "scenarios by name")
+    controllers: dict[str, Any] = setting({}, "controllers by name")
+    studies: dict[str, StudyConfig] = setting({}, "what is compared, by name; the recipes of experiment/ fill it")
 
     def __post_init__(self) -> None:
-        """Check ranges and names once, where they enter."""
-        checks = (
-            ("replicates", self.replicates, 1 <= self.replicates <= 10_000, "1 to 10000"),
-            ("seed", self.seed, self.seed >= 0, "at least 0"),
-            ("workers", self.workers, 0 <= self.workers <= 256, "0 (one per core) to 256"),
-            ("train_seeds", self.train_seeds, 1 <= self.train_seeds <= 1000, "1 to 1000"),
-        )
-        for key, value, ok, allowed in checks:
-            if not ok:
-                raise ValueError(f"{key} = {value}: allowed {allowed}")
+        check(self)
         for name, study in self.studies.items():
             for key in ("scenarios", "plants", "controllers"):
                 known = getattr(self, key)

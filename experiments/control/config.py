@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from conf.schema import part, setting
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.controllers import registry
@@ -23,17 +24,21 @@ BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig, "chibio": ChiBioConfig
 class DeployConfig:
     """`python -m experiments.deploy`."""
 
-    backend: Any = field(default_factory=SimulatedConfig)  # one of BACKENDS
-    plant: PlantConfig = field(default_factory=PlantConfig)  # of a simulated backend
-    safety: SafetyConfig = field(default_factory=SafetyConfig)
-    scenario: Scenario = field(default_factory=Scenario)
-    each: dict[str, Any] = field(default_factory=dict)  # reactor -> what differs from `scenario`, and its `role`
-    controller: Any = field(default_factory=LearnedConfig)  # of a kind of `controllers.registry`
-    policy: str = "latest"  # of controller=dqn: a policy.npz, a run folder, or `latest`
-    env_file: str | None = None  # a calibrated.yaml; its model becomes the simulated plant's
-    fsync: bool = True  # every row on the disk before the next command
-    preflight_only: bool = False  # check the device and stop
-    resume: str | None = None  # a run folder to continue
+    backend: Any = part(SimulatedConfig, "what is controlled")
+    plant: PlantConfig = part(PlantConfig, "what the vials of a simulated backend are")
+    safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
+    scenario: Scenario = part(Scenario, "what the culture is asked to do")
+    each: dict[str, Any] = setting(
+        {}, "what differs for single reactors: each.M1.setpoints=[0.5] each.M1.minutes=[60] each.M1.role=control"
+    )
+    controller: Any = part(LearnedConfig, "what decides the pump rate")
+    policy: str = setting(
+        "latest", "of controller=dqn: a policy.npz, a run folder, or `latest`: of the newest training run under runs/"
+    )
+    env_file: str | None = setting(None, "a calibrated.yaml whose model the simulated plant takes")
+    fsync: bool = setting(True, "every row on the disk before the next command")
+    preflight_only: bool = setting(False, "check the device and stop")
+    resume: str | None = setting(None, "a run folder to continue after a crash")
 
     def schedules(self) -> list[Scenario]:
         """One schedule per reactor. Raises: ValueError naming reactor, key and what is allowed."""

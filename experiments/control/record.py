@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.cli import frame
+from experiments.cli import files
 from experiments.control.loop import Step
 from experiments.control.recovery import REBUILD, complete, read_rows
 from experiments.control.rows import COLUMNS, Array, Row, row_of
@@ -89,7 +89,7 @@ class Record:
     def save(self, state: Mapping[str, Any]) -> None:
         """Replace state.json; it says up to which row of the journal it knows everything."""
         content = {"journal_row": self.journal.next_row, **state}
-        frame.write_json(self.state_path, content, self._fsync, indent=None)
+        files.write_json(self.state_path, content, self._fsync, indent=None)
 
     def series(self, column: str) -> Array:
         """A column of all recordings, shape (N, K); shorter recordings end in nan."""

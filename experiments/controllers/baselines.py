@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from conf.schema import check, setting
 from envs.actions import MAX_PUMP_RATE
 from envs.task import EnvConfig
 from experiments.controllers.base import Array, Mask, usable
@@ -15,17 +16,14 @@ __all__ = ["Hold", "HoldConfig", "Threshold", "ThresholdConfig"]
 
 @dataclass(frozen=True)
 class ThresholdConfig:
-    """rate: mL/s while OD is above the setpoint; hysteresis: OD below the setpoint at which it stops again."""
+    """A rate above the setpoint, none below."""
 
-    kind: str = "threshold"
-    rate: float = MAX_PUMP_RATE
-    hysteresis: float = 0.0
+    kind: str = setting("threshold", "which controller")
+    rate: float = setting(MAX_PUMP_RATE, "while OD is above the setpoint", "mL/s", above=0.0, at_most=0.05)
+    hysteresis: float = setting(0.0, "OD below the setpoint at which it stops again", "OD", within=(0, 0.2))
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.rate <= 0.05:
-            raise ValueError(f"controller.rate = {self.rate} mL/s: allowed 0 < rate <= 0.05")
-        if not 0.0 <= self.hysteresis <= 0.2:
-            raise ValueError(f"controller.hysteresis = {self.hysteresis} OD: allowed 0 to 0.2")
+        check(self, "controller")
 
 
 class Threshold:
@@ -49,14 +47,15 @@ class Threshold:
 
 @dataclass(frozen=True)
 class HoldConfig:
-    """rate: constant pump rate, mL/s; None means mu tau of the model, which holds any OD if the model is true."""
+    """A constant rate. mu tau of the model holds any OD if the model is true."""
 
-    kind: str = "hold"
-    rate: float | None = None
+    kind: str = setting("hold", "which controller")
+    rate: float | None = setting(
+        None, "pump rate; null: mu tau of the model, 0.01 for the nominal one", "mL/s", within=(0, 0.05)
+    )
 
     def __post_init__(self) -> None:
-        if self.rate is not None and not 0.0 <= self.rate <= 0.05:
-            raise ValueError(f"controller.rate = {self.rate} mL/s: allowed 0 to 0.05, or null for mu tau of the model")
+        check(self, "controller")
 
 
 class Hold:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from conf.schema import setting
 from dqn.policy import Policy
 from experiments.controllers.base import Array, Mask
 
@@ -16,7 +17,7 @@ __all__ = ["LearnedConfig", "LearnedController"]
 class LearnedConfig:
     """Everything about a policy is in its file."""
 
-    kind: str = "dqn"
+    kind: str = setting("dqn", "which controller")
 
 
 class LearnedController:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
 
+from conf.schema import check, part, setting
 from envs.task import EnvConfig
 from experiments.controllers.base import Array, Mask, usable
 from experiments.controllers.pso import SwarmConfig, minimise
@@ -18,30 +19,24 @@ LOWEST_OD = 1e-3  # a reading below is taken for this: the model cannot grow fro
 
 @dataclass(frozen=True)
 class MpcConfig:
-    """The paper's receding-horizon controller.
+    """The paper's receding-horizon controller; `gradient` is L-BFGS-B with the exact gradient, as a cross-check."""
 
-    horizon: prediction horizon in control periods of 1 min; the first move is applied (control horizon 1).
-    penalty: added to the cost for every move outside the pump's range.
-    solver: pso (the paper's) | gradient (L-BFGS-B with exact gradient, as a cross-check).
-    seed: of the swarms.
-    """
-
-    kind: str = "mpc"
-    horizon: int = 5
-    penalty: float = 100.0
-    solver: str = "pso"
-    swarm: SwarmConfig = field(default_factory=SwarmConfig)
-    seed: int = 0
+    kind: str = setting("mpc", "which controller")
+    horizon: int = setting(
+        5,
+        "of 1 min (paper); the first move is applied (paper: control horizon 1 min)",
+        "control periods",
+        within=(1, 60),
+    )
+    penalty: float = setting(
+        100.0, "cost of a move outside [0, max_pump_rate] (paper)", above=0.0, note="or the pump's range costs nothing"
+    )
+    solver: str = setting("pso", "of the paper: pso", choices=("pso", "gradient"))
+    swarm: SwarmConfig = part(SwarmConfig, "how the swarms search; the paper names the method and no numbers")
+    seed: int = setting(0, "of the swarms", at_least=0)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.horizon <= 60:
-            raise ValueError(f"controller.horizon = {self.horizon} control periods: allowed 1 to 60")
-        if not self.penalty > 0.0:
-            raise ValueError(f"controller.penalty = {self.penalty}: allowed > 0, or the pump's range costs nothing")
-        if self.solver not in ("pso", "gradient"):
-            raise ValueError(f"controller.solver = {self.solver}: allowed pso, gradient")
-        if self.seed < 0:
-            raise ValueError(f"controller.seed = {self.seed}: allowed >= 0")
+        check(self, "controller")
 
 
 @dataclass(frozen=True, eq=False)

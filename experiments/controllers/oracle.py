@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 
+from conf.schema import check, setting
 from envs.optimum import OptimalPolicy, solve
 from envs.plant.plant import Plant
 from envs.task import EnvConfig
@@ -22,20 +23,14 @@ DRAWN = ("mu", "volume_ml", "pump_gain_ml_s")
 
 @dataclass(frozen=True)
 class OracleConfig:
-    """levels: pump rates it chooses from, equally spaced over the pump's range; gamma: discount per control period.
+    """Action grid and discount. 129 levels hold the learned policy's 17, and finer ones gain nothing measurable."""
 
-    129 levels hold the learned policy's 17 and are fine enough that a continuous rate gains nothing measurable.
-    """
-
-    kind: str = "oracle"
-    levels: int = 129
-    gamma: float = 0.99
+    kind: str = setting("oracle", "which controller")
+    levels: int = setting(129, "pump rates on [0, max_pump_rate]", within=(2, 1001))
+    gamma: float = setting(0.99, "discount per control period, the agent's", at_least=0.0, below=1.0)
 
     def __post_init__(self) -> None:
-        if not 2 <= self.levels <= 1001:
-            raise ValueError(f"controller.levels = {self.levels}: allowed 2 to 1001 pump rates")
-        if not 0.0 <= self.gamma < 1.0:
-            raise ValueError(f"controller.gamma = {self.gamma}: allowed 0 <= gamma < 1")
+        check(self, "controller")
 
 
 @cache

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from conf.schema import check, setting
 from envs.actions import MAX_PUMP_RATE
 from envs.task import EnvConfig
 from experiments.controllers.base import Array, Mask, usable
@@ -18,17 +19,14 @@ LOWEST_OD = 1e-6  # the device puts this for a setpoint of 0 or less
 
 @dataclass(frozen=True)
 class ChiBioPIConfig:
-    """volume_ml: what the device is told the vial holds, it scales the gain; max_pump_rate: its clamp, mL/s."""
+    """What the device's law is told; its gains are constants of the device's code."""
 
-    kind: str = "pi"
-    volume_ml: float = 20.0
-    max_pump_rate: float = MAX_PUMP_RATE
+    kind: str = setting("pi", "which controller")
+    volume_ml: float = setting(20.0, "what the device is told the vial holds; scales the gain", "mL", within=(5, 50))
+    max_pump_rate: float = setting(MAX_PUMP_RATE, "the device's clamp", "mL/s", above=0.0, at_most=0.05)
 
     def __post_init__(self) -> None:
-        if not 5.0 <= self.volume_ml <= 50.0:
-            raise ValueError(f"controller.volume_ml = {self.volume_ml} mL: allowed 5 to 50")
-        if not 0.0 < self.max_pump_rate <= 0.05:
-            raise ValueError(f"controller.max_pump_rate = {self.max_pump_rate} mL/s: allowed 0 < rate <= 0.05")
+        check(self, "controller")
 
 
 class ChiBioPI:
@@ -88,20 +86,17 @@ class ChiBioPI:
 
 @dataclass(frozen=True)
 class TunedPIConfig:
-    """delay_min: time until a decision shows, min; closed_loop_min: wanted time constant, min.
+    """The two times of the tuning rule; mu, tau and the largest pump rate come from the model."""
 
-    feed_forward: start the integrator at mu of the model instead of 0.
-    """
-
-    kind: str = "pi_tuned"
-    delay_min: float = 1.0
-    closed_loop_min: float = 1.0
-    feed_forward: bool = True
+    kind: str = setting("pi_tuned", "which controller")
+    delay_min: float = setting(1.0, "until a decision shows: one control period", "min", within=(0.5, 60))
+    closed_loop_min: float = setting(
+        1.0, "wanted time constant; SIMC's tight setting is the delay", "min", within=(0.5, 60)
+    )
+    feed_forward: bool = setting(True, "start the integrator at mu of the model instead of 0")
 
     def __post_init__(self) -> None:
-        for key, value in (("delay_min", self.delay_min), ("closed_loop_min", self.closed_loop_min)):
-            if not 0.5 <= value <= 60.0:
-                raise ValueError(f"controller.{key} = {value} min: allowed 0.5 to 60")
+        check(self, "controller")
 
 
 class TunedPI:

@@ -8,13 +8,15 @@ import math
 import time
 from array import array
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from conf.schema import check, part, setting
 from envs.scenario import Scenario
+from experiments.controllers.registry import STANDALONE
 from experiments.reliability.audit import audit_doses, audit_rows
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.chibio.protocol import POSITIONS
@@ -32,31 +34,20 @@ Times = dict[str, "array[float]"]  # per reactor, device s; a week of them must 
 
 @dataclass(frozen=True)
 class SoakConfig:
-    """Values of `conf/soak.yaml`. Raises: ValueError naming key, value and allowed range.
+    """How many reactors, how long and with which setpoints. Raises: ValueError naming key, value and allowed range."""
 
-    reactors: how many. days: how long. setpoints: OD, in turn. phase_min: for so long each, min.
-    """
-
-    reactors: int = 8
-    days: float = 7.0
-    setpoints: tuple[float, ...] = (0.5, 0.4, 0.6)
-    phase_min: float = 240.0
-    controller_kind: str = "adaptive_inverse"
-    safety: SafetyConfig = field(default_factory=lambda: SafetyConfig(bottle_ml=1e6, ml_per_run=1e6))
-    seed: int = 0
+    reactors: int = setting(8, "M0 and up", within=(1, 8))
+    days: float = setting(7.0, "length", within=(0.01, 100))
+    setpoints: tuple[float, ...] = setting((0.5, 0.4, 0.6), "in turn", "OD", some=True)
+    phase_min: float = setting(240.0, "each", "min", within=(10, 1e5))
+    controller_kind: str = setting("adaptive_inverse", "what decides the pump rate", choices=STANDALONE)
+    safety: SafetyConfig = part(
+        lambda: SafetyConfig(bottle_ml=1e6, ml_per_run=1e6), "limits of the interlock; somebody fills the bottles"
+    )
+    seed: int = setting(0, "of all noise", at_least=0)
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
-        checks = (
-            ("reactors", self.reactors, 1 <= self.reactors <= 8, "1 to 8"),
-            ("days", self.days, 0.01 <= self.days <= 100.0, "0.01 to 100"),
-            ("setpoints", self.setpoints, len(self.setpoints) >= 1, "one or more OD"),
-            ("phase_min", self.phase_min, 10.0 <= self.phase_min <= 1e5, "10 to 100000 min"),
-            ("seed", self.seed, self.seed >= 0, "at least 0"),
-        )
-        for key, value, ok, allowed in checks:
-            if not ok:
-                raise ValueError(f"{key} = {value}: allowed {allowed}")
+        check(self)
 
     def schedule(self) -> Scenario:
         """The setpoints in turn until the days are over."""

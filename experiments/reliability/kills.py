@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from conf.schema import check, require, setting
+from experiments.controllers.registry import STANDALONE
 from experiments.reliability.audit import SEEN_S, audit_doses
 from hardware.emulator.process import EmulatorProcess
 from hardware.emulator.vial import Dose
@@ -30,37 +32,23 @@ PATIENCE_S = 60.0  # real seconds for a client to start
 
 @dataclass(frozen=True)
 class KillConfig:
-    """Values of `conf/kill_campaign.yaml`. Raises: ValueError naming key, value and allowed range.
+    """How often and when to kill. Raises: ValueError naming key, value and allowed range."""
 
-    kills: in all. runs: recordings they are spread over. workers: runs at a time. speed: device seconds per second.
-    longest_s: longest real time from a client's first written row to its kill. early: share of the kills that may fall
-    into the start itself. reactors, controller_kind, seed: of the runs.
-    """
-
-    kills: int = 200
-    runs: int = 4
-    workers: int = 2
-    speed: float = 60.0
-    longest_s: float = 3.0
-    early: float = 0.2
-    reactors: tuple[str, ...] = ("M0", "M1", "M2")
-    controller_kind: str = "adaptive_inverse"
-    seed: int = 0
+    kills: int = setting(200, "in all", within=(1, 100_000))
+    runs: int = setting(4, "recordings they are spread over; kills at most", at_least=1)
+    workers: int = setting(2, "runs at a time", within=(1, 64))
+    speed: float = setting(60.0, "device seconds per real second", within=(1, 120), note="a client must keep up")
+    longest_s: float = setting(
+        3.0, "real time from a client's first written row to its kill, at most; drawn evenly", "s", within=(0.1, 3600)
+    )
+    early: float = setting(0.2, "share of kills that may fall into the start itself", within=(0, 1))
+    reactors: tuple[str, ...] = setting(("M0", "M1", "M2"), "of the runs")
+    controller_kind: str = setting("adaptive_inverse", "what decides the pump rate", choices=STANDALONE)
+    seed: int = setting(0, "of kill moments and emulators", at_least=0)
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
-        checks = (
-            ("kills", self.kills, 1 <= self.kills <= 100_000, "1 to 100000"),
-            ("runs", self.runs, 1 <= self.runs <= self.kills, "1 to kills"),
-            ("workers", self.workers, 1 <= self.workers <= 64, "1 to 64"),
-            ("speed", self.speed, 1.0 <= self.speed <= 120.0, "1 to 120 (a client must keep up)"),
-            ("longest_s", self.longest_s, 0.1 <= self.longest_s <= 3600.0, "0.1 to 3600 s"),
-            ("early", self.early, 0.0 <= self.early <= 1.0, "0 to 1"),
-            ("seed", self.seed, self.seed >= 0, "at least 0"),
-        )
-        for key, value, ok, allowed in checks:
-            if not ok:
-                raise ValueError(f"{key} = {value}: allowed {allowed}")
+        check(self)
+        require(self.runs <= self.kills, "runs", self.runs, "1 to kills")
 
 
 @dataclass

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
 
@@ -14,32 +15,20 @@ __all__ = ["TrainConfig"]
 class TrainConfig:
     """`python -m experiments.train`. Raises: ValueError naming key, value and allowed range."""
 
-    env: EnvConfig = field(default_factory=EnvConfig)
-    agent: DQNConfig = field(default_factory=DQNConfig)
-    env_file: str | None = None  # a calibrated.yaml; replaces `env`
-    seed: int = 0  # of the first agent
-    n_agents: int = 1  # agents with seeds seed, seed + 1, ... trained in one process
-    device: str = "cpu"  # cpu | cuda
-    threads: int | None = None  # groups of 16 agents trained at the same time; None: one per core; no effect on results
-    eval_every: int = 250  # steps between evaluations of the greedy policy
-    checkpoint_every: int = 1000  # steps between checkpoints
-    resume: str | None = None  # a run folder to continue
+    env: EnvConfig = part(EnvConfig, "the training model and its episodes")
+    agent: DQNConfig = part(DQNConfig, "the agent's hyper-parameters")
+    env_file: str | None = setting(None, "a calibrated.yaml; replaces env")
+    seed: int = setting(0, "of the first agent", at_least=0)
+    n_agents: int = setting(1, "with seeds seed, seed + 1, ... in one process", within=(1, 100_000))
+    device: str = setting("cpu", "where networks are trained", choices=("cpu", "cuda"))
+    threads: int | None = setting(
+        None, "groups of 16 agents trained at the same time; null: one per core. No effect on results", at_least=1
+    )
+    eval_every: int = setting(
+        250, "between evaluations of the greedy policy on the selection grid", "steps", at_least=1
+    )
+    checkpoint_every: int = setting(1000, "between checkpoints", "steps", at_least=1)
+    resume: str | None = setting(None, "a run folder to continue")
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value enters."""
-        checks = (
-            ("seed", self.seed, self.seed >= 0, "at least 0"),
-            ("n_agents", self.n_agents, 1 <= self.n_agents <= 100_000, "1 to 100000"),
-            ("device", self.device, self.device in ("cpu", "cuda"), "cpu or cuda"),
-            (
-                "threads",
-                self.threads,
-                self.threads is None or self.threads >= 1,
-                "at least 1, or null",
-            ),
-            ("eval_every", self.eval_every, self.eval_every >= 1, "at least 1 step"),
-            ("checkpoint_every", self.checkpoint_every, self.checkpoint_every >= 1, "at least 1 step"),
-        )
-        for key, value, ok, allowed in checks:
-            if not ok:
-                raise ValueError(f"{key} = {value}: allowed {allowed}")
+        check(self)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from dqn.checkpoint import CheckpointError
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.training.config import TrainConfig
 from experiments.training.export import export_policies, fingerprint
 from experiments.training.figures import figures
@@ -64,7 +64,7 @@ def _finish(session: Session) -> None:
         "policy_seed": session.seeds[int(best.merit.argmin())],
         "config_hash": fingerprint(c),
     }
-    frame.write_json(session.folder / "summary.json", summary)
+    files.write_json(session.folder / "summary.json", summary)
     numbers = {
         k: v for k, v in {**asdict(c.agent), "mu": c.env.mu, "tau": c.env.tau}.items() if isinstance(v, int | float)
     }

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from conf.presets import groups
+from conf.schema import check, part, require, setting
 from hardware.chibio.dosing import DosingConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import POSITIONS
@@ -17,69 +18,47 @@ __all__ = ["ChiBioConfig", "EmulatorConfig"]
 class ChiBioConfig:
     """How to reach a Chi.Bio, which reactors to run and how.
 
-    kind: which backend these values are for.
-    url, speed: the device's address; device seconds per real second (1 on the bench, more for a fast emulator).
-    reactors: positions to run, M0 to M7.
-    transport: the link.
-    calibration: folder with the files of `experiments.calibrate_pump` and `experiments.blank`.
-    temperature: thermostat target at the start, degC.
-    stir: stirrer target, 0 to 1.
-    volume_ml: culture volume, mL (only told to the device's own regulator).
-    dosing: how a rate becomes a dose. overflow_pump: of a second waste tube, none as a rule.
-    stale_s, lost_s: age of the newest sample that marks a reactor stale, and that starts its recovery.
-    poll_s: pause between two looks for a sample that is due, s.
-    window_s: a dose must end this long after its sample appeared, s (the next measurement begins 47 s after).
-    retry_s: pause before a failed request is tried again, s.
-    stop_s: how long `stop` keeps trying to reach the device, s.
-    recover: restart the experiment of a reactor whose device lost its memory or whose thread died.
-
     Raises: ValueError naming key, value and allowed range.
     """
 
-    kind: str = "chibio"
-    url: str = "http://192.168.7.2:5000"
-    speed: float = 1.0
-    reactors: tuple[str, ...] = ("M0",)
-    transport: TransportConfig = field(default_factory=TransportConfig)
-    calibration: str = "calibration"
-    temperature: float = 37.0
-    stir: float = 0.5
-    volume_ml: float = 20.0
-    dosing: DosingConfig = field(default_factory=DosingConfig)
-    overflow_pump: OverflowPumpConfig = field(default_factory=OverflowPumpConfig)
-    stale_s: float = 100.0
-    lost_s: float = 180.0
-    poll_s: float = 2.0
-    window_s: float = 38.0
-    retry_s: float = 5.0
-    stop_s: float = 60.0
-    recover: bool = True
+    kind: str = setting("chibio", "which backend")
+    url: str = setting("http://192.168.7.2:5000", "of the device's server")
+    speed: float = setting(1.0, "device seconds per real second; more only for a fast emulator", within=(0.1, 1000))
+    reactors: tuple[str, ...] = setting(("M0",), "positions to run, all in one process", choices=POSITIONS, some=True)
+    transport: TransportConfig = part(TransportConfig, "the link to the device")
+    calibration: str = setting(
+        "calibration", "folder with the files of calibrate_pump and blank; what is missing there is nominal"
+    )
+    temperature: float = setting(37.0, "thermostat at the start; scenarios may change it", "degC", within=(15, 42))
+    stir: float = setting(0.5, "stirrer", within=(0, 1))
+    volume_ml: float = setting(20.0, "culture, only told to the device's own regulator", "mL", within=(10, 30))
+    dosing: DosingConfig = part(DosingConfig, "how a rate becomes a dose")
+    overflow_pump: OverflowPumpConfig = part(OverflowPumpConfig, "a second waste line against overflow")
+    stale_s: float = setting(100.0, "age at which a newest sample is no basis for a dose", "s", within=(65, 600))
+    lost_s: float = setting(
+        180.0, "age at which a dead experiment thread is restarted; more than stale_s", "s", within=(100, 3600)
+    )
+    poll_s: float = setting(2.0, "between two looks for a sample that is due", "s", within=(0.2, 10))
+    window_s: float = setting(
+        38.0,
+        "a dose must end this long after its sample appeared; the next measurement begins 47 s after",
+        "s",
+        within=(10, 42),
+    )
+    retry_s: float = setting(5.0, "before a failed request is tried again", "s", within=(0.5, 60))
+    stop_s: float = setting(
+        60.0, "how long a stop tries to verify the pumps off before it escalates", "s", within=(1, 600)
+    )
+    recover: bool = setting(True, "restore and restart a device that lost its memory or whose thread died")
 
     def __post_init__(self) -> None:
-        unknown = [m for m in self.reactors if m not in POSITIONS]
-        if not self.reactors or unknown or len(set(self.reactors)) < len(self.reactors):
-            raise ValueError(f"backend.reactors = {list(self.reactors)}: allowed 1 to 8 different ones of M0 to M7")
-        ranges = {
-            "speed": (0.1, 1000.0),
-            "temperature": (15.0, 42.0),
-            "stir": (0.0, 1.0),
-            "volume_ml": (10.0, 30.0),
-            "stale_s": (65.0, 600.0),
-            "lost_s": (100.0, 3600.0),
-            "poll_s": (0.2, 10.0),
-            "window_s": (10.0, 42.0),
-            "retry_s": (0.5, 60.0),
-            "stop_s": (1.0, 600.0),
-        }
-        for key, (low, high) in ranges.items():
-            if not low <= getattr(self, key) <= high:
-                raise ValueError(f"backend.{key} = {getattr(self, key)}: allowed {low:g} to {high:g}")
-        if abs(self.dosing.period_s - 60.0) > 1e-9:
-            raise ValueError(
-                f"backend.dosing.period_s = {self.dosing.period_s}: allowed 60 (the device measures so often)"
-            )
-        if self.lost_s <= self.stale_s:
-            raise ValueError(f"backend.lost_s = {self.lost_s} s: allowed more than stale_s = {self.stale_s} s")
+        check(self, "backend")
+        unique = len(set(self.reactors)) == len(self.reactors)
+        require(unique, "backend.reactors", self.reactors, "1 to 8 different ones of M0 to M7")
+        at = self.dosing.period_s
+        require(abs(at - 60.0) <= 1e-9, "backend.dosing.period_s", at, "60 (the device measures so often)")
+        later = f"more than stale_s = {self.stale_s} s"
+        require(self.lost_s > self.stale_s, "backend.lost_s", f"{self.lost_s} s", later)
 
     @property
     def control_min(self) -> float:
@@ -89,20 +68,16 @@ class ChiBioConfig:
 
 @dataclass(frozen=True)
 class EmulatorConfig(ChiBioConfig):
-    """`backend=emulator`: the same driver against an emulator that the run starts by itself; `url` is then ignored.
+    """`backend=emulator`: the same driver against an emulator that the run starts by itself; `url` is then ignored."""
 
-    od, plant, seed: of the emulated cultures, see `python -m hardware.emulator --help`.
-    """
-
-    kind: str = "emulator"
-    speed: float = 60.0
-    od: float = 0.3
-    plant: str = "healthy"
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.plant not in groups()["plant"]:
-            raise ValueError(f"backend.plant = {self.plant}: allowed {', '.join(groups()['plant'])}")
-        if not 0.0 <= self.od <= 4.0 or self.seed < 0:
-            raise ValueError(f"backend.od = {self.od}, seed = {self.seed}: allowed 0 to 4, and at least 0")
+    kind: str = setting("emulator", "which backend")
+    speed: float = setting(
+        60.0, "device seconds per real second: ninety minutes pass in one and a half", within=(0.1, 1000)
+    )
+    od: float = setting(0.3, "of the emulated cultures at the start", "OD", within=(0, 4))
+    plant: str = setting(
+        "healthy",
+        "preset of the cultures and pumps; bench: each vial has its own",
+        choices=tuple(groups()["plant"]),
+    )
+    seed: int = setting(0, "of all noise", at_least=0)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from conf.schema import check, setting
 from hardware.chibio.protocol import PERIOD_S
 
 __all__ = ["DosePlan", "DosingConfig", "PumpCalibration", "PumpFit", "ReactorCalibration", "fit_pump", "plan_dose"]
@@ -99,31 +100,18 @@ class ReactorCalibration:
 class DosingConfig:
     """How a feed rate becomes a dose of feed and a dose of waste.
 
-    period_s: control period one dose stands for, s.
-    waste_factor, waste_extra_s: waste on-time is at least factor * feed on-time + extra, s (the device's own law is
-      4 and 4.4 s; the level is set by the height of the waste tube, so too much does no harm).
-    clear_every, clear_duty: every so many doses the waste pump runs at this duty, to clear its tube.
+    The waste runs for factor * feed + extra at least. The device's own law is 4 and 4.4 s; the level is set by the
+    height of the waste tube, so too much does no harm.
     """
 
-    period_s: float = 60.0
-    waste_factor: float = 4.0
-    waste_extra_s: float = 4.4
-    clear_every: int = 5
-    clear_duty: float = 0.25
+    period_s: float = setting(60.0, "one dose per cycle of the device", "s", within=(10, 600))
+    waste_factor: float = setting(4.0, "waste over feed, in time", at_least=4.0, note="less risks an overflow")
+    waste_extra_s: float = setting(4.4, "and so much longer", "s", at_least=4.0, note="less risks an overflow")
+    clear_every: int = setting(5, "doses from one clearing of the waste tube to the next", at_least=1)
+    clear_duty: float = setting(0.25, "of 63 s, which the waste pump then runs", above=0.0, at_most=MAX_WASTE_DUTY)
 
     def __post_init__(self) -> None:
-        if not 10.0 <= self.period_s <= 600.0:
-            raise ValueError(f"dosing.period_s = {self.period_s} s: allowed 10 to 600 (the device measures every 60 s)")
-        if self.waste_factor < 4.0 or self.waste_extra_s < 4.0:
-            raise ValueError(
-                f"dosing.waste_factor = {self.waste_factor}, waste_extra_s = {self.waste_extra_s} s: allowed at "
-                "least 4 and 4 s; less risks an overflow"
-            )
-        if self.clear_every < 1 or not 0.0 < self.clear_duty <= MAX_WASTE_DUTY:
-            raise ValueError(
-                f"dosing.clear_every = {self.clear_every}, clear_duty = {self.clear_duty}: allowed >= 1 and over 0 to "
-                f"{MAX_WASTE_DUTY}"
-            )
+        check(self, "dosing")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 It sucks air unless the level rises, so it may run all the time: `target` = duty and ON, and the pump repeats that every
 63 s without a client (docs/device.md, Pumps), whatever becomes of doses, trips and this program. The experiment cycle
-does not look at Pump3 and Pump4 (section 3); a start or end of an experiment and a restart of the device switch them
+does not look at Pump3 and Pump4; a start or end of an experiment and a restart of the device switch them
 off. Nothing relies on it: the interlock's ledger does not know of it. Plumbing: docs/chibio.md.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from conf.schema import check, setting
 from hardware.chibio.connection import Connection
 from hardware.chibio.logbook import Logbook
 from hardware.chibio.protocol import MAX_OVERFLOW_DUTY, PUMPS, SPARE, DeviceState
@@ -22,25 +23,19 @@ MIN_DUTY = 0.1  # with a pump of 1 mL/s twice as much as the feed pump may ever 
 
 @dataclass(frozen=True)
 class OverflowPumpConfig:
-    """Values of `backend.overflow_pump`.
-
-    pump: Pump3 or Pump4; "" = there is none.
-    duty: share of every 63 s in which it runs, 0.1 to 0.95.
-    flow_ml_s: its flow at full power, mL/s, as weighed; only for what the preflight says of it.
+    """A second waste line that keeps a vial from overflowing (docs/chibio.md); none as a rule.
 
     Raises: ValueError naming key, value and allowed range.
     """
 
-    pump: str = ""
-    duty: float = 0.1
-    flow_ml_s: float = 1.0
+    pump: str = setting("", "of the second line; '': there is none, the standard hardware", choices=(*SPARE, ""))
+    duty: float = setting(0.1, "share of every 63 s in which it runs", within=(MIN_DUTY, MAX_OVERFLOW_DUTY))
+    flow_ml_s: float = setting(
+        1.0, "at full power, as weighed; only for what the preflight says", "mL/s", within=(0.05, 5)
+    )
 
     def __post_init__(self) -> None:
-        if self.pump not in ("", *SPARE):
-            raise ValueError(f"overflow_pump.pump = {self.pump}: allowed {', '.join(SPARE)}, or '' for none")
-        for key, low, high in (("duty", MIN_DUTY, MAX_OVERFLOW_DUTY), ("flow_ml_s", 0.05, 5.0)):
-            if not low <= getattr(self, key) <= high:
-                raise ValueError(f"overflow_pump.{key} = {getattr(self, key)}: allowed {low:g} to {high:g}")
+        check(self, "overflow_pump")
 
     @property
     def others(self) -> tuple[str, ...]:

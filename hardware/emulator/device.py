@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from conf.schema import check, part, setting
 from envs.plant.plant import Plant, PlantConfig
 from hardware.clock import Clock
 from hardware.emulator.computer import AppError, BusStuck, Computer, ProcessDied
@@ -32,23 +33,16 @@ __all__ = ["ChiBioDevice", "DeviceOptions"]
 
 @dataclass(frozen=True)
 class DeviceOptions:
-    """How the emulated device is built.
+    """How the emulated device is built."""
 
-    worker_timeout_s: gunicorn kills a worker whose request takes longer. boot_s: from a dead worker to a serving one.
-    request_s: what any request takes. vial: optics and electronics; plant: culture and pumps, with pulse dosing.
-    """
-
-    worker_timeout_s: float = 30.0
-    boot_s: float = 8.0
-    request_s: float = 0.005
-    vial: VialConfig = field(default_factory=VialConfig)
-    plant: PlantConfig = field(default_factory=lambda: plant_preset("healthy"))
+    worker_timeout_s: float = setting(30.0, "gunicorn kills a worker whose request takes longer", "s", within=(1, 3600))
+    boot_s: float = setting(8.0, "from a dead worker to a serving one", "s", within=(0, 600))
+    request_s: float = setting(0.005, "what any request takes", "s", within=(0, 5))
+    vial: VialConfig = part(VialConfig, "optics and electronics")
+    plant: PlantConfig = part(lambda: plant_preset("healthy"), "cultures and pumps, with pulse dosing")
 
     def __post_init__(self) -> None:
-        for key, low, high in (("worker_timeout_s", 1.0, 3600.0), ("boot_s", 0.0, 600.0), ("request_s", 0.0, 5.0)):
-            value = getattr(self, key)
-            if not low <= value <= high:
-                raise ValueError(f"emulator.{key} = {value} s: allowed {low:g} to {high:g}; change it")
+        check(self, "emulator")
         if self.plant.pump.dosing != "pulse":
             raise ValueError("emulator.plant.pump.dosing = continuous: allowed pulse, as the device's pumps work")
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from conf.schema import check, setting
+
 __all__ = ["MAX_BODY", "Reply", "Transport", "TransportConfig"]
 
 MAX_BODY = 262_144
@@ -48,32 +50,28 @@ class Transport(Protocol):
 
 @dataclass(frozen=True)
 class TransportConfig:
-    """The link to a device. Times are device seconds and are divided by the backend's `speed`, floored at `floor_s`.
+    """The link to a device. Times are device seconds and are divided by the backend's `speed`.
 
-    kind: http | serial.
-    connect_s, read_s: time-outs; read_s stays below the 30 s after which the device's server kills a worker.
-    floor_s: no time-out is shorter than this in real seconds, whatever the speed: this computer may be busy.
-    port, baud: serial device of the PC (prefer /dev/serial/by-id/...) and line rate (irrelevant on USB).
+    The device's server kills a worker that takes 30 s. Prefer a port /dev/serial/by-id/..., which survives replugging.
     """
 
-    kind: str = "http"
-    connect_s: float = 3.0
-    read_s: float = 20.0
-    floor_s: float = 1.0
-    port: str = "/dev/ttyACM0"
-    baud: int = 115200
+    kind: str = setting("http", "which link", choices=("http", "serial"))
+    connect_s: float = setting(
+        3.0, "to connect; on a serial line to write, and for the agent's own answers", "s", above=0.0, below=30.0
+    )
+    read_s: float = setting(20.0, "for a whole answer of the device", "s", above=0.0, below=30.0)
+    floor_s: float = setting(
+        1.0,
+        "in real seconds no time-out is shorter than this, however fast an emulator runs",
+        "s",
+        above=0.0,
+        below=30.0,
+    )
+    port: str = setting("/dev/ttyACM0", "serial device of this computer")
+    baud: int = setting(115200, "irrelevant on the USB gadget, right for the debug header", at_least=9600)
 
     def __post_init__(self) -> None:
-        if self.kind not in ("http", "serial"):
-            raise ValueError(f"transport.kind = {self.kind}: allowed http, serial")
-        for key in ("connect_s", "read_s", "floor_s"):
-            value = getattr(self, key)
-            if not 0.0 < value < 30.0:
-                raise ValueError(
-                    f"transport.{key} = {value} s: allowed over 0 and under 30 (the device's server gives up at 30 s)"
-                )
-        if self.baud < 9600:
-            raise ValueError(f"transport.baud = {self.baud}: allowed >= 9600 (a state of 1 KB must pass in a second)")
+        check(self, "transport")
 
     def timeout(self, seconds: float, speed: float) -> float:
         """Real seconds to wait for what takes `seconds` on a device that runs `speed` times faster."""

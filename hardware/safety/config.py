@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from enum import IntEnum
+
+from conf.schema import check, part, require, setting
 
 __all__ = ["DONE", "REMEDIES", "WORDS", "Response", "Responses", "SafetyConfig"]
 
@@ -63,53 +65,54 @@ REMEDIES = {
 }
 MAY_BE_REPORTED = ("limit", "undosed", "no_dilution", "cannot_hold", "thermometer", "hot", "jump", "stale")
 SENSOR_REASONS = ("impossible", "spectrometer", "frozen", "jump", "no_dilution", "falls", "stale", "lost", "silent")
+CHOICES = tuple(WORDS)
 
 
 @dataclass(frozen=True)
 class Responses:
     """The declared response to every reason: report | hold | pumps_off | regulate | stop.
 
-    link to overflow_pump are the kinds of `reactor.Fault`. A reason that means the sensor cannot be believed may not
-    regulate: the device would pump by the same reading.
+    report: dose as allowed. hold: no dose. pumps_off: no dose and the pumps off, verified. regulate: hand over to the
+    device's own regulation for good. stop: no dose in this run any more. link to overflow_pump are kinds of
+    `reactor.Fault`. A reason that means the sensor cannot be believed may not regulate: the device would pump by the same reading.
     """
 
-    setpoint: str = "hold"
-    controller: str = "hold"
-    controller_lost: str = "regulate"
-    limit: str = "report"
-    budget: str = "hold"
-    bottle: str = "hold"
-    overflow: str = "pumps_off"
-    undosed: str = "report"
-    impossible: str = "hold"
-    spectrometer: str = "pumps_off"
-    frozen: str = "hold"
-    jump: str = "hold"
-    no_dilution: str = "hold"
-    cannot_hold: str = "report"
-    falls: str = "pumps_off"
-    stale: str = "hold"
-    lost: str = "pumps_off"
-    silent: str = "stop"
-    hot: str = "hold"
-    thermometer: str = "report"
-    link: str = "hold"
-    selection: str = "hold"
-    identity: str = "stop"
-    absent: str = "hold"
-    restarted: str = "hold"
-    stopped: str = "pumps_off"
-    stalled: str = "hold"
-    mode: str = "hold"
-    blank: str = "hold"
-    pump: str = "pumps_off"
-    overflow_pump: str = "hold"
+    setpoint: str = setting("hold", "outside (0, max_setpoint]", choices=CHOICES)
+    controller: str = setting("hold", "proposed rate negative or no number", choices=CHOICES)
+    controller_lost: str = setting("regulate", "too many unusable proposals in a row", choices=CHOICES)
+    limit: str = setting("report", "proposed more than max_rate: cut", choices=CHOICES)
+    budget: str = setting("hold", "a feed budget is used up", choices=CHOICES)
+    bottle: str = setting("hold", "the bottle is empty by the ledger", choices=CHOICES)
+    overflow: str = setting("pumps_off", "the vial overflows by the ledger", choices=CHOICES)
+    undosed: str = setting("report", "doses are allowed but the device gets none", choices=CHOICES)
+    impossible: str = setting("hold", "OD or counts that no culture has", choices=CHOICES)
+    spectrometer: str = setting("pumps_off", "OD 12 to 14", choices=CHOICES)
+    frozen: str = setting("hold", "the same reading again and again", choices=CHOICES)
+    jump: str = setting("hold", "a step that neither growth nor dose explains", choices=CHOICES)
+    no_dilution: str = setting("hold", "the pump ran but OD did not fall", choices=CHOICES)
+    cannot_hold: str = setting("report", "full feed and OD does not fall: the pump is outgrown", choices=CHOICES)
+    falls: str = setting("pumps_off", "OD falls without pump", choices=CHOICES)
+    stale: str = setting("hold", "the newest sample is older than stale_s", choices=CHOICES)
+    lost: str = setting("pumps_off", "and older than lost_s", choices=CHOICES)
+    silent: str = setting("stop", "nothing for `silent` minutes", choices=CHOICES)
+    hot: str = setting("hold", "too warm; the heater is switched off as well", choices=CHOICES)
+    thermometer: str = setting("report", "reads nonsense; the heater is switched off", choices=CHOICES)
+    link: str = setting("hold", "no answer", choices=CHOICES)
+    selection: str = setting("hold", "the device addresses another reactor", choices=CHOICES)
+    identity: str = setting("stop", "another device than the run began with", choices=CHOICES)
+    absent: str = setting("hold", "no reactor at this position", choices=CHOICES)
+    restarted: str = setting("hold", "the device lost its memory", choices=CHOICES)
+    stopped: str = setting("pumps_off", "the experiment no longer runs", choices=CHOICES)
+    stalled: str = setting("hold", "the experiment takes no samples", choices=CHOICES)
+    mode: str = setting("hold", "the device regulates or runs something by itself", choices=CHOICES)
+    blank: str = setting("hold", "the blank is not the run's", choices=CHOICES)
+    pump: str = setting("pumps_off", "a pump runs that should not", choices=CHOICES)
+    overflow_pump: str = setting("hold", "an overflow pump is configured and cannot be verified on", choices=CHOICES)
 
     def __post_init__(self) -> None:
+        check(self, "safety.responses")
         for f in fields(self):
             word = getattr(self, f.name)
-            if word not in WORDS:
-                raise ValueError(f"safety.responses.{f.name} = {word}: allowed {', '.join(WORDS)}")
             if word == "regulate" and f.name in (*SENSOR_REASONS, "blank", "stalled", "restarted", "link"):
                 raise ValueError(
                     f"safety.responses.{f.name} = regulate: not allowed, the device would pump by the reading that is "
@@ -121,86 +124,65 @@ class Responses:
 
 @dataclass(frozen=True)
 class SafetyConfig:
-    """Values of `conf/safety/default.yaml`. Volumes mL, rates 1/min or mL/s, times min unless the name says s.
+    """Limits of the interlock between every controller and every pump; volumes by its own ledger."""
 
-    max_rate: largest feed rate that passes, mL/s. period_s: control period a rate stands for, s.
-    ml_per_minute, ml_per_hour, ml_per_run: feed budgets of one reactor; bottle_ml: fresh medium at the start.
-    volume_ml: level the waste tube keeps; max_volume_ml: more than this by the ledger is an overflow.
-    max_setpoint: a larger one is a typing error. od_min, od_max: readings outside are impossible. raw_min, raw_max:
-      likewise, counts. frozen_samples: this many equal readings are a dead thread.
-    mu_max: no culture grows faster. gain_min, gain_max: what a dose can deliver relative to its calibration; death:
-      fastest decline without a dose. jump, jump_fraction: a step of more than max(jump, jump_fraction * OD) beyond
-      what growth and dose explain is no culture. accept_up, accept_down: consistent readings after which a step is
-      believed (bubbles last up to 5 readings).
-    drift: unexplained change of ln OD that trips no_dilution or falls once it has lasted for `persistence` samples;
-      noise_od, noise_fraction: sensor noise, of which six standard deviations are added to it.
-    cooldown: no dose for so long after no_dilution, falls. stale_s, lost_s: age of the newest sample, s; silent: age
-      at which a reactor is given up.
-    hot_excess: allowed above the thermostat target, degC; max_temperature: absolute limit, degC; cooling: a vial
-      cools to a lower target with at most this time constant.
-    controller_patience: so many unusable proposals in a row mean that the controller is lost.
-    """
-
-    max_rate: float = 0.02
-    period_s: float = 60.0
-    ml_per_minute: float = 3.0
-    ml_per_hour: float = 75.0
-    ml_per_run: float = 10000.0
-    bottle_ml: float = 2000.0
-    volume_ml: float = 20.0
-    max_volume_ml: float = 25.0
-    max_setpoint: float = 1.5
-    od_min: float = -0.1
-    od_max: float = 4.0
-    raw_min: float = 5.0
-    raw_max: float = 65534.0
-    frozen_samples: int = 3
-    mu_max: float = 0.04
-    gain_min: float = 0.5
-    gain_max: float = 1.6
-    death: float = 0.005
-    jump: float = 0.04
-    jump_fraction: float = 0.08
-    accept_up: int = 6
-    accept_down: int = 3
-    drift: float = 0.05
-    persistence: int = 3
-    noise_od: float = 0.005
-    noise_fraction: float = 0.005
-    cooldown: float = 5.0
-    stale_s: float = 100.0
-    lost_s: float = 180.0
-    silent: float = 120.0
-    hot_excess: float = 2.0
-    max_temperature: float = 42.0
-    cooling: float = 90.0
-    controller_patience: int = 5
-    responses: Responses = field(default_factory=Responses)
+    max_rate: float = setting(0.02, "largest feed rate that passes, the device's own cap", "mL/s", within=(0, 0.05))
+    period_s: float = setting(60.0, "control period a rate stands for", "s", within=(10, 600))
+    ml_per_minute: float = setting(
+        3.0, "feed budget; two doses may fall into 60 s when a sample is late", "mL", above=0.0, below=math.inf
+    )
+    ml_per_hour: float = setting(75.0, "feed budget", "mL", above=0.0, below=math.inf)
+    ml_per_run: float = setting(10000.0, "feed budget", "mL", above=0.0, below=math.inf)
+    bottle_ml: float = setting(2000.0, "fresh medium at the start, per reactor", "mL", above=0.0, below=math.inf)
+    volume_ml: float = setting(20.0, "level the waste tube keeps", "mL", within=(10, 30))
+    max_volume_ml: float = setting(
+        25.0, "more than this is an overflow (the vial holds 30); volume_ml or more", "mL", at_most=30.0
+    )
+    max_setpoint: float = setting(1.5, "a larger setpoint is a typing error", "OD", within=(0.05, 4))
+    od_min: float = setting(-0.1, "readings below are impossible", "OD")
+    od_max: float = setting(4.0, "readings above are impossible; max_setpoint or more", "OD", at_most=10.0)
+    raw_min: float = setting(5.0, "impossible below; a failed spectrometer reads 1", "counts")
+    raw_max: float = setting(65534.0, "impossible above; a saturated spectrometer reads 65535", "counts")
+    frozen_samples: int = setting(3, "equal readings in a row that no noisy sensor gives", within=(2, 60))
+    mu_max: float = setting(0.04, "no culture grows faster (LB at 37 degC: 0.031)", "1/min", within=(0.001, 0.1))
+    gain_min: float = setting(0.5, "least that a dose delivers, of what its calibration says", within=(0.05, 1))
+    gain_max: float = setting(1.6, "and most", within=(1, 5))
+    death: float = setting(0.005, "fastest decline without a dose", "1/min")
+    jump: float = setting(
+        0.04, "a step beyond growth and dose of more than this is no culture", "OD", above=0.0, below=math.inf
+    )
+    jump_fraction: float = setting(0.08, "or of more than this fraction of OD; 0.6 % of readings are such outliers")
+    accept_up: int = setting(
+        6, "consistent readings after which a step up is believed; bubbles last up to 5", within=(2, 60)
+    )
+    accept_down: int = setting(3, "and a step down", within=(2, 60))
+    drift: float = setting(
+        0.05,
+        "unexplained change of ln OD, on top of six sd of the sensor, that trips no_dilution or falls",
+        within=(0.01, 1),
+    )
+    persistence: int = setting(3, "in so many samples in a row", within=(1, 30))
+    noise_od: float = setting(0.005, "sd of the sensor", "OD")
+    noise_fraction: float = setting(0.005, "its part that is proportional to OD")
+    cooldown: float = setting(5.0, "without a dose after no_dilution or falls", "min", above=0.0, below=math.inf)
+    stale_s: float = setting(100.0, "age of a newest sample that is stale; 1.1 periods or more", "s", at_most=3600.0)
+    lost_s: float = setting(180.0, "and that is lost; stale_s or more", "s", at_most=7200.0)
+    silent: float = setting(120.0, "after which a reactor is given up", "min", above=0.0, below=math.inf)
+    hot_excess: float = setting(2.0, "above the thermostat's target, in 3 samples", "degC")
+    max_temperature: float = setting(42.0, "absolute limit, in 2 samples", "degC", within=(20, 45))
+    cooling: float = setting(
+        90.0, "slowest time constant of cooling to a lower target", "min", above=0.0, below=math.inf
+    )
+    controller_patience: int = setting(5, "unusable proposals in a row: the controller is lost", within=(1, 60))
+    responses: Responses = part(Responses, "what is done about each reason")
 
     def __post_init__(self) -> None:
-        ranges = {
-            "max_rate": (0.0, 0.05),
-            "period_s": (10.0, 600.0),
-            "volume_ml": (10.0, 30.0),
-            "max_volume_ml": (self.volume_ml, 30.0),
-            "max_setpoint": (0.05, 4.0),
-            "od_max": (self.max_setpoint, 10.0),
-            "frozen_samples": (2, 60),
-            "mu_max": (0.001, 0.1),
-            "gain_min": (0.05, 1.0),
-            "gain_max": (1.0, 5.0),
-            "accept_up": (2, 60),
-            "accept_down": (2, 60),
-            "drift": (0.01, 1.0),
-            "persistence": (1, 30),
-            "stale_s": (self.period_s * 1.1, 3600.0),
-            "lost_s": (self.stale_s, 7200.0),
-            "max_temperature": (20.0, 45.0),
-            "controller_patience": (1, 60),
-        }
-        for key, (low, high) in ranges.items():
-            if not low <= getattr(self, key) <= high:
-                raise ValueError(f"safety.{key} = {getattr(self, key)}: allowed {low:g} to {high:g}")
-        for key in ("ml_per_minute", "ml_per_hour", "ml_per_run", "bottle_ml", "jump", "cooldown", "silent", "cooling"):
-            if not 0.0 < getattr(self, key) < math.inf:
-                raise ValueError(f"safety.{key} = {getattr(self, key)}: allowed a finite number over 0")
+        check(self, "safety")
+        for key, low, high in (
+            ("max_volume_ml", self.volume_ml, 30.0),
+            ("od_max", self.max_setpoint, 10.0),
+            ("stale_s", self.period_s * 1.1, 3600.0),
+            ("lost_s", self.stale_s, 7200.0),
+        ):
+            given = getattr(self, key)
+            require(low <= given, f"safety.{key}", given, f"{low:g} to {high:g}")

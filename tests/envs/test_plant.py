@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from conf import presets
+from conf.schema import build
 from envs.growth import DilutedCulture, Exponential
 from envs.integrators import euler
 from envs.plant.culture import GrowthConfig
@@ -19,7 +21,6 @@ from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from envs.plant.thermal import ThermalConfig
 from envs.plant.vessel import VesselConfig
-from experiments.cli import frame
 
 Array = NDArray[np.float64]
 
@@ -28,7 +29,7 @@ PULSE = PumpConfig(dosing="pulse")
 
 
 def preset(name: str) -> PlantConfig:
-    return frame.load(frame.compose(f"plant/{name}", []).plant, PlantConfig())
+    return build(PlantConfig(), presets.load(f"plant/{name}"))
 
 
 def plant(config: PlantConfig, n: int = 1, seed: int = 0) -> Plant:

@@ -195,7 +195,7 @@ def test_help_documents_the_generator(cli: Cli) -> None:
         ("rows=abc", "rows = abc: allowed FIRST:END"),
         ("coverage=-1", "coverage = -1: allowed"),
         ("name=../x", "name = ../x: allowed"),
-        ("pump_ml_s=0", "pump_ml_s = 0.0: allowed"),
+        ("pump_ml_s=0", "pump_ml_s = 0.0 mL/s: allowed"),
         ("identify.window=big", "identify.window = big: allowed auto, all"),
         ("protocol.tau=3", "protocol.tau = 3.0: allowed"),
         ("+identify.windows=all", "identify.windows: no such key"),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 
 import numpy as np
 import pytest
 
+from conf import presets
+from conf.schema import build
 from envs.task import EnvConfig
-from experiments.cli import frame
 from experiments.controllers.adaptive_inverse import AdaptiveInverse, AdaptiveInverseConfig
 from experiments.controllers.base import Controller, Explains
 from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
@@ -98,10 +98,10 @@ def test_explanations_have_one_row_per_reactor(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_the_conf_file_holds_the_defaults(name: str) -> None:
+def test_the_preset_names_the_kind_and_leaves_the_rest_to_the_defaults(name: str) -> None:
     default = CONFIGS[name]
-    assert frame.load(frame.compose(f"controller/{name}", []).controller, default) == default
-    assert set(frame.compose(f"controller/{name}", []).controller) == set(asdict(default))
+    assert build(default, presets.load(f"controller/{name}")) == default
+    assert presets.load(f"controller/{name}") == {"kind": name}
 
 
 def test_threshold_and_hold_by_hand() -> None:

@@ -54,7 +54,7 @@ def test_a_study_leaves_curves_summary_and_figure(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("n_agents=0", "n_agents = 0, eval_every = 500: allowed at least 1"),
+        ("n_agents=0", "n_agents = 0: allowed at least 1"),
         ("trained.mine={doubled: true}", "mine.doubled: no such key"),
     ],
 )

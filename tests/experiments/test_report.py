@@ -18,7 +18,7 @@ from matplotlib.image import imread
 
 from dqn import policy as policies
 from experiments import report
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.comparison import page as comparison
 from experiments.comparison.published import TABLE_2
 from experiments.reporting import charts
@@ -204,7 +204,7 @@ def test_a_table_escapes_what_each_format_reads_as_its_own():
 
 def run_folder(folder: Path, summary: dict) -> Path:
     folder.mkdir(parents=True)
-    frame.write_json(folder / "summary.json", summary)
+    files.write_json(folder / "summary.json", summary)
     (folder / "config.yaml").write_text("seed: 7\nenv:\n  mu: 0.03 # <1/min>\n")
     return folder
 

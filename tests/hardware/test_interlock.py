@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from conf import presets
+from conf.schema import build
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
-from experiments.cli import frame
 from hardware.emulator.plants import plant_preset
 from hardware.reactor import Fault, Measurement, Receipt, Vitals
 from hardware.safety.config import REMEDIES, Response, Responses, SafetyConfig
@@ -443,8 +444,7 @@ def test_state_of_another_run_is_refused() -> None:
 
 
 def test_the_yaml_file_says_what_the_code_does() -> None:
-    cfg = frame.compose("deploy", [])
-    assert frame.load(cfg.safety, SafetyConfig()) == SafetyConfig()
+    assert build(SafetyConfig(), presets.load("safety/default")) == SafetyConfig()
 
 
 @pytest.mark.parametrize("reason", ["spectrometer", "frozen", "jump", "stale", "blank"])

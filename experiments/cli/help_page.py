@@ -1,0 +1,134 @@
+"""What `--help` prints: how a command is used, what can be chosen, and every value with its meaning and range.
+
+Usage is the comment that opens conf/NAME.yaml; all else comes from the fields of the command's config.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from itertools import takewhile
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+
+from conf.presets import ROOT, groups
+from conf.schema import Meaning, meaning
+
+__all__ = ["Entry", "chosen", "entries", "opening", "sentence", "shown", "text"]
+
+WIDTH = 118
+LEFT = 44  # columns of `key = value`
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One field of a config: its name, what was said of it, its value, and the range in words."""
+
+    name: str
+    said: Meaning
+    value: Any
+    allowed: str
+
+
+def entries(config: Any) -> list[Entry]:
+    """The fields of a config dataclass, in order."""
+    found = []
+    for f in fields(config):
+        value, said = getattr(config, f.name), meaning(f)
+        words = said.allowed(f.name, isinstance(value, list | tuple), "None" in str(f.type))
+        found.append(Entry(f.name, said, value, words))
+    return found
+
+
+def shown(value: Any) -> str:
+    """A value as it is written on a command line."""
+    if isinstance(value, list | tuple):
+        return "[" + ",".join(shown(v) for v in value) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k}: {shown(v)}" for k, v in value.items()) + "}"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "''" if value == "" else str(value)
+
+
+def opening(name: str) -> list[str]:
+    """The comment at the top of a file of conf/, line by line."""
+    lines = (ROOT / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
+    first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    return [line[1:].removeprefix(" ") for line in lines[:first] if not line.startswith("# @package")]
+
+
+def sentence(name: str) -> str:
+    """The first sentence of the comment at the top of a file of conf/, without the file's own name before it."""
+    first = " ".join(takewhile(str.strip, opening(name))).removeprefix(f"{name.rpartition('/')[2]}: ")
+    return re.split(r"(?<=\.)\s(?=[A-Z`])", first)[0]
+
+
+def chosen(name: str) -> dict[str, str | None]:
+    """The groups that a command composes, in the place they have by themselves, and the option each starts with."""
+    root = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
+    found: dict[str, str | None] = {}
+    for entry in root.get("defaults", []):
+        if isinstance(entry, dict):
+            found |= {group: option for group, option in entry.items() if "@" not in group}
+    for group in list(found):
+        inner = [g for g in groups() if g.startswith(f"{group}/")]
+        found |= {g: None for g in inner}
+    return found
+
+
+def _choices(name: str) -> Iterator[str]:
+    for group, start in chosen(name).items():
+        yield f"  {group}=" + (f"    (by itself {start})" if start else "")
+        for option in groups()[group]:
+            yield from _line(f"    {option}", sentence(f"{group}/{option}"), 26)
+        yield ""
+
+
+def _line(left: str, right: str, at: int) -> list[str]:
+    """Two columns; the right one is wrapped."""
+    lines = textwrap.wrap(right, WIDTH - at) or [""]
+    head = [left] if len(left) > at - 2 else []
+    lines[0] = (" " * at if head else left.ljust(at)) + lines[0]
+    return [line.rstrip() for line in (*head, lines[0], *(" " * at + line for line in lines[1:]))]
+
+
+def _values(config: Any, prefix: str) -> Iterator[str]:
+    """The plain values of a config, then its parts, each below a line of its own."""
+    parts: list[tuple[str, str, Any]] = []
+    default = type(config)()
+    for entry in entries(config):
+        key = f"{prefix}{entry.name}"
+        if is_dataclass(entry.value):
+            parts.append((key, entry.said.what, entry.value))
+        elif isinstance(entry.value, dict) and entry.value:
+            yield from _line(f"  {key}.NAME", f"{entry.said.what}: {', '.join(entry.value)}", LEFT)
+            name, first = next(iter(entry.value.items()))
+            if is_dataclass(first):
+                parts.append((f"{key}.NAME", f"here the values of {name}", first))
+        else:
+            right = " ".join(filter(None, (entry.said.unit and f"{entry.said.unit}:", entry.said.what)))
+            notes = [f"allowed: {entry.allowed}"] if entry.allowed else []
+            if entry.value != getattr(default, entry.name):
+                notes.append(f"default: {shown(getattr(default, entry.name))}")
+            right += f" ({'; '.join(notes)})" if notes else ""
+            yield from _line(f"  {key} = {shown(entry.value)}", right, LEFT)
+    for key, what, inner in parts:
+        yield ""
+        yield f"{key}: {what}"
+        yield from _values(inner, f"{key}.")
+
+
+def text(name: str, config: Any) -> str:
+    """The whole page, with the values that the rest of the command line gives.
+
+    Args:
+      name: of the command; config: what it would run with.
+    """
+    choices = ["Choices (group=option)", "", *_choices(name)] if chosen(name) else []
+    return "\n".join([*opening(name), "", *choices, "Values (key=value)", "", *_values(config, "")])

@@ -1,0 +1,145 @@
+"""The reference of the configuration, docs/configuration.md, from the fields of every config and the presets of conf/.
+
+python -m experiments.cli.reference > docs/configuration.md
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Iterator
+from dataclasses import is_dataclass
+from typing import Any, cast, get_args, get_type_hints
+
+import yaml  # type: ignore[import-untyped]
+
+from conf.presets import ROOT, groups
+from experiments.cli.frame import Command
+from experiments.cli.help_page import Entry, chosen, entries, sentence, shown
+
+__all__ = ["page"]
+
+SINGULAR = {
+    "agents": "agent",
+    "plants": "plant",
+    "scenarios": "scenario",
+    "controllers": "controller",
+    "studies": "study",
+}
+
+HEAD = """# Configuration
+
+This page is generated from the fields of the config dataclasses and the presets of `conf/`, and a test compares it with
+them. After a change:
+
+    python -m experiments.cli.reference > docs/configuration.md
+
+A value is set by `key=value` and a preset is chosen by `group=preset`, in any order, after
+`python -m experiments.NAME`. `--help` prints a command's keys with the values that the rest of its line gives.
+`--cfg job` prints the resolved config, which every run keeps as `config.yaml` in its folder. A key that belongs to a
+part is written with the part's name before it: `safety.max_rate=0.01`.
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    names = [path.stem for path in sorted(ROOT.glob("*.yaml")) if path.stem != "base"]
+    commands: dict[str, Command[Any]] = {n: importlib.import_module(f"experiments.{n}").main for n in names}
+    parts: dict[type[Any], str] = {}
+    for command in commands.values():
+        for config in _variants(command):
+            _collect(config, "", parts)
+    lines = [HEAD, "## Commands", ""]
+    for name, command in commands.items():
+        lines += [f"### {name}", "", sentence(name), "", *_groups(name), *_table(command.schema, parts), ""]
+    lines += ["## Parts", ""]
+    for kind, name in parts.items():
+        said = (kind.__doc__ or "").split("\n\n")[0].strip().replace("\n    ", " ")
+        lines += [f"### {name}", "", said, "", *_table(kind(), parts), ""]
+    lines += ["## Presets", "", "Each with the values that differ from the defaults above.", ""]
+    for group, options in groups().items():
+        lines += [f"### Presets of {group}", "", "| preset | what it is | what it changes |", "|---|---|---|"]
+        for preset in (f"{group}/{option}" for option in options):
+            lines.append(f"| `{preset.rpartition('/')[2]}` | {sentence(preset)} | {_changes(preset)} |")
+        lines.append("")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _groups(name: str) -> Iterator[str]:
+    """The groups a command has."""
+    taken = [f"[`{group}`](#{_anchor(f'presets of {group}')})" for group in chosen(name)]
+    if taken:
+        yield f"Groups: {', '.join(taken)}."
+        yield ""
+
+
+def _anchor(heading: str) -> str:
+    """Where a heading is found in the page."""
+    return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
+
+
+def _variants(command: Command[Any]) -> Iterator[Any]:
+    """The command's config with every kind of backend and controller that it may hold."""
+    yield command.config()
+    if command.choose:
+        for group in ("backend", "controller"):
+            if group in chosen(command.name):
+                for option in groups()[group]:
+                    yield command.config([f"{group}={option}"])
+
+
+def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:
+    """Every part below a config with the name it is first met by."""
+    for entry in entries(config):
+        named = isinstance(entry.value, dict)
+        name = f"{prefix}{SINGULAR.get(entry.name, entry.name)}"
+        of = _part(config, entry)
+        for value in (*(entry.value.values() if named else [entry.value]), *([of()] if named and of else [])):
+            if is_dataclass(value):
+                kind = getattr(value, "kind", "")
+                parts.setdefault(cast(type[Any], type(value)), f"{name} ({kind})" if kind else name)
+                _collect(value, f"{name}.", parts)
+
+
+def _part(config: Any, entry: Entry) -> type[Any] | None:
+    """What kind of part a field holds, itself or by name."""
+    of: Any = type(entry.value)
+    if of is dict:
+        of = get_args(get_type_hints(type(config))[entry.name])[1]
+    return cast(type[Any], of) if is_dataclass(of) else None
+
+
+def _table(config: Any, parts: dict[type[Any], str]) -> Iterator[str]:
+    """A row per field; a part has a table of its own."""
+    rows = []
+    for entry in entries(config):
+        of = _part(config, entry)
+        own = parts[of] if of else ""
+        default = f"[{own}](#{_anchor(own)})" if own else f"`{shown(entry.value)}`"
+        cells = (f"`{entry.name}`", default, entry.said.unit, entry.allowed, entry.said.what)
+        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    if rows:
+        yield "| key | default | unit | allowed | meaning |"
+        yield "|---|---|---|---|---|"
+        yield from rows
+
+
+def _changes(name: str) -> str:
+    """The values of a preset's own file, and the preset it starts from."""
+    own = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
+    start = [f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_"]
+    flat = [f"`{key}={shown(value)}`" for key, value in _flat(own, "")]
+    words = ["as " + ", ".join(start)] if start else []
+    return "; ".join([*words, *([", ".join(flat)] if flat else [])]) or "nothing"
+
+
+def _flat(values: dict[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+if __name__ == "__main__":
+    print(page(), end="")
