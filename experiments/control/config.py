@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from conf.schema import check, part, setting
+from conf.schema import check, old_name, part, setting
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
@@ -104,7 +104,7 @@ def controller_config(kind: str) -> Any:
     )  # fmt: skip
     known = {config.kind: config for config in kinds}
     if kind not in known:
-        raise ValueError(f"controller.kind = {kind}: allowed {', '.join(known)}")
+        raise ValueError(old_name(f"controller.kind={kind}") or f"controller.kind = {kind}: allowed {', '.join(known)}")
     return known[kind]
 
 
