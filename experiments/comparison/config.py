@@ -1,4 +1,4 @@
-"""What `python -m experiments.benchmark` can be told: the typed schema behind conf/benchmark.yaml."""
+"""What `python -m experiments.benchmark` can be told."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each entry point can be told: the typed schema behind conf/*.yaml. Light to import: no torch, no matplotlib."""
+"""What the entry points can be told. Light to import: no torch, no matplotlib."""
 
 from __future__ import annotations
 
