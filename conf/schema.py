@@ -172,9 +172,9 @@ def old_name(key: str) -> str | None:
         (plants.NAME.pump, ablations.NAME.gamma) is known by what it is (plant.pump, agent.gamma).
     """
     first, *rest = key.split(".")
-    known = key
+    known = key.replace(".kind=", "=")  # a stored kind is the option it was chosen by
     if rest and (first in GROUPED or first in VARIANTS):
-        known = ".".join([first[:-1] if first in GROUPED else "agent", *rest[1:]])
+        known = ".".join([first[:-1] if first in GROUPED else "agent", *known.split(".")[2:]])
     if known in RENAMED:
         return f"{key}: renamed, now {RENAMED[known]}"
     if known in REMOVED:

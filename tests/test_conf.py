@@ -196,6 +196,8 @@ def test_an_old_option_of_a_group_gives_the_new_one(monkeypatch):
     monkeypatch.setitem(RENAMED, "controller=turbidostat", "controller=threshold")
     with pytest.raises(frame.UserError, match=r"^controller=turbidostat: renamed, now controller=threshold$"):
         load_deploy("controller=turbidostat")
+    with pytest.raises(ValueError, match=r"^controller\.kind=turbidostat: renamed, now controller=threshold$"):
+        deploy_schema("sim", "turbidostat")
 
 
 def test_an_old_key_in_a_file_gives_the_new_one(monkeypatch, tmp_path):

@@ -1,4 +1,4 @@
-"""The typed schema behind conf/benchmark.yaml: what `python -m experiments.benchmark` can be given."""
+"""What `python -m experiments.benchmark` can be told."""
 
 from __future__ import annotations
 

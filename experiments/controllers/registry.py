@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from conf.schema import old_name
 from dqn.policy import Policy
 from envs.plant.plant import Plant
 from envs.task import EnvConfig
@@ -39,7 +40,7 @@ STANDALONE = tuple(kind for kind, (_, _, parts) in KINDS.items() if not MISSING.
 def config(kind: str) -> Any:
     """The default config of this kind of controller. Raises: ValueError naming the kinds there are."""
     if kind not in KINDS:
-        raise ValueError(f"controller.kind = {kind}: allowed {', '.join(KINDS)}")
+        raise ValueError(old_name(f"controller.kind={kind}") or f"controller.kind = {kind}: allowed {', '.join(KINDS)}")
     return KINDS[kind][0]()
 
 

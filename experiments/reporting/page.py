@@ -111,7 +111,9 @@ def _other_versions() -> str:
 def provenance(page: Page, run: Path) -> None:
     """What was run: command, seed, versions, and the whole configuration to unfold."""
     overrides = run / ".hydra" / "overrides.yaml"
-    given = re.findall(r"^- (.+)$", overrides.read_text(encoding="utf-8"), re.MULTILINE) if overrides.is_file() else []
+    given = (
+        re.findall(r"^- \+*(.+)$", overrides.read_text(encoding="utf-8"), re.MULTILINE) if overrides.is_file() else []
+    )
     config = run / "config.yaml"
     text = config.read_text(encoding="utf-8") if config.is_file() else ""
     seed = re.search(r"^seed: (\d+)", text, re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Values of `conf/backend/chibio.yaml` and the `backend/transport` group, checked."""
+"""How a Chi.Bio is reached and run: `backend=chibio` and `backend=emulator`."""
 
 from __future__ import annotations
 

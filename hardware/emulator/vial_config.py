@@ -16,9 +16,9 @@ SPARE = ("Pump3", "Pump4")
 class VialConfig:
     """Optics and electronics of a reactor.
 
-    The blank is drawn once per reactor (docs/device.md, OD measurement). With the default noise the mean of four readings has sd
-    0.0036 at OD 0.5 (docs/biology.md, Sensor). A motor's start is what the thread's register writes take on the bus: 0.2
-    to 0.7 s is what the device's own software took on simulated electronics with bus time.
+    The blank is drawn once per reactor (docs/device.md, OD measurement). With the default noise the mean of four
+    readings has sd 0.0036 at OD 0.5 (docs/biology.md, Sensor). A motor's start is what the thread's register writes
+    take on the bus: 0.2 to 0.7 s is what the device's own software took on simulated electronics with bus time.
     """
 
     blank_low: float = setting(11600.0, "least counts of clear medium", within=(3000, 60000))

@@ -74,7 +74,8 @@ class Responses:
 
     report: dose as allowed. hold: no dose. pumps_off: no dose and the pumps off, verified. regulate: hand over to the
     device's own regulation for good. stop: no dose in this run any more. link to overflow_pump are kinds of
-    `reactor.Fault`. A reason that means the sensor cannot be believed may not regulate: the device would pump by the same reading.
+    `reactor.Fault`. A reason that means the sensor cannot be believed may not regulate: the device would pump by the
+    same reading.
     """
 
     setpoint: str = setting("hold", "outside (0, max_setpoint]", choices=CHOICES)
