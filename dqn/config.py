@@ -36,6 +36,7 @@ class DQNConfig:
     hindsight_width: tuple[float, float] = (1e-3, 0.8)  # range of that distance, drawn log-uniformly
     input_matrix: tuple[float, ...] = ()  # features = M observation + c, M row by row; () means identity
     input_offset: tuple[float, ...] = ()  # c, one number per feature
+    init_mirror: tuple[int, ...] = ()  # -1 or 1 per feature: half of the units start as mirror images; () = none
     init_zero_output: bool = False  # the last layer starts at zero
 
     def __post_init__(self) -> None:
@@ -76,6 +77,14 @@ class DQNConfig:
                 f"agent.input_matrix has {len(self.input_matrix)} values and agent.input_offset "
                 f"{len(self.input_offset)}: allowed one row of the matrix per value of the offset, or neither"
             )
+        mirror = self.init_mirror
+        if mirror and (len(mirror) != len(self.input_offset) or set(mirror) - {-1, 1}):
+            raise ValueError(
+                f"agent.init_mirror = {list(mirror)}: allowed -1 or 1 for each of the {len(self.input_offset)} values "
+                "of agent.input_offset, or []"
+            )
+        if mirror and any(units % 2 for units in self.hidden):
+            raise ValueError(f"agent.hidden = {list(self.hidden)}: allowed even sizes with agent.init_mirror, or []")
 
     def epsilon(self, step: int) -> float:
         """Probability of a random action at an environment step: linear in the step, then constant."""

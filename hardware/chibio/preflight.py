@@ -111,8 +111,8 @@ def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Ch
 
 def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration]) -> Check:
     """What the overflow pump covers; without one, what cannot be prevented."""
-    pump, feed = config.overflow_pump, max(calibration.feed.flow_ml_s for calibration in calibrations)
-    if not pump.pump:
+    overflow, feed = config.overflow_pump, max(calibration.feed.flow_ml_s for calibration in calibrations)
+    if not overflow.pump:
         return Check(
             "overflow pump",
             False,
@@ -120,12 +120,12 @@ def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration])
             "a second waste tube on Pump3, backend.overflow_pump.pump=Pump3 (docs/chibio.md)",
             required=False,
         )
-    covers = "a blocked waste tube" + " and a feed motor stuck on" * (pump.removes_ml_s > MARGIN * feed)
+    covers = "a blocked waste tube" + " and a feed motor stuck on" * (overflow.removes_ml_s > MARGIN * feed)
     return Check(
         "overflow pump",
-        pump.removes_ml_s > MAX_FEED_DUTY * feed,
-        f"{pump.pump} at duty {pump.duty:g} takes {pump.removes_ml_s:.2f} mL/s, feed pump {feed:.2f} mL/s at full "
-        f"power: covers {covers}; verified on when the run starts",
+        overflow.removes_ml_s > MAX_FEED_DUTY * feed,
+        f"{overflow.pump} at duty {overflow.duty:g} takes {overflow.removes_ml_s:.2f} mL/s, feed pump {feed:.2f} mL/s "
+        f"at full power: covers {covers}; verified on when the run starts",
         "less than the largest feed: raise backend.overflow_pump.duty",
         required=False,
     )
