@@ -108,12 +108,12 @@ def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
         yield close_loop(setup, SimulatedReactors(vials, backend), record)
         return
     with linked(backend) as (transport, clock):
-        rigs = load_calibrations(Path(backend.calibration), backend.reactors)
+        calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
         if setup.resumed and not earlier:
             raise RecordingError(f"journal {record.journal.path}: missing or empty; put it back, or start a new run")
         if not earlier:
-            check(backend, transport, clock, rigs, record.folder)
-        reactors = ChiBioReactors(transport, clock, backend, rigs, record.journal.append)
+            check(backend, transport, clock, calibrations, record.folder)
+        reactors = ChiBioReactors(transport, clock, backend, calibrations, record.journal.append)
         elapsed_s = (time.time() - float(earlier[0]["wall"])) * backend.speed if earlier else 0.0
         reactors.begin(replay(earlier), elapsed_s)
         try:

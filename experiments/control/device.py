@@ -48,10 +48,10 @@ def _running(backend: ChiBioConfig) -> Iterator[str]:
 
 
 def check(
-    backend: ChiBioConfig, transport: Transport, clock: RealClock, rigs: list[ReactorCalibration], folder: Path
+    backend: ChiBioConfig, transport: Transport, clock: RealClock, calibrations: list[ReactorCalibration], folder: Path
 ) -> None:
     """Log the preflight line by line. Raises: UserError if a required check failed."""
-    checks = preflight(transport, clock, backend, rigs, folder)
+    checks = preflight(transport, clock, backend, calibrations, folder)
     for one in checks:
         log.log(logging.INFO if one.ok else logging.WARNING, "%s", one)
     failed = [one for one in checks if one.required and not one.ok]

@@ -124,8 +124,8 @@ class Rehearsal:
         setup = assemble.unpack(replace(self.config, resume=resume), self.folder)
         self.record = Record(self.folder, self.names, setup.config.fsync)
         self.spans.append([self.clock.now(), np.inf])
-        transport, rigs = EmulatorTransport(self.device), [SOUND] * len(self.names)
-        self.reactors = ChiBioReactors(transport, self.clock, self.config.backend, rigs, self._log)
+        transport, calibrations = EmulatorTransport(self.device), [SOUND] * len(self.names)
+        self.reactors = ChiBioReactors(transport, self.clock, self.config.backend, calibrations, self._log)
         self.reactors.begin(replay(self.record.journal.rows), self.clock.now() - self.spans[0][0])
         self.loop = assemble.close_loop(setup, self.reactors, self.record)
 

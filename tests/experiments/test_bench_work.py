@@ -100,15 +100,15 @@ def test_a_file_of_nonsense_ends_in_one_line(tmp_path: Path, content: str, words
 def test_two_series_leave_the_spread_unknown_and_say_what_to_do() -> None:
     series = [Series(duty, 20, 20 * 0.9 * (PERIOD_S * duty + 0.1)) for duty in (0.01, 0.02, 0.04)]
 
-    def told(found: list[Series]) -> str:
+    def said(found: list[Series]) -> str:
         on_s, doses, grams = np.array([[PERIOD_S * s.duty, s.doses, s.grams] for s in found]).T
         return report(fit_pump(on_s, doses, grams), found)
 
-    assert "nan" not in told(series[:2])
-    assert "spread is unknown (10 % is assumed): weigh a third one" in told(series[:2])
-    assert "flow 0.9000 mL/s, bias +0.100 s, smallest" in told(series[:2])
-    assert "+- 0.0000 mL/s" in told(series)
-    assert "unknown" not in told(series)
+    assert "nan" not in said(series[:2])
+    assert "spread is unknown (10 % is assumed): weigh a third one" in said(series[:2])
+    assert "flow 0.9000 mL/s, bias +0.100 s, smallest" in said(series[:2])
+    assert "+- 0.0000 mL/s" in said(series)
+    assert "unknown" not in said(series)
 
 
 def test_without_a_terminal_there_is_one_clear_line(tmp_path: Path) -> None:

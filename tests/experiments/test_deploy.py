@@ -32,7 +32,7 @@ from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
 from hardware.storage.recording_reader import read_recording
-from tests.hardware.driver_lab import Bed
+from tests.hardware.driver_lab import DriverLab
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
@@ -202,39 +202,39 @@ def test_a_reading_that_is_no_number_is_answered_with_no_dose():
     assert all(step.rate[0] == 0.0 for step in loop.run())
 
 
-def handing_over(bed: Bed) -> ClosedLoop:
+def handing_over(lab: DriverLab) -> ClosedLoop:
     """A loop whose interlock hands every reactor over once its budget is spent."""
     safety = SafetyConfig(ml_per_hour=1.0, responses=Responses(budget="regulate"))
     schedule = Scenario((0.5,), (600.0,), (37.0,))
-    return ClosedLoop(bed.reactors, LearnedController(inverse_policy()), Interlock(len(bed.names), safety), schedule)
+    return ClosedLoop(lab.reactors, LearnedController(inverse_policy()), Interlock(len(lab.names), safety), schedule)
 
 
 def test_a_reactor_left_to_the_on_board_regulation_is_so_again_after_a_resume():
-    bed = Bed(od=0.55)
-    bed.reactors.begin()
-    loop = handing_over(bed)
-    while bed.clock.now() < 900.0:
+    lab = DriverLab(od=0.55)
+    lab.reactors.begin()
+    loop = handing_over(lab)
+    while lab.clock.now() < 900.0:
         loop.step()
     assert loop.handed_over.all()
-    assert bed.device.apps["M0"].data["OD"]["ON"] == 1
+    assert lab.device.apps["M0"].data["OD"]["ON"] == 1
     state = json.loads(json.dumps(loop.state()))
-    bed.client()
-    bed.reactors.begin(replay(json.loads(json.dumps(bed.rows))), bed.clock.now())
-    again = handing_over(bed)
+    lab.client()
+    lab.reactors.begin(replay(json.loads(json.dumps(lab.rows))), lab.clock.now())
+    again = handing_over(lab)
     again.restore(state)
-    while bed.clock.now() < 3600.0:
+    while lab.clock.now() < 3600.0:
         again.step()
-    assert bed.device.apps["M0"].data["OD"]["ON"] == 1
-    assert bed.truth()["od"] == pytest.approx(0.5, abs=0.05)
+    assert lab.device.apps["M0"].data["OD"]["ON"] == 1
+    assert lab.truth()["od"] == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_lasting_reason_is_told_once(caplog):
-    bed = Bed(("M0", "M1"), od=0.55)
-    bed.reactors.begin()
-    loop = handing_over(bed)
+    lab = DriverLab(("M0", "M1"), od=0.55)
+    lab.reactors.begin()
+    loop = handing_over(lab)
     log_changes = ChangeLog(loop)
     with caplog.at_level("WARNING"):
-        while bed.clock.now() < 1800.0:
+        while lab.clock.now() < 1800.0:
             log_changes(loop.step())
     assert loop.handed_over.all()
     assert len([r for r in caplog.records if "budget" in r.message]) == 2
@@ -289,25 +289,25 @@ def test_a_training_that_ends_while_the_latest_policy_is_taken_swaps_nothing(tmp
 
 
 def test_a_run_ends_although_an_absent_reactor_cannot_be_verified_off_and_says_so():
-    bed = Bed(("M0", "M1"), od=0.5)
-    bed.reactors.begin()
+    lab = DriverLab(("M0", "M1"), od=0.5)
+    lab.reactors.begin()
     schedule = Scenario((0.5,), (60.0,), (37.0,))
     interlock = Interlock(2, SafetyConfig(silent=20.0))
-    loop = ClosedLoop(bed.reactors, LearnedController(inverse_policy()), interlock, schedule)
+    loop = ClosedLoop(lab.reactors, LearnedController(inverse_policy()), interlock, schedule)
     steps = loop.run()
-    while bed.clock.now() < 300.0:
+    while lab.clock.now() < 300.0:
         next(steps)
-    bed.fault("unplugged", 1.0, "M1")
-    while bed.device.supervisor.alive:
+    lab.fault("unplugged", 1.0, "M1")
+    while lab.device.supervisor.alive:
         next(steps)
-    bed.fault("restart")
+    lab.fault("restart")
     reasons = [step.reasons[1] or "" for step in steps]  # comes to its end
-    assert bed.clock.now() < 5000.0
+    assert lab.clock.now() < 5000.0
     assert loop.done.tolist() == [True, False]
     assert loop.gone.tolist() == [False, True]
     assert any("absent" in reason for reason in reasons)
     assert any("silent" in reason for reason in reasons)
     with pytest.raises(DeviceStateError, match=r"pumps not verified off: M1: .*absent.*by hand"):
-        bed.reactors.stop()
-    assert bed.motors_off()
-    assert bed.device.supervisor.exits == 1
+        lab.reactors.stop()
+    assert lab.motors_off()
+    assert lab.device.supervisor.exits == 1

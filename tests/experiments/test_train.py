@@ -101,9 +101,9 @@ def test_the_summary_can_be_recomputed_from_the_exported_policy(whole):
 def test_selection_and_report_share_no_start():
     config = EnvConfig()
     kept = {(round(a, 9), round(b, 9)) for a, b in zip(*selection_grid(config), strict=True)}
-    told = {(round(a, 9), round(b, 9)) for a, b in zip(*report_grid(config), strict=True)}
-    assert len(told) == 41 * 9
-    assert not kept & told
+    reported = {(round(a, 9), round(b, 9)) for a, b in zip(*report_grid(config), strict=True)}
+    assert len(reported) == 41 * 9
+    assert not kept & reported
 
 
 def test_killed_at_a_random_moment_and_resumed_gives_the_same_weights(whole, tmp_path):

@@ -8,9 +8,10 @@ import numpy as np
 from envs.scenario import Scenario
 from experiments.control.loop import ClosedLoop, Step
 from experiments.controllers.base import Array, Mask
+from experiments.reliability.rehearsal import SOUND
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Log
-from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
+from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions
@@ -19,11 +20,6 @@ from hardware.emulator.transport import EmulatorTransport
 from hardware.link.transport import Reply
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
-
-# what weighing the emulator's healthy pumps gives: on-time bias 0.11 s, of which 0.05 s deliver nothing
-SOUND = ReactorCalibration(
-    PumpCalibration(bias_s=0.06, date="2026-01-01"), PumpCalibration(bias_s=0.11, date="2026-01-01")
-)
 
 
 class Spy:
@@ -62,8 +58,8 @@ class Law:
         return np.clip((0.025 + 0.5 * error) * 20.0 / 60.0, 0.0, 0.02)
 
 
-class Bed:
-    """A test bed: the program's closed loop around driver and emulated device.
+class DriverLab:
+    """The program's closed loop around driver and emulated device.
 
     Attributes: law, the controller; steps, what the loop yielded; rows, what the driver logged; samples, fed: number of
       samples and mL asked of the pumps, shape (N,).
@@ -97,10 +93,10 @@ class Bed:
         self._state: dict[str, Any] = {}  # of the loop after its last step
         self.client()
 
-    def client(self, rigs: Sequence[ReactorCalibration] | None = None, log: Log | None = None) -> None:
+    def client(self, calibrations: Sequence[ReactorCalibration] | None = None, log: Log | None = None) -> None:
         """A new driver and loop on the same device, as after a restart of the program."""
-        rigs = rigs or [SOUND] * len(self.names)
-        self.reactors = ChiBioReactors(self.wire, self.clock, self.config, rigs, log or self.log)
+        calibrations = calibrations or [SOUND] * len(self.names)
+        self.reactors = ChiBioReactors(self.wire, self.clock, self.config, calibrations, log or self.log)
         interlock = Interlock(len(self.names), self.safety)
         self.loop = ClosedLoop(self.reactors, self.law, interlock, self.scenario)
         if self._state:

@@ -29,7 +29,7 @@ from hardware.link.http import HttpTransport
 from hardware.link.open import open_transport
 from hardware.link.transport import Reply, TransportConfig
 from hardware.reactor import Command
-from tests.hardware.driver_lab import Bed
+from tests.hardware.driver_lab import DriverLab
 from tests.hardware.script import answer, state
 
 FUZZ_CASES = int(os.environ.get("FUZZ_CASES", "100"))
@@ -223,10 +223,10 @@ def test_fuzz_whatever_comes_back_ends_in_an_answer_or_an_error_of_ours(
 
 def test_fuzz_no_dose_on_garbage() -> None:
     """Damaged states and failing POSTs in a run: never two doses for a sample, never more than was asked."""
-    bed = Bed()
-    bed.reactors.begin()
-    bed.run(2)
-    inner, rng = bed.wire.inner, np.random.default_rng(0)
+    lab = DriverLab()
+    lab.reactors.begin()
+    lab.run(2)
+    inner, rng = lab.wire.inner, np.random.default_rng(0)
     real = inner._request
 
     def damaged(method: str, path: str) -> Reply:
@@ -239,18 +239,18 @@ def test_fuzz_no_dose_on_garbage() -> None:
         return Reply(200, body.tobytes()[: body.size - int(rng.integers(0, 3) == 0)])
 
     for _ in range(FUZZ_CASES):
-        before = len(bed.wire.posts)
-        bed.clock.sleep(45.0)  # a sample is due
+        before = len(lab.wire.posts)
+        lab.clock.sleep(45.0)  # a sample is due
         inner._request = damaged  # type: ignore[method-assign]
-        m = bed.reactors.measure()
-        bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+        m = lab.reactors.measure()
+        lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
         inner._request = real  # type: ignore[method-assign]
-        posts = [p for _, p in bed.wire.posts[before:]]
+        posts = [p for _, p in lab.wire.posts[before:]]
         assert sum(p.startswith("/SetOutputOn/Pump1/1") for p in posts) <= 1
         assert all(float(p.split("/")[-1]) <= 0.025 for p in posts if p.startswith("/SetOutputTarget/Pump1"))
-        bed.reactors.stop()
-        assert bed.motors_off()
-    acted = [tuple(r["sample"]) for r in bed.of("intent")]
+        lab.reactors.stop()
+        assert lab.motors_off()
+    acted = [tuple(r["sample"]) for r in lab.of("intent")]
     assert len(acted) > FUZZ_CASES // 100
     assert len(set(acted)) == len(acted)
 

@@ -17,25 +17,25 @@ from hardware.emulator.plants import plant_preset
 from hardware.emulator.server import build, parser
 from hardware.emulator.vial_config import VialConfig
 from hardware.errors import DeviceStateError
-from tests.hardware.driver_lab import Bed
+from tests.hardware.driver_lab import DriverLab
 from tests.hardware.script import state
 
 PUMP = OverflowPumpConfig("Pump3", 0.5)
 
 
-def plumbed(pump: OverflowPumpConfig = PUMP, **config: Any) -> Bed:
+def plumbed(pump: OverflowPumpConfig = PUMP, **config: Any) -> DriverLab:
     """Driver and emulated device with a second waste tube."""
     options = DeviceOptions(vial=VialConfig(overflow_pump=pump.pump))
-    return Bed(options=options, overflow_pump=pump, **config)
+    return DriverLab(options=options, overflow_pump=pump, **config)
 
 
-def posts(bed: Bed) -> list[str]:
-    return [path for _, path in bed.wire.posts if "/Pump3/" in path]
+def posts(lab: DriverLab) -> list[str]:
+    return [path for _, path in lab.wire.posts if "/Pump3/" in path]
 
 
-def runs(bed: Bed) -> bool:
+def runs(lab: DriverLab) -> bool:
     """What the device holds of the overflow pump is what was configured."""
-    pump = bed.device.apps["M0"].data["Pump3"]
+    pump = lab.device.apps["M0"].data["Pump3"]
     return bool(pump["ON"] == 1 and pump["target"] == PUMP.duty)
 
 
@@ -45,11 +45,11 @@ def runs(bed: Bed) -> bool:
 def test_there_is_none_by_default() -> None:
     assert ChiBioConfig().overflow_pump == OverflowPumpConfig()
     assert not OverflowPumpConfig().pump
-    bed = Bed()
-    bed.reactors.begin()
-    bed.run(3)
-    bed.reactors.stop()
-    assert set(posts(bed)) == {"/SetOutputOn/Pump3/0/M0"}
+    lab = DriverLab()
+    lab.reactors.begin()
+    lab.run(3)
+    lab.reactors.stop()
+    assert set(posts(lab)) == {"/SetOutputOn/Pump3/0/M0"}
 
 
 @pytest.mark.parametrize(
@@ -82,210 +82,210 @@ def test_what_a_read_shows_of_it(on: int, target: float, seen: str) -> None:
 
 
 def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_the_end() -> None:
-    bed = plumbed()
-    bed.reactors.begin()
-    assert runs(bed)
-    assert [(row["pump"], row["duty"], row["found"]) for row in bed.of("guard")] == [("Pump3", 0.5, "off")]
-    bed.run(20)
-    assert len(bed.of("intent")) >= 15
-    assert posts(bed) == ["/SetOutputTarget/Pump3/M0/0.500000", "/SetOutputOn/Pump3/1/M0"]
-    starts = [d.start_s for d in bed.device.vials["M0"].doses if d.pump == "Pump3"]
+    lab = plumbed()
+    lab.reactors.begin()
+    assert runs(lab)
+    assert [(row["pump"], row["duty"], row["found"]) for row in lab.of("guard")] == [("Pump3", 0.5, "off")]
+    lab.run(20)
+    assert len(lab.of("intent")) >= 15
+    assert posts(lab) == ["/SetOutputTarget/Pump3/M0/0.500000", "/SetOutputOn/Pump3/1/M0"]
+    starts = [d.start_s for d in lab.device.vials["M0"].doses if d.pump == "Pump3"]
     assert np.diff(starts) == pytest.approx(63.5, abs=0.5)  # the device's own period, never begun anew
-    assert bed.of("fault") == []
-    assert not [row for row in bed.of("note") if "overflow pump" in row["note"]]
-    bed.reactors.stop()
-    assert bed.motors_off()
-    assert bed.device.apps["M0"].data["Pump3"]["ON"] == 0
-    bed.reactors.stop()
-    bed.clock.sleep(200.0)
-    assert bed.motors_off()
+    assert lab.of("fault") == []
+    assert not [row for row in lab.of("note") if "overflow pump" in row["note"]]
+    lab.reactors.stop()
+    assert lab.motors_off()
+    assert lab.device.apps["M0"].data["Pump3"]["ON"] == 0
+    lab.reactors.stop()
+    lab.clock.sleep(200.0)
+    assert lab.motors_off()
 
 
 def test_a_trip_switches_the_others_off_and_leaves_it_on() -> None:
-    bed = plumbed()
-    bed.law.rate = 0.02
-    bed.reactors.begin()
-    bed.run(3)
-    while not bed.step().rows[0]:
+    lab = plumbed()
+    lab.law.rate = 0.02
+    lab.reactors.begin()
+    lab.run(3)
+    while not lab.step().rows[0]:
         pass
-    bed.clock.sleep(0.5)
-    assert bed.truth()["motors"]["Pump2"] == 1
-    assert bed.reactors.pumps_off(np.array([True])) == []
-    assert not any(bed.truth()["motors"][p] for p in ("Pump1", "Pump2", "Pump4"))
-    assert runs(bed)
-    bed.fault("spectrometer_dead")
-    bed.run(5)
-    assert "spectrometer" in bed.kinds()
-    assert runs(bed)
+    lab.clock.sleep(0.5)
+    assert lab.truth()["motors"]["Pump2"] == 1
+    assert lab.reactors.pumps_off(np.array([True])) == []
+    assert not any(lab.truth()["motors"][p] for p in ("Pump1", "Pump2", "Pump4"))
+    assert runs(lab)
+    lab.fault("spectrometer_dead")
+    lab.run(5)
+    assert "spectrometer" in lab.kinds()
+    assert runs(lab)
 
 
 @pytest.mark.parametrize(
     ("path", "found"), [("/SetOutputOn/Pump3/0/M0", "found off"), ("/SetOutputTarget/Pump3/M0/0.1", "a duty of 0.1")]
 )
 def test_another_client_that_changes_it_is_told_of_and_set_right(path: str, found: str) -> None:
-    bed = plumbed()
-    bed.reactors.begin()
-    bed.run(3)
-    bed.device.handle("POST", path)
-    bed.run(2)
-    assert runs(bed)
-    notes = [row["note"] for row in bed.of("note") if "overflow pump" in row["note"]]
+    lab = plumbed()
+    lab.reactors.begin()
+    lab.run(3)
+    lab.device.handle("POST", path)
+    lab.run(2)
+    assert runs(lab)
+    notes = [row["note"] for row in lab.of("note") if "overflow pump" in row["note"]]
     assert len(notes) == 1
     assert found in notes[0]
-    assert bed.kinds() == set()
-    assert bed.samples[0] >= 5
+    assert lab.kinds() == set()
+    assert lab.samples[0] >= 5
 
 
 def test_a_pump_beside_it_that_someone_switches_on_is_still_found() -> None:
-    bed = plumbed()
-    bed.law.rate = 0.0
-    bed.reactors.begin()
-    bed.run(3)
+    lab = plumbed()
+    lab.law.rate = 0.0
+    lab.reactors.begin()
+    lab.run(3)
     for path in ("/SetOutputTarget/Pump4/M0/0.1", "/SetOutputOn/Pump4/1/M0"):
-        bed.device.handle("POST", path)
-    bed.run(3)
-    assert "pump" in bed.kinds()
-    assert bed.truth()["motors"]["Pump4"] == 0
-    assert runs(bed)
+        lab.device.handle("POST", path)
+    lab.run(3)
+    assert "pump" in lab.kinds()
+    assert lab.truth()["motors"]["Pump4"] == 0
+    assert runs(lab)
 
 
 def test_one_that_cannot_be_verified_on_is_an_alarm_with_a_remedy_and_no_dose_is_given() -> None:
-    bed = plumbed()
-    bed.law.rate = 0.0
-    bed.reactors.begin()
-    bed.run(3)
-    bed.device.handle("POST", "/SetOutputOn/Pump3/0/M0")
-    bed.fault("lying", -1)
-    bed.law.rate = 0.01
-    before, given = bed.samples[0], len(bed.of("intent"))
-    bed.run(5)
-    told = [text for step in bed.steps if "overflow_pump:" in (text := step.reasons[0] or "")]
+    lab = plumbed()
+    lab.law.rate = 0.0
+    lab.reactors.begin()
+    lab.run(3)
+    lab.device.handle("POST", "/SetOutputOn/Pump3/0/M0")
+    lab.fault("lying", -1)
+    lab.law.rate = 0.01
+    before, given = lab.samples[0], len(lab.of("intent"))
+    lab.run(5)
+    told = [text for step in lab.steps if "overflow_pump:" in (text := step.reasons[0] or "")]
     assert "the overflow pump, Pump3, is off after it was set to 0.5 and on" in told[0]
     assert "no dose" in told[0]
     assert "restart the device" in told[0]
-    assert len(bed.of("intent")) == given
-    assert bed.samples[0] >= before + 4  # its samples go on
-    bed.fault("lying", 0)
-    bed.run(3)
-    assert runs(bed)
-    assert bed.reactors.stations[0].book.fault is None
-    assert len(bed.of("intent")) > given
+    assert len(lab.of("intent")) == given
+    assert lab.samples[0] >= before + 4  # its samples go on
+    lab.fault("lying", 0)
+    lab.run(3)
+    assert runs(lab)
+    assert lab.reactors.stations[0].book.fault is None
+    assert len(lab.of("intent")) > given
 
 
 def test_a_run_does_not_begin_without_it_and_leaves_no_pump_on() -> None:
-    bed = plumbed()
-    bed.device.handle("POST", "/Experiment/1/M0")
-    bed.clock.sleep(90.0)
-    inner = bed.wire.inner
+    lab = plumbed()
+    lab.device.handle("POST", "/Experiment/1/M0")
+    lab.clock.sleep(90.0)
+    inner = lab.wire.inner
     real = inner.post
 
     def deaf(path: str) -> Any:
-        bed.fault("lying", int(path == "/SetOutputOn/Pump3/1/M0"))
+        lab.fault("lying", int(path == "/SetOutputOn/Pump3/1/M0"))
         return real(path)
 
     inner.post = deaf  # type: ignore[method-assign]
     with pytest.raises(DeviceStateError, match="Pump3, is off after it was set to 0.5 and on; run the preflight"):
-        bed.reactors.begin()
-    assert bed.motors_off()
+        lab.reactors.begin()
+    assert lab.motors_off()
 
 
 def test_a_start_that_fails_at_one_reactor_leaves_no_guard_on_at_another() -> None:
     options = DeviceOptions(vial=VialConfig(overflow_pump="Pump3"))
-    bed = Bed(("M0", "M1"), options=options, overflow_pump=PUMP)
-    bed.device.handle("POST", "/SetOutputOn/Zigzag/1/M1")
+    lab = DriverLab(("M0", "M1"), options=options, overflow_pump=PUMP)
+    lab.device.handle("POST", "/SetOutputOn/Zigzag/1/M1")
     with pytest.raises(DeviceStateError, match="Zigzag"):
-        bed.reactors.begin()
-    assert bed.device.apps["M0"].data["Pump3"]["target"] == 0.5  # it had been on
-    assert bed.motors_off()
+        lab.reactors.begin()
+    assert lab.device.apps["M0"].data["Pump3"]["target"] == 0.5  # it had been on
+    assert lab.motors_off()
 
 
 def test_a_start_that_fails_and_cannot_switch_it_off_again_says_so() -> None:
-    bed = plumbed()
-    bed.device.handle("POST", "/Experiment/1/M0")
-    bed.clock.sleep(90.0)
-    inner = bed.wire.inner
+    lab = plumbed()
+    lab.device.handle("POST", "/Experiment/1/M0")
+    lab.clock.sleep(90.0)
+    inner = lab.wire.inner
     real = inner.post
 
     def dying(path: str) -> Any:
         reply = real(path)
         if path == "/SetOutputOn/Pump3/1/M0":
-            bed.fault("reset_before", -1)
+            lab.fault("reset_before", -1)
         return reply
 
     inner.post = dying  # type: ignore[method-assign]
     with pytest.raises(DeviceStateError, match="reset; overflow pump not verified off: M0: .*reset"):
-        bed.reactors.begin()
+        lab.reactors.begin()
 
 
 def test_a_device_that_lost_its_memory_gets_it_back() -> None:
-    bed = plumbed()
-    bed.reactors.begin()
-    bed.run(5)
-    bed.fault("worker_wipe")
-    bed.run(4)
-    assert "restarted" in bed.kinds()
-    assert runs(bed)
-    assert bed.reactors.stations[0].book.fault is None
+    lab = plumbed()
+    lab.reactors.begin()
+    lab.run(5)
+    lab.fault("worker_wipe")
+    lab.run(4)
+    assert "restarted" in lab.kinds()
+    assert runs(lab)
+    assert lab.reactors.stations[0].book.fault is None
 
 
 def test_a_stopped_experiment_keeps_it() -> None:
-    bed = plumbed()
-    bed.reactors.begin()
-    bed.run(3)
-    bed.device.handle("POST", "/Experiment/0/M0")
-    bed.run(5)  # its last cycle ends with everything off
-    assert "stopped" in bed.kinds()
-    assert runs(bed)
+    lab = plumbed()
+    lab.reactors.begin()
+    lab.run(3)
+    lab.device.handle("POST", "/Experiment/0/M0")
+    lab.run(5)  # its last cycle ends with everything off
+    assert "stopped" in lab.kinds()
+    assert runs(lab)
 
 
 def test_a_reactor_handed_over_to_its_own_regulation_keeps_it_beyond_the_end_of_the_run() -> None:
-    bed = plumbed()
-    bed.reactors.begin()
-    bed.run(5)
-    assert bed.reactors.regulate(np.array([True]), np.array([0.5])) == []
-    bed.run(10)
-    assert runs(bed)
-    assert bed.reactors.stations[0].book.fault is None
-    bed.reactors.stop()
-    bed.clock.sleep(600.0)
-    assert runs(bed)
-    assert bed.truth()["od"] == pytest.approx(0.5, abs=0.1)
+    lab = plumbed()
+    lab.reactors.begin()
+    lab.run(5)
+    assert lab.reactors.regulate(np.array([True]), np.array([0.5])) == []
+    lab.run(10)
+    assert runs(lab)
+    assert lab.reactors.stations[0].book.fault is None
+    lab.reactors.stop()
+    lab.clock.sleep(600.0)
+    assert runs(lab)
+    assert lab.truth()["od"] == pytest.approx(0.5, abs=0.1)
 
 
 # -- resume ----------------------------------------------------------------------------------------------------------
 
 
-def resume(bed: Bed, dead_s: float) -> None:
-    began, rows = bed.reactors.elapsed(), json.loads(json.dumps(bed.rows))
-    bed.clock.sleep(dead_s)
-    bed.client()
-    bed.reactors.begin(replay(rows), began + dead_s)
+def resume(lab: DriverLab, dead_s: float) -> None:
+    began, rows = lab.reactors.elapsed(), json.loads(json.dumps(lab.rows))
+    lab.clock.sleep(dead_s)
+    lab.client()
+    lab.reactors.begin(replay(rows), began + dead_s)
 
 
 def test_a_resumed_run_finds_it_on_and_does_not_interrupt_it() -> None:
-    bed = plumbed()
-    bed.reactors.begin()
-    bed.run(3)
-    before = posts(bed)
-    resume(bed, 500.0)
-    bed.run(5)
-    assert posts(bed) == before
-    assert runs(bed)
-    starts = [d.start_s for d in bed.device.vials["M0"].doses if d.pump == "Pump3"]
+    lab = plumbed()
+    lab.reactors.begin()
+    lab.run(3)
+    before = posts(lab)
+    resume(lab, 500.0)
+    lab.run(5)
+    assert posts(lab) == before
+    assert runs(lab)
+    starts = [d.start_s for d in lab.device.vials["M0"].doses if d.pump == "Pump3"]
     assert np.diff(starts) == pytest.approx(63.5, abs=0.5)
-    bed.reactors.stop()
-    assert bed.motors_off()
+    lab.reactors.stop()
+    assert lab.motors_off()
 
 
 def test_a_resumed_run_tells_that_it_was_off_meanwhile() -> None:
-    bed = plumbed()
-    bed.reactors.begin()
-    bed.run(3)
+    lab = plumbed()
+    lab.reactors.begin()
+    lab.run(3)
     for k in (1, 2, 3, 4):  # what the board agent does when nobody asks for two minutes
-        bed.device.handle("POST", f"/SetOutputOn/Pump{k}/0/M0")
-    resume(bed, 300.0)
-    assert runs(bed)
-    assert ["the overflow pump was found off" in row["note"] for row in bed.of("note")][-1]
+        lab.device.handle("POST", f"/SetOutputOn/Pump{k}/0/M0")
+    resume(lab, 300.0)
+    assert runs(lab)
+    assert ["the overflow pump was found off" in row["note"] for row in lab.of("note")][-1]
 
 
 # -- what it prevents ------------------------------------------------------------------------------------------------
@@ -293,13 +293,13 @@ def test_a_resumed_run_tells_that_it_was_off_meanwhile() -> None:
 
 @pytest.mark.parametrize(("pump", "peak"), [(OverflowPumpConfig("Pump4", 0.1), 23.5), (OverflowPumpConfig(), 30.0)])
 def test_a_blocked_waste_tube_at_the_largest_feed(pump: OverflowPumpConfig, peak: float) -> None:
-    bed = plumbed(pump)
-    bed.law.rate = 0.02
-    bed.reactors.begin()
-    bed.fault("waste_gain_factor", 0.0)
-    bed.run(30)
-    assert bed.truth()["peak_ml"] == pytest.approx(peak, abs=1.0)
-    assert bed.truth()["overflowed"] == (not pump.pump)
+    lab = plumbed(pump)
+    lab.law.rate = 0.02
+    lab.reactors.begin()
+    lab.fault("waste_gain_factor", 0.0)
+    lab.run(30)
+    assert lab.truth()["peak_ml"] == pytest.approx(peak, abs=1.0)
+    assert lab.truth()["overflowed"] == (not pump.pump)
 
 
 @pytest.mark.parametrize(("flow_ml_s", "overflows"), [(1.0, True), (1.2, False)])
@@ -310,13 +310,13 @@ def test_a_feed_motor_stuck_at_full_power_needs_one_that_is_the_stronger_pump(
     pump = OverflowPumpConfig("Pump3", 0.95, flow_ml_s)
     plant = plant_preset("healthy")
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=flow_ml_s))
-    bed = Bed(options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), overflow_pump=pump)
-    bed.reactors.begin()
-    bed.run(3)
-    bed.fault("feed_stuck_open")
-    bed.run(60)
-    assert "falls" in bed.kinds()
-    assert bed.truth()["overflowed"] == overflows
+    lab = DriverLab(options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), overflow_pump=pump)
+    lab.reactors.begin()
+    lab.run(3)
+    lab.fault("feed_stuck_open")
+    lab.run(60)
+    assert "falls" in lab.kinds()
+    assert lab.truth()["overflowed"] == overflows
 
 
 def test_the_emulator_has_one_if_it_is_told_so() -> None:

@@ -5,28 +5,29 @@ from pathlib import Path
 
 import pytest
 
+from experiments.reliability.rehearsal import SOUND
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.preflight import Check, preflight
-from tests.hardware.driver_lab import SOUND, Bed
+from tests.hardware.driver_lab import DriverLab
 
 
-def checks(bed: Bed, rig: ReactorCalibration = SOUND) -> dict[str, Check]:
-    found = preflight(bed.wire, bed.clock, bed.config, [rig] * len(bed.names), Path("."))
+def checks(lab: DriverLab, rig: ReactorCalibration = SOUND) -> dict[str, Check]:
+    found = preflight(lab.wire, lab.clock, lab.config, [rig] * len(lab.names), Path("."))
     return {check.name: check for check in found}
 
 
 def test_a_sound_device_passes_and_nothing_is_switched() -> None:
-    bed = Bed(("M0", "M1"), overflow_pump=OverflowPumpConfig("Pump3"))
-    found = checks(bed)
+    lab = DriverLab(("M0", "M1"), overflow_pump=OverflowPumpConfig("Pump3"))
+    found = checks(lab)
     assert all(check.ok for check in found.values()), "\n".join(map(str, found.values()))
     assert {"disk", "connection", "board clock", "M0 present", "M1 blank", "M1 pump calibration"} <= set(found)
-    assert {path.split("/")[1] for _, path in bed.wire.posts} == {"changeDevice", "MeasureTemp"}
+    assert {path.split("/")[1] for _, path in lab.wire.posts} == {"changeDevice", "MeasureTemp"}
     assert str(found["M0 modes"]) == "pass  M0 modes: none active"
 
 
 def test_without_an_overflow_pump_a_note_says_what_may_happen_and_nothing_else_is_wrong() -> None:
-    found = checks(Bed())
+    found = checks(DriverLab())
     assert [check.name for check in found.values() if not check.ok] == ["overflow pump"]
     assert str(found["overflow pump"]) == (
         "note  overflow pump: none: with a blocked waste tube a vial overflows after about 10 mL of feed -> a second "
@@ -44,19 +45,19 @@ def test_without_an_overflow_pump_a_note_says_what_may_happen_and_nothing_else_i
     ],
 )
 def test_what_an_overflow_pump_covers(pump: OverflowPumpConfig, feed_ml_s: float, ok: bool, covers: str) -> None:
-    found = checks(Bed(overflow_pump=pump), ReactorCalibration(PumpCalibration(flow_ml_s=feed_ml_s), SOUND.waste))[
-        "overflow pump"
-    ]
+    found = checks(
+        DriverLab(overflow_pump=pump), ReactorCalibration(PumpCalibration(flow_ml_s=feed_ml_s), SOUND.waste)
+    )["overflow pump"]
     assert (found.ok, found.required) == (ok, False)
     assert covers in found.detail
     assert "verified on when the run starts" in found.detail
 
 
 def test_a_guard_that_runs_already_is_no_pump_left_on() -> None:
-    bed = Bed(overflow_pump=OverflowPumpConfig("Pump3"))
+    lab = DriverLab(overflow_pump=OverflowPumpConfig("Pump3"))
     for path in ("/SetOutputTarget/Pump3/M0/0.1", "/SetOutputOn/Pump3/1/M0"):
-        bed.device.handle("POST", path)
-    assert checks(bed)["M0 pumps"].ok
+        lab.device.handle("POST", path)
+    assert checks(lab)["M0 pumps"].ok
 
 
 @pytest.mark.parametrize(
@@ -69,10 +70,10 @@ def test_a_guard_that_runs_already_is_no_pump_left_on() -> None:
     ],
 )
 def test_trouble_on_the_device(posts: list[str], name: str, required: bool) -> None:
-    bed = Bed()
+    lab = DriverLab()
     for path in posts:
-        bed.device.handle("POST", path)
-    check = checks(bed)[name]
+        lab.device.handle("POST", path)
+    check = checks(lab)[name]
     assert not check.ok
     assert check.remedy
     assert check.required == required
@@ -80,38 +81,38 @@ def test_trouble_on_the_device(posts: list[str], name: str, required: bool) -> N
 
 
 def test_an_uncalibrated_device_and_a_stored_blank() -> None:
-    bed = Bed(blanked=False)
-    assert not checks(bed)["M0 blank"].ok
-    assert "experiments.blank" in checks(bed)["M0 blank"].remedy
-    assert checks(bed, ReactorCalibration(SOUND.feed, SOUND.waste, 14000.0))["M0 blank"].ok
+    lab = DriverLab(blanked=False)
+    assert not checks(lab)["M0 blank"].ok
+    assert "experiments.blank" in checks(lab)["M0 blank"].remedy
+    assert checks(lab, ReactorCalibration(SOUND.feed, SOUND.waste, 14000.0))["M0 blank"].ok
 
 
 def test_pumps_never_weighed_weighed_elsewhere_or_too_weak() -> None:
-    bed = Bed()
-    never = checks(bed, ReactorCalibration())["M0 pump calibration"]
+    lab = DriverLab()
+    never = checks(lab, ReactorCalibration())["M0 pump calibration"]
     assert (never.ok, never.required) == (False, False)
     elsewhere = ReactorCalibration(
         PumpCalibration(date="2026-01-01", device_id="other"), PumpCalibration(date="2026-01-01")
     )
-    assert "another unit" in checks(bed, elsewhere)["M0 pump calibration"].detail
-    weak = checks(bed, ReactorCalibration(PumpCalibration(flow_ml_s=1.5), PumpCalibration(flow_ml_s=0.3)))[
+    assert "another unit" in checks(lab, elsewhere)["M0 pump calibration"].detail
+    weak = checks(lab, ReactorCalibration(PumpCalibration(flow_ml_s=1.5), PumpCalibration(flow_ml_s=0.3)))[
         "M0 waste over feed"
     ]
     assert (weak.ok, weak.required) == (False, True)
 
 
 def test_an_absent_reactor_a_dead_sensor_a_lost_link() -> None:
-    bed = Bed(("M0",))
-    bed.config = type(bed.config)(reactors=("M0", "M5"))
-    found = preflight(bed.wire, bed.clock, bed.config, [SOUND] * 2)
+    lab = DriverLab(("M0",))
+    lab.config = type(lab.config)(reactors=("M0", "M5"))
+    found = preflight(lab.wire, lab.clock, lab.config, [SOUND] * 2)
     assert [c.ok for c in found if c.name == "M5 present"] == [False]
-    bed = Bed()
-    bed.reactors.begin()
-    bed.fault("spectrometer_dead")
-    bed.run(2)
-    assert not checks(bed)["M0 light sensor"].ok
-    bed.fault("crash")
-    found = checks(bed)
+    lab = DriverLab()
+    lab.reactors.begin()
+    lab.fault("spectrometer_dead")
+    lab.run(2)
+    assert not checks(lab)["M0 light sensor"].ok
+    lab.fault("crash")
+    found = checks(lab)
     assert not found["connection"].ok
     assert "M0 present" not in found
-    assert math.isfinite(bed.clock.now())
+    assert math.isfinite(lab.clock.now())

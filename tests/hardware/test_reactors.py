@@ -8,57 +8,58 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
+from experiments.reliability.rehearsal import SOUND
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError, RecordingError
 from hardware.reactor import Command
-from tests.hardware.driver_lab import SOUND, Bed
+from tests.hardware.driver_lab import DriverLab
 from tests.hardware.emulator_lab import BIAS_S, START_S, quiet
 
 
-def doses(bed: Bed, name: str = "M0", pump: str = "Pump1") -> list[tuple[float, float]]:
+def doses(lab: DriverLab, name: str = "M0", pump: str = "Pump1") -> list[tuple[float, float]]:
     """(start, length) of every run of a motor, device s."""
-    bed.device.run_until(bed.clock.now())
-    return [(d.start_s, d.seconds) for d in bed.device.vials[name].doses if d.pump == pump]
+    lab.device.run_until(lab.clock.now())
+    return [(d.start_s, d.seconds) for d in lab.device.vials[name].doses if d.pump == pump]
 
 
-def fixed(bed: Bed, rate: float) -> None:
-    bed.law.rate = rate
+def fixed(lab: DriverLab, rate: float) -> None:
+    lab.law.rate = rate
 
 
 # -- a healthy run ---------------------------------------------------------------------------------------------------
 
 
 def test_three_reactors_are_held_for_two_hours_without_a_missed_or_doubled_minute() -> None:
-    bed = Bed(("M0", "M1", "M2"))
-    bed.reactors.begin()
-    bed.run(120)
-    bed.reactors.stop()
-    assert np.all(bed.samples >= 118)
-    od = np.array([step.od for step in bed.steps[-180:]])
+    lab = DriverLab(("M0", "M1", "M2"))
+    lab.reactors.begin()
+    lab.run(120)
+    lab.reactors.stop()
+    assert np.all(lab.samples >= 118)
+    od = np.array([step.od for step in lab.steps[-180:]])
     assert np.abs(od - 0.5).mean() < 0.01
-    for i, name in enumerate(bed.names):
-        starts = [t for t, _ in doses(bed, name)]
+    for i, name in enumerate(lab.names):
+        starts = [t for t, _ in doses(lab, name)]
         assert np.diff(starts).min() > 35.0  # the first is late: the start of the others was waited for
         assert np.diff(starts)[2:].min() > 55.0
-        acted = [tuple(r["sample"]) for r in bed.of("intent") if r["reactor"] == name]
+        acted = [tuple(r["sample"]) for r in lab.of("intent") if r["reactor"] == name]
         assert len(set(acted)) == len(acted)
-        assert bed.truth(name)["feed_ml"] == pytest.approx(bed.fed[i], rel=0.08)
-        assert bed.truth(name)["peak_ml"] < 20.5
-    assert bed.motors_off()
-    assert bed.of("fault") == []
-    assert "undosed" not in bed.kinds()
+        assert lab.truth(name)["feed_ml"] == pytest.approx(lab.fed[i], rel=0.08)
+        assert lab.truth(name)["peak_ml"] < 20.5
+    assert lab.motors_off()
+    assert lab.of("fault") == []
+    assert "undosed" not in lab.kinds()
 
 
 def test_the_requests_of_one_dose_are_those_of_single_shot_dosing() -> None:
-    bed = Bed(options=quiet())
-    fixed(bed, 0.0125)
-    bed.reactors.begin()
-    bed.step()
-    begun = len(bed.wire.posts)
-    bed.run(0.5)
-    posts = [(t, path) for t, path in bed.wire.posts[begun - 6 :] if not path.startswith("/changeDevice")]
+    lab = DriverLab(options=quiet())
+    fixed(lab, 0.0125)
+    lab.reactors.begin()
+    lab.step()
+    begun = len(lab.wire.posts)
+    lab.run(0.5)
+    posts = [(t, path) for t, path in lab.wire.posts[begun - 6 :] if not path.startswith("/changeDevice")]
     feed, waste = 0.75 - 0.06, 4.0 * (0.75 - 0.06) + 4.4  # seconds
     assert [path.rsplit("/", 1)[0] for _, path in posts[:2]] == [
         "/SetOutputTarget/Pump2/M0",
@@ -75,101 +76,101 @@ def test_the_requests_of_one_dose_are_those_of_single_shot_dosing() -> None:
         "/MeasureTemp/IR/M0",
     ]
     assert posts[5][0] - waste_on_s == pytest.approx(waste + 2.0, abs=0.1)
-    assert doses(bed) == [(pytest.approx(on_s + START_S, abs=0.1), pytest.approx(feed + BIAS_S, abs=0.01))]
-    [(_, length)] = doses(bed, pump="Pump2")
+    assert doses(lab) == [(pytest.approx(on_s + START_S, abs=0.1), pytest.approx(feed + BIAS_S, abs=0.01))]
+    [(_, length)] = doses(lab, pump="Pump2")
     assert length == pytest.approx(waste + BIAS_S, abs=0.01)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.4, 0.6, 0.9])
 def test_a_slow_link_does_not_cut_doses_short(delay_s: float) -> None:
-    bed = Bed(options=quiet())
-    fixed(bed, 0.01)
-    bed.reactors.begin()
-    bed.fault("slow_s", delay_s)
-    bed.run(10)
+    lab = DriverLab(options=quiet())
+    fixed(lab, 0.01)
+    lab.reactors.begin()
+    lab.fault("slow_s", delay_s)
+    lab.run(10)
     for pump, asked in (("Pump1", [0.54] * 20), ("Pump2", ([4.0 * 0.54 + 4.4] * 4 + [63.0 * 0.25]) * 4)):
-        given = doses(bed, pump=pump)
+        given = doses(lab, pump=pump)
         assert len(given) >= 9
         assert [length for _, length in given] == pytest.approx([s + BIAS_S for s in asked[: len(given)]], abs=0.01)
 
 
 def test_the_waste_motor_turns_before_fluid_comes_and_until_after_it() -> None:
     """Both start late by draws of their own; a bus that dies once the feed runs must find the waste running, too."""
-    bed = Bed(("M0", "M1", "M2"), options=quiet(pump_start_low_s=0.2, pump_start_high_s=0.7))
-    fixed(bed, 0.02)
-    bed.reactors.begin()
-    bed.run(30)
-    for name in bed.names:
-        pairs = list(zip(doses(bed, name), doses(bed, name, "Pump2"), strict=False))
+    lab = DriverLab(("M0", "M1", "M2"), options=quiet(pump_start_low_s=0.2, pump_start_high_s=0.7))
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    lab.run(30)
+    for name in lab.names:
+        pairs = list(zip(doses(lab, name), doses(lab, name, "Pump2"), strict=False))
         assert len(pairs) >= 28
         for (feed_s, feed), (waste_s, waste) in pairs:
             assert waste_s < feed_s < feed_s + feed < waste_s + waste
-        assert bed.truth(name)["peak_ml"] < 20.0 + 1e-6
+        assert lab.truth(name)["peak_ml"] < 20.0 + 1e-6
 
 
 def test_a_late_motor_still_runs_its_whole_dose() -> None:
     """It starts 0.2 to 0.7 s after the answer, drawn anew for every dose."""
-    bed = Bed(("M0", "M1", "M2"), options=quiet(pump_start_low_s=0.2, pump_start_high_s=0.7))
-    fixed(bed, 0.02)
-    bed.reactors.begin()
-    bed.run(30)
-    for name in bed.names:
-        asked = [row for row in bed.of("intent") if row["reactor"] == name]
+    lab = DriverLab(("M0", "M1", "M2"), options=quiet(pump_start_low_s=0.2, pump_start_high_s=0.7))
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    lab.run(30)
+    for name in lab.names:
+        asked = [row for row in lab.of("intent") if row["reactor"] == name]
         for pump, key in (("Pump1", "feed_duty"), ("Pump2", "waste_duty")):
-            lengths = [length for _, length in doses(bed, name, pump)]
+            lengths = [length for _, length in doses(lab, name, pump)]
             expected = [63.0 * row[key] + BIAS_S for row in asked[: len(lengths)]]
             assert len(lengths) >= 28
             assert lengths == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_dose_ends_before_the_next_measurement_and_the_pumps_are_off_most_of_the_time() -> None:
-    bed = Bed(("M0", "M1"))
-    fixed(bed, 0.02)
-    bed.reactors.begin()
-    bed.run(30)
-    for name in bed.names:
-        starts = np.array(bed.peek_cycles(name))
+    lab = DriverLab(("M0", "M1"))
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    lab.run(30)
+    for name in lab.names:
+        starts = np.array(lab.peek_cycles(name))
         for pump in ("Pump1", "Pump2"):
-            for start, length in doses(bed, name, pump):
+            for start, length in doses(lab, name, pump):
                 phase = (start - starts[starts <= start][-1]) % 60.07
                 assert phase > 12.5
                 assert phase + length < 55.0
 
 
 def test_doses_of_several_reactors_overlap() -> None:
-    bed = Bed(("M0", "M1", "M2", "M3"))
-    fixed(bed, 0.02)
-    for name in bed.names:  # all in one phase: four waste doses of 9 to 16 s do not fit one after another
-        bed.device.handle("POST", f"/Experiment/1/{name}")
-    bed.reactors.begin()
-    bed.run(10)
-    assert bed.samples.min() >= 9
-    begun = [doses(bed, name, "Pump2")[-1] for name in bed.names]
+    lab = DriverLab(("M0", "M1", "M2", "M3"))
+    fixed(lab, 0.02)
+    for name in lab.names:  # all in one phase: four waste doses of 9 to 16 s do not fit one after another
+        lab.device.handle("POST", f"/Experiment/1/{name}")
+    lab.reactors.begin()
+    lab.run(10)
+    assert lab.samples.min() >= 9
+    begun = [doses(lab, name, "Pump2")[-1] for name in lab.names]
     ends = [start + length for start, length in begun]
     assert min(ends) > max(start for start, _ in begun)
 
 
 def test_starts_are_staggered_inside_the_minute() -> None:
-    bed = Bed(("M0", "M1", "M2"))
-    bed.reactors.begin()
-    starts = [t for t, path in bed.wire.posts if path.startswith("/Experiment/1")]
+    lab = DriverLab(("M0", "M1", "M2"))
+    lab.reactors.begin()
+    starts = [t for t, path in lab.wire.posts if path.startswith("/Experiment/1")]
     assert np.diff(starts) == pytest.approx([20.0, 20.0], abs=1.5)
 
 
 def test_no_forbidden_request_in_a_run_with_every_trouble() -> None:
-    bed = Bed(("M0", "M1"))
-    bed.reactors.begin()
+    lab = DriverLab(("M0", "M1"))
+    lab.reactors.begin()
     for name, value in (("lost_reply", 3), ("worker_wipe", 1), ("cycle_dead", 1), ("foreign_selects", 0.2)):
-        bed.run(5)
-        bed.fault(name, value)
-    bed.run(10)
-    bed.fault("foreign_selects", 0)
-    bed.reactors.stop()
-    words = {path.split("/")[1] for _, path in bed.wire.posts}
+        lab.run(5)
+        lab.fault(name, value)
+    lab.run(10)
+    lab.fault("foreign_selects", 0)
+    lab.reactors.stop()
+    words = {path.split("/")[1] for _, path in lab.wire.posts}
     assert words == {
         "changeDevice", "SetOutputTarget", "SetOutputOn", "CalibrateOD", "MeasureTemp", "Experiment",
     }  # fmt: skip
-    targets = [float(p.split("/")[4]) for _, p in bed.wire.posts if p.startswith("/SetOutputTarget/Pump1")]
+    targets = [float(p.split("/")[4]) for _, p in lab.wire.posts if p.startswith("/SetOutputTarget/Pump1")]
     assert max(targets) <= 0.05
 
 
@@ -177,79 +178,79 @@ def test_no_forbidden_request_in_a_run_with_every_trouble() -> None:
 
 
 def test_a_running_experiment_is_adopted_not_started_again() -> None:
-    bed = Bed()
-    bed.device.handle("POST", "/Experiment/1/M0")
-    bed.clock.sleep(200.0)
-    bed.reactors.begin()
-    assert not [p for _, p in bed.wire.posts if p.startswith("/Experiment")]
-    first = bed.step()
+    lab = DriverLab()
+    lab.device.handle("POST", "/Experiment/1/M0")
+    lab.clock.sleep(200.0)
+    lab.reactors.begin()
+    assert not [p for _, p in lab.wire.posts if p.startswith("/Experiment")]
+    first = lab.step()
     assert first.rows[0]
-    assert bed.of("sample")[0]["sample"][0] > 180.0  # the one that was there already is not delivered
+    assert lab.of("sample")[0]["sample"][0] > 180.0  # the one that was there already is not delivered
 
 
 def test_a_start_whose_answer_is_lost_is_not_repeated_before_the_state_was_read() -> None:
-    bed = Bed()
-    bed.reactors.stations[0].connection.read()
-    inner = bed.wire.inner
+    lab = DriverLab()
+    lab.reactors.stations[0].connection.read()
+    inner = lab.wire.inner
     real = inner.post
 
     def losing(path: str) -> Any:
         if path == "/Experiment/1/M0":
-            bed.fault("lost_reply", 1)
+            lab.fault("lost_reply", 1)
         return real(path)
 
     inner.post = losing  # type: ignore[method-assign]
-    bed.reactors.begin()
-    bed.run(3)
-    assert len([p for _, p in bed.wire.posts if p == "/Experiment/1/M0"]) == 1
-    assert bed.samples[0] >= 2
+    lab.reactors.begin()
+    lab.run(3)
+    assert len([p for _, p in lab.wire.posts if p == "/Experiment/1/M0"]) == 1
+    assert lab.samples[0] >= 2
 
 
 def test_a_start_soon_after_a_stop_waits_for_the_old_cycle() -> None:
-    bed = Bed()
-    bed.device.handle("POST", "/Experiment/1/M0")
-    bed.clock.sleep(90.0)
-    bed.device.handle("POST", "/Experiment/0/M0")
-    bed.reactors.begin()
-    bed.run(5)
-    data = bed.device.apps["M0"].data
+    lab = DriverLab()
+    lab.device.handle("POST", "/Experiment/1/M0")
+    lab.clock.sleep(90.0)
+    lab.device.handle("POST", "/Experiment/0/M0")
+    lab.reactors.begin()
+    lab.run(5)
+    data = lab.device.apps["M0"].data
     assert data["Thermostat"]["ON"] == 1
     assert data["Stir"]["ON"] == 1
-    assert not [row for row in bed.of("note") if "was off" in row["note"]]
+    assert not [row for row in lab.of("note") if "was off" in row["note"]]
 
 
 def test_a_thermostat_lost_to_the_restart_trap_is_switched_on_again() -> None:
-    bed = Bed()
+    lab = DriverLab()
     for force, pause in ((1, 90.0), (0, 1.0), (1, 5.0)):
-        bed.device.handle("POST", f"/Experiment/{force}/M0")
-        bed.clock.sleep(pause)
-    bed.reactors.begin()
-    bed.run(4)
-    assert bed.device.apps["M0"].data["Thermostat"]["ON"] == 1
-    assert [row["note"] for row in bed.of("note") if "Thermostat was off" in row["note"]]
+        lab.device.handle("POST", f"/Experiment/{force}/M0")
+        lab.clock.sleep(pause)
+    lab.reactors.begin()
+    lab.run(4)
+    assert lab.device.apps["M0"].data["Thermostat"]["ON"] == 1
+    assert [row["note"] for row in lab.of("note") if "Thermostat was off" in row["note"]]
 
 
 def test_pumps_found_on_are_switched_off_before_anything_else() -> None:
-    bed = Bed()
+    lab = DriverLab()
     for path in ("/SetOutputTarget/Pump1/M0/0.02", "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/OD/1/M0"):
-        bed.device.handle("POST", path)
-    bed.reactors.begin()
-    assert bed.motors_off()
-    assert bed.device.apps["M0"].data["OD"]["ON"] == 0
+        lab.device.handle("POST", path)
+    lab.reactors.begin()
+    assert lab.motors_off()
+    assert lab.device.apps["M0"].data["OD"]["ON"] == 0
 
 
 @pytest.mark.parametrize("phase_s", [1.0, 6.0, 9.0, 30.0])
 def test_a_device_that_regulates_itself_gives_no_dose_of_its_own_once_taken_over(phase_s: float) -> None:
-    bed = Bed(od=0.6)
-    bed.device.handle("POST", "/SetOutputOn/OD/1/M0")
-    bed.device.handle("POST", "/Experiment/1/M0")
-    bed.clock.sleep(4 * 60.07 + phase_s)
-    assert doses(bed)
-    taken_over = bed.clock.now()
-    bed.reactors.begin()
-    bed.clock.sleep(20.0)
-    assert not [start for start, _ in doses(bed) if start > taken_over]
-    assert bed.motors_off()
+    lab = DriverLab(od=0.6)
+    lab.device.handle("POST", "/SetOutputOn/OD/1/M0")
+    lab.device.handle("POST", "/Experiment/1/M0")
+    lab.clock.sleep(4 * 60.07 + phase_s)
+    assert doses(lab)
+    taken_over = lab.clock.now()
+    lab.reactors.begin()
+    lab.clock.sleep(20.0)
+    assert not [start for start, _ in doses(lab) if start > taken_over]
+    assert lab.motors_off()
 
 
 @pytest.mark.parametrize("named", [0, 1])
@@ -258,85 +259,85 @@ def test_a_stopped_experiment_is_started_at_once_if_the_device_says_that_it_has_
     named: int, rest_s: float, waits: bool
 ) -> None:
     """Newer apps name the reactor in the line that says so."""
-    bed = Bed()
-    bed.fault("terminal_named", named)
-    bed.device.handle("POST", "/Experiment/1/M0")
-    bed.clock.sleep(80.0)
-    bed.device.handle("POST", "/Experiment/0/M0")
-    bed.clock.sleep(rest_s)
-    before = bed.clock.now()
-    bed.reactors.begin()
-    assert (bed.clock.now() - before > 65.0) is waits
-    bed.run(3)
-    assert bed.samples[0] >= 2
-    assert bed.device.apps["M0"].data["Thermostat"]["ON"] == 1
+    lab = DriverLab()
+    lab.fault("terminal_named", named)
+    lab.device.handle("POST", "/Experiment/1/M0")
+    lab.clock.sleep(80.0)
+    lab.device.handle("POST", "/Experiment/0/M0")
+    lab.clock.sleep(rest_s)
+    before = lab.clock.now()
+    lab.reactors.begin()
+    assert (lab.clock.now() - before > 65.0) is waits
+    lab.run(3)
+    assert lab.samples[0] >= 2
+    assert lab.device.apps["M0"].data["Thermostat"]["ON"] == 1
 
 
 def test_zigzag_is_refused_with_the_remedy() -> None:
-    bed = Bed()
-    bed.device.handle("POST", "/SetOutputOn/Zigzag/1/M0")
+    lab = DriverLab()
+    lab.device.handle("POST", "/SetOutputOn/Zigzag/1/M0")
     with pytest.raises(DeviceStateError, match="Zigzag is on; switch it off"):
-        bed.reactors.begin()
+        lab.reactors.begin()
 
 
 def test_a_stored_blank_replaces_the_devices() -> None:
-    bed = Bed(blanked=False)
-    rig = ReactorCalibration(SOUND.feed, SOUND.waste, blank=bed.device.vials["M0"].spectrometer.blank)
-    bed.client([rig])
-    bed.reactors.begin()
-    bed.run(3)
-    assert bed.steps[-1].od[0] == pytest.approx(0.5, abs=0.06)
+    lab = DriverLab(blanked=False)
+    measured = ReactorCalibration(SOUND.feed, SOUND.waste, blank=lab.device.vials["M0"].spectrometer.blank)
+    lab.client([measured])
+    lab.reactors.begin()
+    lab.run(3)
+    assert lab.steps[-1].od[0] == pytest.approx(0.5, abs=0.06)
 
 
 # -- samples ---------------------------------------------------------------------------------------------------------
 
 
 def test_one_sample_is_acted_on_once() -> None:
-    bed = Bed()
-    bed.reactors.begin()
-    m = bed.reactors.measure()
+    lab = DriverLab()
+    lab.reactors.begin()
+    m = lab.reactors.measure()
     command = Command(m.fresh, np.array([0.02]), np.array([37.0]))
-    assert bed.reactors.actuate(command).volume_ml[0] == pytest.approx(1.2, abs=0.01)
-    again = bed.reactors.actuate(command)
+    assert lab.reactors.actuate(command).volume_ml[0] == pytest.approx(1.2, abs=0.01)
+    again = lab.reactors.actuate(command)
     assert again.volume_ml[0] == 0.0
     assert "no new sample" in again.notes[0]
 
 
 def test_a_decision_that_comes_too_late_doses_nothing() -> None:
-    bed = Bed()
-    bed.reactors.begin()
-    m = bed.reactors.measure()
-    bed.clock.sleep(33.0)
-    receipt = bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+    lab = DriverLab()
+    lab.reactors.begin()
+    m = lab.reactors.measure()
+    lab.clock.sleep(33.0)
+    receipt = lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
     assert receipt.volume_ml[0] == 0.0
     assert "before the next measurement" in receipt.notes[0]
-    assert not doses(bed)
+    assert not doses(lab)
 
 
 def test_without_samples_measure_returns_after_100_s_and_says_how_old_the_newest_is() -> None:
-    bed = Bed(recover=False)
-    bed.reactors.begin()
-    bed.run(3)
-    last = bed.clock.now()
-    bed.fault("cycle_dead")
-    while (m := bed.reactors.measure()).fresh.any():
-        last = bed.clock.now()
+    lab = DriverLab(recover=False)
+    lab.reactors.begin()
+    lab.run(3)
+    last = lab.clock.now()
+    lab.fault("cycle_dead")
+    while (m := lab.reactors.measure()).fresh.any():
+        last = lab.clock.now()
     assert m.vitals is not None
-    assert 100.0 <= bed.clock.now() - last < 125.0
+    assert 100.0 <= lab.clock.now() - last < 125.0
     assert m.vitals.age_s[0] >= 100.0
-    fault = bed.reactors.measure().vitals.faults[0]  # type: ignore[union-attr]
+    fault = lab.reactors.measure().vitals.faults[0]  # type: ignore[union-attr]
     assert fault is not None
     assert fault.kind == "stalled"
 
 
 def test_a_lost_link_is_a_fault_not_an_exception_and_a_day_of_it_does_no_harm() -> None:
-    bed = Bed()
-    bed.reactors.begin()
-    bed.run(5)
-    bed.fault("crash")
-    bed.run(1440)
-    assert {"link", "stale", "lost", "silent"} <= bed.kinds()
-    assert len(bed.of("fault")) < 5  # not a row per try
+    lab = DriverLab()
+    lab.reactors.begin()
+    lab.run(5)
+    lab.fault("crash")
+    lab.run(1440)
+    assert {"link", "stale", "lost", "silent"} <= lab.kinds()
+    assert len(lab.of("fault")) < 5  # not a row per try
 
 
 # -- failures of requests --------------------------------------------------------------------------------------------
@@ -346,236 +347,236 @@ def test_a_lost_link_is_a_fault_not_an_exception_and_a_day_of_it_does_no_harm() 
 @pytest.mark.parametrize("request_number", range(14))
 def test_no_failed_request_doubles_a_dose_or_leaves_a_pump_on(fault: str, request_number: int) -> None:
     """Whichever request of a dose, from its targets to its verification, goes wrong."""
-    bed = Bed(options=quiet(mu=0.025))
-    fixed(bed, 0.0)
-    bed.reactors.begin()
-    bed.run(3)
-    assert not doses(bed)
-    fixed(bed, 0.02)
+    lab = DriverLab(options=quiet(mu=0.025))
+    fixed(lab, 0.0)
+    lab.reactors.begin()
+    lab.run(3)
+    assert not doses(lab)
+    fixed(lab, 0.02)
     asked = 0
-    inner = bed.wire.inner
+    inner = lab.wire.inner
     real = inner._request
 
     def failing(method: str, path: str) -> Any:
         nonlocal asked
         if (asked := asked + 1) == request_number + 1:
-            bed.fault(fault, 1)
+            lab.fault(fault, 1)
         return real(method, path)
 
-    while not (m := bed.reactors.measure()).fresh[0]:
+    while not (m := lab.reactors.measure()).fresh[0]:
         pass
     inner._request = failing  # type: ignore[method-assign]
-    receipt = bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+    receipt = lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
     for _ in range(4):  # it also returns to tell of a link in trouble
-        bed.reactors.measure()
-    given = doses(bed)
+        lab.reactors.measure()
+    given = doses(lab)
     assert len(given) <= 1
     assert sum(length for _, length in given) <= receipt.volume_ml[0] + 0.1
-    assert bed.motors_off()
-    assert bed.of("dose_end")
+    assert lab.motors_off()
+    assert lab.of("dose_end")
 
 
 def test_a_link_that_dies_in_a_dose_is_told_within_a_time_out() -> None:
     """Ends of doses that time out again and again must not keep the loop from hearing of it."""
-    bed = Bed(names=("M0", "M1"))
-    bed.reactors.begin()
-    bed.run(3)
-    fixed(bed, 0.02)
-    while not bed.step().rows[0]:
+    lab = DriverLab(names=("M0", "M1"))
+    lab.reactors.begin()
+    lab.run(3)
+    fixed(lab, 0.02)
+    while not lab.step().rows[0]:
         pass
-    bed.fault("lost_request", -1)
-    began = bed.clock.now()
-    while "link" not in (bed.steps[-1].reasons[0] or ""):
-        bed.step()
-    assert bed.clock.now() - began < 60.0
-    bed.fault("lost_request", 0)
-    fixed(bed, 0.0)
-    bed.run(3)
-    assert bed.motors_off()
+    lab.fault("lost_request", -1)
+    began = lab.clock.now()
+    while "link" not in (lab.steps[-1].reasons[0] or ""):
+        lab.step()
+    assert lab.clock.now() - began < 60.0
+    lab.fault("lost_request", 0)
+    fixed(lab, 0.0)
+    lab.run(3)
+    assert lab.motors_off()
 
 
 def test_targets_changed_by_someone_are_set_back() -> None:
-    bed = Bed()
-    bed.reactors.begin()
-    bed.run(3)
+    lab = DriverLab()
+    lab.reactors.begin()
+    lab.run(3)
     for item, value in (("Thermostat", 30), ("Stir", 0.1)):
-        bed.device.handle("POST", f"/SetOutputTarget/{item}/M0/{value}")
-    bed.run(3)
-    data = bed.device.apps["M0"].data
+        lab.device.handle("POST", f"/SetOutputTarget/{item}/M0/{value}")
+    lab.run(3)
+    data = lab.device.apps["M0"].data
     assert (data["Thermostat"]["target"], data["Stir"]["target"]) == (37.0, 0.5)
-    assert sum("set back to" in row["note"] for row in bed.of("note")) == 2
+    assert sum("set back to" in row["note"] for row in lab.of("note")) == 2
 
 
 def test_a_pump_that_someone_switches_on_is_told_and_switched_off() -> None:
-    bed = Bed()
-    fixed(bed, 0.0)
-    bed.reactors.begin()
-    bed.run(3)
-    bed.device.handle("POST", "/SetOutputTarget/Pump1/M0/0.008")
-    bed.device.handle("POST", "/SetOutputOn/Pump1/1/M0")
-    bed.run(4)
-    assert "pump" in bed.kinds()
-    assert len(doses(bed)) <= 2
-    assert bed.motors_off()
-    assert bed.reactors.stations[0].book.fault is None
+    lab = DriverLab()
+    fixed(lab, 0.0)
+    lab.reactors.begin()
+    lab.run(3)
+    lab.device.handle("POST", "/SetOutputTarget/Pump1/M0/0.008")
+    lab.device.handle("POST", "/SetOutputOn/Pump1/1/M0")
+    lab.run(4)
+    assert "pump" in lab.kinds()
+    assert len(doses(lab)) <= 2
+    assert lab.motors_off()
+    assert lab.reactors.stations[0].book.fault is None
 
 
 def test_no_dose_when_the_device_lies() -> None:
-    bed = Bed()
-    bed.reactors.begin()
-    fixed(bed, 0.0)
-    bed.run(2)
-    fixed(bed, 0.02)
-    bed.fault("lying", -1)
-    bed.run(10)
-    assert not doses(bed)
-    assert "undosed" in bed.kinds()
-    assert any("not as set" in row["note"] for row in bed.of("note"))
+    lab = DriverLab()
+    lab.reactors.begin()
+    fixed(lab, 0.0)
+    lab.run(2)
+    fixed(lab, 0.02)
+    lab.fault("lying", -1)
+    lab.run(10)
+    assert not doses(lab)
+    assert "undosed" in lab.kinds()
+    assert any("not as set" in row["note"] for row in lab.of("note"))
 
 
 def test_a_pump_that_no_command_reaches_is_reported() -> None:
-    bed = Bed(stop_s=10.0)
-    fixed(bed, 0.02)
-    bed.reactors.begin()
-    while not bed.step().rows.any():
+    lab = DriverLab(stop_s=10.0)
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    while not lab.step().rows.any():
         pass
-    bed.fault("lying", -1)
-    bed.run(3)
-    assert "pump" in bed.kinds()
-    assert len(bed.of("intent")) == 1
+    lab.fault("lying", -1)
+    lab.run(3)
+    assert "pump" in lab.kinds()
+    assert len(lab.of("intent")) == 1
     with pytest.raises(DeviceStateError, match="still on"):
-        bed.reactors.stop()
+        lab.reactors.stop()
 
 
 def test_a_bus_that_hangs_while_pumping_is_ended_within_a_minute() -> None:
-    bed = Bed()
-    fixed(bed, 0.02)
-    bed.reactors.begin()
-    bed.run(3)
-    bed.fault("bus_stuck_when_pumping")
-    bed.run(5)
-    assert max(length for _, length in doses(bed)) < 45.0
-    assert bed.device.supervisor.restarts == 1
-    bed.run(5)
-    assert bed.reactors.stations[0].book.fault is None
-    assert bed.truth()["peak_ml"] < 25.0
+    lab = DriverLab()
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    lab.run(3)
+    lab.fault("bus_stuck_when_pumping")
+    lab.run(5)
+    assert max(length for _, length in doses(lab)) < 45.0
+    assert lab.device.supervisor.restarts == 1
+    lab.run(5)
+    assert lab.reactors.stations[0].book.fault is None
+    assert lab.truth()["peak_ml"] < 25.0
 
 
 def test_another_client_that_switches_regulation_on_is_not_fought() -> None:
-    bed = Bed()
-    fixed(bed, 0.02)
-    bed.reactors.begin()
-    bed.run(3)
-    bed.device.handle("POST", "/SetOutputOn/OD/1/M0")
-    bed.run(2)
-    mine = len(bed.wire.posts)
-    bed.run(5)
-    assert "mode" in bed.kinds()
-    assert not [p for _, p in bed.wire.posts[mine:] if p.startswith("/SetOutputTarget/Pump")]
+    lab = DriverLab()
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    lab.run(3)
+    lab.device.handle("POST", "/SetOutputOn/OD/1/M0")
+    lab.run(2)
+    mine = len(lab.wire.posts)
+    lab.run(5)
+    assert "mode" in lab.kinds()
+    assert not [p for _, p in lab.wire.posts[mine:] if p.startswith("/SetOutputTarget/Pump")]
 
 
 def test_a_blank_changed_by_someone_stops_dosing() -> None:
-    bed = Bed()
-    bed.reactors.begin()
-    bed.run(3)
-    bed.device.handle("POST", "/CalibrateOD/OD0/M0/9000/0")
-    begun = len(bed.of("intent"))
-    bed.run(5)
-    assert "blank" in bed.kinds()
-    assert len(bed.of("intent")) == begun
+    lab = DriverLab()
+    lab.reactors.begin()
+    lab.run(3)
+    lab.device.handle("POST", "/CalibrateOD/OD0/M0/9000/0")
+    begun = len(lab.of("intent"))
+    lab.run(5)
+    assert "blank" in lab.kinds()
+    assert len(lab.of("intent")) == begun
 
 
 def test_exchanged_reactors_end_control_of_both() -> None:
-    bed = Bed(("M0", "M1"))
-    bed.reactors.begin()
-    bed.run(3)
-    apps = bed.device.apps
+    lab = DriverLab(("M0", "M1"))
+    lab.reactors.begin()
+    lab.run(3)
+    apps = lab.device.apps
     a, b = apps["M0"].data, apps["M1"].data
     a["DeviceID"], b["DeviceID"] = b["DeviceID"], a["DeviceID"]
-    mine = len(bed.wire.posts)
-    bed.run(5)
-    assert "identity" in bed.kinds()
-    assert {p.split("/")[1] for _, p in bed.wire.posts[mine + 30 :]} == {"changeDevice"}
+    mine = len(lab.wire.posts)
+    lab.run(5)
+    assert "identity" in lab.kinds()
+    assert {p.split("/")[1] for _, p in lab.wire.posts[mine + 30 :]} == {"changeDevice"}
 
 
 # -- recovery --------------------------------------------------------------------------------------------------------
 
 
 def test_a_device_that_lost_its_memory_is_restored() -> None:
-    bed = Bed(("M0", "M1"), scenario=Scenario((0.5, 0.5), (10.0, 600.0), (37.0, 34.0)))
-    bed.reactors.begin()
-    bed.run(10)
-    blanks = [bed.device.apps[n].data["OD0"]["target"] for n in bed.names]
-    bed.run(3)
-    bed.fault("worker_wipe")
-    bed.run(10)
-    assert "restarted" in bed.kinds()
-    for name, blank in zip(bed.names, blanks, strict=True):
-        data = bed.device.apps[name].data
+    lab = DriverLab(("M0", "M1"), scenario=Scenario((0.5, 0.5), (10.0, 600.0), (37.0, 34.0)))
+    lab.reactors.begin()
+    lab.run(10)
+    blanks = [lab.device.apps[n].data["OD0"]["target"] for n in lab.names]
+    lab.run(3)
+    lab.fault("worker_wipe")
+    lab.run(10)
+    assert "restarted" in lab.kinds()
+    for name, blank in zip(lab.names, blanks, strict=True):
+        data = lab.device.apps[name].data
         assert data["OD0"]["target"] == pytest.approx(blank)
         assert data["Thermostat"]["target"] == 34.0
         assert data["Experiment"]["ON"] == 1
         assert data["Experiment"]["cycles"] >= 7
-    assert bed.samples.min() >= 20
+    assert lab.samples.min() >= 20
 
 
 @pytest.mark.parametrize("minutes", [1, 5, 20])
 def test_a_device_started_again_without_one_of_its_reactors_is_not_ended_by_this_program(minutes: float) -> None:
-    bed = Bed(("M0", "M1"))
-    bed.reactors.begin()
-    bed.run(5)
-    bed.fault("unplugged", 1.0, "M1")
-    bed.run(2)  # the next access to it ends the software
-    assert "link" in bed.kinds()
-    bed.run(minutes)
-    bed.fault("restart")
-    before = bed.samples.copy()
-    bed.run(10)
-    assert bed.device.supervisor.alive
-    assert "absent" in bed.kinds()
-    assert (bed.samples - before)[0] >= 8
-    assert (bed.samples - before)[1] == 0
+    lab = DriverLab(("M0", "M1"))
+    lab.reactors.begin()
+    lab.run(5)
+    lab.fault("unplugged", 1.0, "M1")
+    lab.run(2)  # the next access to it ends the software
+    assert "link" in lab.kinds()
+    lab.run(minutes)
+    lab.fault("restart")
+    before = lab.samples.copy()
+    lab.run(10)
+    assert lab.device.supervisor.alive
+    assert "absent" in lab.kinds()
+    assert (lab.samples - before)[0] >= 8
+    assert (lab.samples - before)[1] == 0
 
 
 def test_a_dead_thread_is_restarted_and_the_neighbour_never_notices() -> None:
-    bed = Bed(("M0", "M1"))
-    bed.reactors.begin()
-    bed.run(5)
-    bed.fault("cycle_dead", 1, "M0")
-    before = bed.samples.copy()
-    bed.run(12)
-    got = bed.samples - before
+    lab = DriverLab(("M0", "M1"))
+    lab.reactors.begin()
+    lab.run(5)
+    lab.fault("cycle_dead", 1, "M0")
+    before = lab.samples.copy()
+    lab.run(12)
+    got = lab.samples - before
     assert got[1] >= 11
     assert 6 <= got[0] <= 10
-    assert "stalled" in bed.kinds()
-    data = bed.device.apps["M0"].data
+    assert "stalled" in lab.kinds()
+    data = lab.device.apps["M0"].data
     assert data["Thermostat"]["ON"] == data["Stir"]["ON"] == 1
 
 
 def test_the_hot_guard_switches_heating_off_for_good() -> None:
-    bed = Bed()
-    bed.reactors.begin()
-    bed.run(5)
-    bed.reactors.heat_off(np.array([True]))
-    bed.run(5)
-    data = bed.device.apps["M0"].data
+    lab = DriverLab()
+    lab.reactors.begin()
+    lab.run(5)
+    lab.reactors.heat_off(np.array([True]))
+    lab.run(5)
+    data = lab.device.apps["M0"].data
     assert data["Thermostat"]["ON"] == data["Heat"]["ON"] == 0
-    bed.fault("worker_wipe")
-    bed.run(5)
-    assert bed.device.apps["M0"].data["Thermostat"]["ON"] == 0
+    lab.fault("worker_wipe")
+    lab.run(5)
+    assert lab.device.apps["M0"].data["Thermostat"]["ON"] == 0
 
 
 def test_handing_over_leaves_a_culture_that_regulates_itself() -> None:
-    bed = Bed()
-    bed.reactors.begin()
-    bed.run(5)
-    assert bed.reactors.regulate(np.array([True]), np.array([0.5])) == []
-    bed.run(30)
-    bed.reactors.stop()  # leaves it to itself
-    data = bed.device.apps["M0"].data
+    lab = DriverLab()
+    lab.reactors.begin()
+    lab.run(5)
+    assert lab.reactors.regulate(np.array([True]), np.array([0.5])) == []
+    lab.run(30)
+    lab.reactors.stop()  # leaves it to itself
+    data = lab.device.apps["M0"].data
     assert data["OD"]["ON"] == 1
-    assert bed.truth()["od"] == pytest.approx(0.5, abs=0.1)
-    assert bed.reactors.stations[0].book.fault is None
+    assert lab.truth()["od"] == pytest.approx(0.5, abs=0.1)
+    assert lab.reactors.stations[0].book.fault is None
 
 
 # -- end and resume --------------------------------------------------------------------------------------------------
@@ -584,130 +585,130 @@ def test_handing_over_leaves_a_culture_that_regulates_itself() -> None:
 @pytest.mark.parametrize(("after_s", "running"), [(0.05, False), (1.0, True)])
 def test_stop_in_the_middle_of_a_dose_is_verified_and_idempotent(after_s: float, running: bool) -> None:
     """Also while the motor has not started yet."""
-    bed = Bed(("M0", "M1"))
-    fixed(bed, 0.02)
-    bed.reactors.begin()
-    bed.run(2)
-    while not bed.step().rows.any():
+    lab = DriverLab(("M0", "M1"))
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    lab.run(2)
+    while not lab.step().rows.any():
         pass
-    bed.clock.sleep(after_s)
-    assert not bed.motors_off()
-    assert any(bed.truth(name)["motors"]["Pump1"] for name in bed.names) is running
-    bed.reactors.stop()
-    assert bed.motors_off()
-    bed.reactors.stop()
-    assert bed.device.apps["M0"].data["Experiment"]["ON"] == 1
-    bed.clock.sleep(300.0)
-    assert bed.motors_off()
+    lab.clock.sleep(after_s)
+    assert not lab.motors_off()
+    assert any(lab.truth(name)["motors"]["Pump1"] for name in lab.names) is running
+    lab.reactors.stop()
+    assert lab.motors_off()
+    lab.reactors.stop()
+    assert lab.device.apps["M0"].data["Experiment"]["ON"] == 1
+    lab.clock.sleep(300.0)
+    assert lab.motors_off()
 
 
 def test_a_stop_that_cannot_be_verified_says_so_and_what_to_do() -> None:
-    bed = Bed(stop_s=20.0)
-    bed.reactors.begin()
-    bed.fault("crash")
+    lab = DriverLab(stop_s=20.0)
+    lab.reactors.begin()
+    lab.fault("crash")
     with pytest.raises(DeviceStateError, match="M0: .*refused.*by hand"):
-        bed.reactors.stop()
+        lab.reactors.stop()
 
 
 def test_end_stops_the_experiments_too() -> None:
-    bed = Bed(("M0", "M1"))
-    bed.reactors.begin()
-    bed.run(3)
-    bed.reactors.end()
-    assert all(bed.device.apps[n].data["Experiment"]["ON"] == 0 for n in bed.names)
+    lab = DriverLab(("M0", "M1"))
+    lab.reactors.begin()
+    lab.run(3)
+    lab.reactors.end()
+    assert all(lab.device.apps[n].data["Experiment"]["ON"] == 0 for n in lab.names)
 
 
 def test_an_intent_that_cannot_be_written_prevents_the_dose() -> None:
-    bed = Bed()
+    lab = DriverLab()
 
     def full(kind: str, fields: Any) -> None:
         if kind == "intent":
             raise RecordingError("journal: No space left on device")
 
-    bed.client(log=full)
-    bed.reactors.begin()
-    m = bed.reactors.measure()
+    lab.client(log=full)
+    lab.reactors.begin()
+    m = lab.reactors.measure()
     with pytest.raises(RecordingError):
-        bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
-    assert not doses(bed)
-    bed.reactors.stop()
+        lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+    assert not doses(lab)
+    lab.reactors.stop()
 
 
 def test_a_full_disk_does_not_stand_in_the_way_of_pumps_off() -> None:
-    bed = Bed()
-    fixed(bed, 0.02)
-    bed.reactors.begin()
-    m = bed.reactors.measure()
-    bed.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
+    lab = DriverLab()
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    m = lab.reactors.measure()
+    lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
 
     def full(kind: str, fields: Any) -> None:
         raise RecordingError("journal: No space left on device")
 
-    bed.reactors._log = full
+    lab.reactors._log = full
     with pytest.raises(RecordingError):
-        bed.reactors.measure()
-    bed.reactors.stop()
-    assert bed.motors_off()
+        lab.reactors.measure()
+    lab.reactors.stop()
+    assert lab.motors_off()
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_killed_at_a_random_request_and_resumed_no_sample_is_dosed_twice(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    bed = Bed(options=quiet(mu=0.025))
-    fixed(bed, 0.02)
-    bed.reactors.begin()
-    bed.run(4)
-    fatal = len(bed.wire.posts) + int(rng.integers(1, 60))
-    real = bed.wire.inner.post
+    lab = DriverLab(options=quiet(mu=0.025))
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    lab.run(4)
+    fatal = len(lab.wire.posts) + int(rng.integers(1, 60))
+    real = lab.wire.inner.post
 
     class Killed(BaseException):
         pass
 
     def dying(path: str) -> Any:
-        if len(bed.wire.posts) >= fatal:
+        if len(lab.wire.posts) >= fatal:
             raise Killed
         return real(path)
 
-    bed.wire.inner.post = dying  # type: ignore[method-assign]
+    lab.wire.inner.post = dying  # type: ignore[method-assign]
     with pytest.raises(Killed):
-        bed.run(60)
-    bed.wire.inner.post = real  # type: ignore[method-assign]
-    began = bed.reactors.elapsed()
+        lab.run(60)
+    lab.wire.inner.post = real  # type: ignore[method-assign]
+    began = lab.reactors.elapsed()
     dead_s = float(rng.uniform(1.0, 200.0))
-    bed.clock.sleep(dead_s)
-    rows = json.loads(json.dumps(bed.rows))
-    bed.client()
-    bed.reactors.begin(replay(rows), began + dead_s)
-    assert bed.motors_off()
-    bed.run(5)
-    bed.reactors.stop()
-    acted = [tuple(r["sample"]) for r in bed.of("intent")]
+    lab.clock.sleep(dead_s)
+    rows = json.loads(json.dumps(lab.rows))
+    lab.client()
+    lab.reactors.begin(replay(rows), began + dead_s)
+    assert lab.motors_off()
+    lab.run(5)
+    lab.reactors.stop()
+    acted = [tuple(r["sample"]) for r in lab.of("intent")]
     assert len(set(acted)) == len(acted)
-    runs = len(doses(bed))
+    runs = len(doses(lab))
     repeats = math.floor(dead_s / 63.0) + 1
-    given = [r for r in bed.of("intent") if r["feed_ml"] > 0]
+    given = [r for r in lab.of("intent") if r["feed_ml"] > 0]
     assert len(given) - 2 <= runs  # the kill may have cut one off before it began, and so did the stop at the end
     assert runs <= len(acted) + repeats
     assert (
-        bed.truth()["feed_ml"] <= bed.fed[0] + sum(r["feed_ml"] for r in rows if r["kind"] == "intent") + 1.5 * repeats
+        lab.truth()["feed_ml"] <= lab.fed[0] + sum(r["feed_ml"] for r in rows if r["kind"] == "intent") + 1.5 * repeats
     )
-    assert bed.reactors.elapsed() == pytest.approx(began + dead_s + 300.0, abs=70.0)
+    assert lab.reactors.elapsed() == pytest.approx(began + dead_s + 300.0, abs=70.0)
 
 
 def test_a_dose_left_open_and_ended_by_something_else_is_told_as_unknown() -> None:
-    bed = Bed(options=quiet(mu=0.025))
-    fixed(bed, 0.01)
-    bed.reactors.begin()
-    bed.step()  # begins a dose, whose end this client does not live to see
-    bed.clock.sleep(100.0)
+    lab = DriverLab(options=quiet(mu=0.025))
+    fixed(lab, 0.01)
+    lab.reactors.begin()
+    lab.step()  # begins a dose, whose end this client does not live to see
+    lab.clock.sleep(100.0)
     for pump in (1, 2):
-        bed.device.handle("POST", f"/SetOutputOn/Pump{pump}/0/M0")  # as the board agent does
-    bed.clock.sleep(20.0)
-    rows, elapsed = json.loads(json.dumps(bed.rows)), bed.reactors.elapsed()
-    bed.client()
-    bed.reactors.begin(replay(rows), elapsed)
-    assert len(doses(bed)) == 2
-    assert "unknown, not booked" in bed.of("note")[0]["note"]
+        lab.device.handle("POST", f"/SetOutputOn/Pump{pump}/0/M0")  # as the board agent does
+    lab.clock.sleep(20.0)
+    rows, elapsed = json.loads(json.dumps(lab.rows)), lab.reactors.elapsed()
+    lab.client()
+    lab.reactors.begin(replay(rows), elapsed)
+    assert len(doses(lab)) == 2
+    assert "unknown, not booked" in lab.of("note")[0]["note"]
 
 
 def test_what_the_journal_says_of_a_reactor() -> None:
