@@ -1,4 +1,4 @@
-"""Entry point: a recording in, one trustworthy pair (mu, tau) out, as an environment file for `train`.
+"""A recording in, one trustworthy pair (mu, tau) out, as a model file for `train`: `python -m experiments.calibrate`.
 
 Also the generator of the paper's open-loop protocol (generate=true) and the coverage study (coverage=N).
 """

@@ -1,82 +1,174 @@
-"""Who may import whom, and that the bench path stays free of torch."""
+"""Rooms and who may import whom, no circles, commands that nobody imports, a bench without torch."""
 
 import ast
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-OURS = {"dqn", "envs", "hardware", "experiments"}
-SIMULATED = ("hardware/simulated.py", "hardware/emulator/")  # what of hardware knows envs
+PACKAGES = ("conf", "dqn", "envs", "hardware", "experiments")
+
+FORBIDDEN = {
+    "conf": {"torch", "numpy", "hydra", "omegaconf"},
+    "envs": {"torch", "hydra", "omegaconf", "tensorboard", "matplotlib"},
+    "hardware": {"torch", "hydra", "omegaconf", "tensorboard", "matplotlib", "gymnasium"},
+    "dqn": {"hydra", "omegaconf", "gymnasium", "tensorboard", "matplotlib", "stable_baselines3"},
+    "experiments": {"stable_baselines3"},
+}
+RIVAL = "experiments.timing.rivals"  # what speed is compared with, an extra
 
 
-def sources(package: str) -> list[Path]:
-    return sorted((ROOT / package).rglob("*.py"))
+def architecture() -> str:
+    return (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 
-def imported(path: Path) -> set[str]:
-    """Top-level names of every absolute import in a file, inside functions too."""
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def plan() -> dict[str, set[str]]:
+    """Room -> rooms whose files it imports, beside its own: the table of docs/architecture.md."""
+
+    def dotted(name: str) -> str:
+        return name.removesuffix(".py").replace("/", ".")
+
+    text = architecture().partition("## Rooms")[2]
+    rows = re.findall(r"^\| `([\w/.]+)` \|.*\| ([^|]*)\|$", text, re.MULTILINE)
+    return {dotted(name): {dotted(other) for other in re.findall(r"`([\w/.]+)`", cell)} for name, cell in rows}
+
+
+PLAN = plan()
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Dotted name -> file of every module of ours; a package stands for its `__init__.py`."""
+    found = {}
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            found[name.removesuffix(".__init__")] = path
+    return found
+
+
+@cache
+def tree(module: str) -> ast.Module:
+    return ast.parse(modules()[module].read_text(encoding="utf-8"))
+
+
+def imported(module: str) -> Iterator[str]:
+    """Every name a module imports, inside functions and under TYPE_CHECKING too."""
+    for node in ast.walk(tree(module)):
         if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
-            names.add(node.module.split(".")[0])
-    return names
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                yield full if full in modules() else node.module
 
 
-def allowed(path: Path) -> set[str]:
-    name = path.relative_to(ROOT).as_posix()
-    package = name.split("/")[0]
-    if package == "hardware":
-        knows_envs = name.startswith(SIMULATED)
-        return {"hardware", "envs"} if knows_envs else {"hardware"}
-    return {"envs": {"envs"}, "dqn": {"dqn"}, "experiments": OURS}[package]
+def ours(module: str) -> set[str]:
+    return {name for name in imported(module) if name in modules() and name != module}
 
 
-@pytest.mark.parametrize("package", sorted(OURS))
-def test_imports_go_one_way(package):
-    files = sources(package)
-    assert files
-    for path in files:
-        wrong = (imported(path) & OURS) - allowed(path)
-        assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
+def is_command(module: str) -> bool:
+    return module.count(".") == 1 and module.startswith("experiments.") and modules()[module].name != "__init__.py"
 
 
-@pytest.mark.parametrize(
-    ("package", "forbidden"),
-    [
-        ("envs", {"torch", "hydra", "omegaconf", "tensorboard", "matplotlib"}),
-        ("hardware", {"torch", "hydra", "omegaconf", "tensorboard", "matplotlib", "gymnasium"}),
-        ("dqn", {"hydra", "omegaconf", "gymnasium", "tensorboard", "matplotlib", "stable_baselines3"}),
-        ("experiments", {"stable_baselines3"}),
-    ],
-)
-def test_third_parties_stay_where_they_belong(package, forbidden):
-    rival = {ROOT / "experiments" / "timing" / "rivals.py"}  # what speed is compared with, an extra
-    for path in sources(package):
-        wrong = imported(path) & forbidden
-        assert not wrong or path in rival, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
+def room(module: str) -> str:
+    """The package a module is in; a module with a row of its own on the plan is a room of its own."""
+    return module if module in PLAN or modules()[module].name == "__init__.py" else module.rpartition(".")[0]
+
+
+def test_every_room_is_on_the_plan():
+    rooms = {room(m) for m in modules() if not is_command(m) and m != "experiments"}
+    assert rooms == set(PLAN)
+
+
+@pytest.mark.parametrize("name", sorted(PLAN))
+def test_a_room_imports_what_the_plan_says(name):
+    inside = [m for m in modules() if not is_command(m) and room(m) == name]
+    assert inside
+    used = {room(other): f"{m} imports {other}" for m in inside for other in ours(m) if room(other) != name}
+    unplanned = [used[other] for other in used if other not in PLAN[name]]
+    assert not unplanned
+    assert PLAN[name] == set(used), f"docs/architecture.md names more for {name} than it imports"
+
+
+def test_the_plan_itself_has_no_circle():
+    assert set(TopologicalSorter(PLAN).static_order()) == set(PLAN)
+
+
+def test_no_circle_of_imports():
+    graph = {m: ours(m) - {"envs"} for m in modules()}  # importing any file of envs runs its registration
+    try:
+        list(TopologicalSorter(graph).static_order())
+    except CycleError as circle:
+        pytest.fail(" -> ".join(circle.args[1]))
+
+
+def test_nobody_imports_a_command():
+    for module in modules():
+        wrong = {m for m in ours(module) if is_command(m)}
+        assert not wrong, f"{module} imports {sorted(wrong)}"
+
+
+def test_every_command_can_be_run():
+    for module in filter(is_command, modules()):
+        text = modules()[module].read_text(encoding="utf-8")
+        assert 'if __name__ == "__main__":' in text, module
+        assert f"experiments.{module.split('.')[1]}" in (ast.get_docstring(tree(module)) or ""), module
+
+
+def test_a_package_says_what_it_is_for_and_does_nothing():
+    for module, path in modules().items():
+        if path.name == "__init__.py":
+            text = ast.get_docstring(tree(module))
+            assert text, module
+            assert len(text.splitlines()) <= 5, module
+            assert len(tree(module).body) == 1 or module == "envs", f"{module}: code in __init__.py"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_third_parties_stay_where_they_belong(package):
+    for module in modules():
+        if module.split(".")[0] == package and module != RIVAL:
+            wrong = {name.split(".")[0] for name in imported(module)} & FORBIDDEN[package]
+            assert not wrong, f"{module} imports {sorted(wrong)}"
 
 
 def test_no_module_level_random_numbers():
-    for package in sorted(OURS):
-        for path in sources(package):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute):
-                    name = f"{ast.unparse(node.value)}.{node.attr}"
-                    good = ("Generator", "SeedSequence", "default_rng", "Philox", "PCG64")
-                    assert not name.startswith("np.random.") or node.attr in good, f"{path}: {name}"
+    for module in modules():
+        for node in ast.walk(tree(module)):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute):
+                name = f"{ast.unparse(node.value)}.{node.attr}"
+                good = ("Generator", "SeedSequence", "default_rng", "Philox", "PCG64")
+                assert not name.startswith("np.random.") or node.attr in good, f"{module}: {name}"
 
 
 def test_the_bench_path_loads_no_torch():
     """Deploying needs NumPy policy, loop, recorder and TensorBoard's writer; none of them may pull torch."""
-    code = (
-        "import sys, dqn.policy, experiments.deploy, experiments.control.loop, experiments.reporting.tensorboard, "
-        "experiments.reporting.charts, "
-        "experiments.controllers.learned, hardware.simulated; print('torch' in sys.modules)"
-    )
+    names = [m for m in modules() if room(m) in ("experiments.control", "experiments.controllers", "hardware.chibio")]
+    code = f"import sys, {', '.join([*names, 'experiments.deploy'])}; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_the_page_names_files_that_exist():
+    named = set(re.findall(r"\b(?:conf|dqn|envs|hardware|experiments|tests|docs)/[\w/.-]+\.\w+", architecture()))
+    assert len(named) > 40
+    missing = sorted(name for name in named if not (ROOT / name).is_file())
+    assert not missing
+
+
+def test_the_drawings_name_files_and_functions_that_exist():
+    drawings = re.findall(r"```mermaid\n(.*?)```", architecture(), re.DOTALL)
+    assert len(drawings) >= 4
+    for drawing in drawings:
+        assert len(drawing.splitlines()) <= 40, "more than a screen"
+        for file, names in re.findall(r"([\w/]+/\w+\.py)<br/>([\w., ]+)", drawing):
+            text = (ROOT / file).read_text(encoding="utf-8")
+            for name in re.findall(r"\w+", names):
+                assert re.search(rf"\b(?:def|class) {name}\b|^{name}\b", text, re.MULTILINE), f"{file}: {name}"

@@ -35,6 +35,7 @@ from hardware.storage.recording_reader import read_recording
 from tests.hardware.driver_lab import DriverLab
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.xdist_group("deploy")  # its tests share a run, made once
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 
 

@@ -27,6 +27,7 @@ from experiments.reporting.tables import Best, Table, number, plus_minus, typese
 from tests.experiments.test_deploy import inverse_policy
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.xdist_group("report")  # its tests share a run, made once
 BROWSER = next((b for b in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if b), None)
 VOID = {"meta", "link", "br", "img", "hr"}
 

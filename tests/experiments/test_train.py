@@ -28,6 +28,7 @@ SHORT = [
     "checkpoint_every=200",
 ]
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.xdist_group("train")  # its tests share a run, made once
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 
 
