@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
-from hardware.emulator.computer import AppError
-from hardware.emulator.events import Steps
-from hardware.emulator.outputs import Outputs
-from hardware.emulator.position import Position
+from hardware.emulator.computer import AppError, Steps
+from hardware.emulator.outputs import Outputs, Position
 from hardware.emulator.sysdata import SLOTS
 
 __all__ = ["Optics"]

@@ -3,19 +3,43 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 from urllib.parse import unquote
 
-from hardware.emulator.events import Steps
-from hardware.emulator.exchange import Answer, Exchange
+from hardware.emulator.computer import Steps
 from hardware.emulator.software import Software
 from hardware.emulator.sysdata import ALL_REACTORS, add_terminal, clear_terminal
 
-__all__ = ["HTML", "answer_request", "find_route"]
+__all__ = ["HTML", "Exchange", "answer_request", "find_route"]
 
 LONG_ROUTE_S = 1.9  # GetSpectrum, ExperimentReset
 HTML = {"Content-Type": "text/html; charset=utf-8"}
+
+Answer = tuple[int, bytes, dict[str, str]]  # status, body, headers
+
+
+@dataclass(eq=False)
+class Exchange:
+    """One request and what became of it.
+
+    `answer` is (status, body, headers). `fate` says how it ended without one: "refused" (nobody listens), "reset"
+    (connection broken) or "lost" (silence until the client's time-out), else "". `cut` is how many body bytes to leave
+    out.
+    """
+
+    method: str
+    path: str
+    headers: Mapping[str, str]
+    answer: Answer | None = None
+    fate: str = ""
+    cut: int = 0
+
+    @property
+    def done(self) -> bool:
+        """Answered or given up?"""
+        return self.answer is not None or self.fate != ""
 
 
 class Route(NamedTuple):

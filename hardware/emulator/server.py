@@ -26,11 +26,10 @@ import numpy as np
 
 from conf.presets import groups
 from hardware.clock import RealClock
-from hardware.emulator.device import ChiBioDevice, DeviceOptions
-from hardware.emulator.exchange import Exchange
+from hardware.emulator.device import ChiBioDevice, DeviceOptions, plant_preset
 from hardware.emulator.faults import FAULTS, inject
-from hardware.emulator.plants import plant_preset
-from hardware.emulator.vial_config import SPARE, VialConfig
+from hardware.emulator.routes import Exchange
+from hardware.emulator.vial import SPARE, VialConfig
 
 __all__ = ["EmulatorServer", "main"]
 

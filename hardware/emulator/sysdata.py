@@ -10,6 +10,7 @@ __all__ = [
     "LIGHTS",
     "PUMPS",
     "SLOTS",
+    "SysData",
     "add_terminal",
     "append_records",
     "clear_terminal",

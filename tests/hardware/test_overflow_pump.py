@@ -12,10 +12,9 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import parse_state
 from hardware.chibio.resume import replay
-from hardware.emulator.device import DeviceOptions
-from hardware.emulator.plants import plant_preset
+from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.server import build, parser
-from hardware.emulator.vial_config import VialConfig
+from hardware.emulator.vial import VialConfig
 from hardware.errors import DeviceStateError
 from tests.hardware.driver_lab import DriverLab
 from tests.hardware.script import state
