@@ -115,12 +115,12 @@ class LinkFaults:
 class Computer:
     """Clocks, threads and bus.
 
-    Args: events: device time; faults: of the board; rng: how busy it happens to be.
+    Args: now: device time at the start, s; rng: how busy it happens to be.
     `wall_offset_s` is by how much the board's clock was set forward; `errors` holds what the software did not catch.
     """
 
-    def __init__(self, events: EventQueue, faults: LinkFaults, rng: np.random.Generator) -> None:
-        self.events, self.faults, self.rng = events, faults, rng
+    def __init__(self, now: float, rng: np.random.Generator) -> None:
+        self.events, self.faults, self.rng = EventQueue(now), LinkFaults(), rng
         self.wall_offset_s = 0.0
         self.errors: deque[str] = deque(maxlen=200)
 

@@ -18,17 +18,7 @@ from conf.presets import load
 from conf.schema import build, check, part, setting
 from envs.plant.plant import Plant, PlantConfig
 from hardware.clock import Clock
-from hardware.emulator.computer import (
-    HARDWARE,
-    AppError,
-    BusStuck,
-    Computer,
-    Event,
-    EventQueue,
-    LinkFaults,
-    ProcessDied,
-    Steps,
-)
+from hardware.emulator.computer import HARDWARE, AppError, BusStuck, Computer, Event, ProcessDied, Steps
 from hardware.emulator.routes import Exchange
 from hardware.emulator.software import ReactorApp
 from hardware.emulator.supervisor import REQUEST, Supervisor
@@ -93,11 +83,11 @@ class ChiBioDevice:
         ods = [float(od)] * len(reactors) if isinstance(od, (int, float)) else [float(x) for x in od]
         if len(ods) != len(reactors):
             raise ValueError(f"od has {len(ods)} values: allowed 1 or {len(reactors)}, one per reactor")
-        self.clock, self.options, self.faults = clock, options or DeviceOptions(), LinkFaults()
+        self.clock, self.options = clock, options or DeviceOptions()
         o = self.options
-        self._events = EventQueue(clock.now())
         noise, *streams = rng.spawn(1 + len(reactors))
-        self.computer = Computer(self._events, self.faults, noise)
+        self.computer = Computer(clock.now(), noise)
+        self.faults, self._events = self.computer.faults, self.computer.events
         self.vials: dict[str, Vial] = {}
         for name, stream, start_od in zip(reactors, streams, ods, strict=True):
             plant_stream, vial_stream = stream.spawn(2)
