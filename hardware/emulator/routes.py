@@ -118,9 +118,9 @@ def _set_fp(s: Software, slot: str, led: str, base: str, emit1: str, emit2: str,
 
 def _set_custom(s: Software, program: str, status: str) -> None:
     data = s.apps[s.selected].data["Custom"]
-    _toggle(data, Program=program)
+    data["ON"] = int(data["ON"] != 1)
     if data["ON"]:
-        data.update({"Status": float(status), "param1": 0.0, "param2": 0.0, "param3": 0.0})
+        data.update({"Program": program, "Status": float(status), "param1": 0.0, "param2": 0.0, "param3": 0.0})
 
 
 def _characterise(s: Software, m: str, program: str) -> None:
