@@ -79,12 +79,7 @@ class Plant:
         self.sensor = OdSensor(config.sensor, once, reading)
         self.thermal = Thermal(config.thermal, n)
         self.feed.media_left_ml[:] = config.vessel.media_ml
-        self.draws: dict[str, Array] = {
-            **self.culture.draws,
-            **self.vessel.draws,
-            **self.feed.draws,
-            **self.sensor.draws,
-        }
+        self.draws = self.culture.draws | self.vessel.draws | self.feed.draws | self.sensor.draws
         self._tape = Tape(process, normals=3, uniforms=2)
         self.reset()
 

@@ -14,7 +14,6 @@ from hardware.chibio.dosing import DosePlan, ReactorCalibration, plan_dose
 from hardware.chibio.logbook import Logbook
 from hardware.chibio.protocol import FEED, PERIOD_S, WASTE, DeviceState
 from hardware.chibio.resume import ReactorHistory
-from hardware.clock import Clock
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 
 __all__ = ["DoseSequence"]
@@ -39,11 +38,10 @@ class DoseSequence:
         calibration: ReactorCalibration,
         config: ChiBioConfig,
         agenda: Agenda,
-        clock: Clock,
         book: Logbook,
     ) -> None:
         self._connection, self._calibration, self._config = connection, calibration, config
-        self._agenda, self._clock, self._book = agenda, clock, book
+        self._agenda, self._clock, self._book = agenda, connection.clock, book
         self.running = False
         self.stuck = ""
         self.repeated_ml = self.repeated_waste_ml = 0.0

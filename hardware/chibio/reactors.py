@@ -67,7 +67,6 @@ class ChiBioReactors:
                 calibration,
                 config,
                 self._agenda,
-                clock,
                 Logbook(m, self._note_down, self._write, self.elapsed),
             )
             for m, calibration in zip(config.reactors, calibrations, strict=True)

@@ -12,7 +12,7 @@ from typing import Any
 from hardware.chibio.agenda import Agenda, Task
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
-from hardware.chibio.diagnosis import Expected, diagnose, fault_of
+from hardware.chibio.diagnosis import diagnose, fault_of
 from hardware.chibio.dose_sequence import DoseSequence
 from hardware.chibio.dosing import DosePlan, ReactorCalibration
 from hardware.chibio.logbook import Logbook
@@ -21,7 +21,6 @@ from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import DeviceState
 from hardware.chibio.resume import ReactorHistory
 from hardware.chibio.sampling import Sampling
-from hardware.clock import Clock
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 
 __all__ = ["Station"]
@@ -33,11 +32,8 @@ class Station:
     """One reactor under control.
 
     Args:
-      connection: its verified conversation.
-      calibration: of its pumps and its zero.
-      config: shared values.
-      agenda, clock: shared; what must happen later is put on the agenda.
-      book: what it reports.
+      connection: its verified conversation. calibration: of its pumps and its zero. book: what it reports.
+      config, agenda: shared; what must happen later is put on the agenda.
 
     Attributes: sampling, doses, regulation, overflow_pump: its parts; busy while the reactor is being started or
       recovered.
@@ -49,16 +45,15 @@ class Station:
         calibration: ReactorCalibration,
         config: ChiBioConfig,
         agenda: Agenda,
-        clock: Clock,
         book: Logbook,
     ) -> None:
         self.connection, self.book = connection, book
-        self.sampling = Sampling(config, clock)
-        self.doses = DoseSequence(connection, calibration, config, agenda, clock, book)
+        self.sampling = Sampling(config, connection.clock)
+        self.doses = DoseSequence(connection, calibration, config, agenda, book)
         self.regulation = OnboardRegulation(connection, config.overflow_pump, book)
         self.overflow_pump = OverflowPump(connection, config.overflow_pump, book)
         self.busy = False
-        self._calibration, self._config, self._agenda, self._clock = calibration, config, agenda, clock
+        self._calibration, self._config, self._agenda, self._clock = calibration, config, agenda, connection.clock
         self._target_c = config.temperature
         self._heat = True
         self._blank = math.nan
@@ -200,7 +195,17 @@ class Station:
         now, elapsed = self._clock.now(), self.book.elapsed()
         is_new = self.sampling.look(state, now)
         age = 0.0 if is_new else now - self.sampling.arrived_s
-        fault = diagnose(state, self._expected(), age, self._config)
+        fault = diagnose(
+            state,
+            self._config,
+            age_s=age,
+            start_time=self._start_time,
+            blank=self._blank,
+            setpoint=self.regulation.setpoint,
+            dosing=self.doses.running,
+            stuck=self.doses.stuck,
+            overflow_trouble=self.overflow_pump.trouble,
+        )
         self.book.report(fault)
         recoverable = fault is not None and (
             fault.kind == "restarted" or (fault.kind == "stalled" and age > self._config.lost_s)
@@ -213,16 +218,6 @@ class Station:
             return True
         self.sampling.not_taken(is_new)
         return False
-
-    def _expected(self) -> Expected:
-        return Expected(
-            start_time=self._start_time,
-            blank=self._blank,
-            setpoint=self.regulation.setpoint,
-            dosing=self.doses.running,
-            stuck=self.doses.stuck,
-            overflow_trouble=self.overflow_pump.trouble,
-        )
 
     def _take(self, state: DeviceState, now: float, elapsed: float) -> None:
         """Deliver a new sample, write it down, and put heater and stirrer right."""

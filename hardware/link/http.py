@@ -8,12 +8,12 @@ from urllib.parse import urlsplit
 import httpx
 
 from hardware.errors import LinkError, ProtocolError
-from hardware.link.transport import MAX_BODY, Reply, TransportConfig
+from hardware.link.transport import MAX_BODY, Reply, Transport, TransportConfig
 
 __all__ = ["HttpTransport"]
 
 
-class HttpTransport:
+class HttpTransport(Transport):
     """HTTP to a Chi.Bio server, one connection per request (its gunicorn worker closes each one anyway).
 
     Proxies of the environment are ignored, redirects are not followed, compression is not asked for, and the whole
@@ -52,9 +52,6 @@ class HttpTransport:
     def post(self, path: str) -> Reply:
         """POST `path` without a body. Raises: LinkError (the device may have acted), ProtocolError."""
         return self._request("POST", path)
-
-    def disarm(self) -> None:
-        """Nothing: no switch on this way."""
 
     def close(self) -> None:
         """Close the client. Idempotent."""

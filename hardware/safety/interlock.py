@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 from hardware.reactor import Array, Mask, Measurement, Receipt
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import DONE, REMEDIES, WORDS, Response, SafetyConfig
-from hardware.safety.finding import Finding
-from hardware.safety.heat import Heat
-from hardware.safety.readings import Readings
+from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
 __all__ = ["Interlock", "Verdict"]
