@@ -54,11 +54,8 @@ class Connection:
         self.took_s = 0.0  # how long the last verified read took
         self._unsure = False  # a request was not answered as expected since presence was last seen
         self._seen_s = -math.inf  # clock time at which this reactor was last known to be present
-        self._reactors = tuple(reactors)
-        self._transport = transport
-        self.clock = clock
-        self._log = log
-        self._overflow_pump = overflow_pump
+        self.clock, self._transport, self._log = clock, transport, log
+        self._reactors, self._overflow_pump = tuple(reactors), overflow_pump
 
     def read(self, tries: int = 3) -> DeviceState:
         """The reactor's state, certainly its own.

@@ -14,17 +14,9 @@ __all__ = ["diagnose", "fault_of"]
 
 
 def diagnose(
-    state: DeviceState,
-    config: ChiBioConfig,
-    *,
-    age_s: float,
-    start_time: str,
-    blank: float,
-    setpoint: float,
-    dosing: bool,
-    stuck: str,
-    overflow_trouble: str,
-) -> Fault | None:
+    state: DeviceState, config: ChiBioConfig, *, age_s: float, start_time: str, blank: float, setpoint: float,
+    dosing: bool, stuck: str, overflow_trouble: str,
+) -> Fault | None:  # fmt: skip
     """The gravest fault that a verified state shows, against how the reactor should be found.
 
     Args:

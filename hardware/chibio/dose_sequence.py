@@ -110,16 +110,9 @@ class DoseSequence:
     def _intend(self, plan: DosePlan, rate: float) -> None:
         """Write down what is about to be done. Only then may it be done: a resumed run acts once per sample."""
         self._book.intend(
-            sample=self._acted,
-            rate=rate,
-            feed_duty=plan.feed_duty,
-            waste_duty=plan.waste_duty,
-            feed_ml=plan.feed_ml,
-            waste_ml=plan.waste_ml,
-            carry_ml=plan.carry_ml,
-            doses=self._doses,
-            on_s=self._book.elapsed(),
-        )
+            sample=self._acted, rate=rate, feed_duty=plan.feed_duty, waste_duty=plan.waste_duty, feed_ml=plan.feed_ml,
+            waste_ml=plan.waste_ml, carry_ml=plan.carry_ml, doses=self._doses, on_s=self._book.elapsed(),
+        )  # fmt: skip
 
     def _switch_on(self, plan: DosePlan, appeared_s: float) -> bool:
         """Targets, read back, then on; True if the pumps run or may run. The end is planned before anything is on."""

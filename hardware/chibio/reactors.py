@@ -54,10 +54,7 @@ class ChiBioReactors:
         calibrations = calibrations if calibrations is not None else [ReactorCalibration()] * len(config.reactors)
         if len(calibrations) != len(config.reactors):
             raise ValueError(f"calibrations for {len(calibrations)} reactors, reactors = {list(config.reactors)}")
-        self.config = config
-        self._transport = transport
-        self._clock = clock
-        self._log = log
+        self.config, self._transport, self._clock, self._log = config, transport, clock, log
         self._log_error: Exception | None = None
         self._agenda = Agenda(clock)
         self._zero = clock.now()
@@ -104,9 +101,7 @@ class ChiBioReactors:
             self._bring_up(histories or {})
         except (ReactorError, KeyboardInterrupt) as error:
             switched = np.array([s.overflow_pump.was_on or s.overflow_pump.tried for s in self.stations])
-            if failed := self._each(
-                switched & ~self.handed_over, lambda station: station.connection.pumps_off(tries=1)
-            ):
+            if failed := self._each(switched & ~self.handed_over, lambda s: s.connection.pumps_off(tries=1)):
                 raise DeviceStateError(f"{error}; overflow pump not verified off: {'; '.join(failed)}") from error
             raise
 

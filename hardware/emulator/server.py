@@ -116,7 +116,10 @@ class EmulatorServer:
                     inject(device, parts[1], reactor, float(value))
                     return 204, b""
                 if method == "GET" and parts == ["truth"]:
-                    return 200, _json({name: device.truth(name) for name in device.vials} | self._state())
+                    s = device.supervisor
+                    software = {"alive": s.alive, "restarts": s.restarts, "exits": s.exits}
+                    seen = {"selected": s.worker.software.selected, "errors": list(device.computer.errors)}
+                    return 200, _json({**{m: device.truth(m) for m in device.vials}, **software, **seen})
                 if method == "GET" and parts[0] in ("doses", "samples") and parts[1:] in [[m] for m in device.vials]:
                     return 200, _json([row._asdict() for row in getattr(device.vials[parts[1]], parts[0])])
                 if method == "GET" and parts == ["faults"]:
@@ -124,16 +127,6 @@ class EmulatorServer:
             except ValueError as problem:
                 return 400, f"{problem}\n".encode()
         return 404, b"allowed: POST fault/<name>/<M>/<value>, GET truth, doses/<M>, samples/<M>, faults\n"
-
-    def _state(self) -> dict[str, object]:
-        s = self.device.supervisor
-        return {
-            "alive": s.alive,
-            "restarts": s.restarts,
-            "exits": s.exits,
-            "selected": s.worker.software.selected,
-            "errors": list(self.device.computer.errors),
-        }
 
 
 def _json(value: object) -> bytes:

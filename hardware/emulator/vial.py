@@ -157,11 +157,8 @@ class Spectrometer:
         if moving:
             light *= max(c.stir_factor * (1.0 + rng.normal(0.0, c.stir_noise)), 0.01)
         light *= 1.0 + self._common + rng.normal(0.0, c.noise_fraction)
-        self._last_raw = int(
-            np.clip(
-                round(DARK_COUNTS + light * min((self._lit_s(at) - self._lit_before) / exposure_s, 1.0)), 0, FULL_SCALE
-            )
-        )
+        lit = min((self._lit_s(at) - self._lit_before) / exposure_s, 1.0)
+        self._last_raw = int(np.clip(round(DARK_COUNTS + light * lit), 0, FULL_SCALE))
         return self._last_raw
 
 
@@ -277,9 +274,8 @@ class Vial:
         thermal, plant = self.plant.config.thermal, self.plant
         heat = 1.0 if self.faults.heater_runaway and self.powered else self.heat
         minutes = seconds / 60.0
-        cooled = thermal.ambient_c + (plant.thermal.temperature - thermal.ambient_c) * np.exp(
-            -minutes / thermal.cooling_min
-        )
+        kept = np.exp(-minutes / thermal.cooling_min)
+        cooled = thermal.ambient_c + (plant.thermal.temperature - thermal.ambient_c) * kept
         still = self.stir == 0.0 and self._at + seconds - self._stirred_at > STIR_STOPPED_S
         plant.culture.stir_factor[:] = 0.0 if still else 1.0
         plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, overflow)
@@ -306,20 +302,12 @@ class Vial:
     def truth(self, at: float) -> dict[str, Any]:
         """What no client can know of the reactor at device time `at`."""
         self.sync(at)
-        plant = self.plant
+        plant, vessel = self.plant, self.plant.vessel
         return {
-            "od": float(plant.culture.od[0]),
-            "apparent_od": float(plant.apparent_od[0]),
-            "temperature": float(plant.thermal.temperature[0]),
-            "volume_ml": float(plant.vessel.volume_ml[0]),
-            "peak_ml": self.peak_ml,
-            "overflowed": bool(plant.vessel.overflowed[0]),
-            "feed_ml": float(plant.feed.delivered_ml[0]),
-            "media_left_ml": float(plant.feed.media_left_ml[0]),
-            "on_s": dict(self.on_s),
-            "motors": {pump: self.motor(pump) for pump in self.on_s},
-            "heat": self.heat,
-            "stir": self.stir,
-            "powered": self.powered,
-            "blank": self.spectrometer.blank,
-        }
+            "od": float(plant.culture.od[0]), "apparent_od": float(plant.apparent_od[0]),
+            "temperature": float(plant.thermal.temperature[0]), "volume_ml": float(vessel.volume_ml[0]),
+            "peak_ml": self.peak_ml, "overflowed": bool(vessel.overflowed[0]),
+            "feed_ml": float(plant.feed.delivered_ml[0]), "media_left_ml": float(plant.feed.media_left_ml[0]),
+            "on_s": dict(self.on_s), "motors": {pump: self.motor(pump) for pump in self.on_s},
+            "heat": self.heat, "stir": self.stir, "powered": self.powered, "blank": self.spectrometer.blank,
+        }  # fmt: skip

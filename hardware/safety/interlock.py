@@ -59,6 +59,7 @@ class Interlock:
         self._readings = Readings(n, self.config)
         self._change = UnexplainedChange(n, self.config)
         self._heat = Heat(n, self.config)
+        self._parts = (self.budget, self._readings, self._change, self._heat)
         self._hold_until_s = np.full(n, -math.inf)
         self._hold_kind = np.full(n, -1.0)  # index into REMEDIES
         self._latched = np.zeros(n)  # a `Response` that no later one may fall below
@@ -160,8 +161,7 @@ class Interlock:
 
     def _arrays(self) -> dict[str, Array]:
         own = {"_hold_until_s": self._hold_until_s, "_hold_kind": self._hold_kind, "_latched": self._latched}
-        parts = (self.budget, self._readings, self._change, self._heat)
-        return {key: array for part in parts for key, array in part.state().items()} | own
+        return {key: array for part in self._parts for key, array in part.state().items()} | own
 
     def restore(self, state: Any) -> None:
         """The inverse of `state`, of an interlock that has not been used; None stands for nan or -inf, as in JSON.
@@ -172,7 +172,7 @@ class Interlock:
         for key, codes in (("_latched", list(Response)), ("_hold_kind", range(-1, len(REMEDIES)))):
             if not np.isin(saved[key], np.array(codes)).all():
                 raise ValueError(f"saved interlock: {key} = {state[key]}: no such code")
-        for part in (self.budget, self._readings, self._change, self._heat):
+        for part in self._parts:
             part.restore(saved)
         self._hold_until_s = np.where(np.isnan(saved["_hold_until_s"]), -math.inf, saved["_hold_until_s"])
         self._hold_kind, self._latched = saved["_hold_kind"], saved["_latched"]

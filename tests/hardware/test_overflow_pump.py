@@ -59,7 +59,7 @@ def test_there_is_none_by_default() -> None:
         ({"pump": "Pump3", "duty": 1.0}, "overflow_pump.duty = 1.0: allowed 0.1 to 0.95"),
         ({"duty": 0.05}, "overflow_pump.duty = 0.05: allowed"),
         ({"duty": math.nan}, "overflow_pump.duty = nan: allowed"),
-        ({"flow_ml_s": 0.0}, "overflow_pump.flow_ml_s = 0.0: allowed"),
+        ({"flow_ml_s": 0.0}, "overflow_pump.flow_ml_s = 0.0 mL/s: allowed"),
     ],
 )
 def test_values_out_of_range_name_key_value_and_range(values: dict[str, Any], message: str) -> None:
