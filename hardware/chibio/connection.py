@@ -38,9 +38,7 @@ class Connection:
     have been started again without this reactor. Then the next command looks first.
 
     Args:
-      name: position, M0 to M7.
-      reactors: all positions this client owns.
-      transport, clock: how requests travel, how time passes.
+      name: position, M0 to M7; reactors: all positions this client owns.
       log: takes every command and its answer.
       overflow_pump: spare pump that may be switched on; "" if there is none.
     """

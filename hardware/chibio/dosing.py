@@ -150,11 +150,8 @@ def plan_dose(
     a carry never exceeds one smallest dose.
 
     Args:
-      rate: mean feed rate, mL/s, >= 0.
-      carry_ml: `carry_ml` of the previous plan, mL.
+      rate: mean feed rate, mL/s, >= 0. carry_ml: of the previous plan, mL.
       doses: number of feed doses given so far; every `clear_every`-th clears the waste tube.
-      calibration: pumps of this reactor.
-      config: period and waste law.
     Raises: ValueError if the rate is negative or not finite.
     """
     if not (math.isfinite(rate) and rate >= 0.0):

@@ -35,9 +35,7 @@ class ChiBioReactors:
     any case, `end` to end the experiments too.
 
     Args:
-      transport: the link; this object is its only user.
-      clock: device time.
-      config: checked values.
+      transport: the link; this object is its only user. clock: device time.
       calibrations: one per reactor of `config.reactors`; nominal ones if left out.
       log: takes samples, intents, doses, commands, faults and notes, e.g. `Journal.append`. An intent is written
         before its dose, so a log that raises there prevents the dose; elsewhere its error is raised by `measure`.

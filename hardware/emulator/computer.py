@@ -149,11 +149,6 @@ class Computer:
         if self.faults.bus_stuck:
             raise BusStuck(name)
 
-    def write_row(self, name: str) -> None:
-        """One line of a data file, written under the bus lock. Raises: BusStuck, also for a full disk."""
-        self.faults.bus_stuck = self.faults.bus_stuck or self.faults.disk_full
-        self.bus(name)
-
     def spawn(self, steps: Steps, owner: str) -> None:
         """Start a thread of the software; it runs at the present device time, after what is already due."""
         self.events.add(0.0, steps, self.events.life, owner)

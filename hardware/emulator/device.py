@@ -142,10 +142,6 @@ class ChiBioDevice:
         self.supervisor.kill_worker()
         yield from ()
 
-    def kill_thread(self, owner: str) -> None:
-        """Fault: the thread `owner`, e.g. "M0/Experiment", ends as after an exception."""
-        self._events.remove(owner)
-
     # -- requests --------------------------------------------------------------------------------------------------
 
     def submit(self, method: str, path: str, headers: Mapping[str, str] | None = None) -> Exchange:

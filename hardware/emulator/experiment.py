@@ -126,11 +126,12 @@ class Experiment:
             clear_terminal(data, self._position.computer.stamp())
         append_records(data, started)
         if self._position.vial is not None:
-            self._position.vial.samples.append(
-                Sample(self._position.computer.now(), started, float(data["OD"]["current"]))
-            )
+            sample = Sample(self._position.computer.now(), started, float(data["OD"]["current"]))
+            self._position.vial.samples.append(sample)
         thin_records(data)
-        self._position.computer.write_row(self._position.name)
+        faults = self._position.computer.faults
+        faults.bus_stuck = faults.bus_stuck or faults.disk_full  # a row is written under the bus lock
+        self._position.computer.bus(self._position.name)
         if experiment["cycles"] % 10 == 1:
             raw, experiment["startTimeRaw"] = experiment["startTimeRaw"], 0
             yield FILE_DUMP_S

@@ -112,4 +112,4 @@ def _act(device: ChiBioDevice, name: str, names: tuple[str, ...], value: float) 
         device.computer.wall_offset_s += value
     else:
         for m in names:
-            device.kill_thread(f"{m}/Experiment")
+            device.computer.events.remove(f"{m}/Experiment")

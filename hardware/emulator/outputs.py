@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from hardware.emulator.computer import AppError, Computer, ProcessDied, Steps
-from hardware.emulator.sysdata import LIGHTS, PUMPS, add_terminal, fresh_sysdata
+from hardware.emulator.sysdata import LIGHTS, PUMPS, SysData, add_terminal, fresh_sysdata
 from hardware.emulator.vial import Vial, VialConfig
 
-__all__ = ["BUS_S", "PERIOD_FACTOR", "Outputs", "Position"]
+__all__ = ["BUS_S", "PERIOD_FACTOR", "Outputs", "Position", "store_target"]
 
 BUS_S = 0.02  # a register written and read back
 PERIOD_FACTOR = 1.05  # pump period over cycle time: 63 s
@@ -35,7 +34,7 @@ class Position:
 
     def forget(self, selected: str) -> None:
         """sysData as after power-on. A thread that runs keeps the parts of the old one it holds, as on the device."""
-        self.data: dict[str, Any] = fresh_sysdata(self.device_id if self.answers else "", selected)
+        self.data: SysData = fresh_sysdata(self.device_id if self.answers else "", selected)
         self.terminal("System Initialised")
 
     def terminal(self, text: str) -> None:
@@ -62,6 +61,12 @@ class Position:
         meter["current"] = value if value <= 100.0 else meter["current"]
 
 
+def store_target(output: SysData, value: float) -> None:
+    """Store a target within its limits; nan passes them, as it does on the device."""
+    value = output["min"] if value < output["min"] else value
+    output["target"] = output["max"] if value > output["max"] else value
+
+
 class Outputs:
     """The outputs of one reactor."""
 
@@ -76,11 +81,7 @@ class Outputs:
     def set_target(self, item: str, value: float) -> Steps:
         """`SetOutputTarget`: clamp, store, and restart the output if it is on."""
         output = self._position.data[item]
-        if value < output["min"]:
-            value = output["min"]
-        if value > output["max"]:
-            value = output["max"]
-        output["target"] = value
+        store_target(output, value)
         if output["ON"] == 1 and item not in ("OD", "Thermostat"):
             yield from self.set_on(item, 0)
             yield from self.set_on(item, 1)

@@ -241,34 +241,28 @@ class _DeviceHandler(_Handler):
 def parser() -> argparse.ArgumentParser:
     """Arguments of the program."""
     p = argparse.ArgumentParser(prog="python -m hardware.emulator", description="Emulated Chi.Bio behind HTTP.")
-    p.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
-    p.add_argument("--port", type=int, default=5000, help="port of the device; 0 = any free one (default %(default)s)")
-    p.add_argument("--control-port", type=int, help="port of /_emulator/ (default: port + 1)")
-    p.add_argument("--reactors", default="M0", help="positions with a reactor, e.g. M0,M1,M2 (default %(default)s)")
-    p.add_argument("--speed", type=float, default=1.0, help="device seconds per real second (default %(default)s)")
-    p.add_argument("--seed", type=int, default=0, help="of all noise (default %(default)s)")
-    p.add_argument("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
-    p.add_argument("--temperature", type=float, default=37.0, help="initial, degC (default %(default)s)")
-    p.add_argument(
-        "--plant",
-        choices=groups()["plant"],
-        default="healthy",
-        help="preset of cultures and pumps (default %(default)s)",
-    )
-    p.add_argument(
-        "--overflow-pump", choices=SPARE, default="", help="pump that keeps a vial from overflowing (default: none)"
-    )
-    p.add_argument("--overflow-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
-    default = VialConfig()
-    p.add_argument(
+    add, start = p.add_argument, VialConfig()
+    add("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
+    add("--port", type=int, default=5000, help="port of the device; 0 = any free one (default %(default)s)")
+    add("--control-port", type=int, help="port of /_emulator/ (default: port + 1)")
+    add("--reactors", default="M0", help="positions with a reactor, e.g. M0,M1,M2 (default %(default)s)")
+    add("--speed", type=float, default=1.0, help="device seconds per real second (default %(default)s)")
+    add("--seed", type=int, default=0, help="of all noise (default %(default)s)")
+    add("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
+    add("--temperature", type=float, default=37.0, help="initial, degC (default %(default)s)")
+    plants = groups()["plant"]
+    add("--plant", choices=plants, default="healthy", help="preset of cultures and pumps (default %(default)s)")
+    add("--overflow-pump", choices=SPARE, default="", help="pump that keeps a vial from overflowing (default: none)")
+    add("--overflow-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
+    add(
         "--pump-start",
         type=float,
         nargs=2,
         metavar=("LOW", "HIGH"),
-        default=(default.pump_start_low_s, default.pump_start_high_s),
+        default=(start.pump_start_low_s, start.pump_start_high_s),
         help="from the answer to a pump command until its motor turns, s (default %(default)s)",
     )
-    p.add_argument("--unblanked", action="store_true", help="start with the zero at 65000, as after power-on")
+    add("--unblanked", action="store_true", help="start with the zero at 65000, as after power-on")
     return p
 
 

@@ -20,9 +20,7 @@ class HttpTransport(Transport):
     answer must come within `read_s`, so that a server that dribbles bytes cannot hold the control loop.
 
     Args:
-      url: http://host:port of the device.
-      speed: device seconds per real second (1 on the bench).
-      config: time-outs.
+      url: http://host:port of the device; speed: device seconds per real second (1 on the bench).
     Raises: ValueError for a malformed address; LinkError, ProtocolError from the calls.
     """
 
@@ -44,14 +42,6 @@ class HttpTransport(Transport):
             headers={"X-Requested-With": "XMLHttpRequest", "Accept-Encoding": "identity", "Connection": "close"},
             trust_env=False,
         )
-
-    def get(self, path: str) -> Reply:
-        """GET `path`. Raises: LinkError, ProtocolError."""
-        return self._request("GET", path)
-
-    def post(self, path: str) -> Reply:
-        """POST `path` without a body. Raises: LinkError (the device may have acted), ProtocolError."""
-        return self._request("POST", path)
 
     def close(self) -> None:
         """Close the client. Idempotent."""

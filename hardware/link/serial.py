@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hardware.errors import LinkError, ProtocolError
-from hardware.link.transport import MAX_BODY, Reply, TransportConfig
+from hardware.link.transport import MAX_BODY, Reply, Transport, TransportConfig
 
 if TYPE_CHECKING:
     import serial
@@ -52,37 +52,26 @@ def decode_header(line: bytes) -> ReplyHeader | None:
     return ReplyHeader(int(match[1]), int(match[2]), int(match[3]), int(match[4], 16)) if match else None
 
 
-class SerialTransport:
+class SerialTransport(Transport):
     """Framed requests over a serial line to `board_agent.py`; a line that was unplugged is reopened on the next call.
 
     The very same request line is repeated when its reply is lost or damaged: the agent answers a repeated ID from
     memory, so nothing is carried out twice. Opened exclusively, so that no second client can speak in between.
+    The state comes reduced (see `board_agent.py`).
 
     Args:
-      port: serial device or pyserial URL.
-      speed: device seconds per real second.
-      config: line rate and time-outs.
+      port: serial device or pyserial URL; speed: device seconds per real second.
       attempts: times one request line is sent before the link counts as lost.
     Raises: LinkError when the line cannot be opened or nothing comes back, ProtocolError when only garbage does.
     """
 
     def __init__(self, port: str, speed: float = 1.0, config: TransportConfig | None = None, attempts: int = 5) -> None:
-        self.port = port
+        self.port, self._speed, self._attempts = port, speed, attempts
         self._config = config or TransportConfig(kind="serial")
-        self._speed = speed
-        self._attempts = attempts
         self._line: serial.Serial | None = None
         self._id = 0
         self.hello: dict[str, Any] = {}
         self._open()
-
-    def get(self, path: str) -> Reply:
-        """GET `path`; /getSysdata/ comes reduced (see `board_agent.py`). Raises: LinkError, ProtocolError."""
-        return self._request("GET", path)
-
-    def post(self, path: str) -> Reply:
-        """POST `path`. Raises: LinkError (the device may have acted), ProtocolError."""
-        return self._request("POST", path)
 
     def disarm(self) -> None:
         """BYE to the agent, whose switch then rests until the next request."""
@@ -103,9 +92,8 @@ class SerialTransport:
                 self.port, baudrate=self._config.baud, timeout=connect_s, write_timeout=connect_s, exclusive=True
             )
         except (OSError, ValueError) as error:  # SerialException is an OSError
-            raise LinkError(
-                f"serial port {self.port}: {error}; check cable and port name, close other programs"
-            ) from error
+            remedy = "check cable and port name, close other programs"
+            raise LinkError(f"serial port {self.port}: {error}; {remedy}") from error
         self._id = random.SystemRandom().randrange(1, 2**31)  # so that no request repeats an ID of an earlier session
         try:
             self.hello = self._parse_hello(self._exchange("HELLO", "/"))
@@ -148,9 +136,8 @@ class SerialTransport:
         frame = encode_request(self._id, method, path)
         if len(frame) > MAX_REQUEST:
             raise ProtocolError(f"{method} {path[:40]}...: request of {len(frame)} bytes, allowed {MAX_REQUEST}")
-        seconds = self._config.timeout(
-            self._config.read_s if method in ("GET", "POST") else self._config.connect_s, self._speed
-        )
+        wait_s = self._config.read_s if method in ("GET", "POST") else self._config.connect_s
+        seconds = self._config.timeout(wait_s, self._speed)
         garbage = 0
         last_try = time.monotonic() + 1.5 * seconds  # however many replies are damaged, no third full time-out
         try:

@@ -47,9 +47,6 @@ class Verdict:
 class Interlock:
     """Stands between controllers and pumps of N reactors: asks its four parts, then concludes.
 
-    Args:
-      n: number of reactors.
-      config: limits and declared responses.
     Attributes: budget, the ledger of feed and level.
     """
 
@@ -140,9 +137,7 @@ class Interlock:
     def confirm(self, receipt: Receipt, now: float) -> None:
         """Book what was dosed; without a waste pump in the model the level stays at its tube.
 
-        Args:
-          receipt: of the command that followed `check`.
-          now: monotonic time of the dose, s.
+        Args: receipt: of the command that followed `check`; now: monotonic time of the dose, s.
         """
         feed = np.asarray(receipt.volume_ml, dtype=np.float64)
         waste = np.full(self.n, math.inf) if receipt.waste_ml is None else np.asarray(receipt.waste_ml)

@@ -86,9 +86,7 @@ class Journal:
     """
 
     def __init__(self, path: Path, wall: Callable[[], float] = time.time, fsync: bool = True) -> None:
-        self.path = path
-        self._wall = wall
-        self._fsync = fsync
+        self.path, self._wall, self._fsync = path, wall, fsync
         try:
             size = path.stat().st_size if path.exists() else 0
             before = max(size - TAIL, 0)
@@ -126,9 +124,8 @@ class Journal:
             if self._fsync:
                 os.fsync(self._file)
         except OSError as error:
-            raise RecordingError(
-                f"journal {self.path}: {error.strerror or error}; free disk space, then resume the run"
-            ) from error
+            remedy = "free disk space, then resume the run"
+            raise RecordingError(f"journal {self.path}: {error.strerror or error}; {remedy}") from error
         self.next_row += 1
         self._size += written
 
