@@ -41,7 +41,7 @@ def blank(config: BlankConfig, folder: Path) -> None:
             reactors = ChiBioReactors(transport, clock, backend)
             try:
                 reactors.begin()
-                found = measure_blanks(reactors, config.samples)
+                mean, spread = measure_blanks(reactors, config.samples)
                 stored = [s.connection.device_id for s in reactors.stations]
                 reactors.end()
             except BaseException:
@@ -50,9 +50,9 @@ def blank(config: BlankConfig, folder: Path) -> None:
     except ReactorError as error:
         raise frame.UserError(str(error)) from None
     rows = {}
-    for name, identity, raw, sd in zip(reactors.names, stored, found.raw, found.sd, strict=True):
+    for name, identity, raw, sd in zip(reactors.names, stored, mean, spread, strict=True):
         when = {"date": date.today().isoformat(), "device_id": identity}
-        values = {"blank": float(raw), "sd": float(sd), "samples": found.samples, **when}
+        values = {"blank": float(raw), "sd": float(sd), "samples": config.samples, **when}
         path = save(Path(backend.calibration), name, "blank", values)
         rows[name] = {**values, "file": str(path)}
         log.info("%s: blank %.0f +- %.0f counts, stored in %s", name, raw, sd, path)

@@ -131,13 +131,9 @@ class Culture:
             x, s, w = y
             rate = self._law.specific_rate(s) * relative
             exchange = g.wall_attach_per_min * x - g.wall_detach_per_min * w
-            return np.stack(
-                [
-                    (rate - dilution) * x - exchange,
-                    dilution * (1.0 - s) - rate * x / g.yield_od,
-                    exchange + g.wall_growth_ratio * rate * w * (1.0 - w / g.wall_capacity_od),
-                ]
-            )
+            grown = g.wall_growth_ratio * rate * w * (1.0 - w / g.wall_capacity_od)
+            dx, ds = (rate - dilution) * x - exchange, dilution * (1.0 - s) - rate * x / g.yield_od
+            return np.stack([dx, ds, exchange + grown])
 
         state = np.stack([self.od, self.substrate, self.wall])
         state = self._integrate(derivative, state, minutes, self.substeps(minutes))
@@ -159,9 +155,8 @@ class Culture:
 
     def settle(self, minutes: float) -> None:
         """Cells sink where the stirrer stands still, and rise again where it turns."""
-        self._settled += (SETTLED_FRACTION * (1.0 - self.stir_factor) - self._settled) * -np.expm1(
-            -minutes / SETTLING_MIN
-        )
+        sunk = SETTLED_FRACTION * (1.0 - self.stir_factor)
+        self._settled += (sunk - self._settled) * -np.expm1(-minutes / SETTLING_MIN)
 
     @property
     def in_light_path(self) -> Array:

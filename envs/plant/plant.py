@@ -79,12 +79,7 @@ class Plant:
         self.sensor = OdSensor(config.sensor, once, reading)
         self.thermal = Thermal(config.thermal, n)
         self.feed.media_left_ml[:] = config.vessel.media_ml
-        self.draws: dict[str, Array] = {
-            **self.culture.draws,
-            **self.vessel.draws,
-            **self.feed.draws,
-            **self.sensor.draws,
-        }
+        self.draws = self.culture.draws | self.vessel.draws | self.feed.draws | self.sensor.draws
         self._tape = Tape(process, normals=3, uniforms=2)
         self.reset()
 
@@ -133,9 +128,8 @@ class Plant:
         waste = np.full(self.n, np.inf) if waste_s is None else np.broadcast_to(waste_s, (self.n,))
         above = np.broadcast_to(np.asarray(overflow_s, dtype=np.float64), (self.n,))
         if not np.all(np.isfinite(feed)) or np.any(np.isnan(waste + above)):
-            raise ValueError(
-                f"pump on-time = feed {feed} s, waste {waste} s, overflow {above} s: allowed finite numbers"
-            )
+            given = f"feed {feed} s, waste {waste} s, overflow {above} s"
+            raise ValueError(f"pump on-time = {given}: allowed finite numbers")
         if temperature_target is not None:
             self.thermal.set_target(temperature_target)
         pieces = max(1, int(np.ceil(minutes - 1e-9)))

@@ -100,22 +100,24 @@ class FeedPump:
         self._timing = c.timing_error_s * u_timing
         self._prime = c.prime_low + (c.prime_high - c.prime_low) * u_prime
 
-    def _effective(self, on_s: Array) -> Array:
-        """Seconds of a pulse of `on_s` s that move liquid."""
+    def _effective(self, on_s: Array, longer_s: Array | float) -> Array:
+        """Seconds of a pulse of `on_s` s that move liquid if it lasts `longer_s` s longer than asked."""
         c = self.config
         moves = (on_s > 0.0) & (on_s >= c.min_pulse_s)
-        return np.where(moves, np.maximum(on_s + self._timing - c.dead_time_s, 0.0), 0.0)
+        return np.where(moves, np.maximum(on_s + longer_s - c.dead_time_s, 0.0), 0.0)
+
+    def _flow(self, clock_min: float) -> Array:
+        """Mean flow at full power of heads that are `clock_min` min old, mL/s, shape (N,)."""
+        drift = 1.0 + self.config.gain_drift_per_h * clock_min / 60.0
+        return self.draws["pump_gain_ml_s"] * self.gain_factor * drift
 
     def expected(self, on_s: Array, clock_min: float) -> Array:
         """Mean dose of one pulse of `on_s` s by a primed head, mL; on_s and the result end in (N,). Changes nothing.
 
         Args: as `deliver`.
         """
-        c = self.config
-        moves = (on_s > 0.0) & (on_s >= c.min_pulse_s)
-        moving = np.where(moves, np.maximum(on_s + 0.5 * c.timing_error_s - c.dead_time_s, 0.0), 0.0)
-        flow = self.draws["pump_gain_ml_s"] * self.gain_factor * (1.0 + c.gain_drift_per_h * clock_min / 60.0)
-        return np.asarray(np.clip(flow * moving - self.back_leak_ml, 0.0, self.media_left_ml))
+        moving = self._effective(on_s, 0.5 * self.config.timing_error_s)
+        return np.asarray(np.clip(self._flow(clock_min) * moving - self.back_leak_ml, 0.0, self.media_left_ml))
 
     def deliver(self, on_s: Array, minutes: float, clock_min: float) -> Array:
         """Run forward for `on_s` s at the start of an interval; volume of fresh medium delivered, mL, shape (N,).
@@ -125,17 +127,15 @@ class FeedPump:
           minutes: length of the interval, min; on_s that fills it leaves the pulse open.
           clock_min: age of the head, min, for its drift.
         """
-        c = self.config
         pulsing = on_s > 0.0
         start = pulsing & ~self._running
-        primed = np.where(self._idle_min > c.prime_idle_min, self._prime, 1.0)
+        primed = np.where(self._idle_min > self.config.prime_idle_min, self._prime, 1.0)
         self._pulse_prime = np.where(start, primed, self._pulse_prime)
         for store in (self._on_s, self._moved_ml, self._dosed_ml):
             store[start] = 0.0
-        flow = self.draws["pump_gain_ml_s"] * self.gain_factor * (1.0 + c.gain_drift_per_h * clock_min / 60.0)
-        flow = np.maximum(flow * (1.0 + c.pulse_cv * self._noise), 0.0) * self._pulse_prime
-        before, self._on_s = self._effective(self._on_s), self._on_s + on_s
-        self._moved_ml += flow * np.maximum(self._effective(self._on_s) - before, 0.0)
+        flow = np.maximum(self._flow(clock_min) * (1.0 + self.config.pulse_cv * self._noise), 0.0) * self._pulse_prime
+        before, self._on_s = self._effective(self._on_s, self._timing), self._on_s + on_s
+        self._moved_ml += flow * np.maximum(self._effective(self._on_s, self._timing) - before, 0.0)
         dose = np.maximum(self._moved_ml - self.back_leak_ml, 0.0) - self._dosed_ml
         dose = np.where(pulsing, np.clip(dose, 0.0, self.media_left_ml), 0.0)
         self._dosed_ml = self._dosed_ml + dose

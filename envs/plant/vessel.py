@@ -74,13 +74,10 @@ class Vessel:
         Args:
           fresh: fresh medium, mL, shape (N,). waste_s, overflow_s: on-times of the two pumps, s, shape (N,).
         """
-        pump = self._pump
+        above_ml = self._tube_ml + self.config.overflow_above_ml
         outlets = [  # from below: level of the tube, mL the pump is able to move
-            [self._tube_ml, _moved(waste_s, pump.waste_ml_s * self.waste_gain_factor)],
-            [
-                self._tube_ml + self.config.overflow_above_ml,
-                _moved(overflow_s, pump.overflow_ml_s * self.overflow_gain_factor),
-            ],
+            [self._tube_ml, _moved(waste_s, self._pump.waste_ml_s * self.waste_gain_factor)],
+            [above_ml, _moved(overflow_s, self._pump.overflow_ml_s * self.overflow_gain_factor)],
         ]
         level, left, kept = self.volume_ml, fresh, np.ones(fresh.size)
         for outlet in outlets:

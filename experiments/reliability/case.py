@@ -12,7 +12,7 @@ from experiments.reliability.outcome import Outcome, judge
 from experiments.reliability.rehearsal import Killed, Rehearsal
 from experiments.reliability.watch import Watch
 from hardware.emulator.device import DeviceOptions
-from hardware.emulator.vial_config import VialConfig
+from hardware.emulator.vial import VialConfig
 from hardware.errors import ReactorError
 from hardware.storage.journal import read_journal
 

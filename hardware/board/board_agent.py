@@ -123,33 +123,16 @@ def encode_reply(number: int, status: int, body: bytes) -> bytes:
     return head + b" %08x\n" % zlib.crc32(head + body) + body + b"\n"
 
 
-KEPT = {
-    "UIDevice": None,
-    "presentDevices": None,
-    "DeviceID": None,
-    "Version": ("value",),
+KEPT = {  # None = the whole field
+    "UIDevice": None, "presentDevices": None, "DeviceID": None, "Version": ("value",),
     "Experiment": ("ON", "cycles", "startTime"),
-    "time": ("record",),
-    "OD": ("ON", "current", "target", "Measuring", "record"),
-    "OD0": ("raw", "target"),
-    "Pump1": ("ON", "target"),
-    "Pump2": ("ON", "target"),
-    "Pump3": ("ON", "target"),
-    "Pump4": ("ON", "target"),
-    "Stir": ("ON", "target"),
-    "Heat": ("ON", "target"),
-    "Thermostat": ("ON", "target"),
-    "ThermometerIR": ("current", "record"),
-    "Volume": ("target",),
-    "Zigzag": ("ON",),
-    "Custom": ("ON",),
-    "Chemostat": ("ON",),
-    "Light": ("ON",),
-    "FP1": ("ON",),
-    "FP2": ("ON",),
-    "FP3": ("ON",),
-    "Terminal": ("text",),
-}  # None = the whole field
+    "time": ("record",), "OD": ("ON", "current", "target", "Measuring", "record"), "OD0": ("raw", "target"),
+    "Pump1": ("ON", "target"), "Pump2": ("ON", "target"), "Pump3": ("ON", "target"), "Pump4": ("ON", "target"),
+    "Stir": ("ON", "target"), "Heat": ("ON", "target"), "Thermostat": ("ON", "target"),
+    "ThermometerIR": ("current", "record"), "Volume": ("target",),
+    "Zigzag": ("ON",), "Custom": ("ON",), "Chemostat": ("ON",), "Light": ("ON",), "FP1": ("ON",), "FP2": ("ON",),
+    "FP3": ("ON",), "Terminal": ("text",),
+}  # fmt: skip
 
 
 def reduce_sysdata(body: bytes) -> bytes:
@@ -260,19 +243,12 @@ class Agent:
 
     def status(self) -> bytes:
         """The JSON of HELLO, PING and BYE."""
-        return json.dumps(
-            {
-                "agent": "board_agent",
-                "protocol": PROTOCOL,
-                "version": VERSION,
-                "deadman_s": self.deadman_s,
-                "silent_s": round(self.silent_s, 3),
-                "armed": self.armed,
-                "trips": self.trips,
-                "last_trip": self.last_trip,
-                "url": self.device.url,
-            }
-        ).encode("ascii")
+        answer = {
+            "agent": "board_agent", "protocol": PROTOCOL, "version": VERSION, "deadman_s": self.deadman_s,
+            "silent_s": round(self.silent_s, 3), "armed": self.armed, "trips": self.trips,
+            "last_trip": self.last_trip, "url": self.device.url,
+        }  # fmt: skip
+        return json.dumps(answer).encode("ascii")
 
     def answer_line(self, line: bytes) -> bytes:
         """The reply frame for one received line; b"" for a line that is no frame."""

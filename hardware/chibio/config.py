@@ -76,8 +76,6 @@ class EmulatorConfig(ChiBioConfig):
     )
     od: float = setting(0.3, "of the emulated cultures at the start", "OD", within=(0, 4))
     plant: str = setting(
-        "healthy",
-        "preset of the cultures and pumps; bench: each vial has its own",
-        choices=tuple(groups()["plant"]),
+        "healthy", "preset of the cultures and pumps; bench: each vial has its own", choices=tuple(groups()["plant"])
     )
     seed: int = setting(0, "of all noise", at_least=0)

@@ -38,9 +38,7 @@ class Connection:
     have been started again without this reactor. Then the next command looks first.
 
     Args:
-      name: position, M0 to M7.
-      reactors: all positions this client owns.
-      transport, clock: how requests travel, how time passes.
+      name: position, M0 to M7; reactors: all positions this client owns.
       log: takes every command and its answer.
       overflow_pump: spare pump that may be switched on; "" if there is none.
     """
@@ -54,11 +52,8 @@ class Connection:
         self.took_s = 0.0  # how long the last verified read took
         self._unsure = False  # a request was not answered as expected since presence was last seen
         self._seen_s = -math.inf  # clock time at which this reactor was last known to be present
-        self._reactors = tuple(reactors)
-        self._transport = transport
-        self._clock = clock
-        self._log = log
-        self._overflow_pump = overflow_pump
+        self.clock, self._transport, self._log = clock, transport, log
+        self._reactors, self._overflow_pump = tuple(reactors), overflow_pump
 
     def read(self, tries: int = 3) -> DeviceState:
         """The reactor's state, certainly its own.
@@ -68,7 +63,7 @@ class Connection:
         """
         selected = ""
         for _ in range(tries):
-            start = self._clock.now()
+            start = self.clock.now()
             self._post(f"/changeDevice/{self.name}", quiet=True)
             state = self._look()
             selected = state.selected
@@ -102,7 +97,7 @@ class Connection:
         if self.name not in state.present:
             self.state = None  # nothing is sent to it from now on
             raise DeviceStateError(f"{self.name} is absent (present: {', '.join(state.present) or 'none'})")
-        self._seen_s = self._clock.now()
+        self._seen_s = self.clock.now()
         return state
 
     def post(self, path: str) -> None:
@@ -111,16 +106,16 @@ class Connection:
         Raises: LinkError (it may have been carried out), ProtocolError for a status other than 204, DeviceStateError
           if the command is not allowed or the reactor was not present when it was last looked at.
         """
-        if self.state is not None and (self._unsure or self._clock.now() - self._seen_s > SEEN_S):
+        if self.state is not None and (self._unsure or self.clock.now() - self._seen_s > SEEN_S):
             self._look()
         if self.state is None or self.name not in self.state.present:
             raise DeviceStateError(f"refused to send POST {path}: {self.name} was not seen present")
         self._post(path)
-        self._seen_s = self._clock.now()
+        self._seen_s = self.clock.now()
 
     def _post(self, path: str, quiet: bool = False) -> None:
         check_command(path, self._reactors, self._overflow_pump)
-        start = self._clock.now()
+        start = self.clock.now()
         answer: int | str = ""
         before, self._unsure = self._unsure, True
         try:
@@ -140,7 +135,7 @@ class Connection:
         self._unsure = before
 
     def _since(self, start: float) -> float:
-        return round(self._clock.now() - start, 3)
+        return round(self.clock.now() - start, 3)
 
     def target(self, item: str, value: float) -> None:
         """Set the target of `item`. Raises: as `post`."""
@@ -166,7 +161,7 @@ class Connection:
         error: ReactorError | None = None
         for attempt in range(tries):
             if attempt:
-                self._clock.sleep(1.0)
+                self.clock.sleep(1.0)
             error = None
             if self.state is None:
                 self.read()  # presence first
@@ -181,7 +176,7 @@ class Connection:
                         break
             if error is not None:
                 continue
-            self._clock.sleep(SETTLE_S)
+            self.clock.sleep(SETTLE_S)
             try:
                 self.probe()
                 on = [p for p in self.read().running_pumps if p in pumps]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.onboard_regulation import describe, regulates
@@ -11,49 +10,42 @@ from hardware.chibio.protocol import DeviceState
 from hardware.errors import DeviceStateError, IdentityError, ReactorError
 from hardware.reactor import Fault
 
-__all__ = ["Expected", "diagnose", "fault_of"]
+__all__ = ["diagnose", "fault_of"]
 
 
-@dataclass(frozen=True)
-class Expected:
-    """How a reactor should be found.
+def diagnose(
+    state: DeviceState, config: ChiBioConfig, *, age_s: float, start_time: str, blank: float, setpoint: float,
+    dosing: bool, stuck: str, overflow_trouble: str,
+) -> Fault | None:  # fmt: skip
+    """The gravest fault that a verified state shows, against how the reactor should be found.
 
-    start_time: of its experiment. blank: counts. setpoint: OD at which it was handed over to the on-board regulation,
-    nan if this program controls. dosing: its pumps may be on. stuck: why its pumps could not be verified off, ""
-    if they were. overflow_trouble: why its overflow pump could not be verified on, "" if it was.
+    Args:
+      age_s: of the newest sample, s. start_time: of its experiment. blank: counts.
+      setpoint: OD at which it was handed over to the on-board regulation, nan if this program controls.
+      dosing: its pumps may be on. stuck: why its pumps could not be verified off, "" if they were.
+      overflow_trouble: why its overflow pump could not be verified on, "" if it was.
     """
-
-    start_time: str
-    blank: float
-    setpoint: float
-    dosing: bool
-    stuck: str
-    overflow_trouble: str
-
-
-def diagnose(state: DeviceState, expected: Expected, age_s: float, config: ChiBioConfig) -> Fault | None:
-    """The gravest fault that a verified state shows; `age_s` is the age of the newest sample, s."""
-    if state.start_time != expected.start_time or not state.started:
+    if state.start_time != start_time or not state.started:
         return Fault(
             "restarted",
-            f"the experiment of {expected.start_time} is gone, cycles {state.cycles}, blank {state.blank:.0f}",
+            f"the experiment of {start_time} is gone, cycles {state.cycles}, blank {state.blank:.0f}",
             "blank and targets are restored and the experiment is started again; check the board's power",
         )
     if not state.running:
         return Fault("stopped", "the experiment was stopped by someone", "start it in the device's web page")
-    if abs(state.blank - expected.blank) > 0.5:
+    if abs(state.blank - blank) > 0.5:
         return Fault(
             "blank",
-            f"the blank was changed from {expected.blank:.1f} to {state.blank:.1f}",
-            f"set it back (raw {expected.blank:.1f}, OD 0) or start a new run",
+            f"the blank was changed from {blank:.1f} to {state.blank:.1f}",
+            f"set it back (raw {blank:.1f}, OD 0) or start a new run",
         )
-    if expected.stuck:
-        return Fault("pump", expected.stuck, "switch the pump board off by hand")
-    handed_over = math.isfinite(expected.setpoint)
+    if stuck:
+        return Fault("pump", stuck, "switch the pump board off by hand")
+    handed_over = math.isfinite(setpoint)
     on = config.overflow_pump.others_on(state)
-    if on and not expected.dosing and not handed_over:
+    if on and not dosing and not handed_over:
         return Fault("pump", f"pumps on: {on}, not by this program", "close the device's web page everywhere")
-    if state.pumping_modes or (not regulates(state, expected.setpoint) if handed_over else state.regulating):
+    if state.pumping_modes or (not regulates(state, setpoint) if handed_over else state.regulating):
         what = ", ".join(state.pumping_modes) or describe(state)
         return Fault("mode", f"{what}: not as this program left it", "set it back in the device's web page")
     if age_s > config.stale_s:
@@ -62,8 +54,8 @@ def diagnose(state: DeviceState, expected: Expected, age_s: float, config: ChiBi
             f"no new sample for {age_s:.0f} s, cycles {state.cycles}",
             f"after {config.lost_s:.0f} s its experiment is restarted; look at the device's terminal",
         )
-    if trouble := expected.overflow_trouble:
-        return Fault("overflow_pump", trouble, "close the device's web page everywhere; restart the device")
+    if overflow_trouble:
+        return Fault("overflow_pump", overflow_trouble, "close the device's web page everywhere; restart the device")
     return None
 
 

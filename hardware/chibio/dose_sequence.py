@@ -14,7 +14,6 @@ from hardware.chibio.dosing import DosePlan, ReactorCalibration, plan_dose
 from hardware.chibio.logbook import Logbook
 from hardware.chibio.protocol import FEED, PERIOD_S, WASTE, DeviceState
 from hardware.chibio.resume import ReactorHistory
-from hardware.clock import Clock
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 
 __all__ = ["DoseSequence"]
@@ -39,11 +38,10 @@ class DoseSequence:
         calibration: ReactorCalibration,
         config: ChiBioConfig,
         agenda: Agenda,
-        clock: Clock,
         book: Logbook,
     ) -> None:
         self._connection, self._calibration, self._config = connection, calibration, config
-        self._agenda, self._clock, self._book = agenda, clock, book
+        self._agenda, self._clock, self._book = agenda, connection.clock, book
         self.running = False
         self.stuck = ""
         self.repeated_ml = self.repeated_waste_ml = 0.0
@@ -112,16 +110,9 @@ class DoseSequence:
     def _intend(self, plan: DosePlan, rate: float) -> None:
         """Write down what is about to be done. Only then may it be done: a resumed run acts once per sample."""
         self._book.intend(
-            sample=self._acted,
-            rate=rate,
-            feed_duty=plan.feed_duty,
-            waste_duty=plan.waste_duty,
-            feed_ml=plan.feed_ml,
-            waste_ml=plan.waste_ml,
-            carry_ml=plan.carry_ml,
-            doses=self._doses,
-            on_s=self._book.elapsed(),
-        )
+            sample=self._acted, rate=rate, feed_duty=plan.feed_duty, waste_duty=plan.waste_duty, feed_ml=plan.feed_ml,
+            waste_ml=plan.waste_ml, carry_ml=plan.carry_ml, doses=self._doses, on_s=self._book.elapsed(),
+        )  # fmt: skip
 
     def _switch_on(self, plan: DosePlan, appeared_s: float) -> bool:
         """Targets, read back, then on; True if the pumps run or may run. The end is planned before anything is on."""

@@ -150,11 +150,8 @@ def plan_dose(
     a carry never exceeds one smallest dose.
 
     Args:
-      rate: mean feed rate, mL/s, >= 0.
-      carry_ml: `carry_ml` of the previous plan, mL.
+      rate: mean feed rate, mL/s, >= 0. carry_ml: of the previous plan, mL.
       doses: number of feed doses given so far; every `clear_every`-th clears the waste tube.
-      calibration: pumps of this reactor.
-      config: period and waste law.
     Raises: ValueError if the rate is negative or not finite.
     """
     if not (math.isfinite(rate) and rate >= 0.0):
@@ -185,12 +182,11 @@ def plan_dose(
 
 @dataclass(frozen=True)
 class PumpFit:
-    """A fitted calibration with the uncertainty of its parameters (one standard error) and the residuals, mL."""
+    """A fitted calibration with the uncertainty of its parameters (one standard error)."""
 
     calibration: PumpCalibration
     flow_se: float
     bias_se: float
-    residual_ml: Array
 
 
 def fit_pump(on_s: Array, doses: Array, grams: Array, date: str = "", device_id: str = "") -> PumpFit:
@@ -234,4 +230,4 @@ def fit_pump(on_s: Array, doses: Array, grams: Array, date: str = "", device_id:
     useful = t[dose >= 0.7 * flow * np.maximum(t + bias, 1e-9)]
     min_on = float(np.clip(useful.min() if useful.size else t.max(), 0.3, 2.0))
     calibration = PumpCalibration(flow, bias, spread, min_on, date, device_id)
-    return PumpFit(calibration, flow_se, bias_se, residual)
+    return PumpFit(calibration, flow_se, bias_se)

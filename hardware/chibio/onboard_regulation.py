@@ -8,7 +8,6 @@ from hardware.chibio.connection import Connection
 from hardware.chibio.logbook import Logbook
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import DeviceState
-from hardware.chibio.resume import ReactorHistory
 from hardware.errors import DeviceStateError
 
 __all__ = ["OnboardRegulation", "describe", "regulates"]
@@ -38,10 +37,6 @@ class OnboardRegulation:
     def active(self) -> bool:
         """Whether the reactor was handed over."""
         return math.isfinite(self.setpoint)
-
-    def restore(self, history: ReactorHistory) -> None:
-        """Continue as an earlier life of the run left it."""
-        self.setpoint = history.handed_over
 
     def as_handed_over(self, state: DeviceState) -> bool:
         """Whether the device regulates as the reactor was handed over; False if it never was."""

@@ -14,7 +14,6 @@ from conf.schema import check, setting
 from hardware.chibio.connection import Connection
 from hardware.chibio.logbook import Logbook
 from hardware.chibio.protocol import MAX_OVERFLOW_DUTY, PUMPS, SPARE, DeviceState
-from hardware.chibio.resume import ReactorHistory
 
 __all__ = ["OverflowPump", "OverflowPumpConfig"]
 
@@ -73,10 +72,6 @@ class OverflowPump:
     def __init__(self, connection: Connection, config: OverflowPumpConfig, book: Logbook) -> None:
         self.trouble, self.was_on, self.tried = "", False, False
         self._connection, self._config, self._book = connection, config, book
-
-    def restore(self, history: ReactorHistory) -> None:
-        """Continue as an earlier life of the run left it."""
-        self.was_on = history.overflow_pump_on
 
     def keep_on(self, state: DeviceState) -> DeviceState:
         """Have it on with its duty; the reactor's state then. What cannot be had becomes `trouble`.

@@ -68,14 +68,11 @@ def preflight(
                 connection.probe()  # a device that never ran an experiment shows no temperature yet
                 state = connection.read()
         except ReactorError as error:
-            checks.append(
-                Check(f"{name} present", False, str(error), "plug it in with the server stopped, or leave it out")
-            )
+            remedy = "plug it in with the server stopped, or leave it out"
+            checks.append(Check(f"{name} present", False, str(error), remedy))
             continue
-        checks.append(
-            Check(f"{name} present", True, f"identity {state.device_id}, software {state.version or 'unnamed'}")
-        )
-        checks += _reactor(name, state, calibration, config.overflow_pump)
+        found = f"identity {state.device_id}, software {state.version or 'unnamed'}"
+        checks += [Check(f"{name} present", True, found), *_reactor(name, state, calibration, config.overflow_pump)]
     return checks
 
 
@@ -104,9 +101,8 @@ def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Ch
             return Check("board clock", True, "not visible over this link", required=False)
         clock.sleep(pause)
     drift = (dates[1] - dates[0]) - (times[1] - times[0]) / config.speed
-    return Check(
-        "board clock", abs(drift) < 2.5, f"{drift:+.1f} s against this computer", "stop clock corrections on the board"
-    )
+    seen = f"{drift:+.1f} s against this computer"
+    return Check("board clock", abs(drift) < 2.5, seen, "stop clock corrections on the board")
 
 
 def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration]) -> Check:

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hardware.chibio.connection import Connection
 from hardware.chibio.protocol import PERIOD_S
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, SensorError
+from hardware.reactor import Array
 
-__all__ = ["Blank", "dose_series", "measure_blanks"]
-
-Array = NDArray[np.float64]
+__all__ = ["dose_series", "measure_blanks"]
 
 PAUSE_S = 2.0  # between two doses, so that the fluid comes to rest
 LATE_S = 2.0  # a pump starts a little after the answer, and later on a busy bus; its dose must not be cut short
@@ -44,17 +41,10 @@ def dose_series(connection: Connection, clock: Clock, pump: str, duty: float, do
         connection.pumps_off()
 
 
-@dataclass(frozen=True)
-class Blank:
-    """Counts of clear medium: mean and standard deviation over `samples` cycles, shape (N,)."""
-
-    raw: Array
-    sd: Array
-    samples: int
-
-
-def measure_blanks(reactors: ChiBioReactors, samples: int) -> Blank:
+def measure_blanks(reactors: ChiBioReactors, samples: int) -> tuple[Array, Array]:
     """Average the raw counts of `samples` cycles of every reactor and set them as the devices' blanks.
+
+    Returns their mean and standard deviation, shape (N,).
 
     Needs clear medium in stirred, heated vials and `reactors.begin()`; the counts are those of the experiment's own
     measurement, stirrer still, so they hold under run conditions (docs/device.md, Blank).
@@ -79,4 +69,4 @@ def measure_blanks(reactors: ChiBioReactors, samples: int) -> Blank:
             )
     for station, value in zip(reactors.stations, mean, strict=True):
         station.set_blank(float(value))
-    return Blank(mean, sd, samples)
+    return mean, sd

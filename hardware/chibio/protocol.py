@@ -15,18 +15,9 @@ from typing import Any
 from hardware.errors import DeviceStateError, ProtocolError
 
 __all__ = [
-    "FEED",
-    "MAX_OVERFLOW_DUTY",
-    "PERIOD_S",
-    "POSITIONS",
-    "PUMPS",
-    "SPARE",
-    "UNSET_BLANK",
-    "WASTE",
-    "DeviceState",
-    "check_command",
-    "parse_state",
-]
+    "FEED", "MAX_OVERFLOW_DUTY", "PERIOD_S", "POSITIONS", "PUMPS", "SPARE", "UNSET_BLANK", "WASTE", "DeviceState",
+    "check_command", "parse_state",
+]  # fmt: skip
 
 POSITIONS = tuple(f"M{k}" for k in range(8))
 PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")

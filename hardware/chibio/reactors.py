@@ -35,9 +35,7 @@ class ChiBioReactors:
     any case, `end` to end the experiments too.
 
     Args:
-      transport: the link; this object is its only user.
-      clock: device time.
-      config: checked values.
+      transport: the link; this object is its only user. clock: device time.
       calibrations: one per reactor of `config.reactors`; nominal ones if left out.
       log: takes samples, intents, doses, commands, faults and notes, e.g. `Journal.append`. An intent is written
         before its dose, so a log that raises there prevents the dose; elsewhere its error is raised by `measure`.
@@ -54,10 +52,7 @@ class ChiBioReactors:
         calibrations = calibrations if calibrations is not None else [ReactorCalibration()] * len(config.reactors)
         if len(calibrations) != len(config.reactors):
             raise ValueError(f"calibrations for {len(calibrations)} reactors, reactors = {list(config.reactors)}")
-        self.config = config
-        self._transport = transport
-        self._clock = clock
-        self._log = log
+        self.config, self._transport, self._clock, self._log = config, transport, clock, log
         self._log_error: Exception | None = None
         self._agenda = Agenda(clock)
         self._zero = clock.now()
@@ -67,7 +62,6 @@ class ChiBioReactors:
                 calibration,
                 config,
                 self._agenda,
-                clock,
                 Logbook(m, self._note_down, self._write, self.elapsed),
             )
             for m, calibration in zip(config.reactors, calibrations, strict=True)
@@ -105,9 +99,7 @@ class ChiBioReactors:
             self._bring_up(histories or {})
         except (ReactorError, KeyboardInterrupt) as error:
             switched = np.array([s.overflow_pump.was_on or s.overflow_pump.tried for s in self.stations])
-            if failed := self._each(
-                switched & ~self.handed_over, lambda station: station.connection.pumps_off(tries=1)
-            ):
+            if failed := self._each(switched & ~self.handed_over, lambda s: s.connection.pumps_off(tries=1)):
                 raise DeviceStateError(f"{error}; overflow pump not verified off: {'; '.join(failed)}") from error
             raise
 

@@ -55,10 +55,6 @@ class Sampling:
         """Count the age of the newest sample from now on, and look at once."""
         self.arrived_s = self.next_poll = self._clock.now()
 
-    def forget(self) -> None:
-        """The device's records begin anew: any sample is a new one."""
-        self.key = None
-
     def retry_later(self) -> None:
         """Plan the look after one that fails."""
         self.next_poll = self._clock.now() + self._config.retry_s

@@ -12,7 +12,7 @@ from typing import Any
 from hardware.chibio.agenda import Agenda, Task
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
-from hardware.chibio.diagnosis import Expected, diagnose, fault_of
+from hardware.chibio.diagnosis import diagnose, fault_of
 from hardware.chibio.dose_sequence import DoseSequence
 from hardware.chibio.dosing import DosePlan, ReactorCalibration
 from hardware.chibio.logbook import Logbook
@@ -21,7 +21,6 @@ from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import DeviceState
 from hardware.chibio.resume import ReactorHistory
 from hardware.chibio.sampling import Sampling
-from hardware.clock import Clock
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 
 __all__ = ["Station"]
@@ -33,11 +32,8 @@ class Station:
     """One reactor under control.
 
     Args:
-      connection: its verified conversation.
-      calibration: of its pumps and its zero.
-      config: shared values.
-      agenda, clock: shared; what must happen later is put on the agenda.
-      book: what it reports.
+      connection: its verified conversation. calibration: of its pumps and its zero. book: what it reports.
+      config, agenda: shared; what must happen later is put on the agenda.
 
     Attributes: sampling, doses, regulation, overflow_pump: its parts; busy while the reactor is being started or
       recovered.
@@ -49,16 +45,15 @@ class Station:
         calibration: ReactorCalibration,
         config: ChiBioConfig,
         agenda: Agenda,
-        clock: Clock,
         book: Logbook,
     ) -> None:
         self.connection, self.book = connection, book
-        self.sampling = Sampling(config, clock)
-        self.doses = DoseSequence(connection, calibration, config, agenda, clock, book)
+        self.sampling = Sampling(config, connection.clock)
+        self.doses = DoseSequence(connection, calibration, config, agenda, book)
         self.regulation = OnboardRegulation(connection, config.overflow_pump, book)
         self.overflow_pump = OverflowPump(connection, config.overflow_pump, book)
         self.busy = False
-        self._calibration, self._config, self._agenda, self._clock = calibration, config, agenda, clock
+        self._calibration, self._config, self._agenda, self._clock = calibration, config, agenda, connection.clock
         self._target_c = config.temperature
         self._heat = True
         self._blank = math.nan
@@ -82,8 +77,7 @@ class Station:
             self._target_c = history.temperature
         state = self.connection.read()
         self._blank = next((b for b in (history.blank, self._calibration.blank) if math.isfinite(b)), state.blank)
-        self.overflow_pump.restore(history)
-        self.regulation.restore(history)
+        self.overflow_pump.was_on, self.regulation.setpoint = history.overflow_pump_on, history.handed_over
         if not self.regulation.as_handed_over(state):
             if state.regulating:
                 self.regulation.switch_off()
@@ -121,12 +115,9 @@ class Station:
             self._start_time = self.overflow_pump.keep_on(self.connection.read()).start_time
             self.sampling.wait_from_now()
             self.book.log(
-                "device",
-                device_id=self.connection.device_id,
-                blank=self._blank,
-                temperature=self._target_c,
+                "device", device_id=self.connection.device_id, blank=self._blank, temperature=self._target_c,
                 start_time=self._start_time,
-            )
+            )  # fmt: skip
         finally:
             self.busy = False
 
@@ -175,7 +166,7 @@ class Station:
                 self.connection.post(f"/Experiment/0/{self.name}")
                 yield OLD_CYCLE_S
             else:
-                self.sampling.forget()
+                self.sampling.key = None  # the device's records begin anew: any sample is a new one
                 self.doses.forget_sample()
             yield from self.bring_up(waited=True)
             self.book.tell(f"recovered from: {kind}")
@@ -200,7 +191,11 @@ class Station:
         now, elapsed = self._clock.now(), self.book.elapsed()
         is_new = self.sampling.look(state, now)
         age = 0.0 if is_new else now - self.sampling.arrived_s
-        fault = diagnose(state, self._expected(), age, self._config)
+        fault = diagnose(
+            state, self._config, age_s=age, start_time=self._start_time, blank=self._blank,
+            setpoint=self.regulation.setpoint, dosing=self.doses.running, stuck=self.doses.stuck,
+            overflow_trouble=self.overflow_pump.trouble,
+        )  # fmt: skip
         self.book.report(fault)
         recoverable = fault is not None and (
             fault.kind == "restarted" or (fault.kind == "stalled" and age > self._config.lost_s)
@@ -214,47 +209,27 @@ class Station:
         self.sampling.not_taken(is_new)
         return False
 
-    def _expected(self) -> Expected:
-        return Expected(
-            start_time=self._start_time,
-            blank=self._blank,
-            setpoint=self.regulation.setpoint,
-            dosing=self.doses.running,
-            stuck=self.doses.stuck,
-            overflow_trouble=self.overflow_pump.trouble,
-        )
-
     def _take(self, state: DeviceState, now: float, elapsed: float) -> None:
         """Deliver a new sample, write it down, and put heater and stirrer right."""
         sampling = self.sampling
         if note := sampling.take(state, now, elapsed):
             self.book.tell(note)
         self.book.log(
-            "sample",
-            sample=sampling.key,
-            od=sampling.od,
-            temperature=sampling.temperature,
-            raw=sampling.raw,
-            blank=state.blank,
-            late_s=sampling.late_s,
-            read_s=self.connection.took_s,
-        )
+            "sample", sample=sampling.key, od=sampling.od, temperature=sampling.temperature, raw=sampling.raw,
+            blank=state.blank, late_s=sampling.late_s, read_s=self.connection.took_s,
+        )  # fmt: skip
         if sampling.late_s > 30.0 or self.doses.running:
             return  # the stirrer may be off for the next measurement already
         self._put_targets_right(state)
 
     def _put_targets_right(self, state: DeviceState) -> None:
         """Heating and stirring as this run wants them: a quick restart loses them silently, a web page changes them."""
-        targets = (
-            ("Thermostat", state.temperature_target, self._target_c),
-            ("Stir", state.stir_target, self._config.stir),
-        )
-        switches = (("Thermostat", state.heating, self._heat), ("Stir", state.stirring, self._config.stir > 0.0))
-        connection = self.connection
+        connection, stir = self.connection, self._config.stir
+        targets = (("Thermostat", state.temperature_target, self._target_c), ("Stir", state.stir_target, stir))
         for item, value, wanted in targets:
             if abs(value - wanted) > 1e-3:
                 self._mend(f"{item} was set to {value:g}", f"set back to {wanted:g}", connection.target, item, wanted)
-        for item, on, needed in switches:
+        for item, on, needed in (("Thermostat", state.heating, self._heat), ("Stir", state.stirring, stir > 0.0)):
             if needed and not on:
                 self._mend(f"{item} was off", "switched on again", connection.switch, item, True)
 

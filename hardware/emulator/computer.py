@@ -1,19 +1,27 @@
-"""The board computer as the device's software sees it: clocks, threads, the bus to the reactors."""
+"""The board computer as the device's software sees it: device time, clocks, threads, the bus to the reactors.
+
+Threads of software and electronics are generators that yield the seconds they sleep.
+"""
 
 from __future__ import annotations
 
+import heapq
+import math
 from collections import deque
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import format_datetime
+from typing import NamedTuple
 
 import numpy as np
 
-from hardware.emulator.events import EventQueue, Steps
-from hardware.emulator.link_faults import LinkFaults
+__all__ = ["HARDWARE", "AppError", "BusStuck", "Computer", "Event", "EventQueue", "LinkFaults", "ProcessDied", "Steps"]
 
-__all__ = ["AppError", "BusStuck", "Computer", "ProcessDied"]
+Steps = Generator[float, None, None]
 
 EPOCH = 1_767_225_600.0  # the board's clock at device second 0: 2026-01-01 00:00:00
+HARDWARE = -1  # life of what goes on without the software
 
 
 class AppError(Exception):
@@ -28,15 +36,91 @@ class ProcessDied(Exception):
     """The software ended itself (exit code 4)."""
 
 
+class Event(NamedTuple):
+    """A generator that is due. `life` is the software process it belongs to, or HARDWARE; `owner` names it."""
+
+    at: float
+    order: int  # of equal times the earlier scheduled comes first; unique, so nothing further is compared
+    steps: Steps
+    life: int
+    owner: str
+
+
+class EventQueue:
+    """Events in the order of device time. `now` is the time of the event in progress, `life` the present process."""
+
+    def __init__(self, now: float) -> None:
+        self.now, self.life = now, 0
+        self._events: list[Event] = []
+        self._order = 0
+
+    def add(self, delay: float, steps: Steps, life: int, owner: str) -> None:
+        """Have `steps` continue after `delay` s."""
+        self._order += 1
+        heapq.heappush(self._events, Event(self.now + delay, self._order, steps, life, owner))
+
+    def next_time(self) -> float:
+        """When the next event is due, device s; inf if none."""
+        return self._events[0].at if self._events else math.inf
+
+    def due(self, t: float) -> Iterator[Event]:
+        """Every event up to device time `t`, in order; those of earlier processes are dropped."""
+        while self._events and self._events[0].at <= t:
+            event = heapq.heappop(self._events)
+            if event.life in (HARDWARE, self.life):
+                self.now = max(self.now, event.at)
+                yield event
+        self.now = max(self.now, t)
+
+    def remove(self, owner: str) -> None:
+        """Drop the events of `owner` in the present process."""
+        self._events = [e for e in self._events if e.owner != owner or e.life != self.life]
+        heapq.heapify(self._events)
+
+
+@dataclass
+class LinkFaults:
+    """Fault switches of network, server and board, as in `faults.FAULTS`.
+
+    Counters go down with every use, -1 = until set to 0. The last four are variants seen in forks and newer apps
+    (docs/device.md, Variants).
+    """
+
+    slow_s: float = 0.0
+    hang_s: float = 0.0
+    lost_request: int = 0
+    lost_reply: int = 0
+    reset_before: int = 0
+    reset_after: int = 0
+    malformed: int = 0
+    truncated: int = 0
+    lying: int = 0
+    bus_stuck: bool = False
+    bus_stuck_when_pumping: bool = False
+    disk_full: bool = False
+    foreign_selects: float = 0.0
+    require_requested_with: bool = False
+    terminal_as_list: bool = False
+    terminal_named: bool = False
+    extra_fields: bool = False
+
+    def take(self, name: str) -> bool:
+        """Is this counted fault due? Counts it down."""
+        left: int = getattr(self, name)
+        if left > 0:
+            setattr(self, name, left - 1)
+        return left != 0
+
+
 class Computer:
     """Clocks, threads and bus.
 
-    Args: events: device time; faults: of the board; rng: how busy it happens to be.
+    Args: now: device time at the start, s; rng: how busy it happens to be.
     `wall_offset_s` is by how much the board's clock was set forward; `errors` holds what the software did not catch.
     """
 
-    def __init__(self, events: EventQueue, faults: LinkFaults, rng: np.random.Generator) -> None:
-        self.events, self.faults, self.rng = events, faults, rng
+    def __init__(self, now: float, rng: np.random.Generator) -> None:
+        self.events, self.faults, self.rng = EventQueue(now), LinkFaults(), rng
         self.wall_offset_s = 0.0
         self.errors: deque[str] = deque(maxlen=200)
 
@@ -64,11 +148,6 @@ class Computer:
         """One bus access. Raises: BusStuck."""
         if self.faults.bus_stuck:
             raise BusStuck(name)
-
-    def write_row(self, name: str) -> None:
-        """One line of a data file, written under the bus lock. Raises: BusStuck, also for a full disk."""
-        self.faults.bus_stuck = self.faults.bus_stuck or self.faults.disk_full
-        self.bus(name)
 
     def spawn(self, steps: Steps, owner: str) -> None:
         """Start a thread of the software; it runs at the present device time, after what is already due."""

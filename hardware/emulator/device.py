@@ -6,29 +6,37 @@ virtual clock, `hardware/emulator/server.py` for a real one. Source: docs/device
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from conf.schema import check, part, setting
+from conf.presets import load
+from conf.schema import build, check, part, setting
 from envs.plant.plant import Plant, PlantConfig
 from hardware.clock import Clock
-from hardware.emulator.computer import AppError, BusStuck, Computer, ProcessDied
-from hardware.emulator.events import HARDWARE, Event, EventQueue, Steps
-from hardware.emulator.exchange import Exchange
-from hardware.emulator.link_faults import LinkFaults
-from hardware.emulator.plants import plant_preset
-from hardware.emulator.reactor_app import ReactorApp
-from hardware.emulator.supervisor import Supervisor
+from hardware.emulator.computer import HARDWARE, AppError, BusStuck, Computer, Event, ProcessDied, Steps
+from hardware.emulator.routes import Exchange
+from hardware.emulator.software import ReactorApp
+from hardware.emulator.supervisor import REQUEST, Supervisor
 from hardware.emulator.sysdata import ALL_REACTORS
-from hardware.emulator.vial import Vial
-from hardware.emulator.vial_config import FEED, VialConfig
-from hardware.emulator.worker import REQUEST
+from hardware.emulator.vial import FEED, Vial, VialConfig
 
-__all__ = ["ChiBioDevice", "DeviceOptions"]
+__all__ = ["ChiBioDevice", "DeviceOptions", "plant_preset"]
+
+
+@functools.cache
+def plant_preset(name: str) -> PlantConfig:
+    """Preset `conf/plant/NAME.yaml` with pulse dosing, the only one the device knows.
+
+    The vial's optics (`VialConfig`) stand for noise, misreadings and counts of the preset's sensor, which are left out:
+    a vial takes only the sensor's noise-free value. Raises: ValueError naming the presets.
+    """
+    plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
+    return replace(plant, pump=replace(plant.pump, dosing="pulse"))
 
 
 @dataclass(frozen=True)
@@ -75,11 +83,11 @@ class ChiBioDevice:
         ods = [float(od)] * len(reactors) if isinstance(od, (int, float)) else [float(x) for x in od]
         if len(ods) != len(reactors):
             raise ValueError(f"od has {len(ods)} values: allowed 1 or {len(reactors)}, one per reactor")
-        self.clock, self.options, self.faults = clock, options or DeviceOptions(), LinkFaults()
+        self.clock, self.options = clock, options or DeviceOptions()
         o = self.options
-        self._events = EventQueue(clock.now())
         noise, *streams = rng.spawn(1 + len(reactors))
-        self.computer = Computer(self._events, self.faults, noise)
+        self.computer = Computer(clock.now(), noise)
+        self.faults, self._events = self.computer.faults, self.computer.events
         self.vials: dict[str, Vial] = {}
         for name, stream, start_od in zip(reactors, streams, ods, strict=True):
             plant_stream, vial_stream = stream.spawn(2)
@@ -133,10 +141,6 @@ class ChiBioDevice:
         """What a request that outlives the worker's time-out comes to."""
         self.supervisor.kill_worker()
         yield from ()
-
-    def kill_thread(self, owner: str) -> None:
-        """Fault: the thread `owner`, e.g. "M0/Experiment", ends as after an exception."""
-        self._events.remove(owner)
 
     # -- requests --------------------------------------------------------------------------------------------------
 

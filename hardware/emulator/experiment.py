@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from hardware.emulator.computer import AppError
-from hardware.emulator.events import Steps
-from hardware.emulator.od_regulation import feed_duty, zigzag
+import math
+
+from hardware.emulator.computer import AppError, Steps
 from hardware.emulator.optics import Optics
-from hardware.emulator.outputs import BUS_S, Outputs
-from hardware.emulator.position import Position
-from hardware.emulator.pump_outputs import PERIOD_FACTOR
-from hardware.emulator.sysdata import append_records, clear_terminal, thin_records
+from hardware.emulator.outputs import BUS_S, PERIOD_FACTOR, Outputs, Position
+from hardware.emulator.sysdata import SysData, append_records, clear_terminal, thin_records
 from hardware.emulator.vial import Sample
 
 __all__ = ["Experiment"]
@@ -128,11 +126,12 @@ class Experiment:
             clear_terminal(data, self._position.computer.stamp())
         append_records(data, started)
         if self._position.vial is not None:
-            self._position.vial.samples.append(
-                Sample(self._position.computer.now(), started, float(data["OD"]["current"]))
-            )
+            sample = Sample(self._position.computer.now(), started, float(data["OD"]["current"]))
+            self._position.vial.samples.append(sample)
         thin_records(data)
-        self._position.computer.write_row(self._position.name)
+        faults = self._position.computer.faults
+        faults.bus_stuck = faults.bus_stuck or faults.disk_full  # a row is written under the bus lock
+        self._position.computer.bus(self._position.name)
         if experiment["cycles"] % 10 == 1:
             raw, experiment["startTimeRaw"] = experiment["startTimeRaw"], 0
             yield FILE_DUMP_S
@@ -146,8 +145,8 @@ class Experiment:
             raise AppError("division by a volume of 0")
         swinging = data["Zigzag"]["ON"] == 1
         if swinging:
-            zigzag(data)
-        feed = 0.0 if cycles < 3 or len(data["time"]["record"]) < 2 else feed_duty(data)
+            _zigzag(data)
+        feed = 0.0 if cycles < 3 or len(data["time"]["record"]) < 2 else _feed_duty(data)
         feed = min(max(feed, 0.0), FEED_CAP)
         if data["Chemostat"]["ON"] == 1:
             feed = float(data["Chemostat"]["p1"])
@@ -161,3 +160,50 @@ class Experiment:
         yield from self._outputs.set_on("Pump2", 1)
         if swinging:
             od["target"] = restore
+
+
+def _feed_duty(data: SysData) -> float:
+    """Duty of the feed pump before clipping: P on ln(x / r) per minute, two integrators, none after a jump up.
+
+    `data` is sysData with at least two records and a volume; OD.Integral and OD.Integral2 are updated.
+    """
+    od, times = data["OD"], data["time"]["record"]
+    now, before = od["current"], od["record"][-1]
+    target = od["target"] if od["target"] > 0 else 1e-6
+    minutes = (times[-1] - times[-2]) / 60.0
+    growth = math.log(now / target) / minutes if now > 0 and minutes != 0 else 0.0
+    feed = growth / (240.0 / data["Volume"]["target"])
+    error, change = now - target, now - before
+    if error < 0.01:
+        od["Integral"] = 0
+    elif abs(change) < 0.05 and error > 0.025:
+        od["Integral"] += 0.1 * error
+    if abs(error) > 0.1 and abs(change) < 0.05:
+        od["Integral2"] = 0
+    elif abs(change) < 0.1:
+        od["Integral2"] += 0.01 * error
+        feed *= 0.7
+    return 0.0 if change > 0.04 else float(feed + od["Integral"] + od["Integral2"])
+
+
+def _zigzag(data: SysData) -> None:
+    """Swing OD.target about its centre; estimate growth (1/h) while nothing is pumped.
+
+    Raises: AppError for an OD of 0 or less, of which the device takes the logarithm.
+    """
+    state = data["Zigzag"]
+    centre, now, zig = data["OD"]["target"], data["OD"]["current"], state["Zig"]
+    cycles = data["Experiment"]["cycles"]
+    last = data["OD"]["record"][-1] if data["OD"]["record"] else now
+    if now < centre - zig and last < centre:
+        if state["target"] != 5.0:
+            state["SwitchPoint"] = cycles
+        state["target"] = 5.0
+    elif now > centre + zig and last > centre + zig:
+        state["target"], state["SwitchPoint"] = centre - 1.5 * zig, cycles
+    data["OD"]["target"] = state["target"]
+    if cycles > 6 and cycles - state["SwitchPoint"] > 5:
+        if not (now > 0 and last > 0):
+            raise AppError("logarithm of an OD of 0 or less")
+        growth = 60.0 * math.log(now / last)
+        data["GrowthRate"]["current"] = 0.95 * data["GrowthRate"]["current"] + 0.05 * growth

@@ -101,19 +101,15 @@ def inject(device: ChiBioDevice, name: str, reactor: str = "all", value: float =
 
 
 def _act(device: ChiBioDevice, name: str, names: tuple[str, ...], value: float) -> None:
-    if name == "worker_wipe":
-        device.supervisor.kill_worker()
-    elif name == "crash":
-        device.supervisor.crash()
-    elif name == "power_cut":
-        device.supervisor.cut_power()
+    s = device.supervisor
+    of_board = {"worker_wipe": s.kill_worker, "crash": s.crash, "power_cut": s.cut_power, "restart": s.restart}
+    if name in of_board:
+        of_board[name]()
     elif name == "marked_absent":
         for m in names:
             device.apps[m].data["present"] = 0
-    elif name == "restart":
-        device.supervisor.restart()
     elif name == "clock_step":
         device.computer.wall_offset_s += value
     else:
         for m in names:
-            device.kill_thread(f"{m}/Experiment")
+            device.computer.events.remove(f"{m}/Experiment")

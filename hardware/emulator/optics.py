@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
-from hardware.emulator.computer import AppError
-from hardware.emulator.events import Steps
-from hardware.emulator.outputs import Outputs
-from hardware.emulator.position import Position
+from hardware.emulator.computer import AppError, Steps
+from hardware.emulator.outputs import Outputs, Position, store_target
 from hardware.emulator.sysdata import SLOTS
 
 __all__ = ["Optics"]
@@ -59,9 +57,4 @@ class Optics:
         a, b = od0["LASERa"], od0["LASERb"]
         od = 0 if od < 0 else od
         zero = raw * 10.0 ** (math.sqrt(od / a + (b / (2 * a)) ** 2) - b / (2 * a))
-        output = self._position.data[item]
-        if zero < output["min"]:
-            zero = output["min"]
-        if zero > output["max"]:
-            zero = output["max"]
-        output["target"] = zero
+        store_target(self._position.data[item], zero)

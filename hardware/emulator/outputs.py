@@ -1,38 +1,87 @@
-"""What a reactor's outputs do when they are switched: lights, laser, stirrer, heater, thermostat, pumps."""
+"""One position M0 to M7 and what its outputs do when they are switched: lights, laser, stirrer, heater, pumps."""
 
 from __future__ import annotations
 
-from hardware.emulator.computer import AppError
-from hardware.emulator.events import Steps
-from hardware.emulator.position import Position
-from hardware.emulator.pump_outputs import PumpOutputs
-from hardware.emulator.sysdata import LIGHTS, PUMPS
+import math
 
-__all__ = ["BUS_S", "Outputs"]
+from hardware.emulator.computer import AppError, Computer, ProcessDied, Steps
+from hardware.emulator.sysdata import LIGHTS, PUMPS, SysData, add_terminal, fresh_sysdata
+from hardware.emulator.vial import Vial, VialConfig
+
+__all__ = ["BUS_S", "PERIOD_FACTOR", "Outputs", "Position", "store_target"]
 
 BUS_S = 0.02  # a register written and read back
+PERIOD_FACTOR = 1.05  # pump period over cycle time: 63 s
+OFF_SHARE, QUIET_SHARE = 0.2, 0.8  # of a pump's start delay: until a running motor stops, until the pause is counted
+
+
+class Position:
+    """What outputs, optics and experiment of one reactor share; `data` is its sysData.
+
+    Args:
+      name: M0 to M7; computer: the board; vial: what hangs on the cable, None for an empty position;
+      device_id: what its IR thermometer answers as identity; selected: reactor shown on the web page.
+    """
+
+    def __init__(self, name: str, computer: Computer, vial: Vial | None, device_id: str, selected: str) -> None:
+        self.name, self.computer, self.vial, self.device_id = name, computer, vial, device_id
+        self.forget(selected)
+
+    @property
+    def answers(self) -> bool:
+        """Does a reactor hang on the cable?"""
+        return self.vial is not None and not self.vial.faults.unplugged
+
+    def forget(self, selected: str) -> None:
+        """sysData as after power-on. A thread that runs keeps the parts of the old one it holds, as on the device."""
+        self.data: SysData = fresh_sysdata(self.device_id if self.answers else "", selected)
+        self.terminal("System Initialised")
+
+    def terminal(self, text: str) -> None:
+        """One line in the web page's log."""
+        add_terminal(self.data, self.computer.stamp(), text)
+
+    def hardware(self) -> Vial:
+        """The reactor behind the bus. Raises: BusStuck, ProcessDied (absent or unplugged reactor)."""
+        self.computer.bus(self.name)
+        if self.data["present"] == 0 or self.vial is None or self.vial.faults.unplugged:
+            raise ProcessDied(f"access to absent reactor {self.name}")
+        return self.vial
+
+    def measure_temperature(self, which: str) -> None:
+        """`MeasureTemp`. Raises: AppError for another name, or an internal thermometer that does not answer."""
+        if which not in ("IR", "Internal", "External"):
+            raise AppError(f"no thermometer {which}")
+        meter = self.data[f"Thermometer{which}"]
+        self.computer.bus(self.name)
+        if which == "Internal" and self.data["present"] and not self.answers:
+            self.data["present"] = 0
+            raise AppError("internal thermometer does not answer")
+        value = self.hardware().temperature(which, self.computer.now())
+        meter["current"] = value if value <= 100.0 else meter["current"]
+
+
+def store_target(output: SysData, value: float) -> None:
+    """Store a target within its limits; nan passes them, as it does on the device."""
+    value = output["min"] if value < output["min"] else value
+    output["target"] = output["max"] if value > output["max"] else value
 
 
 class Outputs:
     """The outputs of one reactor."""
 
     def __init__(self, position: Position) -> None:
-        self._position, self._pumps = position, PumpOutputs(position)
-        self._thermostats = 0
+        self._position = position
+        self.forget()
 
     def forget(self) -> None:
-        """As after `initialise()`: no thread counted."""
-        self._pumps.forget()
-        self._thermostats = 0
+        """As after `initialise()`: no thread counted; threads of before stay alive, as they do on the device."""
+        self._thermostats, self._pump_threads = 0, dict.fromkeys(PUMPS, 0)
 
     def set_target(self, item: str, value: float) -> Steps:
         """`SetOutputTarget`: clamp, store, and restart the output if it is on."""
         output = self._position.data[item]
-        if value < output["min"]:
-            value = output["min"]
-        if value > output["max"]:
-            value = output["max"]
-        output["target"] = value
+        store_target(output, value)
         if output["ON"] == 1 and item not in ("OD", "Thermostat"):
             yield from self.set_on(item, 0)
             yield from self.set_on(item, 1)
@@ -56,15 +105,13 @@ class Outputs:
         elif item in LIGHTS or item == "UV":
             self._position.hardware()
         elif item == "LASER650":
-            self._position.hardware().spectrometer.set_laser(
-                output["target"] * output["ON"] > 0, self._position.computer.now()
-            )
+            self._position.hardware().spectrometer.set_laser(output["target"] * output["ON"] > 0, now)
         elif item == "Thermostat":
             self._start_thermostat()
         elif item in PUMPS:
             if output["target"] == 0:
                 output["ON"] = 0
-            self._pumps.start(item)
+            self._start_pump(item)
         elif item == "OD":
             yield from self.set_on("Pump1", 0)
             yield from self.set_on("Pump2", 0)
@@ -129,3 +176,39 @@ class Outputs:
         else:
             heat["ON"], heat["target"] = 0, 0
             yield from self._apply("Heat")
+
+    def _start_pump(self, item: str) -> None:
+        self._position.computer.spawn(self._period(item), f"{self._position.name}/{item}")
+
+    def _period(self, item: str) -> Steps:
+        """`PumpModulation`: one period of 63 s; a newer thread of the same pump takes over.
+
+        Five registers are written one after another: In1, In2, In1, In2 to off, then the one that drives to on.
+        """
+        pump, computer = self._position.data[item], self._position.computer
+        mine = self._pump_threads[item] = (self._pump_threads[item] + 1) % 100
+        config = self._position.vial.config if self._position.vial is not None else VialConfig()
+        delay = computer.uniform(config.pump_start_low_s, config.pump_start_high_s)
+        yield OFF_SHARE * delay
+        if abs(pump["target"] * pump["ON"]) != 1 and mine == self._pump_threads[item]:
+            self._position.hardware().drive(item, 0, computer.now())
+        yield (QUIET_SHARE - OFF_SHARE) * delay
+        if pump["ON"] == 0:
+            return
+        began = computer.wall()
+        period = PERIOD_FACTOR * self._position.data["Experiment"]["cycleTime"]
+        on_s = period * abs(pump["target"])
+        if math.isnan(on_s):
+            raise AppError("sleep length is not a number")
+        yield (1.0 - QUIET_SHARE) * delay
+        vial = self._position.hardware()
+        if mine == self._pump_threads[item] and pump["target"] != 0:
+            vial.drive(item, 1 if pump["target"] > 0 else -1, computer.now())
+        yield on_s + computer.uniform(vial.config.on_time_bias_low_s, vial.config.on_time_bias_high_s)
+        if abs(pump["target"]) != 1 and mine == self._pump_threads[item]:
+            self._position.hardware().drive(item, 0, computer.now())
+        pause = period - round(computer.wall() - began, 2)
+        if pause > 0.0:
+            yield pause
+        if pump["ON"] == 1 and mine == self._pump_threads[item]:
+            self._start_pump(item)

@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Sequence
-from types import TracebackType
 
 from hardware.errors import LinkError
 
@@ -26,6 +25,7 @@ class EmulatorProcess:
         command = [sys.executable, "-m", "hardware.emulator", "--port", "0", *arguments]
         # a session of its own: Ctrl-C reaches the client first, which then still has a device to switch off
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+        self.pid = self._process.pid
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         ready = re.match(r"emulator ready: (http://\S+) .* control (http://\S+)", line)
@@ -33,11 +33,6 @@ class EmulatorProcess:
             self.close()
             raise LinkError(f"the emulator did not start: {line.strip() or 'no output'}")
         self.url, self.control = ready[1], ready[2]
-
-    @property
-    def pid(self) -> int:
-        """Of the child process."""
-        return self._process.pid
 
     def close(self) -> None:
         """End it. Idempotent."""
@@ -54,7 +49,5 @@ class EmulatorProcess:
     def __enter__(self) -> EmulatorProcess:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()

@@ -3,27 +3,51 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 from urllib.parse import unquote
 
-from hardware.emulator.events import Steps
-from hardware.emulator.exchange import Answer, Exchange
+from hardware.emulator.computer import Steps
 from hardware.emulator.software import Software
-from hardware.emulator.sysdata import ALL_REACTORS, add_terminal, clear_terminal
+from hardware.emulator.sysdata import ALL_REACTORS, SysData, add_terminal, clear_terminal
 
-__all__ = ["HTML", "answer_request", "find_route"]
+__all__ = ["HTML", "Exchange", "answer_request", "find_route"]
 
 LONG_ROUTE_S = 1.9  # GetSpectrum, ExperimentReset
 HTML = {"Content-Type": "text/html; charset=utf-8"}
 
+Answer = tuple[int, bytes, dict[str, str]]  # status, body, headers
 
-class Route(NamedTuple):
-    """A path with one "*" per argument; `run(software, *arguments)` is the view."""
+
+@dataclass(eq=False)
+class Exchange:
+    """One request and what became of it.
+
+    `answer` is (status, body, headers). `fate` says how it ended without one: "refused" (nobody listens), "reset"
+    (connection broken) or "lost" (silence until the client's time-out), else "". `cut` is how many body bytes to leave
+    out.
+    """
 
     method: str
     path: str
-    run: Callable[..., Steps]
+    headers: Mapping[str, str]
+    answer: Answer | None = None
+    fate: str = ""
+    cut: int = 0
+
+    @property
+    def done(self) -> bool:
+        """Answered or given up?"""
+        return self.answer is not None or self.fate != ""
+
+
+class Route(NamedTuple):
+    """A path with one "*" per argument; `run(software, *arguments)` is the view, in steps if it takes time."""
+
+    method: str
+    path: str
+    run: Callable[..., Steps | None]
 
 
 def _set_target(s: Software, item: str, m: str, value: str) -> Steps:
@@ -36,10 +60,9 @@ def _set_on(s: Software, item: str, force: str, m: str) -> Steps:
     yield from s.app(m).outputs.set_on(item, number)
 
 
-def _change(s: Software, m: str) -> Steps:
+def _change(s: Software, m: str) -> None:
     if s.apps[m].data["present"] == 1:
         s.select(m)
-    yield from ()
 
 
 def _scan(s: Software, which: str) -> Steps:
@@ -51,30 +74,20 @@ def _scan(s: Software, which: str) -> Steps:
         yield 0.02
 
 
-def _direction(s: Software, item: str, m: str) -> Steps:
+def _direction(s: Software, item: str, m: str) -> None:
     data = s.app(m).data
     data[item]["target"] = -1.0 * data[item]["target"]
     if data["OD"]["ON"] == 1:
         data[item]["direction"] = -1.0 * data[item]["direction"]
-    yield from ()
 
 
-def _measure_od(s: Software, m: str) -> Steps:
-    yield from s.app(m).optics.measure_od()
-
-
-def _calibrate(s: Software, item: str, m: str, raw: str, od: str) -> Steps:
+def _calibrate(s: Software, item: str, m: str, raw: str, od: str) -> None:
     s.app(m).optics.calibrate(item, float(raw), float(od))
-    yield from ()
 
 
 def _measure_temperature(s: Software, which: str, m: str) -> Steps:
     s.app(m).measure_temperature(which)
     yield 0.003
-
-
-def _measure_fp(s: Software, m: str) -> Steps:
-    yield from s.app(m).optics.measure_fluorescence()
 
 
 def _spectrum(s: Software, gain: str, m: str) -> Steps:
@@ -85,10 +98,6 @@ def _spectrum(s: Software, gain: str, m: str) -> Steps:
     app.data["AS7341"]["spectrum"]["CLEAR"] = raw
 
 
-def _experiment(s: Software, value: str, m: str) -> Steps:
-    yield from s.app(m).experiment.start_or_stop(int(value))
-
-
 def _reset(s: Software) -> Steps:
     app = s.apps[s.selected]
     app.initialise(s.selected)
@@ -97,64 +106,47 @@ def _reset(s: Software) -> Steps:
         yield LONG_ROUTE_S
 
 
-def _clear(s: Software, m: str) -> Steps:
-    clear_terminal(s.app(m).data, s.computer.stamp())
-    yield from ()
+def _toggle(entry: SysData, **fields: str) -> None:
+    entry["ON"] = int(entry["ON"] != 1)
+    if entry["ON"]:
+        entry.update(fields)
 
 
-def _set_fp(s: Software, slot: str, led: str, base: str, emit1: str, emit2: str, gain: str) -> Steps:
-    data = s.apps[s.selected].data[slot]
-    data["ON"] = int(data["ON"] != 1)
-    if data["ON"]:
-        data.update({"LED": led, "BaseBand": base, "Emit1Band": emit1, "Emit2Band": emit2, "Gain": gain})
-    yield from ()
+def _set_fp(s: Software, slot: str, led: str, base: str, emit1: str, emit2: str, gain: str) -> None:
+    _toggle(s.apps[s.selected].data[slot], LED=led, BaseBand=base, Emit1Band=emit1, Emit2Band=emit2, Gain=gain)
 
 
-def _set_custom(s: Software, program: str, status: str) -> Steps:
+def _set_custom(s: Software, program: str, status: str) -> None:
     data = s.apps[s.selected].data["Custom"]
     data["ON"] = int(data["ON"] != 1)
     if data["ON"]:
         data.update({"Program": program, "Status": float(status), "param1": 0.0, "param2": 0.0, "param3": 0.0})
-    yield from ()
 
 
-def _set_light(s: Software, led: str) -> Steps:
-    data = s.apps[s.selected].data["Light"]
-    data["ON"] = int(data["ON"] != 1)
-    if data["ON"]:
-        data["Excite"] = led
-    yield from ()
-
-
-def _characterise(s: Software, m: str, program: str) -> Steps:
+def _characterise(s: Software, m: str, program: str) -> None:
     """Its thread dies with a TypeError for M0 to M7; with 0 it would sweep LEDs for minutes."""
     add_terminal(s.app(m).data, s.computer.stamp(), f"Characterisation {program} requested")
-    yield from ()
-
-
-def _nothing(s: Software) -> Steps:
-    yield from ()
 
 
 ROUTES = (
-    Route("GET", "/", _nothing),
-    Route("GET", "/getSysdata/", _nothing),
+    Route("GET", "/", lambda s: None),
+    Route("GET", "/getSysdata/", lambda s: None),
     Route("POST", "/changeDevice/*", _change),
     Route("POST", "/scanDevices/*", _scan),
     Route("POST", "/SetOutputTarget/*/*/*", _set_target),
     Route("POST", "/SetOutputOn/*/*/*", _set_on),
     Route("POST", "/Direction/*/*", _direction),
-    Route("POST", "/MeasureOD/*", _measure_od),
+    Route("POST", "/MeasureOD/*", lambda s, m: s.app(m).optics.measure_od()),
     Route("POST", "/CalibrateOD/*/*/*/*", _calibrate),
     Route("POST", "/MeasureTemp/*/*", _measure_temperature),
-    Route("POST", "/MeasureFP/*", _measure_fp),
+    Route("POST", "/MeasureFP/*", lambda s, m: s.app(m).optics.measure_fluorescence()),
     Route("POST", "/GetSpectrum/*/*", _spectrum),
-    Route("POST", "/Experiment/*/*", _experiment),
+    Route("POST", "/Experiment/*/*", lambda s, value, m: s.app(m).experiment.start_or_stop(int(value))),
     Route("POST", "/ExperimentReset", _reset),
-    Route("POST", "/ClearTerminal/*", _clear),
+    Route("POST", "/ClearTerminal/*", lambda s, m: clear_terminal(s.app(m).data, s.computer.stamp())),
     Route("POST", "/SetFPMeasurement/*/*/*/*/*/*", _set_fp),
     Route("POST", "/SetCustom/*/*", _set_custom),
-    Route("POST", "/SetLightActuation/*", _set_light),
+    Route("POST", "/SetLightActuation/*", lambda s, led: _toggle(s.apps[s.selected].data["Light"], Excite=led)),
     Route("POST", "/CharacteriseDevice/*/*", _characterise),
 )
 
@@ -197,7 +189,7 @@ def answer_request(software: Software, exchange: Exchange) -> Generator[float, N
         return 403, b"<!doctype html>\n<title>403 Forbidden</title>\n", HTML
     if found.method == "POST":
         if not faults.take("lying"):
-            yield from found.run(software, *arguments)
+            yield from found.run(software, *arguments) or ()
         return 204, b"", HTML
     if found.path == "/":
         return 200, b"<!doctype html>\n<title>Chi.Bio emulator</title>\n", HTML

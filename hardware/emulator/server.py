@@ -26,11 +26,10 @@ import numpy as np
 
 from conf.presets import groups
 from hardware.clock import RealClock
-from hardware.emulator.device import ChiBioDevice, DeviceOptions
-from hardware.emulator.exchange import Exchange
+from hardware.emulator.device import ChiBioDevice, DeviceOptions, plant_preset
 from hardware.emulator.faults import FAULTS, inject
-from hardware.emulator.plants import plant_preset
-from hardware.emulator.vial_config import SPARE, VialConfig
+from hardware.emulator.routes import Exchange
+from hardware.emulator.vial import SPARE, VialConfig
 
 __all__ = ["EmulatorServer", "main"]
 
@@ -117,7 +116,10 @@ class EmulatorServer:
                     inject(device, parts[1], reactor, float(value))
                     return 204, b""
                 if method == "GET" and parts == ["truth"]:
-                    return 200, _json({name: device.truth(name) for name in device.vials} | self._state())
+                    s = device.supervisor
+                    software = {"alive": s.alive, "restarts": s.restarts, "exits": s.exits}
+                    seen = {"selected": s.worker.software.selected, "errors": list(device.computer.errors)}
+                    return 200, _json({**{m: device.truth(m) for m in device.vials}, **software, **seen})
                 if method == "GET" and parts[0] in ("doses", "samples") and parts[1:] in [[m] for m in device.vials]:
                     return 200, _json([row._asdict() for row in getattr(device.vials[parts[1]], parts[0])])
                 if method == "GET" and parts == ["faults"]:
@@ -125,16 +127,6 @@ class EmulatorServer:
             except ValueError as problem:
                 return 400, f"{problem}\n".encode()
         return 404, b"allowed: POST fault/<name>/<M>/<value>, GET truth, doses/<M>, samples/<M>, faults\n"
-
-    def _state(self) -> dict[str, object]:
-        s = self.device.supervisor
-        return {
-            "alive": s.alive,
-            "restarts": s.restarts,
-            "exits": s.exits,
-            "selected": s.worker.software.selected,
-            "errors": list(self.device.computer.errors),
-        }
 
 
 def _json(value: object) -> bytes:
@@ -249,34 +241,28 @@ class _DeviceHandler(_Handler):
 def parser() -> argparse.ArgumentParser:
     """Arguments of the program."""
     p = argparse.ArgumentParser(prog="python -m hardware.emulator", description="Emulated Chi.Bio behind HTTP.")
-    p.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
-    p.add_argument("--port", type=int, default=5000, help="port of the device; 0 = any free one (default %(default)s)")
-    p.add_argument("--control-port", type=int, help="port of /_emulator/ (default: port + 1)")
-    p.add_argument("--reactors", default="M0", help="positions with a reactor, e.g. M0,M1,M2 (default %(default)s)")
-    p.add_argument("--speed", type=float, default=1.0, help="device seconds per real second (default %(default)s)")
-    p.add_argument("--seed", type=int, default=0, help="of all noise (default %(default)s)")
-    p.add_argument("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
-    p.add_argument("--temperature", type=float, default=37.0, help="initial, degC (default %(default)s)")
-    p.add_argument(
-        "--plant",
-        choices=groups()["plant"],
-        default="healthy",
-        help="preset of cultures and pumps (default %(default)s)",
-    )
-    p.add_argument(
-        "--overflow-pump", choices=SPARE, default="", help="pump that keeps a vial from overflowing (default: none)"
-    )
-    p.add_argument("--overflow-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
-    default = VialConfig()
-    p.add_argument(
+    add, start = p.add_argument, VialConfig()
+    add("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
+    add("--port", type=int, default=5000, help="port of the device; 0 = any free one (default %(default)s)")
+    add("--control-port", type=int, help="port of /_emulator/ (default: port + 1)")
+    add("--reactors", default="M0", help="positions with a reactor, e.g. M0,M1,M2 (default %(default)s)")
+    add("--speed", type=float, default=1.0, help="device seconds per real second (default %(default)s)")
+    add("--seed", type=int, default=0, help="of all noise (default %(default)s)")
+    add("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
+    add("--temperature", type=float, default=37.0, help="initial, degC (default %(default)s)")
+    plants = groups()["plant"]
+    add("--plant", choices=plants, default="healthy", help="preset of cultures and pumps (default %(default)s)")
+    add("--overflow-pump", choices=SPARE, default="", help="pump that keeps a vial from overflowing (default: none)")
+    add("--overflow-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
+    add(
         "--pump-start",
         type=float,
         nargs=2,
         metavar=("LOW", "HIGH"),
-        default=(default.pump_start_low_s, default.pump_start_high_s),
+        default=(start.pump_start_low_s, start.pump_start_high_s),
         help="from the answer to a pump command until its motor turns, s (default %(default)s)",
     )
-    p.add_argument("--unblanked", action="store_true", help="start with the zero at 65000, as after power-on")
+    add("--unblanked", action="store_true", help="start with the zero at 65000, as after power-on")
     return p
 
 

@@ -1,4 +1,9 @@
-"""The device's software between two starts: one app per position, and which of them the web page shows."""
+"""The device's software between two starts: one app per position, and which of them the web page shows.
+
+Every activity that the device runs in a thread, or that makes a caller wait, is a generator that yields the seconds it
+sleeps; `ChiBioDevice` runs them on device time. Races between threads of the real software are therefore the same races
+between generators. Source: docs/device.md, checked against runs of the real software described there.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +12,29 @@ import re
 from collections.abc import Mapping
 
 from hardware.emulator.computer import Computer
-from hardware.emulator.reactor_app import ReactorApp
+from hardware.emulator.experiment import Experiment
+from hardware.emulator.optics import Optics
+from hardware.emulator.outputs import Outputs, Position
 from hardware.emulator.sysdata import ALL_REACTORS
 from hardware.emulator.vial import Vial
 
-__all__ = ["Software"]
+__all__ = ["ReactorApp", "Software"]
+
+
+class ReactorApp(Position):
+    """A position with its outputs, its optics and its experiment; arguments as `Position`."""
+
+    def __init__(self, name: str, computer: Computer, vial: Vial | None, device_id: str, selected: str) -> None:
+        super().__init__(name, computer, vial, device_id, selected)
+        self.outputs = Outputs(self)
+        self.optics = Optics(self, self.outputs)
+        self.experiment = Experiment(self, self.outputs, self.optics)
+
+    def initialise(self, selected: str) -> None:
+        """`initialise()`: everything forgotten. Threads of before stay alive, as they do on the device."""
+        self.forget(selected)
+        self.outputs.forget()
+        self.experiment.forget()
 
 
 class Software:

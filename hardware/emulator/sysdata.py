@@ -6,16 +6,9 @@ from collections.abc import Iterator
 from typing import Any
 
 __all__ = [
-    "ALL_REACTORS",
-    "LIGHTS",
-    "PUMPS",
-    "SLOTS",
-    "add_terminal",
-    "append_records",
-    "clear_terminal",
-    "fresh_sysdata",
-    "thin_records",
-]
+    "ALL_REACTORS", "LIGHTS", "PUMPS", "SLOTS", "SysData", "add_terminal", "append_records", "clear_terminal",
+    "fresh_sysdata", "thin_records",
+]  # fmt: skip
 
 SysData = dict[str, Any]
 
@@ -24,17 +17,9 @@ PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")
 SLOTS = ("FP1", "FP2", "FP3")
 BANDS = ("nm410", "nm440", "nm470", "nm510", "nm550", "nm583", "nm620", "nm670", "CLEAR", "NIR")
 WAVELENGTHS = {
-    "LEDA": "395",
-    "LEDB": "457",
-    "LEDC": "500",
-    "LEDD": "523",
-    "LEDE": "595",
-    "LEDF": "623",
-    "LEDG": "6500K",
-    "LEDH": "600",
-    "LEDI": "550",
-    "LEDV": "White",
-}
+    "LEDA": "395", "LEDB": "457", "LEDC": "500", "LEDD": "523", "LEDE": "595", "LEDF": "623", "LEDG": "6500K",
+    "LEDH": "600", "LEDI": "550", "LEDV": "White",
+}  # fmt: skip
 LIGHTS = tuple(WAVELENGTHS)
 UNSET_ZERO = 65000.0  # OD0 after every initialise: the blank is forgotten
 
@@ -52,19 +37,9 @@ def _pump() -> SysData:
 
 def _slot(led: str, emit1: str, emit2: str) -> SysData:
     return {
-        "ON": 0,
-        "LED": led,
-        "Base": 0,
-        "Emit1": 0,
-        "Emit2": 0,
-        "BaseBand": "CLEAR",
-        "Emit1Band": emit1,
-        "Emit2Band": emit2,
-        "Gain": "x10",
-        "BaseRecord": [],
-        "Emit1Record": [],
-        "Emit2Record": [],
-    }
+        "ON": 0, "LED": led, "Base": 0, "Emit1": 0, "Emit2": 0, "BaseBand": "CLEAR", "Emit1Band": emit1,
+        "Emit2Band": emit2, "Gain": "x10", "BaseRecord": [], "Emit1Record": [], "Emit2Record": [],
+    }  # fmt: skip
 
 
 def fresh_sysdata(device_id: str, selected: str) -> SysData:
@@ -82,62 +57,28 @@ def fresh_sysdata(device_id: str, selected: str) -> SysData:
         "Version": {"value": "Turbidostat V3.0", "LED": 1},
         "time": {"record": []},
         "Experiment": {
-            "ON": 0,
-            "cycles": 0,
-            "cycleTime": 60.0,
-            "indicator": "USR0",
-            "startTime": " Waiting ",
-            "startTimeRaw": 0,
+            "ON": 0, "cycles": 0, "cycleTime": 60.0, "indicator": "USR0", "startTime": " Waiting ", "startTimeRaw": 0,
             "threadCount": 0,
         },
         "OD": {
-            "current": 0.0,
-            "target": 0.5,
-            "default": 0.5,
-            "max": 10,
-            "min": 0,
-            "record": [],
-            "targetrecord": [],
-            "Measuring": 0,
-            "ON": 0,
-            "Integral": 0.0,
-            "Integral2": 0.0,
-            "device": "LASER650",
+            "current": 0.0, "target": 0.5, "default": 0.5, "max": 10, "min": 0, "record": [], "targetrecord": [],
+            "Measuring": 0, "ON": 0, "Integral": 0.0, "Integral2": 0.0, "device": "LASER650",
         },
         "OD0": {
-            "target": UNSET_ZERO,
-            "raw": UNSET_ZERO,
-            "max": 100000.0,
-            "min": 0.0,
-            "LASERa": 0.226,
-            "LASERb": 1.833,
-            "LEDAa": 7.0,
-            "LEDFa": 0.673,
+            "target": UNSET_ZERO, "raw": UNSET_ZERO, "max": 100000.0, "min": 0.0, "LASERa": 0.226, "LASERb": 1.833,
+            "LEDAa": 7.0, "LEDFa": 0.673,
         },
         **{pump: _pump() for pump in PUMPS},
         "Stir": _output(0.5),
         "Heat": {**_output(0), "record": []},
-        "Thermostat": {
-            **_output(37.0),
-            "max": 50.0,
-            "Integral": 0,
-            "last": -1,
-            "cycleTime": 30.0,
-            "record": [],
-        },
+        "Thermostat": {**_output(37.0), "max": 50.0, "Integral": 0, "last": -1, "cycleTime": 30.0, "record": []},
         **{f"Thermometer{name}": {"current": 0.0, "record": []} for name in ("IR", "Internal", "External")},
         "Volume": {"ON": 0, "target": 20.0, "max": 50.0, "min": 0.0},
         "Chemostat": {"ON": 0, "p1": 0.0, "p2": 0.1},
         "Zigzag": {"ON": 0, "Zig": 0.04, "target": 0.0, "SwitchPoint": 0},
         "GrowthRate": {"current": 2.0, "default": 2.0, "record": []},
         "Custom": {
-            "ON": 0,
-            "Program": "C1",
-            "Status": 0.0,
-            "default": 0.0,
-            "param1": 0.0,
-            "param2": 0.0,
-            "param3": 0.0,
+            "ON": 0, "Program": "C1", "Status": 0.0, "default": 0.0, "param1": 0.0, "param2": 0.0, "param3": 0.0,
             "record": [],
         },
         "Light": {**_output(0.5), "Excite": "LEDD", "record": []},
@@ -154,7 +95,7 @@ def fresh_sysdata(device_id: str, selected: str) -> SysData:
         },
         "biofilm": {led: dict.fromkeys(BANDS, 0) for led in (*LIGHTS[:7], "LASER650")},
         "Terminal": {"text": ""},
-    }
+    }  # fmt: skip
     data["LEDV"]["ScaleFactor"] = 0.4
     return data
 

@@ -27,14 +27,6 @@ class EmulatorTransport(Transport):
         self._device, self._timeout_s = device, timeout_s
         self._clock: Clock = device.clock
 
-    def get(self, path: str) -> Reply:
-        """Raises: LinkError when no answer came."""
-        return self._request("GET", path)
-
-    def post(self, path: str) -> Reply:
-        """Raises: LinkError when no answer came; the device may have acted all the same."""
-        return self._request("POST", path)
-
     def _request(self, method: str, path: str) -> Reply:
         device, clock = self._device, self._clock
         device.run_until(clock.now())

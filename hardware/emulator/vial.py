@@ -7,16 +7,22 @@ electronics (power, motors, faults) are here, because the device sees counts, no
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from conf.schema import check, require, setting
 from envs.plant.plant import Plant
-from hardware.emulator.spectrometer import Spectrometer
-from hardware.emulator.vial_config import FEED, SPARE, WASTE, VialConfig, VialFaults
+from envs.plant.sensor import density
 
-__all__ = ["Dose", "Sample", "Vial"]
+__all__ = ["FEED", "SPARE", "WASTE", "Dose", "Sample", "Spectrometer", "Vial", "VialConfig", "VialFaults"]
 
+FEED, WASTE = "Pump1", "Pump2"
+SPARE = ("Pump3", "Pump4")
+
+FULL_SCALE = 65535
+DARK_COUNTS = 3.0  # what the spectrometer counts without light
 LONGEST_STEP_S = 60.0
 SENSOR_STEP_S = 2.0
 STIR_SETTLE_S = 2.0  # readings sooner after the stirrer stopped are still disturbed
@@ -40,6 +46,120 @@ class Sample(NamedTuple):
     stored_s: float
     sample_s: float
     od: float
+
+
+@dataclass(frozen=True)
+class VialConfig:
+    """Optics and electronics of a reactor.
+
+    The blank is drawn once per reactor (docs/device.md, OD measurement). With the default noise the mean of four
+    readings has sd 0.0036 at OD 0.5 (docs/biology.md, Sensor). A motor's start is what the thread's register writes
+    take on the bus: 0.2 to 0.7 s is what the device's own software took on simulated electronics with bus time.
+    """
+
+    blank_low: float = setting(11600.0, "least counts of clear medium", within=(3000, 60000))
+    blank_high: float = setting(15800.0, "and most", at_most=60000.0)
+    noise_fraction: float = setting(0.003, "sd of one reading, as a fraction of raw", within=(0, 0.2))
+    common_fraction: float = setting(
+        0.004, "sd that all readings of one measurement share, as a fraction of raw", within=(0, 0.2)
+    )
+    outlier_rate: float = setting(0.006, "per measurement: an isolated jump of more than 0.04 OD", within=(0, 1))
+    stir_factor: float = setting(0.4, "raw while stirring, relative to still", within=(0.05, 1))
+    stir_noise: float = setting(0.05, "its spread", within=(0, 0.5))
+    on_time_bias_low_s: float = setting(
+        0.02, "a pump runs at least so much longer than asked (docs/device.md, Pumps)", "s", within=(0, 1)
+    )
+    on_time_bias_high_s: float = setting(0.2, "and at most", "s", at_most=1.0)
+    pump_start_low_s: float = setting(
+        0.2, "least time from the answer to a pump command until the motor turns", "s", within=(0, 5)
+    )
+    pump_start_high_s: float = setting(0.7, "and most", "s", at_most=5.0)
+    air_c: float = setting(24.0, "air outside", "degC", within=(0, 45))
+    overflow_pump: str = setting("", "pump whose tube ends a little above the waste tube", choices=(*SPARE, ""))
+
+    def __post_init__(self) -> None:
+        check(self, "vial")
+        for key, low, high in (
+            ("blank_high", self.blank_low, 60000.0),
+            ("on_time_bias_high_s", self.on_time_bias_low_s, 1.0),
+            ("pump_start_high_s", self.pump_start_low_s, 5.0),
+        ):
+            require(low <= getattr(self, key), f"vial.{key}", getattr(self, key), f"{low:g} to {high:g}")
+
+
+@dataclass
+class VialFaults:
+    """What is broken at one reactor, as in `faults.FAULTS`; may be set at any time."""
+
+    unplugged: bool = False
+    od_frozen: bool = False
+    od_offset: float = 0.0
+    od_jump: float = 0.0
+    spectrometer_dead: bool = False
+    spectrometer_dark: bool = False
+    spectrometer_glitch: float = 0.0
+    feed_stuck_open: bool = False
+    waste_stuck_open: bool = False
+    heater_runaway: bool = False
+    stirrer_dead: bool = False
+
+
+class Spectrometer:
+    """One laser and the chip that counts its light.
+
+    Args: config: optics; faults: what is broken, may change at any time; rng: noise of this reactor.
+    `blank` is the count of clear medium.
+    """
+
+    def __init__(self, config: VialConfig, faults: VialFaults, rng: np.random.Generator) -> None:
+        self._config, self._faults, self._rng = config, faults, rng
+        self.blank = float(rng.uniform(config.blank_low, config.blank_high))
+        self._lit, self._lit_before, self._laser_since = 0.0, 0.0, np.nan
+        self._common, self._jump, self._measured_at, self._last_raw = 0.0, 0.0, -np.inf, 0
+
+    def set_laser(self, on: bool, at: float) -> None:
+        """Laser on or off."""
+        if not np.isnan(self._laser_since):
+            self._lit += at - self._laser_since
+        self._laser_since = at if on else np.nan
+
+    def begin_exposure(self, at: float) -> None:
+        """The spectrometer starts integrating, and forgets what another thread had begun to integrate."""
+        self._lit_before = self._lit_s(at)
+
+    def _lit_s(self, at: float) -> float:
+        """Total time the laser has been on."""
+        return self._lit + (0.0 if np.isnan(self._laser_since) else at - self._laser_since)
+
+    def counts(self, at: float, exposure_s: float, od: float, moving: bool) -> int:
+        """One spectrometer reading of the laser, 16-bit counts.
+
+        raw = blank 10^-R with LINEAR R + QUADRATIC R^2 = what a noise-free sensor would show; stirred or half-lit
+        readings are lower.
+        Args:
+          at: device s; exposure_s: how long it should have been lit since `begin_exposure`.
+          od: what a noise-free sensor would show, OD; moving: whether the vial's content is in motion.
+        """
+        f, c, rng = self._faults, self._config, self._rng
+        if at - self._measured_at > 10.0:  # a new measurement: what its readings share is drawn again
+            self._common, self._jump = rng.normal(0.0, c.common_fraction), f.od_jump
+            f.od_jump = 0.0
+            if rng.random() < c.outlier_rate:
+                self._jump += (0.04 + rng.exponential(0.05)) * (1.0 if rng.random() < 0.54 else -1.0)
+        self._measured_at = at
+        if f.spectrometer_dark:
+            return 0
+        if f.spectrometer_dead or rng.random() < f.spectrometer_glitch:
+            return 1
+        if f.od_frozen and self._last_raw > 0:
+            return self._last_raw
+        light = self.blank * 10.0 ** -float(density(od + f.od_offset + self._jump))
+        if moving:
+            light *= max(c.stir_factor * (1.0 + rng.normal(0.0, c.stir_noise)), 0.01)
+        light *= 1.0 + self._common + rng.normal(0.0, c.noise_fraction)
+        lit = min((self._lit_s(at) - self._lit_before) / exposure_s, 1.0)
+        self._last_raw = int(np.clip(round(DARK_COUNTS + light * lit), 0, FULL_SCALE))
+        return self._last_raw
 
 
 class Vial:
@@ -154,9 +274,8 @@ class Vial:
         thermal, plant = self.plant.config.thermal, self.plant
         heat = 1.0 if self.faults.heater_runaway and self.powered else self.heat
         minutes = seconds / 60.0
-        cooled = thermal.ambient_c + (plant.thermal.temperature - thermal.ambient_c) * np.exp(
-            -minutes / thermal.cooling_min
-        )
+        kept = np.exp(-minutes / thermal.cooling_min)
+        cooled = thermal.ambient_c + (plant.thermal.temperature - thermal.ambient_c) * kept
         still = self.stir == 0.0 and self._at + seconds - self._stirred_at > STIR_STOPPED_S
         plant.culture.stir_factor[:] = 0.0 if still else 1.0
         plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, overflow)
@@ -183,20 +302,12 @@ class Vial:
     def truth(self, at: float) -> dict[str, Any]:
         """What no client can know of the reactor at device time `at`."""
         self.sync(at)
-        plant = self.plant
+        plant, vessel = self.plant, self.plant.vessel
         return {
-            "od": float(plant.culture.od[0]),
-            "apparent_od": float(plant.apparent_od[0]),
-            "temperature": float(plant.thermal.temperature[0]),
-            "volume_ml": float(plant.vessel.volume_ml[0]),
-            "peak_ml": self.peak_ml,
-            "overflowed": bool(plant.vessel.overflowed[0]),
-            "feed_ml": float(plant.feed.delivered_ml[0]),
-            "media_left_ml": float(plant.feed.media_left_ml[0]),
-            "on_s": dict(self.on_s),
-            "motors": {pump: self.motor(pump) for pump in self.on_s},
-            "heat": self.heat,
-            "stir": self.stir,
-            "powered": self.powered,
-            "blank": self.spectrometer.blank,
-        }
+            "od": float(plant.culture.od[0]), "apparent_od": float(plant.apparent_od[0]),
+            "temperature": float(plant.thermal.temperature[0]), "volume_ml": float(vessel.volume_ml[0]),
+            "peak_ml": self.peak_ml, "overflowed": bool(vessel.overflowed[0]),
+            "feed_ml": float(plant.feed.delivered_ml[0]), "media_left_ml": float(plant.feed.media_left_ml[0]),
+            "on_s": dict(self.on_s), "motors": {pump: self.motor(pump) for pump in self.on_s},
+            "heat": self.heat, "stir": self.stir, "powered": self.powered, "blank": self.spectrometer.blank,
+        }  # fmt: skip

@@ -8,21 +8,19 @@ from urllib.parse import urlsplit
 import httpx
 
 from hardware.errors import LinkError, ProtocolError
-from hardware.link.transport import MAX_BODY, Reply, TransportConfig
+from hardware.link.transport import MAX_BODY, Reply, Transport, TransportConfig
 
 __all__ = ["HttpTransport"]
 
 
-class HttpTransport:
+class HttpTransport(Transport):
     """HTTP to a Chi.Bio server, one connection per request (its gunicorn worker closes each one anyway).
 
     Proxies of the environment are ignored, redirects are not followed, compression is not asked for, and the whole
     answer must come within `read_s`, so that a server that dribbles bytes cannot hold the control loop.
 
     Args:
-      url: http://host:port of the device.
-      speed: device seconds per real second (1 on the bench).
-      config: time-outs.
+      url: http://host:port of the device; speed: device seconds per real second (1 on the bench).
     Raises: ValueError for a malformed address; LinkError, ProtocolError from the calls.
     """
 
@@ -44,17 +42,6 @@ class HttpTransport:
             headers={"X-Requested-With": "XMLHttpRequest", "Accept-Encoding": "identity", "Connection": "close"},
             trust_env=False,
         )
-
-    def get(self, path: str) -> Reply:
-        """GET `path`. Raises: LinkError, ProtocolError."""
-        return self._request("GET", path)
-
-    def post(self, path: str) -> Reply:
-        """POST `path` without a body. Raises: LinkError (the device may have acted), ProtocolError."""
-        return self._request("POST", path)
-
-    def disarm(self) -> None:
-        """Nothing: no switch on this way."""
 
     def close(self) -> None:
         """Close the client. Idempotent."""

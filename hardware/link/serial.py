@@ -1,54 +1,77 @@
-"""The serial line to the board agent, which carries the requests to the device's server."""
+"""The serial line to the board agent, which carries the requests to the device's server.
+
+Frames are those of protocol 1, described in `hardware/board/board_agent.py`.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import random
+import re
 import time
+import zlib
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hardware.errors import LinkError, ProtocolError
-from hardware.link.frames import MAX_REQUEST, decode_header, encode_request
-from hardware.link.transport import MAX_BODY, Reply, TransportConfig
+from hardware.link.transport import MAX_BODY, Reply, Transport, TransportConfig
 
 if TYPE_CHECKING:
     import serial
 
-__all__ = ["SerialTransport"]
+__all__ = ["SerialTransport", "decode_header", "encode_request"]
+
+MAX_REQUEST = 512  # bytes of a request line with its newline
+_HEADER = re.compile(rb"^<(\d{1,10}) (\d{1,3}) (\d{1,6}) ([0-9a-f]{8})$")
 
 
-class SerialTransport:
+@dataclass(frozen=True)
+class ReplyHeader:
+    """What comes before the body of a reply: ID of the request (0: it was unreadable), status, bytes of body, CRC."""
+
+    number: int
+    status: int
+    length: int
+    crc: int
+
+    def fits(self, body: bytes) -> bool:
+        """Whether this header and `body` came undamaged."""
+        return zlib.crc32(b"<%d %d %d" % (self.number, self.status, self.length) + body) == self.crc
+
+
+def encode_request(number: int, method: str, path: str) -> bytes:
+    """A request line with its newline."""
+    head = f">{number} {method} {path}".encode("ascii")
+    return head + b" %08x\n" % zlib.crc32(head)
+
+
+def decode_header(line: bytes) -> ReplyHeader | None:
+    """The header at the end of a line without its newline, whatever stands before it; None if there is none."""
+    match = _HEADER.match(line[line.rfind(b"<") :]) if b"<" in line else None
+    return ReplyHeader(int(match[1]), int(match[2]), int(match[3]), int(match[4], 16)) if match else None
+
+
+class SerialTransport(Transport):
     """Framed requests over a serial line to `board_agent.py`; a line that was unplugged is reopened on the next call.
 
     The very same request line is repeated when its reply is lost or damaged: the agent answers a repeated ID from
     memory, so nothing is carried out twice. Opened exclusively, so that no second client can speak in between.
+    The state comes reduced (see `board_agent.py`).
 
     Args:
-      port: serial device or pyserial URL.
-      speed: device seconds per real second.
-      config: line rate and time-outs.
+      port: serial device or pyserial URL; speed: device seconds per real second.
       attempts: times one request line is sent before the link counts as lost.
     Raises: LinkError when the line cannot be opened or nothing comes back, ProtocolError when only garbage does.
     """
 
     def __init__(self, port: str, speed: float = 1.0, config: TransportConfig | None = None, attempts: int = 5) -> None:
-        self.port = port
+        self.port, self._speed, self._attempts = port, speed, attempts
         self._config = config or TransportConfig(kind="serial")
-        self._speed = speed
-        self._attempts = attempts
         self._line: serial.Serial | None = None
         self._id = 0
         self.hello: dict[str, Any] = {}
         self._open()
-
-    def get(self, path: str) -> Reply:
-        """GET `path`; /getSysdata/ comes reduced (see `board_agent.py`). Raises: LinkError, ProtocolError."""
-        return self._request("GET", path)
-
-    def post(self, path: str) -> Reply:
-        """POST `path`. Raises: LinkError (the device may have acted), ProtocolError."""
-        return self._request("POST", path)
 
     def disarm(self) -> None:
         """BYE to the agent, whose switch then rests until the next request."""
@@ -69,9 +92,8 @@ class SerialTransport:
                 self.port, baudrate=self._config.baud, timeout=connect_s, write_timeout=connect_s, exclusive=True
             )
         except (OSError, ValueError) as error:  # SerialException is an OSError
-            raise LinkError(
-                f"serial port {self.port}: {error}; check cable and port name, close other programs"
-            ) from error
+            remedy = "check cable and port name, close other programs"
+            raise LinkError(f"serial port {self.port}: {error}; {remedy}") from error
         self._id = random.SystemRandom().randrange(1, 2**31)  # so that no request repeats an ID of an earlier session
         try:
             self.hello = self._parse_hello(self._exchange("HELLO", "/"))
@@ -114,9 +136,8 @@ class SerialTransport:
         frame = encode_request(self._id, method, path)
         if len(frame) > MAX_REQUEST:
             raise ProtocolError(f"{method} {path[:40]}...: request of {len(frame)} bytes, allowed {MAX_REQUEST}")
-        seconds = self._config.timeout(
-            self._config.read_s if method in ("GET", "POST") else self._config.connect_s, self._speed
-        )
+        wait_s = self._config.read_s if method in ("GET", "POST") else self._config.connect_s
+        seconds = self._config.timeout(wait_s, self._speed)
         garbage = 0
         last_try = time.monotonic() + 1.5 * seconds  # however many replies are damaged, no third full time-out
         try:

@@ -30,10 +30,14 @@ class Transport(Protocol):
 
     def get(self, path: str) -> Reply:
         """Raises: LinkError when no answer came."""
-        ...
+        return self._request("GET", path)
 
     def post(self, path: str) -> Reply:
         """POST without a body. Raises: LinkError when no answer came; the device may have acted all the same."""
+        return self._request("POST", path)
+
+    def _request(self, method: str, path: str) -> Reply:
+        """One request over this link, GET or POST. Raises: as `get` and `post`."""
         ...
 
     def disarm(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hardware.reactor import Array, Mask
 from hardware.safety.config import SafetyConfig
-from hardware.safety.finding import Finding
+from hardware.safety.readings import Finding
 
 __all__ = ["FeedBudget"]
 

@@ -25,20 +25,9 @@ class Response(IntEnum):
     STOP = 4
 
 
-WORDS = {
-    "report": Response.PASS,
-    "hold": Response.HOLD,
-    "pumps_off": Response.PUMPS_OFF,
-    "regulate": Response.REGULATE,
-    "stop": Response.STOP,
-}
-DONE = {
-    Response.PASS: "reported",
-    Response.HOLD: "no dose",
-    Response.PUMPS_OFF: "pumps off",
-    Response.REGULATE: "handed over to the on-board regulation",
-    Response.STOP: "stopped",
-}
+WORDS = dict(zip(("report", "hold", "pumps_off", "regulate", "stop"), Response, strict=True))
+_DONE = ("reported", "no dose", "pumps off", "handed over to the on-board regulation", "stopped")
+DONE = dict(zip(Response, _DONE, strict=True))
 
 REMEDIES = {
     "setpoint": "correct the schedule: setpoints are OD over 0 and at most the configured maximum",

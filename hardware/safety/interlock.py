@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 from hardware.reactor import Array, Mask, Measurement, Receipt
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import DONE, REMEDIES, WORDS, Response, SafetyConfig
-from hardware.safety.finding import Finding
-from hardware.safety.heat import Heat
-from hardware.safety.readings import Readings
+from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
 __all__ = ["Interlock", "Verdict"]
@@ -49,9 +47,6 @@ class Verdict:
 class Interlock:
     """Stands between controllers and pumps of N reactors: asks its four parts, then concludes.
 
-    Args:
-      n: number of reactors.
-      config: limits and declared responses.
     Attributes: budget, the ledger of feed and level.
     """
 
@@ -61,6 +56,7 @@ class Interlock:
         self._readings = Readings(n, self.config)
         self._change = UnexplainedChange(n, self.config)
         self._heat = Heat(n, self.config)
+        self._parts = (self.budget, self._readings, self._change, self._heat)
         self._hold_until_s = np.full(n, -math.inf)
         self._hold_kind = np.full(n, -1.0)  # index into REMEDIES
         self._latched = np.zeros(n)  # a `Response` that no later one may fall below
@@ -141,9 +137,7 @@ class Interlock:
     def confirm(self, receipt: Receipt, now: float) -> None:
         """Book what was dosed; without a waste pump in the model the level stays at its tube.
 
-        Args:
-          receipt: of the command that followed `check`.
-          now: monotonic time of the dose, s.
+        Args: receipt: of the command that followed `check`; now: monotonic time of the dose, s.
         """
         feed = np.asarray(receipt.volume_ml, dtype=np.float64)
         waste = np.full(self.n, math.inf) if receipt.waste_ml is None else np.asarray(receipt.waste_ml)
@@ -162,8 +156,7 @@ class Interlock:
 
     def _arrays(self) -> dict[str, Array]:
         own = {"_hold_until_s": self._hold_until_s, "_hold_kind": self._hold_kind, "_latched": self._latched}
-        parts = (self.budget, self._readings, self._change, self._heat)
-        return {key: array for part in parts for key, array in part.state().items()} | own
+        return {key: array for part in self._parts for key, array in part.state().items()} | own
 
     def restore(self, state: Any) -> None:
         """The inverse of `state`, of an interlock that has not been used; None stands for nan or -inf, as in JSON.
@@ -174,7 +167,7 @@ class Interlock:
         for key, codes in (("_latched", list(Response)), ("_hold_kind", range(-1, len(REMEDIES)))):
             if not np.isin(saved[key], np.array(codes)).all():
                 raise ValueError(f"saved interlock: {key} = {state[key]}: no such code")
-        for part in (self.budget, self._readings, self._change, self._heat):
+        for part in self._parts:
             part.restore(saved)
         self._hold_until_s = np.where(np.isnan(saved["_hold_until_s"]), -math.inf, saved["_hold_until_s"])
         self._hold_kind, self._latched = saved["_hold_kind"], saved["_latched"]

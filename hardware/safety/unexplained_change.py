@@ -9,7 +9,7 @@ import numpy as np
 
 from hardware.reactor import Array, Mask
 from hardware.safety.config import SafetyConfig
-from hardware.safety.finding import Finding
+from hardware.safety.readings import Finding
 
 __all__ = ["UnexplainedChange"]
 
@@ -109,15 +109,13 @@ class UnexplainedChange:
         self._futile = np.where(helpless | rising, 0.0, futile)
         return [
             Finding(
-                "no_dilution", rising, lambda i: f"the pump ran, ln OD is {excess[i]:.2f} above what it must be",
-                cool=rising,
+                "no_dilution", rising, lambda i: f"the pump ran, ln OD is {excess[i]:.2f} above what it must be", rising
             ),
             Finding(
-                "falls", falling, lambda i: f"ln OD is {deficit[i]:.2f} below what growth and doses explain",
-                cool=falling,
+                "falls", falling, lambda i: f"ln OD is {deficit[i]:.2f} below what growth and doses explain", falling
             ),
             Finding("cannot_hold", helpless, lambda i: f"at full feed OD {od[i]:.3f} does not fall"),
-        ]  # fmt: skip
+        ]
 
     def dosed(self, feed_ml: Array) -> None:
         """Book what was dosed, mL, shape (N,)."""

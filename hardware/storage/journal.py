@@ -80,14 +80,13 @@ class Journal:
       wall: clock of the day, s since 1970; only ever for the record and for the position of a resumed run.
       fsync: False leaves the flushing to the operating system: survives a kill, not a power cut (simulated runs).
     Attributes: cut, bytes of a torn last line that were removed on opening; rows, what was there before: all of it in a
-      file of up to 20 MB, else its first row, those of the kinds in LANDMARKS, and the last 20 MB.
+      file of up to 20 MB, else its first row, those of the kinds in LANDMARKS, and the last 20 MB; next_row, the number
+      the next row will have.
     Raises: RecordingError if the file cannot be opened, read or written; the message says what to do.
     """
 
     def __init__(self, path: Path, wall: Callable[[], float] = time.time, fsync: bool = True) -> None:
-        self.path = path
-        self._wall = wall
-        self._fsync = fsync
+        self.path, self._wall, self._fsync = path, wall, fsync
         try:
             size = path.stat().st_size if path.exists() else 0
             before = max(size - TAIL, 0)
@@ -108,14 +107,14 @@ class Journal:
         except RecordingError:
             self.close()
             raise
-        self._n = self.rows[-1]["n"] + 1 if self.rows else 0
+        self.next_row = self.rows[-1]["n"] + 1 if self.rows else 0
         self._size = kept
 
     def append(self, kind: str, fields: Mapping[str, Any]) -> None:
         """Write one row. Raises: RecordingError if it is not wholly on disk; nothing half-written stays."""
         if self._file is None:
             raise RecordingError(f"journal {self.path}: written to after it was closed")
-        row = {"n": self._n, "wall": round(self._wall(), 3), "mono": round(time.monotonic(), 3), "kind": kind}
+        row = {"n": self.next_row, "wall": round(self._wall(), 3), "mono": round(time.monotonic(), 3), "kind": kind}
         line = json.dumps(_plain({**row, **fields}), separators=(",", ":"), allow_nan=False).encode() + b"\n"
         try:
             written = os.write(self._file, line)
@@ -125,16 +124,10 @@ class Journal:
             if self._fsync:
                 os.fsync(self._file)
         except OSError as error:
-            raise RecordingError(
-                f"journal {self.path}: {error.strerror or error}; free disk space, then resume the run"
-            ) from error
-        self._n += 1
+            remedy = "free disk space, then resume the run"
+            raise RecordingError(f"journal {self.path}: {error.strerror or error}; {remedy}") from error
+        self.next_row += 1
         self._size += written
-
-    @property
-    def next_row(self) -> int:
-        """Number the next row will have."""
-        return self._n
 
     def close(self) -> None:
         """Release the file. Idempotent."""

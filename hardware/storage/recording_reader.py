@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,12 +21,12 @@ __all__ = ["Recording", "read_recording"]
 Array = NDArray[np.float64]
 
 TIME = {"exp_time": 1 / 60, "time_min": 1.0, "minutes": 1.0, "min": 1.0, "time_s": 1 / 60, "time_h": 60.0}
-OD = {"od_measured": 1.0, "od": 1.0}
-PUMP = {"pump_1_rate": 1.0, "pump_rate_ml_s": 1.0, "pump_rate": 1.0}
-TEMPERATURE = {"media_temp": 1.0, "temperature_degc": 1.0, "temperature_c": 1.0, "temperature": 1.0}
+OD = ("od_measured", "od")
+PUMP = ("pump_1_rate", "pump_rate_ml_s", "pump_rate")
+TEMPERATURE = ("media_temp", "temperature_degc", "temperature_c", "temperature")
 
 DUTY_COLUMN = "pump_1_rate"  # the Chi.Bio writes the share of full power, not a flow
-CHIBIO_BY_POSITION = {"exp_time": 0, "od_measured": 1, "media_temp": 8, "pump_1_rate": 10}
+CHIBIO_POSITIONS = (0, 1, 10, 8)  # of exp_time, od_measured, pump_1_rate, media_temp
 CHIBIO_COMMON_COLUMNS = 16  # the first 16 columns are the same in every release; later ones were inserted after them
 
 LOWEST_OD = -0.05  # blank error and noise reach this far below zero; a culture does not
@@ -160,9 +160,8 @@ def _layout(path: Path, first: Sequence[str], pump_ml_s: float) -> _Layout:
     if len(first) == 3:
         return _Layout("three columns without header (min, OD, mL/s)", (0, 1, 2, None), (1.0, 1.0, 1.0), None)
     if len(first) >= CHIBIO_COMMON_COLUMNS:
-        at = CHIBIO_BY_POSITION
-        index = (at["exp_time"], at["od_measured"], at["pump_1_rate"], at["media_temp"])
-        return _Layout("Chi.Bio without header, columns by position", index, (1 / 60, 1.0, pump_ml_s), None)
+        factor = (1 / 60, 1.0, pump_ml_s)
+        return _Layout("Chi.Bio without header, columns by position", CHIBIO_POSITIONS, factor, None)
     raise RecordingError(
         f"{path}: has {len(first)} columns and no header; without a header only 3 columns (minutes, OD, mL/s) or the "
         f"Chi.Bio's own (at least {CHIBIO_COMMON_COLUMNS}) are known; add a header such as time_min,od,pump_rate_ml_s"
@@ -172,7 +171,7 @@ def _layout(path: Path, first: Sequence[str], pump_ml_s: float) -> _Layout:
 def _named_layout(path: Path, first: Sequence[str], pump_ml_s: float) -> _Layout:
     names = [re.sub(r"[^a-z0-9]+", "_", cell.lower()).strip("_") for cell in first]
 
-    def find(known: Mapping[str, float]) -> str | None:
+    def find(known: Iterable[str]) -> str | None:
         return next((name for name in known if name in names), None)
 
     found = [find(TIME), find(OD), find(PUMP)]
@@ -182,16 +181,11 @@ def _named_layout(path: Path, first: Sequence[str], pump_ml_s: float) -> _Layout
                 f"{path}: no column for the {what}; looked for {', '.join(known)}; found {', '.join(first)[:120]}"
             )
     time, od, pump = (str(name) for name in found)
-    temperature = find(TEMPERATURE)
+    temperature, at = find(TEMPERATURE), names.index
     return _Layout(
         source="Chi.Bio CSV" if pump == DUTY_COLUMN else "recording with header",
-        index=(
-            names.index(time),
-            names.index(od),
-            names.index(pump),
-            None if temperature is None else names.index(temperature),
-        ),
-        factor=(TIME[time], OD[od], pump_ml_s if pump == DUTY_COLUMN else PUMP[pump]),
+        index=(at(time), at(od), at(pump), None if temperature is None else at(temperature)),
+        factor=(TIME[time], 1.0, pump_ml_s if pump == DUTY_COLUMN else 1.0),
         header=tuple(first),
         reactor=names.index("reactor") if "reactor" in names else None,
     )

@@ -10,7 +10,7 @@ from envs.plant.plant import PlantConfig
 from envs.plant.pump import PumpConfig
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions
-from hardware.emulator.vial_config import VialConfig
+from hardware.emulator.vial import VialConfig
 
 BLANK = 14000.0
 BIAS_S = 0.1  # every pump run is longer than asked by this

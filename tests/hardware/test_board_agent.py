@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 
 from hardware.board import board_agent
 from hardware.board.board_agent import Agent, Device, decode_request, encode_reply, reduce_sysdata
-from hardware.link.frames import decode_header, encode_request
+from hardware.link.serial import decode_header, encode_request
 from tests.hardware.emulator_lab import Lab
 from tests.hardware.test_emulator_server import Process
 

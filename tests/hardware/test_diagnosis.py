@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.diagnosis import Expected, diagnose, fault_of
+from hardware.chibio.diagnosis import diagnose, fault_of
 from hardware.chibio.protocol import DeviceState, parse_state
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
 from tests.hardware.script import state
@@ -21,7 +21,10 @@ def read(**values: Any) -> DeviceState:
 
 
 SOUND = replace(read(), running=True, cycles=5, blank=15000.0)
-EXPECTED = Expected(SOUND.start_time, 15000.0, math.nan, dosing=False, stuck="", overflow_trouble="")
+EXPECTED = {
+    "start_time": SOUND.start_time, "blank": 15000.0, "setpoint": math.nan, "dosing": False, "stuck": "",
+    "overflow_trouble": "",
+}  # fmt: skip
 ON = (True, False, False, False)
 
 
@@ -50,7 +53,7 @@ ON = (True, False, False, False)
 def test_each_fault_by_itself_and_the_gravest_first(
     found: dict[str, Any], expected: dict[str, Any], age_s: float, kind: str | None
 ) -> None:
-    fault = diagnose(replace(SOUND, **found), replace(EXPECTED, **expected), age_s, CONFIG)
+    fault = diagnose(replace(SOUND, **found), CONFIG, age_s=age_s, **{**EXPECTED, **expected})
     assert (fault.kind if fault else None) == kind
     assert fault is None or (fault.detail and fault.remedy)
 

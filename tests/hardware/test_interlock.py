@@ -11,7 +11,7 @@ from conf import presets
 from conf.schema import build
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
-from hardware.emulator.plants import plant_preset
+from hardware.emulator.device import plant_preset
 from hardware.reactor import Fault, Measurement, Receipt, Vitals
 from hardware.safety.config import REMEDIES, Response, Responses, SafetyConfig
 from hardware.safety.interlock import Interlock, Verdict

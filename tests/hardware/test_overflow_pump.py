@@ -12,10 +12,9 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import parse_state
 from hardware.chibio.resume import replay
-from hardware.emulator.device import DeviceOptions
-from hardware.emulator.plants import plant_preset
+from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.server import build, parser
-from hardware.emulator.vial_config import VialConfig
+from hardware.emulator.vial import VialConfig
 from hardware.errors import DeviceStateError
 from tests.hardware.driver_lab import DriverLab
 from tests.hardware.script import state
@@ -60,7 +59,7 @@ def test_there_is_none_by_default() -> None:
         ({"pump": "Pump3", "duty": 1.0}, "overflow_pump.duty = 1.0: allowed 0.1 to 0.95"),
         ({"duty": 0.05}, "overflow_pump.duty = 0.05: allowed"),
         ({"duty": math.nan}, "overflow_pump.duty = nan: allowed"),
-        ({"flow_ml_s": 0.0}, "overflow_pump.flow_ml_s = 0.0: allowed"),
+        ({"flow_ml_s": 0.0}, "overflow_pump.flow_ml_s = 0.0 mL/s: allowed"),
     ],
 )
 def test_values_out_of_range_name_key_value_and_range(values: dict[str, Any], message: str) -> None:

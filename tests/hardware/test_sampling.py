@@ -32,7 +32,7 @@ def test_a_sample_is_new_once_and_never_goes_back() -> None:
     assert not sampling.look(sample(60.0, 3), 0.0)  # cycles counts cycles begun
     assert not sampling.look(sample(0.0, 1), 0.0)
     assert sampling.look(sample(120.0, 3), 0.0)
-    sampling.forget()
+    sampling.key = None
     assert sampling.look(sample(0.0, 1), 0.0)
     sampling.pass_over(sample(0.0, 1))
     assert not sampling.look(sample(0.0, 1), 0.0)
