@@ -21,8 +21,7 @@ from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
 from experiments.cli import files, frame
-from experiments.training.config import TrainConfig
-from experiments.training.variants import variant
+from experiments.training.config import TrainConfig, variant
 from hardware.storage import atomic
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from dqn.config import DQNConfig
 from envs.optimum import OptimalPolicy, solve
 from envs.task import EnvConfig
 from experiments.cli import files, frame
-from experiments.training.variants import variant
+from experiments.training.config import variant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -136,13 +136,13 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
 
     from dqn.agent import STREAMS, DQNAgent
     from dqn.replay import Transition
-    from experiments.training import build, seeding
+    from experiments.training import build
     from experiments.training.evaluation import Evaluation, report_grid
 
     agent = variant(config.agent, name, config.fitted[name])
     seeds = range(config.seed, config.seed + config.n_agents)
     relabel = build.hindsight(config.env, agent)
-    learner = DQNAgent(agent, 2, config.env.n_actions, seeding.streams(seeds, STREAMS), relabel)
+    learner = DQNAgent(agent, 2, config.env.n_actions, build.streams(seeds, STREAMS), relabel)
     unit = solve(replace(config.env, start_od=(0.04, 3.9)), agent.gamma, setpoints=np.array([0.5]), grid=9001)
     numbers = [np.random.default_rng(seed) for seed in seeds]
     low, high = config.env.start_od

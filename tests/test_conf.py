@@ -18,9 +18,7 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame, help_page, reference
 from experiments.control.config import deploy_schema
-from experiments.training.config import TrainConfig
-from experiments.training.model_file import read_env_file
-from experiments.training.variants import variant
+from experiments.training.config import TrainConfig, read_env_file, variant
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.link.transport import TransportConfig
 from hardware.safety.config import SafetyConfig

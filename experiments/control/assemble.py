@@ -26,7 +26,7 @@ from experiments.control.policies import run_policy
 from experiments.control.record import Record
 from experiments.control.recovery import continue_loop
 from experiments.controllers import registry
-from experiments.training.model_file import read_env_file
+from experiments.training.config import read_env_file
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
 from hardware.errors import RecordingError
