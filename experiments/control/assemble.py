@@ -18,9 +18,8 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame
-from experiments.control.calibration_files import load_calibrations
 from experiments.control.config import DeployConfig
-from experiments.control.device import check, linked
+from experiments.control.device import check, linked, load_calibrations
 from experiments.control.loop import ClosedLoop
 from experiments.control.policies import run_policy
 from experiments.control.record import Record

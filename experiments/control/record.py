@@ -17,8 +17,7 @@ import numpy as np
 
 from experiments.cli import files
 from experiments.control.loop import Step
-from experiments.control.recovery import REBUILD, complete, read_rows
-from experiments.control.rows import COLUMNS, Array, Row, row_of
+from experiments.control.recovery import COLUMNS, REBUILD, Array, Row, complete, read_rows, row_of
 from experiments.reporting.tensorboard import Events
 from hardware.errors import RecordingError
 from hardware.storage.journal import Journal

@@ -19,9 +19,9 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
 from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
-from experiments.control.console import ChangeLog
 from experiments.control.loop import ClosedLoop
 from experiments.control.record import Record
+from experiments.control.summary import ChangeLog
 from experiments.controllers import registry
 from experiments.controllers.learned import LearnedController
 from hardware.chibio.config import ChiBioConfig
