@@ -11,8 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from envs.rewards import tracking_reward
-from envs.task import EnvConfig, step_factors
+from envs.task import EnvConfig, step_factors, tracking_reward
 
 __all__ = ["BioreactorVectorEnv", "EpisodeStreams", "action_space", "observation_space"]
 

@@ -18,9 +18,8 @@ from experiments.cli import files, frame
 from experiments.controllers.registry import STANDALONE
 from experiments.reliability.case import MOMENTS, FaultCase
 from experiments.reliability.faults import FAULTY, by_name
-from experiments.reliability.outcome import Outcome
+from experiments.reliability.outcome import Outcome, declared, table, totals, write_cases
 from experiments.reliability.rehearsal import rehearsed
-from experiments.reliability.tables import declared, table, totals, write_cases
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.safety.config import SafetyConfig
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from envs.actions import MAX_PUMP_RATE, pump_rates
 from envs.growth import DilutedCulture, Exponential
 from envs.integrators import rk4
+from envs.task import MAX_PUMP_RATE, pump_rates
 
 __all__ = ["OpenLoop", "open_loop"]
 

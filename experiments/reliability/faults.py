@@ -186,7 +186,6 @@ def control(rate: float | None) -> Act:
 
 INF = np.inf
 LINK = ("link", "stale", "lost", "restarted")
-SWITCHED_OFF = "found at the next sample and switched on again"
 FLOW = ("no_dilution", "cannot_hold")
 ONCE = "a single loss is read again, or the command repeated; the journal has it, and a dose hit by it a note"
 HELD = "feedback makes up for it; only weighing doses (experiments.calibrate_pump) tells it from a change of growth"

@@ -13,8 +13,7 @@ from dqn.hindsight import Relabel, goal_relabel
 from dqn.network import QNetwork
 from dqn.population import GROUP, Population
 from dqn.trainer import Trainer
-from envs.rewards import tracking_reward
-from envs.task import EnvConfig
+from envs.task import EnvConfig, tracking_reward
 from envs.vector_env import BioreactorVectorEnv
 from experiments.training.evaluation import Act
 
