@@ -6,14 +6,14 @@ Also the generator of the paper's open-loop protocol (generate=true) and the cov
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from conf.schema import check, meaning, part, require, setting
+from conf.schema import check, entries, part, require, setting
 from envs.identification.fit import Parameter
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series, row_spans
@@ -207,11 +207,11 @@ def environment_yaml(result: Calibration, source: str) -> str:
         f"# 95 % intervals: mu {mu.low:.6g} to {mu.high:.6g} 1/min, tau {tau.low:.6g} to {tau.high:.6g}.",
         *(f"# Warning: {w}." for w in result.warnings),
     ]
-    env = EnvConfig(mu=mu.value, tau=tau.value)
-    for f in fields(env):
-        given, said = getattr(env, f.name), meaning(f)
-        comment = ", ".join(filter(None, (said.what, said.unit)))
-        lines.append(f"{f.name}: {list(given) if isinstance(given, tuple) else given} # {comment}")
+    for entry in entries(EnvConfig(mu=mu.value, tau=tau.value)):
+        comment = ", ".join(filter(None, (entry.said.what, entry.said.unit)))
+        lines.append(
+            f"{entry.name}: {list(entry.value) if isinstance(entry.value, tuple) else entry.value} # {comment}"
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -14,19 +14,13 @@ from typing import Any, cast, get_args, get_type_hints
 import yaml  # type: ignore[import-untyped]
 
 from conf.presets import ROOT, groups
+from conf.schema import Entry, entries
 from experiments.cli.frame import Command
-from experiments.cli.help_page import Entry, chosen, entries, sentence, shown
+from experiments.cli.help_page import chosen, sentence, shown
 
 __all__ = ["page"]
 
-SINGULAR = {
-    "agents": "agent",
-    "plants": "plant",
-    "scenarios": "scenario",
-    "controllers": "controller",
-    "studies": "study",
-}
-
+SINGULAR = {"studies": "study"}  # the others lose their s
 HEAD = """# Configuration
 
 This page is generated from the fields of the config dataclasses and the presets of `conf/`, and a test compares it with
@@ -68,9 +62,7 @@ def page() -> str:
 def _groups(name: str) -> Iterator[str]:
     """The groups a command has."""
     taken = [f"[`{group}`](#{_anchor(f'presets of {group}')})" for group in chosen(name)]
-    if taken:
-        yield f"Groups: {', '.join(taken)}."
-        yield ""
+    yield from (f"Groups: {', '.join(taken)}.", "") if taken else ()
 
 
 def _anchor(heading: str) -> str:
@@ -91,14 +83,14 @@ def _variants(command: Command[Any]) -> Iterator[Any]:
 def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:
     """Every part below a config with the name it is first met by."""
     for entry in entries(config):
-        named = isinstance(entry.value, dict)
-        name = f"{prefix}{SINGULAR.get(entry.name, entry.name)}"
-        of = _part(config, entry)
-        for value in (*(entry.value.values() if named else [entry.value]), *([of()] if named and of else [])):
-            if is_dataclass(value):
-                kind = getattr(value, "kind", "")
-                parts.setdefault(cast(type[Any], type(value)), f"{name} ({kind})" if kind else name)
-                _collect(value, f"{name}.", parts)
+        values, name = [entry.value], entry.name
+        if isinstance(entry.value, dict):
+            of = _part(config, entry)
+            values, name = [*entry.value.values(), *([of()] if of else [])], SINGULAR.get(name, name[:-1])
+        for value in filter(is_dataclass, values):
+            kind = getattr(value, "kind", "")
+            parts.setdefault(cast(type[Any], type(value)), f"{prefix}{name} ({kind})" if kind else f"{prefix}{name}")
+            _collect(value, f"{prefix}{name}.", parts)
 
 
 def _part(config: Any, entry: Entry) -> type[Any] | None:
@@ -127,10 +119,9 @@ def _table(config: Any, parts: dict[type[Any], str]) -> Iterator[str]:
 def _changes(name: str) -> str:
     """The values of a preset's own file, and the preset it starts from."""
     own = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
-    start = [f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_"]
-    flat = [f"`{key}={shown(value)}`" for key, value in _flat(own, "")]
-    words = ["as " + ", ".join(start)] if start else []
-    return "; ".join([*words, *([", ".join(flat)] if flat else [])]) or "nothing"
+    start = ", ".join(f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_")
+    changed = ", ".join(f"`{key}={shown(value)}`" for key, value in _flat(own, ""))
+    return "; ".join(filter(None, (start and f"as {start}", changed))) or "nothing"
 
 
 def _flat(values: dict[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
