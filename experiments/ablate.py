@@ -8,10 +8,9 @@ figure, and one sub-folder per variant with its TensorBoard curves. A stopped ru
 from __future__ import annotations
 
 import csv
-import io
 import logging
 import re
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +20,8 @@ from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
 from experiments.cli import files, frame
+from experiments.reporting.tables import markdown
 from experiments.training.config import TrainConfig, variant
-from hardware.storage import atomic
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -99,19 +98,9 @@ def _read(path: Path) -> list[Row]:
     if not path.is_file():
         return []
     with open(path, newline="", encoding="utf-8") as f:
-        return [
-            Row(r["ablation"], int(r["seed"]), **{k: float(r[k]) for k in (*MEASURES, "train_seconds")})
-            for r in csv.DictReader(f)
-        ]
-
-
-def _write(path: Path, rows: list[Row]) -> None:
-    """All rows so far, atomically."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow([k.name for k in fields(Row)])
-    writer.writerows([getattr(row, k.name) for k in fields(Row)] for row in rows)
-    atomic.write(path, text.getvalue(), fsync=False)
+        rows = list(csv.DictReader(f))
+    numbers = (*MEASURES, "train_seconds")
+    return [Row(r["ablation"], int(r["seed"]), **{k: float(r[k]) for k in numbers}) for r in rows]
 
 
 def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
@@ -125,15 +114,10 @@ def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
     finally:
         session.writer.close()
     _, kept, last = session.report()
+    scores = (kept.regret_pct, kept.steady_abs_error, last.regret_pct, last.steady_abs_error)
     return [
         Row(
-            ablation=name,
-            seed=seed,
-            regret_pct=float(kept.regret_pct[i]),
-            steady_abs_error=float(kept.steady_abs_error[i]),
-            regret_pct_last=float(last.regret_pct[i]),
-            steady_abs_error_last=float(last.steady_abs_error[i]),
-            train_seconds=session.seconds,
+            name, seed, train_seconds=session.seconds, **{m: float(s[i]) for m, s in zip(MEASURES, scores, strict=True)}
         )
         for i, seed in enumerate(session.seeds)
     ]
@@ -160,16 +144,13 @@ def summarise(rows: list[Row]) -> dict[str, dict[str, Any]]:
 
 def table(rows: list[Row]) -> str:
     """The summary as a Markdown table: median over seeds and, in brackets, the worst seed."""
-    lines = [
-        "| variant | seeds | regret, % | steady error, OD | last regret, % | last steady error, OD | time, s |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    head = ("variant", "seeds", "regret, %", "steady error, OD", "last regret, %", "last steady error, OD", "time, s")
+    lines = []
     for name, entry in summarise(rows).items():
-        cells = []
-        for measure, digits in zip(MEASURES, (3, 4, 3, 4), strict=True):
-            cells.append(f"{entry[measure]['median']:.{digits}f} ({entry[measure]['worst']:.{digits}f})")
-        lines.append(f"| {name} | {entry['seeds']} | {' | '.join(cells)} | {entry['train_seconds']:.0f} |")
-    return "\n".join(lines) + "\n"
+        values = zip((entry[m] for m in MEASURES), (3, 4, 3, 4), strict=True)
+        cells = [f"{v['median']:.{digits}f} ({v['worst']:.{digits}f})" for v, digits in values]
+        lines.append((name, entry["seeds"], *cells, f"{entry['train_seconds']:.0f}"))
+    return markdown(head, lines)
 
 
 def figure(rows: list[Row]) -> Figure:
@@ -205,7 +186,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
             continue
         log.info("variant %d of %d: %s %s", k + 1, len(config.names), name, config.ablations[name])
         rows += _train(config.training(name), name, folder / name)
-        _write(path, rows)
+        files.write_csv(path, [asdict(row) for row in rows])
         entry = summarise(rows)[name]
         regret, steady, last = (entry[m] for m in MEASURES[:3])
         log.info(

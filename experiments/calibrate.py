@@ -208,10 +208,8 @@ def environment_yaml(result: Calibration, source: str) -> str:
         *(f"# Warning: {w}." for w in result.warnings),
     ]
     for entry in entries(EnvConfig(mu=mu.value, tau=tau.value)):
-        comment = ", ".join(filter(None, (entry.said.what, entry.said.unit)))
-        lines.append(
-            f"{entry.name}: {list(entry.value) if isinstance(entry.value, tuple) else entry.value} # {comment}"
-        )
+        comment, given = ", ".join(filter(None, (entry.said.what, entry.said.unit))), entry.value
+        lines.append(f"{entry.name}: {list(given) if isinstance(given, tuple) else given} # {comment}")
     return "\n".join(lines) + "\n"
 
 

@@ -12,7 +12,6 @@ Two measurements, on the same task and seeds:
 
 from __future__ import annotations
 
-import csv
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -193,10 +192,7 @@ def degradation(config: DegradationConfig, folder: Path) -> float:
         raise frame.UserError("trained: no variant; name at least one, as conf/degradation.yaml does")
     torch.set_num_threads(1)
     rows = [row for name in config.trained for row in _watch(config, name)]
-    with open(folder / "curves.csv", "w", newline="", encoding="utf-8") as f:
-        writer = csv.DictWriter(f, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(rows)
+    files.write_csv(folder / "curves.csv", rows)
     fitted = {name: _fit(config, name) for name in config.fitted}
     gap = action_gap(solve(config.env, config.agent.gamma))
     log.info("one level beside the best action costs %.1e at the setpoint", gap)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from conf.schema import check, part, require, setting
 from envs.scenario import Scenario
@@ -81,44 +81,32 @@ def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
     return controls + [(name, moment, config.seed, guarded) for name, guarded in rigs for moment in config.moments]
 
 
-@contextmanager
-def pool(workers: int) -> Iterator[Executor]:
-    """Fresh processes: a limit on file size, which one fault sets, is the process's."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers or None, mp_context=context) as executor:
-        yield executor
-
-
-def run_all(config: FaultMatrixConfig, tick: Callable[[], object]) -> list[Outcome]:
-    """Every case, in order."""
+def run_all(config: FaultMatrixConfig) -> list[Outcome]:
+    """Every case, in order; a bar on a terminal, every 50th case in a log."""
     cases = all_cases(config)
-    with pool(config.workers) as executor:
+    fresh = multiprocessing.get_context("spawn")  # a limit on file size, which one fault sets, is the process's
+    with (
+        ProcessPoolExecutor(config.workers or None, mp_context=fresh) as executor,
+        logging_redirect_tqdm(),
+        tqdm(total=len(cases), disable=None, unit="case") as bar,
+    ):
         futures = [executor.submit(run_case, config, *case) for case in cases]
-        for future in as_completed(futures):
+        for done, future in enumerate(as_completed(futures), 1):
             future.result()
-            tick()
+            bar.update()
+            if done % 50 == 0 and bar.disable:
+                log.info("%d of %d cases", done, len(cases))
         return [future.result() for future in futures]
 
 
 def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     """Run the matrix, write cases.csv, table.md, summary.json and the figure. Raises: UserError if it fails."""
-    from tqdm import tqdm
-    from tqdm.contrib.logging import logging_redirect_tqdm
-
     from experiments.reliability.chart import fault_map
     from experiments.reporting import charts
 
     began = time.monotonic()
     faults = [f for f in by_name(config.faults) if config.overflow_pump.pump or not f.guard]
-    total_cases, over = len(all_cases(config)), itertools.count(1)
-    with logging_redirect_tqdm(), tqdm(total=total_cases, disable=None, unit="case") as bar:
-
-        def tick() -> None:
-            bar.update()
-            if (done := next(over)) % 50 == 0 and bar.disable:
-                log.info("%d of %d cases", done, total_cases)
-
-        outcomes = run_all(config, tick)
+    outcomes = run_all(config)
     if not outcomes:
         raise frame.UserError("nothing to run: give faults or controls")
     write_cases(folder / "cases.csv", outcomes)

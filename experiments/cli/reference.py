@@ -17,6 +17,7 @@ from conf.presets import ROOT, groups
 from conf.schema import Entry, entries
 from experiments.cli.frame import Command
 from experiments.cli.help_page import chosen, sentence, shown
+from experiments.reporting.tables import markdown
 
 __all__ = ["page"]
 
@@ -45,17 +46,15 @@ def page() -> str:
             _collect(config, "", parts)
     lines = [HEAD, "## Commands", ""]
     for name, command in commands.items():
-        lines += [f"### {name}", "", sentence(name), "", *_groups(name), *_table(command.schema, parts), ""]
+        lines += [f"### {name}", "", sentence(name), "", *_groups(name), *_table(command.schema, parts)]
     lines += ["## Parts", ""]
     for kind, name in parts.items():
         said = (kind.__doc__ or "").split("\n\n")[0].strip().replace("\n    ", " ")
-        lines += [f"### {name}", "", said, "", *_table(kind(), parts), ""]
+        lines += [f"### {name}", "", said, "", *_table(kind(), parts)]
     lines += ["## Presets", "", "Each with the values that differ from the defaults above.", ""]
     for group, options in groups().items():
-        lines += [f"### Presets of {group}", "", "| preset | what it is | what it changes |", "|---|---|---|"]
-        for preset in (f"{group}/{option}" for option in options):
-            lines.append(f"| `{preset.rpartition('/')[2]}` | {sentence(preset)} | {_changes(preset)} |")
-        lines.append("")
+        rows = [(f"`{option}`", sentence(f"{group}/{option}"), _changes(f"{group}/{option}")) for option in options]
+        lines += [f"### Presets of {group}", "", markdown(("preset", "what it is", "what it changes"), rows)]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -101,7 +100,7 @@ def _part(config: Any, entry: Entry) -> type[Any] | None:
     return cast(type[Any], of) if is_dataclass(of) else None
 
 
-def _table(config: Any, parts: dict[type[Any], str]) -> Iterator[str]:
+def _table(config: Any, parts: dict[type[Any], str]) -> list[str]:
     """A row per field; a part has a table of its own."""
     rows = []
     for entry in entries(config):
@@ -109,11 +108,8 @@ def _table(config: Any, parts: dict[type[Any], str]) -> Iterator[str]:
         own = parts[of] if of else ""
         default = f"[{own}](#{_anchor(own)})" if own else f"`{shown(entry.value)}`"
         cells = (f"`{entry.name}`", default, entry.said.unit, entry.allowed, entry.said.what)
-        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    if rows:
-        yield "| key | default | unit | allowed | meaning |"
-        yield "|---|---|---|---|---|"
-        yield from rows
+        rows.append([cell.replace("|", "\\|") for cell in cells])
+    return [markdown(("key", "default", "unit", "allowed", "meaning"), rows)] if rows else []
 
 
 def _changes(name: str) -> str:

@@ -8,16 +8,16 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from types import TracebackType
-from typing import TYPE_CHECKING
 
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from dqn.policy import Policy
 from envs.plant.plant import Plant
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.trials import Trial, run_trial
 from experiments.controllers import registry
 from experiments.controllers.base import Controller
-
-if TYPE_CHECKING:
-    from dqn.policy import Policy
 
 __all__ = ["Cell", "Loops", "cells", "run_cell"]
 
@@ -80,8 +80,6 @@ class Loops:
 
     def results(self) -> dict[Cell, Trial]:
         """Wait for all trials; a bar on a terminal, ten lines in a log."""
-        from tqdm import tqdm
-        from tqdm.contrib.logging import logging_redirect_tqdm
 
         total, trials = len(self._waiting) + len(self._running), {}
         with logging_redirect_tqdm(), tqdm(total=total, disable=None, unit="loop") as bar:

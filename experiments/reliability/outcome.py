@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from experiments.cli import files
 from experiments.reliability.faults import Fault
+from experiments.reporting.tables import markdown
 
 __all__ = ["Outcome", "declared", "judge", "table", "totals", "write_cases"]
 
@@ -103,9 +104,10 @@ def table(outcomes: Sequence[Outcome]) -> str:
         "fault", "told after, min", "by", "response", "peak mL", "peak OD error", "rows missed", "rows lost",
         "doses doubled", "pumps off", "as declared",
     )  # fmt: skip
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    rows = []
     for name in dict.fromkeys(o.label for o in outcomes):
         mine = [o for o in outcomes if o.label == name]
+        wrong = dict.fromkeys(w for o in mine for w in o.wrong)
         told = [o.detected_s / 60.0 for o in mine if o.reason]
         cells = [
             name if mine[0].fault != "none" else f"{name} ({len(mine)} healthy runs)",
@@ -118,24 +120,17 @@ def table(outcomes: Sequence[Outcome]) -> str:
             str(sum(o.rows_lost + o.rows_doubled for o in mine)),
             str(sum(o.doses_doubled for o in mine)),
             f"{sum(o.pumps_off for o in mine)} of {len(mine)}",
-            "yes"
-            if all(o.ok for o in mine)
-            else "**no**: " + ", ".join(dict.fromkeys(w for o in mine for w in o.wrong)),
+            f"**no**: {', '.join(wrong)}" if wrong else "yes",
         ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        rows.append(cells)
+    return markdown(head, rows)
 
 
 def declared(faults: Sequence[Fault]) -> str:
     """Markdown: what is not detected, or overflows without a guard, and why."""
-    lines = [
-        "| fault | what happens | not detected because | without a guard it overflows because |",
-        "|---|---|---|---|",
-    ]
-    for f in faults:
-        if f.why_not or f.overflow:
-            lines.append(f"| {f.name} | {f.what} | {f.why_not or '(detected)'} | {f.overflow or '–'} |")
-    return "\n".join(lines) + "\n"
+    head = ("fault", "what happens", "not detected because", "without a guard it overflows because")
+    told = [f for f in faults if f.why_not or f.overflow]
+    return markdown(head, ((f.name, f.what, f.why_not or "(detected)", f.overflow or "–") for f in told))
 
 
 def totals(outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -166,10 +161,8 @@ def totals(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 def write_cases(path: Path, outcomes: Sequence[Outcome]) -> None:
     """cases.csv: one row per case."""
-    rows = [o.as_dict() for o in outcomes]
-    with open(path, "w", newline="", encoding="utf-8") as f:
-        writer = csv.DictWriter(f, list(rows[0]))
-        writer.writeheader()
-        for row in rows:
-            counts = {k: " ".join(f"{name} x{n}" for name, n in row[k].items()) for k in ("kinds", "notes")}
-            writer.writerow({**row, **counts, "wrong": ", ".join(row["wrong"])})
+    rows = []
+    for row in (o.as_dict() for o in outcomes):
+        counts = {k: " ".join(f"{name} x{n}" for name, n in row[k].items()) for k in ("kinds", "notes")}
+        rows.append({**row, **counts, "wrong": ", ".join(row["wrong"])})
+    files.write_csv(path, rows)

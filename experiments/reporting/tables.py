@@ -5,11 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Best", "Table", "number", "plus_minus", "typeset", "write"]
+__all__ = ["Best", "Table", "markdown", "number", "plus_minus", "typeset", "write"]
 
 
 class Best(str):
@@ -33,6 +33,12 @@ def plus_minus(mean: float | None, sd: float | None, digits: int = 3) -> str:
     if mean is None or sd is None or not sd > 1e-6 * abs(mean):
         return number(mean, digits)
     return f"{number(mean, digits)} ± {number(sd, 2)}"
+
+
+def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown, with its last line end."""
+    head, *body = ("| " + " | ".join(map(str, row)) + " |" for row in (columns, *rows))
+    return "\n".join([head, "|" + "---|" * len(columns), *body]) + "\n"
 
 
 def typeset(text: str) -> str:
