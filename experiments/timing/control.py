@@ -53,8 +53,8 @@ def loops() -> Iterator[Measurement]:
     swarm = registry.config("mpc")
     gradient = replace(swarm, solver="gradient")
     yield Measurement("closed loop, mpc", f"{what}, particle swarm",
-                      "the same with SciPy's L-BFGS-B, exact gradient",
-                      lambda: loop(swarm, REPLICATES, 0), lambda: loop(gradient, REPLICATES, 0), limit=20.0)  # fmt: skip
+                      "the same with SciPy's L-BFGS-B, exact gradient", partial(loop, swarm, REPLICATES, 0),
+                      partial(loop, gradient, REPLICATES, 0), limit=20.0)  # fmt: skip
 
 
 def _untrained_policy(model: EnvConfig) -> Policy:
