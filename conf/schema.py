@@ -64,8 +64,7 @@ class Meaning:
     def allowed(self, key: str, many: bool = False, optional: bool = False) -> str:
         """The range in words, "" if every value of the type is allowed.
 
-        Args:
-          key: name of the field; many: it is a tuple; optional: it may be null.
+        Args: key: name of the field; many: it is a tuple; optional: it may be null.
         """
         words = self._range((self.unit or "value") if many else key)
         if words and many and not self.interval:
@@ -141,8 +140,7 @@ def require(holds: bool, key: str, given: object, allowed: str) -> None:
 def check(config: Any, prefix: str = "") -> None:
     """Check every field of a config dataclass against its own range; called by `__post_init__`.
 
-    Args:
-      prefix: where the config stands, "plant.pump"; "" for that of a command.
+    Args: prefix: where the config stands, "plant.pump"; "" for that of a command.
     Raises: ValueError `prefix.key = value unit: allowed RANGE`.
     """
     for entry in (e for e in entries(config) if not e.said.holds(e.value)):

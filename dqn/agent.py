@@ -33,8 +33,7 @@ class DQNAgent:
     config change three of these: `hindsight_share` the minibatch, `action_gap` the target y, `huber` the loss.
 
     Args:
-      config: hyper-parameters.
-      observations: O, numbers per observation. actions: A.
+      config: hyper-parameters. observations: O, numbers per observation. actions: A.
       streams: for each name in STREAMS one SeedSequence per agent.
       relabel: goal replacement, used on a share `config.hindsight_share` of each minibatch.
       device: "cpu" or "cuda".
@@ -133,8 +132,7 @@ class DQNAgent:
     def fit(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> None:
         """One Adam step towards Q(observation, action) = target; then, where due, the copy and a look at the loss.
 
-        Args:
-          observation: (S, B, O). action: (S, B) int64. target: (S, B).
+        Args: observation: (S, B, O). action: (S, B) int64. target: (S, B).
         """
         c = self.config
         q, inputs = self.online.forward(observation)

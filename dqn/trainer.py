@@ -73,10 +73,7 @@ class TrainRecord:
 class Trainer:
     """Lets S agents act in S copies of the environment and learn.
 
-    Args:
-      env: one copy per agent.
-      agent: the S agents.
-      interval: steps between records.
+    Args: env: one copy per agent. agent: the S agents. interval: steps between records.
     """
 
     def __init__(self, env: TrainingEnv, agent: DQNAgent, interval: int) -> None:

@@ -94,9 +94,7 @@ def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
     The model is linear in x, so the configured integrator, run once from x = 1 with all its sub-steps, gives f
     exactly: for Euler f = (1 + h (mu - u/tau))^substeps. Environment, optimum and MPC all step by this factor.
 
-    Args:
-      config: the task.
-      rates: pump rates u, mL/s, any shape; None means the action grid, shape (A,).
+    Args: config: the task. rates: pump rates u, mL/s, any shape; None means the action grid, shape (A,).
     """
     u = config.pump_rates() if rates is None else np.asarray(rates, dtype=np.float64)
     flat = u.reshape(-1)
@@ -110,8 +108,7 @@ def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
 def tracking_reward(od: T, setpoint: T) -> T:
     """r = -(x - setpoint)^2 (paper, equation 4), of the OD reached by the step.
 
-    Args:
-      od: x, shape (N,) or any; a NumPy array or a tensor. setpoint: same type, same or broadcastable shape.
+    Args: od: x, shape (N,) or any; a NumPy array or a tensor. setpoint: same type, same or broadcastable shape.
     Returns: shape of the broadcast. Raises: nothing.
     """
     error: T = od - setpoint

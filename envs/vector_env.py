@@ -89,9 +89,7 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
     End: never terminated; truncated after `episode_steps` steps (bootstrapping continues).
     Autoreset: SAME_STEP; the last observation of an ended episode is in infos["final_obs"].
 
-    Args:
-      num_envs: N >= 1.
-      config: the task.
+    Args: num_envs: N >= 1. config: the task.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
@@ -168,8 +166,7 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """One control period in every copy.
 
-        Args:
-          actions: indices of pump rates, shape (N,), integers.
+        Args: actions: indices of pump rates, shape (N,), integers.
         Returns: observations (N, 2), rewards (N,), terminated (N,) all False, truncated (N,), infos; where an episode
           ended infos["final_obs"] (N, 2) holds its last observation and infos["_final_obs"] (N,) says where.
         Raises: RuntimeError before the first reset; IndexError for an action outside the grid.

@@ -60,8 +60,7 @@ class DegradationConfig:
 def optimal_q(policy: OptimalPolicy, od: Array, row: NDArray[np.intp]) -> Array:
     """Q*(x, s, a) = -[(f_a x - s)^2 + gamma V(f_a x)], the discounted return, shape of `od` + (A,).
 
-    Args:
-      policy: the solved task. od: x, any shape. row: index of the setpoint in `policy.setpoints`, shape of `od`.
+    Args: policy: the solved task. od: x, any shape. row: index of the setpoint in `policy.setpoints`, shape of `od`.
     """
     after = od[..., None] * policy.factors
     goal = policy.setpoints[row][..., None]

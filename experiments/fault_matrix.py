@@ -45,10 +45,7 @@ class FaultMatrixConfig:
     overflow_pump: OverflowPumpConfig = part(lambda: OverflowPumpConfig("Pump3", 0.95, 1.2), "of the rig")
     faults: tuple[str, ...] = setting((), "names, as in docs/faults.md; empty: all")
     moments: tuple[str, ...] = setting(
-        MOMENTS,
-        "recovery; steady at the first setpoint; after the step; feed pump running",
-        choices=MOMENTS,
-        some=True,
+        MOMENTS, "recovery; steady at the first setpoint; after the step; feed pump running", choices=MOMENTS, some=True
     )
     controls: int = setting(10, "healthy runs: whatever the interlock says there is a false alarm", within=(0, 1000))
     seed: int = setting(0, "of all noise", at_least=0)

@@ -141,8 +141,7 @@ class Calibration:
 def calibrate(series: Series, config: IdentifyConfig | None = None) -> Calibration:
     """Fit (mu, tau) to the best window of a recording and report how far that pair can be trusted.
 
-    Args:
-      series: raw recording. config: see `IdentifyConfig`; None is the default.
+    Args: series: raw recording. config: see `IdentifyConfig`; None is the default.
     Raises: NotIdentifiable when the trustworthy rows cannot give tau; ValueError when none are left.
     """
     config = IdentifyConfig() if config is None else config
@@ -345,10 +344,7 @@ def _warnings(result: Calibration, limit: float) -> list[str]:
             f"residuals are correlated from row to row ({fitted.autocorrelation:.2f}): the model misses some of the "
             "culture's behaviour; the intervals allow for it"
         )
-    for name, value, (low, high) in (
-        ("mu", fitted.mu.value, PLAUSIBLE_MU),
-        ("tau", result.tau.value, PLAUSIBLE_TAU),
-    ):
+    for name, value, (low, high) in (("mu", fitted.mu.value, PLAUSIBLE_MU), ("tau", result.tau.value, PLAUSIBLE_TAU)):
         if not low <= value <= high:
             found.append(
                 f"{name} = {value:.3g} lies outside the usual {low:g} to {high:g}: check the units of time and pump"

@@ -105,8 +105,7 @@ def _values(config: Any, prefix: str) -> Iterator[str]:
 def text(name: str, config: Any) -> str:
     """The whole page, with the values that the rest of the command line gives.
 
-    Args:
-      name: of the command; config: what it would run with.
+    Args: name: of the command; config: what it would run with.
     """
     choices = ["Choices (group=option)", "", *_choices(name)] if chosen(name) else []
     return "\n".join([*_opening(name), "", *choices, "Values (key=value)", "", *_values(config, "")])

@@ -30,8 +30,7 @@ class Record:
     """Journal, recordings, state and events of one run.
 
     Args:
-      folder: run folder; what an earlier life of the run left there is continued.
-      names: of the reactors.
+      folder: run folder; what an earlier life of the run left there is continued. names: of the reactors.
       fsync: each row on the disk before the call returns.
     Attributes: journal (the driver writes into it, too); state_path; rows, of each reactor; repairs, what was mended on
       opening, one line each.

@@ -139,8 +139,7 @@ class Mpc:
 
     Each solution, shifted by one period, is where one particle (or the gradient) starts the next time.
 
-    Args:
-      config: horizon, penalty, solver; model: mu, tau, control period, integrator and the largest pump rate.
+    Args: config: horizon, penalty, solver; model: mu, tau, control period, integrator and the largest pump rate.
     """
 
     def __init__(self, config: MpcConfig, model: EnvConfig) -> None:

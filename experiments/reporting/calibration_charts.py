@@ -22,8 +22,7 @@ DATA, MODEL, PUMP, REJECTED, UNUSED = COLOURS[0], COLOURS[1], COLOURS[2], COLOUR
 def fit_figure(raw: Series, result: Calibration, title: str) -> Figure:
     """Measured OD with the fitted trajectory, the residuals below, and the pump rate.
 
-    Args:
-      raw: the recording before screening, at the same positions as `result`'s. result: of `window.calibrate`.
+    Args: raw: the recording before screening, at the same positions as `result`'s. result: of `window.calibrate`.
     """
     figure, axes = new_figure(11.0, 7.2, 3, sharex=True, height_ratios=(3.0, 1.3, 0.8))
     top, middle, bottom = axes
@@ -137,8 +136,7 @@ def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list
 def coverage_figure(mu: Array, tau: Array, truth: tuple[float, float], title: str) -> Figure:
     """Intervals of many simulated recordings against the truth, sorted by estimate; misses in colour.
 
-    Args:
-      mu, tau: (value, low, high) of each recording, shape (N, 3). truth: (mu, tau).
+    Args: mu, tau: (value, low, high) of each recording, shape (N, 3). truth: (mu, tau).
     """
     figure, axes = new_figure(10.5, 4.6, 1, 2)
     figure.suptitle(title, fontsize=10)

@@ -125,8 +125,5 @@ def stable_baselines_dqn(config: DQNConfig, seed: int) -> object:
 def sync_vector_env(copies: int) -> gymnasium.vector.VectorEnv:
     """Gymnasium's own vectorisation: a Python loop over single environments."""
     return gymnasium.make_vec(
-        ENV_ID,
-        num_envs=copies,
-        vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+        ENV_ID, num_envs=copies, vectorization_mode="sync", vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}
     )
