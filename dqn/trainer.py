@@ -57,17 +57,9 @@ class TrainRecord:
     @classmethod
     def joined(cls, records: Sequence[TrainRecord]) -> TrainRecord:
         """One record of the agents of several, taken at the same step."""
-
-        def all_of(key: str) -> NDArray[np.float64]:
-            return np.concatenate([getattr(record, key) for record in records])
-
-        return replace(
-            records[0],
-            episode_return=all_of("episode_return"),
-            loss=all_of("loss"),
-            q_min=all_of("q_min"),
-            q_max=all_of("q_max"),
-        )
+        each = ("episode_return", "loss", "q_min", "q_max")
+        whole: dict[str, Any] = {key: np.concatenate([getattr(r, key) for r in records]) for key in each}
+        return replace(records[0], **whole)
 
 
 class Trainer:

@@ -144,14 +144,9 @@ def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str,
         "warnings": list(result.warnings),
         "notes": list(recording.notes),
         "rejected": [
-            {
-                "rows": row_spans(r.rows),
-                "first": int(r.rows[0]),
-                "last": int(r.rows[-1]),
-                "n": len(r.rows),
-                "reason": r.reason,
-            }
-            for r in result.rejections
+            {"rows": row_spans(r.rows), "first": int(r.rows[0]), "last": int(r.rows[-1])}
+            | {"n": len(r.rows), "reason": r.reason}
+            for r in result.screened.rejections
         ],
         "window": result.window_reason,
         "rows": [int(raw.row[0]), int(raw.row[-1]) + 1],
@@ -187,14 +182,8 @@ def _interval(p: Parameter) -> dict[str, Any]:
 def _drift(d: Drift | None) -> dict[str, Any] | None:
     if d is None:
         return None
-    return {
-        "first": d.first,
-        "last": d.last,
-        "change_pct": d.change_pct,
-        "per_hour": _interval(d.slope_per_h),
-        "significant": d.significant,
-        "segments": d.segments,
-    }
+    line = {"first": d.first, "last": d.last, "change_pct": d.change_pct, "per_hour": _interval(d.slope_per_h)}
+    return {**line, "significant": d.significant, "segments": d.segments}
 
 
 def environment_yaml(result: Calibration, source: str) -> str:
@@ -219,11 +208,11 @@ def _events(folder: Path, result: Calibration, figures: dict[str, Figure]) -> No
 
     events = Events(folder)
     for tag, value in (
-        ("calibration/mu_per_min", result.fit.mu.value),
-        ("calibration/tau", result.tau.value),
-        ("calibration/pmse_pct", result.fit.pmse_pct),
+        ("mu_per_min", result.fit.mu.value),
+        ("tau", result.tau.value),
+        ("pmse_pct", result.fit.pmse_pct),
     ):
-        events.scalar(tag, value, 0)
+        events.scalar(f"calibration/{tag}", value, 0)
     for i, segment in enumerate(result.segments):
         for name, parameter in (("mu_per_min", segment.mu), ("tau", segment.tau)):
             if parameter is not None:
@@ -259,7 +248,7 @@ def report(result: Calibration, recording: Recording, content: dict[str, Any]) -
                 f"  drift       {name} {drift.first:.3g} to {drift.last:.3g} along the recording "
                 f"({drift.change_pct:+.0f} %{sure})"
             )
-    lines += [f"  rejected    rows {row_spans(r.rows)} ({len(r.rows)}): {r.reason}" for r in result.rejections]
+    lines += [f"  rejected    rows {row_spans(r.rows)} ({len(r.rows)}): {r.reason}" for r in result.screened.rejections]
     lines += [f"  note        {note}" for note in recording.notes]
     lines += [f"  warning     {warning}" for warning in result.warnings]
     return "\n".join(lines)
@@ -304,15 +293,9 @@ def _coverage(config: CalibrateConfig, folder: Path) -> float:
     from experiments.reporting.charts import save
 
     save(coverage_figure(mu, tau, truth, title), folder / "figures", "coverage")
-    files.write_json(
-        folder / "summary.json",
-        {
-            "recordings": n,
-            "coverage_pct": {"mu": shares[0], "tau": shares[1]},
-            "noise": protocol.noise,
-            "relative_half_width_pct": {"mu": _half_width(mu), "tau": _half_width(tau)},
-        },
-    )
+    found_pct = {"coverage_pct": {"mu": shares[0], "tau": shares[1]}, "noise": protocol.noise}
+    widths = {"relative_half_width_pct": {"mu": _half_width(mu), "tau": _half_width(tau)}}
+    files.write_json(folder / "summary.json", {"recordings": n, **found_pct, **widths})
     print(f"95 % intervals hold the truth: mu {shares[0]:.1f} %, tau {shares[1]:.1f} % of {n}")
     print(f"figure and summary in {folder}")
     return min(shares)

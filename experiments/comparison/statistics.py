@@ -46,14 +46,15 @@ def _median_or_never(settling: Array) -> float:
     return middle if np.isfinite(middle) else float("nan")
 
 
+def _names(trial: Trial) -> dict[str, Any]:
+    return {"controller": trial.controller, "plant": trial.plant, "scenario": trial.scenario}
+
+
 def row(trial: Trial, window: Window) -> dict[str, Any]:
     """One row of summary.json: measured OD, T = 1 min; settling is the median, the other values are means."""
     score = trial.score(window)
     ise, itae = Spread(score.ise), Spread(score.itae)
-    return {
-        "controller": trial.controller,
-        "plant": trial.plant,
-        "scenario": trial.scenario,
+    return _names(trial) | {
         "window": window.label,
         "setpoint": window.setpoint,
         "n": ise.n,
@@ -81,10 +82,8 @@ def details(trials: Sequence[Trial]) -> list[dict[str, Any]]:
         for window in windows(trial.schedule):
             measured, clean, floor = trial.score(window), trial.score_clean(window), trial.score_floor(window)
             found.append(
-                {
-                    "controller": trial.controller,
-                    "plant": trial.plant,
-                    "scenario": trial.scenario,
+                _names(trial)
+                | {
                     "window": window.label,
                     "window_min": window.end - window.start,
                     "ise_per_window": Spread(measured.ise_mean).mean,
@@ -111,12 +110,7 @@ def totals(trials: Sequence[Trial]) -> list[dict[str, Any]]:
     """One entry per trial: ISE and ITAE summed over its windows, and what it cost in medium and pump moves."""
     found = []
     for trial in trials:
-        entry: dict[str, Any] = {
-            "controller": trial.controller,
-            "plant": trial.plant,
-            "scenario": trial.scenario,
-            "n": int(trial.od.shape[0]),
-        }
+        entry = _names(trial) | {"n": int(trial.od.shape[0])}
         for metric in METRICS:
             value = Spread(_total(trial, metric))
             entry |= {f"{metric}_mean": value.mean, f"{metric}_sd": value.sd, f"{metric}_ci95": value.ci95}

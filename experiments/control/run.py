@@ -86,7 +86,7 @@ def _run(loop: ClosedLoop, record: Record) -> str:
         with _held_back():
             try:
                 reactors.stop()
-                left = ", ".join(n for n, h in zip(reactors.names, loop.handed_over, strict=True) if h)
+                left = ", ".join(n for n, h in zip(reactors.names, reactors.handed_over, strict=True) if h)
                 log.info("pumps verified off%s", f"; {left}: left to the on-board regulation" if left else "")
             except ReactorError as error:
                 outcome = f"failed: {error}"

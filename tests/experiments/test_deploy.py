@@ -215,7 +215,7 @@ def test_a_reactor_left_to_the_on_board_regulation_is_so_again_after_a_resume():
     loop = handing_over(lab)
     while lab.clock.now() < 900.0:
         loop.step()
-    assert loop.handed_over.all()
+    assert loop.reactors.handed_over.all()
     assert lab.device.apps["M0"].data["OD"]["ON"] == 1
     state = json.loads(json.dumps(loop.state()))
     lab.client()
@@ -236,7 +236,7 @@ def test_a_lasting_reason_is_told_once(caplog):
     with caplog.at_level("WARNING"):
         while lab.clock.now() < 1800.0:
             log_changes(loop.step())
-    assert loop.handed_over.all()
+    assert loop.reactors.handed_over.all()
     assert len([r for r in caplog.records if "budget" in r.message]) == 2
     assert len(caplog.records) <= 4
 
