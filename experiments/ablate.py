@@ -12,7 +12,7 @@ import logging
 import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from envs.task import EnvConfig
 from experiments.cli import files, frame
 from experiments.reporting.tables import markdown
 from experiments.training.config import TrainConfig, variant
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["AblateConfig", "Row", "main", "summarise"]
 
@@ -153,7 +150,7 @@ def table(rows: list[Row]) -> str:
     return markdown(head, lines)
 
 
-def figure(rows: list[Row]) -> Figure:
+def draw(rows: list[Row], folder: Path) -> None:
     """One point per seed: regret and steady error of the kept policy, and regret of the last iterate."""
     from experiments.reporting import charts
 
@@ -168,14 +165,12 @@ def figure(rows: list[Row]) -> Figure:
         own = {name: np.array([getattr(row, measure) for row in rows if row.ablation == name]) for name in names}
         charts.seeds(ax, own, label)
         ax.axvline(limit, color=charts.COLOURS[6], linewidth=1, linestyle="--")
-    return canvas
+    charts.save(canvas, folder / "figures", "ablation")
 
 
 def ablate(config: AblateConfig, folder: Path) -> float:
     """Train all variants; returns the median regret of the first, the objective of a sweep."""
     import torch
-
-    from experiments.reporting.charts import save
 
     torch.set_num_threads(1)
     path = folder / "ablation.csv"
@@ -197,7 +192,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
     summary = summarise(rows)
     files.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
     (folder / "table.md").write_text(table(rows), encoding="utf-8")
-    save(figure(rows), folder / "figures", "ablation")
+    draw(rows, folder)
     log.info("table %s, figure %s", folder / "table.md", folder / "figures" / "ablation.png")
     return float(summary[config.names[0]]["regret_pct"]["median"])
 

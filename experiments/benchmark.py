@@ -15,8 +15,7 @@ from dqn import policy as policies
 from dqn.policy import Policy
 from experiments.cli import files, frame
 from experiments.comparison.config import BenchmarkConfig
-from experiments.comparison.trials import Trial
-from experiments.comparison.workers import Loops, cells
+from experiments.comparison.trials import Loops, Trial, cells
 from experiments.control.policies import load_policy
 from experiments.controllers import registry
 from experiments.training.config import TrainConfig

@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +23,6 @@ from experiments.cli import files, frame
 from hardware.errors import RecordingError
 from hardware.storage.recorder import Recorder
 from hardware.storage.recording_reader import Recording, read_recording
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["CalibrateConfig", "body", "environment_yaml", "main", "summary"]
 
@@ -94,21 +91,12 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
         result = calibrate(raw, config.identify)
     except ValueError as error:
         raise frame.UserError(f"{source}: {error}") from None
-    from experiments.reporting.calibration_charts import drift_figure, fit_figure
-    from experiments.reporting.charts import save
-
     name = Path(source).name
-    figures = {
-        "fit": fit_figure(raw, result, f"{name}: measured and free-running model"),
-        "drift": drift_figure(result, f"{name}: segments of about {config.identify.segment_min:g} min, fitted alone"),
-    }
-    for key, figure in figures.items():
-        save(figure, folder / "figures", key)
     environment = folder / f"{config.name}.yaml"
     environment.write_text(environment_yaml(result, name), encoding="utf-8")
     content = summary(result, recording, raw)
     files.write_json(folder / "summary.json", {**content, "data": source, "env_file": str(environment)})
-    _events(folder, result, figures)
+    _draw(folder, raw, result, name, config.identify.segment_min)
     print(report(result, recording, content))
     print(f"\n  files       {environment}\n              {folder}/{{summary.json, figures/}}")
     return result.fit.pmse_pct
@@ -202,10 +190,16 @@ def environment_yaml(result: Calibration, source: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _events(folder: Path, result: Calibration, figures: dict[str, Figure]) -> None:
-    """Scalars and figures for TensorBoard."""
+def _draw(folder: Path, raw: Series, result: Calibration, name: str, segment_min: float) -> None:
+    """Figures, as files and for TensorBoard, and its scalars."""
+    from experiments.reporting.calibration_charts import drift_figure, fit_figure
+    from experiments.reporting.charts import save
     from experiments.reporting.tensorboard import Events
 
+    figures = {
+        "fit": fit_figure(raw, result, f"{name}: measured and free-running model"),
+        "drift": drift_figure(result, f"{name}: segments of about {segment_min:g} min, fitted alone"),
+    }
     events = Events(folder)
     for tag, value in (
         ("mu_per_min", result.fit.mu.value),
@@ -218,6 +212,7 @@ def _events(folder: Path, result: Calibration, figures: dict[str, Figure]) -> No
             if parameter is not None:
                 events.scalar(f"drift/{name}", parameter.value, i)
     for key, figure in figures.items():
+        save(figure, folder / "figures", key)
         events.figure(f"calibration/{key}", figure, 0)
     events.close()
 

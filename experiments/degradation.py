@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,6 @@ from envs.optimum import OptimalPolicy, solve
 from envs.task import EnvConfig
 from experiments.cli import files, frame
 from experiments.training.config import variant
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["DegradationConfig", "action_gap", "main", "optimal_q"]
 
@@ -160,7 +157,7 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
     return {"regret_pct": score.regret_pct, "steady_abs_error": score.steady_abs_error}
 
 
-def figure(rows: list[dict[str, float | str]], fitted: dict[str, dict[str, Any]]) -> Figure:
+def draw(rows: list[dict[str, float | str]], fitted: dict[str, dict[str, Any]], folder: Path) -> None:
     """Regret and value error during training; regret and steady error of the networks fitted to exact values."""
     from experiments.reporting import charts
 
@@ -178,14 +175,12 @@ def figure(rows: list[dict[str, float | str]], fitted: dict[str, dict[str, Any]]
     panels = (("regret_pct", "regret when fitted to Q*, %"), ("steady_abs_error", "steady error when fitted to Q*, OD"))
     for ax, (key, label) in zip(fits, panels, strict=True):
         charts.seeds(ax, {name: np.asarray(score[key]) for name, score in fitted.items()}, label)
-    return canvas
+    charts.save(canvas, folder / "figures", "degradation")
 
 
 def degradation(config: DegradationConfig, folder: Path) -> float:
     """Both measurements; returns the median regret of the first trained variant at its end."""
     import torch
-
-    from experiments.reporting.charts import save
 
     if not config.trained:
         raise frame.UserError("trained: no variant; name at least one, as conf/degradation.yaml does")
@@ -197,7 +192,7 @@ def degradation(config: DegradationConfig, folder: Path) -> float:
     log.info("one level beside the best action costs %.1e at the setpoint", gap)
     ends = {name: [r for r in rows if r["variant"] == name][-1] for name in config.trained}
     files.write_json(folder / "summary.json", {"action_gap": gap, "trained": ends, "fitted": fitted})
-    save(figure(rows, fitted), folder / "figures", "degradation")
+    draw(rows, fitted, folder)
     log.info("curves %s, figure %s", folder / "curves.csv", folder / "figures" / "degradation.png")
     return float(rows[-1]["regret_pct"])
 
