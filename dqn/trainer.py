@@ -108,14 +108,9 @@ class Trainer:
         agent = self.agent
         q_range = agent.q_range.cpu().numpy().astype(np.float64)
         return TrainRecord(
-            step=agent.steps,
-            updates=agent.updates,
-            epsilon=agent.epsilon,
-            episode_return=self._finished.copy(),
-            loss=agent.loss.cpu().numpy().astype(np.float64),
-            q_min=q_range[:, 0],
-            q_max=q_range[:, 1],
-        )
+            step=agent.steps, updates=agent.updates, epsilon=agent.epsilon, episode_return=self._finished.copy(),
+            loss=agent.loss.cpu().numpy().astype(np.float64), q_min=q_range[:, 0], q_max=q_range[:, 1],
+        )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:
         """Complete state of agents, environment and loop."""

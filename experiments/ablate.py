@@ -66,15 +66,10 @@ class AblateConfig:
     def training(self, name: str) -> TrainConfig:
         """The training run of one variant."""
         return TrainConfig(
-            env=self.env,
-            agent=variant(self.agent, name, self.ablations[name]),
-            seed=self.seed,
-            n_agents=self.n_agents,
-            device=self.device,
-            threads=self.threads,
-            eval_every=self.eval_every,
+            env=self.env, agent=variant(self.agent, name, self.ablations[name]), seed=self.seed, n_agents=self.n_agents,
+            device=self.device, threads=self.threads, eval_every=self.eval_every,
             checkpoint_every=self.agent.total_steps,
-        )
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

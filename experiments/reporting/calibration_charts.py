@@ -117,17 +117,9 @@ def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list
         for side in zip(*((v.value - v.low, v.high - v.value) for _, v in known), strict=True)
     )
     ax.errorbar(
-        middle,
-        value,
-        yerr=[down, up],
-        xerr=across,
-        fmt="o",
-        ms=5,
-        color=DATA,
-        elinewidth=1.1,
-        capsize=2.5,
+        middle, value, yerr=[down, up], xerr=across, fmt="o", ms=5, color=DATA, elinewidth=1.1, capsize=2.5,
         label="segment alone, 95 % interval",
-    )
+    )  # fmt: skip
     spread = value.max() - value.min() + 0.25 * abs(float(value.mean()))
     ax.set_ylim(max(0.0, value.min() - spread), value.max() + spread)  # one wide interval must not flatten the rest
     return [float(m) for m in middle]
@@ -146,13 +138,9 @@ def coverage_figure(mu: Array, tau: Array, truth: tuple[float, float], title: st
         hit = (data[:, 1] <= true) & (true <= data[:, 2])
         for mask, colour, name in ((hit, DATA, "holds the truth"), (~hit, MODEL, "misses it")):
             ax.vlines(
-                np.flatnonzero(mask),
-                data[mask, 1],
-                data[mask, 2],
-                color=colour,
-                lw=1.0,
+                np.flatnonzero(mask), data[mask, 1], data[mask, 2], color=colour, lw=1.0,
                 label=f"95 % interval {name}: {mask.sum()} of {len(mask)}",
-            )
+            )  # fmt: skip
         ax.plot(data[:, 0], ".", ms=2.5, color="black", label="estimate")
         ax.axhline(true, color=PUMP, lw=1.3, label=f"truth {true:g}")
         ax.set_ylabel(label)

@@ -101,23 +101,13 @@ def stable_baselines_dqn(config: DQNConfig, seed: int) -> object:
     from stable_baselines3 import DQN
 
     model = DQN(
-        "MlpPolicy",
-        gymnasium.make(ENV_ID),
-        learning_rate=config.learning_rate,
-        buffer_size=config.replay_size,
-        learning_starts=config.learn_start,
-        batch_size=config.batch_size,
-        gamma=config.gamma,
-        train_freq=1,
-        gradient_steps=config.updates_per_step,
-        target_update_interval=config.target_period,
-        exploration_fraction=config.epsilon_steps / config.total_steps,
-        exploration_initial_eps=config.epsilon_start,
-        exploration_final_eps=config.epsilon_end,
-        policy_kwargs={"net_arch": list(config.hidden)},
-        seed=seed,
+        "MlpPolicy", gymnasium.make(ENV_ID), learning_rate=config.learning_rate, buffer_size=config.replay_size,
+        learning_starts=config.learn_start, batch_size=config.batch_size, gamma=config.gamma, train_freq=1,
+        gradient_steps=config.updates_per_step, target_update_interval=config.target_period,
+        exploration_fraction=config.epsilon_steps / config.total_steps, exploration_initial_eps=config.epsilon_start,
+        exploration_final_eps=config.epsilon_end, policy_kwargs={"net_arch": list(config.hidden)}, seed=seed,
         device="cpu",
-    )
+    )  # fmt: skip
     model.learn(config.total_steps)
     return model
 
