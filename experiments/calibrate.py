@@ -279,29 +279,22 @@ def _coverage(config: CalibrateConfig, folder: Path) -> float:
             found.append(calibrate(Series(time, od[i], pump_rate[i], rows), config.identify))
         except ValueError as error:
             raise frame.UserError(f"simulated recording {i}: {error}") from None
-    mu = np.array([(c.fit.mu.value, c.fit.mu.low, c.fit.mu.high) for c in found])
-    tau = np.array([(c.tau.value, c.tau.low, c.tau.high) for c in found])
-    truth = (protocol.mu, protocol.tau)
-    shares = [_share(values, true) for values, true in zip((mu, tau), truth, strict=True)]
+    pairs = [(c.fit.mu, c.tau) for c in found]
+    mu, tau = (np.array([(p.value, p.low, p.high) for p in column]) for column in zip(*pairs, strict=True))
+    truth, shares, widths = (protocol.mu, protocol.tau), {}, {}
+    for name, values, true in zip(("mu", "tau"), (mu, tau), truth, strict=True):
+        shares[name] = 100.0 * float(np.mean((values[:, 1] <= true) & (true <= values[:, 2])))
+        widths[name] = 50.0 * float(np.median((values[:, 2] - values[:, 1]) / values[:, 0]))
     title = f"{n} simulated recordings of {protocol.hours:g} h, {100 * protocol.noise:g} % noise (seed {protocol.seed})"
     from experiments.reporting.calibration_charts import coverage_figure
     from experiments.reporting.charts import save
 
     save(coverage_figure(mu, tau, truth, title), folder / "figures", "coverage")
-    found_pct = {"coverage_pct": {"mu": shares[0], "tau": shares[1]}, "noise": protocol.noise}
-    widths = {"relative_half_width_pct": {"mu": _half_width(mu), "tau": _half_width(tau)}}
-    files.write_json(folder / "summary.json", {"recordings": n, **found_pct, **widths})
-    print(f"95 % intervals hold the truth: mu {shares[0]:.1f} %, tau {shares[1]:.1f} % of {n}")
+    numbers = {"recordings": n, "coverage_pct": shares, "noise": protocol.noise, "relative_half_width_pct": widths}
+    files.write_json(folder / "summary.json", numbers)
+    print(f"95 % intervals hold the truth: mu {shares['mu']:.1f} %, tau {shares['tau']:.1f} % of {n}")
     print(f"figure and summary in {folder}")
-    return min(shares)
-
-
-def _share(values: np.ndarray[Any, np.dtype[np.float64]], truth: float) -> float:
-    return 100.0 * float(np.mean((values[:, 1] <= truth) & (truth <= values[:, 2])))
-
-
-def _half_width(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
-    return 50.0 * float(np.median((values[:, 2] - values[:, 1]) / values[:, 0]))
+    return min(shares.values())
 
 
 main = frame.Command("calibrate", CalibrateConfig(), body)

@@ -57,14 +57,6 @@ def chosen(name: str) -> dict[str, str | None]:
     return found | {inner: None for group in found for inner in groups() if inner.startswith(f"{group}/")}
 
 
-def _choices(name: str) -> Iterator[str]:
-    for group, start in chosen(name).items():
-        yield f"  {group}=" + (f"    (by itself {start})" if start else "")
-        for option in groups()[group]:
-            yield from _line(f"    {option}", sentence(f"{group}/{option}"), 26)
-        yield ""
-
-
 def _line(left: str, right: str, at: int) -> list[str]:
     """Two columns; the right one is wrapped."""
     lines = textwrap.wrap(right, WIDTH - at) or [""]
@@ -107,5 +99,11 @@ def text(name: str, config: Any) -> str:
 
     Args: name: of the command; config: what it would run with.
     """
-    choices = ["Choices (group=option)", "", *_choices(name)] if chosen(name) else []
-    return "\n".join([*_opening(name), "", *choices, "Values (key=value)", "", *_values(config, "")])
+    choices = []
+    for group, start in chosen(name).items():
+        choices.append(f"  {group}=" + (f"    (by itself {start})" if start else ""))
+        for option in groups()[group]:
+            choices += _line(f"    {option}", sentence(f"{group}/{option}"), 26)
+        choices.append("")
+    head = ["Choices (group=option)", ""] if choices else []
+    return "\n".join([*_opening(name), "", *head, *choices, "Values (key=value)", "", *_values(config, "")])

@@ -17,6 +17,7 @@ from conf.presets import ROOT, groups
 from conf.schema import Entry, entries
 from experiments.cli.frame import Command
 from experiments.cli.help_page import chosen, sentence, shown
+from experiments.reporting.page import flat
 from experiments.reporting.tables import markdown
 
 __all__ = ["page"]
@@ -46,7 +47,9 @@ def page() -> str:
             _collect(config, "", parts)
     lines = [HEAD, "## Commands", ""]
     for name, command in commands.items():
-        lines += [f"### {name}", "", sentence(name), "", *_groups(name), *_table(command.schema, parts)]
+        taken = ", ".join(f"[`{group}`](#{_anchor(f'presets of {group}')})" for group in chosen(name))
+        lines += [f"### {name}", "", sentence(name), "", *((f"Groups: {taken}.", "") if taken else ())]
+        lines += _table(command.schema, parts)
     lines += ["## Parts", ""]
     for kind, name in parts.items():
         said = (kind.__doc__ or "").split("\n\n")[0].strip().replace("\n    ", " ")
@@ -56,12 +59,6 @@ def page() -> str:
         rows = [(f"`{option}`", sentence(f"{group}/{option}"), _changes(f"{group}/{option}")) for option in options]
         lines += [f"### Presets of {group}", "", markdown(("preset", "what it is", "what it changes"), rows)]
     return "\n".join(lines).rstrip() + "\n"
-
-
-def _groups(name: str) -> Iterator[str]:
-    """The groups a command has."""
-    taken = [f"[`{group}`](#{_anchor(f'presets of {group}')})" for group in chosen(name)]
-    yield from (f"Groups: {', '.join(taken)}.", "") if taken else ()
 
 
 def _anchor(heading: str) -> str:
@@ -116,16 +113,8 @@ def _changes(name: str) -> str:
     """The values of a preset's own file, and the preset it starts from."""
     own = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
     start = ", ".join(f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_")
-    changed = ", ".join(f"`{key}={shown(value)}`" for key, value in _flat(own, ""))
+    changed = ", ".join(f"`{key}={shown(value)}`" for key, value in flat(own))
     return "; ".join(filter(None, (start and f"as {start}", changed))) or "nothing"
-
-
-def _flat(values: dict[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for key, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 if __name__ == "__main__":

@@ -104,9 +104,6 @@ class Trial:
         minute = np.broadcast_to(self.minute, od.shape)
         return window_metrics(minute, od, window.setpoint, window.start, window.end)
 
-    def _inside(self, window: Window) -> NDArray[np.bool_]:
-        return (self.minute > window.start - 1e-6) & (self.minute < window.end - 1e-6)
-
     def media(self, window: Window) -> Array:
         """Fresh medium delivered within the window, mL, (N,)."""
         first, last = np.searchsorted(self.minute, [window.start - 1e-6, window.end - 1e-6])
@@ -114,7 +111,8 @@ class Trial:
 
     def effort(self, window: Window) -> Array:
         """Control effort: mean change of the pump rate from one decision to the next, µL/s, (N,)."""
-        return np.asarray(1000.0 * np.abs(np.diff(self.rate[:, self._inside(window)], axis=1)).mean(axis=1))
+        inside = (self.minute > window.start - 1e-6) & (self.minute < window.end - 1e-6)
+        return np.asarray(1000.0 * np.abs(np.diff(self.rate[:, inside], axis=1)).mean(axis=1))
 
 
 def run_trial(

@@ -82,7 +82,7 @@ class Table:
             r"\toprule",
             " & ".join(_tex(c) for c in self.columns) + r" \\",
             r"\midrule",
-            *(" & ".join(_tex_cell(c) for c in row) + r" \\" for row in self.rows),
+            *(" & ".join(_tex(c) for c in row) + r" \\" for row in self.rows),
             r"\bottomrule",
             r"\end{tabular}",
             r"\end{table}",
@@ -97,11 +97,8 @@ TEX = {"\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#"
 
 
 def _tex(text: str) -> str:
-    return "".join(TEX.get(character, character) for character in text)
-
-
-def _tex_cell(cell: str) -> str:
-    return rf"\textbf{{{_tex(cell)}}}" if isinstance(cell, Best) else _tex(cell)
+    plain = "".join(TEX.get(character, character) for character in text)
+    return rf"\textbf{{{plain}}}" if isinstance(text, Best) else plain
 
 
 def write(tables: Sequence[Table], folder: Path) -> None:
