@@ -25,10 +25,8 @@ Array = NDArray[np.float64]
 class OptimalPolicy:
     """Greedy policy with respect to the optimal value function.
 
-    log_od: uniform grid of log OD, shape (G,).
-    setpoints: shape (M,), sorted.
-    value: discounted cost-to-go V, shape (M, G).
-    factors: x(t+1) = factors[a] x(t), shape (A,).
+    log_od: uniform grid of log OD, shape (G,). setpoints: shape (M,), sorted.
+    value: discounted cost-to-go V, shape (M, G). factors: x(t+1) = factors[a] x(t), shape (A,).
     gamma: discount per step.
     """
 

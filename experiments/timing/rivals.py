@@ -28,26 +28,20 @@ class Ring:
     """A replay memory in NumPy, one array per field."""
 
     def __init__(self, capacity: int, observations: int) -> None:
-        self.before = np.zeros((capacity, 1, observations), dtype=np.float32)
-        self.after = np.zeros((capacity, 1, observations), dtype=np.float32)
-        self.action = np.zeros((capacity, 1), dtype=np.int64)
-        self.reward = np.zeros((capacity, 1), dtype=np.float32)
-        self.ended = np.zeros((capacity, 1), dtype=np.float32)
-        self.added = 0
+        kinds = ((observations,), "f4"), ((observations,), "f4"), ((), "i8"), ((), "f4"), ((), "f4")
+        self.fields: list[NDArray[Any]] = [np.zeros((capacity, 1, *shape), dtype=kind) for shape, kind in kinds]
+        self.capacity, self.added = capacity, 0
 
     def add(self, *fields: NDArray[Any]) -> None:
         """Store one transition (before, after, action, reward, ended) in place of the oldest."""
-        k = self.added % len(self.action)
-        stores: tuple[NDArray[Any], ...] = (self.before, self.after, self.action, self.reward, self.ended)
-        for store, value in zip(stores, fields, strict=True):
-            store[k] = value
+        for store, value in zip(self.fields, fields, strict=True):
+            store[self.added % self.capacity] = value
         self.added += 1
 
     def sample(self, rng: np.random.Generator, batch: int) -> list[torch.Tensor]:
         """A uniform minibatch as tensors."""
-        k = rng.integers(0, min(self.added, len(self.action)), batch)
-        fields = (self.before, self.after, self.action, self.reward, self.ended)
-        return [torch.from_numpy(field[k, 0]) for field in fields]
+        k = rng.integers(0, min(self.added, self.capacity), batch)
+        return [torch.from_numpy(field[k, 0]) for field in self.fields]
 
 
 def single_file_dqn(config: DQNConfig, seed: int) -> torch.nn.Module:
