@@ -127,8 +127,8 @@ def totals(trials: Sequence[Trial]) -> list[dict[str, Any]]:
     return found
 
 
-def _pair(one: Trial, other: Trial, metric: str, window: str, difference: Array, scale: Array) -> dict[str, Any]:
-    found, mean = Spread(difference), Spread(scale).mean
+def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, theirs: Array) -> dict[str, Any]:
+    found, mean = Spread(mine - theirs), Spread(theirs).mean
     return {
         "controller": one.controller,
         "against": other.controller,
@@ -155,17 +155,15 @@ def pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:
     for one, other in _partners(trials, against):
         for window in windows(one.schedule):
             mine, theirs = one.score(window), other.score(window)
-            for metric in METRICS:
-                a, b = getattr(mine, metric), getattr(theirs, metric)
-                found.append(_pair(one, other, metric, window.label, a - b, b))
+            scores = ((metric, getattr(mine, metric), getattr(theirs, metric)) for metric in METRICS)
+            found += [_pair(one, other, metric, window.label, a, b) for metric, a, b in scores]
     return found
 
 
 def total_pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:
     """As `pairs`, of the sums over windows."""
-    found = []
-    for one, other in _partners(trials, against):
-        for metric in METRICS:
-            a, b = _total(one, metric), _total(other, metric)
-            found.append(_pair(one, other, metric, "all", a - b, b))
-    return found
+    return [
+        _pair(one, other, metric, "all", _total(one, metric), _total(other, metric))
+        for one, other in _partners(trials, against)
+        for metric in METRICS
+    ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,26 +33,20 @@ PARTS = ("feed", "waste", "blank")  # one YAML file per reactor and part, REACTO
 @contextmanager
 def linked(backend: ChiBioConfig) -> Iterator[tuple[Transport, RealClock]]:
     """The open link to a device and the device's clock. Raises: LinkError."""
-    with _running(backend) as url:
-        transport = open_transport(backend.transport, url, backend.speed)
-        try:
-            yield transport, RealClock(backend.speed)
-        finally:
-            transport.close()
-
-
-@contextmanager
-def _running(backend: ChiBioConfig) -> Iterator[str]:
-    """Address of the device; `backend=emulator` starts one for as long as the run lasts. Raises: LinkError."""
-    if not isinstance(backend, EmulatorConfig):
-        yield backend.url
-        return
-    arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
-    if (overflow := backend.overflow_pump).pump:
-        arguments |= {"overflow-pump": overflow.pump, "overflow-flow": overflow.flow_ml_s}
-    with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
-        log.info("emulated device at %s, %g times real time; faults at %s", device.url, backend.speed, device.control)
-        yield device.url
+    with ExitStack() as stack:
+        url = backend.url
+        if isinstance(backend, EmulatorConfig):  # one is started for as long as the run lasts
+            arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
+            if (overflow := backend.overflow_pump).pump:
+                arguments |= {"overflow-pump": overflow.pump, "overflow-flow": overflow.flow_ml_s}
+            words = [word for k, v in arguments.items() for word in (f"--{k}", str(v))]
+            device = stack.enter_context(EmulatorProcess(words))
+            log.info(
+                "emulated device at %s, %g times real time; faults at %s", device.url, backend.speed, device.control
+            )
+            url = device.url
+        transport = stack.enter_context(closing(open_transport(backend.transport, url, backend.speed)))
+        yield transport, RealClock(backend.speed)
 
 
 def check(
