@@ -27,8 +27,7 @@ def groups() -> dict[str, list[str]]:
 def load(name: str) -> dict[str, Any]:
     """What a preset changes, together with the presets of its group that it starts from.
 
-    Args:
-      name: group and option, "plant/bench".
+    Args: name: group and option, "plant/bench".
     Raises: ValueError naming the presets of the group.
     """
     group, _, option = name.rpartition("/")

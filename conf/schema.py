@@ -12,12 +12,12 @@ import copy
 import math
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from conf.renamed import REMOVED, RENAMED
 
-__all__ = ["Meaning", "build", "check", "meaning", "old_name", "part", "require", "setting"]
+__all__ = ["Entry", "build", "check", "entries", "old_name", "part", "require", "setting"]
 
 T = TypeVar("T")
 
@@ -64,10 +64,9 @@ class Meaning:
     def allowed(self, key: str, many: bool = False, optional: bool = False) -> str:
         """The range in words, "" if every value of the type is allowed.
 
-        Args:
-          key: name of the field; many: it is a tuple; optional: it may be null.
+        Args: key: name of the field; many: it is a tuple; optional: it may be null.
         """
-        words = self._interval() if self.interval else self._range((self.unit or "value") if many else key)
+        words = self._range((self.unit or "value") if many else key)
         if words and many and not self.interval:
             words = f"each {'one of ' if self.choices else ''}{words}"
         if self.some:
@@ -78,64 +77,58 @@ class Meaning:
 
     def _range(self, name: str) -> str:
         if self.choices:
-            named = ", ".join(choice for choice in self.choices if choice)
-            return f"{named}, or '' for none" if "" in self.choices else named
-        low = self.above if self.at_least is None else self.at_least
-        high = self.below if self.at_most is None else self.at_most
-        if low is None and high is None:
-            return ""
-        if high is None:
-            return f"{'greater than' if self.at_least is None else 'at least'} {low:g}"
-        if low is None:
-            return f"{'less than' if self.at_most is None else 'at most'} {high:g}"
-        if math.isinf(high) and self.at_most is None:
-            return f"a finite number {'greater than' if self.at_least is None else 'of at least'} {low:g}"
-        if self.above is None and self.below is None:
-            return f"{low:g} to {high:g}"
-        return (
-            f"{low:g} {'<' if self.at_least is None else '<='} {name} {'<' if self.at_most is None else '<='} {high:g}"
-        )
-
-    def _interval(self) -> str:
+            return ", ".join(filter(None, self.choices)) + (", or '' for none" if "" in self.choices else "")
         low = self.above if self.at_least is None else self.at_least
         high = self.below if self.at_most is None else self.at_most
         left = "" if low is None else f"{low:g} {'<' if self.at_least is None else '<='} "
         right = "" if high is None else f" {'<' if self.at_most is None else '<='} {high:g}"
-        return f"[low, high] with {left}low <= high{right}"
+        if self.interval:
+            return f"[low, high] with {left}low <= high{right}"
+        if high is None:
+            return f"{'greater than' if self.at_least is None else 'at least'} {low:g}" if left else ""
+        if low is None:
+            return f"{'less than' if self.at_most is None else 'at most'} {high:g}"
+        if math.isinf(high) and self.at_most is None:
+            return f"a finite number {'greater than' if self.at_least is None else 'of at least'} {low:g}"
+        return f"{low:g} to {high:g}" if self.above is None and self.below is None else f"{left}{name}{right}"
 
 
-def setting(
-    default: T,
-    what: str,
-    unit: str = "",
-    *,
-    within: tuple[float, float] | None = None,
-    above: float | None = None,
-    at_least: float | None = None,
-    below: float | None = None,
-    at_most: float | None = None,
-    choices: Sequence[str] = (),
-    interval: bool = False,
-    some: bool = False,
-    note: str = "",
-) -> T:
+@dataclass(frozen=True)
+class Entry:
+    """One field of a config: its name, what was said of it (nothing without `setting` or `part`), and its value."""
+
+    name: str
+    said: Meaning
+    value: Any
+    optional: bool
+
+    @property
+    def allowed(self) -> str:
+        """The range in words."""
+        return self.said.allowed(self.name, isinstance(self.value, list | tuple), self.optional)
+
+
+def entries(config: Any) -> list[Entry]:
+    """The fields of a config dataclass, in order."""
+    return [
+        Entry(f.name, f.metadata.get("meaning", Meaning("")), getattr(config, f.name), "None" in str(f.type))
+        for f in fields(config)
+    ]
+
+
+def setting(default: T, what: str, unit: str = "", within: tuple[float, float] | None = None, **bounds: Any) -> T:
     """A field of a config dataclass; the arguments are those of `Meaning`, and within=(low, high) gives both bounds."""
     if within:
-        at_least, at_most = within
-    said = Meaning(what, unit, above, at_least, below, at_most, tuple(choices), interval, some, note)
+        bounds |= {"at_least": within[0], "at_most": within[1]}
+    said = {"meaning": Meaning(what, unit, **bounds)}
     if isinstance(default, dict | list):
-        return field(default_factory=lambda: copy.copy(default), metadata={"meaning": said})
-    return field(default=default, metadata={"meaning": said})
+        return field(default_factory=lambda: copy.copy(default), metadata=said)
+    return field(default=default, metadata=said)
 
 
 def part(factory: Callable[[], T], what: str) -> T:
     """A field that holds a config dataclass of its own."""
     return field(default_factory=factory, metadata={"meaning": Meaning(what)})
-
-
-def meaning(of: Field[Any]) -> Meaning:
-    """What was said about a field; nothing, for one that was made without `setting` or `part`."""
-    return cast(Meaning, of.metadata.get("meaning", Meaning("")))
 
 
 def require(holds: bool, key: str, given: object, allowed: str) -> None:
@@ -147,21 +140,15 @@ def require(holds: bool, key: str, given: object, allowed: str) -> None:
 def check(config: Any, prefix: str = "") -> None:
     """Check every field of a config dataclass against its own range; called by `__post_init__`.
 
-    Args:
-      prefix: where the config stands, "plant.pump"; "" for that of a command.
+    Args: prefix: where the config stands, "plant.pump"; "" for that of a command.
     Raises: ValueError `prefix.key = value unit: allowed RANGE`.
     """
-    for of in fields(config):
-        said, given = meaning(of), getattr(config, of.name)
-        if said.holds(given):
-            continue
-        key = f"{prefix}.{of.name}" if prefix else of.name
-        now = old_name(f"{key}={given}")
-        if now:
+    for entry in (e for e in entries(config) if not e.said.holds(e.value)):
+        key = f"{prefix}.{entry.name}" if prefix else entry.name
+        if now := old_name(f"{key}={entry.value}"):
             raise ValueError(now)
-        many = isinstance(given, list | tuple)
-        shown = list(given) if many else f"{given} {said.unit}".rstrip()
-        require(False, key, shown, said.allowed(of.name, many, "None" in str(of.type)))
+        shown = entry.value if isinstance(entry.value, list | tuple) else f"{entry.value} {entry.said.unit}".rstrip()
+        require(False, key, shown, entry.allowed)
 
 
 def old_name(key: str) -> str | None:
@@ -210,21 +197,20 @@ def _converted(given: Any, hint: Any, default: Any, key: str) -> Any:
         if given is None:
             return None
         hint = next(h for h in get_args(hint) if h is not types.NoneType)
-    if is_dataclass(default) or is_dataclass(hint):
-        require(isinstance(given, Mapping), key, given, f"keys and values, as {key}.NAME=VALUE")
-        return build(default if is_dataclass(default) else hint(), given, key)
     origin, inner = get_origin(hint) or hint, get_args(hint)
-    if origin is dict:
+    holds_part = is_dataclass(default) or is_dataclass(hint)
+    if holds_part or origin is dict:
         require(isinstance(given, Mapping), key, given, f"keys and values, as {key}.NAME=VALUE")
-        of = inner[1] if inner else Any
-        own = default if isinstance(default, dict) else {}
+    if holds_part:
+        return build(default if is_dataclass(default) else hint(), given, key)
+    if origin is dict:
+        of, own = (inner[1] if inner else Any), default or {}
         return own | {str(k): _converted(v, of, own.get(k), f"{key}.{k}") for k, v in given.items()}
     if origin in (tuple, list):
         require(isinstance(given, list | tuple), key, given, "a list, as [1,2]")
         of = inner[0] if inner else Any
-        rows = of is float  # a matrix may be given row by row
-        return origin(
-            _converted(v, hint if rows and isinstance(v, list | tuple) else of, None, f"{key}[{i}]")
+        return origin(  # a matrix may be given row by row
+            _converted(v, hint if of is float and isinstance(v, list | tuple) else of, None, f"{key}[{i}]")
             for i, v in enumerate(given)
         )
     return _scalar(given, hint, key)
@@ -237,9 +223,8 @@ def _scalar(given: Any, hint: Any, key: str) -> Any:
         require(word in (*TRUE, *FALSE), key, given, "true or false")
         return word in TRUE
     if hint in (int, float):
-        number = isinstance(given, str | int) or (hint is float and isinstance(given, float))
         try:
-            if number and not isinstance(given, bool):
+            if isinstance(given, str | int | hint) and not isinstance(given, bool):
                 return hint(given)
         except ValueError:
             pass

@@ -33,8 +33,7 @@ class DQNAgent:
     config change three of these: `hindsight_share` the minibatch, `action_gap` the target y, `huber` the loss.
 
     Args:
-      config: hyper-parameters.
-      observations: O, numbers per observation. actions: A.
+      config: hyper-parameters. observations: O, numbers per observation. actions: A.
       streams: for each name in STREAMS one SeedSequence per agent.
       relabel: goal replacement, used on a share `config.hindsight_share` of each minibatch.
       device: "cpu" or "cuda".
@@ -76,6 +75,10 @@ class DQNAgent:
             raise ValueError(
                 f"agent.hindsight_share = {config.hindsight_share}: this task has no goal to replace; set it to 0"
             )
+        self._parts: dict[str, Adam | Replay | UniformStream] = {
+            "adam": self._adam, "replay": self.replay,
+            "explore": self._explore, "draws": self._draws, "goals": self._goals,
+        }  # fmt: skip
         self.steps = 0  # environment steps taken
         self.updates = 0
         self.loss = torch.zeros(self.n_agents, device=self.device)  # of the last diagnosed update
@@ -133,8 +136,7 @@ class DQNAgent:
     def fit(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> None:
         """One Adam step towards Q(observation, action) = target; then, where due, the copy and a look at the loss.
 
-        Args:
-          observation: (S, B, O). action: (S, B) int64. target: (S, B).
+        Args: observation: (S, B, O). action: (S, B) int64. target: (S, B).
         """
         c = self.config
         q, inputs = self.online.forward(observation)
@@ -150,29 +152,17 @@ class DQNAgent:
 
     def state_dict(self) -> dict[str, Any]:
         """The complete learning state. A new agent of the same config that loads it continues to the bit."""
-        return {
-            "online": self.online.flat.cpu(),
-            "target": self.target.flat.cpu(),
-            "adam": self._adam.state_dict(),
-            "replay": self.replay.state_dict(),
-            "explore": self._explore.state_dict(),
-            "draws": self._draws.state_dict(),
-            "goals": self._goals.state_dict(),
-            "steps": self.steps,
-            "updates": self.updates,
-            "loss": self.loss.cpu(),
-            "q_range": self.q_range.cpu(),
-        }
+        tensors = {"online": self.online.flat, "target": self.target.flat, "loss": self.loss, "q_range": self.q_range}
+        counts = {"steps": self.steps, "updates": self.updates}
+        parts = {name: part.state_dict() for name, part in self._parts.items()}
+        return {**{name: tensor.cpu() for name, tensor in tensors.items()}, **parts, **counts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue as saved. Raises: RuntimeError from torch where shapes differ."""
         self.online.flat.copy_(state["online"])
         self.target.flat.copy_(state["target"])
-        self._adam.load_state_dict(state["adam"])
-        self.replay.load_state_dict(state["replay"])
-        self._explore.load_state_dict(state["explore"])
-        self._draws.load_state_dict(state["draws"])
-        self._goals.load_state_dict(state["goals"])
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
         self.steps = state["steps"]
         self.updates = state["updates"]
         self.loss = state["loss"].to(self.device)

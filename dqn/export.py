@@ -20,8 +20,7 @@ def export(
     """The greedy policy of one agent; a basis of the outputs is multiplied into the last layer.
 
     Args:
-      network: gives layer sizes and input map.
-      agent: index into `flat`.
+      network: gives layer sizes and input map. agent: index into `flat`.
       flat: weights of all agents, shape (S, P); not necessarily the network's own (the best ones, say).
       pump_rates: the action grid, mL/s, shape (A,).
       metadata: control_min, model, config_hash and whatever else a bench should check or show.

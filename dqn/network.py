@@ -24,8 +24,7 @@ def initial_weights(
 
     Args:
       sizes: units of feature, hidden and output layers; hidden ones even with `mirror`.
-      seed: the agent's own stream.
-      mirror: 1 or -1 for each feature; () = every unit is drawn.
+      seed: the agent's own stream. mirror: 1 or -1 for each feature; () = every unit is drawn.
       zero_output: the last layer starts at 0, and with it every Q value.
     Returns: float32, shape (P,), laid out as `QNetwork` wants it.
     """
@@ -55,8 +54,7 @@ def action_basis(actions: int, decay: float) -> torch.Tensor:
     actions is learned the more slowly the higher its degree. Q is nearly a parabola in the pump rate, which three rows
     give exactly. A cosine series would flatten the parabola at the ends of the grid.
 
-    Args:
-      actions: A. decay: >= 0.
+    Args: actions: A. decay: >= 0.
     Returns: shape (A, A), float32.
     """
     grid = np.linspace(-1.0, 1.0, actions)

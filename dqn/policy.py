@@ -30,10 +30,8 @@ class PolicyError(Exception):
 class Policy:
     """pump rate = rates[argmax_a Q(M [od, setpoint] + c, a)].
 
-    weights, biases: per layer (in, out) and (out,), float32.
-    input_matrix: M (F, O); input_offset: c (F,).
-    pump_rates: (A,), mL/s.
-    metadata: as in the module's description.
+    weights, biases: per layer (in, out) and (out,), float32. input_matrix: M (F, O); input_offset: c (F,).
+    pump_rates: (A,), mL/s. metadata: as in the module's description.
     """
 
     weights: tuple[NDArray[np.float32], ...]

@@ -34,8 +34,7 @@ class Replay:
     A transition is one row of 2 O + 3 float32 numbers, so that remembering one is one copy and drawing a minibatch one
     gather.
 
-    Args:
-      agents: S. capacity: transitions per agent. observations: O. device: where they are kept.
+    Args: agents: S. capacity: transitions per agent. observations: O. device: where they are kept.
     """
 
     def __init__(self, agents: int, capacity: int, observations: int, device: torch.device) -> None:
@@ -69,8 +68,7 @@ class Replay:
     def sample(self, uniform: torch.Tensor) -> Transition:
         """Uniform draws with replacement.
 
-        Args:
-          uniform: numbers in [0, 1), shape (S, B); number v picks row floor(v * size).
+        Args: uniform: numbers in [0, 1), shape (S, B); number v picks row floor(v * size).
         Returns: a minibatch, copies. Raises: ValueError while the memory is empty.
         """
         if self.added == 0:

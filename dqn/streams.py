@@ -21,8 +21,7 @@ class UniformStream:
     the block is drawn again. Once the block is used up, the generators are saved as they are.
 
     Args:
-      seeds: one per agent, S.
-      width: numbers per agent and call.
+      seeds: one per agent, S. width: numbers per agent and call.
       device: where the numbers go; a block at a time travels there.
     """
 

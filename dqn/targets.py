@@ -10,8 +10,7 @@ __all__ = ["advantage_target", "huber_loss", "loss_gradient", "q_target"]
 def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor) -> torch.Tensor:
     """y = r + gamma c max_a Q_target(s', a) (Mnih 2015).
 
-    Args:
-      r_t, continues: shape (S, B); q_t: target network at s', shape (S, B, A).
+    Args: r_t, continues: shape (S, B); q_t: target network at s', shape (S, B, A).
     Returns: shape (S, B).
     """
     return torch.addcmul(r_t, continues, q_t.amax(-1), value=gamma)
@@ -23,8 +22,7 @@ def advantage_target(target: torch.Tensor, alpha: float, q_tm1: torch.Tensor, a_
     The fixed point has the same greedy policy and the same maximum V; its gaps V - Q(s, a) are 1 / (1 - alpha) times
     those of Q-learning, so that an error of the network confuses fewer actions.
 
-    Args:
-      target: y, (S, B); q_tm1: target network at s, (S, B, A); a_tm1: (S, B) int64.
+    Args: target: y, (S, B); q_tm1: target network at s, (S, B, A); a_tm1: (S, B) int64.
     Returns: shape (S, B).
     """
     return target - alpha * (q_tm1.amax(-1) - q_tm1.gather(-1, a_tm1.unsqueeze(-1)).squeeze(-1))
@@ -35,8 +33,7 @@ def loss_gradient(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """TD errors d = Q(s, a) - y and the gradient of `huber_loss` of each agent by all Q values.
 
-    Args:
-      q_tm1: (S, B, A); a_tm1: (S, B) int64; target: y (S, B); huber: 0 means squared error.
+    Args: q_tm1: (S, B, A); a_tm1: (S, B) int64; target: y (S, B); huber: 0 means squared error.
     Returns: d (S, B), dL/dQ (S, B, A).
     """
     action = a_tm1.unsqueeze(-1)

@@ -57,26 +57,15 @@ class TrainRecord:
     @classmethod
     def joined(cls, records: Sequence[TrainRecord]) -> TrainRecord:
         """One record of the agents of several, taken at the same step."""
-
-        def all_of(key: str) -> NDArray[np.float64]:
-            return np.concatenate([getattr(record, key) for record in records])
-
-        return replace(
-            records[0],
-            episode_return=all_of("episode_return"),
-            loss=all_of("loss"),
-            q_min=all_of("q_min"),
-            q_max=all_of("q_max"),
-        )
+        each = ("episode_return", "loss", "q_min", "q_max")
+        whole: dict[str, Any] = {key: np.concatenate([getattr(r, key) for r in records]) for key in each}
+        return replace(records[0], **whole)
 
 
 class Trainer:
     """Lets S agents act in S copies of the environment and learn.
 
-    Args:
-      env: one copy per agent.
-      agent: the S agents.
-      interval: steps between records.
+    Args: env: one copy per agent. agent: the S agents. interval: steps between records.
     """
 
     def __init__(self, env: TrainingEnv, agent: DQNAgent, interval: int) -> None:
@@ -119,14 +108,9 @@ class Trainer:
         agent = self.agent
         q_range = agent.q_range.cpu().numpy().astype(np.float64)
         return TrainRecord(
-            step=agent.steps,
-            updates=agent.updates,
-            epsilon=agent.epsilon,
-            episode_return=self._finished.copy(),
-            loss=agent.loss.cpu().numpy().astype(np.float64),
-            q_min=q_range[:, 0],
-            q_max=q_range[:, 1],
-        )
+            step=agent.steps, updates=agent.updates, epsilon=agent.epsilon, episode_return=self._finished.copy(),
+            loss=agent.loss.cpu().numpy().astype(np.float64), q_min=q_range[:, 0], q_max=q_range[:, 1],
+        )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:
         """Complete state of agents, environment and loop."""

@@ -35,8 +35,7 @@ class GrowthLaw(Protocol):
     def specific_rate(self, substrate: Array) -> Array:
         """mu in 1/min, shape (N,).
 
-        Args:
-          substrate: limiting substrate relative to fresh medium (1 = fresh, 0 = exhausted), shape (N,), >= 0.
+        Args: substrate: limiting substrate relative to fresh medium (1 = fresh, 0 = exhausted), shape (N,), >= 0.
         Raises: nothing; parameters are checked where they are set, so the hot path stays bare.
         """
         ...
@@ -46,8 +45,7 @@ class GrowthLaw(Protocol):
 class Exponential:
     """mu is constant: the paper's growth law, x' = (mu - u/tau) x (equation 5).
 
-    Args:
-      mu: 1/min, scalar or shape (N,), >= 0.
+    Args: mu: 1/min, scalar or shape (N,), >= 0.
     """
 
     mu: float | Array
@@ -78,8 +76,7 @@ class Monod:
 class Arrhenius:
     """phi(T) = exp(-Ea / (R (T + 273.15))), valid 21 to 37 degC for E. coli (Ingraham & Marr, BioNumbers 105003).
 
-    Args:
-      activation_kj_mol: Ea, kJ/mol; 54 to 59 in the literature, mu(30)/mu(37) = 0.59 to 0.62.
+    Args: activation_kj_mol: Ea, kJ/mol; 54 to 59 in the literature, mu(30)/mu(37) = 0.59 to 0.62.
     """
 
     activation_kj_mol: float = 56.0
@@ -96,8 +93,7 @@ class Cardinal:
     phi(T) = (T - t_max)(T - t_min)^2
              / {(t_opt - t_min)[(t_opt - t_min)(T - t_opt) - (t_opt - t_max)(t_opt + t_min - 2 T)]}
 
-    Args:
-      t_min, t_opt, t_max: degC, t_min < t_opt < t_max.
+    Args: t_min, t_opt, t_max: degC, t_min < t_opt < t_max.
     """
 
     t_min: float = 6.0
@@ -142,9 +138,7 @@ class DilutedCulture:
     def derivative(self, state: Array, pump_rate: Array) -> Array:
         """d[x, s]/dt in 1/min.
 
-        Args:
-          state: [x, s], shape (N, 2).
-          pump_rate: u, mL/s, shape (N,), >= 0.
+        Args: state: [x, s], shape (N, 2). pump_rate: u, mL/s, shape (N,), >= 0.
         Returns: shape (N, 2). Raises: nothing.
         """
         x, s = state[:, 0], state[:, 1]

@@ -18,8 +18,7 @@ def euler(f: Derivative, y: Array, duration: float, substeps: int) -> Array:
     """Explicit Euler, y <- y + h f(y), first order; with h = 0.1 min what the paper integrates its model by.
 
     Args:
-      f: derivative, maps y to y' of the same shape.
-      y: start value, any shape.
+      f: derivative, maps y to y' of the same shape. y: start value, any shape.
       duration: time to advance, same unit of time as f.
       substeps: number of equal steps, >= 1; h = duration / substeps.
     Returns: y at the end, a new array. Raises: nothing.

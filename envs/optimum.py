@@ -25,10 +25,8 @@ Array = NDArray[np.float64]
 class OptimalPolicy:
     """Greedy policy with respect to the optimal value function.
 
-    log_od: uniform grid of log OD, shape (G,).
-    setpoints: shape (M,), sorted.
-    value: discounted cost-to-go V, shape (M, G).
-    factors: x(t+1) = factors[a] x(t), shape (A,).
+    log_od: uniform grid of log OD, shape (G,). setpoints: shape (M,), sorted.
+    value: discounted cost-to-go V, shape (M, G). factors: x(t+1) = factors[a] x(t), shape (A,).
     gamma: discount per step.
     """
 
@@ -49,8 +47,7 @@ class OptimalPolicy:
     def act(self, od: Array, setpoint: Array) -> NDArray[np.intp]:
         """Index of the best action by one exact look-ahead from `od`.
 
-        Args:
-          od: shape (N,), > 0; setpoint: shape (N,), each one of `setpoints`.
+        Args: od: shape (N,), > 0; setpoint: shape (N,), each one of `setpoints`.
         Raises: ValueError for a setpoint the policy was not solved for.
         """
         row = np.searchsorted(self.setpoints, setpoint - 1e-9)
@@ -95,8 +92,7 @@ def solve(config: EnvConfig, gamma: float = 0.99, setpoints: Array | None = None
 
     Args:
       config: the task; its 17 actions and its integrator are used as they are.
-      gamma: discount per control step.
-      setpoints: OD values, shape (M,); None takes the config's.
+      gamma: discount per control step. setpoints: OD values, shape (M,); None takes the config's.
       grid: number of points of log OD between a third of the lowest and twice the highest OD that can matter.
     Returns: the optimal policy. Raises: nothing beyond NumPy's own for absurd sizes.
     """

@@ -1,20 +1,36 @@
-"""The control task an agent is trained on: model, control period, action grid, episode (paper, section 3)."""
+"""The control task an agent is trained on: model, control period, action grid, reward, episode (paper, section 3)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
-from envs.actions import MAX_PUMP_RATE, pump_rates
 from envs.growth import DilutedCulture, Exponential
 from envs.integrators import INTEGRATORS
 
-__all__ = ["EnvConfig", "step_factors"]
+__all__ = ["MAX_PUMP_RATE", "EnvConfig", "pump_rates", "step_factors", "tracking_reward"]
 
 Array = NDArray[np.float64]
+T = TypeVar("T", bound=Any)
+
+MAX_PUMP_RATE = 0.02
+"""mL/s. The Chi.Bio's own regulator never exceeds a duty of 0.02 of a 1 mL/s pump (docs/device.md, Regulation)."""
+
+
+def pump_rates(n: int = 17, maximum: float = MAX_PUMP_RATE) -> Array:
+    """n pump rates in mL/s, equally spaced from 0 to `maximum`, shape (n,).
+
+    Raises: ValueError if n < 2 or `maximum` is not positive.
+    """
+    if n < 2:
+        raise ValueError(f"number of pump rates = {n}: allowed >= 2 (the pump must be able to stop and to run)")
+    if not maximum > 0.0:
+        raise ValueError(f"maximum pump rate = {maximum} mL/s: allowed > 0")
+    return np.linspace(0.0, maximum, n)
 
 
 @dataclass(frozen=True)
@@ -78,9 +94,7 @@ def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
     The model is linear in x, so the configured integrator, run once from x = 1 with all its sub-steps, gives f
     exactly: for Euler f = (1 + h (mu - u/tau))^substeps. Environment, optimum and MPC all step by this factor.
 
-    Args:
-      config: the task.
-      rates: pump rates u, mL/s, any shape; None means the action grid, shape (A,).
+    Args: config: the task. rates: pump rates u, mL/s, any shape; None means the action grid, shape (A,).
     """
     u = config.pump_rates() if rates is None else np.asarray(rates, dtype=np.float64)
     flat = u.reshape(-1)
@@ -89,3 +103,14 @@ def step_factors(config: EnvConfig, rates: Array | None = None) -> Array:
     advance = INTEGRATORS[config.integrator]
     end = advance(lambda y: culture.derivative(y, flat), unit, config.control_min, config.substeps)
     return end[:, 0].reshape(u.shape)
+
+
+def tracking_reward(od: T, setpoint: T) -> T:
+    """r = -(x - setpoint)^2 (paper, equation 4), of the OD reached by the step.
+
+    Args: od: x, shape (N,) or any; a NumPy array or a tensor. setpoint: same type, same or broadcastable shape.
+    Returns: shape of the broadcast. Raises: nothing.
+    """
+    error: T = od - setpoint
+    reward: T = -error * error
+    return reward

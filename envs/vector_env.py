@@ -11,8 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from envs.rewards import tracking_reward
-from envs.task import EnvConfig, step_factors
+from envs.task import EnvConfig, step_factors, tracking_reward
 
 __all__ = ["BioreactorVectorEnv", "EpisodeStreams", "action_space", "observation_space"]
 
@@ -90,9 +89,7 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
     End: never terminated; truncated after `episode_steps` steps (bootstrapping continues).
     Autoreset: SAME_STEP; the last observation of an ended episode is in infos["final_obs"].
 
-    Args:
-      num_envs: N >= 1.
-      config: the task.
+    Args: num_envs: N >= 1. config: the task.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
@@ -107,20 +104,10 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._factors = step_factors(self.config)
         self._setpoints = np.asarray(self.config.setpoints)
-        self._od = np.ones(num_envs)
-        self._setpoint = np.ones(num_envs)
+        self.od = np.ones(num_envs)  # true x in full precision
+        self.setpoint = np.ones(num_envs)  # of the running episode
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._streams: EpisodeStreams | None = None
-
-    @property
-    def od(self) -> Array:
-        """True x in full precision, shape (N,); a view to read."""
-        return self._od
-
-    @property
-    def setpoint(self) -> Array:
-        """Setpoint of the running episode, shape (N,); a view to read."""
-        return self._setpoint
 
     def seed_streams(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
         """Give every copy its stream; `reset(seed=...)` does this with seed, seed + 1, ..."""
@@ -131,14 +118,14 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
         assert self._streams is not None
         numbers = self._streams.take(copies)
         low, high = self.config.start_od
-        self._od[copies] = low + (high - low) * numbers[:, 0]
-        self._setpoint[copies] = self._setpoints[(numbers[:, 1] * self._setpoints.size).astype(np.intp)]
+        self.od[copies] = low + (high - low) * numbers[:, 0]
+        self.setpoint[copies] = self._setpoints[(numbers[:, 1] * self._setpoints.size).astype(np.intp)]
         self._steps[copies] = 0
 
     def _observe(self) -> NDArray[np.float32]:
         observation = np.empty((self.num_envs, 2), dtype=np.float32)
-        observation[:, 0] = self._od
-        observation[:, 1] = self._setpoint
+        observation[:, 0] = self.od
+        observation[:, 1] = self.setpoint
         return observation
 
     def reset(
@@ -169,17 +156,16 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """One control period in every copy.
 
-        Args:
-          actions: indices of pump rates, shape (N,), integers.
+        Args: actions: indices of pump rates, shape (N,), integers.
         Returns: observations (N, 2), rewards (N,), terminated (N,) all False, truncated (N,), infos; where an episode
           ended infos["final_obs"] (N, 2) holds its last observation and infos["_final_obs"] (N,) says where.
         Raises: RuntimeError before the first reset; IndexError for an action outside the grid.
         """
         if self._streams is None:
             raise RuntimeError("step before reset: call reset(seed=...) first")
-        np.multiply(self._od, self._factors[actions], out=self._od)
-        np.minimum(self._od, MAX_OD, out=self._od)
-        reward = tracking_reward(self._od, self._setpoint)
+        np.multiply(self.od, self._factors[actions], out=self.od)
+        np.minimum(self.od, MAX_OD, out=self.od)
+        reward = tracking_reward(self.od, self.setpoint)
         self._steps += 1
         truncated = self._steps >= self.config.episode_steps
         infos: dict[str, Any] = {}
@@ -196,8 +182,8 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
         """Everything needed to continue to the bit; plain numbers and lists."""
         assert self._streams is not None, "reset before state_dict"
         return {
-            "od": self._od.tolist(),
-            "setpoint": self._setpoint.tolist(),
+            "od": self.od.tolist(),
+            "setpoint": self.setpoint.tolist(),
             "steps": self._steps.tolist(),
             "streams": self._streams.state_dict(),
         }
@@ -205,8 +191,8 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
     def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
         """Continue as saved; returns the current observations (N, 2)."""
         assert self._streams is not None, "seed_streams before load_state_dict"
-        self._od[:] = state["od"]
-        self._setpoint[:] = state["setpoint"]
+        self.od[:] = state["od"]
+        self.setpoint[:] = state["setpoint"]
         self._steps[:] = state["steps"]
         self._streams.load_state_dict(state["streams"])
         return self._observe()

@@ -8,12 +8,11 @@ figure, and one sub-folder per variant with its TensorBoard curves. A stopped ru
 from __future__ import annotations
 
 import csv
-import io
 import logging
 import re
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,12 +20,8 @@ from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
 from experiments.cli import files, frame
-from experiments.training.config import TrainConfig
-from experiments.training.variants import variant
-from hardware.storage import atomic
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from experiments.reporting.tables import markdown
+from experiments.training.config import TrainConfig, variant
 
 __all__ = ["AblateConfig", "Row", "main", "summarise"]
 
@@ -71,15 +66,10 @@ class AblateConfig:
     def training(self, name: str) -> TrainConfig:
         """The training run of one variant."""
         return TrainConfig(
-            env=self.env,
-            agent=variant(self.agent, name, self.ablations[name]),
-            seed=self.seed,
-            n_agents=self.n_agents,
-            device=self.device,
-            threads=self.threads,
-            eval_every=self.eval_every,
+            env=self.env, agent=variant(self.agent, name, self.ablations[name]), seed=self.seed, n_agents=self.n_agents,
+            device=self.device, threads=self.threads, eval_every=self.eval_every,
             checkpoint_every=self.agent.total_steps,
-        )
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -100,19 +90,9 @@ def _read(path: Path) -> list[Row]:
     if not path.is_file():
         return []
     with open(path, newline="", encoding="utf-8") as f:
-        return [
-            Row(r["ablation"], int(r["seed"]), **{k: float(r[k]) for k in (*MEASURES, "train_seconds")})
-            for r in csv.DictReader(f)
-        ]
-
-
-def _write(path: Path, rows: list[Row]) -> None:
-    """All rows so far, atomically."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow([k.name for k in fields(Row)])
-    writer.writerows([getattr(row, k.name) for k in fields(Row)] for row in rows)
-    atomic.write(path, text.getvalue(), fsync=False)
+        rows = list(csv.DictReader(f))
+    numbers = (*MEASURES, "train_seconds")
+    return [Row(r["ablation"], int(r["seed"]), **{k: float(r[k]) for k in numbers}) for r in rows]
 
 
 def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
@@ -126,15 +106,10 @@ def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
     finally:
         session.writer.close()
     _, kept, last = session.report()
+    scores = (kept.regret_pct, kept.steady_abs_error, last.regret_pct, last.steady_abs_error)
     return [
         Row(
-            ablation=name,
-            seed=seed,
-            regret_pct=float(kept.regret_pct[i]),
-            steady_abs_error=float(kept.steady_abs_error[i]),
-            regret_pct_last=float(last.regret_pct[i]),
-            steady_abs_error_last=float(last.steady_abs_error[i]),
-            train_seconds=session.seconds,
+            name, seed, train_seconds=session.seconds, **{m: float(s[i]) for m, s in zip(MEASURES, scores, strict=True)}
         )
         for i, seed in enumerate(session.seeds)
     ]
@@ -161,19 +136,16 @@ def summarise(rows: list[Row]) -> dict[str, dict[str, Any]]:
 
 def table(rows: list[Row]) -> str:
     """The summary as a Markdown table: median over seeds and, in brackets, the worst seed."""
-    lines = [
-        "| variant | seeds | regret, % | steady error, OD | last regret, % | last steady error, OD | time, s |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    head = ("variant", "seeds", "regret, %", "steady error, OD", "last regret, %", "last steady error, OD", "time, s")
+    lines = []
     for name, entry in summarise(rows).items():
-        cells = []
-        for measure, digits in zip(MEASURES, (3, 4, 3, 4), strict=True):
-            cells.append(f"{entry[measure]['median']:.{digits}f} ({entry[measure]['worst']:.{digits}f})")
-        lines.append(f"| {name} | {entry['seeds']} | {' | '.join(cells)} | {entry['train_seconds']:.0f} |")
-    return "\n".join(lines) + "\n"
+        values = zip((entry[m] for m in MEASURES), (3, 4, 3, 4), strict=True)
+        cells = [f"{v['median']:.{digits}f} ({v['worst']:.{digits}f})" for v, digits in values]
+        lines.append((name, entry["seeds"], *cells, f"{entry['train_seconds']:.0f}"))
+    return markdown(head, lines)
 
 
-def figure(rows: list[Row]) -> Figure:
+def draw(rows: list[Row], folder: Path) -> None:
     """One point per seed: regret and steady error of the kept policy, and regret of the last iterate."""
     from experiments.reporting import charts
 
@@ -188,14 +160,12 @@ def figure(rows: list[Row]) -> Figure:
         own = {name: np.array([getattr(row, measure) for row in rows if row.ablation == name]) for name in names}
         charts.seeds(ax, own, label)
         ax.axvline(limit, color=charts.COLOURS[6], linewidth=1, linestyle="--")
-    return canvas
+    charts.save(canvas, folder / "figures", "ablation")
 
 
 def ablate(config: AblateConfig, folder: Path) -> float:
     """Train all variants; returns the median regret of the first, the objective of a sweep."""
     import torch
-
-    from experiments.reporting.charts import save
 
     torch.set_num_threads(1)
     path = folder / "ablation.csv"
@@ -206,7 +176,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
             continue
         log.info("variant %d of %d: %s %s", k + 1, len(config.names), name, config.ablations[name])
         rows += _train(config.training(name), name, folder / name)
-        _write(path, rows)
+        files.write_csv(path, [asdict(row) for row in rows])
         entry = summarise(rows)[name]
         regret, steady, last = (entry[m] for m in MEASURES[:3])
         log.info(
@@ -217,7 +187,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
     summary = summarise(rows)
     files.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
     (folder / "table.md").write_text(table(rows), encoding="utf-8")
-    save(figure(rows), folder / "figures", "ablation")
+    draw(rows, folder)
     log.info("table %s, figure %s", folder / "table.md", folder / "figures" / "ablation.png")
     return float(summary[config.names[0]]["regret_pct"]["median"])
 

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig
 
+from dqn import policy as policies
+from dqn.policy import Policy
 from experiments.cli import files, frame
 from experiments.comparison.config import BenchmarkConfig
+from experiments.comparison.trials import Loops, Trial, cells
+from experiments.control.policies import load_policy
 from experiments.controllers import registry
 from experiments.training.config import TrainConfig
-
-if TYPE_CHECKING:
-    from dqn.policy import Policy
-    from experiments.comparison.trials import Trial
 
 log = logging.getLogger(__name__)
 
@@ -25,11 +27,7 @@ def learned(
     config: BenchmarkConfig, wanted: set[str], folder: Path
 ) -> tuple[dict[str, Policy], dict[str, Any], list[dict[str, str]]]:
     """Policies of the learned controllers, where each comes from, and the figures of those trained here."""
-    import json
-
-    from dqn import policy as policies
-    from experiments.control.policies import load_policy
-    from experiments.training.run import train
+    from experiments.training.run import train  # torch, only where agents are trained
 
     found: dict[str, Policy] = {}
     agents: dict[str, Any] = {}
@@ -57,20 +55,13 @@ def learned(
             f"Bands over seeds: range and middle half. The policy used here is that of seed {summary['policy_seed']}, "
             f"best on the selection grid: regret {summary['regret_pct'][at]:.2f} % on the reported grid."
         )
-        figures.append(
-            {
-                "file": f"training/{name}/figures/learning.svg",
-                "title": f"Training of {name} (the paper's Fig. 2b)",
-                "caption": caption,
-            }
-        )
+        title = f"Training of {name} (the paper's Fig. 2b)"
+        figures.append({"file": f"training/{name}/figures/learning.svg", "title": title, "caption": caption})
     return found, agents, figures
 
 
 def _store(trials: list[Trial], folder: Path) -> None:
     """Every trajectory, as `scenario/plant/controller/od` etc. of shape (N, K), in trajectories.npz."""
-    import numpy as np
-
     arrays = {
         f"{t.scenario}/{t.plant}/{t.controller}/{key}": getattr(t, key).astype(np.float32)
         for t in trials
@@ -83,7 +74,6 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     """Calibrate, train, run every closed loop, compare, draw, report."""
     from experiments.comparison import page as pages
     from experiments.comparison import studies
-    from experiments.comparison.workers import Loops, cells
     from experiments.reporting import charts, page
 
     wanted = cells(config)
@@ -106,12 +96,12 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     names = {c for c, _, _ in wanted if config.controllers[c].kind == "dqn"}
     with Loops(config) as loops:
         loops.start([cell for cell in wanted if cell[0] not in names])  # they run while the agents are trained
-        policies, agents, learning = learned(config, names | (set(config.agents) if config.training else set()), folder)
+        found, agents, learning = learned(config, names | (set(config.agents) if config.training else set()), folder)
         shown += learning
         for name in sorted(names):
-            loops.start([cell for cell in wanted if cell[0] == name], policies[name])
-        found = loops.results()
-    trials = [found[cell] for cell in wanted]
+            loops.start([cell for cell in wanted if cell[0] == name], found[name])
+        done = loops.results()
+    trials = [done[cell] for cell in wanted]
     summary = studies.summarise(config, trials) | {"calibration": fitted, "agents": agents}
     for drawing in studies.draw(config, trials, summary):
         keep(drawing)

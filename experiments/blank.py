@@ -9,8 +9,7 @@ from pathlib import Path
 
 from conf.schema import check, part, setting
 from experiments.cli import files, frame
-from experiments.control.calibration_files import save
-from experiments.control.device import linked
+from experiments.control.device import linked, save_calibration
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.procedures import measure_blanks
 from hardware.chibio.reactors import ChiBioReactors
@@ -53,7 +52,7 @@ def blank(config: BlankConfig, folder: Path) -> None:
     for name, identity, raw, sd in zip(reactors.names, stored, mean, spread, strict=True):
         when = {"date": date.today().isoformat(), "device_id": identity}
         values = {"blank": float(raw), "sd": float(sd), "samples": config.samples, **when}
-        path = save(Path(backend.calibration), name, "blank", values)
+        path = save_calibration(Path(backend.calibration), name, "blank", values)
         rows[name] = {**values, "file": str(path)}
         log.info("%s: blank %.0f +- %.0f counts, stored in %s", name, raw, sd, path)
     files.write_json(folder / "summary.json", rows)

@@ -6,14 +6,14 @@ Also the generator of the paper's open-loop protocol (generate=true) and the cov
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from conf.schema import check, meaning, part, require, setting
+from conf.schema import check, entries, part, require, setting
 from envs.identification.fit import Parameter
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series, row_spans
@@ -23,9 +23,6 @@ from experiments.cli import files, frame
 from hardware.errors import RecordingError
 from hardware.storage.recorder import Recorder
 from hardware.storage.recording_reader import Recording, read_recording
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["CalibrateConfig", "body", "environment_yaml", "main", "summary"]
 
@@ -94,21 +91,12 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
         result = calibrate(raw, config.identify)
     except ValueError as error:
         raise frame.UserError(f"{source}: {error}") from None
-    from experiments.reporting.calibration_charts import drift_figure, fit_figure
-    from experiments.reporting.charts import save
-
     name = Path(source).name
-    figures = {
-        "fit": fit_figure(raw, result, f"{name}: measured and free-running model"),
-        "drift": drift_figure(result, f"{name}: segments of about {config.identify.segment_min:g} min, fitted alone"),
-    }
-    for key, figure in figures.items():
-        save(figure, folder / "figures", key)
     environment = folder / f"{config.name}.yaml"
     environment.write_text(environment_yaml(result, name), encoding="utf-8")
     content = summary(result, recording, raw)
     files.write_json(folder / "summary.json", {**content, "data": source, "env_file": str(environment)})
-    _events(folder, result, figures)
+    _draw(folder, raw, result, name, config.identify.segment_min)
     print(report(result, recording, content))
     print(f"\n  files       {environment}\n              {folder}/{{summary.json, figures/}}")
     return result.fit.pmse_pct
@@ -144,14 +132,9 @@ def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str,
         "warnings": list(result.warnings),
         "notes": list(recording.notes),
         "rejected": [
-            {
-                "rows": row_spans(r.rows),
-                "first": int(r.rows[0]),
-                "last": int(r.rows[-1]),
-                "n": len(r.rows),
-                "reason": r.reason,
-            }
-            for r in result.rejections
+            {"rows": row_spans(r.rows), "first": int(r.rows[0]), "last": int(r.rows[-1])}
+            | {"n": len(r.rows), "reason": r.reason}
+            for r in result.screened.rejections
         ],
         "window": result.window_reason,
         "rows": [int(raw.row[0]), int(raw.row[-1]) + 1],
@@ -187,14 +170,8 @@ def _interval(p: Parameter) -> dict[str, Any]:
 def _drift(d: Drift | None) -> dict[str, Any] | None:
     if d is None:
         return None
-    return {
-        "first": d.first,
-        "last": d.last,
-        "change_pct": d.change_pct,
-        "per_hour": _interval(d.slope_per_h),
-        "significant": d.significant,
-        "segments": d.segments,
-    }
+    line = {"first": d.first, "last": d.last, "change_pct": d.change_pct, "per_hour": _interval(d.slope_per_h)}
+    return {**line, "significant": d.significant, "segments": d.segments}
 
 
 def environment_yaml(result: Calibration, source: str) -> str:
@@ -207,30 +184,35 @@ def environment_yaml(result: Calibration, source: str) -> str:
         f"# 95 % intervals: mu {mu.low:.6g} to {mu.high:.6g} 1/min, tau {tau.low:.6g} to {tau.high:.6g}.",
         *(f"# Warning: {w}." for w in result.warnings),
     ]
-    env = EnvConfig(mu=mu.value, tau=tau.value)
-    for f in fields(env):
-        given, said = getattr(env, f.name), meaning(f)
-        comment = ", ".join(filter(None, (said.what, said.unit)))
-        lines.append(f"{f.name}: {list(given) if isinstance(given, tuple) else given} # {comment}")
+    for entry in entries(EnvConfig(mu=mu.value, tau=tau.value)):
+        comment, given = ", ".join(filter(None, (entry.said.what, entry.said.unit))), entry.value
+        lines.append(f"{entry.name}: {list(given) if isinstance(given, tuple) else given} # {comment}")
     return "\n".join(lines) + "\n"
 
 
-def _events(folder: Path, result: Calibration, figures: dict[str, Figure]) -> None:
-    """Scalars and figures for TensorBoard."""
+def _draw(folder: Path, raw: Series, result: Calibration, name: str, segment_min: float) -> None:
+    """Figures, as files and for TensorBoard, and its scalars."""
+    from experiments.reporting.calibration_charts import drift_figure, fit_figure
+    from experiments.reporting.charts import save
     from experiments.reporting.tensorboard import Events
 
+    figures = {
+        "fit": fit_figure(raw, result, f"{name}: measured and free-running model"),
+        "drift": drift_figure(result, f"{name}: segments of about {segment_min:g} min, fitted alone"),
+    }
     events = Events(folder)
     for tag, value in (
-        ("calibration/mu_per_min", result.fit.mu.value),
-        ("calibration/tau", result.tau.value),
-        ("calibration/pmse_pct", result.fit.pmse_pct),
+        ("mu_per_min", result.fit.mu.value),
+        ("tau", result.tau.value),
+        ("pmse_pct", result.fit.pmse_pct),
     ):
-        events.scalar(tag, value, 0)
+        events.scalar(f"calibration/{tag}", value, 0)
     for i, segment in enumerate(result.segments):
         for name, parameter in (("mu_per_min", segment.mu), ("tau", segment.tau)):
             if parameter is not None:
                 events.scalar(f"drift/{name}", parameter.value, i)
     for key, figure in figures.items():
+        save(figure, folder / "figures", key)
         events.figure(f"calibration/{key}", figure, 0)
     events.close()
 
@@ -261,7 +243,7 @@ def report(result: Calibration, recording: Recording, content: dict[str, Any]) -
                 f"  drift       {name} {drift.first:.3g} to {drift.last:.3g} along the recording "
                 f"({drift.change_pct:+.0f} %{sure})"
             )
-    lines += [f"  rejected    rows {row_spans(r.rows)} ({len(r.rows)}): {r.reason}" for r in result.rejections]
+    lines += [f"  rejected    rows {row_spans(r.rows)} ({len(r.rows)}): {r.reason}" for r in result.screened.rejections]
     lines += [f"  note        {note}" for note in recording.notes]
     lines += [f"  warning     {warning}" for warning in result.warnings]
     return "\n".join(lines)
@@ -297,35 +279,22 @@ def _coverage(config: CalibrateConfig, folder: Path) -> float:
             found.append(calibrate(Series(time, od[i], pump_rate[i], rows), config.identify))
         except ValueError as error:
             raise frame.UserError(f"simulated recording {i}: {error}") from None
-    mu = np.array([(c.fit.mu.value, c.fit.mu.low, c.fit.mu.high) for c in found])
-    tau = np.array([(c.tau.value, c.tau.low, c.tau.high) for c in found])
-    truth = (protocol.mu, protocol.tau)
-    shares = [_share(values, true) for values, true in zip((mu, tau), truth, strict=True)]
+    pairs = [(c.fit.mu, c.tau) for c in found]
+    mu, tau = (np.array([(p.value, p.low, p.high) for p in column]) for column in zip(*pairs, strict=True))
+    truth, shares, widths = (protocol.mu, protocol.tau), {}, {}
+    for name, values, true in zip(("mu", "tau"), (mu, tau), truth, strict=True):
+        shares[name] = 100.0 * float(np.mean((values[:, 1] <= true) & (true <= values[:, 2])))
+        widths[name] = 50.0 * float(np.median((values[:, 2] - values[:, 1]) / values[:, 0]))
     title = f"{n} simulated recordings of {protocol.hours:g} h, {100 * protocol.noise:g} % noise (seed {protocol.seed})"
     from experiments.reporting.calibration_charts import coverage_figure
     from experiments.reporting.charts import save
 
     save(coverage_figure(mu, tau, truth, title), folder / "figures", "coverage")
-    files.write_json(
-        folder / "summary.json",
-        {
-            "recordings": n,
-            "coverage_pct": {"mu": shares[0], "tau": shares[1]},
-            "noise": protocol.noise,
-            "relative_half_width_pct": {"mu": _half_width(mu), "tau": _half_width(tau)},
-        },
-    )
-    print(f"95 % intervals hold the truth: mu {shares[0]:.1f} %, tau {shares[1]:.1f} % of {n}")
+    numbers = {"recordings": n, "coverage_pct": shares, "noise": protocol.noise, "relative_half_width_pct": widths}
+    files.write_json(folder / "summary.json", numbers)
+    print(f"95 % intervals hold the truth: mu {shares['mu']:.1f} %, tau {shares['tau']:.1f} % of {n}")
     print(f"figure and summary in {folder}")
-    return min(shares)
-
-
-def _share(values: np.ndarray[Any, np.dtype[np.float64]], truth: float) -> float:
-    return 100.0 * float(np.mean((values[:, 1] <= truth) & (truth <= values[:, 2])))
-
-
-def _half_width(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
-    return 50.0 * float(np.median((values[:, 2] - values[:, 1]) / values[:, 0]))
+    return min(shares.values())
 
 
 main = frame.Command("calibrate", CalibrateConfig(), body)

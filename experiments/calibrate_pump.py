@@ -15,8 +15,7 @@ import numpy as np
 
 from conf.schema import check, part, require, setting
 from experiments.cli import files, frame
-from experiments.control.calibration_files import save
-from experiments.control.device import linked
+from experiments.control.device import linked, save_calibration
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection, no_log
 from hardware.chibio.dosing import PumpFit, fit_pump
@@ -157,7 +156,7 @@ def calibrate(config: CalibratePumpConfig, folder: Path) -> None:
     weighings = [{"duty": s.duty, "doses": s.doses, "grams": s.grams} for s in found]
     uncertainty = {"flow_se": fit.flow_se, "bias_se": fit.bias_se}
     values = {**fit.calibration.as_dict(), **uncertainty, "weighings": weighings}
-    path = save(Path(config.backend.calibration), config.reactor, config.pump, values)
+    path = save_calibration(Path(config.backend.calibration), config.reactor, config.pump, values)
     files.write_json(folder / "summary.json", {**values, "file": str(path)})
     log.info("%s %s pump\n%s\nstored in %s", config.reactor, config.pump, report(fit, found), path)
 

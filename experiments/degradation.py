@@ -12,11 +12,10 @@ Two measurements, on the same task and seeds:
 
 from __future__ import annotations
 
-import csv
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +25,7 @@ from dqn.config import DQNConfig
 from envs.optimum import OptimalPolicy, solve
 from envs.task import EnvConfig
 from experiments.cli import files, frame
-from experiments.training.variants import variant
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from experiments.training.config import variant
 
 __all__ = ["DegradationConfig", "action_gap", "main", "optimal_q"]
 
@@ -61,8 +57,7 @@ class DegradationConfig:
 def optimal_q(policy: OptimalPolicy, od: Array, row: NDArray[np.intp]) -> Array:
     """Q*(x, s, a) = -[(f_a x - s)^2 + gamma V(f_a x)], the discounted return, shape of `od` + (A,).
 
-    Args:
-      policy: the solved task. od: x, any shape. row: index of the setpoint in `policy.setpoints`, shape of `od`.
+    Args: policy: the solved task. od: x, any shape. row: index of the setpoint in `policy.setpoints`, shape of `od`.
     """
     after = od[..., None] * policy.factors
     goal = policy.setpoints[row][..., None]
@@ -136,13 +131,13 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
 
     from dqn.agent import STREAMS, DQNAgent
     from dqn.replay import Transition
-    from experiments.training import build, seeding
+    from experiments.training import build
     from experiments.training.evaluation import Evaluation, report_grid
 
     agent = variant(config.agent, name, config.fitted[name])
     seeds = range(config.seed, config.seed + config.n_agents)
     relabel = build.hindsight(config.env, agent)
-    learner = DQNAgent(agent, 2, config.env.n_actions, seeding.streams(seeds, STREAMS), relabel)
+    learner = DQNAgent(agent, 2, config.env.n_actions, build.streams(seeds, STREAMS), relabel)
     unit = solve(replace(config.env, start_od=(0.04, 3.9)), agent.gamma, setpoints=np.array([0.5]), grid=9001)
     numbers = [np.random.default_rng(seed) for seed in seeds]
     low, high = config.env.start_od
@@ -162,7 +157,7 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
     return {"regret_pct": score.regret_pct, "steady_abs_error": score.steady_abs_error}
 
 
-def figure(rows: list[dict[str, float | str]], fitted: dict[str, dict[str, Any]]) -> Figure:
+def draw(rows: list[dict[str, float | str]], fitted: dict[str, dict[str, Any]], folder: Path) -> None:
     """Regret and value error during training; regret and steady error of the networks fitted to exact values."""
     from experiments.reporting import charts
 
@@ -180,29 +175,24 @@ def figure(rows: list[dict[str, float | str]], fitted: dict[str, dict[str, Any]]
     panels = (("regret_pct", "regret when fitted to Q*, %"), ("steady_abs_error", "steady error when fitted to Q*, OD"))
     for ax, (key, label) in zip(fits, panels, strict=True):
         charts.seeds(ax, {name: np.asarray(score[key]) for name, score in fitted.items()}, label)
-    return canvas
+    charts.save(canvas, folder / "figures", "degradation")
 
 
 def degradation(config: DegradationConfig, folder: Path) -> float:
     """Both measurements; returns the median regret of the first trained variant at its end."""
     import torch
 
-    from experiments.reporting.charts import save
-
     if not config.trained:
         raise frame.UserError("trained: no variant; name at least one, as conf/degradation.yaml does")
     torch.set_num_threads(1)
     rows = [row for name in config.trained for row in _watch(config, name)]
-    with open(folder / "curves.csv", "w", newline="", encoding="utf-8") as f:
-        writer = csv.DictWriter(f, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(rows)
+    files.write_csv(folder / "curves.csv", rows)
     fitted = {name: _fit(config, name) for name in config.fitted}
     gap = action_gap(solve(config.env, config.agent.gamma))
     log.info("one level beside the best action costs %.1e at the setpoint", gap)
     ends = {name: [r for r in rows if r["variant"] == name][-1] for name in config.trained}
     files.write_json(folder / "summary.json", {"action_gap": gap, "trained": ends, "fitted": fitted})
-    save(figure(rows, fitted), folder / "figures", "degradation")
+    draw(rows, fitted, folder)
     log.info("curves %s, figure %s", folder / "curves.csv", folder / "figures" / "degradation.png")
     return float(rows[-1]["regret_pct"])
 

@@ -2,109 +2,19 @@
 
 from __future__ import annotations
 
-import logging
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from experiments.cli import files, frame
+from experiments.cli import frame
 from experiments.control.config import DeployConfig, deploy_schema
-
-if TYPE_CHECKING:
-    from experiments.control.assemble import Setup
-    from experiments.control.loop import ClosedLoop
-    from experiments.control.record import Record
-
-log = logging.getLogger(__name__)
-
-
-def _run(loop: ClosedLoop, record: Record) -> str:
-    """The loop until its end or trouble; returns the outcome. Pumps are verified off, whatever happens."""
-    from tqdm import tqdm
-    from tqdm.contrib.logging import logging_redirect_tqdm
-
-    from experiments.control import signals
-    from experiments.control.console import ChangeLog
-    from hardware.errors import ReactorError
-
-    log_changes, reactors = ChangeLog(loop), loop.reactors
-    outcome = "failed: see the log"
-    record.journal.append("start", {"time_s": round(reactors.elapsed(), 3), "pid": os.getpid()})
-    try:
-        with logging_redirect_tqdm(), tqdm(disable=None, unit="sample") as bar:
-            for step in loop.run():
-                record.done(step, loop.state())
-                log_changes(step)
-                bar.update(int(step.rows.sum()))
-        given_up = [name for name, s in zip(reactors.names, loop.stopped, strict=True) if s]
-        outcome = f"stopped by the interlock: {', '.join(given_up)}" if given_up else "completed"
-    except KeyboardInterrupt:
-        outcome = "stopped by the operator"
-    except ReactorError as error:
-        outcome = f"failed: {error}"
-    except Exception as error:  # whatever it is, what was recorded is worth a summary
-        log.exception("the run ends")
-        outcome = f"failed: {type(error).__name__}: {error}"
-    finally:
-        with signals.held_back():
-            try:
-                reactors.stop()
-                left = ", ".join(n for n, h in zip(reactors.names, loop.handed_over, strict=True) if h)
-                log.info("pumps verified off%s", f"; {left}: left to the on-board regulation" if left else "")
-            except ReactorError as error:
-                outcome = f"failed: {error}"
-    return outcome
-
-
-def _finish(record: Record, setup: Setup, outcome: str) -> str:
-    """Figure and summary.json, whatever the outcome; returns the outcome, failed if they could not be written."""
-    from experiments.control.console import metrics_table
-    from experiments.control.summary import figure_of, summarise
-    from experiments.reporting import charts
-
-    config, folder = setup.config, record.folder
-    try:
-        figure = figure_of(record, setup.scenarios, f"{config.backend.kind}: {outcome}")
-        path = charts.save(figure, folder / "figures", "closed_loop")
-        record.events.figure("figures/closed_loop", figure, record.series("time_min").shape[1])
-        roles = [config.role(name) for name in record.names]
-        summary = {**summarise(record, setup.scenarios, roles, outcome), "figure": str(path)}
-        files.write_json(folder / "summary.json", summary)
-    except OSError as error:
-        why = f"figure and summary not written ({error.strerror or error})"
-        return f"failed: {outcome.removeprefix('failed: ')}; {why}"
-    log.info("%s after %.0f min, %.1f mL of fresh medium", outcome, summary["minutes"], summary["volume_ml"])
-    what = "ISE, ITAE with T = 1 min; /T with T = window; settled: min until |e| stays within 5 %"
-    log.info("%s\n%s", what, metrics_table(summary["windows"]))
-    log.info("recordings %s; figure %s; tensorboard --logdir %s", folder / "recordings", path, folder)
-    return outcome
 
 
 def deploy(config: DeployConfig, folder: Path) -> None:
     """One closed loop over the scenario."""
-    from contextlib import closing
+    from experiments.control import run  # matplotlib and SciPy, only once the config has been checked
 
-    from experiments.control import assemble, signals
-    from experiments.control.record import Record
-    from hardware.errors import ReactorError
-
-    setup = assemble.unpack(config, folder)
-    try:
-        if config.preflight_only:
-            assemble.run_preflight(setup, folder)
-            return
-        with signals.like_ctrl_c(), closing(Record(folder, config.backend.reactors, config.fsync)) as record:
-            for repair in record.repairs:
-                log.warning("%s", repair)
-            with assemble.opened(setup, record) as loop:
-                outcome = _run(loop, record)
-            outcome = _finish(record, setup, outcome)
-    except ReactorError as error:
-        raise frame.UserError(str(error)) from None
-    if outcome.startswith("failed"):
-        raise frame.UserError(outcome)
+    run.deploy(config, folder)
 
 
 def _schema(cfg: DictConfig) -> DeployConfig:

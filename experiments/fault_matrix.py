@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
+import math
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from conf.schema import check, part, require, setting
 from envs.scenario import Scenario
@@ -18,9 +20,8 @@ from experiments.cli import files, frame
 from experiments.controllers.registry import STANDALONE
 from experiments.reliability.case import MOMENTS, FaultCase
 from experiments.reliability.faults import FAULTY, by_name
-from experiments.reliability.outcome import Outcome
+from experiments.reliability.outcome import Outcome, declared, table, totals, write_cases
 from experiments.reliability.rehearsal import rehearsed
-from experiments.reliability.tables import declared, table, totals, write_cases
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.safety.config import SafetyConfig
 
@@ -46,10 +47,7 @@ class FaultMatrixConfig:
     overflow_pump: OverflowPumpConfig = part(lambda: OverflowPumpConfig("Pump3", 0.95, 1.2), "of the rig")
     faults: tuple[str, ...] = setting((), "names, as in docs/faults.md; empty: all")
     moments: tuple[str, ...] = setting(
-        MOMENTS,
-        "recovery; steady at the first setpoint; after the step; feed pump running",
-        choices=MOMENTS,
-        some=True,
+        MOMENTS, "recovery; steady at the first setpoint; after the step; feed pump running", choices=MOMENTS, some=True
     )
     controls: int = setting(10, "healthy runs: whatever the interlock says there is a false alarm", within=(0, 1000))
     seed: int = setting(0, "of all noise", at_least=0)
@@ -82,44 +80,59 @@ def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
     return controls + [(name, moment, config.seed, guarded) for name, guarded in rigs for moment in config.moments]
 
 
-@contextmanager
-def pool(workers: int) -> Iterator[Executor]:
-    """Fresh processes: a limit on file size, which one fault sets, is the process's."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers or None, mp_context=context) as executor:
-        yield executor
-
-
-def run_all(config: FaultMatrixConfig, tick: Callable[[], object]) -> list[Outcome]:
-    """Every case, in order."""
+def run_all(config: FaultMatrixConfig) -> list[Outcome]:
+    """Every case, in order; a bar on a terminal, every 50th case in a log."""
     cases = all_cases(config)
-    with pool(config.workers) as executor:
+    fresh = multiprocessing.get_context("spawn")  # a limit on file size, which one fault sets, is the process's
+    with (
+        ProcessPoolExecutor(config.workers or None, mp_context=fresh) as executor,
+        logging_redirect_tqdm(),
+        tqdm(total=len(cases), disable=None, unit="case") as bar,
+    ):
         futures = [executor.submit(run_case, config, *case) for case in cases]
-        for future in as_completed(futures):
+        for done, future in enumerate(as_completed(futures), 1):
             future.result()
-            tick()
+            bar.update()
+            if done % 50 == 0 and bar.disable:
+                log.info("%d of %d cases", done, len(cases))
         return [future.result() for future in futures]
+
+
+def draw(outcomes: list[Outcome], moments: tuple[str, ...], folder: Path) -> None:
+    """Fault by moment: time until it was reported (number, min) over the largest OD error it caused (colour).
+
+    A dash means that it was not reported; a frame, that the case did not go as declared.
+    """
+    from matplotlib.colors import LogNorm
+
+    from experiments.reporting.charts import COLOURS, new_figure, save
+
+    names = list(dict.fromkeys(o.label for o in outcomes))
+    error = np.full((len(names), len(moments)), np.nan)
+    figure, (ax,) = new_figure(3.6 + 1.1 * len(moments), 1.2 + 0.2 * len(names))
+    ax.grid(False)
+    for o in outcomes:
+        row, column = names.index(o.label), moments.index(o.moment)
+        error[row, column] = max(o.peak_error, 0.01)
+        text = f"{o.detected_s / 60.0:.1f}" if math.isfinite(o.detected_s) else "–"
+        dark = o.peak_error > 0.4
+        ax.text(column, row, text, ha="center", va="center", fontsize=6, color="white" if dark else "black")
+        if not o.ok:
+            ax.plot(column, row, marker="s", markersize=14, markerfacecolor="none", markeredgecolor=COLOURS[1])
+    image = ax.imshow(error, norm=LogNorm(0.02, 2.0), cmap="cividis_r", aspect="auto")
+    ax.set_xticks(range(len(moments)), moments, fontsize=8)
+    ax.set_yticks(range(len(names)), names, fontsize=7)
+    ax.set_title("minutes until reported (–: not reported)", fontsize=9)
+    bar = figure.colorbar(image, ax=ax, shrink=0.4, extend="both")
+    bar.set_label("largest OD error of the culture", fontsize=8)
+    save(figure, folder / "figures", "fault_matrix")
 
 
 def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     """Run the matrix, write cases.csv, table.md, summary.json and the figure. Raises: UserError if it fails."""
-    from tqdm import tqdm
-    from tqdm.contrib.logging import logging_redirect_tqdm
-
-    from experiments.reliability.chart import fault_map
-    from experiments.reporting import charts
-
     began = time.monotonic()
     faults = [f for f in by_name(config.faults) if config.overflow_pump.pump or not f.guard]
-    total_cases, over = len(all_cases(config)), itertools.count(1)
-    with logging_redirect_tqdm(), tqdm(total=total_cases, disable=None, unit="case") as bar:
-
-        def tick() -> None:
-            bar.update()
-            if (done := next(over)) % 50 == 0 and bar.disable:
-                log.info("%d of %d cases", done, total_cases)
-
-        outcomes = run_all(config, tick)
+    outcomes = run_all(config)
     if not outcomes:
         raise frame.UserError("nothing to run: give faults or controls")
     write_cases(folder / "cases.csv", outcomes)
@@ -129,7 +142,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     (folder / "table.md").write_text("\n".join([*parts, declared(faults)]), encoding="utf-8")
     struck = [o for o in outcomes if o.fault != "none"]
     if struck:
-        charts.save(fault_map(struck, config.moments), folder / "figures", "fault_matrix")
+        draw(struck, config.moments, folder)
     total = totals(outcomes)
     seconds = {"wall_s": round(time.monotonic() - began, 1)}
     files.write_json(folder / "summary.json", {**total, **seconds, "cases_list": [o.as_dict() for o in outcomes]})

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.cli import files, frame
-from experiments.control.calibration_files import save
+from experiments.control.device import save_calibration
 from experiments.reliability.kills import Findings, KillConfig, killed_run
 from experiments.reliability.rehearsal import SOUND
 
@@ -27,7 +27,7 @@ def one_run(config: KillConfig, folder: Path, run: int) -> Findings:
     """One recording with its share of the kills."""
     for name in config.reactors:
         for part, pump in (("feed", SOUND.feed), ("waste", SOUND.waste)):
-            save(folder / "calibration", name, part, pump.as_dict())
+            save_calibration(folder / "calibration", name, part, pump.as_dict())
     kills = config.kills // config.runs + (run < config.kills % config.runs)
     began = time.monotonic()
     findings = killed_run(config, kills, folder / f"run{run}", run)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from experiments.cli import files, frame
 from experiments.reliability.endurance import Day, SoakConfig, growth, soak_run
+from experiments.reporting.tables import markdown
 
 __all__ = ["soak"]
 
@@ -24,10 +25,8 @@ def soak(config: SoakConfig, folder: Path) -> None:
     wall = round(time.monotonic() - began, 1)
     summary = {**found, "growth_per_day": slopes, "wall_s": wall, "days": [asdict(d) for d in days]}
     files.write_json(folder / "summary.json", summary)
-    head = list(asdict(days[0]))
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    lines += ["| " + " | ".join(str(v) for v in asdict(d).values()) + " |" for d in days]
-    (folder / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    table = markdown(list(asdict(days[0])), (list(asdict(d).values()) for d in days))
+    (folder / "table.md").write_text(table, encoding="utf-8")
     errors = [abs(v["fed_error_pct"]) for v in found["reactors"].values()]
     levels = [abs(v["ledger_ml"] - v["volume_ml"]) for v in found["reactors"].values()]
     log.info("growth per day %s; %d rows lost; feed booked within %.2f %%, level within %.2f mL; %.0f s", slopes,

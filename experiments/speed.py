@@ -14,6 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
 from conf.schema import check, setting
 from experiments.cli import files, frame
 from experiments.reporting import tables
@@ -61,9 +64,6 @@ GROUPS: dict[str, Callable[[], Iterator[Measurement]]] = {
 
 def speed(config: SpeedConfig, folder: Path) -> None:
     """Measure every group; summary.json, a table in tables/ and on the screen, a report."""
-    from tqdm import tqdm
-    from tqdm.contrib.logging import logging_redirect_tqdm
-
     from experiments.reporting import charts, page
 
     found = []

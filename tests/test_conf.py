@@ -11,16 +11,14 @@ import pytest
 import yaml
 
 from conf.renamed import REMOVED, RENAMED
-from conf.schema import build
+from conf.schema import build, entries
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.cli import frame, help_page, reference
+from experiments.cli import frame, reference
 from experiments.control.config import deploy_schema
-from experiments.training.config import TrainConfig
-from experiments.training.model_file import read_env_file
-from experiments.training.variants import variant
+from experiments.training.config import TrainConfig, read_env_file, variant
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.link.transport import TransportConfig
 from hardware.safety.config import SafetyConfig
@@ -145,7 +143,7 @@ COMMANDS = sorted(p.stem for p in CONF.glob("*.yaml") if p.stem != "base")
 def test_every_field_of_every_command_says_what_it_is(name):
     def silent(config: Any, prefix: str = "") -> list[str]:
         found = []
-        for entry in help_page.entries(config):
+        for entry in entries(config):
             found += [] if entry.said.what else [f"{prefix}{entry.name}"]
             inner = entry.value if isinstance(entry.value, dict) else {entry.name: entry.value}
             for key, value in inner.items():
@@ -166,7 +164,7 @@ def test_help_shows_usage_and_every_value(name, capsys, monkeypatch):
     command()
     page = capsys.readouterr().out
     assert f"python -m experiments.{name}" in page
-    for entry in help_page.entries(command.schema):
+    for entry in entries(command.schema):
         assert re.search(rf"^(  )?{entry.name}\b", page, re.MULTILINE), entry.name
     assert max(len(line) for line in page.splitlines()) <= 122
 

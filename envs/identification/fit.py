@@ -87,8 +87,7 @@ def trajectory(time: Array, pump_rate: Array, mu: Array | float, tau: Array | fl
 def pmse(od: Array, model: Array) -> float:
     """Percentage mean square error, 100 * sum (x - x_model)^2 / sum x^2, over the rows with a reading; in %.
 
-    Args:
-      od: measured, nan where there is none, shape (n,). model: same shape.
+    Args: od: measured, nan where there is none, shape (n,). model: same shape.
     """
     used = np.isfinite(od)
     return float(100.0 * np.sum((od[used] - model[used]) ** 2) / np.sum(od[used] ** 2))

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from envs.actions import MAX_PUMP_RATE, pump_rates
 from envs.growth import DilutedCulture, Exponential
 from envs.integrators import rk4
+from envs.task import MAX_PUMP_RATE, pump_rates
 
 __all__ = ["OpenLoop", "open_loop"]
 
@@ -28,9 +28,7 @@ class OpenLoop:
 
     mu: float = setting(0.028, "specific growth rate", "1/min", above=0.0, at_most=0.1)
     tau: float = setting(
-        0.31,
-        "u/tau is the dilution rate in 1/min; below 0.02/mu, so that the pump outruns growth",
-        above=0.0,
+        0.31, "u/tau is the dilution rate in 1/min; below 0.02/mu, so that the pump outruns growth", above=0.0
     )
     start_od: float = setting(0.12, "at the start", "OD", above=0.0, at_most=2.0)
     hours: float = setting(6.0, "length of the recording", "h", within=(2, 100))
@@ -70,10 +68,7 @@ def open_loop(config: OpenLoop, rng: np.random.Generator, n: int = 1) -> tuple[A
     The culture is `DilutedCulture(Exponential(mu), tau)` of envs.growth, integrated by RK4 in steps of 0.1 min (error
     below 1e-10, so that the truth is mu and tau and not an integrator's); decisions are taken on the noisy readings.
 
-    Args:
-      config: protocol, culture and sensor.
-      rng: source of rates and noise.
-      n: number of recordings N.
+    Args: config: protocol, culture and sensor. rng: source of rates and noise. n: number of recordings N.
     Returns: time in min, shape (T,); measured OD, shape (N, T); pump rate in mL/s held to the next row, shape (N, T).
     Raises: nothing.
     """

@@ -39,8 +39,7 @@ GAP_MIN = 5.0  # and five times the usual spacing: what the pump did meanwhile i
 class Series:
     """A recording as the fit wants it.
 
-    time: min, strictly increasing, shape (n,).
-    od: OD, nan where there is no reading, shape (n,).
+    time: min, strictly increasing, shape (n,). od: OD, nan where there is no reading, shape (n,).
     pump_rate: mL/s, >= 0, held from each row to the next, shape (n,).
     row: number by which rows are reported, increasing, shape (n,).
     Raises: ValueError when shapes or values disagree with that.

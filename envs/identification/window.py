@@ -24,7 +24,7 @@ from envs.identification.fit import (
     start_level,
     trajectory,
 )
-from envs.identification.screening import Rejection, Screened, Series, noise_sd, screen
+from envs.identification.screening import Screened, Series, noise_sd, screen
 
 __all__ = ["Calibration", "Drift", "IdentifyConfig", "Segment", "Validation", "calibrate"]
 
@@ -132,17 +132,11 @@ class Calibration:
         row = self.screened.series.row
         return int(row[self.window[0]]), int(row[self.window[1] - 1]) + 1
 
-    @property
-    def rejections(self) -> tuple[Rejection, ...]:
-        """What was rejected and why."""
-        return self.screened.rejections
-
 
 def calibrate(series: Series, config: IdentifyConfig | None = None) -> Calibration:
     """Fit (mu, tau) to the best window of a recording and report how far that pair can be trusted.
 
-    Args:
-      series: raw recording. config: see `IdentifyConfig`; None is the default.
+    Args: series: raw recording. config: see `IdentifyConfig`; None is the default.
     Raises: NotIdentifiable when the trustworthy rows cannot give tau; ValueError when none are left.
     """
     config = IdentifyConfig() if config is None else config
@@ -261,7 +255,7 @@ def _predictions_outside(
     predicted: list[Array] = []
     for first, end in screened.stretches:
         for a, b in ((first, min(end, window[0])), (max(first, window[1]), end)):
-            for part in _pieces(clean, a, b, horizon):
+            for part in (clean.part(*cut) for cut in _cuts(clean, a, b, horizon)):
                 used = np.flatnonzero(np.isfinite(part.od))[5:]
                 if len(used) < 10:
                     continue
@@ -283,10 +277,6 @@ def _cuts(clean: Series, a: int, b: int, length: float) -> list[tuple[int, int]]
     inner = np.searchsorted(clean.time[a:b], clean.time[a] + span * np.arange(1, n) / n) + a
     edges = [a, *(int(i) for i in inner), b]
     return list(pairwise(edges))
-
-
-def _pieces(clean: Series, a: int, b: int, length: float) -> list[Series]:
-    return [clean.part(*cut) for cut in _cuts(clean, a, b, length)]
 
 
 def _segments(screened: Screened, length: float) -> tuple[Segment, ...]:
@@ -345,10 +335,7 @@ def _warnings(result: Calibration, limit: float) -> list[str]:
             f"residuals are correlated from row to row ({fitted.autocorrelation:.2f}): the model misses some of the "
             "culture's behaviour; the intervals allow for it"
         )
-    for name, value, (low, high) in (
-        ("mu", fitted.mu.value, PLAUSIBLE_MU),
-        ("tau", result.tau.value, PLAUSIBLE_TAU),
-    ):
+    for name, value, (low, high) in (("mu", fitted.mu.value, PLAUSIBLE_MU), ("tau", result.tau.value, PLAUSIBLE_TAU)):
         if not low <= value <= high:
             found.append(
                 f"{name} = {value:.3g} lies outside the usual {low:g} to {high:g}: check the units of time and pump"

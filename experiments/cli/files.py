@@ -1,16 +1,18 @@
-"""JSON as every command writes it: whole or not at all, plain values only."""
+"""JSON and CSV as every command writes them: whole or not at all."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from hardware.storage import atomic
 
-__all__ = ["plain", "write_json"]
+__all__ = ["plain", "write_csv", "write_json"]
 
 
 def plain(value: Any) -> Any:
@@ -29,3 +31,12 @@ def plain(value: Any) -> Any:
 def write_json(path: Path, content: Mapping[str, Any], fsync: bool = True, indent: int | None = 2) -> None:
     """Write a mapping as JSON, atomically."""
     atomic.write(path, json.dumps(plain(content), indent=indent) + "\n", fsync)
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows under the keys of the first one, atomically."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(rows[0]))
+    writer.writeheader()
+    writer.writerows(rows)
+    atomic.write(path, text.getvalue(), fsync=False)

@@ -8,39 +8,19 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import is_dataclass
 from itertools import takewhile
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
 from conf.presets import ROOT, groups
-from conf.schema import Meaning, meaning
+from conf.schema import entries
 
-__all__ = ["Entry", "chosen", "entries", "opening", "sentence", "shown", "text"]
+__all__ = ["chosen", "sentence", "shown", "text"]
 
 WIDTH = 118
 LEFT = 44  # columns of `key = value`
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One field of a config: its name, what was said of it, its value, and the range in words."""
-
-    name: str
-    said: Meaning
-    value: Any
-    allowed: str
-
-
-def entries(config: Any) -> list[Entry]:
-    """The fields of a config dataclass, in order."""
-    found = []
-    for f in fields(config):
-        value, said = getattr(config, f.name), meaning(f)
-        words = said.allowed(f.name, isinstance(value, list | tuple), "None" in str(f.type))
-        found.append(Entry(f.name, said, value, words))
-    return found
 
 
 def shown(value: Any) -> str:
@@ -56,7 +36,7 @@ def shown(value: Any) -> str:
     return "''" if value == "" else str(value)
 
 
-def opening(name: str) -> list[str]:
+def _opening(name: str) -> list[str]:
     """The comment at the top of a file of conf/, line by line."""
     lines = (ROOT / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
     first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
@@ -65,29 +45,16 @@ def opening(name: str) -> list[str]:
 
 def sentence(name: str) -> str:
     """The first sentence of the comment at the top of a file of conf/, without the file's own name before it."""
-    first = " ".join(takewhile(str.strip, opening(name))).removeprefix(f"{name.rpartition('/')[2]}: ")
+    first = " ".join(takewhile(str.strip, _opening(name))).removeprefix(f"{name.rpartition('/')[2]}: ")
     return re.split(r"(?<=\.)\s(?=[A-Z`])", first)[0]
 
 
 def chosen(name: str) -> dict[str, str | None]:
     """The groups that a command composes, in the place they have by themselves, and the option each starts with."""
     root = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
-    found: dict[str, str | None] = {}
-    for entry in root.get("defaults", []):
-        if isinstance(entry, dict):
-            found |= {group: option for group, option in entry.items() if "@" not in group}
-    for group in list(found):
-        inner = [g for g in groups() if g.startswith(f"{group}/")]
-        found |= {g: None for g in inner}
-    return found
-
-
-def _choices(name: str) -> Iterator[str]:
-    for group, start in chosen(name).items():
-        yield f"  {group}=" + (f"    (by itself {start})" if start else "")
-        for option in groups()[group]:
-            yield from _line(f"    {option}", sentence(f"{group}/{option}"), 26)
-        yield ""
+    entries = [entry for entry in root.get("defaults", []) if isinstance(entry, dict)]
+    found = {group: option for entry in entries for group, option in entry.items() if "@" not in group}
+    return found | {inner: None for group in found for inner in groups() if inner.startswith(f"{group}/")}
 
 
 def _line(left: str, right: str, at: int) -> list[str]:
@@ -112,12 +79,15 @@ def _values(config: Any, prefix: str) -> Iterator[str]:
             if is_dataclass(first):
                 parts.append((f"{key}.NAME", f"here the values of {name}", first))
         else:
-            right = " ".join(filter(None, (entry.said.unit and f"{entry.said.unit}:", entry.said.what)))
+            usual = getattr(default, entry.name)
             notes = [f"allowed: {entry.allowed}"] if entry.allowed else []
-            if entry.value != getattr(default, entry.name):
-                notes.append(f"default: {shown(getattr(default, entry.name))}")
-            right += f" ({'; '.join(notes)})" if notes else ""
-            yield from _line(f"  {key} = {shown(entry.value)}", right, LEFT)
+            notes += [f"default: {shown(usual)}"] if entry.value != usual else []
+            words = (
+                entry.said.unit and f"{entry.said.unit}:",
+                entry.said.what,
+                f"({'; '.join(notes)})" if notes else "",
+            )
+            yield from _line(f"  {key} = {shown(entry.value)}", " ".join(filter(None, words)), LEFT)
     for key, what, inner in parts:
         yield ""
         yield f"{key}: {what}"
@@ -127,8 +97,13 @@ def _values(config: Any, prefix: str) -> Iterator[str]:
 def text(name: str, config: Any) -> str:
     """The whole page, with the values that the rest of the command line gives.
 
-    Args:
-      name: of the command; config: what it would run with.
+    Args: name: of the command; config: what it would run with.
     """
-    choices = ["Choices (group=option)", "", *_choices(name)] if chosen(name) else []
-    return "\n".join([*opening(name), "", *choices, "Values (key=value)", "", *_values(config, "")])
+    choices = []
+    for group, start in chosen(name).items():
+        choices.append(f"  {group}=" + (f"    (by itself {start})" if start else ""))
+        for option in groups()[group]:
+            choices += _line(f"    {option}", sentence(f"{group}/{option}"), 26)
+        choices.append("")
+    head = ["Choices (group=option)", ""] if choices else []
+    return "\n".join([*_opening(name), "", *head, *choices, "Values (key=value)", "", *_values(config, "")])

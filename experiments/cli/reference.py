@@ -14,19 +14,15 @@ from typing import Any, cast, get_args, get_type_hints
 import yaml  # type: ignore[import-untyped]
 
 from conf.presets import ROOT, groups
+from conf.schema import Entry, entries
 from experiments.cli.frame import Command
-from experiments.cli.help_page import Entry, chosen, entries, sentence, shown
+from experiments.cli.help_page import chosen, sentence, shown
+from experiments.reporting.page import flat
+from experiments.reporting.tables import markdown
 
 __all__ = ["page"]
 
-SINGULAR = {
-    "agents": "agent",
-    "plants": "plant",
-    "scenarios": "scenario",
-    "controllers": "controller",
-    "studies": "study",
-}
-
+SINGULAR = {"studies": "study"}  # the others lose their s
 HEAD = """# Configuration
 
 This page is generated from the fields of the config dataclasses and the presets of `conf/`, and a test compares it with
@@ -51,26 +47,18 @@ def page() -> str:
             _collect(config, "", parts)
     lines = [HEAD, "## Commands", ""]
     for name, command in commands.items():
-        lines += [f"### {name}", "", sentence(name), "", *_groups(name), *_table(command.schema, parts), ""]
+        taken = ", ".join(f"[`{group}`](#{_anchor(f'presets of {group}')})" for group in chosen(name))
+        lines += [f"### {name}", "", sentence(name), "", *((f"Groups: {taken}.", "") if taken else ())]
+        lines += _table(command.schema, parts)
     lines += ["## Parts", ""]
     for kind, name in parts.items():
         said = (kind.__doc__ or "").split("\n\n")[0].strip().replace("\n    ", " ")
-        lines += [f"### {name}", "", said, "", *_table(kind(), parts), ""]
+        lines += [f"### {name}", "", said, "", *_table(kind(), parts)]
     lines += ["## Presets", "", "Each with the values that differ from the defaults above.", ""]
     for group, options in groups().items():
-        lines += [f"### Presets of {group}", "", "| preset | what it is | what it changes |", "|---|---|---|"]
-        for preset in (f"{group}/{option}" for option in options):
-            lines.append(f"| `{preset.rpartition('/')[2]}` | {sentence(preset)} | {_changes(preset)} |")
-        lines.append("")
+        rows = [(f"`{option}`", sentence(f"{group}/{option}"), _changes(f"{group}/{option}")) for option in options]
+        lines += [f"### Presets of {group}", "", markdown(("preset", "what it is", "what it changes"), rows)]
     return "\n".join(lines).rstrip() + "\n"
-
-
-def _groups(name: str) -> Iterator[str]:
-    """The groups a command has."""
-    taken = [f"[`{group}`](#{_anchor(f'presets of {group}')})" for group in chosen(name)]
-    if taken:
-        yield f"Groups: {', '.join(taken)}."
-        yield ""
 
 
 def _anchor(heading: str) -> str:
@@ -91,14 +79,14 @@ def _variants(command: Command[Any]) -> Iterator[Any]:
 def _collect(config: Any, prefix: str, parts: dict[type[Any], str]) -> None:
     """Every part below a config with the name it is first met by."""
     for entry in entries(config):
-        named = isinstance(entry.value, dict)
-        name = f"{prefix}{SINGULAR.get(entry.name, entry.name)}"
-        of = _part(config, entry)
-        for value in (*(entry.value.values() if named else [entry.value]), *([of()] if named and of else [])):
-            if is_dataclass(value):
-                kind = getattr(value, "kind", "")
-                parts.setdefault(cast(type[Any], type(value)), f"{name} ({kind})" if kind else name)
-                _collect(value, f"{name}.", parts)
+        values, name = [entry.value], entry.name
+        if isinstance(entry.value, dict):
+            of = _part(config, entry)
+            values, name = [*entry.value.values(), *([of()] if of else [])], SINGULAR.get(name, name[:-1])
+        for value in filter(is_dataclass, values):
+            kind = getattr(value, "kind", "")
+            parts.setdefault(cast(type[Any], type(value)), f"{prefix}{name} ({kind})" if kind else f"{prefix}{name}")
+            _collect(value, f"{prefix}{name}.", parts)
 
 
 def _part(config: Any, entry: Entry) -> type[Any] | None:
@@ -109,7 +97,7 @@ def _part(config: Any, entry: Entry) -> type[Any] | None:
     return cast(type[Any], of) if is_dataclass(of) else None
 
 
-def _table(config: Any, parts: dict[type[Any], str]) -> Iterator[str]:
+def _table(config: Any, parts: dict[type[Any], str]) -> list[str]:
     """A row per field; a part has a table of its own."""
     rows = []
     for entry in entries(config):
@@ -117,28 +105,16 @@ def _table(config: Any, parts: dict[type[Any], str]) -> Iterator[str]:
         own = parts[of] if of else ""
         default = f"[{own}](#{_anchor(own)})" if own else f"`{shown(entry.value)}`"
         cells = (f"`{entry.name}`", default, entry.said.unit, entry.allowed, entry.said.what)
-        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    if rows:
-        yield "| key | default | unit | allowed | meaning |"
-        yield "|---|---|---|---|---|"
-        yield from rows
+        rows.append([cell.replace("|", "\\|") for cell in cells])
+    return [markdown(("key", "default", "unit", "allowed", "meaning"), rows)] if rows else []
 
 
 def _changes(name: str) -> str:
     """The values of a preset's own file, and the preset it starts from."""
     own = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
-    start = [f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_"]
-    flat = [f"`{key}={shown(value)}`" for key, value in _flat(own, "")]
-    words = ["as " + ", ".join(start)] if start else []
-    return "; ".join([*words, *([", ".join(flat)] if flat else [])]) or "nothing"
-
-
-def _flat(values: dict[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for key, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+    start = ", ".join(f"`{entry}`" for entry in own.pop("defaults", []) if isinstance(entry, str) and entry != "_self_")
+    changed = ", ".join(f"`{key}={shown(value)}`" for key, value in flat(own))
+    return "; ".join(filter(None, (start and f"as {start}", changed))) or "nothing"
 
 
 if __name__ == "__main__":

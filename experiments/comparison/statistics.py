@@ -46,14 +46,15 @@ def _median_or_never(settling: Array) -> float:
     return middle if np.isfinite(middle) else float("nan")
 
 
+def _names(trial: Trial) -> dict[str, Any]:
+    return {"controller": trial.controller, "plant": trial.plant, "scenario": trial.scenario}
+
+
 def row(trial: Trial, window: Window) -> dict[str, Any]:
     """One row of summary.json: measured OD, T = 1 min; settling is the median, the other values are means."""
     score = trial.score(window)
     ise, itae = Spread(score.ise), Spread(score.itae)
-    return {
-        "controller": trial.controller,
-        "plant": trial.plant,
-        "scenario": trial.scenario,
+    return _names(trial) | {
         "window": window.label,
         "setpoint": window.setpoint,
         "n": ise.n,
@@ -81,10 +82,8 @@ def details(trials: Sequence[Trial]) -> list[dict[str, Any]]:
         for window in windows(trial.schedule):
             measured, clean, floor = trial.score(window), trial.score_clean(window), trial.score_floor(window)
             found.append(
-                {
-                    "controller": trial.controller,
-                    "plant": trial.plant,
-                    "scenario": trial.scenario,
+                _names(trial)
+                | {
                     "window": window.label,
                     "window_min": window.end - window.start,
                     "ise_per_window": Spread(measured.ise_mean).mean,
@@ -111,12 +110,7 @@ def totals(trials: Sequence[Trial]) -> list[dict[str, Any]]:
     """One entry per trial: ISE and ITAE summed over its windows, and what it cost in medium and pump moves."""
     found = []
     for trial in trials:
-        entry: dict[str, Any] = {
-            "controller": trial.controller,
-            "plant": trial.plant,
-            "scenario": trial.scenario,
-            "n": int(trial.od.shape[0]),
-        }
+        entry = _names(trial) | {"n": int(trial.od.shape[0])}
         for metric in METRICS:
             value = Spread(_total(trial, metric))
             entry |= {f"{metric}_mean": value.mean, f"{metric}_sd": value.sd, f"{metric}_ci95": value.ci95}
@@ -133,8 +127,8 @@ def totals(trials: Sequence[Trial]) -> list[dict[str, Any]]:
     return found
 
 
-def _pair(one: Trial, other: Trial, metric: str, window: str, difference: Array, scale: Array) -> dict[str, Any]:
-    found, mean = Spread(difference), Spread(scale).mean
+def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, theirs: Array) -> dict[str, Any]:
+    found, mean = Spread(mine - theirs), Spread(theirs).mean
     return {
         "controller": one.controller,
         "against": other.controller,
@@ -161,17 +155,15 @@ def pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:
     for one, other in _partners(trials, against):
         for window in windows(one.schedule):
             mine, theirs = one.score(window), other.score(window)
-            for metric in METRICS:
-                a, b = getattr(mine, metric), getattr(theirs, metric)
-                found.append(_pair(one, other, metric, window.label, a - b, b))
+            scores = ((metric, getattr(mine, metric), getattr(theirs, metric)) for metric in METRICS)
+            found += [_pair(one, other, metric, window.label, a, b) for metric, a, b in scores]
     return found
 
 
 def total_pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:
     """As `pairs`, of the sums over windows."""
-    found = []
-    for one, other in _partners(trials, against):
-        for metric in METRICS:
-            a, b = _total(one, metric), _total(other, metric)
-            found.append(_pair(one, other, metric, "all", a - b, b))
-    return found
+    return [
+        _pair(one, other, metric, "all", _total(one, metric), _total(other, metric))
+        for one, other in _partners(trials, against)
+        for metric in METRICS
+    ]

@@ -1,29 +1,45 @@
-"""One controller on one plant in one scenario, all replicates as a single batch through the closed loop."""
+"""Closed loops to compare: one is a controller on a plant in a scenario, all replicates as a single batch.
+
+`Loops` runs those that the studies of a benchmark need, in processes of their own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from multiprocessing import get_context
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
+from dqn.policy import Policy
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
+from experiments.comparison.config import BenchmarkConfig
 from experiments.control.loop import ClosedLoop
 from experiments.control.metrics import WindowMetrics, window_metrics
+from experiments.controllers import registry
 from experiments.controllers.base import Controller
 from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 
-__all__ = ["Trial", "Window", "run_trial", "windows"]
+__all__ = ["Cell", "Loops", "Trial", "Window", "cells", "run_cell", "run_trial", "windows"]
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
+Cell = tuple[str, str, str]  # controller, plant, scenario
 LEAST_NOISE = 1e-9  # OD, of a sensor that is meant to have none
 
 
@@ -88,9 +104,6 @@ class Trial:
         minute = np.broadcast_to(self.minute, od.shape)
         return window_metrics(minute, od, window.setpoint, window.start, window.end)
 
-    def _inside(self, window: Window) -> NDArray[np.bool_]:
-        return (self.minute > window.start - 1e-6) & (self.minute < window.end - 1e-6)
-
     def media(self, window: Window) -> Array:
         """Fresh medium delivered within the window, mL, (N,)."""
         first, last = np.searchsorted(self.minute, [window.start - 1e-6, window.end - 1e-6])
@@ -98,11 +111,12 @@ class Trial:
 
     def effort(self, window: Window) -> Array:
         """Control effort: mean change of the pump rate from one decision to the next, µL/s, (N,)."""
-        return np.asarray(1000.0 * np.abs(np.diff(self.rate[:, self._inside(window)], axis=1)).mean(axis=1))
+        inside = (self.minute > window.start - 1e-6) & (self.minute < window.end - 1e-6)
+        return np.asarray(1000.0 * np.abs(np.diff(self.rate[:, inside], axis=1)).mean(axis=1))
 
 
 def run_trial(
-    names: tuple[str, str, str],
+    names: Cell,
     plant_config: PlantConfig,
     schedule: Scenario,
     make: Callable[[Plant], Controller],
@@ -142,3 +156,78 @@ def run_trial(
             stored[key][row, column] = values[row]
         held[row] += step.response[row] >= Response.HOLD
     return Trial(*names, schedule, minute, **stored, held=held, overflowed=plant.vessel.overflowed)
+
+
+def cells(config: BenchmarkConfig) -> list[Cell]:
+    """Every closed loop that some study needs, once, in the order in which they are asked for."""
+    wanted: dict[Cell, None] = {}
+    for study in config.studies.values():
+        for scenario in study.scenarios:
+            for plant in study.plants:
+                wanted.update(dict.fromkeys((controller, plant, scenario) for controller in study.controllers))
+    return list(wanted)
+
+
+def run_cell(config: BenchmarkConfig, cell: Cell, policy: Policy | None) -> Trial:
+    """One closed loop of a benchmark; all it needs is in its arguments, so it is the same in any process."""
+    name, plant, scenario = cell
+
+    def make(vials: Plant) -> Controller:
+        return registry.build(config.controllers[name], config.env, policy, vials)
+
+    return run_trial(
+        cell, config.plants[plant], config.scenarios[scenario], make, config.env, config.replicates, config.seed
+    )
+
+
+class Loops:
+    """Runs cells in processes of their own, one per core, from `start` on.
+
+    Args: config: of the benchmark; `workers` processes, 0 for one per core, 1 for none but this one.
+    A context: leaving it stops what has not begun.
+    """
+
+    def __init__(self, config: BenchmarkConfig) -> None:
+        self.config = config
+        self._waiting: dict[Cell, Policy | None] = {}
+        self._running: dict[Future[Trial], Cell] = {}
+        workers = config.workers or os.cpu_count() or 1
+        # Spawned, because a fork would copy torch's threads in whatever state they are.
+        self._pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn")) if workers > 1 else None
+
+    def start(self, cells: Sequence[Cell], policy: Policy | None = None) -> None:
+        """Queue cells that all follow `policy`, or none."""
+        for cell in cells:
+            if self._pool is None:
+                self._waiting[cell] = policy
+            else:
+                self._running[self._pool.submit(run_cell, self.config, cell, policy)] = cell
+
+    def _finished(self) -> Iterator[tuple[Cell, Trial]]:
+        """Every cell with its trial, as they come."""
+        for cell, policy in self._waiting.items():
+            yield cell, run_cell(self.config, cell, policy)
+        for future in as_completed(self._running):
+            yield self._running[future], future.result()
+
+    def results(self) -> dict[Cell, Trial]:
+        """Wait for all trials; a bar on a terminal, ten lines in a log."""
+
+        total, trials = len(self._waiting) + len(self._running), {}
+        with logging_redirect_tqdm(), tqdm(total=total, disable=None, unit="loop") as bar:
+            for k, (cell, trial) in enumerate(self._finished(), 1):
+                trials[cell] = trial
+                bar.set_postfix_str(f"{cell[0]} on {cell[1]}")
+                bar.update()
+                if bar.disable and (k % max(total // 10, 1) == 0 or k == total):
+                    log.info("closed loop %d of %d: %s, %s, %s", k, total, cell[2], cell[1], cell[0])
+        return trials
+
+    def __enter__(self) -> Loops:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)

@@ -18,15 +18,14 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame
-from experiments.control.calibration_files import load_calibrations
 from experiments.control.config import DeployConfig
-from experiments.control.device import check, linked
+from experiments.control.device import check, linked, load_calibrations
 from experiments.control.loop import ClosedLoop
 from experiments.control.policies import run_policy
 from experiments.control.record import Record
 from experiments.control.recovery import continue_loop
 from experiments.controllers import registry
-from experiments.training.model_file import read_env_file
+from experiments.training.config import read_env_file
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
 from hardware.errors import RecordingError

@@ -85,11 +85,6 @@ class ClosedLoop:
         self.gone = np.zeros(n, dtype=np.bool_)  # given up, and not there any more for its pumps to be verified off
         controller.reset(n)
 
-    @property
-    def handed_over(self) -> Mask:
-        """Reactors that are regulated by the devices themselves."""
-        return self.reactors.handed_over
-
     def run(self) -> Iterator[Step]:
         """Go on until every reactor's schedule is over or it was given up. Raises: ReactorError."""
         while not self.over:
@@ -151,7 +146,7 @@ class ClosedLoop:
         if stop.any():
             failed += self.reactors.give_up(stop)
             self.stopped = self.stopped | (stop & ~self._named(failed))
-        regulate = (verdict.response == Response.REGULATE) & ~self.handed_over
+        regulate = (verdict.response == Response.REGULATE) & ~self.reactors.handed_over
         if regulate.any():
             failed += self.reactors.regulate(regulate, verdict.setpoint)
         if verdict.heat_off.any():
@@ -164,20 +159,15 @@ class ClosedLoop:
 
     def state(self) -> dict[str, Any]:
         """Where each reactor's schedule and the interlock stand; plain numbers and lists."""
-        return {
-            "began": self.began.tolist(),
-            "done": self.done.tolist(),
-            "stopped": self.stopped.tolist(),
-            "interlock": self.interlock.state(),
-        }
+        known = {"began": self.began, "done": self.done, "stopped": self.stopped}
+        return {**{key: values.tolist() for key, values in known.items()}, "interlock": self.interlock.state()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit."""
+        number = (int, float, type(None))
         for key, kinds, what in (
-            ("began", (int, float, type(None)), "numbers"),
-            ("done", bool, "true or false"),
-            ("stopped", bool, "true or false"),
-        ):
+            ("began", number, "numbers"), ("done", bool, "true or false"), ("stopped", bool, "true or false")
+        ):  # fmt: skip
             values = state.get(key, "missing")
             if not (isinstance(values, list) and all(isinstance(value, kinds) for value in values)):
                 raise ValueError(f"{key}: {str(values)[:40]}, expected a list of {what}")

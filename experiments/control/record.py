@@ -17,8 +17,7 @@ import numpy as np
 
 from experiments.cli import files
 from experiments.control.loop import Step
-from experiments.control.recovery import REBUILD, complete, read_rows
-from experiments.control.rows import COLUMNS, Array, Row, row_of
+from experiments.control.recovery import COLUMNS, REBUILD, Array, Row, complete, read_rows, row_of
 from experiments.reporting.tensorboard import Events
 from hardware.errors import RecordingError
 from hardware.storage.journal import Journal
@@ -31,8 +30,7 @@ class Record:
     """Journal, recordings, state and events of one run.
 
     Args:
-      folder: run folder; what an earlier life of the run left there is continued.
-      names: of the reactors.
+      folder: run folder; what an earlier life of the run left there is continued. names: of the reactors.
       fsync: each row on the disk before the call returns.
     Attributes: journal (the driver writes into it, too); state_path; rows, of each reactor; repairs, what was mended on
       opening, one line each.

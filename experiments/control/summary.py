@@ -1,21 +1,73 @@
-"""What a run came to: the metrics of every window, the totals of every reactor, and the figure of it all."""
+"""What a run says: changes while it runs; at its end metrics of every window, totals of every reactor, the figure."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from envs.scenario import Scenario
+from experiments.control.loop import ClosedLoop, Step
 from experiments.control.metrics import window_metrics
 from experiments.control.record import Record
 from experiments.reporting import charts
 
-__all__ = ["figure_of", "summarise"]
+__all__ = ["ChangeLog", "figure_of", "metrics_table", "summarise"]
 
-METRICS = ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error")
+log = logging.getLogger(__name__)
+
+FORMATS = {  # of the metrics of a window
+    "ise": "8.4f",
+    "itae": "8.2f",
+    "ise_mean": "8.5f",
+    "itae_mean": "8.3f",
+    "settling_min": "8.1f",
+    "steady_abs_error": "8.4f",
+}
+
+
+class ChangeLog:
+    """Logs what changes, once: phases, words of the interlock, notes of the reactors."""
+
+    def __init__(self, loop: ClosedLoop) -> None:
+        self._names = loop.reactors.names
+        self._phase = [-2] * len(self._names)
+        self._reason: list[str | None] = [None] * len(self._names)
+        self._noted: set[str] = set()
+
+    def __call__(self, step: Step) -> None:
+        """Log what is new in this step."""
+        for n, name in enumerate(self._names):
+            if step.rows[n] and int(step.phase[n]) != self._phase[n]:
+                self._phase[n] = int(step.phase[n])
+                what = "recovery" if self._phase[n] < 0 else f"setpoint {step.setpoint[n]:g}"
+                log.info("%s: %s from minute %.0f, OD %.3f", name, what, step.minute[n], step.od[n])
+            reason = step.reasons[n] or ""
+            if not step.rows[n] and (not reason or reason.endswith("earlier in this run")):
+                continue  # what a sample was refused for is not over because there is no new one yet
+            kinds = reason.split(":")[0]
+            if kinds != (self._reason[n] or ""):
+                self._reason[n] = kinds
+                log.warning("%s: %s", name, step.reasons[n] or "interlock: all well again")
+        for note in step.notes:
+            kind = re.sub(r"[\d.]+", "#", note)
+            if kind not in self._noted:  # the journal has every one of them
+                self._noted.add(kind)
+                log.info("%s (noted once here, every time in the journal)", note)
+
+
+def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:
+    """A head and one line per window of a summary."""
+    heads = ("setpoint", "ISE", "ITAE", "ISE/T", "ITAE/T", "settled", "steady")
+    lines = [f"{'reactor':8} " + " ".join(f"{head:>8}" for head in heads)]
+    for w in windows:
+        cells = [f"{w[key]:{form}}" if w[key] == w[key] else f"{'–':>8}" for key, form in FORMATS.items()]
+        lines.append(f"{w['reactor']:8} {w['setpoint']:8.2f} " + " ".join(cells))
+    return "\n".join(lines)
 
 
 def summarise(record: Record, scenarios: Sequence[Scenario], roles: Sequence[str], outcome: str) -> dict[str, Any]:
@@ -45,7 +97,7 @@ def _windows(record: Record, scenarios: Sequence[Scenario]) -> list[dict[str, An
             m = window_metrics(elapsed[n : n + 1], od[n : n + 1], setpoint, start, end)
             window = {"reactor": name, "phase": phase, "setpoint": setpoint, "start_min": start, "end_min": end}
             window["temperature"] = scenario.temperatures[phase]
-            rows.append({**window, **{key: float(getattr(m, key)[0]) for key in METRICS}})
+            rows.append({**window, **{key: float(getattr(m, key)[0]) for key in FORMATS}})
     return rows
 
 

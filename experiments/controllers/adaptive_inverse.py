@@ -52,8 +52,7 @@ class AdaptiveInverse:
 
       u = tau/g (mu + (ln x - ln r)/h), clipped to the pump's range.
 
-    Args:
-      config: the filter's beliefs; model: mu, tau, control period and largest pump rate of the calibrated model.
+    Args: config: the filter's beliefs; model: mu, tau, control period and largest pump rate of the calibrated model.
     """
 
     def __init__(self, config: AdaptiveInverseConfig, model: EnvConfig) -> None:

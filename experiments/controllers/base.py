@@ -28,8 +28,7 @@ class Controller(Protocol):
         """Pump rates for the coming control period, mL/s, shape (N,).
 
         Args:
-          od: newest reading, shape (N,); nan where there is none.
-          setpoint: OD to hold, shape (N,), > 0.
+          od: newest reading, shape (N,); nan where there is none. setpoint: OD to hold, shape (N,), > 0.
           minute: when the reading was taken, min since the run began, shape (N,).
           rows: True where the reading is new, shape (N,). Only these rows' internal state advances; what is returned
             elsewhere is ignored.

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from conf.schema import check, setting
-from envs.actions import MAX_PUMP_RATE
-from envs.task import EnvConfig
+from envs.task import MAX_PUMP_RATE, EnvConfig
 from experiments.controllers.base import Array, Mask, usable
 
 __all__ = ["Hold", "HoldConfig", "Threshold", "ThresholdConfig"]

@@ -23,8 +23,7 @@ class LearnedConfig:
 class LearnedController:
     """u = rates[argmax_a Q([od, setpoint], a)] (paper, section 3).
 
-    Args:
-      policy: as read by `dqn.policy.load`.
+    Args: policy: as read by `dqn.policy.load`.
     """
 
     def __init__(self, policy: Policy) -> None:

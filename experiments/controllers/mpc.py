@@ -100,14 +100,9 @@ class Problem:
             guess = np.clip(start[row], 0.0, 1.0)
             # The cost is of the order of the smallest OD error that matters, squared; scaled up for the solver's tests
             found = minimize(
-                one.value_and_gradient,
-                guess,
-                args=(1e4,),
-                jac=True,
-                method="L-BFGS-B",
-                bounds=[(0.0, 1.0)] * guess.size,
-                options={"ftol": 1e-14, "gtol": 1e-9, "maxiter": 200},
-            )
+                one.value_and_gradient, guess, args=(1e4,), jac=True, method="L-BFGS-B",
+                bounds=[(0.0, 1.0)] * guess.size, options={"ftol": 1e-14, "gtol": 1e-9, "maxiter": 200},
+            )  # fmt: skip
             moves[row] = found.x
         return moves
 
@@ -139,8 +134,7 @@ class Mpc:
 
     Each solution, shifted by one period, is where one particle (or the gradient) starts the next time.
 
-    Args:
-      config: horizon, penalty, solver; model: mu, tau, control period, integrator and the largest pump rate.
+    Args: config: horizon, penalty, solver; model: mu, tau, control period, integrator and the largest pump rate.
     """
 
     def __init__(self, config: MpcConfig, model: EnvConfig) -> None:

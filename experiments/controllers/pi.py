@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from conf.schema import check, setting
-from envs.actions import MAX_PUMP_RATE
-from envs.task import EnvConfig
+from envs.task import MAX_PUMP_RATE, EnvConfig
 from experiments.controllers.base import Array, Mask, usable
 
 __all__ = ["ChiBioPI", "ChiBioPIConfig", "TunedPI", "TunedPIConfig"]
@@ -110,8 +109,7 @@ class TunedPI:
     its tight setting t_c = delay = one control period, the sampled closed loop has the double pole 0.75. Anti-windup:
     I stands still while u is at a bound and z would push it further.
 
-    Args:
-      config: the rule's two times; model: mu, tau, control period and the largest pump rate.
+    Args: config: the rule's two times; model: mu, tau, control period and the largest pump rate.
     """
 
     def __init__(self, config: TunedPIConfig, model: EnvConfig) -> None:

@@ -55,8 +55,7 @@ def audit_doses(journal: Sequence[Mapping[str, Any]], doses: Sequence[Dose], nam
     A run belongs to the newest intent before it. A second one for the same intent is the device's own repetition if it
     begins a pump period after the one before, else it is a doubled dose; so are two intents for one sample.
 
-    Args:
-      journal: rows; doses: of this reactor's pumps; name: of the reactor; zero: device time of run time 0, s.
+    Args: journal: rows; doses: of this reactor's pumps; name: of the reactor; zero: device time of run time 0, s.
     """
     experiment, samples, intents = "", [], []
     for row in journal:

@@ -66,11 +66,6 @@ class Fault:
             raise ValueError(f"fault {self.name}: needs either `by` or `why_not`")
 
 
-def guard_off(r: Rehearsal) -> None:
-    """Another client switches the overflow guard's pump off."""
-    post(f"/SetOutputOn/{r.config.backend.overflow_pump.pump}/0/{FAULTY}")(r)
-
-
 def set_(name: str, value: float = 1.0) -> Act:
     """Switch of the emulator (docs/emulator.md), at the faulty reactor where it belongs to one."""
     return lambda r: inject(r.device, name, FAULTY, value)
@@ -186,7 +181,6 @@ def control(rate: float | None) -> Act:
 
 INF = np.inf
 LINK = ("link", "stale", "lost", "restarted")
-SWITCHED_OFF = "found at the next sample and switched on again"
 FLOW = ("no_dilution", "cannot_hold")
 ONCE = "a single loss is read again, or the command repeated; the journal has it, and a dose hit by it a note"
 HELD = "feedback makes up for it; only weighing doses (experiments.calibrate_pump) tells it from a change of growth"
@@ -311,7 +305,8 @@ FAULTS: tuple[Fault, ...] = (
     Fault("foreign pump", "the feed pump is switched on twice, 0.5 mL every 63 s",
           again(post(f"/SetOutputTarget/Pump1/{FAULTY}/0.008", f"/SetOutputOn/Pump1/1/{FAULTY}"), 95.0),
           ("pump", "note:pumps on", "mode"), rogue=True),
-    Fault("foreign guard off", "the overflow guard's pump is switched off", guard_off, ("note:overflow pump",),
+    Fault("foreign guard off", "the overflow guard's pump is switched off",
+          lambda r: post(f"/SetOutputOn/{r.config.backend.overflow_pump.pump}/0/{FAULTY}")(r), ("note:overflow pump",),
           guard=True),
     Fault("foreign stop", "the experiment is stopped; started again after 10 min", post(f"/Experiment/0/{FAULTY}"),
           ("stopped",), post(f"/Experiment/1/{FAULTY}"), 10.0, blind=True),

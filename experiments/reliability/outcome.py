@@ -1,14 +1,18 @@
-"""What became of one fault at one moment of a rehearsed run, and whether that is what its declaration says."""
+"""What became of faults at moments of rehearsed runs: each judged by its declaration, all in tables and sums."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
+from experiments.cli import files
 from experiments.reliability.faults import Fault
+from experiments.reporting.tables import markdown
 
-__all__ = ["Outcome", "judge"]
+__all__ = ["Outcome", "declared", "judge", "table", "totals", "write_cases"]
 
 
 @dataclass
@@ -86,3 +90,79 @@ def judge(out: Outcome, fault: Fault | None) -> list[str]:
         "false alarm": out.early_alarms + out.neighbour_alarms > 0 or (fault is None and bool(out.kinds)),
     }
     return [name for name, is_wrong in checks.items() if is_wrong]
+
+
+def _span(values: Sequence[float], form: str) -> str:
+    """Smallest to largest, one number if they look the same; a dash for what is not finite."""
+    low, high = (format(v, form) if math.isfinite(v) else "–" for v in (min(values), max(values)))
+    return low if low == high else f"{low} – {high}"
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """Markdown: one row per fault over all moments; single cases are in cases.csv."""
+    head = (
+        "fault", "told after, min", "by", "response", "peak mL", "peak OD error", "rows missed", "rows lost",
+        "doses doubled", "pumps off", "as declared",
+    )  # fmt: skip
+    rows = []
+    for name in dict.fromkeys(o.label for o in outcomes):
+        mine = [o for o in outcomes if o.label == name]
+        wrong = dict.fromkeys(w for o in mine for w in o.wrong)
+        told = [o.detected_s / 60.0 for o in mine if o.reason]
+        cells = [
+            name if mine[0].fault != "none" else f"{name} ({len(mine)} healthy runs)",
+            _span(told, ".1f") + (f" ({len(told)} of {len(mine)})" if len(told) < len(mine) else "") if told else "–",
+            ", ".join(dict.fromkeys(o.reason for o in mine if o.reason)) or "–",
+            ", ".join(dict.fromkeys(o.response for o in mine if o.response)) or "–",
+            _span([o.peak_ml for o in mine], ".1f"),
+            _span([o.peak_error for o in mine], ".2f"),
+            str(sum(o.rows_missed for o in mine)),
+            str(sum(o.rows_lost + o.rows_doubled for o in mine)),
+            str(sum(o.doses_doubled for o in mine)),
+            f"{sum(o.pumps_off for o in mine)} of {len(mine)}",
+            f"**no**: {', '.join(wrong)}" if wrong else "yes",
+        ]
+        rows.append(cells)
+    return markdown(head, rows)
+
+
+def declared(faults: Sequence[Fault]) -> str:
+    """Markdown: what is not detected, or overflows without a guard, and why."""
+    head = ("fault", "what happens", "not detected because", "without a guard it overflows because")
+    told = [f for f in faults if f.why_not or f.overflow]
+    return markdown(head, ((f.name, f.what, f.why_not or "(detected)", f.overflow or "–") for f in told))
+
+
+def totals(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """The sums by which the matrix passes or fails."""
+    healthy = [o for o in outcomes if o.fault == "none"]
+    bare = [o for o in outcomes if not o.guarded]
+    return {
+        "cases": len(outcomes),
+        "faults": len({o.fault for o in outcomes} - {"none"}),
+        "overflows": sum(o.overflowed for o in outcomes if o.guarded),
+        "cases_without_guard": len(bare),
+        "overflows_without_guard": sum(o.overflowed for o in bare),
+        "rows_lost": sum(o.rows_lost for o in outcomes),
+        "rows_doubled": sum(o.rows_doubled for o in outcomes),
+        "doses_doubled": sum(o.doses_doubled for o in outcomes),
+        "doses_repeated_by_the_device": sum(o.repeats for o in outcomes),
+        "undetected": sum("not detected" in o.wrong for o in outcomes),
+        "software_ended": sum(o.exits for o in outcomes),
+        "neighbours_lost": sum(o.neighbours_lost for o in outcomes),
+        "pumps_not_off": sum("pumps not off" in o.wrong for o in outcomes),
+        "false_alarms": sum(o.early_alarms + o.neighbour_alarms for o in outcomes)
+        + sum(sum(o.kinds.values()) for o in healthy),
+        "healthy_runs": len(healthy),
+        "healthy_peak_error": max((o.peak_error for o in healthy), default=math.nan),
+        "not_as_declared": sum(not o.ok for o in outcomes),
+    }
+
+
+def write_cases(path: Path, outcomes: Sequence[Outcome]) -> None:
+    """cases.csv: one row per case."""
+    rows = []
+    for row in (o.as_dict() for o in outcomes):
+        counts = {k: " ".join(f"{name} x{n}" for name, n in row[k].items()) for k in ("kinds", "notes")}
+        rows.append({**row, **counts, "wrong": ", ".join(row["wrong"])})
+    files.write_csv(path, rows)

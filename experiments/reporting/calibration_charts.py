@@ -22,8 +22,7 @@ DATA, MODEL, PUMP, REJECTED, UNUSED = COLOURS[0], COLOURS[1], COLOURS[2], COLOUR
 def fit_figure(raw: Series, result: Calibration, title: str) -> Figure:
     """Measured OD with the fitted trajectory, the residuals below, and the pump rate.
 
-    Args:
-      raw: the recording before screening, at the same positions as `result`'s. result: of `window.calibrate`.
+    Args: raw: the recording before screening, at the same positions as `result`'s. result: of `window.calibrate`.
     """
     figure, axes = new_figure(11.0, 7.2, 3, sharex=True, height_ratios=(3.0, 1.3, 0.8))
     top, middle, bottom = axes
@@ -118,17 +117,9 @@ def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list
         for side in zip(*((v.value - v.low, v.high - v.value) for _, v in known), strict=True)
     )
     ax.errorbar(
-        middle,
-        value,
-        yerr=[down, up],
-        xerr=across,
-        fmt="o",
-        ms=5,
-        color=DATA,
-        elinewidth=1.1,
-        capsize=2.5,
+        middle, value, yerr=[down, up], xerr=across, fmt="o", ms=5, color=DATA, elinewidth=1.1, capsize=2.5,
         label="segment alone, 95 % interval",
-    )
+    )  # fmt: skip
     spread = value.max() - value.min() + 0.25 * abs(float(value.mean()))
     ax.set_ylim(max(0.0, value.min() - spread), value.max() + spread)  # one wide interval must not flatten the rest
     return [float(m) for m in middle]
@@ -137,8 +128,7 @@ def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list
 def coverage_figure(mu: Array, tau: Array, truth: tuple[float, float], title: str) -> Figure:
     """Intervals of many simulated recordings against the truth, sorted by estimate; misses in colour.
 
-    Args:
-      mu, tau: (value, low, high) of each recording, shape (N, 3). truth: (mu, tau).
+    Args: mu, tau: (value, low, high) of each recording, shape (N, 3). truth: (mu, tau).
     """
     figure, axes = new_figure(10.5, 4.6, 1, 2)
     figure.suptitle(title, fontsize=10)
@@ -148,13 +138,9 @@ def coverage_figure(mu: Array, tau: Array, truth: tuple[float, float], title: st
         hit = (data[:, 1] <= true) & (true <= data[:, 2])
         for mask, colour, name in ((hit, DATA, "holds the truth"), (~hit, MODEL, "misses it")):
             ax.vlines(
-                np.flatnonzero(mask),
-                data[mask, 1],
-                data[mask, 2],
-                color=colour,
-                lw=1.0,
+                np.flatnonzero(mask), data[mask, 1], data[mask, 2], color=colour, lw=1.0,
                 label=f"95 % interval {name}: {mask.sum()} of {len(mask)}",
-            )
+            )  # fmt: skip
         ax.plot(data[:, 0], ".", ms=2.5, color="black", label="estimate")
         ax.axhline(true, color=PUMP, lw=1.3, label=f"truth {true:g}")
         ax.set_ylabel(label)

@@ -162,8 +162,7 @@ def closed_loop(
 ) -> Figure:
     """A recorded closed loop: OD over setpoint, above pump rate (and temperature).
 
-    Args:
-      minutes, od, setpoint, rate, temperature: (K, N), nan where a reactor has no sample. names: N labels.
+    Args: minutes, od, setpoint, rate, temperature: (K, N), nan where a reactor has no sample. names: N labels.
     """
     rows = 2 if temperature is None else 3
     ratios = [2.2, 1.0] if temperature is None else [2.2, 1.0, 0.8]

@@ -23,7 +23,7 @@ from markupsafe import Markup
 from experiments.reporting import tables
 from experiments.reporting.tables import Best, Table, number, typeset
 
-__all__ = ["Page", "inline_svg", "of_runs", "provenance", "save"]
+__all__ = ["Page", "flat", "inline_svg", "of_runs", "provenance", "save"]
 
 PACKAGE = "turbidostat-dqn"
 HERE = Path(__file__).parent
@@ -126,11 +126,11 @@ def provenance(page: Page, run: Path) -> None:
         page.add("folded_text", heading="Configuration, every value", text=text)
 
 
-def _flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Leaves of nested mappings with dotted names; lists count as leaves."""
     for key, item in value.items():
         if isinstance(item, Mapping):
-            yield from _flat(item, f"{prefix}{key}.")
+            yield from flat(item, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", item
 
@@ -147,22 +147,17 @@ def _show(value: Any) -> str:
 
 def _results(page: Page, run: Path, prefix: str) -> None:
     """summary.json as tables, whose names begin with `prefix`, and every figure of a run folder."""
-    leaves = dict(_flat(json.loads((run / "summary.json").read_text(encoding="utf-8"))))
+    leaves = dict(flat(json.loads((run / "summary.json").read_text(encoding="utf-8"))))
     lists = {k: v for k, v in leaves.items() if isinstance(v, list) and v and isinstance(v[0], Mapping)}
     page.add("keys", pairs=[(k, _show(v)) for k, v in leaves.items() if k not in lists])
     for key, value in lists.items():
-        entries = [dict(_flat(entry)) for entry in value]
+        entries = [dict(flat(entry)) for entry in value]
         columns = tuple(dict.fromkeys(c for entry in entries for c in entry))
         rows = tuple(tuple(_show(entry.get(c)) for c in columns) for entry in entries)
         page.table(Table(prefix + key.replace(".", "_"), key.replace("_", " "), columns, rows))
-    for path in _figures_of(run):
-        page.figure(path, path.stem.replace("_", " "))
-
-
-def _figures_of(run: Path) -> list[Path]:
-    """Figures in a run folder and its figures/: the SVG of each, its PNG where there is no SVG."""
-    found = [p for folder in (run / "figures", run) for p in sorted(folder.glob("*.*"))]
-    return [p for p in found if p.suffix == ".svg" or (p.suffix == ".png" and not p.with_suffix(".svg").exists())]
+    for path in (p for folder in (run / "figures", run) for p in sorted(folder.glob("*.*"))):
+        if path.suffix == ".svg" or (path.suffix == ".png" and not path.with_suffix(".svg").exists()):
+            page.figure(path, path.stem.replace("_", " "))
 
 
 def of_runs(folder: Path, runs: Sequence[Path]) -> Page:

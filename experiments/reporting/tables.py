@@ -5,11 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Best", "Table", "number", "plus_minus", "typeset", "write"]
+__all__ = ["Best", "Table", "markdown", "number", "plus_minus", "typeset", "write"]
 
 
 class Best(str):
@@ -33,6 +33,12 @@ def plus_minus(mean: float | None, sd: float | None, digits: int = 3) -> str:
     if mean is None or sd is None or not sd > 1e-6 * abs(mean):
         return number(mean, digits)
     return f"{number(mean, digits)} ± {number(sd, 2)}"
+
+
+def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown, with its last line end."""
+    head, *body = ("| " + " | ".join(map(str, row)) + " |" for row in (columns, *rows))
+    return "\n".join([head, "|" + "---|" * len(columns), *body]) + "\n"
 
 
 def typeset(text: str) -> str:
@@ -76,7 +82,7 @@ class Table:
             r"\toprule",
             " & ".join(_tex(c) for c in self.columns) + r" \\",
             r"\midrule",
-            *(" & ".join(_tex_cell(c) for c in row) + r" \\" for row in self.rows),
+            *(" & ".join(_tex(c) for c in row) + r" \\" for row in self.rows),
             r"\bottomrule",
             r"\end{tabular}",
             r"\end{table}",
@@ -91,11 +97,8 @@ TEX = {"\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#"
 
 
 def _tex(text: str) -> str:
-    return "".join(TEX.get(character, character) for character in text)
-
-
-def _tex_cell(cell: str) -> str:
-    return rf"\textbf{{{_tex(cell)}}}" if isinstance(cell, Best) else _tex(cell)
+    plain = "".join(TEX.get(character, character) for character in text)
+    return rf"\textbf{{{plain}}}" if isinstance(text, Best) else plain
 
 
 def write(tables: Sequence[Table], folder: Path) -> None:

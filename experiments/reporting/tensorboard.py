@@ -84,8 +84,7 @@ class PopulationWriter:
     One agent: tags stand in the run folder itself. Several: `agents/seedNNNN/` hold the single curves, and the run
     folder has tag/iqm, tag/min and tag/max over seeds. Every value is also a row of progress.csv.
 
-    Args:
-      folder: run folder. seeds: of the agents. first_step: step of the checkpoint a run is resumed from, or 0.
+    Args: folder: run folder. seeds: of the agents. first_step: step of the checkpoint a run is resumed from, or 0.
     """
 
     def __init__(self, folder: Path, seeds: Sequence[int], first_step: int = 0) -> None:

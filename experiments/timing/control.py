@@ -9,14 +9,17 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize
 
 from dqn.policy import Policy
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame
+from experiments.comparison.trials import run_trial
 from experiments.controllers import registry
 from experiments.controllers.base import Array, Controller
+from experiments.controllers.mpc import MpcConfig, Problem
 from experiments.timing.measurement import Measurement
 
 __all__ = ["loops", "mpc"]
@@ -27,8 +30,6 @@ STATES = 64  # of the MPC's problem
 
 def loops() -> Iterator[Measurement]:
     """Closed loops of 90 min on `nominal_noise`: 64 vials as a batch beside the same 64 one after another."""
-    from experiments.comparison.trials import run_trial
-
     model = EnvConfig()
     plant = frame.load(frame.compose("plant/nominal_noise", []).plant, PlantConfig())
     scenario = Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), recovery_od=0.8)
@@ -44,26 +45,16 @@ def loops() -> Iterator[Measurement]:
         for seed in np.arange(REPLICATES):
             loop(config, 1, int(seed))
 
+    what = f"{REPLICATES} vials x 90 min after recovery"
     for kind in ("pi", "dqn", "adaptive_inverse"):
         chosen = registry.config(kind)
-        yield Measurement(
-            f"closed loop, {kind}",
-            f"{REPLICATES} vials x 90 min after recovery",
-            "as many vials one after another",
-            partial(loop, chosen, REPLICATES, 0),
-            partial(one_by_one, chosen),
-            limit=1.0,
-        )
+        yield Measurement(f"closed loop, {kind}", what, "as many vials one after another",
+                          partial(loop, chosen, REPLICATES, 0), partial(one_by_one, chosen), limit=1.0)  # fmt: skip
     swarm = registry.config("mpc")
     gradient = replace(swarm, solver="gradient")
-    yield Measurement(
-        "closed loop, mpc",
-        f"{REPLICATES} vials x 90 min after recovery, particle swarm",
-        "the same with SciPy's L-BFGS-B, exact gradient",
-        lambda: loop(swarm, REPLICATES, 0),
-        lambda: loop(gradient, REPLICATES, 0),
-        limit=20.0,
-    )
+    yield Measurement("closed loop, mpc", f"{what}, particle swarm",
+                      "the same with SciPy's L-BFGS-B, exact gradient", partial(loop, swarm, REPLICATES, 0),
+                      partial(loop, gradient, REPLICATES, 0), limit=20.0)  # fmt: skip
 
 
 def _untrained_policy(model: EnvConfig) -> Policy:
@@ -77,10 +68,6 @@ def _untrained_policy(model: EnvConfig) -> Policy:
 
 def mpc() -> Iterator[Measurement]:
     """The MPC's problem from random states, cold: the swarm beside two of SciPy's solvers."""
-    from scipy.optimize import minimize
-
-    from experiments.controllers.mpc import MpcConfig, Problem
-
     model, config = EnvConfig(), MpcConfig()
     rng = np.random.default_rng(1)
     start, setpoint = rng.uniform(0.2, 1.0, STATES), rng.uniform(0.2, 1.0, STATES)

@@ -9,17 +9,15 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
+from envs.vector_env import BioreactorVectorEnv
 from experiments.timing.measurement import Measurement, seconds
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from dqn.agent import DQNAgent
 
 __all__ = ["environment", "scaling", "start_up", "training", "update"]
 
@@ -103,26 +101,23 @@ def update() -> Iterator[Measurement]:
         products = _matrix_work(agents, config.batch_size, (2, *config.hidden, 17))
         yield Measurement(
             f"update, {agents} agent(s)", "batch 64", "its matrix products alone",
-            partial(_one_thread, _warm_agent(agents, config).learn, repeats), partial(_one_thread, products, repeats),
+            partial(_one_thread, _warm_update(agents, config), repeats), partial(_one_thread, products, repeats),
             "µs", 1e6, repeats,
         )  # fmt: skip
 
 
-def _warm_agent(agents: int, config: DQNConfig) -> DQNAgent:
-    """One group of agents whose replay memory is full."""
+def _warm_update(agents: int, config: DQNConfig) -> Callable[[], None]:
+    """The update of one group of agents whose replay memory is full."""
     from experiments.training import build
 
     trainer = build.trainer(EnvConfig(), replace(config, learn_start=config.total_steps), range(agents))
     for _ in trainer.run():
         pass
-    return trainer.agent
+    return trainer.agent.learn
 
 
 def environment() -> Iterator[Measurement]:
     """Control steps of 4 096 copies, autoreset included, beside Gymnasium's sync and the memory it must move."""
-    import numpy as np
-
-    from envs.vector_env import BioreactorVectorEnv
     from experiments.timing import rivals
 
     rng = np.random.default_rng(0)
@@ -169,24 +164,12 @@ def start_up() -> Iterator[Measurement]:
 def scaling(runs: int) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """Median cost over one size at a time: agents S and batch B of an update, copies N of an environment step,
     episodes of a training, each as (sizes, seconds)."""
-    import numpy as np
-
-    from envs.vector_env import BioreactorVectorEnv
 
     def timed(work: Callable[[], object], repeats: int) -> float:
         work()
         return median(seconds(work, repeats) for _ in range(runs))
 
     config = DQNConfig()
-    agents = np.array([1, 2, 4, 8, 16, 32, 64, 128])
-    batches = np.array([16, 32, 64, 128, 256, 512])
-    copies = np.array([1, 16, 256, 4096, 65536])
-    episodes = np.array([10, 20, 50, 100])
-    found = {"agents S, one update": (agents, [timed(_warm_agent(int(s), config).learn, 50) for s in agents])}
-    found["batch B, one update"] = (
-        batches,
-        [timed(_warm_agent(1, replace(config, batch_size=int(b))).learn, 200) for b in batches],
-    )
 
     def env_step(n: int) -> float:
         env = BioreactorVectorEnv(n)
@@ -194,9 +177,15 @@ def scaling(runs: int) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]
         action = np.random.default_rng(0).integers(0, 17, n)
         return timed(lambda: env.step(action), 200)
 
-    found["copies N, one environment step"] = (copies, [env_step(int(n)) for n in copies])
-    found["episodes, one training"] = (
-        episodes,
-        [timed(partial(_train, 1, replace(config, total_steps=100 * int(e))), 1) for e in episodes],
-    )
-    return {key: (sizes, np.array(seconds)) for key, (sizes, seconds) in found.items()}
+    def training(n: int) -> float:
+        return timed(partial(_train, 1, replace(config, total_steps=100 * n)), 1)
+
+    costs: dict[str, tuple[list[int], Callable[[int], float]]] = {
+        "agents S, one update": ([1, 2, 4, 8, 16, 32, 64, 128], lambda n: timed(_warm_update(n, config), 50)),
+        "batch B, one update": (
+            [16, 32, 64, 128, 256, 512], lambda n: timed(_warm_update(1, replace(config, batch_size=n)), 200)
+        ),
+        "copies N, one environment step": ([1, 16, 256, 4096, 65536], env_step),
+        "episodes, one training": ([10, 20, 50, 100], training),
+    }  # fmt: skip
+    return {key: (np.array(sizes), np.array([cost(n) for n in sizes])) for key, (sizes, cost) in costs.items()}

@@ -28,26 +28,20 @@ class Ring:
     """A replay memory in NumPy, one array per field."""
 
     def __init__(self, capacity: int, observations: int) -> None:
-        self.before = np.zeros((capacity, 1, observations), dtype=np.float32)
-        self.after = np.zeros((capacity, 1, observations), dtype=np.float32)
-        self.action = np.zeros((capacity, 1), dtype=np.int64)
-        self.reward = np.zeros((capacity, 1), dtype=np.float32)
-        self.ended = np.zeros((capacity, 1), dtype=np.float32)
-        self.added = 0
+        kinds = ((observations,), "f4"), ((observations,), "f4"), ((), "i8"), ((), "f4"), ((), "f4")
+        self.fields: list[NDArray[Any]] = [np.zeros((capacity, 1, *shape), dtype=kind) for shape, kind in kinds]
+        self.capacity, self.added = capacity, 0
 
     def add(self, *fields: NDArray[Any]) -> None:
         """Store one transition (before, after, action, reward, ended) in place of the oldest."""
-        k = self.added % len(self.action)
-        stores: tuple[NDArray[Any], ...] = (self.before, self.after, self.action, self.reward, self.ended)
-        for store, value in zip(stores, fields, strict=True):
-            store[k] = value
+        for store, value in zip(self.fields, fields, strict=True):
+            store[self.added % self.capacity] = value
         self.added += 1
 
     def sample(self, rng: np.random.Generator, batch: int) -> list[torch.Tensor]:
         """A uniform minibatch as tensors."""
-        k = rng.integers(0, min(self.added, len(self.action)), batch)
-        fields = (self.before, self.after, self.action, self.reward, self.ended)
-        return [torch.from_numpy(field[k, 0]) for field in fields]
+        k = rng.integers(0, min(self.added, self.capacity), batch)
+        return [torch.from_numpy(field[k, 0]) for field in self.fields]
 
 
 def single_file_dqn(config: DQNConfig, seed: int) -> torch.nn.Module:
@@ -101,23 +95,13 @@ def stable_baselines_dqn(config: DQNConfig, seed: int) -> object:
     from stable_baselines3 import DQN
 
     model = DQN(
-        "MlpPolicy",
-        gymnasium.make(ENV_ID),
-        learning_rate=config.learning_rate,
-        buffer_size=config.replay_size,
-        learning_starts=config.learn_start,
-        batch_size=config.batch_size,
-        gamma=config.gamma,
-        train_freq=1,
-        gradient_steps=config.updates_per_step,
-        target_update_interval=config.target_period,
-        exploration_fraction=config.epsilon_steps / config.total_steps,
-        exploration_initial_eps=config.epsilon_start,
-        exploration_final_eps=config.epsilon_end,
-        policy_kwargs={"net_arch": list(config.hidden)},
-        seed=seed,
+        "MlpPolicy", gymnasium.make(ENV_ID), learning_rate=config.learning_rate, buffer_size=config.replay_size,
+        learning_starts=config.learn_start, batch_size=config.batch_size, gamma=config.gamma, train_freq=1,
+        gradient_steps=config.updates_per_step, target_update_interval=config.target_period,
+        exploration_fraction=config.epsilon_steps / config.total_steps, exploration_initial_eps=config.epsilon_start,
+        exploration_final_eps=config.epsilon_end, policy_kwargs={"net_arch": list(config.hidden)}, seed=seed,
         device="cpu",
-    )
+    )  # fmt: skip
     model.learn(config.total_steps)
     return model
 
@@ -125,8 +109,5 @@ def stable_baselines_dqn(config: DQNConfig, seed: int) -> object:
 def sync_vector_env(copies: int) -> gymnasium.vector.VectorEnv:
     """Gymnasium's own vectorisation: a Python loop over single environments."""
     return gymnasium.make_vec(
-        ENV_ID,
-        num_envs=copies,
-        vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+        ENV_ID, num_envs=copies, vectorization_mode="sync", vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}
     )

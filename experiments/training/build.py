@@ -13,13 +13,21 @@ from dqn.hindsight import Relabel, goal_relabel
 from dqn.network import QNetwork
 from dqn.population import GROUP, Population
 from dqn.trainer import Trainer
-from envs.rewards import tracking_reward
-from envs.task import EnvConfig
+from envs.task import EnvConfig, tracking_reward
 from envs.vector_env import BioreactorVectorEnv
-from experiments.training import seeding
 from experiments.training.evaluation import Act
 
-__all__ = ["act_with", "hindsight", "population", "trainer"]
+__all__ = ["act_with", "hindsight", "population", "streams", "trainer"]
+
+
+def streams(seeds: Sequence[int], names: Sequence[str]) -> dict[str, list[np.random.SeedSequence]]:
+    """For each name one SeedSequence per seed, independent of the other names and seeds.
+
+    The stream of a name depends on its seed and its place in `names` only, so agent i of a population has the streams
+    of the same seed alone. New names go at the end.
+    """
+    spawned = [np.random.SeedSequence(seed).spawn(len(names)) for seed in seeds]
+    return {name: [children[k] for children in spawned] for k, name in enumerate(names)}
 
 
 def population(
@@ -33,10 +41,10 @@ def population(
 
 def trainer(env: EnvConfig, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu") -> Trainer:
     """One group of agents with the given seeds, each in its own copy of the environment; one record per episode."""
-    streams = seeding.streams(seeds, (*STREAMS, "env"))
+    own = streams(seeds, (*STREAMS, "env"))
     copies = BioreactorVectorEnv(len(seeds), env)
-    copies.seed_streams(streams["env"])
-    learner = DQNAgent(agent, 2, env.n_actions, streams, hindsight(env, agent), device)
+    copies.seed_streams(own["env"])
+    learner = DQNAgent(agent, 2, env.n_actions, own, hindsight(env, agent), device)
     return Trainer(copies, learner, interval=env.episode_steps)
 
 

@@ -1,14 +1,18 @@
-"""What a training run is told."""
+"""What a training run is told: its config, a variant of its agent, a calibrated model. Free of torch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from conf.schema import check, part, setting
+from omegaconf import DictConfig, OmegaConf
+
+from conf.schema import build, check, part, setting
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
+from experiments.cli import frame
 
-__all__ = ["TrainConfig"]
+__all__ = ["TrainConfig", "read_env_file", "variant"]
 
 
 @dataclass(frozen=True)
@@ -32,3 +36,32 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check(self)
+
+
+def read_env_file(path: str) -> EnvConfig:
+    """The model a calibration wrote. Raises: UserError naming the file and what is wrong with it."""
+    remedy = "give the calibrated.yaml of a calibration run"
+    try:
+        content = OmegaConf.load(path)
+    except OSError as error:
+        raise frame.UserError(f"env_file={path}: {error.strerror}; {remedy}") from None
+    except Exception as error:  # whatever PyYAML's parser meets, and text that is no UTF-8
+        raise frame.UserError(f"env_file={path}: not YAML ({str(error).splitlines()[0]}); {remedy}") from None
+    if not isinstance(content, DictConfig):
+        raise frame.UserError(f"env_file={path}: holds no key: value pairs; {remedy}")
+    try:
+        return frame.load(content, EnvConfig(), "env")
+    except frame.UserError as error:
+        raise frame.UserError(f"env_file={path}: {error}") from None
+
+
+def variant(agent: DQNConfig, name: str, values: dict[str, Any]) -> DQNConfig:
+    """`agent` with some values replaced.
+
+    Raises: ValueError naming the variant and the key that does not exist or is out of range.
+    """
+    where = f"ablations.{name}"
+    try:
+        return build(agent, values, where)
+    except ValueError as error:
+        raise ValueError(str(error) if str(error).startswith(where) else f"{where}: {error}") from None

@@ -55,9 +55,7 @@ def _grid(starts: Array, config: EnvConfig) -> tuple[Array, Array]:
 def rollout(act: Act, factors: Array, od: Array, setpoint: Array, steps: int) -> Rollout:
     """Noise-free closed loop x <- factors[a] x of S policies from G starts.
 
-    Args:
-      act: the policies. factors: of `step_factors`, shape (A,).
-      od, setpoint: starts, shape (S, G). steps: K.
+    Args: act: the policies. factors: of `step_factors`, shape (A,). od, setpoint: starts, shape (S, G). steps: K.
     """
     ods = np.empty((steps, *od.shape))
     actions = np.empty((steps, *od.shape), dtype=np.intp)
@@ -75,8 +73,7 @@ class Evaluation:
     not counted); regret_pct = 100 (J / J* - 1); steady_abs_error = median over grid and last 30 steps of
     |x - setpoint|.
 
-    Args:
-      config: the task. gamma: discount of the optimum. grid: start OD and setpoint, each (G,).
+    Args: config: the task. gamma: discount of the optimum. grid: start OD and setpoint, each (G,).
     """
 
     def __init__(self, config: EnvConfig, gamma: float, grid: tuple[Array, Array]) -> None:

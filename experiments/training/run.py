@@ -1,7 +1,9 @@
-"""One training run from its config to policies, figures and summary.json."""
+"""One training run from its config to what it leaves: a policy file per agent, figures and summary.json."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -9,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dqn import policy
 from dqn.checkpoint import CheckpointError
+from dqn.export import export
+from envs.optimum import solve
 from experiments.cli import files, frame
-from experiments.training.config import TrainConfig
-from experiments.training.export import export_policies, fingerprint
-from experiments.training.figures import figures
-from experiments.training.model_file import read_env_file
+from experiments.reporting import charts
+from experiments.training.config import TrainConfig, read_env_file
+from experiments.training.evaluation import Score, rollout
 from experiments.training.session import Session
 
 __all__ = ["train"]
@@ -46,8 +50,8 @@ def _finish(session: Session) -> None:
     """Score on the reported grid, export, draw, write summary.json."""
     c, agents, best = session.config, session.agents, session.best
     report, kept, last = session.report()
-    path = export_policies(session, kept)
-    figures(session, path)
+    path = _export(session, kept)
+    _figures(session, path)
     summary = {
         "seeds": list(session.seeds),
         "env_steps": agents.steps,
@@ -62,7 +66,7 @@ def _finish(session: Session) -> None:
         "optimum_steady_abs_error": report.optimum_steady,
         "policy": str(path),
         "policy_seed": session.seeds[int(best.merit.argmin())],
-        "config_hash": fingerprint(c),
+        "config_hash": _fingerprint(c),
     }
     files.write_json(session.folder / "summary.json", summary)
     numbers = {
@@ -75,3 +79,68 @@ def _finish(session: Session) -> None:
         kept.regret_pct.max(), np.median(kept.steady_abs_error),
     )  # fmt: skip
     log.info("policy %s; figures %s; tensorboard --logdir %s", path, session.folder / "figures", session.folder)
+
+
+def _fingerprint(config: TrainConfig) -> str:
+    """Short hash of everything that shapes the policy."""
+    relevant = {"env": asdict(config.env), "agent": asdict(config.agent)}
+    return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _export(session: Session, score: Score) -> Path:
+    """Every agent's best policy under policies/, the best agent's as policy.npz."""
+    c, best = session.config, session.best
+    folder = session.folder / "policies"
+    folder.mkdir(exist_ok=True)
+    for i, seed in enumerate(session.seeds):
+        metadata = {
+            "seed": seed,
+            "control_min": c.env.control_min,
+            "model": asdict(c.env),
+            "agent": asdict(c.agent),
+            "config_hash": _fingerprint(c),
+            "trained_steps": int(best.step[i]),
+            "regret_pct": float(score.regret_pct[i]),
+            "steady_abs_error": float(score.steady_abs_error[i]),
+        }
+        exported = export(session.agents.network, i, best.weights, c.env.pump_rates(), metadata)
+        policy.save(folder / f"seed{seed:04d}.npz", exported)
+        if i == int(best.merit.argmin()):
+            policy.save(session.folder / "policy.npz", exported)
+    return session.folder / "policy.npz"
+
+
+def _figures(session: Session, policy_path: Path) -> None:
+    """Learning curves, policy map and example trajectories, as files and in TensorBoard."""
+    env, gamma, best = session.config.env, session.config.agent.gamma, session.best
+    rates, factors = env.pump_rates(), session.selection.factors
+    learned = policy.load(policy_path)
+    history = np.array([[step, *regret] for step, regret, _ in best.history])
+    drawn = {
+        "learning": charts.learning(np.array(session.returns), history[:, 0], history[:, 1:], best.step.astype(float))
+    }
+
+    od, setpoint = np.linspace(0.05, 1.25, 241), np.linspace(min(env.setpoints), max(env.setpoints), 33)
+    optimum = solve(env, gamma, setpoints=np.append(setpoint, env.setpoints), grid=3001)
+    x, s = (a.ravel() for a in np.meshgrid(od, setpoint))
+    learned_map = learned.rate(np.stack([x, s], axis=1)).reshape(setpoint.size, od.size)
+    best_map = rates[optimum.act(x, s)].reshape(setpoint.size, od.size)
+    drawn["policy_map"] = charts.policy_map(od, setpoint, learned_map, best_map)
+
+    goals = np.asarray(env.setpoints)[[0, len(env.setpoints) // 2, -1]]
+    starts, targets = np.repeat(env.start_od, goals.size)[None], np.tile(goals, 2)[None]
+    ours = rollout(
+        lambda a, b: learned.act(np.stack([a[0], b[0]], axis=1))[None], factors, starts, targets, env.episode_steps
+    )
+    theirs = rollout(lambda a, b: optimum.act(a[0], b[0])[None], factors, starts, targets, env.episode_steps)
+    drawn["trajectories"] = charts.trajectories(
+        np.arange(env.episode_steps + 1, dtype=np.float64) * env.control_min,
+        np.concatenate([starts, ours.od[:, 0]]),
+        np.concatenate([starts, theirs.od[:, 0]]),
+        targets[0],
+        rates[ours.action[:, 0]],
+        rates[theirs.action[:, 0]],
+    )
+    for name, figure in drawn.items():
+        charts.save(figure, session.folder / "figures", name)
+        session.writer.events.figure(f"figures/{name}", figure, session.agents.steps)

@@ -31,7 +31,7 @@ def dither(first: int = 0, end: int | None = None) -> Series:
 
 
 def rejected(result: Calibration) -> dict[str, list[int]]:
-    return {r.reason.split(":")[0]: r.rows.tolist() for r in result.rejections}
+    return {r.reason.split(":")[0]: r.rows.tolist() for r in result.screened.rejections}
 
 
 # ---------------------------------------------------------------- the model
@@ -311,7 +311,7 @@ def test_pause_parts_the_recording_without_rejecting() -> None:
     keep = (s.time < 200) | (s.time > 260)
     result = calibrate(series(s.time[keep], s.od[keep], s.pump_rate[keep]))
     assert len(result.screened.stretches) == 2
-    assert not result.rejections
+    assert not result.screened.rejections
     assert result.window_rows[0] == 200
 
 
@@ -429,7 +429,7 @@ def test_free_run_through_the_drift_is_refused() -> None:
 @needs_dither
 def test_whole_real_recording() -> None:
     result = calibrate(dither())
-    broken = next(r for r in result.rejections if "sensor broken" in r.reason)
+    broken = next(r for r in result.screened.rejections if "sensor broken" in r.reason)
     assert broken.rows.tolist() == list(range(1157, 1209))
     first, end = result.window_rows
     assert end <= 780

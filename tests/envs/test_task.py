@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from envs.actions import pump_rates
-from envs.rewards import tracking_reward
-from envs.task import EnvConfig, step_factors
+from envs.task import EnvConfig, pump_rates, step_factors, tracking_reward
 
 
 def test_action_grid_is_the_papers():

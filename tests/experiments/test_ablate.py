@@ -17,7 +17,7 @@ from hydra import compose, initialize_config_module
 from dqn.config import DQNConfig
 from experiments.ablate import AblateConfig, Row, summarise
 from experiments.cli import frame
-from experiments.training.variants import variant
+from experiments.training.config import variant
 
 ROOT = Path(__file__).parents[2]
 SHORT = ["agent.total_steps=300", "agent.learn_start=100", "agent.epsilon_steps=100", "eval_every=300", "n_agents=2"]

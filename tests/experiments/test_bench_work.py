@@ -12,7 +12,7 @@ import pytest
 from experiments.blank import BlankConfig, blank
 from experiments.calibrate_pump import CalibratePumpConfig, Series, calibrate, report, weigh
 from experiments.cli import frame
-from experiments.control.calibration_files import load_calibrations, save
+from experiments.control.device import load_calibrations, save_calibration
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import fit_pump
 from hardware.chibio.protocol import PERIOD_S
@@ -166,9 +166,9 @@ def test_a_broken_calibration_file_is_named(tmp_path: Path, content: str, words:
 
 
 def test_what_was_stored_is_loaded(tmp_path: Path) -> None:
-    save(tmp_path, "M3", "blank", {"blank": 13000.0})
+    save_calibration(tmp_path, "M3", "blank", {"blank": 13000.0})
     assert load_calibrations(tmp_path, ["M3"])[0].blank == 13000.0
-    save(tmp_path, "M3", "blank", {"blank": 13.0})
+    save_calibration(tmp_path, "M3", "blank", {"blank": 13.0})
     with pytest.raises(frame.UserError, match="blank = 13"):
         load_calibrations(tmp_path, ["M3"])
 

@@ -21,8 +21,7 @@ from experiments.cli import frame
 from experiments.comparison import statistics as comparison
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.published import TABLE_2
-from experiments.comparison.trials import Trial, Window, run_trial, windows
-from experiments.comparison.workers import cells
+from experiments.comparison.trials import Trial, Window, cells, run_trial, windows
 from experiments.controllers import registry
 from tests.experiments.test_deploy import inverse_policy
 

@@ -19,9 +19,9 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
 from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
-from experiments.control.console import ChangeLog
 from experiments.control.loop import ClosedLoop
 from experiments.control.record import Record
+from experiments.control.summary import ChangeLog
 from experiments.controllers import registry
 from experiments.controllers.learned import LearnedController
 from hardware.chibio.config import ChiBioConfig
@@ -216,7 +216,7 @@ def test_a_reactor_left_to_the_on_board_regulation_is_so_again_after_a_resume():
     loop = handing_over(lab)
     while lab.clock.now() < 900.0:
         loop.step()
-    assert loop.handed_over.all()
+    assert loop.reactors.handed_over.all()
     assert lab.device.apps["M0"].data["OD"]["ON"] == 1
     state = json.loads(json.dumps(loop.state()))
     lab.client()
@@ -237,7 +237,7 @@ def test_a_lasting_reason_is_told_once(caplog):
     with caplog.at_level("WARNING"):
         while lab.clock.now() < 1800.0:
             log_changes(loop.step())
-    assert loop.handed_over.all()
+    assert loop.reactors.handed_over.all()
     assert len([r for r in caplog.records if "budget" in r.message]) == 2
     assert len(caplog.records) <= 4
 

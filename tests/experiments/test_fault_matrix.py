@@ -15,9 +15,8 @@ from experiments.fault_matrix import FaultMatrixConfig, all_cases
 from experiments.reliability.audit import audit_doses
 from experiments.reliability.case import FaultCase
 from experiments.reliability.faults import FAULTS, Fault, both, by_name, post, run_device, set_
-from experiments.reliability.outcome import Outcome
+from experiments.reliability.outcome import Outcome, declared, table, totals
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
-from experiments.reliability.tables import declared, table, totals
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.emulator.vial import Dose
 from hardware.safety.config import SafetyConfig

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from experiments.control.record import Record
-from experiments.control.recovery import load_state
-from experiments.control.rows import COLUMNS
+from experiments.control.recovery import COLUMNS, load_state
 from hardware.errors import RecordingError
 
 

@@ -217,5 +217,5 @@ def test_a_sweep_gives_each_run_its_folder(tmp_path):
 def test_help_and_config_printing(flags):
     done = run("train", *flags)
     assert done.returncode == 0
-    assert "mu: 0.03" in done.stdout or "env: sim" in done.stdout
+    assert "mu: 0.03" in done.stdout or "env.mu = 0.03" in done.stdout
     assert "Traceback" not in done.stderr
