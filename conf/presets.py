@@ -1,7 +1,5 @@
 """The presets of conf/ as plain values, for readers that do without Hydra."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path

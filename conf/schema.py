@@ -6,8 +6,6 @@
 docs/configuration.md are written from the same fields.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import types

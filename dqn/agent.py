@@ -1,7 +1,5 @@
 """The agent: epsilon-greedy action choice and one DQN update, for S independent seeds at once (S = 1: one agent)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Complete training states on disk: written atomically, read without executing anything."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Hyper-parameters of the agent; free of torch, so that a command line can be checked without loading it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from conf.schema import check, require, setting

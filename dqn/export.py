@@ -1,7 +1,5 @@
 """From the weights of one torch agent to `dqn.policy.Policy`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

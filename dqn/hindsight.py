@@ -1,7 +1,5 @@
 """Hindsight: a replayed transition (x, u, x') does not depend on the goal, so it is as true under any other goal."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Adam on the flat weights of S agents."""
 
-from __future__ import annotations
-
 import torch
 
 __all__ = ["Adam"]

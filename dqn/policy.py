@@ -5,8 +5,6 @@ relu), `input_matrix` (F, O) and `input_offset` (F,), `pump_rates` (A,) in mL/s,
 {format, observation: names, control_min, model: {mu, tau, ...}, config_hash, ...}. No pickled objects.
 """
 
-from __future__ import annotations
-
 import json
 import zipfile
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Any number of agents, trained in groups side by side on the CPU's cores."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor

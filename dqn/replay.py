@@ -1,7 +1,5 @@
 """Replay memory: a preallocated ring of transitions for S agents that step together."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

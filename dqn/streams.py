@@ -1,7 +1,5 @@
 """Random numbers for a population: agent i draws the same ones whether it is trained alone or among others."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

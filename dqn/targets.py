@@ -1,7 +1,5 @@
 """TD targets and losses as pure functions; S agents, B transitions, A actions."""
 
-from __future__ import annotations
-
 import torch
 
 __all__ = ["advantage_target", "huber_loss", "loss_gradient", "q_target"]

@@ -3,8 +3,6 @@
 Everything takes a leading axis of N vials; one vial is N = 1. Units: min, 1/min, mL/s (pump rate), degC; OD has none.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,7 +1,5 @@
 """The single-environment view of the vector environment, for libraries that expect `gymnasium.Env`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

@@ -1,7 +1,5 @@
 """Fixed-step integrators of y' = f(y), all with one signature, for any leading batch shape."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

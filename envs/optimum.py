@@ -5,8 +5,6 @@ log x by policy iteration (Howard 1960): on that grid an action is a shift by lo
 sparse linear system. V is linear between grid points.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

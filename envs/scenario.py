@@ -1,7 +1,5 @@
 """What a culture is asked to do over time: a sequence of phases with a setpoint and a temperature each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The control task an agent is trained on: model, control period, action grid, reward, episode (paper, section 3)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """N training episodes side by side as one `gymnasium.vector.VectorEnv`, without a Python loop over copies."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

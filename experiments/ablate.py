@@ -5,8 +5,6 @@ some of its values replaced. The run folder gets ablation.csv (a row per variant
 figure, and one sub-folder per variant with its TensorBoard curves. A stopped run goes on with `resume=RUN`.
 """
 
-from __future__ import annotations
-
 import csv
 import logging
 import re

@@ -1,7 +1,5 @@
 """Controllers side by side on simulated reactors, `python -m experiments.benchmark`: the paper and beyond it."""
 
-from __future__ import annotations
-
 import json
 import logging
 from dataclasses import asdict

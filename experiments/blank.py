@@ -1,7 +1,5 @@
 """Measure the blank of clear medium under run conditions and store it: `python -m experiments.blank`."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 from datetime import date

@@ -3,8 +3,6 @@
 Also the generator of the paper's open-loop protocol (generate=true) and the coverage study (coverage=N).
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from importlib import resources

@@ -1,7 +1,5 @@
 """Weigh a pump's doses and store its calibration: `python -m experiments.calibrate_pump`."""
 
-from __future__ import annotations
-
 import csv
 import logging
 import math

@@ -10,8 +10,6 @@ Two measurements, on the same task and seeds:
    bootstrapping.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path

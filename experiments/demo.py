@@ -3,8 +3,6 @@
 Each step is the command a user would type, shown before it runs.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

@@ -1,7 +1,5 @@
 """Run a controller in closed loop and record everything: `python -m experiments.deploy`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from omegaconf import DictConfig

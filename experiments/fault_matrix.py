@@ -1,7 +1,5 @@
 """Every fault at every moment of a run, in virtual time: `python -m experiments.fault_matrix`."""
 
-from __future__ import annotations
-
 import logging
 import math
 import multiprocessing

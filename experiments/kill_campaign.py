@@ -4,8 +4,6 @@ A real client process (`experiments.deploy`) controls a real emulator process. A
 with `resume=RUN`; at the end, what the emulator knows it did is compared with what the run recorded.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from concurrent.futures import ThreadPoolExecutor

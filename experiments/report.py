@@ -1,7 +1,5 @@
 """A run folder as one self-contained HTML page, `python -m experiments.report run=RUN`, with its tables beside it."""
 
-from __future__ import annotations
-
 import json
 import logging
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Days of a run with all reactors in virtual time: does anything grow, drift or get lost? `experiments.soak`."""
 
-from __future__ import annotations
-
 import logging
 import time
 from dataclasses import asdict

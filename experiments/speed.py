@@ -4,8 +4,6 @@ A measurement is two callables that do the same work. They are timed in pairs, i
 else the machine does meets both; what is reported is the median of each and the median of the paired ratios.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import platform

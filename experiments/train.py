@@ -1,7 +1,5 @@
 """Learn a pump policy on the calibrated growth model: `python -m experiments.train`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from experiments.cli import frame

@@ -1,7 +1,5 @@
 """Time as an argument: the real monotonic clock, a scaled one, and one that only moves when told to."""
 
-from __future__ import annotations
-
 import time
 from typing import Protocol
 

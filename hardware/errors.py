@@ -3,8 +3,6 @@
 Every message names the thing, its value with unit, the allowed range and the remedy.
 """
 
-from __future__ import annotations
-
 __all__ = [
     "DeviceStateError",
     "IdentityError",

@@ -4,8 +4,6 @@ All arrays have a leading axis of N reactors. A loop step is: `measure` (waits u
 sample), decide for the rows that are `fresh`, `actuate` those rows. `stop` is idempotent and always allowed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Reactors in this process: N vials of `envs.Plant`, sampled and dosed once per control period, in virtual time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

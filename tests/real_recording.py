@@ -1,7 +1,5 @@
 """The real Chi.Bio recording that lies beside the project; tests that need it skip where it is absent."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

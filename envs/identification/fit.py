@@ -8,8 +8,6 @@ so the simulated trajectory, its derivatives and the fit need no integrator. The
 trajectory, run freely from a fitted start. Pure functions of arrays; no file, no clock, no random numbers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The paper's open-loop calibration experiment, simulated: growth, dilution at full rate, then random pump rates."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

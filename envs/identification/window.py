@@ -5,8 +5,6 @@ that one free-running trajectory describes, what lies outside it is used to test
 whole recording show how the numbers wander.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 

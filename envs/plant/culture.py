@@ -1,7 +1,5 @@
 """The culture: suspended cells, their substrate, and what grows on the wall."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Where a plant's randomness comes from: one stream per vial, drawn on a schedule no controller can bend."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ It is not the training model. It shares the growth-law interface with it and not
 everything real is switched off (the defaults of `PlantConfig`). Units: min, mL, mL/s, degC, 1/min; OD has none.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

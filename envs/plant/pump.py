@@ -1,7 +1,5 @@
 """A peristaltic pump head: seconds at full power in, millilitres of fresh medium out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

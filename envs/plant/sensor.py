@@ -1,7 +1,5 @@
 """The optical-density sensor of one vial: optics, noise, outliers, bubbles, drift and freezing."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

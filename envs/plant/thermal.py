@@ -1,7 +1,5 @@
 """The vial's temperature: thermostat, surroundings, fresh medium."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The vial as a vessel: what flows in and out, where the level ends, what evaporates."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

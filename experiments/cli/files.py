@@ -1,7 +1,5 @@
 """JSON and CSV as every command writes them: whole or not at all."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

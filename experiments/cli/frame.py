@@ -4,8 +4,6 @@ Hydra composes plain YAML; the dataclass of the entry point is the schema. Whate
 wrong type, value out of range, misspelt option) ends as one line on standard error, before a run folder exists.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import re

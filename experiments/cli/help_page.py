@@ -3,8 +3,6 @@
 Usage is the comment that opens conf/NAME.yaml; all else comes from the fields of the command's config.
 """
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 python -m experiments.cli.reference > docs/configuration.md
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 from collections.abc import Iterator

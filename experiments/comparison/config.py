@@ -1,7 +1,5 @@
 """What `python -m experiments.benchmark` can be told."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Figures of a benchmark, from trials and from the rows of its summary."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

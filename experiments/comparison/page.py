@@ -1,7 +1,5 @@
 """The page of a benchmark: the paper's Table 2 beside the run's, every plant, and what the learned policy loses."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """What the paper reports, cell by cell (Brancato et al., L4DC 2024, Table 2): real reactors, three replicates."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 __all__ = ["SETTLING_MIN", "TABLE_2", "Published"]

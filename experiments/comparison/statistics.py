@@ -1,7 +1,5 @@
 """From trials to numbers: means with intervals, and paired differences between controllers that met the same draws."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

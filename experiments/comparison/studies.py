@@ -1,7 +1,5 @@
 """What a benchmark draws and counts: its closed loops, the calibration, the figures of its studies, summary.json."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 

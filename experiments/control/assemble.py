@@ -3,8 +3,6 @@
 A rehearsal is assembled here too, with a clock and a transport of its own.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """What a closed loop is told: reactors, controller, scenario and safety."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 from typing import Any
 

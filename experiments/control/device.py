@@ -1,7 +1,5 @@
 """The device behind a backend's config: the link to it, its preflight, and the files of its calibrations."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -3,8 +3,6 @@
 It is a generator of what happened. Clocks and wires belong to the reactors, files and screens to the caller.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

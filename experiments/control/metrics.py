@@ -9,8 +9,6 @@ with e = x - setpoint, t in min from the start of the window, integrals by the t
 first convention (T = 1 min, the control period) is the only one under which the published table is consistent.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The policy file of a run: finding it, checking it, and keeping a copy with the run."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

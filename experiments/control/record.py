@@ -5,8 +5,6 @@ dose; the dose's intent too (by the driver); after it the row goes into the CSV 
 that is killed in between is completed from the journal when it is resumed.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping, Sequence
 from functools import partial

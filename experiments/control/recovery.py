@@ -3,8 +3,6 @@
 The journal is written before everything else, so whatever the other files lack can be had from it.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import logging

@@ -3,8 +3,6 @@
 Signals stop the loop like Ctrl-C, and they do not cut short the switching off of the pumps.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

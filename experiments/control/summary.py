@@ -1,7 +1,5 @@
 """What a run says: changes while it runs; at its end metrics of every window, totals of every reactor, the figure."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """A Kalman filter for OD, growth rate and pump gain, and the pump rate that puts the next reading on the setpoint."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

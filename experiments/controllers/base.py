@@ -1,7 +1,5 @@
 """What a controller is: N reactors in, N pump rates out, once per sample. Structural; nothing has to inherit."""
 
-from __future__ import annotations
-
 from typing import Protocol, runtime_checkable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The honest baselines: a classic threshold turbidostat and a constant rate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The exported DQN policy as a controller: a map from (OD, setpoint) to a pump rate, without memory."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Model predictive control of OD on the training model, solved by particle swarm or by gradient."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

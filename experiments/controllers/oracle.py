@@ -1,7 +1,5 @@
 """The yardstick: dynamic programming on the very plant that is being controlled."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

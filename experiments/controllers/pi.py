@@ -1,7 +1,5 @@
 """PI control of OD: the Chi.Bio's on-board law as it is, and one that is tuned."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Particle swarms, many at once: R independent minimisations of the same kind, batched over swarms and particles."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Every kind of controller: its config, its class, and what the class is built from."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a run recorded against what the emulated device did: samples and rows, doses and intents."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """One fault at one moment of a rehearsed run: watched from then on, judged by what only the emulator knows."""
 
-from __future__ import annotations
-
 import math
 import re
 import tempfile

@@ -1,7 +1,5 @@
 """Days of a run with all reactors in virtual time: what they cost, and whether anything was lost or drifted."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import math

@@ -4,8 +4,6 @@ The table `FAULTS` is the declaration: for every fault either the reasons of whi
 detection is needed or possible (`why_not`). Sources: docs/device.md, Failures; docs/biology.md, Faults.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 from collections.abc import Callable

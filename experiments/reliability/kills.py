@@ -1,7 +1,5 @@
 """One recording that survives kills: the client processes, and their record against what the emulated device did."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,7 +1,5 @@
 """What became of faults at moments of rehearsed runs: each judged by its declaration, all in tables and sums."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field

@@ -4,8 +4,6 @@ What a run would be in days takes seconds, everything about the culture is known
 moment and resumed.
 """
 
-from __future__ import annotations
-
 import heapq
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence

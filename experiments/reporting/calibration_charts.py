@@ -1,7 +1,5 @@
 """Figures of a calibration: measured against model, drift along the recording, coverage of the intervals."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure

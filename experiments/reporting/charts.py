@@ -3,8 +3,6 @@
 Each function takes arrays and returns a matplotlib Figure; `save` writes it as SVG and PNG.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ The page links to nothing: figures stand in it as SVG (or as embedded PNG where 
 markup is report.html.j2.
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import json

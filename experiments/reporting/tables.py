@@ -1,7 +1,5 @@
 """A table once: its cells for a page, and the same as CSV and LaTeX."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

@@ -1,7 +1,5 @@
 """Measurements of `experiments.speed` on control: closed loops of each controller, and the solvers of the MPC."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Measurements of `experiments.speed` on learning: training, updates, vector environment, start-up, scaling."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """One comparison of speed: two callables that do the same work, and how to time them fairly."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ ring buffer, Gymnasium's sync vector environment with one copy and episode stati
 Same schedule as ours throughout.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

@@ -1,7 +1,5 @@
 """From an agent's config to agents in their environments, and from weights to the policies they stand for."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

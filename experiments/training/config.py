@@ -1,7 +1,5 @@
 """What a training run is told: its config, a variant of its agent, a calibrated model. Free of torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

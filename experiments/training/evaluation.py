@@ -1,7 +1,5 @@
 """How good a policy is on the training model: noise-free rollouts on a grid, compared with the optimum."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

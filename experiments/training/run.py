@@ -1,7 +1,5 @@
 """One training run from its config to what it leaves: a policy file per agent, figures and summary.json."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -1,7 +1,5 @@
 """What has to happen at its time: a queue of small tasks on a clock, run by one thread."""
 
-from __future__ import annotations
-
 import heapq
 import itertools
 from collections.abc import Iterator

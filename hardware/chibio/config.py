@@ -1,7 +1,5 @@
 """How a Chi.Bio is reached and run: `backend=chibio` and `backend=emulator`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from conf.presets import groups

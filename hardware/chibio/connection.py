@@ -1,7 +1,5 @@
 """The connection to one reactor: every request verified. No schedule, no policy, no safety rules."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """What is wrong with a reactor, from what was read of it: pure functions."""
 
-from __future__ import annotations
-
 import math
 
 from hardware.chibio.config import ChiBioConfig

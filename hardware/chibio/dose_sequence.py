@@ -1,7 +1,5 @@
 """One dose from intent to verified off, what is carried to the next, and what the device may have repeated."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

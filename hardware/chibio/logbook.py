@@ -1,7 +1,5 @@
 """What one reactor has to report: rows for the journal, notes for the next receipt, its present fault."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

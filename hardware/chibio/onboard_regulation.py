@@ -1,7 +1,5 @@
 """The hand-over of a reactor to the device's own OD regulation, which feeds at most 0.02 of full power."""
 
-from __future__ import annotations
-
 import math
 
 from hardware.chibio.connection import Connection

@@ -6,8 +6,6 @@ does not look at Pump3 and Pump4; a start or end of an experiment and a restart 
 off. Nothing relies on it: the interlock's ledger does not know of it. Plumbing: docs/chibio.md.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from conf.schema import check, setting

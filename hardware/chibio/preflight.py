@@ -1,7 +1,5 @@
 """Before a run: one line per check, passed or with the remedy. Changes only which reactor is selected."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Work on the bench before a run: series of doses to weigh, and the blank of clear medium under run conditions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -3,8 +3,6 @@
 Nothing here talks to a device. Facts and traps: docs/device.md.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -6,8 +6,6 @@ an agenda that `measure` works through while it waits, so the doses of several r
 carried out even when other requests fail.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

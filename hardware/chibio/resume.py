@@ -1,7 +1,5 @@
 """What a run must remember of each Chi.Bio reactor, and how the journal gives it back after a crash."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

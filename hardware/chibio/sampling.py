@@ -1,7 +1,5 @@
 """What a sample of the device is: whether it is new, when it appeared, and when to look for the next one."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

@@ -3,8 +3,6 @@
 Longer actions are tasks on the agenda that a station shares with its neighbours.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

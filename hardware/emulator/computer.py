@@ -3,8 +3,6 @@
 Threads of software and electronics are generators that yield the seconds they sleep.
 """
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections import deque

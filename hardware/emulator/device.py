@@ -4,8 +4,6 @@
 virtual clock, `hardware/emulator/server.py` for a real one. Source: docs/device.md, Hardware, Routes and Failures.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence

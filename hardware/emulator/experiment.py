@@ -1,7 +1,5 @@
 """The experiment thread of one reactor: measure, regulate, stir, record, once a minute."""
 
-from __future__ import annotations
-
 import math
 
 from hardware.emulator.computer import AppError, Steps

@@ -1,7 +1,5 @@
 """Faults of the emulated device that can be switched while it runs, by name: in process or over HTTP."""
 
-from __future__ import annotations
-
 from hardware.emulator.device import ChiBioDevice
 
 __all__ = ["FAULTS", "inject"]

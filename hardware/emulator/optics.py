@@ -1,7 +1,5 @@
 """Optical measurement: laser and spectrometer, OD from counts, the zero."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator
 

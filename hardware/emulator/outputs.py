@@ -1,7 +1,5 @@
 """One position M0 to M7 and what its outputs do when they are switched: lights, laser, stirrer, heater, pumps."""
 
-from __future__ import annotations
-
 import math
 
 from hardware.emulator.computer import AppError, Computer, ProcessDied, Steps

@@ -1,7 +1,5 @@
 """The device's routes: which paths exist, the order of their arguments, what they answer (docs/device.md, Routes)."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass

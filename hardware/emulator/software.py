@@ -5,8 +5,6 @@ sleeps; `ChiBioDevice` runs them on device time. Races between threads of the re
 between generators. Source: docs/device.md, checked against runs of the real software described there.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """gunicorn: its worker serves one request at a time; starts and ends of the software, the watchdog's power latch."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 

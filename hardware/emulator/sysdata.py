@@ -1,7 +1,5 @@
 """The device's memory: the sysData dictionary of one reactor as it is after `initialise()`, and its record lists."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

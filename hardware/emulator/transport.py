@@ -1,7 +1,5 @@
 """Link to an emulated device in the same process: no socket, and on a virtual clock no waiting."""
 
-from __future__ import annotations
-
 from hardware.clock import Clock
 from hardware.emulator.device import ChiBioDevice
 from hardware.errors import LinkError

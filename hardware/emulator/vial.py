@@ -4,8 +4,6 @@ Seconds are device seconds. The culture is `envs.plant.Plant` with one vial; the
 electronics (power, motors, faults) are here, because the device sees counts, not OD.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from typing import Any, NamedTuple

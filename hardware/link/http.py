@@ -1,7 +1,5 @@
 """HTTP, straight to the device's server."""
 
-from __future__ import annotations
-
 import time
 from urllib.parse import urlsplit
 

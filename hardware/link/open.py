@@ -1,7 +1,5 @@
 """The configured link to a device, for one client per device on this computer."""
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import os

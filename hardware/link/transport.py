@@ -3,8 +3,6 @@
 A transport raises `LinkError` when no answer came and `ProtocolError` when it was garbage.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """What may be fed: the ledger of feed and level, and the limits on a proposal."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

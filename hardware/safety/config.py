@@ -1,7 +1,5 @@
 """Limits and declared responses of the interlock, and the remedy for each of its reasons."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from enum import IntEnum

@@ -1,8 +1,6 @@
 """What each sample says by itself: whether it came in time, whether a working sensor can have given it, whether it is
 too hot."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Changes of the OD that growth, doses and noise do not explain: steps at once, drifts by a cumulated sum."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """A file that is either whole or as it was before."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

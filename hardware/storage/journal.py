@@ -1,7 +1,5 @@
 """Append-only journal of a run: JSON lines, each on disk before the call returns, a torn last line cut on reopening."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

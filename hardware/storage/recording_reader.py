@@ -3,8 +3,6 @@
 `read_recording` refuses whatever is not a usable recording, and reports what it left out of one that is.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Small problems with known answers, as environments for the trainer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The agent as a whole: an easy problem, populations, resuming, and one update recomputed with torch's own parts."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

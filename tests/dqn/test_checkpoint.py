@@ -1,7 +1,5 @@
 """Checkpoints: whole on disk, exact in content, and never executed."""
 
-from __future__ import annotations
-
 import os
 import pickle
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Relabelled transitions: still true, goals where they are said to be."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The hand-written network against torch's own layers and autograd."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

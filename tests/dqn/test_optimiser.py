@@ -1,7 +1,5 @@
 """The optimiser against torch's own."""
 
-from __future__ import annotations
-
 import torch
 
 from dqn.optimiser import Adam

@@ -1,7 +1,5 @@
 """The exported policy against the torch network it came from, and files that are none."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Agents in groups: the same whatever the number of threads, and whole again after a stop."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """The ring against a plain list."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Random numbers: agent i draws the same ones alone and among others, and goes on after a restart."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Targets by hand on a chain of two states, losses against autograd."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

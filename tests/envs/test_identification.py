@@ -1,7 +1,5 @@
 """mu and tau from recordings: against brute force, other integrators, simulated truth and independent fits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize

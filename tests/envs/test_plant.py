@@ -1,7 +1,5 @@
 """The plant against formulas: training model, mass balances, pump, temperature, faults, and its random streams."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import resources

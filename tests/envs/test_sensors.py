@@ -1,7 +1,5 @@
 """The sensor against its formula and against the frequencies it is configured with."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

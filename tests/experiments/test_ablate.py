@@ -1,7 +1,5 @@
 """The ablation study as a user runs it, and its table against numbers recomputed from the rows."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

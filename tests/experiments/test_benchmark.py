@@ -1,7 +1,5 @@
 """What must hold of every comparison: the oracle is the bound, feedback beats none, noise is paired, seeds decide."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """`python -m experiments.calibrate` as a user runs it: its files, its numbers, and its refusals."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

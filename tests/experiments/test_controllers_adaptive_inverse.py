@@ -1,7 +1,5 @@
 """Adaptive inverse control: its filter against least squares on all data at once, and what it learns in a loop."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

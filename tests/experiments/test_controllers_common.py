@@ -1,7 +1,5 @@
 """What every controller owes the loop: independence of rows, indifference to bad readings, and a place in conf/."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The MPC: model, cost, swarm against exhaustive and gradient references, and the loop against the optimum."""
 
-from __future__ import annotations
-
 import time
 from itertools import product
 

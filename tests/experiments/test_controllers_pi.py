@@ -1,7 +1,5 @@
 """The PI laws against their difference equations, computed by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The page: complete, self-contained, and rendered by a real browser; its tables are the summary's numbers."""
 
-from __future__ import annotations
-
 import csv
 import html.parser
 import json

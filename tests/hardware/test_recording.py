@@ -1,7 +1,5 @@
 """The recording format: written so that a crash costs one row, read so that nothing bad passes in silence."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
