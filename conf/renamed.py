@@ -14,6 +14,8 @@ RENAMED: dict[str, str] = {  # old dotted key, or group=option, or key=choice ->
     "backend.guard.duty": "backend.overflow_pump.duty",
     "backend.guard.flow_ml_s": "backend.overflow_pump.flow_ml_s",
     "backend.guard.pump": "backend.overflow_pump.pump",
+    "faults=foreign guard off": "faults=foreign overflow pump off",
+    "faults=guard blocked": "faults=overflow pump blocked",
     "guard": "overflow_pump",  # of the fault matrix
     "guard.duty": "overflow_pump.duty",
     "guard.flow_ml_s": "overflow_pump.flow_ml_s",

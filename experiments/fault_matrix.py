@@ -33,7 +33,7 @@ class FaultMatrixConfig:
     """Which faults to try, and when. Raises: ValueError naming key, value and allowed range.
 
     Faults that overflow without an overflow pump are run on a rig without as well. Without a pump everything is run on
-    that rig, and faults of the guard are left out. Healthy runs have no sensor outliers.
+    that rig, and its own faults are left out. Healthy runs have no sensor outliers.
     """
 
     reactors: tuple[str, ...] = setting(("M0", "M1"), "the first falls sick, the others are its neighbours", some=True)
@@ -61,7 +61,7 @@ class FaultMatrixConfig:
 
 
 def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int, guarded: bool) -> Outcome:
-    """One case, in whatever process. Args: name: of the fault, "" for a healthy run. guarded: the rig has a guard."""
+    """One case, in whatever process. Args: name: of the fault, "" for a healthy run. guarded: with an overflow pump."""
     fault = by_name((name,))[0] if name else None
     pump = config.overflow_pump if guarded else OverflowPumpConfig()
     run = rehearsed(config.reactors, config.scenario, config.safety, config.controller_kind, pump)
@@ -69,10 +69,10 @@ def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int, guard
 
 
 def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
-    """(fault, moment, seed, rig with guard) of every case; controls first, the rig without guard last."""
+    """(fault, moment, seed, rig with overflow pump) of every case; controls first, the rig without one last."""
     there = bool(config.overflow_pump.pump)
     faults = by_name(config.faults)
-    rigs = [(f.name, there) for f in faults if there or not f.guard]
+    rigs = [(f.name, there) for f in faults if there or not f.of_overflow_pump]
     rigs += [(f.name, False) for f in faults if there and f.overflow]
     controls = [("", "steady", config.seed + k, there) for k in range(config.controls)]
     return controls + [(name, moment, config.seed, guarded) for name, guarded in rigs for moment in config.moments]
@@ -129,13 +129,13 @@ def draw(outcomes: list[Outcome], moments: tuple[str, ...], folder: Path) -> Non
 def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     """Run the matrix, write cases.csv, table.md, summary.json and the figure. Raises: UserError if it fails."""
     began = time.monotonic()
-    faults = [f for f in by_name(config.faults) if config.overflow_pump.pump or not f.guard]
+    faults = [f for f in by_name(config.faults) if config.overflow_pump.pump or not f.of_overflow_pump]
     outcomes = run_all(config)
     if not outcomes:
         raise frame.UserError("nothing to run: give faults or controls")
     write_cases(folder / "cases.csv", outcomes)
     rigs = [[o for o in outcomes if o.guarded], [o for o in outcomes if not o.guarded]]
-    heads = (f"With an overflow guard ({config.overflow_pump.pump} at {config.overflow_pump.duty:g})", "Without")
+    heads = (f"With an overflow pump ({config.overflow_pump.pump} at {config.overflow_pump.duty:g})", "Without")
     parts = [f"## {head}\n\n{table(rig)}" for head, rig in zip(heads, rigs, strict=True) if rig]
     (folder / "table.md").write_text("\n".join([*parts, declared(faults)]), encoding="utf-8")
     struck = [o for o in outcomes if o.fault != "none"]

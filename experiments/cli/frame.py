@@ -158,7 +158,7 @@ class Command(Generic[T]):
             flags = {a for a in given if a.startswith("-")}
             plain = [a for a in given if not a.startswith("-")]
             if flags & {"--help", "-h"}:
-                print(help_page.text(self.name, self.config(plain)))
+                print(help_page.text(self.name, self.config(plain)), flush=True)
                 return
             if flags & {"--cfg", "-c"} and "job" in plain:
                 plain.remove("job")
@@ -176,6 +176,8 @@ class Command(Generic[T]):
         except (UserError, ValueError) as error:  # a ValueError is the schema's own word on a value
             print(f"error: {error}", file=sys.stderr)
             sys.exit(1)
+        except BrokenPipeError:  # `--help | head`: whoever reads has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         except KeyboardInterrupt:
             print("stopped by Ctrl-C", file=sys.stderr)
             sys.exit(130)

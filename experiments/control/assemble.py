@@ -115,7 +115,7 @@ def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
         reactors.begin(replay(earlier), elapsed_s)
         try:
             yield close_loop(setup, reactors, record)
-        except BaseException:  # before the loop, which ends with the same by itself: an overflow guard runs already
+        except BaseException:  # before the loop, which ends with the same by itself: an overflow pump runs already
             reactors.stop()
             raise
 

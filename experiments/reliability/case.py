@@ -116,7 +116,7 @@ class FaultCase:
 
     Args:
       fault: None for a healthy control run. moment: of `MOMENTS`.
-      config: of the run, as `rehearsed` gives it, with `FAULTY` the first reactor; its overflow guard is the rig's,
+      config: of the run, as `rehearsed` gives it, with `FAULTY` the first reactor; its overflow pump is the rig's,
         and an overflow may be declared only where there is none.
       seed: of all noise.
     """

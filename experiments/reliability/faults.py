@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from conf.schema import old_name
 from envs.scenario import Scenario
 from experiments.controllers.base import Array, Mask
 from experiments.reliability.rehearsal import Rehearsal
@@ -38,9 +39,9 @@ class Fault:
     rogue: something else than this program moves the feed pump, so its runs say nothing about doubled doses.
     stuck: a motor that runs whatever it is told cannot be at rest at the end.
     gone: the reactor is absent at the end: its pumps rest without power, which cannot be verified and must be told.
-    overflow: why it overflows on a rig without an overflow guard, on which it is run as well; empty if there must be no
+    overflow: why it overflows on a rig without an overflow pump, on which it is run as well; empty if there must be no
       overflow on either.
-    guard: it is a fault of the overflow guard, run only where there is one.
+    of_overflow_pump: it is a fault of that pump, run only where there is one.
     """
 
     name: str
@@ -57,7 +58,7 @@ class Fault:
     stuck: bool = False
     gone: bool = False
     overflow: str = ""
-    guard: bool = False
+    of_overflow_pump: bool = False
 
     def __post_init__(self) -> None:
         if bool(self.by) == bool(self.why_not):
@@ -207,7 +208,8 @@ FAULTS: tuple[Fault, ...] = (
         why_not="the level is set by the height of the waste tube: it sucks air",
     ),
     Fault(
-        "guard blocked", "the overflow guard moves nothing", set_("overflow_gain_factor", 0.0), guard=True,
+        "overflow pump blocked", "the overflow pump moves nothing", set_("overflow_gain_factor", 0.0),
+        of_overflow_pump=True,
         why_not="nothing flows there unless the level rises: its tube is checked daily, like the waste tube",
     ),
     # ---- sensor
@@ -303,9 +305,9 @@ FAULTS: tuple[Fault, ...] = (
     Fault("foreign pump", "the feed pump is switched on twice, 0.5 mL every 63 s",
           again(post(f"/SetOutputTarget/Pump1/{FAULTY}/0.008", f"/SetOutputOn/Pump1/1/{FAULTY}"), 95.0),
           ("pump", "note:pumps on", "mode"), rogue=True),
-    Fault("foreign guard off", "the overflow guard's pump is switched off",
+    Fault("foreign overflow pump off", "the overflow pump is switched off",
           lambda r: post(f"/SetOutputOn/{r.config.backend.overflow_pump.pump}/0/{FAULTY}")(r), ("note:overflow pump",),
-          guard=True),
+          of_overflow_pump=True),
     Fault("foreign stop", "the experiment is stopped; started again after 10 min", post(f"/Experiment/0/{FAULTY}"),
           ("stopped",), post(f"/Experiment/1/{FAULTY}"), 10.0, blind=True),
     Fault("foreign thermostat off", "heating switched off", post(f"/SetOutputOn/Thermostat/0/{FAULTY}"),
@@ -338,11 +340,11 @@ FAULTS: tuple[Fault, ...] = (
           rogue=True),
     Fault("controller asks 1 mL/s", "fifty times the limit", control(1.0), ("limit",), wide=True),
     Fault("setpoint typo", "the schedule asks for OD 5.0", typo, ("setpoint",)),
-    # ---- beyond what a program can prevent: an overflow guard does
+    # ---- beyond what a program can prevent: an overflow pump does
     Fault("feed stuck open", "feed pump at full power for good", set_("feed_stuck_open"), ("falls",), rogue=True,
           stuck=True, overflow="1 mL/s fills the headroom of 10 mL in 10 s, OD is measured every 60 s"),
     Fault("waste blocked", "waste pump delivers nothing for good", set_("waste_gain_factor", 0.0),
-          why_not="without a level sensor it looks like faster growth; a guard keeps the level where its tube ends",
+          why_not="without a level sensor it looks like faster growth; an overflow pump keeps the level at its tube",
           overflow="10 mL of headroom fill in 15 to 25 min of feed"),
 )  # fmt: skip
 
@@ -352,5 +354,7 @@ def by_name(names: tuple[str, ...]) -> tuple[Fault, ...]:
     known = {f.name: f for f in FAULTS}
     for name in names:
         if name not in known:
-            raise ValueError(f"faults = {name}: no such fault; allowed {', '.join(known)}")
+            raise ValueError(
+                old_name(f"faults={name}") or f"faults = {name}: no such fault; allowed {', '.join(known)}"
+            )
     return tuple(known[name] for name in names) or FAULTS

@@ -17,7 +17,7 @@ __all__ = ["Outcome", "declared", "judge", "table", "totals", "write_cases"]
 class Outcome:
     """What happened. Times s after the fault, volumes mL; nan where there is nothing to tell.
 
-    guarded: whether the rig has an overflow guard.
+    guarded: whether the rig has an overflow pump.
     detected_s, reason: first declared word on the fault. response: of the interlock to it. kinds: all reasons after
       it; notes: of the driver.
     peak_ml, overflowed: of the worst vial.
@@ -67,7 +67,7 @@ class Outcome:
     @property
     def label(self) -> str:
         """The fault's name, and the rig if it is the standard one."""
-        return self.fault if self.guarded else f"{self.fault}, no guard"
+        return self.fault if self.guarded else f"{self.fault}, no overflow pump"
 
     def as_dict(self) -> dict[str, Any]:
         """For summary.json."""
@@ -125,8 +125,8 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 
 def declared(faults: Sequence[Fault]) -> str:
-    """Markdown: what is not detected, or overflows without a guard, and why."""
-    head = ("fault", "what happens", "not detected because", "without a guard it overflows because")
+    """Markdown: what is not detected, or overflows without an overflow pump, and why."""
+    head = ("fault", "what happens", "not detected because", "without an overflow pump it overflows because")
     told = [f for f in faults if f.why_not or f.overflow]
     return markdown(head, ((f.name, f.what, f.why_not or "(detected)", f.overflow or "–") for f in told))
 

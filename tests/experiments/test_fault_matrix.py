@@ -98,24 +98,24 @@ def test_an_overflow_is_found_unless_it_is_declared() -> None:
 
 
 @pytest.mark.parametrize("name", ["feed stuck open", "waste blocked"])
-def test_what_overflows_on_the_standard_rig_does_not_with_a_guard(name: str) -> None:
+def test_what_overflows_on_the_standard_rig_does_not_with_an_overflow_pump(name: str) -> None:
     fault = by_name((name,))[0]
     without = run(fault)
     assert without.ok, without
-    assert (without.overflowed, without.label) == (True, f"{name}, no guard")
+    assert (without.overflowed, without.label) == (True, f"{name}, no overflow pump")
     guarded = run(fault, pump=FaultMatrixConfig().overflow_pump)
     assert guarded.ok, guarded
     assert (guarded.overflowed, guarded.label) == (False, name)
     assert guarded.peak_ml < 27.0
 
 
-def test_an_overflow_beside_a_guard_is_never_as_declared() -> None:
+def test_an_overflow_beside_an_overflow_pump_is_never_as_declared() -> None:
     too_weak = OverflowPumpConfig("Pump3", 0.95, 0.9)
     assert run(by_name(("feed stuck open",))[0], pump=too_weak).wrong == ["overflow"]
 
 
-@pytest.mark.parametrize("name", ["guard blocked", "foreign guard off"])
-def test_faults_of_the_guard_itself(name: str) -> None:
+@pytest.mark.parametrize("name", ["overflow pump blocked", "foreign overflow pump off"])
+def test_faults_of_the_overflow_pump_itself(name: str) -> None:
     outcome = run(by_name((name,))[0], pump=FaultMatrixConfig().overflow_pump)
     assert outcome.ok, outcome
 
@@ -137,11 +137,12 @@ def test_a_resumed_run_does_not_speak_of_lost_reactors_before_they_had_their_cha
     r.close()
 
 
-def test_rigs_with_and_without_guard_are_counted_apart() -> None:
-    names = ("waste blocked", "guard blocked", "feed blocked")
+def test_rigs_with_and_without_overflow_pump_are_counted_apart() -> None:
+    names = ("waste blocked", "overflow pump blocked", "feed blocked")
     config = FaultMatrixConfig(faults=names, moments=("dose",), controls=1)
     assert [(name, guarded) for name, _, _, guarded in all_cases(config)] == [
-        ("", True), ("waste blocked", True), ("guard blocked", True), ("feed blocked", True), ("waste blocked", False),
+        ("", True), ("waste blocked", True), ("overflow pump blocked", True), ("feed blocked", True),
+        ("waste blocked", False),
     ]  # fmt: skip
     bare = replace(config, overflow_pump=OverflowPumpConfig())
     assert [(name, guarded) for name, _, _, guarded in all_cases(bare)] == [
@@ -151,7 +152,7 @@ def test_rigs_with_and_without_guard_are_counted_apart() -> None:
     found += [Outcome("a", "dose", False, overflowed=True)] * 3
     total = totals(found)
     assert (total["overflows"], total["cases_without_guard"], total["overflows_without_guard"]) == (1, 3, 3)
-    assert "| a, no guard |" in table(found)
+    assert "| a, no overflow pump |" in table(found)
 
 
 def test_a_word_in_a_healthy_run_is_a_false_alarm() -> None:

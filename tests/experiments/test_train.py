@@ -213,6 +213,13 @@ def test_a_sweep_gives_each_run_its_folder(tmp_path):
     assert seeds == [[0], [1]]
 
 
+def test_help_that_nobody_reads_to_the_end_says_nothing_about_it():
+    line = f"{sys.executable} -m experiments.train --help | head -1"
+    done = subprocess.run(["bash", "-o", "pipefail", "-c", line], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.count("\n") == 1
+
+
 @pytest.mark.parametrize("flags", [["--help"], ["--cfg", "job"], ["--cfg", "job", "+env=sim", "+experiment=smoke"]])
 def test_help_and_config_printing(flags):
     done = run("train", *flags)
