@@ -106,10 +106,11 @@ def table(outcomes: Sequence[Outcome]) -> str:
     for name in dict.fromkeys(o.label for o in outcomes):
         mine = [o for o in outcomes if o.label == name]
         wrong = dict.fromkeys(w for o in mine for w in o.wrong)
-        told = [o.detected_s / 60.0 for o in mine if o.reason]
+        reported = [o.detected_s / 60.0 for o in mine if o.reason]
+        some = f" ({len(reported)} of {len(mine)})" if len(reported) < len(mine) else ""
         cells = [
             name if mine[0].fault != "none" else f"{name} ({len(mine)} healthy runs)",
-            _span(told, ".1f") + (f" ({len(told)} of {len(mine)})" if len(told) < len(mine) else "") if told else "–",
+            _span(reported, ".1f") + some if reported else "–",
             ", ".join(dict.fromkeys(o.reason for o in mine if o.reason)) or "–",
             ", ".join(dict.fromkeys(o.response for o in mine if o.response)) or "–",
             _span([o.peak_ml for o in mine], ".1f"),
@@ -127,8 +128,8 @@ def table(outcomes: Sequence[Outcome]) -> str:
 def declared(faults: Sequence[Fault]) -> str:
     """Markdown: what is not detected, or overflows without an overflow pump, and why."""
     head = ("fault", "what happens", "not detected because", "without an overflow pump it overflows because")
-    told = [f for f in faults if f.why_not or f.overflow]
-    return markdown(head, ((f.name, f.what, f.why_not or "(detected)", f.overflow or "–") for f in told))
+    shown = [f for f in faults if f.why_not or f.overflow]
+    return markdown(head, ((f.name, f.what, f.why_not or "(detected)", f.overflow or "–") for f in shown))
 
 
 def totals(outcomes: Sequence[Outcome]) -> dict[str, Any]:

@@ -18,9 +18,9 @@ Steps = Sequence[tuple[str, Reply | Exception]]
 
 def connection(steps: Steps, log: list[Any] | None = None) -> tuple[Connection, Script]:
     script = Script(steps)
-    told = [] if log is None else log
+    rows = [] if log is None else log
     return Connection(
-        "M0", ("M0", "M1"), script, VirtualClock(), lambda kind, fields: told.append((kind, fields))
+        "M0", ("M0", "M1"), script, VirtualClock(), lambda kind, fields: rows.append((kind, fields))
     ), script
 
 

@@ -158,10 +158,10 @@ def test_one_that_cannot_be_verified_on_is_an_alarm_with_a_remedy_and_no_dose_is
     lab.law.rate = 0.01
     before, given = lab.samples[0], len(lab.of("intent"))
     lab.run(5)
-    told = [text for step in lab.steps if "overflow_pump:" in (text := step.reasons[0] or "")]
-    assert "the overflow pump, Pump3, is off after it was set to 0.5 and on" in told[0]
-    assert "no dose" in told[0]
-    assert "restart the device" in told[0]
+    reasons = [text for step in lab.steps if "overflow_pump:" in (text := step.reasons[0] or "")]
+    assert "the overflow pump, Pump3, is off after it was set to 0.5 and on" in reasons[0]
+    assert "no dose" in reasons[0]
+    assert "restart the device" in reasons[0]
     assert len(lab.of("intent")) == given
     assert lab.samples[0] >= before + 4  # its samples go on
     lab.fault("lying", 0)
