@@ -23,9 +23,6 @@ log = logging.getLogger(__name__)
 
 def one_run(config: KillConfig, folder: Path, run: int) -> Findings:
     """One recording with its share of the kills."""
-    for name in config.reactors:
-        for part, pump in (("feed", SOUND.feed), ("waste", SOUND.waste)):
-            save_calibration(folder / "calibration", name, part, pump.as_dict())
     kills = config.kills // config.runs + (run < config.kills % config.runs)
     began = time.monotonic()
     findings = killed_run(config, kills, folder / f"run{run}", run)
@@ -36,6 +33,9 @@ def one_run(config: KillConfig, folder: Path, run: int) -> Findings:
 def kill_campaign(config: KillConfig, folder: Path) -> None:
     """All runs; summary.json. Raises: UserError if anything was lost or doubled."""
     began = time.monotonic()
+    for name in config.reactors:
+        for part, pump in (("feed", SOUND.feed), ("waste", SOUND.waste)):
+            save_calibration(folder / "calibration", name, part, pump.as_dict())
     with ThreadPoolExecutor(config.workers) as executor:
         found = list(executor.map(lambda run: one_run(config, folder, run), range(config.runs)))
     keys = [k for k, v in asdict(found[0]).items() if isinstance(v, (int, float)) and not isinstance(v, bool)]
