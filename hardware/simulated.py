@@ -1,4 +1,4 @@
-"""Reactors in this process: N vials of `envs.Plant`, sampled and dosed once per control period, in virtual time."""
+"""Reactors in this process: N vials of a `Plant`, sampled and dosed once per control period, in virtual time."""
 
 from dataclasses import dataclass
 

@@ -24,7 +24,7 @@ PAGE = re.compile(r"(?<![\w/.-])([\w./-]+\.md)\b(?!\")")  # a file name in quota
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 SECTION = re.compile(r"\bsections? (?:\d|[a-d]\b)", re.IGNORECASE)
 LITERATURE = re.compile(r"\bpaper\b|\d:\d")  # a paper's sections may be cited; 25:1 is volume and page
-END = r"(?:(?= and\b)|(?! ?[\w-]))"  # what may follow a heading; more words would be another heading
+END = r"(?:(?= and\b)|(?! ?[\w-]|\.\d))"  # what may follow a heading; more words would be another heading
 LEADER = re.compile(r"\s*\n\s*(?:# ?)?")
 
 
@@ -101,6 +101,7 @@ def test_what_is_cited_exists(source):
         ("a.py", "# docs/device.md, Pump", "no heading 'Pump'"),
         ("a.py", "# docs/device.md, Pumps and Wasted", "no heading 'Wasted'"),
         ("a.py", "# docs/device.md, Pumps period", "no heading 'Pumps period'"),
+        ("a.py", "# docs/device.md, Pumps.1", "no heading 'Pumps.1'"),
         ("a.py", "# docs/device.md section 3", "not a number"),
         ("a.py", "# as section 5.1 has it", "not a number"),
         ("README.md", "[pumps](docs/device.md#pump)", "no such heading"),

@@ -1,4 +1,6 @@
-"""Growth rate mu and dilution constant tau of x' = (mu - u/tau) x from a recording, with honest intervals.
+"""Growth rate mu and dilution constant tau of x' = (mu - u/tau) x from a recording.
+
+Intervals allow for correlated errors.
 
 With u held from each row to the next, equation (5) of the paper has the exact solution
 

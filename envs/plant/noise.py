@@ -1,4 +1,4 @@
-"""Where a plant's randomness comes from: one stream per vial, drawn on a schedule no controller can bend."""
+"""Where a plant's randomness comes from: one stream per vial, drawn whatever a controller does."""
 
 from collections.abc import Sequence
 

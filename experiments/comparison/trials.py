@@ -70,7 +70,7 @@ def windows(schedule: Scenario) -> list[Window]:
 class Trial:
     """What N replicates did, sample by sample since the schedule began; arrays (N, K).
 
-    minute: (K,). od: as measured. clean: what a sensor without noise would have shown. rate: mL/s after the guard.
+    minute: (K,). od: as measured. clean: what a sensor without noise would have shown. rate: mL/s after the interlock.
     temperature: degC. media_ml: fresh medium delivered since the culture began.
     held: samples on which the interlock allowed no dose, (N,). overflowed: at the end, (N,).
     """

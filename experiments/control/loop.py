@@ -135,7 +135,7 @@ class ClosedLoop:
         return replace(decision, volume_ml=receipt.volume_ml, notes=(*failures, *receipt.notes))
 
     def _respond(self, verdict: Verdict) -> list[str]:
-        """Carry out what the interlock demands beyond not dosing; returns what failed (it is tried again next time)."""
+        """Carry out what the interlock demands beyond not dosing; returns what failed, to be tried again."""
         failed: list[str] = []
         off = verdict.response == Response.PUMPS_OFF
         stop = (verdict.response == Response.STOP) & ~self.stopped

@@ -1,4 +1,4 @@
-"""The honest baselines: a classic threshold turbidostat and a constant rate."""
+"""The simple baselines: a classic threshold turbidostat and a constant rate."""
 
 from dataclasses import dataclass
 

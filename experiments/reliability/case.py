@@ -190,9 +190,9 @@ class FaultCase:
         self.result.outcome = ended or whole
 
     def _stop(self) -> bool:
-        """What deploy does at its end: pumps off, verified. True if every motor is at rest and it claims what it can.
+        """What deploy does at its end: pumps off, verified. True if every motor is at rest and the claim is right.
 
-        That is verified off for all, but for a reactor that is gone: of that one it must say that it is not.
+        Right is "verified off" for every reactor that is there, and "not verified" for one that is gone.
         """
         unverified = ""
         try:

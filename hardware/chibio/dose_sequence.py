@@ -17,7 +17,7 @@ from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorE
 __all__ = ["DoseSequence"]
 
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
-WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: fluid must not come before it is taken off
+WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste motor must already turn when feed arrives
 
 
 class DoseSequence:

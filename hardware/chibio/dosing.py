@@ -16,7 +16,7 @@ __all__ = ["DosePlan", "DosingConfig", "PumpCalibration", "PumpFit", "ReactorCal
 
 Array = NDArray[np.float64]
 
-MAX_FEED_DUTY = 0.05  # docs/device.md, Preflight lessons.1; the lowest layer (`protocol.check_command`) refuses more
+MAX_FEED_DUTY = 0.05  # docs/device.md, Client rules; the lowest layer (`protocol.check_command`) refuses more
 MAX_WASTE_DUTY = 0.5  # 63 s * duty must end before the next measurement
 
 

@@ -57,7 +57,7 @@ class OnboardRegulation:
         self.setpoint = setpoint
 
     def hand_over_again(self) -> None:
-        """It was handed over for good, so it stays so over a restart of program or device. Raises: ReactorError."""
+        """Hand over again where a restart of program or device ended it. Raises: ReactorError."""
         state = self._connection.read()
         what = "left to it"
         if not self.as_handed_over(state):

@@ -19,7 +19,7 @@ from hardware.link.transport import Transport
 __all__ = ["Check", "preflight"]
 
 MARGIN = 1.1  # over the feed pump's flow: pumps differ from their calibration
-VIAL_ML = 30.0  # up to its rim (docs/biology.md, Stirring)
+VIAL_ML = 30.0  # up to its rim (docs/biology.md, Volume)
 FREE_MB = 1000.0  # a week of eight reactors writes about 240 MB (docs/faults.md)
 
 

@@ -23,7 +23,7 @@ FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
 """Without tubes on a standard reactor; one of them may be an overflow pump (`overflow_pump.py`)."""
 MAX_OVERFLOW_DUTY = 0.95
-"""Never 1: the device does not switch such a pump off between its periods (docs/device.md, Pumps.1 and 12.1)."""
+"""Never 1: the device does not switch such a pump off between its periods (docs/device.md, Pumps)."""
 PERIOD_S = 63.0
 """A pump that is ON runs at full power for PERIOD_S * target seconds of every PERIOD_S (docs/device.md, Pumps)."""
 UNSET_BLANK = 65000.0

@@ -87,8 +87,8 @@ class Sampling:
     def _measure_lateness(self, offset: float) -> str:
         """How much later than possible this sample was seen: its offset against the smallest of recent ones.
 
-        Only samples that were waited for are a measure, so after three of them a step of the board's clock, which
-        looks the same, is forgotten.
+        A step of the board's clock looks like lateness. Only samples that were waited for enter the measure, so three
+        of them replace the offsets of before.
         """
         note = ""
         if self._offsets and not -30.0 < offset - min(self._offsets) < 65.0:

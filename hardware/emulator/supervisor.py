@@ -145,7 +145,7 @@ class Supervisor:
         self.exit()
 
     def cut_power(self) -> None:
-        """Fault: the whole board loses power; its clock starts again where it had started before."""
+        """Fault: the whole board loses power; its clock starts again at its first date."""
         self.crash()
         self._computer.wall_offset_s = -self._computer.now()
         self._power_off()

@@ -1,6 +1,6 @@
 """What stands behind the device's chips: one vial with its pumps, heater, stirrer and light path, and what can break.
 
-Seconds are device seconds. The culture is `envs.plant.Plant` with one vial; the optics (blank, counts, noise) and the
+Seconds are device seconds. The culture is a `Plant` with one vial; the optics (blank, counts, noise) and the
 electronics (power, motors, faults) are here, because the device sees counts, not OD.
 """
 

@@ -1,3 +1,3 @@
 """The interlock between every controller and every pump.
 
-Entered by the closed loop alone. Knows measurements and receipts, no device."""
+Entered by whatever assembles a closed loop. Knows measurements and receipts, no device."""

@@ -31,8 +31,8 @@ REMEDIES = {
     "setpoint": "correct the schedule: setpoints are OD over 0 and at most the configured maximum",
     "controller": "look at the policy's input and output in the journal",
     "controller_lost": "replace the policy, then start a new run",
-    "limit": "nothing if the controller asked too much; else raise the limit in conf/safety",
-    "budget": "check for a leak or wash-out; raise the budget in conf/safety if the flow is right",
+    "limit": "nothing if the controller asked too much; else raise safety.max_rate",
+    "budget": "check for a leak or wash-out; if the flow is right, raise safety.ml_per_hour or ml_per_run",
     "bottle": "fill the bottle and start a new run with its content",
     "overflow": "check waste pump and tube",
     "undosed": "look at the run's notes for why doses are not given: link too slow, device not as set",
@@ -60,9 +60,9 @@ class Responses:
     """The declared response to every reason: report | hold | pumps_off | regulate | stop.
 
     report: dose as allowed. hold: no dose. pumps_off: no dose and the pumps off, verified. regulate: hand over to the
-    device's own regulation for good. stop: no dose in this run any more. link to overflow_pump are kinds of
-    `reactor.Fault`. A reason that means the sensor cannot be believed may not regulate: the device would pump by the
-    same reading.
+    device's own regulation for good. stop: no dose in this run any more. The fields from link to overflow_pump are
+    kinds of `reactor.Fault`. A reason that means the sensor cannot be believed may not regulate: the device would pump
+    by the same reading.
     """
 
     setpoint: str = setting("hold", "outside (0, max_setpoint]", choices=CHOICES)

@@ -127,7 +127,7 @@ class Heat:
         ]
 
     def _relieve(self, temperature: Array, target: Array, known: Mask, now: float) -> None:
-        """A drop of the target is relief, which decays with the cooling time; so is what a run finds at its start."""
+        """A drop of the target raises the limit by as much; that decays with the cooling time. So at a run's start."""
         seen = np.isfinite(self._target_c)
         minutes = np.where(known & seen, (now - self._thermo_s) / 60.0, 0.0)
         drop = np.where(known & seen, np.maximum(self._target_c - target, 0.0), 0.0)
