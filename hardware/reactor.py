@@ -120,6 +120,10 @@ class Reactor(Protocol):
         """Carry out a command. Raises: as `measure`."""
         ...
 
+    def repeated(self) -> list[tuple[float, Receipt]]:
+        """Doses that were given again without a command and not told before: run time, s, and volumes, in order."""
+        ...
+
     def elapsed(self) -> float:
         """Run time, s, on a monotonic clock; what `Measurement.time_s` is counted on."""
         ...

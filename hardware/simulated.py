@@ -77,6 +77,10 @@ class SimulatedReactors:
         self._target = np.where(command.rows, command.temperature, np.nan)
         return Receipt(volume_ml=volume)
 
+    def repeated(self) -> list[tuple[float, Receipt]]:
+        """None ever is."""
+        return []
+
     def elapsed(self) -> float:
         """Run time on the clock, s."""
         return self._clock.now() - self._started

@@ -26,7 +26,8 @@ class Step:
     rows: reactors with a new sample, for which the rest is to be read. now_s: run time, s.
     minute: when the OD was measured, min since the run began. elapsed: since the schedule began, nan in recovery.
     phase: of the schedule, -1 in recovery. proposed, rate: before and after the interlock, mL/s.
-    volume_ml: asked of the pump; known only after the dose was begun. reasons: of the interlock, for all reactors.
+    volume_ml: asked of the pump, and what the device repeated since the row before; known only after the dose was
+    begun. reasons: of the interlock, for all reactors.
     response: of the interlock. notes: of the reactors. explanation: of the controller. done: schedule over.
     """
 
@@ -80,6 +81,7 @@ class ClosedLoop:
         self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
         self.done = np.zeros(n, dtype=np.bool_)
         self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
+        self.repeated_ml = np.zeros(n)  # by the devices themselves, in no step yet
         self.gone = np.zeros(n, dtype=np.bool_)  # given up, and not there any more for its pumps to be verified off
         controller.reset(n)
 
@@ -106,6 +108,7 @@ class ClosedLoop:
         """Wait for a sample of at least one reactor (or for trouble), and act on it."""
         m = self.reactors.measure()
         now = self.reactors.elapsed()
+        self._book_repeats()
         rows = m.fresh & ~self.done & ~self.stopped
         minute = m.time_s / 60.0
         recovered = (m.od >= self._recovery_od) | (minute >= self._recovery_limit)
@@ -132,7 +135,15 @@ class ClosedLoop:
         heat = np.where(verdict.heat_off, np.nan, temperature)
         receipt = self.reactors.actuate(Command(rows, verdict.rate, heat))
         self.interlock.confirm(receipt, now)
-        return replace(decision, volume_ml=receipt.volume_ml, notes=(*failures, *receipt.notes))
+        volume = receipt.volume_ml + np.where(rows, self.repeated_ml, 0.0)
+        self.repeated_ml = np.where(rows, 0.0, self.repeated_ml)
+        return replace(decision, volume_ml=volume, notes=(*failures, *receipt.notes))
+
+    def _book_repeats(self) -> None:
+        """What the devices dosed by themselves counts when it happened, before the sample after it is judged."""
+        for at_s, receipt in self.reactors.repeated():
+            self.interlock.confirm(receipt, at_s)
+            self.repeated_ml = self.repeated_ml + receipt.volume_ml
 
     def _respond(self, verdict: Verdict) -> list[str]:
         """Carry out what the interlock demands beyond not dosing; returns what failed, to be tried again."""

@@ -3,6 +3,7 @@
 The journal is written before everything else, so whatever the other files lack can be had from it.
 """
 
+import bisect
 import csv
 import json
 import logging
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.control.loop import ClosedLoop, Step
+from hardware.chibio.resume import dosed
 from hardware.errors import RecordingError
 from hardware.reactor import Receipt
 from hardware.safety.config import Response
@@ -107,14 +109,18 @@ def complete(journal: Journal, name: str, rows: Rows, write: Callable[[Row], Non
 
 def _unwritten(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Iterator[Row]:
     last = rows.last().get("time_min", -math.inf)
-    kinds = ("sample", "decision", "intent")
-    mine = [r for r in journal if r.get("reactor") == name and r["kind"] in kinds]
-    around = zip([{}, *mine], mine, [*mine[1:], {}], strict=False)
-    for earlier, this, following in around:
+    mine = [r for r in journal if r.get("reactor") == name and r["kind"] in ("sample", "decision")]
+    decided = [r["n"] for r in mine if r["kind"] == "decision"]
+    volume = dict.fromkeys(decided, 0.0)
+    for dose in dosed(journal):
+        k = bisect.bisect(decided, dose.n)  # a dose belongs to the decision before it, its repetitions to the next one
+        if dose.reactor == name and 0 <= k - (not dose.again) < len(decided):
+            volume[decided[k - (not dose.again)]] += dose.feed_ml
+    for earlier, this, following in zip([{}, *mine], mine, [*mine[1:], {}], strict=False):
         if this["kind"] == "decision":
             row: Row = {c: math.nan if this["row"][c] is None else this["row"][c] for c in COLUMNS}
-            row["volume_ml"] = float(following["feed_ml"]) if following.get("kind") == "intent" else 0.0
-        elif this["kind"] == "sample" and not following and earlier.get("kind") != "sample":
+            row["volume_ml"] = volume[this["n"]]
+        elif not following and earlier.get("kind") != "sample":
             row = _undecided(this, rows.last())
         else:
             continue
@@ -162,16 +168,6 @@ def _no_state(path: Path, why: str) -> RecordingError:
     return RecordingError(f"{path}: no state to resume from ({why}); {remedy}")
 
 
-def _doses(journal: Journal, since: int, names: Sequence[str]) -> list[Receipt]:
-    """The doses begun from row `since` of the journal on."""
-    receipts = []
-    for row in journal.rows:
-        if row.get("kind") == "intent" and row["n"] >= since:
-            mine = np.array([name == row["reactor"] for name in names])
-            receipts.append(Receipt(np.where(mine, row["feed_ml"], 0.0), (), np.where(mine, row["waste_ml"], 0.0)))
-    return receipts
-
-
 def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
     """Put the loop where its state was saved, and book the doses and hand-overs begun after that.
 
@@ -179,13 +175,17 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
     Raises: RecordingError for a state that is damaged or does not fit.
     """
     state = load_state(path)
-    doses = _doses(journal, state["journal_row"], loop.reactors.names)
+    doses = [dose for dose in dosed(journal.rows) if dose.n >= state["journal_row"]]
     try:
         loop.restore(state)
     except ValueError as error:
         raise _no_state(path, str(error)) from None
     loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
-    now = loop.reactors.elapsed()
-    for receipt in doses:
-        loop.interlock.confirm(receipt, now)
-    log.info("resumed at minute %.1f; %d dose(s) booked from the journal", now / 60.0, len(doses))
+    decided = {row["reactor"]: row["n"] for row in journal.rows if row["kind"] == "decision"}
+    for dose in doses:
+        mine = np.array([name == dose.reactor for name in loop.reactors.names])
+        loop.interlock.confirm(Receipt(mine * dose.feed_ml, (), mine * dose.waste_ml), dose.at_s)
+        if dose.again and dose.n > decided.get(dose.reactor, -1):  # in no row yet
+            loop.repeated_ml += mine * dose.feed_ml
+    minute = loop.reactors.elapsed() / 60.0
+    log.info("resumed at minute %.1f; %d dose(s) booked from the journal", minute, len(doses))

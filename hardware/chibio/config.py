@@ -47,6 +47,13 @@ class ChiBioConfig:
     stop_s: float = setting(
         60.0, "how long a stop tries to verify the pumps off before it escalates", "s", within=(1, 600)
     )
+    deadman_s: float = setting(
+        120.0,
+        "silence after which a board agent, where there is one, switches pumps off: its --deadman",
+        "s",
+        within=(20, 3600),
+        note="what a dose may have repeated until then is booked",
+    )
     recover: bool = setting(True, "restore and restart a device that lost its memory or whose thread died")
 
     def __post_init__(self) -> None:

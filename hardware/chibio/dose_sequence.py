@@ -1,6 +1,8 @@
 """One dose from intent to verified off, what is carried to the next, and what the device may have repeated."""
 
 import math
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -9,15 +11,33 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.diagnosis import fault_of
 from hardware.chibio.dosing import DosePlan, ReactorCalibration, plan_dose
+from hardware.chibio.ending import Ending, repeats_until
 from hardware.chibio.logbook import Logbook
-from hardware.chibio.protocol import FEED, PERIOD_S, WASTE, DeviceState
-from hardware.chibio.resume import ReactorHistory
+from hardware.chibio.protocol import FEED, WASTE, DeviceState
+from hardware.chibio.resume import ReactorHistory, conclude
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 
 __all__ = ["DoseSequence"]
 
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste motor must already turn when feed arrives
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A dose whose end is not on record.
+
+    on_s: run time at which its feed pump was switched on, before that at which it was intended, s. wasted, fed: its
+    pumps were, or may have been, switched on. feed_off_s: run time at which the device took the feed's off, else nan.
+    experiment: start time of the device's experiment in which it was begun.
+    """
+
+    plan: DosePlan
+    on_s: float
+    wasted: bool = False
+    fed: bool = False
+    feed_off_s: float = math.nan
+    experiment: str = ""
 
 
 class DoseSequence:
@@ -27,7 +47,7 @@ class DoseSequence:
     repeats its dose every 63 s until it is switched off, so a late end means that more was dosed than planned.
 
     Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
-      not be verified off; repeated_ml, repeated_waste_ml, what the device may have dosed again, not booked yet.
+      not be verified off; endings, of doses that the device has repeated, until somebody books and clears them.
     """
 
     def __init__(
@@ -42,7 +62,8 @@ class DoseSequence:
         self._agenda, self._clock, self._book = agenda, connection.clock, book
         self.running = False
         self.stuck = ""
-        self.repeated_ml = self.repeated_waste_ml = 0.0
+        self.endings: list[Ending] = []
+        self._begun: _Begun | None = None
         self._acted: tuple[float, int] | None = None  # newest sample a dose was decided for
         self._carry_ml, self._doses = 0.0, 0
 
@@ -52,16 +73,8 @@ class DoseSequence:
         The device repeats a dose that was left open every 63 s, whatever becomes of the program.
         """
         self._acted, self._carry_ml, self._doses = history.sample, history.carry_ml, history.doses
-        if not history.open:
-            return
-        times = max(math.floor((self._book.elapsed() - history.on_s) / PERIOD_S), 0)
-        self.repeated_ml = history.feed_ml * times * state.pumps_on[0]
-        self.repeated_waste_ml = history.waste_ml * times * state.pumps_on[1]
-        followed = f"{self.repeated_ml:.2f} mL may have followed"
-        if times > 0 and not state.pumps_on[0]:
-            followed = "repeated every 63 s until something else switched the pump off: unknown, not booked"
-        self._book.tell(f"a dose of {history.feed_ml:.2f} mL was left open; {followed}")
-        self._book.log("dose_end", verified_off=True, repeated_ml=self.repeated_ml)
+        if history.open:
+            self._conclude(*conclude(history, state, self._book.elapsed(), self._config.deadman_s))
 
     def forget_sample(self) -> None:
         """The device's records begin anew: no dose was decided for any sample in them."""
@@ -90,7 +103,10 @@ class DoseSequence:
         if plan.shortfall_ml > 0.0:
             self._book.tell(f"the dose was cut by {plan.shortfall_ml:.3f} mL to the feed limit")
         self._intend(plan, rate)
-        return plan if plan.feed_duty > 0.0 and self._switch_on(plan, appeared_s) else DosePlan()
+        if plan.feed_duty == 0.0:
+            return DosePlan()
+        self._begun = _Begun(plan, self._book.elapsed())
+        return plan if self._switch_on(plan, appeared_s) else DosePlan()
 
     def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> str:
         """Why no dose may be given for this sample now; "" if nothing stands against it."""
@@ -113,23 +129,34 @@ class DoseSequence:
         )  # fmt: skip
 
     def _switch_on(self, plan: DosePlan, appeared_s: float) -> bool:
-        """Targets, read back, then on; True if the pumps run or may run. The end is planned before anything is on."""
+        """Targets, read back, then on; True if the feed runs or may run. The end is planned before anything is on."""
         try:
             self._set_targets(plan, appeared_s)
         except ReactorError as error:
             self._book.tell(f"no dose: {error}")
-            self._agenda.add(self._finish(DosePlan()))
+            self._agenda.add(self._finish())
             return False
         self.running = True
         self._agenda.add(self._feed_off(), WASTE_FIRST_S + plan.feed_s + DOSE_OFF_S)
-        self._agenda.add(self._finish(plan), plan.waste_s + DOSE_OFF_S)
+        self._agenda.add(self._finish(), plan.waste_s + DOSE_OFF_S)
+        fed = False
         try:
+            self._mark(wasted=True)
             self._connection.switch(WASTE, True)
             self._clock.sleep(WASTE_FIRST_S)
+            fed, on_s = True, self._book.elapsed()
+            self._mark(fed=True, on_s=on_s)
+            self._book.log("feed_on", on_s=on_s)  # before it is done: a resumed run must know that it may have been fed
             self._connection.switch(FEED, True)
         except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
-            self._book.tell(f"the answer to a pump command was lost, counted as dosed: {error}")
-        return True
+            counted = "counted as dosed" if fed else "no medium was given"
+            self._book.tell(f"the answer to a pump command was lost, {counted}: {error}")
+        return fed
+
+    def _mark(self, **known: Any) -> None:
+        """Note what has become of the dose under way."""
+        if self._begun is not None:
+            self._begun = replace(self._begun, **known)
 
     def _set_targets(self, plan: DosePlan, appeared_s: float) -> None:
         """Set both duties and read them back. Raises: ReactorError if the device is not ready for this dose in time."""
@@ -141,6 +168,7 @@ class DoseSequence:
         on = self._config.overflow_pump.others_on(state)
         if not as_set or on or not state.running or state.regulating:
             raise DeviceStateError(f"targets {state.pump_targets[:2]}, pumps on: {on or 'none'}: not as set")
+        self._mark(experiment=state.start_time)
         past = self._clock.now() - appeared_s
         if past + plan.waste_s > self._config.window_s:
             raise DeviceStateError(f"the device answers too slowly ({past:.0f} s after the sample)")
@@ -150,6 +178,7 @@ class DoseSequence:
         while self.running:
             try:
                 self._connection.switch(FEED, False)
+                self._mark(feed_off_s=self._book.elapsed())
                 return
             except (LinkError, ProtocolError) as error:
                 self._book.report(fault_of(error, present=True))
@@ -157,9 +186,8 @@ class DoseSequence:
                 pass
             yield min(self._config.retry_s, 2.0)
 
-    def _finish(self, plan: DosePlan) -> Task:
+    def _finish(self) -> Task:
         """Task: the pumps off, verified, however long it takes; then the dose is on record as ended."""
-        due = self._clock.now()  # the moment the dose should be over
         self.running = True
         for refusals in range(10**9):
             pause = min(self._config.retry_s, 2.0)
@@ -173,17 +201,45 @@ class DoseSequence:
                     pause = 30.0  # absent or exchanged: nothing may be sent to it
                 else:
                     self.stuck = str(error)
+                    if FEED in self._connection.state.running_pumps:
+                        self._mark(feed_off_s=math.nan)  # it was answered, not done
                     if refusals == 3:
                         self._connection.escalate()
             yield pause
-        self.stuck = ""
-        self._end(plan, math.floor((self._clock.now() - due) / PERIOD_S))
+        self.ended(self._book.elapsed())
 
-    def _end(self, plan: DosePlan, repeats: int) -> None:
-        """The pumps are off; the device may have repeated the dose so often before."""
-        if repeats > 0 and plan.feed_ml > 0.0:
-            self.repeated_ml += repeats * plan.feed_ml
-            self.repeated_waste_ml += repeats * plan.waste_ml
-            self._book.tell(f"the pumps were verified off late: the dose may have been repeated {repeats} times")
-        self.running = False
-        self._book.log("dose_end", verified_off=True, repeated_ml=repeats * plan.feed_ml)
+    def ended(self, off_s: float) -> None:
+        """The pumps were switched off at run time `off_s` and verified: a dose under way is over, and so on record."""
+        self.running, self.stuck = False, ""
+        if (begun := self._begun) is None:
+            return
+        self._begun = None
+        ending, note = self._ending(begun, off_s), ""
+        state = self._connection.state
+        if begun.experiment and state is not None and state.start_time != begun.experiment:
+            note = "the device was restarted in a dose, which ended it"
+            ending = replace(ending, feed_times=0, waste_times=0)
+        elif ending.feed_times > 0:
+            note = f"the pumps were verified off late: the dose may have been repeated {ending.feed_times} times"
+        self._conclude(ending, note)
+
+    def _ending(self, begun: _Begun, off_s: float) -> Ending:
+        """What a dose gave until its pumps were off: less than planned where it was cut short, more where late."""
+        plan, calibration = begun.plan, self._calibration
+        feed_off_s = off_s if math.isnan(begun.feed_off_s) else begun.feed_off_s
+        ending = Ending(begun.on_s)
+        if begun.wasted:
+            waste_ml = calibration.waste.volume(min(plan.waste_s, off_s - begun.on_s))
+            ending = replace(ending, waste_ml=waste_ml, waste_times=repeats_until(off_s, begun.on_s))
+        if begun.fed:
+            feed_ml = calibration.feed.volume(min(plan.feed_s, feed_off_s - begun.on_s))
+            ending = replace(ending, feed_ml=feed_ml, feed_times=repeats_until(feed_off_s, begun.on_s))
+        return ending
+
+    def _conclude(self, ending: Ending, note: str) -> None:
+        """A dose is over: on record, and its repetitions wait to be booked."""
+        if note:
+            self._book.tell(note)
+        self._book.log("dose_end", **ending.row())
+        if ending.feed_times or ending.waste_times:
+            self.endings.append(ending)

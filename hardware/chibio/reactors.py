@@ -174,13 +174,20 @@ class ChiBioReactors:
                 plan = station.dose(float(command.pump_rate[i]))
                 volume[i], waste[i] = plan.feed_ml, plan.waste_ml
                 self._work()
-            volume[i] += station.doses.repeated_ml
-            waste[i] += station.doses.repeated_waste_ml
-            station.doses.repeated_ml = station.doses.repeated_waste_ml = 0.0
         notes = tuple(f"{station.name}: {note}" for station in self.stations for note in station.book.notes)
         for station in self.stations:
             station.book.notes.clear()
         return Receipt(volume, notes, waste)
+
+    def repeated(self) -> list[tuple[float, Receipt]]:
+        """Doses that the device repeated by itself, not told before: run time, s, and volumes, in order."""
+        found = []
+        for i, station in enumerate(self.stations):
+            mine = np.arange(len(self.stations)) == i
+            endings, station.doses.endings = station.doses.endings, []
+            for at_s, feed_ml, waste_ml in (again for ending in endings for again in ending.repeats()):
+                found.append((at_s, Receipt(mine * feed_ml, (), mine * waste_ml)))
+        return sorted(found, key=lambda one: one[0])
 
     def pumps_off(self, rows: Mask) -> list[str]:
         """All pumps of `rows` off, verified, but for an overflow pump; returns what failed, one line per reactor."""
@@ -239,12 +246,13 @@ class ChiBioReactors:
 
     @staticmethod
     def _silence(station: Station, errors: dict[str, ReactorError]) -> bool:
+        off_s = station.book.elapsed()
         try:
             station.connection.pumps_off(tries=1)
         except ReactorError as error:
             errors[station.name] = error
             return False
-        station.doses.running = False
+        station.doses.ended(off_s)
         return True
 
     def end(self) -> None:

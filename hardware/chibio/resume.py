@@ -1,19 +1,24 @@
-"""What a run must remember of each Chi.Bio reactor, and how the journal gives it back after a crash."""
+"""What a run must remember of each Chi.Bio reactor and its doses, and how the journal gives it back after a crash."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from hardware.chibio.ending import Ending, repeats_until
+from hardware.chibio.protocol import FEED, DeviceState
 from hardware.errors import RecordingError
 from hardware.storage.journal import REMEDY
 
-__all__ = ["ReactorHistory", "replay"]
+__all__ = ["Dosed", "ReactorHistory", "conclude", "dosed", "replay"]
+
+SWITCH_S = 10.0  # after its silence the board agent needs a moment, and the last request before it is not on record
 
 KEYS: Mapping[str, Callable[[Any], Any]] = {
     "device_id": str, "blank": float, "carry_ml": float, "doses": int, "temperature": float, "feed_ml": float,
-    "waste_ml": float, "on_s": float,
+    "waste_ml": float, "on_s": float, "start_time": str,
 }  # fmt: skip
+KINDS = ("device", "intent", "feed_on", "command", "dose_end", "temperature", "guard", "regulate")
 
 
 @dataclass(frozen=True)
@@ -21,8 +26,10 @@ class ReactorHistory:
     """What a run must remember of one reactor across a restart of this program.
 
     overflow_pump_on: it was verified on. handed_over: OD at which it was handed over to the on-board regulation.
-    sample: (record time, cycles) of the last sample a dose was decided for. open: a dose was begun and its end was
-    never recorded; then feed_ml, waste_ml are its volumes and on_s the run time at which it began, s.
+    sample: (record time, cycles) of the last sample a dose was decided for. start_time: of the device's experiment.
+    open: a dose was begun and its end was never recorded; then feed_ml, waste_ml are its volumes, on_s the run time at
+    which it began, s, fed, whether its feed pump was switched on, feed_off, whether it was switched off again.
+    seen_s: run time of the newest row, s.
     """
 
     device_id: str = ""
@@ -37,6 +44,26 @@ class ReactorHistory:
     feed_ml: float = 0.0
     waste_ml: float = 0.0
     on_s: float = 0.0
+    fed: bool = False
+    feed_off: bool = False
+    start_time: str = ""
+    seen_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Dosed:
+    """What was dosed at one moment.
+
+    n: row of the journal that tells: the intent, or, where the device repeated a dose (again), its end. at_s: run time,
+    s. Volumes in mL.
+    """
+
+    n: int
+    reactor: str
+    at_s: float
+    feed_ml: float
+    waste_ml: float
+    again: bool = False
 
 
 def _take(entry: dict[str, Any], row: Mapping[str, Any]) -> None:
@@ -44,7 +71,12 @@ def _take(entry: dict[str, Any], row: Mapping[str, Any]) -> None:
     entry.update({key: kind(row[key]) for key, kind in KEYS.items() if row.get(key) is not None})
     if row["kind"] == "intent":
         sample, volumes = row["sample"], (float(row["feed_ml"]), float(row["waste_ml"]))
-        entry.update(sample=(float(sample[0]), int(sample[1])), open=volumes[0] > 0.0)
+        entry.update(sample=(float(sample[0]), int(sample[1])), open=volumes[0] > 0.0, fed=False, feed_off=False)
+    elif row["kind"] == "feed_on":
+        entry["fed"] = True
+    elif row["kind"] == "command":
+        if row["path"] == f"/SetOutputOn/{FEED}/0/{row['reactor']}" and row["answer"] == 204:
+            entry["feed_off"] = True
     elif row["kind"] == "dose_end":
         entry["open"] = False
     elif row["kind"] == "guard":
@@ -62,12 +94,92 @@ def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, ReactorHistory]:
     Raises: RecordingError for a row that is not as the driver wrote it.
     """
     known: dict[str, dict[str, Any]] = {}
+    seen_s = 0.0
     for row in rows:
-        if row.get("kind") not in ("device", "intent", "dose_end", "temperature", "guard", "regulate"):
+        seen_s = max(seen_s, float(row.get("time_s") or 0.0))
+        if row.get("kind") not in KINDS:
             continue
         try:
             _take(known.setdefault(str(row["reactor"]), {}), row)
         except (IndexError, KeyError, TypeError, ValueError) as error:
-            what = f"row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error})"
-            raise RecordingError(f"journal.jsonl: {what}; {REMEDY}") from None
-    return {name: ReactorHistory(**entry) for name, entry in known.items()}
+            raise _damaged(row, error) from None
+    return {name: ReactorHistory(**entry, seen_s=seen_s) for name, entry in known.items()}
+
+
+def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
+    """Every dose of a journal with what it really gave, and what the device repeated of it, in the order of time.
+
+    A dose whose feed pump was never switched on gave nothing. One whose end is not on record is counted whole; what the
+    device repeated of it is told by the `dose_end` that a resumed run writes.
+
+    Args: rows: of a journal, oldest first. Raises: RecordingError for a row that is not as the driver wrote it.
+    """
+    ledger = _Ledger()
+    for row in rows:
+        if row.get("kind") in ("intent", "feed_on", "dose_end"):
+            try:
+                ledger.take(row)
+            except (KeyError, TypeError, ValueError) as error:
+                raise _damaged(row, error) from None
+    return sorted([*ledger.given.values(), *ledger.repeated], key=lambda d: d.at_s)
+
+
+class _Ledger:
+    """Doses by the row of their intent, their repetitions, and by reactor the one that has not ended."""
+
+    def __init__(self) -> None:
+        self.given: dict[int, Dosed] = {}
+        self.repeated: list[Dosed] = []
+        self._begun: dict[str, Dosed] = {}
+
+    def take(self, row: Mapping[str, Any]) -> None:
+        """Enter what one row says."""
+        kind, name = row["kind"], str(row["reactor"])
+        if kind == "intent":
+            volumes = float(row["feed_ml"]), float(row["waste_ml"])
+            self._begun[name] = Dosed(row["n"], name, float(row["on_s"]), *volumes)
+        elif kind == "feed_on" and name in self._begun:
+            self.given[self._begun[name].n] = self._begun[name]
+        elif kind == "dose_end" and "feed_times" in row:
+            ending = Ending.of_row(row)
+            if dose := self._begun.pop(name, None):
+                self.given[dose.n] = Dosed(dose.n, name, ending.on_s, ending.feed_ml, ending.waste_ml)
+            self.repeated += [Dosed(row["n"], name, *one, again=True) for one in ending.repeats()]
+
+
+def _damaged(row: Mapping[str, Any], error: Exception) -> RecordingError:
+    what = f"row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error})"
+    return RecordingError(f"journal.jsonl: {what}; {REMEDY}")
+
+
+def conclude(history: ReactorHistory, state: DeviceState, now_s: float, silence_s: float) -> tuple[Ending, str]:
+    """What became of the dose that an earlier life of the program left open, and that in words.
+
+    A pump that is still on has repeated its dose until now. One that is off, although this program never switched it
+    off, was switched off by something else, as the board agent does after a silence: it may have repeated until then.
+    A device that was restarted meanwhile forgot its pumps.
+
+    Args:
+      state: as the device was found, before its pumps were switched off. now_s: run time at which they were, s.
+      silence_s: after which the board agent switches pumps off.
+    """
+    feed_on, waste_on = state.pumps_on[:2]
+    fed, what = history.fed or feed_on, f"a dose of {history.feed_ml:.2f} mL was left open"
+    whole = Ending(history.on_s, history.feed_ml if fed else 0.0, history.waste_ml)
+    if history.start_time and (state.start_time != history.start_time or not state.started):
+        return whole, f"{what}; the device was restarted since, which ends every dose: nothing more is booked"
+    found_on = feed_on or waste_on
+    off_s = now_s if found_on else min(now_s, history.seen_s + silence_s + SWITCH_S)
+    times = repeats_until(off_s, history.on_s)
+    feeding = feed_on or (fed and not history.feed_off and not waste_on)
+    wasting = waste_on or (fed and not found_on)
+    ending = Ending(whole.on_s, whole.feed_ml, whole.waste_ml, times * feeding, times * wasting)
+    if not fed:
+        return ending, f"{what} before its feed pump was switched on: no medium was given"
+    if not feeding:
+        return ending, f"{what} after its feed pump had been switched off: no medium followed"
+    followed = f"repeated {times} times, {ending.repeated_ml:.2f} mL, booked at their times"
+    if found_on:
+        return ending, f"{what}; {followed}"
+    by = f"something else switched its pumps off, after a silence of {silence_s:g} s if it was the board agent"
+    return ending, f"{what}; {by}; {followed}"

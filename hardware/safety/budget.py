@@ -66,20 +66,24 @@ class FeedBudget:
 
     def _roll(self, now: float) -> None:
         """Forget feed of more than an hour ago: entry k of the ring belongs to the minutes with k = minute mod 60."""
-        minute = np.floor(now / 60.0)
-        ages = (minute - np.arange(60)) % 60  # how long ago each entry was last current, if the ring is up to date
-        stale = ages[None, :] < np.minimum(minute - self._minute, 60)[:, None]
+        minute = np.maximum(np.floor(now / 60.0), self._minute)
+        ages = (minute[:, None] - np.arange(60)) % 60  # how long ago each entry was current, in an up-to-date ring
+        stale = ages < np.minimum(minute - self._minute, 60)[:, None]
         self._hour = np.where(stale, 0.0, self._hour)
-        self._minute = np.full_like(self._minute, minute)
+        self._minute = minute
 
     def grant(self, rate: Array) -> None:
         """Remember what is allowed now, mL/s, shape (N,), until it is dosed."""
         self._owed_ml = self._owed_ml + rate * self._config.period_s
 
     def book(self, feed: Array, waste: Array, now: float) -> None:
-        """Book what was dosed, mL, shape (N,): V <- max(V_tube, V + feed - waste), and V + feed where waste is 0."""
+        """Book what was dosed at `now`, mL, shape (N,): V <- max(V_tube, V + feed - waste), V + feed where waste is 0.
+
+        `now` may lie before what another reactor was booked at; what lies an hour back counts only for the run.
+        """
         self._roll(now)
-        self._hour[:, int(now // 60.0) % 60] += feed
+        within = self._minute - now // 60.0 < 60.0
+        self._hour[:, int(now // 60.0) % 60] += np.where(within, feed, 0.0)
         self.fed_ml = self.fed_ml + feed
         dosed = feed > 0.0
         for mine, new in ((self._dose_s, np.full(len(feed), now)), (self._dose_ml, feed)):

@@ -21,7 +21,10 @@ def sample(minute: float) -> dict[str, object]:
 
 
 def intent(ml: float) -> dict[str, object]:
-    return {"reactor": "M0", "feed_ml": ml}
+    return {"reactor": "M0", "feed_ml": ml, "waste_ml": 9.0, "on_s": 130.0}
+
+
+FED = ("feed_on", {"reactor": "M0", "on_s": 131.0})
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -37,7 +40,7 @@ def killed_after(folder: Path, *events: tuple[str, dict[str, object]]) -> None:
 
 
 def test_a_decided_row_is_completed_with_the_dose_of_its_intent(tmp_path: Path) -> None:
-    killed_after(tmp_path, ("sample", sample(2.0)), ("decision", decision(2.0)), ("intent", intent(0.7)))
+    killed_after(tmp_path, ("sample", sample(2.0)), ("decision", decision(2.0)), ("intent", intent(0.7)), FED)
     record = Record(tmp_path, ("M0",), fsync=False)
     record.close()
     assert [(r["time_min"], r["volume_ml"], r["elapsed_min"]) for r in rows(tmp_path)] == [("2.0", "0.7", "1.0")]
@@ -48,7 +51,7 @@ def test_a_decided_row_is_completed_with_the_dose_of_its_intent(tmp_path: Path) 
 
 
 def test_a_sample_that_was_not_decided_on_becomes_a_row_without_a_dose(tmp_path: Path) -> None:
-    killed_after(tmp_path, ("sample", sample(2.0)), ("decision", decision(2.0)), ("intent", intent(0.7)),
+    killed_after(tmp_path, ("sample", sample(2.0)), ("decision", decision(2.0)), ("intent", intent(0.7)), FED,
                  ("sample", sample(3.0)))  # fmt: skip
     Record(tmp_path, ("M0",), fsync=False).close()
     last = rows(tmp_path)[-1]

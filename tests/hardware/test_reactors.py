@@ -695,7 +695,7 @@ def test_killed_at_a_random_request_and_resumed_no_sample_is_dosed_twice(seed: i
     assert lab.reactors.elapsed() == pytest.approx(began + dead_s + 300.0, abs=70.0)
 
 
-def test_a_dose_left_open_and_ended_by_something_else_is_told_as_unknown() -> None:
+def test_a_dose_left_open_and_ended_by_something_else_is_booked_as_long_as_that_may_have_taken() -> None:
     lab = DriverLab(options=quiet(mu=0.025))
     fixed(lab, 0.01)
     lab.reactors.begin()
@@ -708,7 +708,9 @@ def test_a_dose_left_open_and_ended_by_something_else_is_told_as_unknown() -> No
     lab.client()
     lab.reactors.begin(replay(rows), elapsed)
     assert len(doses(lab)) == 2
-    assert "unknown, not booked" in lab.of("note")[0]["note"]
+    assert "something else switched its pumps off" in lab.of("note")[0]["note"]
+    assert sum(receipt.volume_ml[0] for _, receipt in lab.reactors.repeated()) == pytest.approx(0.6)
+    assert lab.reactors.repeated() == []
 
 
 def test_what_the_journal_says_of_a_reactor() -> None:

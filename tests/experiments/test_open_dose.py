@@ -1,0 +1,231 @@
+"""A program that dies in a dose: what the device repeated is booked when it happened, before it is judged by."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.scenario import Scenario
+from experiments.control.loop import Step
+from experiments.controllers.base import Array, Mask
+from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
+from hardware.emulator.faults import inject
+from hardware.storage.journal import read_journal
+from tests.hardware.emulator_lab import quiet
+
+FEED_ON, FEED_OFF, WASTE_ON = "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump1/0/M0", "/SetOutputOn/Pump2/1/M0"
+TARGET = "/SetOutputTarget/Pump1/M0/"
+
+
+class Full:
+    """A controller that always asks for the largest rate."""
+
+    def reset(self, n: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
+        return np.full(od.shape, 0.02)
+
+
+class Cut(Rehearsal):
+    """One reactor at full feed; the program ends at the first request of a kind after some minutes.
+
+    how: "kill", or "stop" as on a signal.
+    """
+
+    def __init__(self, folder: Path, request: str, how: str = "kill") -> None:
+        super().__init__(folder, rehearsed(("M0",), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
+        self._request, self._how, self._whole = request, how, self.device.submit
+        self.begin()
+        with pytest.raises((Killed, KeyboardInterrupt)):
+            self._until_cut()
+        if how == "stop":
+            self.reactors.stop()
+        self.died_s = self.clock.now()
+        self.close()
+
+    def begin(self) -> None:
+        super().begin()
+        self.loop.controller = Full()
+
+    def _until_cut(self) -> None:
+        for _ in self.run(300.0):
+            pass
+        self.device.submit = self._cut  # type: ignore[method-assign]
+        for _ in self.run(900.0):
+            pass
+
+    def _cut(self, method: str, path: str, *rest: Any) -> Any:
+        exchange = self._whole(method, path, *rest)
+        if path.startswith(self._request):
+            self.device.submit = self._whole  # type: ignore[method-assign]
+            self.clock.sleep(0.6)  # carried out, and so long later
+            if self._how == "stop":
+                raise KeyboardInterrupt
+            self.kill()
+        return exchange
+
+    def resumed(self, minutes: float = 4.0) -> list[Step]:
+        """Steps of the next life that bring a sample."""
+        self.begin()
+        return [step for step in self.run(self.clock.now() + 60.0 * minutes) if step.rows.any()]
+
+    def journal(self, kind: str) -> list[dict[str, Any]]:
+        return [row for row in read_journal(self.folder / "journal.jsonl")[0] if row["kind"] == kind]
+
+    def note(self) -> str:
+        """The one note on the dose that was left open."""
+        (note,) = [row["note"] for row in self.journal("note") if "left open" in row["note"]]
+        return str(note)
+
+    def off_by_ml(self) -> float:
+        """What is booked beyond what really flowed, after the last dose has."""
+        self.wait(5.0)
+        return float(self.loop.interlock.budget.fed_ml[0]) - float(self.truth("M0")["feed_ml"])
+
+
+def reasons(steps: list[Step]) -> str:
+    return " ".join(step.reasons[0] or "" for step in steps)
+
+
+def test_repeats_of_a_dead_program_are_booked_when_they_happened_and_alarm_nobody(tmp_path: Path) -> None:
+    run = Cut(tmp_path, FEED_ON)
+    run.wait(900.0)
+    steps = run.resumed()
+    assert "falls" not in reasons(steps)
+    assert "budget" not in reasons(steps)
+    assert steps[0].rate[0] == 0.02  # dosed with the very first sample
+    times = 900 // 63
+    assert f"repeated {times} times, {1.2 * times:.2f} mL" in run.note()
+    assert abs(run.off_by_ml()) < 0.1 * times  # a single dose varies
+    (end,) = [row for row in run.journal("dose_end") if row["feed_times"]]
+    assert end["repeated_ml"] == pytest.approx(1.2 * times, rel=1e-3)
+    zero = run.spans[0][0]
+    starts = [d.start_s for d in run.device.vials["M0"].doses if d.pump == "Pump1"]
+    again = [at for at in starts if run.died_s + 5.0 < at < run.spans[1][0]]
+    booked = [end["on_s"] + 63.0 * k + zero for k in range(1, times + 1)]
+    assert len(again) == times
+    np.testing.assert_allclose(booked, again, atol=0.6 * times)  # the device's period is a little longer
+    volume = run.record.series("volume_ml")[0]
+    assert volume.sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
+    hour = run.loop.interlock.budget.state()["_hour"][0]
+    assert hour.max() < 2.5  # a minute holds two repetitions at most
+
+
+def test_they_are_booked_once_however_often_the_program_dies(tmp_path: Path) -> None:
+    run = Cut(tmp_path, FEED_ON)
+    run.wait(500.0)
+    run.begin()  # dies again before its first sample
+    run.close()
+    run.wait(100.0)
+    run.resumed()
+    assert abs(run.off_by_ml()) < 1.0
+    assert "left open" in run.note()
+    assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
+
+
+@pytest.mark.parametrize("how", ["worker_wipe", "power_cut"])
+def test_a_device_that_was_restarted_repeated_nothing(tmp_path: Path, how: str) -> None:
+    run = Cut(tmp_path, FEED_ON)
+    run.wait(3.0)
+    inject(run.device, how)
+    run.wait(40.0)
+    if how == "power_cut":
+        inject(run.device, "restart")
+    run.wait(860.0)
+    run.resumed()
+    assert "restarted since" in run.note()
+    assert abs(run.off_by_ml()) < 1.0
+    assert not any(row["feed_times"] for row in run.journal("dose_end"))
+
+
+def test_killed_in_the_waste_tail_no_medium_followed(tmp_path: Path) -> None:
+    run = Cut(tmp_path, FEED_OFF)
+    run.wait(900.0)
+    run.resumed()
+    assert "after its feed pump had been switched off: no medium followed" in run.note()
+    assert abs(run.off_by_ml()) < 1.0
+    assert [row["waste_times"] for row in run.journal("dose_end") if row["waste_times"]] == [900 // 63]
+
+
+@pytest.mark.parametrize("request_", [TARGET, WASTE_ON])
+def test_killed_before_the_feed_pump_was_started_nothing_is_booked(tmp_path: Path, request_: str) -> None:
+    run = Cut(tmp_path, request_)
+    run.wait(900.0)
+    run.resumed()
+    assert "before its feed pump was switched on: no medium was given" in run.note()
+    assert abs(run.off_by_ml()) < 1.0
+    assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
+
+
+@pytest.mark.parametrize(("request_", "fed"), [(FEED_ON, True), (WASTE_ON, False), (TARGET, False)])
+def test_a_clean_stop_leaves_no_dose_open_and_its_row_tells_what_was_given(
+    tmp_path: Path, request_: str, fed: bool
+) -> None:
+    run = Cut(tmp_path, request_, "stop")
+    end = run.journal("dose_end")[-1]
+    true = [d for d in run.device.vials["M0"].doses if d.pump == "Pump1" and d.start_s > run.died_s - 5.0]
+    assert len(true) == fed
+    assert end["feed_ml"] == pytest.approx(sum(d.seconds for d in true), abs=0.6)  # the motor starts late
+    assert (0.0 < end["feed_ml"] < 1.0) is fed  # cut short: 1.2 mL were planned
+    run.wait(900.0)
+    run.resumed()
+    assert not [row for row in run.journal("note") if "left open" in row["note"]]
+    rows = run.record.series("volume_ml")[0]
+    assert end["feed_ml"] in rows
+    assert abs(run.off_by_ml()) < 1.0
+
+
+def test_repeats_before_a_board_agent_ended_them_are_booked(tmp_path: Path) -> None:
+    run = Cut(tmp_path, FEED_ON)
+    run.wait(run.config.backend.deadman_s)
+    before = run.truth("M0")["feed_ml"]
+    for pump in (1, 2):
+        run.device.handle("POST", f"/SetOutputOn/Pump{pump}/0/M0")  # as the board agent does
+    run.wait(3000.0)
+    assert run.truth("M0")["feed_ml"] == pytest.approx(before, abs=0.01)
+    run.resumed()
+    assert "something else switched its pumps off, after a silence of 120 s" in run.note()
+    assert -0.6 < run.off_by_ml() < 1.8  # every repetition, and at most one that the agent was quicker than
+
+
+def test_repeats_under_a_lost_link_are_booked_before_the_next_sample_is_judged(tmp_path: Path) -> None:
+    run = Rehearsal(tmp_path, rehearsed(("M0", "M1"), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
+    run.begin()
+    run.loop.controller = Full()
+    for _ in run.run(300.0):
+        pass
+    while not run.device.apps["M0"].data["Pump1"]["ON"]:
+        run.loop.step()
+    inject(run.device, "lost_request", "all", -1)
+    end = run.clock.now() + 600.0
+    for _ in run.run(end):
+        pass
+    inject(run.device, "lost_request", "all", 0)
+    steps = [step for step in run.run(end + 300.0) if step.rows[0]]
+    assert "falls" not in reasons(steps)
+    assert "budget" not in reasons(steps)
+    fed = run.loop.interlock.budget.fed_ml[0]
+    assert fed - run.truth("M0")["feed_ml"] == pytest.approx(0.0, abs=1.5)
+    assert (
+        any("repeated" in row["note"] for row in run.record.journal.rows or [] if row["kind"] == "note") or fed > 15.0
+    )
+
+
+def test_a_device_that_was_restarted_in_a_dose_repeated_nothing(tmp_path: Path) -> None:
+    run = Rehearsal(tmp_path, rehearsed(("M0",), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
+    run.begin()
+    run.loop.controller = Full()
+    for _ in run.run(300.0):
+        pass
+    while not run.device.apps["M0"].data["Pump1"]["ON"]:
+        run.loop.step()
+    inject(run.device, "power_cut")
+    for _ in run.run(run.clock.now() + 900.0):
+        pass
+    inject(run.device, "restart")
+    for _ in run.run(run.clock.now() + 300.0):
+        pass
+    run.wait(5.0)
+    assert float(run.loop.interlock.budget.fed_ml[0]) - run.truth("M0")["feed_ml"] < 1.5
