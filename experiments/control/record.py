@@ -45,11 +45,27 @@ class Record:
         paths = [folder / "recordings" / f"{name}.csv" for name in names]
         self._recorders = [Recorder(path, COLUMNS, fsync, REBUILD) for path in paths]
         self.repairs += [r.repaired for r in self._recorders if r.repaired]
+        self._paths = paths
         self.rows = [read_rows(path) for path in paths]
-        for n, name in enumerate(names):
-            self.repairs += complete(self.journal, name, self.rows[n], partial(self._write, n))
+        self.repairs += self._completed(self.journal.rows)
         self._points = max(map(len, self.rows), default=0)  # of the curves: the newest minute
         self.events = Events(folder, self._points)
+
+    def complete(self) -> None:
+        """Write the rows that the end of the loop kept from being written, as the journal has them.
+
+        What was written is read from the disk, because a signal may have come between a row and the memory of it.
+        Raises: RecordingError.
+        """
+        self.rows = [read_rows(path) for path in self._paths]
+        self._completed(self.journal.reread())
+
+    def _completed(self, journal: Sequence[Mapping[str, Any]]) -> list[str]:
+        """What was completed from the rows of the journal, one line each."""
+        lines = []
+        for n, name in enumerate(self.names):
+            lines += complete(journal, name, self.rows[n], partial(self._write, n))
+        return lines
 
     def _write(self, n: int, row: Row) -> None:
         self._recorders[n].write(row)

@@ -90,20 +90,20 @@ def read_rows(path: Path) -> Rows:
     return found
 
 
-def complete(journal: Journal, name: str, rows: Rows, write: Callable[[Row], None]) -> list[str]:
+def complete(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows, write: Callable[[Row], None]) -> list[str]:
     """Write the rows of reactor `name` that are in the journal and that a kill kept from being written.
 
-    Args: rows: those already written, into which `write` takes each new one.
+    Args: journal: its rows. rows: those already written, into which `write` takes each new one.
     Returns: one line per row. Raises: RecordingError for a row of the journal that was damaged.
     """
     repairs = []
     try:
-        for row in _unwritten(journal.rows, name, rows):
+        for row in _unwritten(journal, name, rows):
             write(row)
             repairs.append(f"{name}: the row of minute {row['time_min']} was completed from the journal")
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         what = f"a row of {name} is damaged ({type(error).__name__}: {error})"
-        raise RecordingError(f"journal {journal.path}: {what}; {REMEDY}") from None
+        raise RecordingError(f"journal.jsonl: {what}; {REMEDY}") from None
     return repairs
 
 

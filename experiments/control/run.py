@@ -6,8 +6,8 @@ Signals stop the loop like Ctrl-C, and they do not cut short the switching off o
 import logging
 import os
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -22,37 +22,32 @@ from experiments.control.loop import ClosedLoop
 from experiments.control.record import Record
 from experiments.control.summary import ChangeLog, figure_of, metrics_table, summarise
 from experiments.reporting import charts
-from hardware.errors import ReactorError
+from hardware.errors import ReactorError, RecordingError
 
 __all__ = ["deploy"]
 
 log = logging.getLogger(__name__)
 
 
-def _like_ctrl_c() -> AbstractContextManager[None]:
-    """SIGTERM (a service manager, a shutting-down PC) and SIGHUP (a closed terminal) raise KeyboardInterrupt."""
+@contextmanager
+def _one_interrupt() -> Iterator[None]:
+    """Ctrl-C, SIGTERM (a service manager, a shutting-down PC) or SIGHUP (a closed terminal) raise KeyboardInterrupt.
 
-    def interrupt(number: int, stack: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    return _handled(interrupt, signal.SIGTERM, signal.SIGHUP)
-
-
-def _held_back() -> AbstractContextManager[None]:
-    """A second Ctrl-C, SIGTERM or SIGHUP does not end the program before the pumps are verified off."""
+    Only the first of them: what comes after it does not cut short the switching off of the pumps, nor the summary.
+    Signals that are ignored on purpose (nohup) stay so.
+    """
+    told: list[int] = []
 
     def answer(number: int, stack: FrameType | None) -> None:
+        told.append(number)
+        if len(told) == 1:
+            raise KeyboardInterrupt
         log.warning("the pumps are being switched off and verified; this takes up to a minute")
 
-    return _handled(answer, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-
-@contextmanager
-def _handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[None]:
-    """These signals call `handler` for a while, except those that are ignored on purpose (nohup)."""
-    before = {n: old for n in numbers if (old := signal.getsignal(n)) is not signal.SIG_IGN}
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {n: old for n in signals if (old := signal.getsignal(n)) is not signal.SIG_IGN}
     for number in before:
-        signal.signal(number, handler)
+        signal.signal(number, answer)
     try:
         yield
     finally:
@@ -81,19 +76,21 @@ def _run(loop: ClosedLoop, record: Record) -> str:
         log.exception("the run ends")
         outcome = f"failed: {type(error).__name__}: {error}"
     finally:
-        with _held_back():
-            try:
-                reactors.stop()
-                left = ", ".join(n for n, h in zip(reactors.names, reactors.handed_over, strict=True) if h)
-                log.info("pumps verified off%s", f"; {left}: left to the on-board regulation" if left else "")
-            except ReactorError as error:
-                outcome = f"failed: {error}"
+        try:
+            reactors.stop()
+            left = ", ".join(n for n, h in zip(reactors.names, reactors.handed_over, strict=True) if h)
+            log.info("pumps verified off%s", f"; {left}: left to the on-board regulation" if left else "")
+        except ReactorError as error:
+            outcome = f"failed: {error}"
     return outcome
 
 
 def _finish(record: Record, setup: Setup, outcome: str) -> str:
     """Figure and summary.json, whatever the outcome; returns the outcome, failed if they could not be written."""
     config, folder = setup.config, record.folder
+    if not outcome.startswith(("completed", "stopped by the interlock")):
+        with suppress(RecordingError):  # a signal or an error in a dose ends the loop before its row is written
+            record.complete()
     try:
         figure = figure_of(record, setup.scenarios, f"{config.backend.kind}: {outcome}")
         path = charts.save(figure, folder / "figures", "closed_loop")
@@ -118,7 +115,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         if config.preflight_only:
             assemble.run_preflight(setup, folder)
             return
-        with _like_ctrl_c(), closing(Record(folder, config.backend.reactors, config.fsync)) as record:
+        with _one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync)) as record:
             for repair in record.repairs:
                 log.warning("%s", repair)
             with assemble.opened(setup, record) as loop:

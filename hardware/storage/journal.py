@@ -127,6 +127,14 @@ class Journal:
         self.next_row += 1
         self._size += written
 
+    def reread(self) -> list[dict[str, Any]]:
+        """Its newest rows, 20 MB of them, as they are on the disk now. Raises: RecordingError."""
+        try:
+            newest = _tail(self.path, max(self.path.stat().st_size - TAIL, 0))
+        except OSError as error:
+            raise RecordingError(f"journal {self.path}: {error.strerror or error}; check folder and disk") from error
+        return list(_parse(newest, self.path))
+
     def close(self) -> None:
         """Release the file. Idempotent."""
         if self._file is not None:

@@ -1,5 +1,6 @@
 """However a run ends, its pumps are verified off: real processes, real signals, a disk that really refuses."""
 
+import csv
 import json
 import os
 import resource
@@ -93,6 +94,59 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
         if one.client.poll() is None:
             one.client.kill()
             one.client.communicate()
+
+
+def volumes(folder: Path, name: str) -> list[float]:
+    with open(folder / "recordings" / f"{name}.csv", newline="") as file:
+        return [float(row["volume_ml"]) for row in csv.DictReader(file)]
+
+
+def test_a_signal_while_the_pumps_are_being_switched_on_costs_no_row(bench: Bench) -> None:
+    """The journal's newest row tells when the waste pump runs and the feed pump not yet: a second of device time."""
+    journal = bench.folder / "journal.jsonl"
+    bench.until_a_dose()
+    time.sleep(2.0 * 60.0 / SPEED)
+    urllib.request.urlopen(
+        urllib.request.Request(f"{bench.device.control}/_emulator/fault/slow_s/all/6", method="POST"), timeout=10.0
+    ).close()  # 0.2 s for each request: the signal falls inside the switching on
+    began = journal.stat().st_size
+    deadline = time.monotonic() + 30.0
+    while b'"kind":"intent"' not in journal.read_bytes()[began:]:
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    bench.client.send_signal(signal.SIGTERM)
+    status, said = bench.end()
+    assert status == 0, said
+    rows, _ = read_journal(journal)
+    for name in ("M0", "M1"):
+        decided = [row for row in rows if row["kind"] == "decision" and row["reactor"] == name]
+        given = volumes(bench.folder, name)
+        assert len(given) == len(decided)
+        intents = [row for row in rows if row["kind"] == "intent" and row["reactor"] == name]
+        ends = [row for row in rows if row["kind"] == "dose_end" and row["reactor"] == name]
+        assert len(ends) == sum(row["feed_ml"] > 0.0 for row in intents)
+        if ends and ends[-1]["feed_ml"] == 0.0:  # switched off again before the feed pump was on
+            assert given[-1] == 0.0
+    bench.check("stopped by the operator")
+
+
+def test_three_signals_at_once_end_with_a_summary(bench: Bench) -> None:
+    bench.until_a_dose()
+    time.sleep(2.0 * 60.0 / SPEED)
+    bench.until_a_dose()
+    for _ in range(3):
+        bench.client.send_signal(signal.SIGINT)
+        time.sleep(0.15)
+    for _ in range(40):  # and all the way through the summary
+        time.sleep(0.05)
+        if bench.client.poll() is not None:
+            break
+        bench.client.send_signal(signal.SIGINT)
+    status, said = bench.end()
+    assert "pumps verified off" in said
+    assert "Traceback" not in said
+    bench.check("stopped by the operator")
+    assert status in (0, 130, -signal.SIGINT)  # the last one may fall into the end of the interpreter
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
