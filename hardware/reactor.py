@@ -39,7 +39,7 @@ class Vitals:
     """What a device tells of itself beside the sample.
 
     age_s: time since the newest sample arrived, by this computer's monotonic clock, shape (N,).
-    raw: spectrometer counts of the newest sample, shape (N,); nan where unknown.
+    raw: spectrometer counts of the newest sample, shape (N,); nan is a reading that is not to be believed.
     faults: what is wrong with each reactor, or None; N entries.
     """
 

@@ -13,11 +13,12 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 
 from experiments.cli import frame
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
+from hardware.chibio.connection import identity
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.preflight import preflight
 from hardware.clock import RealClock
 from hardware.emulator.process import EmulatorProcess
-from hardware.link.open import open_transport
+from hardware.link.open import lock, open_transport
 from hardware.link.transport import Transport
 from hardware.storage import atomic
 
@@ -30,7 +31,10 @@ PARTS = ("feed", "waste", "blank")  # one YAML file per reactor and part, REACTO
 
 @contextmanager
 def linked(backend: ChiBioConfig) -> Iterator[tuple[Transport, RealClock]]:
-    """The open link to a device and the device's clock. Raises: LinkError."""
+    """The open link to a device that no other client has, and the device's clock.
+
+    Raises: ReactorError if nothing answers, or another client on this computer has the device, by whatever name.
+    """
     with ExitStack() as stack:
         url = backend.url
         if isinstance(backend, EmulatorConfig):  # one is started for as long as the run lasts
@@ -44,7 +48,10 @@ def linked(backend: ChiBioConfig) -> Iterator[tuple[Transport, RealClock]]:
             )
             url = device.url
         transport = stack.enter_context(closing(open_transport(backend.transport, url, backend.speed)))
-        yield transport, RealClock(backend.speed)
+        clock = RealClock(backend.speed)
+        if not isinstance(backend, EmulatorConfig):  # that one is this run's own
+            stack.enter_context(lock(f"the device with reactor {identity(transport, clock)}"))
+        yield transport, clock
 
 
 def check(

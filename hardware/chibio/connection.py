@@ -9,7 +9,7 @@ from hardware.clock import Clock
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
 from hardware.link.transport import Transport
 
-__all__ = ["Connection", "Log", "no_log"]
+__all__ = ["Connection", "Log", "identity", "no_log"]
 
 SEEN_S = 1.0
 """For so long after an answer a reactor counts as present: a server that ended needs more time before it listens again.
@@ -24,6 +24,20 @@ Log = Callable[[str, Mapping[str, Any]], None]
 
 def no_log(kind: str, fields: Mapping[str, Any]) -> None:
     """Keeps nothing."""
+
+
+def identity(transport: Transport, clock: Clock) -> str:
+    """Identity of the first reactor that is present: the same by whatever name or link a device is reached.
+
+    Raises: LinkError, ProtocolError; DeviceStateError if there is no reactor.
+    """
+    reply = transport.get("/getSysdata/")
+    if reply.status != 200:
+        raise ProtocolError(f"GET /getSysdata/: status {reply.status}, expected 200; check the address")
+    present = parse_state(reply.body).present
+    if not present:
+        raise DeviceStateError("the device has no reactor; plug one in with the server stopped")
+    return Connection(present[0], present[:1], transport, clock, no_log).read().device_id
 
 
 class Connection:

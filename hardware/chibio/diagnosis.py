@@ -31,7 +31,7 @@ def diagnose(
         )
     if not state.running:
         return Fault("stopped", "the experiment was stopped by someone", "start it in the device's web page")
-    if abs(state.blank - blank) > 0.5:
+    if not abs(state.blank - blank) <= 0.5:  # also nan
         return Fault(
             "blank",
             f"the blank was changed from {blank:.1f} to {state.blank:.1f}",

@@ -26,6 +26,8 @@ MAX_OVERFLOW_DUTY = 0.95
 """Never 1: the device does not switch such a pump off between its periods (docs/device.md, Pumps)."""
 PERIOD_S = 63.0
 """A pump that is ON runs at full power for PERIOD_S * target seconds of every PERIOD_S (docs/device.md, Pumps)."""
+MAX_TEXT = 160
+"""Characters of a text of the device that are taken; the longest line of its log that matters has 80."""
 UNSET_BLANK = 65000.0
 """Blank of a device that lost its memory or was never calibrated (docs/device.md, Blank)."""
 
@@ -129,10 +131,15 @@ def _flag(data: Any, *keys: str) -> bool:
     raise ProtocolError(f"device state: {'.'.join(keys)} = {str(value)[:40]!r}, expected 0 or 1")
 
 
+def _line(text: str) -> str:
+    """One line of printable ASCII, cut: the device's words end up in every row of the journal."""
+    return re.sub(r"[^ -~]", "?", text[:MAX_TEXT])
+
+
 def _text(data: Any, *keys: str) -> str:
     value = _get(data, *keys)
     if isinstance(value, str):
-        return value
+        return _line(value)
     raise ProtocolError(f"device state: {'.'.join(keys)} = {str(value)[:40]!r}, expected text")
 
 
@@ -159,7 +166,7 @@ def _terminal(data: Any) -> str:
     text = text.get("text", "") if isinstance(text, dict) else ""
     if isinstance(text, list):
         text = text[0] if text else ""
-    return str(text).split("</br>", 1)[0][:160]
+    return _line(str(text)[:400].split("</br>", 1)[0])
 
 
 def _modes(data: Any) -> tuple[str, ...]:
@@ -188,7 +195,7 @@ def parse_state(body: bytes) -> DeviceState:
         selected=_text(data, "UIDevice"),
         present=tuple(m for m in POSITIONS if isinstance(present, dict) and m in present and _flag(present, m)),
         device_id=_text(data, "DeviceID"),
-        version=str(data["Version"].get("value", ""))[:60] if isinstance(data.get("Version"), dict) else "",
+        version=_line(str(data["Version"].get("value", ""))) if isinstance(data.get("Version"), dict) else "",
         running=_flag(data, "Experiment", "ON"),
         cycles=int(cycles),
         start_time=_text(data, "Experiment", "startTime"),

@@ -127,17 +127,18 @@ class Station:
             raise DeviceStateError(f"{self.name}: {modes} is on; switch it off in the device's web page")
         if state.regulating and not self.regulation.active:
             self.regulation.switch_off()
-        if abs(state.blank - self._blank) > 0.5:
+        if not abs(state.blank - self._blank) <= 0.5:  # also nan
             connection.set_blank(self._blank)
         for item, value, wanted in (
             ("Volume", state.volume_ml, self._config.volume_ml),
             ("Stir", state.stir_target, self._config.stir),
             ("Thermostat", state.temperature_target, self._target_c),
         ):
-            if abs(value - wanted) > 1e-5:
+            if not abs(value - wanted) <= 1e-5:
                 connection.target(item, wanted)
         state = connection.read()
-        if abs(state.blank - self._blank) > 0.5 or abs(state.temperature_target - self._target_c) > 1e-3:
+        taken = abs(state.blank - self._blank) <= 0.5 and abs(state.temperature_target - self._target_c) <= 1e-3
+        if not taken:
             raise DeviceStateError(
                 f"{self.name} did not take its settings: blank {state.blank:.1f} (asked {self._blank:.1f}), thermostat "
                 f"{state.temperature_target} degC (asked {self._target_c}); run the preflight"
@@ -225,7 +226,7 @@ class Station:
         connection, stir = self.connection, self._config.stir
         targets = (("Thermostat", state.temperature_target, self._target_c), ("Stir", state.stir_target, stir))
         for item, value, wanted in targets:
-            if abs(value - wanted) > 1e-3:
+            if not abs(value - wanted) <= 1e-3:
                 self._mend(f"{item} was set to {value:g}", f"set back to {wanted:g}", connection.target, item, wanted)
         for item, on, needed in (("Thermostat", state.heating, self._heat), ("Stir", state.stirring, stir > 0.0)):
             if needed and not on:

@@ -113,11 +113,12 @@ class LinkFaults:
 class Computer:
     """Clocks, threads and bus.
 
-    Args: now: device time at the start, s; rng: how busy it happens to be.
+    Args: now: device time at the start, s; rng: how busy it happens to be; unit: which of several devices.
     `wall_offset_s` is by how much the board's clock was set forward; `errors` holds what the software did not catch.
     """
 
-    def __init__(self, now: float, rng: np.random.Generator) -> None:
+    def __init__(self, now: float, rng: np.random.Generator, unit: int = 0) -> None:
+        self.unit = unit
         self.events, self.faults, self.rng = EventQueue(now), LinkFaults(), rng
         self.wall_offset_s = 0.0
         self.errors: deque[str] = deque(maxlen=200)

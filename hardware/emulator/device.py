@@ -43,6 +43,7 @@ class DeviceOptions:
 
     worker_timeout_s: float = setting(30.0, "gunicorn kills a worker whose request takes longer", "s", within=(1, 3600))
     boot_s: float = setting(8.0, "from a dead worker to a serving one", "s", within=(0, 600))
+    unit: int = setting(0, "which of several devices: no two of them have the same identities", at_least=0)
     request_s: float = setting(0.005, "what any request takes", "s", within=(0, 5))
     vial: VialConfig = part(VialConfig, "optics and electronics")
     plant: PlantConfig = part(lambda: plant_preset("healthy"), "cultures and pumps, with pulse dosing")
@@ -84,7 +85,7 @@ class ChiBioDevice:
         self.clock, self.options = clock, options or DeviceOptions()
         o = self.options
         noise, *streams = rng.spawn(1 + len(reactors))
-        self.computer = Computer(clock.now(), noise)
+        self.computer = Computer(clock.now(), noise, o.unit)
         self.faults, self._events = self.computer.faults, self.computer.events
         self.vials: dict[str, Vial] = {}
         for name, stream, start_od in zip(reactors, streams, ods, strict=True):

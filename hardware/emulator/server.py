@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import signal
 import socket
 import struct
@@ -262,6 +263,7 @@ def parser() -> argparse.ArgumentParser:
         default=(start.pump_start_low_s, start.pump_start_high_s),
         help="from the answer to a pump command until its motor turns, s (default %(default)s)",
     )
+    add("--unit", type=int, default=os.getpid(), help="which of several devices: its identities (default: own ones)")
     add("--unblanked", action="store_true", help="start with the zero at 65000, as after power-on")
     return p
 
@@ -280,7 +282,7 @@ def build(arguments: argparse.Namespace) -> ChiBioDevice:
         tuple(arguments.reactors.split(",")),
         RealClock(arguments.speed),
         np.random.default_rng(arguments.seed),
-        DeviceOptions(vial=vial, plant=plant),
+        DeviceOptions(unit=arguments.unit, vial=vial, plant=plant),
         od=ods[0] if len(ods) == 1 else ods,
         temperature=arguments.temperature,
         blanked=not arguments.unblanked,

@@ -45,7 +45,8 @@ class Software:
         self.computer, self.selected = computer, "M0"
         self._reactors = tuple(vials)
         self.apps = {
-            name: ReactorApp(name, computer, vials.get(name), device_id(name), self.selected) for name in ALL_REACTORS
+            name: ReactorApp(name, computer, vials.get(name), device_id(name, computer.unit), self.selected)
+            for name in ALL_REACTORS
         }
 
     def app(self, name: str) -> ReactorApp:
@@ -84,7 +85,7 @@ class Software:
         return json.dumps(data, sort_keys=True, separators=(",", ":")).encode() + b"\n"
 
 
-def device_id(name: str) -> str:
-    """Four ID words of the IR thermometer at a position, decimal strings joined."""
+def device_id(name: str, unit: int) -> str:
+    """Four ID words of the IR thermometer at a position, decimal strings joined; no two units have the same."""
     k = int(name[1])
-    return f"{1000 + k}{2000 + 7 * k}{3000 + 11 * k}{4000 + 13 * k}"
+    return f"{1000 + k}{2000 + 7 * k}{3000 + 11 * k + 100 * (unit // 40000)}{4000 + 13 * k + unit % 40000}"

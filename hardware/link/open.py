@@ -12,15 +12,16 @@ from hardware.link.http import HttpTransport
 from hardware.link.serial import SerialTransport
 from hardware.link.transport import Transport, TransportConfig
 
-__all__ = ["open_transport"]
+__all__ = ["lock", "open_transport"]
 
 
-def _lock(url: str) -> IO[str]:
-    """A locked file for the device at `url`; the kernel frees it when it is closed or the process ends.
+def lock(device: str) -> IO[str]:
+    """A locked file for a device; the kernel frees it when it is closed or the process ends.
 
+    Args: device: its address, or what else names it: one device may have several names, each is locked.
     Raises: DeviceStateError if another process holds it.
     """
-    name = hashlib.sha256(url.encode()).hexdigest()[:16]
+    name = hashlib.sha256(device.encode()).hexdigest()[:16]
     file: IO[str] = open(Path(tempfile.gettempdir()) / f"chibio-{name}.lock", "a+")  # noqa: SIM115 (held)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -28,7 +29,7 @@ def _lock(url: str) -> IO[str]:
         file.seek(0)
         holder = file.read().strip() or "unknown"
         file.close()
-        raise DeviceStateError(f"{url} is already controlled by process {holder}: one client per device") from error
+        raise DeviceStateError(f"{device} is already controlled by process {holder}: one client per device") from error
     file.truncate(0)
     file.write(str(os.getpid()))
     file.flush()
@@ -40,7 +41,7 @@ class _OwnedHttp(HttpTransport):
 
     def __init__(self, url: str, speed: float, config: TransportConfig) -> None:
         super().__init__(url, speed, config)
-        self._owner = _lock(self.url)
+        self._owner = lock(self.url)
 
     def close(self) -> None:
         super().close()

@@ -42,10 +42,10 @@ class Readings:
         """The fresh rows whose reading may be believed, and what is wrong with the others."""
         findings = self._ages(m, fresh, now)
         c, od = self._config, m.od
-        raw = m.vitals.raw if m.vitals is not None else np.full(len(fresh), math.nan)
+        raw = m.vitals.raw if m.vitals is not None else np.full(len(fresh), c.raw_min)  # without a device no counts
         with np.errstate(invalid="ignore"):
             broken = fresh & ((od > 10.0) | (raw < c.raw_min))
-            impossible = fresh & ~broken & ~((od > c.od_min) & (od < c.od_max) & ~(raw > c.raw_max))
+            impossible = fresh & ~broken & ~((od > c.od_min) & (od < c.od_max) & (raw <= c.raw_max))  # also nan
             repeats = np.where(fresh, np.where(od == self._seen, self._repeats + 1, 0), self._repeats)
         self._seen, self._repeats = np.where(fresh, od, self._seen), repeats
         frozen = fresh & ~broken & ~impossible & (repeats >= c.frozen_samples - 1)

@@ -27,7 +27,7 @@ def truth(emulator: EmulatorProcess) -> dict:  # type: ignore[type-arg]
 
 
 def test_weighing_the_emulators_pump_finds_what_it_delivers() -> None:
-    with EmulatorProcess(["--speed", "200"]) as emulator:
+    with EmulatorProcess(["--speed", "200", "--unit", "5"]) as emulator:
         backend = ChiBioConfig(url=emulator.url, speed=200.0)
         config = CalibratePumpConfig(backend, duties=(0.008, 0.02, 0.04), doses=10)
         on_balance = [0.0]
@@ -42,7 +42,7 @@ def test_weighing_the_emulators_pump_finds_what_it_delivers() -> None:
 
         found, identity = weigh(config, ask)
         after = truth(emulator)
-    assert identity == "1000200030004000"
+    assert identity == "1000200030004005"
     assert [s.duty for s in found] == [0.008, 0.02, 0.04]
     assert found[0].grams == 12.5  # asked again after an answer that is no number; a comma is a point
     assert not any(after["motors"].values())

@@ -136,6 +136,7 @@ def test_feed_without_waste_stops_before_the_vial_is_full() -> None:
         ({"od": -0.2}, "impossible"),
         ({"od": 5.0}, "impossible"),
         ({"od": 0.3, "raw": 65535.0}, "impossible"),
+        ({"od": 0.3, "raw": float("nan")}, "impossible"),
     ],
 )
 def test_a_reading_no_sensor_gives_never_pumps(values: dict[str, float], kind: str) -> None:

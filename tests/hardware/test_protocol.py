@@ -242,3 +242,13 @@ def test_no_combination_of_words_pumps_too_much_or_reaches_another_reactor(words
     if verb == "SetOutputOn":
         assert args[0] in (*PUMPS, "OD", "Stir", "Thermostat", "Heat")
         assert args[1] in ("0", "1")
+
+
+def test_a_text_of_the_device_is_one_short_line_whatever_it_sends() -> None:
+    long = "Mon\n" + "x" * 200_000
+    data = state()
+    data["Experiment"]["startTime"] = data["DeviceID"] = long
+    data["Terminal"], data["Version"] = {"text": long}, {"value": long}
+    found = parse(data)
+    for text in (found.start_time, found.device_id, found.version, found.terminal):
+        assert text == "Mon?" + "x" * 156

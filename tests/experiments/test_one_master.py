@@ -1,0 +1,50 @@
+"""One client per device, by whatever name or link it is reached; a device that is not there is told at once."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from experiments.control.device import linked
+from hardware.chibio.config import ChiBioConfig
+from hardware.emulator.process import EmulatorProcess
+from hardware.errors import DeviceStateError
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_second_master_is_refused_under_another_name_of_the_device() -> None:
+    with EmulatorProcess(["--speed", "100", "--reactors", "M1,M2"]) as device:
+        by_number = ChiBioConfig(url=device.url, speed=100.0, reactors=("M1",))
+        by_name = ChiBioConfig(url=device.url.replace("127.0.0.1", "localhost"), speed=100.0, reactors=("M2",))
+        with linked(by_number):
+            with pytest.raises(DeviceStateError, match=f"already controlled by process {os.getpid()}: one client per"):
+                with linked(by_name):
+                    pass
+        with linked(by_name):
+            pass
+
+
+def test_two_devices_may_have_a_master_each() -> None:
+    with EmulatorProcess(["--speed", "100"]) as one, EmulatorProcess(["--speed", "100"]) as other:
+        with linked(ChiBioConfig(url=one.url, speed=100.0)), linked(ChiBioConfig(url=other.url, speed=100.0)):
+            pass
+
+
+@pytest.mark.parametrize("command", ["blank", "deploy"])
+def test_a_wrong_address_is_one_line_at_once_and_speaks_of_no_pumps(tmp_path: Path, command: str) -> None:
+    words = ["backend.url=http://127.0.0.1:9", f"hydra.run.dir={tmp_path}/run"]
+    words += ["backend=chibio", "controller=adaptive_inverse"] if command == "deploy" else []
+    start = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-m", f"experiments.{command}", *words], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    said = (done.stdout + done.stderr).splitlines()
+    assert done.returncode == 1
+    assert "no answer from http://127.0.0.1:9" in said[-1]
+    assert "check cable" in said[-1]
+    assert not any("Traceback" in line or "not verified off" in line or "by hand" in line for line in said)
+    assert time.monotonic() - start < 40.0  # importing takes most of it; it was a minute of trying before
