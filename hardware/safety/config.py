@@ -78,7 +78,9 @@ class Responses:
     frozen: str = setting("hold", "the same reading again and again", choices=CHOICES)
     jump: str = setting("hold", "a step that neither growth nor dose explains", choices=CHOICES)
     no_dilution: str = setting("hold", "the pump ran but OD did not fall", choices=CHOICES)
-    cannot_hold: str = setting("report", "full feed and OD does not fall: the pump is outgrown", choices=CHOICES)
+    cannot_hold: str = setting(
+        "report", "full feed does not bring OD to the setpoint; lasts as long as that", choices=CHOICES
+    )
     falls: str = setting("pumps_off", "OD falls without pump", choices=CHOICES)
     stale: str = setting("hold", "the newest sample is older than stale_s", choices=CHOICES)
     lost: str = setting("pumps_off", "and older than lost_s", choices=CHOICES)

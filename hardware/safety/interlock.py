@@ -23,6 +23,8 @@ from hardware.safety.unexplained_change import UnexplainedChange
 
 __all__ = ["Interlock", "Verdict"]
 
+ADDED = ("_helpless_od", "_eased")  # to the saved state of earlier versions
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -77,7 +79,7 @@ class Interlock:
         target_c = np.asarray(temperature_target, dtype=np.float64)
         fresh = np.asarray(measurement.fresh, dtype=np.bool_)
         believed, of_readings = self._readings.check(measurement, fresh, now)
-        of_changes = self._change.check(measurement.od, measurement.time_s, believed)
+        of_changes = self._change.check(measurement.od, measurement.time_s, believed, setpoint)
         of_heat = self._heat.check(measurement.temperature, fresh, target_c, now)
         sound = (setpoint > 0.0) & (setpoint <= self.config.max_setpoint)
         of_setpoint = Finding("setpoint", ~sound, lambda i: f"setpoint {setpoint[i]:g}")
@@ -189,6 +191,7 @@ def _checked(state: Any, unused: dict[str, Array], n: int) -> dict[str, Array]:
     """The arrays of a saved state, if they are like those of an `unused` interlock. Raises: ValueError."""
     if not isinstance(state, dict):
         raise ValueError(f"saved interlock: {str(state)[:40]}, expected its fields")
+    state = {key: unused[key].tolist() for key in ADDED} | state  # earlier versions did not have them
     if set(state) != set(unused):
         raise ValueError(f"saved interlock has other fields: {', '.join(sorted(set(state) ^ set(unused)))[:80]}")
     saved = {}

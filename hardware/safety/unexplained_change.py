@@ -18,7 +18,8 @@ class UnexplainedChange:
     A step is no culture's, and is believed only if enough later readings agree with it: a bubble goes, a vial that was
     moved stays. What is small enough to be growth or dilution goes into three one-sided cumulated sums (CUSUM):
     `excess` (ln OD rises more than the doses allow), `deficit` (it falls more than they explain) and `futile` (it does
-    not fall at full feed).
+    not fall at full feed). The last is no event but a condition: it lasts until the feed is no longer full, the
+    setpoint is reached, or OD falls after all.
     """
 
     def __init__(self, n: int, config: SafetyConfig) -> None:
@@ -30,11 +31,13 @@ class UnexplainedChange:
         self._mu = np.full(n, config.mu_max)  # slow estimate of the growth rate
         self._excess, self._deficit, self._futile = np.zeros(n), np.zeros(n), np.zeros(n)
         self._over = np.zeros((n, 3))  # samples in a row for which each of the three was over its limit
+        self._helpless_od = np.full(n, math.nan)  # highest OD since full feed was found not to be enough; nan: it is
+        self._eased = np.zeros(n)  # samples in a row that speak against it
 
-    def check(self, reading: Array, time_s: Array, believed: Mask) -> list[Finding]:
+    def check(self, reading: Array, time_s: Array, believed: Mask, setpoint: Array) -> list[Finding]:
         """Judge the readings of the `believed` rows.
 
-        Args: reading: OD, shape (N,). time_s: when it was taken, s, shape (N,).
+        Args: reading, setpoint: OD, shape (N,). time_s: when it was taken, s, shape (N,).
         """
         c = self._config
         od, t, before = np.where(believed, reading, math.nan), time_s / 60.0, self._od
@@ -55,7 +58,7 @@ class UnexplainedChange:
                 "falls", step & down, lambda i: f"OD {before[i]:.3f} to {od[i]:.3f}: no dose explains that",
                 cool=settled & down,
             ),
-            *self._accumulate(od, t, usual),
+            *self._accumulate(od, t, usual, setpoint),
         ]  # fmt: skip
         taken = first | usual | settled
         self._excess, self._deficit = (np.where(settled, 0.0, s) for s in (self._excess, self._deficit))
@@ -73,7 +76,7 @@ class UnexplainedChange:
         high = base * np.exp(np.minimum(c.mu_max * minutes, 5.0)) + tolerance
         return low, high
 
-    def _accumulate(self, od: Array, t: Array, usual: Mask) -> list[Finding]:
+    def _accumulate(self, od: Array, t: Array, usual: Mask, setpoint: Array) -> list[Finding]:
         """Cumulated sums of what ln OD did beyond the best and the worst explanation.
 
         With d = dosed / volume and x the change of ln OD in dt minutes, a sound pump gives x <= mu dt - gain_min d,
@@ -102,9 +105,10 @@ class UnexplainedChange:
         over = np.where(sums > limit[:, None], self._over + 1, 0)  # an outlier is over it once only
         self._over = np.where(usual[:, None], over, self._over)
         rising, falling, futile_now = (self._over >= c.persistence).T & usual
-        helpless = futile_now & ~rising
+        short = full & (od > setpoint * (1.0 + c.drift))
+        helpless = self._lasting(futile_now & ~rising & short, od, usual, short, limit)
         self._excess, self._deficit = np.where(rising, 0.0, excess), np.where(falling, 0.0, deficit)
-        self._futile = np.where(helpless | rising, 0.0, futile)
+        self._futile = np.where((futile_now & short) | rising, 0.0, futile)
         return [
             Finding(
                 "no_dilution", rising, lambda i: f"the pump ran, ln OD is {excess[i]:.2f} above what it must be", rising
@@ -112,8 +116,27 @@ class UnexplainedChange:
             Finding(
                 "falls", falling, lambda i: f"ln OD is {deficit[i]:.2f} below what growth and doses explain", falling
             ),
-            Finding("cannot_hold", helpless, lambda i: f"at full feed OD {od[i]:.3f} does not fall"),
+            Finding(
+                "cannot_hold",
+                helpless & np.isfinite(od),
+                lambda i: f"full feed does not bring OD down to {setpoint[i]:g}",
+            ),
         ]
+
+    def _lasting(self, begins: Mask, od: Array, usual: Mask, short: Mask, limit: Array) -> Mask:
+        """Reactors in which full feed does not reach the setpoint, shape (N,).
+
+        Args: begins: a sum says so now. short: fed in full and above the setpoint. limit: of a fall of ln OD.
+        """
+        highest = np.fmax(self._helpless_od, np.where(usual, od, -math.inf))
+        lasts = np.isfinite(self._helpless_od)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            falls = lasts & (np.log(od / highest) < -limit)
+        self._eased = np.where(usual, np.where(lasts & (~short | falls), self._eased + 1, 0), self._eased)
+        ends = lasts & (self._eased >= self._config.persistence)
+        self._helpless_od = np.where(ends, math.nan, np.where(lasts & usual, highest, self._helpless_od))
+        self._helpless_od = np.where(begins & ~lasts, od, self._helpless_od)
+        return np.isfinite(self._helpless_od)
 
     def dosed(self, feed_ml: Array) -> None:
         """Book what was dosed, mL, shape (N,)."""
@@ -126,7 +149,7 @@ class UnexplainedChange:
             "_suspect": self._suspect, "_suspect_at": self._suspect_at,
             "_suspects": self._suspects, "_mu": self._mu,
             "_excess": self._excess, "_deficit": self._deficit, "_futile": self._futile,
-            "_over": self._over,
+            "_over": self._over, "_helpless_od": self._helpless_od, "_eased": self._eased,
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, Array]) -> None:
@@ -136,3 +159,4 @@ class UnexplainedChange:
         self._suspects, self._mu = state["_suspects"], state["_mu"]
         self._excess, self._deficit, self._futile = state["_excess"], state["_deficit"], state["_futile"]
         self._over = state["_over"]
+        self._helpless_od, self._eased = state["_helpless_od"], state["_eased"]

@@ -20,18 +20,21 @@ def test_a_second_master_is_refused_under_another_name_of_the_device() -> None:
     with EmulatorProcess(["--speed", "100", "--reactors", "M1,M2"]) as device:
         by_number = ChiBioConfig(url=device.url, speed=100.0, reactors=("M1",))
         by_name = ChiBioConfig(url=device.url.replace("127.0.0.1", "localhost"), speed=100.0, reactors=("M2",))
-        with linked(by_number):
-            with pytest.raises(DeviceStateError, match=f"already controlled by process {os.getpid()}: one client per"):
-                with linked(by_name):
-                    pass
+        refusal = pytest.raises(DeviceStateError, match=f"already controlled by process {os.getpid()}: one client per")
+        with linked(by_number), refusal, linked(by_name):
+            pass
         with linked(by_name):
             pass
 
 
 def test_two_devices_may_have_a_master_each() -> None:
-    with EmulatorProcess(["--speed", "100"]) as one, EmulatorProcess(["--speed", "100"]) as other:
-        with linked(ChiBioConfig(url=one.url, speed=100.0)), linked(ChiBioConfig(url=other.url, speed=100.0)):
-            pass
+    with (
+        EmulatorProcess(["--speed", "100"]) as one,
+        EmulatorProcess(["--speed", "100"]) as other,
+        linked(ChiBioConfig(url=one.url, speed=100.0)),
+        linked(ChiBioConfig(url=other.url, speed=100.0)),
+    ):
+        pass
 
 
 @pytest.mark.parametrize("command", ["blank", "deploy"])

@@ -391,7 +391,7 @@ def test_the_saved_state_has_the_fields_that_earlier_runs_wrote() -> None:
         "volume_ml", "fed_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_unusable",
         "_fresh_s", "_seen", "_repeats",
         "_od", "_at", "_since_ml", "_suspect", "_suspect_at", "_suspects", "_mu",
-        "_excess", "_deficit", "_futile", "_over",
+        "_excess", "_deficit", "_futile", "_over", "_helpless_od", "_eased",
         "_target_c", "_relief_c", "_thermo_s", "_hot", "_too_hot", "_nonsense", "_heat_off",
         "_hold_until_s", "_hold_kind", "_latched",
     }  # fmt: skip
@@ -484,3 +484,52 @@ def test_a_reason_that_is_only_reported_lets_the_dose_pass() -> None:
             assert verdict.rate[0] == 0.02
         vials.advance(1.0, np.zeros(1))
     assert seen
+
+
+def test_a_pump_too_weak_for_the_setpoint_is_told_for_as_long_as_that_lasts() -> None:
+    """Half the flow: 0.03 1/min dilute what grows with 0.031, so OD stays where it is, at full feed."""
+    drive, rng, kinds, od = Drive(), np.random.default_rng(2), [], 0.7
+
+    def live(minutes: int, pump: float, setpoint: float) -> None:
+        nonlocal od
+        for _ in range(minutes):
+            rate = 0.02 if od > setpoint else 0.0
+            verdict = drive(od=od * (1.0 + 0.006 * rng.standard_normal()), rate=rate, setpoint=setpoint)
+            kinds.append(only(verdict))
+            od *= float(np.exp(0.031 - pump * verdict.rate[0] * 60.0 / 20.0))
+
+    live(80, 0.5, 0.5)
+    first = kinds.index(("cannot_hold",))
+    assert first < 40
+    assert all(kind == ("cannot_hold",) for kind in kinds[first:])
+    state = json.loads(json.dumps(drive.interlock.state()).replace("-Infinity", "null").replace("NaN", "null"))
+    drive.interlock = Interlock(1)
+    drive.interlock.restore(state)
+    live(10, 0.5, 0.5)
+    assert kinds[-8:] == [("cannot_hold",)] * 8
+    live(5, 0.5, 1.0)  # a setpoint it can hold: told until three samples say so
+    assert kinds[-3:] == [()] * 3
+    live(60, 0.5, 0.5)
+    assert kinds[-1] == ("cannot_hold",)
+    live(15, 1.0, 0.5)  # the pump is sound again: OD falls
+    assert kinds[-1] == ()
+    assert od > 0.5
+
+
+def test_full_feed_at_the_setpoint_is_no_trouble() -> None:
+    """Nor is a long way down, as long as OD falls."""
+    for mu, start in ((0.06, 0.5), (0.04, 1.4)):
+        drive, rng, od = Drive(), np.random.default_rng(3), start
+        for _ in range(60):
+            verdict = drive(od=od * (1.0 + 0.006 * rng.standard_normal()), rate=0.02, setpoint=0.5)
+            assert "cannot_hold" not in only(verdict)
+            od *= float(np.exp(mu - 0.06 * (verdict.rate[0] > 0.0)))
+
+
+def test_a_state_of_an_earlier_version_is_taken() -> None:
+    state = json.loads(json.dumps(Interlock(2).state()).replace("-Infinity", "null").replace("NaN", "null"))
+    del state["_helpless_od"], state["_eased"]
+    Interlock(2).restore(state)
+    del state["_mu"]
+    with pytest.raises(ValueError, match="other fields: _mu"):
+        Interlock(2).restore(state)
