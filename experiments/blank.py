@@ -9,7 +9,7 @@ from conf.schema import check, part, setting
 from experiments.cli import files, frame
 from experiments.control.device import linked, save_calibration
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.procedures import measure_blanks
+from hardware.chibio.procedures import measure_blanks, warm_up
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.errors import ReactorError
 
@@ -17,12 +17,18 @@ __all__ = ["BlankConfig", "blank"]
 
 log = logging.getLogger(__name__)
 
+PROGRESS_MIN = 5  # from one line about the temperature to the next
+
 
 @dataclass(frozen=True)
 class BlankConfig:
     """Which reactors to measure, and for how long. Raises: ValueError naming key, value and allowed range."""
 
     backend: ChiBioConfig = part(ChiBioConfig, "the device and its reactors")
+    warm_up: float = setting(90.0, "how long the medium may take to its temperature", "min", within=(0, 600))
+    tolerance: float = setting(
+        1.0, "of the temperature from that of the thermostat at which it counts as reached", "degC", within=(0.2, 15)
+    )
     samples: int = setting(6, "to average, one reading each", "min", within=(3, 60), note="one a minute")
 
     def __post_init__(self) -> None:
@@ -30,14 +36,18 @@ class BlankConfig:
 
 
 def blank(config: BlankConfig, folder: Path) -> None:
-    """Stir and heat clear medium, average its counts, set them as blanks, store them. Raises: UserError."""
+    """Stir clear medium, heat it, average its counts, set them as blanks, store them. Raises: UserError."""
     backend = config.backend
-    log.info("clear medium in %s; this takes %d minutes", ", ".join(backend.reactors), config.samples + 1)
+    what = "clear medium in %s: to %g degC first, then %d minutes"
+    log.info(what, ", ".join(backend.reactors), backend.temperature, config.samples + 1)
     try:
         with linked(backend) as (transport, clock):
             reactors = ChiBioReactors(transport, clock, backend)
             try:
                 reactors.begin()
+                for minute, coldest in warm_up(reactors, config.tolerance, config.warm_up):
+                    if minute % PROGRESS_MIN == 0:
+                        log.info("minute %d: %.1f degC, waiting for %g", minute, coldest, backend.temperature)
                 mean, spread = measure_blanks(reactors, config.samples)
                 stored = [s.connection.device_id for s in reactors.stations]
                 reactors.end()

@@ -59,6 +59,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     backend, resumed = config.backend, config.resume is not None
     try:
         scenarios = config.schedules()
+        config.ends()
     except ValueError as error:
         raise frame.UserError(str(error)) from None
     if resumed and backend.kind == "sim":
@@ -90,7 +91,7 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     except ValueError as error:
         raise frame.UserError(str(error)) from None
     interlock = Interlock(len(reactors.names), setup.config.safety)
-    loop = ClosedLoop(reactors, controller, interlock, setup.scenarios, record.decided)
+    loop = ClosedLoop(reactors, controller, interlock, setup.scenarios, record.decided, setup.config.ends())
     if setup.resumed:
         continue_loop(loop, record.journal, record.state_path)
     return loop

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from conf.schema import part, setting
+from conf.schema import check, part, require, setting
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.controllers import registry
@@ -15,6 +15,8 @@ from hardware.simulated import SimulatedConfig
 __all__ = ["BACKENDS", "DeployConfig", "deploy_schema"]
 
 
+AT_END = ("hold", "stop", "regulate")
+OF_RUN = ("role", "at_end")  # keys of `each` that are not of its scenario
 BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig, "chibio": ChiBioConfig, "emulator": EmulatorConfig}
 
 
@@ -26,8 +28,16 @@ class DeployConfig:
     plant: PlantConfig = part(PlantConfig, "what the vials of a simulated backend are")
     safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
     scenario: Scenario = part(Scenario, "what the culture is asked to do")
+    at_end: str = setting(
+        "hold",
+        "a reactor whose schedule is over while others go on: hold the last setpoint, stop dosing, or regulate: hand "
+        "over to the device's own regulation, which goes on after the run",
+        choices=AT_END,
+    )
     each: dict[str, Any] = setting(
-        {}, "what differs for single reactors: each.M1.setpoints=[0.5] each.M1.minutes=[60] each.M1.role=control"
+        {},
+        "what differs for single reactors: each.M1.setpoints=[0.5] each.M1.minutes=[60] each.M1.role=control "
+        "each.M1.at_end=stop",
     )
     controller: Any = part(LearnedConfig, "what decides the pump rate")
     policy: str = setting(
@@ -37,6 +47,9 @@ class DeployConfig:
     fsync: bool = setting(True, "every row on the disk before the next command")
     preflight_only: bool = setting(False, "check the device and stop")
     resume: str | None = setting(None, "a run folder to continue after a crash")
+
+    def __post_init__(self) -> None:
+        check(self)
 
     def schedules(self) -> list[Scenario]:
         """One schedule per reactor. Raises: ValueError naming reactor, key and what is allowed."""
@@ -48,16 +61,23 @@ class DeployConfig:
             given = self.each.get(name, {})
             if not isinstance(given, dict):
                 raise ValueError(f"each.{name} = {given}: allowed keys and values, as each.{name}.minutes=[90]")
-            own = {k: v for k, v in given.items() if k != "role"}
+            own = {k: v for k, v in given.items() if k not in OF_RUN}
             wrong = set(own) - {f.name for f in fields(Scenario)}
             if wrong:
-                allowed = ", ".join([f.name for f in fields(Scenario)] + ["role"])
+                allowed = ", ".join([f.name for f in fields(Scenario)] + [*OF_RUN])
                 raise ValueError(f"each.{name}.{sorted(wrong)[0]}: no such key; allowed {allowed}")
             try:
                 schedules.append(replace(self.scenario, **own) if own else self.scenario)
             except (TypeError, ValueError) as error:
                 raise ValueError(f"each.{name}: {error}") from None
         return schedules
+
+    def ends(self) -> list[str]:
+        """What each reactor does when its schedule is over. Raises: ValueError naming reactor and what is allowed."""
+        ends = [str(self.each.get(name, {}).get("at_end", self.at_end)) for name in self.backend.reactors]
+        for name, end in zip(self.backend.reactors, ends, strict=True):
+            require(end in AT_END, f"each.{name}.at_end", end, ", ".join(AT_END))
+        return ends
 
     def role(self, reactor: str) -> str:
         """What a reactor is for, in words of the user."""

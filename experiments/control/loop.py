@@ -57,6 +57,8 @@ class ClosedLoop:
     Args:
       reactors: N reactors. controller: decides. interlock: of N reactors.
       schedules: one per reactor, or one for all.
+      at_end: of each reactor, or one for all, once its schedule is over and others are not: "hold" goes on at the last
+        setpoint, "stop" gives no dose any more, "regulate" hands over to the device's own regulation for good.
       before_dose: called with the step as decided, before anything is dosed (volume_ml still nan): the journal.
     Raises: ValueError for another number of schedules than of reactors.
     """
@@ -68,6 +70,7 @@ class ClosedLoop:
         interlock: Interlock,
         schedules: Sequence[Scenario] | Scenario,
         before_dose: Callable[[Step], None] | None = None,
+        at_end: Sequence[str] | str = "stop",
     ) -> None:
         n = len(reactors.names)
         self.reactors, self.controller, self.interlock = reactors, controller, interlock
@@ -75,6 +78,7 @@ class ClosedLoop:
         if len(self.schedules) != n:
             raise ValueError(f"{len(self.schedules)} schedules: allowed one for each of the {n} reactors")
         self._before_dose = before_dose
+        self._at_end = np.array([at_end] * n if isinstance(at_end, str) else list(at_end))
         self._recovery_od = np.array([s.recovery_od for s in self.schedules])
         self._recovery_limit = np.array([s.recovery_limit_min for s in self.schedules])
         self._total = np.array([s.total_min for s in self.schedules])
@@ -109,7 +113,7 @@ class ClosedLoop:
         m = self.reactors.measure()
         now = self.reactors.elapsed()
         self._book_repeats()
-        rows = m.fresh & ~self.done & ~self.stopped
+        rows = m.fresh & ~(self.done & (self._at_end == "stop")) & ~self.stopped
         minute = m.time_s / 60.0
         recovered = (m.od >= self._recovery_od) | (minute >= self._recovery_limit)
         self.began = np.where(rows & np.isnan(self.began) & recovered, minute, self.began)
@@ -118,7 +122,8 @@ class ClosedLoop:
         self.done = self.done | (rows & (elapsed >= self._total - 1e-6))
 
         decided = self.controller.act(m.od, setpoint, minute, rows & (phase >= 0))
-        proposed = np.where((phase >= 0) & ~self.done, decided, 0.0)
+        proposed = np.where((phase >= 0) & ~(self.done & (self._at_end != "hold")), decided, 0.0)
+        self.interlock.latch(Response.REGULATE, self.done & (self._at_end == "regulate"))
         verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
         explanation = self.controller.explain() if isinstance(self.controller, Explains) else {}
 

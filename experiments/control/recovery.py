@@ -10,6 +10,7 @@ import logging
 import math
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from hardware.chibio.resume import dosed
 from hardware.errors import RecordingError
 from hardware.reactor import Receipt
 from hardware.safety.config import Response
+from hardware.safety.interlock import kinds_of
 from hardware.storage.journal import REMEDY, Journal
 
 __all__ = ["COLUMNS", "REBUILD", "Row", "complete", "continue_loop", "load_state", "read_rows", "row_of"]
@@ -54,12 +56,25 @@ def row_of(step: Step, n: int) -> Row:
     }
 
 
+@dataclass
+class Told:
+    """A reason of the interlock: in how many rows, and the minutes of the first and the last of them."""
+
+    rows: int
+    first_min: float
+    last_min: float
+
+
 class Rows:
-    """All rows of one reactor's recording: the numbers by column, and in how many rows the interlock spoke."""
+    """All rows of one reactor's recording: the numbers by column, and what the interlock said.
+
+    Attributes: alarms, in how many rows it spoke; told, by kind of reason.
+    """
 
     def __init__(self) -> None:
         self.columns = {key: array("d") for key in NUMBERS}
-        self.alarms = 0  # rows in which the interlock spoke
+        self.alarms = 0
+        self.told: dict[str, Told] = {}
 
     def __len__(self) -> int:
         return len(self.columns["time_min"])
@@ -69,6 +84,10 @@ class Rows:
         for key, column in self.columns.items():
             column.append(float(row[key]))
         self.alarms += bool(row["interlock"])
+        for kind in kinds_of(str(row["interlock"])):
+            minute = float(row["time_min"])
+            told = self.told.setdefault(kind, Told(0, minute, minute))
+            told.rows, told.last_min = told.rows + 1, minute
 
     def last(self) -> dict[str, float]:
         """The numbers of the newest row; none for an empty recording."""

@@ -20,7 +20,7 @@ from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
 from experiments.control.loop import ClosedLoop
 from experiments.control.record import Record
-from experiments.control.summary import ChangeLog, figure_of, metrics_table, summarise
+from experiments.control.summary import ChangeLog, figure_of, metrics_table, reasons_line, summarise
 from experiments.reporting import charts
 from hardware.errors import ReactorError, RecordingError
 
@@ -102,6 +102,9 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
         why = f"figure and summary not written ({error.strerror or error})"
         return f"failed: {outcome.removeprefix('failed: ')}; {why}"
     log.info("%s after %.0f min, %.1f mL of fresh medium", outcome, summary["minutes"], summary["volume_ml"])
+    for name, rows in zip(record.names, record.rows, strict=True):
+        if line := reasons_line(rows):
+            log.warning("%s: the interlock told: %s", name, line)
     what = "ISE, ITAE with T = 1 min; /T with T = window; settled: min until |e| stays within 5 %"
     log.info("%s\n%s", what, metrics_table(summary["windows"]))
     log.info("recordings %s; figure %s; tensorboard --logdir %s", folder / "recordings", path, folder)

@@ -3,6 +3,7 @@
 import logging
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,11 @@ from envs.scenario import Scenario
 from experiments.control.loop import ClosedLoop, Step
 from experiments.control.metrics import window_metrics
 from experiments.control.record import Record
+from experiments.control.recovery import Rows
 from experiments.reporting import charts
+from hardware.safety.interlock import kinds_of
 
-__all__ = ["ChangeLog", "figure_of", "metrics_table", "summarise"]
+__all__ = ["ChangeLog", "figure_of", "metrics_table", "reasons_line", "summarise"]
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +50,7 @@ class ChangeLog:
             reason = step.reasons[n] or ""
             if not step.rows[n] and (not reason or reason.endswith("earlier in this run")):
                 continue  # what a sample was refused for is not over because there is no new one yet
-            kinds = reason.split(":")[0]
+            kinds = " ".join(kinds_of(reason)) or reason
             if kinds != (self._reason[n] or ""):
                 self._reason[n] = kinds
                 log.warning("%s: %s", name, step.reasons[n] or "interlock: all well again")
@@ -68,11 +71,25 @@ def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def reasons_line(rows: Rows) -> str:
+    """What the interlock said in a run, most frequent first; "" if it had nothing to say."""
+    often = sorted(rows.told.items(), key=lambda item: -item[1].rows)
+    return "; ".join(
+        f"{kind} in {t.rows} of {len(rows)} rows, minute {t.first_min:.0f} to {t.last_min:.0f}" for kind, t in often
+    )
+
+
 def summarise(record: Record, scenarios: Sequence[Scenario], roles: Sequence[str], outcome: str) -> dict[str, Any]:
     """Every number of a run. Args: scenarios, roles: one per reactor. outcome: how it ended."""
     volume, minute = np.nansum(record.series("volume_ml"), axis=1), record.series("time_min")
     reactors = {
-        name: {"role": role, "volume_ml": float(ml), "rows": len(rows), "interlock": rows.alarms}
+        name: {
+            "role": role,
+            "volume_ml": float(ml),
+            "rows": len(rows),
+            "interlock": rows.alarms,
+            "reasons": {kind: asdict(told) for kind, told in rows.told.items()},
+        }
         for name, role, ml, rows in zip(record.names, roles, volume, record.rows, strict=True)
     }
     return {

@@ -9,9 +9,9 @@ from hardware.chibio.protocol import PERIOD_S
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, SensorError
-from hardware.reactor import Array
+from hardware.reactor import Array, Measurement
 
-__all__ = ["dose_series", "measure_blanks"]
+__all__ = ["dose_series", "measure_blanks", "warm_up"]
 
 PAUSE_S = 2.0  # between two doses, so that the fluid comes to rest
 LATE_S = 2.0  # a pump starts a little after the answer, and later on a busy bus; its dose must not be cut short
@@ -39,6 +39,42 @@ def dose_series(connection: Connection, clock: Clock, pump: str, duty: float, do
         connection.pumps_off()
 
 
+def warm_up(reactors: ChiBioReactors, tolerance: float, limit_min: float) -> Iterator[tuple[int, float]]:
+    """Wait until every reactor is within `tolerance` degC of its thermostat in two samples in a row.
+
+    Yields, once a minute, the minute and the temperature that is farthest off.
+    Raises: SensorError if that takes longer than `limit_min`; ReactorError.
+    """
+    target, start, reached = reactors.config.temperature, reactors.elapsed(), np.zeros(len(reactors.names))
+    last = -1
+    while True:
+        m = _sound(reactors)
+        off = np.abs(m.temperature - target)
+        reached = np.where(m.fresh, np.where(off <= tolerance, reached + 1, 0), reached)  # nan is not reached
+        if (reached >= 2).all():
+            return
+        minutes = (reactors.elapsed() - start) / 60.0
+        worst = int(np.argmax(np.where(reached >= 2, -1.0, np.nan_to_num(off, nan=np.inf))))
+        if minutes > limit_min:
+            raise SensorError(
+                f"{reactors.names[worst]}: {m.temperature[worst]:.1f} degC after {minutes:.0f} min, wanted {target:g} "
+                f"+- {tolerance:g}; check heater and lid, warm the medium first, or raise warm_up or tolerance"
+            )
+        if int(minutes) > last:
+            last = int(minutes)
+            yield last, float(m.temperature[worst])
+
+
+def _sound(reactors: ChiBioReactors) -> Measurement:
+    """The newest samples of reactors without a fault. Raises: DeviceStateError naming the faults."""
+    m = reactors.measure()
+    assert m.vitals is not None
+    faults = [f"{n}: {f}" for n, f in zip(reactors.names, m.vitals.faults, strict=True) if f is not None]
+    if faults:
+        raise DeviceStateError("; ".join(faults))
+    return m
+
+
 def measure_blanks(reactors: ChiBioReactors, samples: int) -> tuple[Array, Array]:
     """Average the raw counts of `samples` cycles of every reactor and set them as the devices' blanks.
 
@@ -50,11 +86,8 @@ def measure_blanks(reactors: ChiBioReactors, samples: int) -> tuple[Array, Array
     """
     rows: list[list[float]] = [[] for _ in reactors.names]
     while min(map(len, rows)) < samples:
-        m = reactors.measure()
+        m = _sound(reactors)
         assert m.vitals is not None
-        faults = [f"{n}: {f}" for n, f in zip(reactors.names, m.vitals.faults, strict=True) if f is not None]
-        if faults:
-            raise DeviceStateError("; ".join(faults))
         for i in np.flatnonzero(m.fresh):
             rows[i].append(float(m.vitals.raw[i]))
     counts = np.array([row[:samples] for row in rows])

@@ -21,7 +21,7 @@ from hardware.safety.config import DONE, REMEDIES, WORDS, Response, SafetyConfig
 from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
-__all__ = ["Interlock", "Verdict"]
+__all__ = ["Interlock", "Verdict", "kinds_of"]
 
 ADDED = ("_helpless_od", "_eased")  # to the saved state of earlier versions
 
@@ -185,6 +185,11 @@ class _Reason:
 
     def __str__(self) -> str:
         return f"{self.kind}: {self.text}; {DONE[self.response]}; {REMEDIES.get(self.kind, '')}".rstrip("; ")
+
+
+def kinds_of(text: str) -> list[str]:
+    """The kinds of the reasons in a line of the interlock's."""
+    return [kind for kind, colon, _ in (part.partition(": ") for part in text.split(" | ")) if colon]
 
 
 def _checked(state: Any, unused: dict[str, Array], n: int) -> dict[str, Array]:

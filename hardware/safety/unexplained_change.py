@@ -136,7 +136,7 @@ class UnexplainedChange:
         ends = lasts & (self._eased >= self._config.persistence)
         self._helpless_od = np.where(ends, math.nan, np.where(lasts & usual, highest, self._helpless_od))
         self._helpless_od = np.where(begins & ~lasts, od, self._helpless_od)
-        return np.isfinite(self._helpless_od)
+        return np.asarray(np.isfinite(self._helpless_od))
 
     def dosed(self, feed_ml: Array) -> None:
         """Book what was dosed, mL, shape (N,)."""

@@ -1,6 +1,7 @@
 """Pump calibration and blank: against the emulated device over HTTP, and from weighings in a file."""
 
 import json
+import re
 import subprocess
 import sys
 import urllib.request
@@ -143,6 +144,28 @@ def test_the_blank_of_clear_medium_is_found_stored_and_restored(tmp_path: Path) 
     assert json.loads((tmp_path / "summary.json").read_text())["M0"]["samples"] == 4
 
 
+def test_a_cold_vial_is_warmed_before_its_blank_is_measured(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    words = ["--speed", "600", "--od", "0", "--unblanked", "--reactors", "M0,M1", "--temperature", "25"]
+    with EmulatorProcess(words) as emulator, caplog.at_level("INFO"):
+        backend = ChiBioConfig(
+            url=emulator.url, speed=600.0, reactors=("M0", "M1"), calibration=str(tmp_path), temperature=33.0
+        )
+        blank(BlankConfig(backend, samples=3), tmp_path)
+        said = [record.getMessage() for record in caplog.records]
+        assert truth(emulator)["temperature"] == pytest.approx(33.0, abs=1.5)
+    assert re.fullmatch(r"minute 0: 2[5-7]\.\d degC, waiting for 33", next(line for line in said if "minute 0" in line))
+    assert len([line for line in said if line.startswith("minute")]) > 1
+
+
+def test_a_vial_that_does_not_warm_up_gets_no_blank(tmp_path: Path) -> None:
+    words = ["--speed", "600", "--od", "0", "--unblanked", "--temperature", "20"]
+    with EmulatorProcess(words) as emulator:
+        backend = ChiBioConfig(url=emulator.url, speed=600.0, calibration=str(tmp_path))
+        with pytest.raises(frame.UserError, match=r"M0: .*degC after [56] min, wanted 37 \+- 1; check heater and lid"):
+            blank(BlankConfig(backend, samples=3, warm_up=5.0), tmp_path)
+    assert not list(tmp_path.glob("*blank.yaml"))
+
+
 def test_a_culture_is_no_blank(tmp_path: Path) -> None:
     with EmulatorProcess(["--speed", "100", "--od", "2.5", "--unblanked"]) as emulator:
         backend = ChiBioConfig(url=emulator.url, speed=100.0, calibration=str(tmp_path))
@@ -179,4 +202,4 @@ def test_the_operator_is_not_shown_every_request(tmp_path: Path) -> None:
         command += [f"backend.url={emulator.url}", "backend.speed=200", f"backend.calibration={tmp_path}/c"]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
-    assert len((done.stdout + done.stderr).splitlines()) == 2  # what it does, what it found
+    assert len((done.stdout + done.stderr).splitlines()) <= 4  # what it does, how warm it is, what it found

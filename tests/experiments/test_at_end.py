@@ -1,0 +1,66 @@
+"""What a reactor does once its own schedule is over and its neighbour's is not."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from envs.scenario import Scenario
+from experiments.control.config import DeployConfig
+from experiments.reliability.rehearsal import Rehearsal, rehearsed
+from tests.hardware.emulator_lab import quiet
+
+
+def ended(folder: Path, **each: str) -> Rehearsal:
+    """M0 has ten minutes to do, M1 seventy; both grow with 0.03 1/min."""
+    config = rehearsed(("M0", "M1"), Scenario((0.4,), (70.0,), (37.0,)))
+    run = Rehearsal(folder, replace(config, each={"M0": {"minutes": [10.0], **each}}), quiet(mu=0.03), od=0.4)
+    run.begin()
+    for _ in run.run():
+        pass
+    assert run.loop.done.all()
+    return run
+
+
+@pytest.mark.parametrize("each", [{}, {"at_end": "hold"}])
+def test_it_goes_on_at_its_last_setpoint(tmp_path: Path, each: dict[str, str]) -> None:
+    run = ended(tmp_path, **each)
+    assert run.truth("M0")["od"] == pytest.approx(0.4, abs=0.03)
+    assert run.truth("M1")["od"] == pytest.approx(0.4, abs=0.03)
+    assert abs(len(run.record.rows[0]) - len(run.record.rows[1])) <= 1
+    run.reactors.stop()
+    assert not any(run.truth("M0")["motors"].values())
+
+
+def test_it_stops_dosing(tmp_path: Path) -> None:
+    run = ended(tmp_path, at_end="stop")
+    assert run.truth("M0")["od"] > 1.5  # an hour of undiluted growth, 0.4 exp(1.8) if the medium lasts
+    assert len(run.record.rows[0]) == pytest.approx(11, abs=1)
+
+
+def test_it_is_handed_over_to_the_device_and_stays_so(tmp_path: Path) -> None:
+    run = ended(tmp_path, at_end="regulate")
+    assert run.reactors.handed_over.tolist() == [True, False]
+    run.reactors.stop()
+    run.wait(1800.0)
+    data = run.device.apps["M0"].data
+    assert (data["OD"]["ON"], data["OD"]["target"]) == (1, 0.4)
+    assert run.truth("M0")["od"] == pytest.approx(0.4, abs=0.1)
+    assert run.truth("M1")["od"] > 0.6  # nobody doses it after the run
+    assert "falls" not in run.record.rows[0].told
+
+
+def test_the_last_reactor_is_handed_over_too_before_the_run_ends(tmp_path: Path) -> None:
+    config = replace(rehearsed(("M0",), Scenario((0.4,), (5.0,), (37.0,))), at_end="regulate")
+    run = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.4)
+    run.begin()
+    for _ in run.run():
+        pass
+    assert run.reactors.handed_over.tolist() == [True]
+
+
+def test_a_word_that_is_none_of_them_is_refused() -> None:
+    with pytest.raises(ValueError, match="at_end = sleep: allowed hold, stop, regulate"):
+        DeployConfig(at_end="sleep")
+    with pytest.raises(ValueError, match=r"each\.M0\.at_end = sleep: allowed hold, stop, regulate"):
+        DeployConfig(each={"M0": {"at_end": "sleep"}}).ends()

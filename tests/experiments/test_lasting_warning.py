@@ -1,0 +1,41 @@
+"""A pump too weak for its culture, from the emulator to the console, the journal and the summary."""
+
+from pathlib import Path
+
+import pytest
+
+from envs.scenario import Scenario
+from experiments.control.summary import ChangeLog, reasons_line, summarise
+from experiments.reliability.rehearsal import Rehearsal, rehearsed
+from hardware.emulator.faults import inject
+from hardware.storage.journal import read_journal
+from tests.hardware.emulator_lab import quiet
+
+
+def test_half_the_flow_is_told_at_its_beginning_at_its_end_and_in_every_row_between(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scenario = Scenario((0.5,), (130.0,), (37.0,))
+    run = Rehearsal(tmp_path, rehearsed(("M0",), scenario), quiet(mu=0.032), od=0.7)
+    inject(run.device, "pump_gain_factor", "M0", 0.5)
+    run.begin()
+    log_changes = ChangeLog(run.loop)
+    with caplog.at_level("WARNING"):
+        for step in run.run():
+            log_changes(step)
+            if step.minute[0] > 70.0:
+                inject(run.device, "pump_gain_factor", "M0", 1.0)
+    assert [record.getMessage().split(";")[0] for record in caplog.records] == [
+        "M0: cannot_hold: full feed does not bring OD down to 0.5",
+        "M0: interlock: all well again",
+    ]
+    (told,) = run.record.rows[0].told.items()
+    assert told[0] == "cannot_hold"
+    assert told[1].first_min < 40.0
+    assert 70.0 < told[1].last_min < 100.0
+    assert told[1].rows == pytest.approx(told[1].last_min - told[1].first_min + 1.0, abs=1.5)  # without a gap
+    rows = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "decision"]
+    assert sum("cannot_hold" in row["row"]["interlock"] for row in rows) == told[1].rows
+    summary = summarise(run.record, [scenario], ["replicate"], "completed")
+    assert summary["reactors"]["M0"]["reasons"]["cannot_hold"]["rows"] == told[1].rows
+    assert reasons_line(run.record.rows[0]).startswith(f"cannot_hold in {told[1].rows} of {len(rows)} rows, minute ")
