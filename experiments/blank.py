@@ -17,8 +17,6 @@ __all__ = ["BlankConfig", "blank"]
 
 log = logging.getLogger(__name__)
 
-PROGRESS_MIN = 5  # from one line about the temperature to the next
-
 
 @dataclass(frozen=True)
 class BlankConfig:
@@ -45,9 +43,8 @@ def blank(config: BlankConfig, folder: Path) -> None:
             reactors = ChiBioReactors(transport, clock, backend)
             try:
                 reactors.begin()
-                for minute, coldest in warm_up(reactors, config.tolerance, config.warm_up):
-                    if minute % PROGRESS_MIN == 0:
-                        log.info("minute %d: %.1f degC, waiting for %g", minute, coldest, backend.temperature)
+                for minute, farthest in warm_up(reactors, config.tolerance, config.warm_up):
+                    log.info("minute %.0f: %.1f degC, waiting for %g", minute, farthest, backend.temperature)
                 mean, spread = measure_blanks(reactors, config.samples)
                 stored = [s.connection.device_id for s in reactors.stations]
                 reactors.end()

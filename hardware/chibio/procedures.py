@@ -39,14 +39,16 @@ def dose_series(connection: Connection, clock: Clock, pump: str, duty: float, do
         connection.pumps_off()
 
 
-def warm_up(reactors: ChiBioReactors, tolerance: float, limit_min: float) -> Iterator[tuple[int, float]]:
+def warm_up(
+    reactors: ChiBioReactors, tolerance: float, limit_min: float, every_min: float = 5.0
+) -> Iterator[tuple[float, float]]:
     """Wait until every reactor is within `tolerance` degC of its thermostat in two samples in a row.
 
-    Yields, once a minute, the minute and the temperature that is farthest off.
+    Yields, every `every_min`, the minutes that have passed and the temperature that is farthest off.
     Raises: SensorError if that takes longer than `limit_min`; ReactorError.
     """
     target, start, reached = reactors.config.temperature, reactors.elapsed(), np.zeros(len(reactors.names))
-    last = -1
+    due = 0.0
     while True:
         m = _sound(reactors)
         off = np.abs(m.temperature - target)
@@ -60,9 +62,9 @@ def warm_up(reactors: ChiBioReactors, tolerance: float, limit_min: float) -> Ite
                 f"{reactors.names[worst]}: {m.temperature[worst]:.1f} degC after {minutes:.0f} min, wanted {target:g} "
                 f"+- {tolerance:g}; check heater and lid, warm the medium first, or raise warm_up or tolerance"
             )
-        if int(minutes) > last:
-            last = int(minutes)
-            yield last, float(m.temperature[worst])
+        if minutes >= due and np.isfinite(m.temperature).all():
+            due = minutes + every_min
+            yield minutes, float(m.temperature[worst])
 
 
 def _sound(reactors: ChiBioReactors) -> Measurement:
