@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.cli import files
 from experiments.control.loop import Step
-from experiments.control.recovery import COLUMNS, REBUILD, Array, Row, complete, read_rows, row_of
+from experiments.control.recovery import COLUMNS, REBUILD, Array, Row, complete, cut_short, read_rows, row_of
 from experiments.reporting.tensorboard import Events
 from hardware.errors import RecordingError
 from hardware.storage.journal import Journal
@@ -52,13 +52,17 @@ class Record:
         self.events = Events(folder, self._points)
 
     def complete(self) -> None:
-        """Write the rows that the end of the loop kept from being written, as the journal has them.
+        """Write what the end of the loop kept from being written, as the journal has it: rows, and a dose cut short.
 
         What was written is read from the disk, because a signal may have come between a row and the memory of it.
         Raises: RecordingError.
         """
-        self.rows = [read_rows(path) for path in self._paths]
-        self._completed(self.journal.reread())
+        self.rows, journal = [read_rows(path) for path in self._paths], self.journal.reread()
+        self._completed(journal)
+        for n, name in enumerate(self.names):
+            if row := cut_short(journal, name, self.rows[n]):
+                self._recorders[n].amend(row)
+                self.rows[n] = read_rows(self._paths[n])
 
     def _completed(self, journal: Sequence[Mapping[str, Any]]) -> list[str]:
         """What was completed from the rows of the journal, one line each."""

@@ -25,7 +25,9 @@ from hardware.safety.config import Response
 from hardware.safety.interlock import kinds_of
 from hardware.storage.journal import REMEDY, Journal
 
-__all__ = ["COLUMNS", "REBUILD", "Row", "complete", "continue_loop", "load_state", "read_rows", "row_of"]
+__all__ = [
+    "COLUMNS", "REBUILD", "Row", "complete", "continue_loop", "cut_short", "load_state", "read_rows", "row_of",
+]  # fmt: skip
 
 log = logging.getLogger(__name__)
 
@@ -126,15 +128,38 @@ def complete(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows, write:
     return repairs
 
 
+def volumes(journal: Sequence[Mapping[str, Any]], name: str) -> dict[int, float]:
+    """mL that belong to each decision for a reactor, by its row of the journal, oldest first.
+
+    A dose belongs to the decision before it, its repetitions to the next one. Raises: RecordingError.
+    """
+    decided = [r["n"] for r in journal if r.get("reactor") == name and r["kind"] == "decision"]
+    found = dict.fromkeys(decided, 0.0)
+    for dose in dosed(journal):
+        k = bisect.bisect(decided, dose.n) - (not dose.again)
+        if dose.reactor == name and 0 <= k < len(decided):
+            found[decided[k]] += dose.feed_ml
+    return found
+
+
+def cut_short(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Row | None:
+    """The last row of reactor `name` as it should be, if the end of the run cut its dose short; else None.
+
+    Args: rows: as written, with the dose as it was planned. Raises: RecordingError.
+    """
+    decisions = [r for r in journal if r.get("reactor") == name and r["kind"] == "decision"]
+    if not decisions or not len(rows) or rows.last()["time_min"] != decisions[-1]["row"]["time_min"]:
+        return None
+    given = volumes(journal, name)[decisions[-1]["n"]]
+    if given >= rows.last()["volume_ml"] - 1e-6:
+        return None
+    return {c: decisions[-1]["row"][c] for c in COLUMNS} | {"volume_ml": given}
+
+
 def _unwritten(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Iterator[Row]:
     last = rows.last().get("time_min", -math.inf)
     mine = [r for r in journal if r.get("reactor") == name and r["kind"] in ("sample", "decision")]
-    decided = [r["n"] for r in mine if r["kind"] == "decision"]
-    volume = dict.fromkeys(decided, 0.0)
-    for dose in dosed(journal):
-        k = bisect.bisect(decided, dose.n)  # a dose belongs to the decision before it, its repetitions to the next one
-        if dose.reactor == name and 0 <= k - (not dose.again) < len(decided):
-            volume[decided[k - (not dose.again)]] += dose.feed_ml
+    volume = volumes(journal, name)
     for earlier, this, following in zip([{}, *mine], mine, [*mine[1:], {}], strict=False):
         if this["kind"] == "decision":
             row: Row = {c: math.nan if this["row"][c] is None else this["row"][c] for c in COLUMNS}

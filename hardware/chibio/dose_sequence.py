@@ -149,7 +149,7 @@ class DoseSequence:
             self._book.log("feed_on", on_s=on_s)  # before it is done: a resumed run must know that it may have been fed
             self._connection.switch(FEED, True)
         except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
-            counted = "counted as dosed" if fed else "no medium was given"
+            counted = "counted as dosed" if fed else "no dose was begun"
             self._book.tell(f"the answer to a pump command was lost, {counted}: {error}")
         return fed
 

@@ -8,6 +8,7 @@ import pytest
 
 from envs.scenario import Scenario
 from experiments.control.loop import Step
+from experiments.control.record import Record
 from experiments.controllers.base import Array, Mask
 from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.emulator.faults import inject
@@ -175,6 +176,27 @@ def test_a_clean_stop_leaves_no_dose_open_and_its_row_tells_what_was_given(
     rows = run.record.series("volume_ml")[0]
     assert end["feed_ml"] in rows
     assert abs(run.off_by_ml()) < 1.0
+
+
+def test_a_stop_after_the_row_was_written_puts_the_dose_right_in_it(tmp_path: Path) -> None:
+    """The row comes with the feed pump's start, the end half a second later."""
+    run = Rehearsal(tmp_path, rehearsed(("M0",), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
+    run.begin()
+    run.loop.controller = Full()
+    steps = [step for step in run.run(300.0) if step.rows[0]]
+    assert run.device.apps["M0"].data["Pump1"]["ON"]
+    run.clock.sleep(0.6)
+    run.reactors.stop()
+    run.record.complete()
+    given = run.record.journal.reread()[-2]
+    assert (given["kind"], given["feed_times"]) == ("dose_end", 0)
+    assert given["feed_ml"] == pytest.approx(0.66, abs=0.02)  # 0.6 s and the bias of 0.06 s at 1 mL/s
+    volume = run.record.series("volume_ml")[0]
+    np.testing.assert_allclose(volume, [*[step.volume_ml[0] for step in steps[:-1]], given["feed_ml"]])
+    run.record.complete()  # nothing is left to do
+    np.testing.assert_allclose(run.record.series("volume_ml")[0], volume)
+    run.record.close()
+    np.testing.assert_allclose(Record(tmp_path, ("M0",), fsync=False).series("volume_ml")[0], volume)
 
 
 def test_repeats_before_a_board_agent_ended_them_are_booked(tmp_path: Path) -> None:
