@@ -7,7 +7,7 @@ from pathlib import Path
 
 from conf.schema import check, part, setting
 from experiments.cli import files, frame
-from experiments.control.device import linked, save_calibration
+from experiments.control.device import linked, one_interrupt, save_calibration
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.procedures import measure_blanks, warm_up
 from hardware.chibio.reactors import ChiBioReactors
@@ -39,7 +39,7 @@ def blank(config: BlankConfig, folder: Path) -> None:
     what = "clear medium in %s: to %g degC first, then %d minutes"
     log.info(what, ", ".join(backend.reactors), backend.temperature, config.samples + 1)
     try:
-        with linked(backend) as (transport, clock):
+        with one_interrupt(), linked(backend) as (transport, clock):
             reactors = ChiBioReactors(transport, clock, backend)
             try:
                 reactors.begin()

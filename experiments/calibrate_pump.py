@@ -13,7 +13,7 @@ import numpy as np
 
 from conf.schema import check, part, require, setting
 from experiments.cli import files, frame
-from experiments.control.device import linked, save_calibration
+from experiments.control.device import linked, one_interrupt, save_calibration
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection, no_log
 from hardware.chibio.dosing import PumpFit, fit_pump
@@ -99,7 +99,7 @@ def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tup
     Raises: ReactorError.
     """
     found = []
-    with linked(config.backend) as (transport, clock):
+    with one_interrupt(), linked(config.backend) as (transport, clock):
         connection = Connection(config.reactor, [config.reactor], transport, clock, no_log)
         identity = connection.read().device_id
         print(

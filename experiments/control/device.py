@@ -2,9 +2,11 @@
 
 import logging
 import math
+import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -22,11 +24,37 @@ from hardware.link.open import lock, open_transport
 from hardware.link.transport import Transport
 from hardware.storage import atomic
 
-__all__ = ["check", "linked", "load_calibrations", "save_calibration"]
+__all__ = ["check", "linked", "load_calibrations", "one_interrupt", "save_calibration"]
 
 log = logging.getLogger(__name__)
 EMULATED = ("speed", "seed", "od", "plant")  # values of backend=emulator that its process is started with
 PARTS = ("feed", "waste", "blank")  # one YAML file per reactor and part, REACTOR_PART.yaml
+
+
+@contextmanager
+def one_interrupt() -> Iterator[None]:
+    """Ctrl-C, SIGTERM (a service manager, a shutting-down PC) or SIGHUP (a closed terminal) raise KeyboardInterrupt.
+
+    Only the first of them: what comes after it does not cut short the switching off of the pumps, nor the summary.
+    Signals that are ignored on purpose (nohup) stay so.
+    """
+    told: list[int] = []
+
+    def answer(number: int, stack: FrameType | None) -> None:
+        told.append(number)
+        if len(told) == 1:
+            raise KeyboardInterrupt
+        log.warning("the pumps are being switched off and verified; this takes up to a minute")
+
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {n: old for n in signals if (old := signal.getsignal(n)) is not signal.SIG_IGN}
+    for number in before:
+        signal.signal(number, answer)
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
 
 
 @contextmanager

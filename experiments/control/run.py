@@ -1,15 +1,9 @@
-"""One run at the console: the loop until its end or trouble, the pumps verified off, figure and summary.
-
-Signals stop the loop like Ctrl-C, and they do not cut short the switching off of the pumps.
-"""
+"""One run at the console: the loop until its end or trouble, the pumps verified off, figure and summary."""
 
 import logging
 import os
-import signal
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from pathlib import Path
-from types import FrameType
 
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -18,6 +12,7 @@ from experiments.cli import files, frame
 from experiments.control import assemble
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
+from experiments.control.device import one_interrupt
 from experiments.control.loop import ClosedLoop
 from experiments.control.record import Record
 from experiments.control.summary import ChangeLog, figure_of, metrics_table, reasons_line, summarise
@@ -27,32 +22,6 @@ from hardware.errors import ReactorError, RecordingError
 __all__ = ["deploy"]
 
 log = logging.getLogger(__name__)
-
-
-@contextmanager
-def _one_interrupt() -> Iterator[None]:
-    """Ctrl-C, SIGTERM (a service manager, a shutting-down PC) or SIGHUP (a closed terminal) raise KeyboardInterrupt.
-
-    Only the first of them: what comes after it does not cut short the switching off of the pumps, nor the summary.
-    Signals that are ignored on purpose (nohup) stay so.
-    """
-    told: list[int] = []
-
-    def answer(number: int, stack: FrameType | None) -> None:
-        told.append(number)
-        if len(told) == 1:
-            raise KeyboardInterrupt
-        log.warning("the pumps are being switched off and verified; this takes up to a minute")
-
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {n: old for n in signals if (old := signal.getsignal(n)) is not signal.SIG_IGN}
-    for number in before:
-        signal.signal(number, answer)
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
 
 
 def _run(loop: ClosedLoop, record: Record) -> str:
@@ -118,7 +87,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         if config.preflight_only:
             assemble.run_preflight(setup, folder)
             return
-        with _one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync)) as record:
+        with one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync)) as record:
             for repair in record.repairs:
                 log.warning("%s", repair)
             with assemble.opened(setup, record) as loop:

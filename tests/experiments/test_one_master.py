@@ -1,9 +1,11 @@
 """One client per device, by whatever name or link it is reached; a device that is not there is told at once."""
 
+import json
 import os
 import subprocess
 import sys
 import time
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -51,3 +53,35 @@ def test_a_wrong_address_is_one_line_at_once_and_speaks_of_no_pumps(tmp_path: Pa
     assert "check cable" in said[-1]
     assert not any("Traceback" in line or "not verified off" in line or "by hand" in line for line in said)
     assert time.monotonic() - start < 40.0  # importing takes most of it; it was a minute of trying before
+
+
+def test_a_service_manager_that_ends_a_blank_leaves_its_pumps_off(tmp_path: Path) -> None:
+    """By SIGTERM, and by a second one at once."""
+    with EmulatorProcess(["--speed", "20", "--od", "0", "--unblanked"]) as device:
+        words = [f"backend.url={device.url}", "backend.speed=20", f"hydra.run.dir={tmp_path}/run"]
+        client = subprocess.Popen(
+            [sys.executable, "-m", "experiments.blank", *words, f"backend.calibration={tmp_path}/c"],
+            cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        assert client.stdout is not None
+        line = ""
+        while "waiting for" not in line:
+            line = client.stdout.readline()
+            assert line
+        with (
+            urllib.request.urlopen(
+                urllib.request.Request(f"{device.url}/SetOutputTarget/Pump1/M0/0.05", method="POST"), timeout=10.0
+            ),
+            urllib.request.urlopen(
+                urllib.request.Request(f"{device.url}/SetOutputOn/Pump1/1/M0", method="POST"), timeout=10.0
+            ),
+        ):  # somebody else's hand
+            pass
+        client.terminate()
+        time.sleep(0.02)
+        client.terminate()
+        said = client.communicate(timeout=60.0)[0]
+        with urllib.request.urlopen(f"{device.url}/getSysdata/", timeout=10.0) as answer:
+            assert json.load(answer)["Pump1"]["ON"] == 0
+    assert client.returncode == 130
+    assert "Traceback" not in said
