@@ -9,9 +9,8 @@ from typing import Any
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError  # type: ignore[import-untyped]
 
-from experiments.cli import frame
+from experiments.cli import files, frame
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.preflight import preflight
@@ -77,8 +76,8 @@ def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        content = OmegaConf.to_container(OmegaConf.load(path))
-    except (OSError, YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
+        content = OmegaConf.to_container(files.load_yaml(path))
+    except (OSError, ValueError, OmegaConfBaseException) as error:
         raise frame.UserError(
             f"calibration {path}: not readable ({str(error).splitlines()[0]}); measure again"
         ) from None
