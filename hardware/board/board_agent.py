@@ -74,9 +74,9 @@ that uses this address instead of the device's has the same switch. A request ne
     X-Session        0 to 65535, names the client; 0 if it is left out
 
 No route of the device takes a body, so a POST says Content-Length: 0, once (else 411, 413 or 400). A head is at most
-8192 bytes and must be there within 5 s; 32 connections are served at a time. The agent's own routes:
-GET /_agent/status (the JSON of HELLO; no heartbeat, and it may come from any session), POST /_agent/heartbeat (204) for
-a client that talks to the device directly, and POST /_agent/bye (204). 502 means that the device refused the
+8192 bytes and must be there within 5 s, and of 33 connections that have not shown the token the oldest is ended. The
+agent's own routes: GET /_agent/status (the JSON of HELLO; no heartbeat, from any session), POST /_agent/heartbeat (204)
+for a client that talks to the device directly, and POST /_agent/bye (204). 502 means that the device refused the
 connection, 504 that no complete answer came. A refusal is one line of text; it was not carried out and is no heartbeat.
 """
 
@@ -119,7 +119,7 @@ RETRY_S = (2.0, 60.0)  # first and longest pause between passes of the dead-man 
 WRITE_TIMEOUT_S = 5.0  # without a byte leaving
 BACKOFF_S = (0.2, 5.0)  # first and longest pause before the line is opened again
 HEAD_S, MAX_HEAD, MAX_FIELDS = 5.0, 8192, 64  # of an HTTP request: time to send its head, bytes and fields of it
-CONNECTIONS = 32  # at a time
+CONNECTIONS = 32  # at a time that have not shown the token
 
 log = logging.getLogger("board_agent")
 
@@ -511,7 +511,7 @@ class Refusal(Exception):
 REASONS = {
     400: "Bad Request", 401: "Unauthorized", 403: "Forbidden", 404: "Not Found", 405: "Method Not Allowed",
     408: "Request Timeout", 409: "Conflict", 411: "Length Required", 413: "Payload Too Large",
-    431: "Request Header Fields Too Large", 502: "Bad Gateway", 503: "Service Unavailable", 504: "Gateway Timeout",
+    431: "Request Header Fields Too Large", 502: "Bad Gateway", 504: "Gateway Timeout",
 }  # fmt: skip
 REQUEST = re.compile(rb"([A-Z]{1,16}) (/[!-~]{0,511}) HTTP/1\.[01]")
 FIELD = re.compile(rb"([!#$%&'*+.^_`|~0-9A-Za-z-]+):[ \t]*([\t -~\x80-\xff]*)")
@@ -580,24 +580,31 @@ class Proxy(socketserver.ThreadingTCPServer):
     def __init__(self, address: tuple[str, int], agent: Agent, token: bytes, names: Iterable[str]) -> None:
         self.agent, self.token = agent, token
         self.names = {"localhost", "127.0.0.1", address[0].lower(), *(name.lower() for name in names)}
-        self._room = threading.BoundedSemaphore(CONNECTIONS)
+        self._strangers: dict[socket.socket, None] = {}  # who has not shown the token yet, the oldest first
+        self._list = threading.Lock()
         super().__init__(address, ProxyHandler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """In a thread of its own, if there is room for one more."""
-        if self._room.acquire(blocking=False):
-            super().process_request(request, client_address)
-            return
-        with contextlib.suppress(OSError):
-            request.sendall(encode_answer(503, b"too many connections at a time; try again\n", "text/plain"))
-        self.shutdown_request(request)
+        """In a thread of its own; where too many wait to be let in, the oldest has to go."""
+        with self._list:
+            if len(self._strangers) >= CONNECTIONS:
+                oldest = next(iter(self._strangers))
+                del self._strangers[oldest]
+                hang_up(oldest)
+            self._strangers[request] = None
+        super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """And its place is free again."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._room.release()
+            self.let_in(request)
+
+    def let_in(self, request: socket.socket) -> None:
+        """It has shown the token, or is gone. Idempotent."""
+        with self._list:
+            self._strangers.pop(request, None)
 
 
 def encode_answer(status: int, body: bytes, kind: str) -> bytes:
@@ -685,6 +692,7 @@ class ProxyHandler(socketserver.BaseRequestHandler):
         session = fields.get("x-session", "0")
         if not re.fullmatch("[0-9]{1,5}", session) or int(session) > 0xFFFF:
             raise Refusal(400, "X-Session: allowed 0 to 65535")
+        self.server.let_in(self.request)
         return int(session)
 
 
