@@ -77,7 +77,7 @@ No route of the device takes a body, so a POST says Content-Length: 0, once (els
 8192 bytes and must be there within 5 s, and of 33 connections that have not shown the token the oldest is ended. The
 agent's own routes: GET /_agent/status (the JSON of HELLO; no heartbeat, from any session), POST /_agent/heartbeat (204)
 for a client that talks to the device directly, and POST /_agent/bye (204). 502 means that the device refused the
-connection, 504 that no complete answer came. A refusal is one line of text; it was not carried out and is no heartbeat.
+connection, 504 that no usable answer came. A refusal is one line of text; it was not carried out and is no heartbeat.
 """
 
 from __future__ import annotations
@@ -672,7 +672,7 @@ class ProxyHandler(socketserver.BaseRequestHandler):
             with agent.lock:
                 return agent.device.request(method, path)
         except Unanswered as problem:
-            raise Refusal(504 if problem.status == NO_ANSWER else 502, str(problem)) from problem
+            raise Refusal(502 if problem.status == REFUSED else 504, str(problem)) from problem
 
     def _admit(self, fields: dict[str, str]) -> int:
         """The session of a client that may ask. Raises: Refusal for a web page and for who does not know the token."""

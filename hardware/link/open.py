@@ -27,16 +27,15 @@ class _Lock:
     def __init__(self, where: str) -> None:
         name = hashlib.sha256(where.encode()).hexdigest()[:16]
         self._file = open(Path(tempfile.gettempdir()) / f"chibio-{name}.lock", "a+")  # noqa: SIM115 (held)
-        known = self._read()
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
+            holder = self._read().get("process", "unknown")
             self.close()
-            holder = known.get("process", "unknown")
             raise DeviceStateError(
                 f"{where} is already controlled by process {holder}: one client per device"
             ) from error
-        session = known.get("session")
+        session = self._read().get("session")
         self.session = session if isinstance(session, int) and 0 < session < 2**16 else new_session()
         self._file.truncate(0)
         json.dump({"process": os.getpid(), "session": self.session}, self._file)
