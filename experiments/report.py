@@ -4,6 +4,7 @@ import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from conf.schema import setting
 from experiments.cli import frame
@@ -20,6 +21,16 @@ class ReportConfig:
     run: str = setting("latest", "a run folder, a folder of run folders, or `latest`: the newest run below runs/")
 
 
+def _summary(run: Path) -> Any:
+    """What a run found. Raises: frame.UserError for a file that holds no JSON, or half characters, or no end."""
+    try:
+        summary = json.loads((run / "summary.json").read_text("utf-8"))
+        json.dumps(summary, ensure_ascii=False).encode()
+    except (ValueError, RecursionError) as error:
+        raise frame.UserError(f"run={run}: its summary.json is damaged ({error}); run it again") from None
+    return summary
+
+
 def write(folder: Path) -> Path:
     """Write report.html and tables/ into a folder; returns the page's path.
 
@@ -32,11 +43,17 @@ def write(folder: Path) -> Path:
     runs = [folder] if (folder / "summary.json").is_file() else sorted(p.parent for p in folder.glob("*/summary.json"))
     if not runs:
         raise frame.UserError(f"run={folder}: holds no summary.json; give the folder of a finished run")
+    summaries = [_summary(run) for run in runs]
+    compared = runs == [folder] and isinstance(summaries[0], dict) and "beside_paper" in summaries[0]
     try:
-        compared = runs == [folder] and "beside_paper" in json.loads((folder / "summary.json").read_text("utf-8"))
         return page.save(comparison.of_benchmark(folder) if compared else page.of_runs(folder, runs), folder)
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise frame.UserError(f"run={folder}: its summary.json is damaged ({error}); run it again") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise frame.UserError(f"run={folder}: {error}") from None
+    except (LookupError, TypeError, AttributeError) as error:
+        if not compared:
+            raise
+        why = f"{type(error).__name__}: {error}"
+        raise frame.UserError(f"run={folder}: not the summary.json of a benchmark ({why}); run it again") from None
 
 
 def find(name: str, root: Path = Path("runs")) -> Path:

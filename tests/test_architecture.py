@@ -172,3 +172,16 @@ def test_the_drawings_name_files_and_functions_that_exist():
             text = (ROOT / file).read_text(encoding="utf-8")
             for name in re.findall(r"\w+", names):
                 assert re.search(rf"\b(?:def|class) {name}\b|^{name}\b", text, re.MULTILINE), f"{file}: {name}"
+
+
+def test_no_random_numbers_are_seeded_from_a_clock() -> None:
+    """A failure that nobody can repeat teaches nothing."""
+    found = []
+    for path in [*modules().values(), *sorted((ROOT / "tests").rglob("*.py"))]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and re.search("default_rng|Random|SeedSeq|seed$", ast.unparse(node.func)):
+                given = ast.unparse(node)
+                found += [f"{path.relative_to(ROOT)}: {given}"] * bool(
+                    re.search(r"time(_ns)?\(|monotonic|now\(", given)
+                )
+    assert found == []

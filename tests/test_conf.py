@@ -213,6 +213,36 @@ def test_an_old_key_in_a_file_gives_the_new_one(monkeypatch, tmp_path):
         variant(DQNConfig(), "mine", {"noisy": True})
 
 
+LAUGHS = "a0: &a0 [x]\n" + "".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 9)}]\n" for k in range(9))
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (LAUGHS, "an alias or interpolation in line 2: write the value out"),
+        ("mu: &x 0.03\ntau: *x\n", "an alias or interpolation in line 2"),
+        ("base: &b {mu: 1}\nenv:\n  <<: *b\n", "an alias or interpolation in line 3"),
+        ("a: 'xxxxxxxx'\nmu: ${a}${a}\n", "an alias or interpolation in line 2"),
+        ("mu: " + 50_000 * "[", "deeper than 30 levels in line 1"),
+        ("".join(f"{k * ' '}a:\n" for k in range(200)), "deeper than 30 levels in line 31"),
+        ("mu: 0.03 #" + 300_000 * "x", "longer than 200000 bytes"),
+        ("mu: [", "not YAML"),
+        ("mu: !!python/name:os.system\n", "not YAML"),
+        ("mu: " + 5000 * "9", "not YAML|Exceeds the limit"),
+        ("- 1", "holds no key: value pairs"),
+    ],
+)
+def test_a_model_file_that_would_take_for_ever_is_refused_in_one_line(content, why, tmp_path):
+    path = tmp_path / "model.yaml"
+    path.write_text(content)
+    with pytest.raises(frame.UserError, match=rf"^env_file={path}: ({why}).*; give the calibrated.yaml") as caught:
+        read_env_file(str(path))
+    assert "\n" not in str(caught.value)
+    path.write_bytes(b"mu: \xff")
+    with pytest.raises(frame.UserError, match=r"no UTF-8 text; give"):
+        read_env_file(str(path))
+
+
 @pytest.mark.parametrize(
     ("given", "understood"),
     [

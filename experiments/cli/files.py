@@ -1,4 +1,4 @@
-"""JSON and CSV as every command writes them: whole or not at all."""
+"""JSON and CSV as every command writes them, whole or not at all, and YAML as every command reads it."""
 
 import csv
 import io
@@ -8,9 +8,41 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml  # type: ignore[import-untyped]
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
 from hardware.storage import atomic
 
-__all__ = ["plain", "write_csv", "write_json"]
+__all__ = ["load_yaml", "plain", "write_csv", "write_json"]
+
+LARGEST, DEEPEST = 200_000, 30  # bytes and levels of a YAML file; those of ours have a tenth and a third of it
+
+
+def load_yaml(path: Path | str) -> DictConfig | ListConfig:
+    """A YAML file without aliases and interpolations: a few lines of those can stand for gigabytes.
+
+    Raises: OSError; ValueError, in one line, also for a file that is too large or too deep.
+    """
+    with open(path, "rb") as f:
+        data = f.read(LARGEST + 1)
+    if len(data) > LARGEST:
+        raise ValueError(f"longer than {LARGEST} bytes")
+    try:
+        depth, text = 0, data.decode("utf-8")
+        for event in yaml.parse(text, yaml.SafeLoader):
+            where = f"in line {event.start_mark.line + 1}"
+            if isinstance(event, yaml.AliasEvent) or "${" in getattr(event, "value", ""):
+                raise ValueError(f"an alias or interpolation {where}: write the value out")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST:
+                raise ValueError(f"deeper than {DEEPEST} levels {where}")
+        return OmegaConf.load(io.StringIO(text))
+    except UnicodeDecodeError:
+        raise ValueError("no UTF-8 text") from None
+    except ValueError:
+        raise
+    except Exception as error:  # whatever PyYAML and OmegaConf meet
+        raise ValueError(f"not YAML ({str(error).splitlines()[0]})") from None
 
 
 def plain(value: Any) -> Any:

@@ -20,11 +20,10 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError  # type: ignore[import-untyped]
 
 from conf.presets import groups
 from conf.schema import build, old_name
-from experiments.cli import help_page
+from experiments.cli import files, help_page
 
 __all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config"]
 
@@ -116,12 +115,12 @@ def save_config(config: Any, folder: Path) -> None:
 def _stored(path: Path, resume: str, fitting: Callable[[DictConfig], T]) -> T:
     """The config a run was started with. Raises: UserError naming the file and what is wrong with it."""
     try:
-        stored = OmegaConf.load(path)
+        stored = files.load_yaml(path)
         if not isinstance(stored, DictConfig):
             raise UserError("it holds no keys and values")
         stored.resume = resume
         return load(stored, fitting(stored))
-    except (UserError, OSError, ValueError, AttributeError, YAMLError, OmegaConfBaseException) as error:
+    except (UserError, OSError, ValueError, AttributeError, OmegaConfBaseException) as error:
         why = _one_line(error) or type(error).__name__
         remedy = "put it back as the run wrote it, or start a new run"
         raise UserError(f"{path}: not the config of this run ({why}); {remedy}") from None

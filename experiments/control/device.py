@@ -11,16 +11,15 @@ from typing import Any
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError  # type: ignore[import-untyped]
 
-from experiments.cli import frame
+from experiments.cli import files, frame
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.chibio.connection import identity
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.preflight import preflight
 from hardware.clock import RealClock
 from hardware.emulator.process import EmulatorProcess
-from hardware.link.open import lock, open_transport
+from hardware.link.open import DeviceLock, open_transport
 from hardware.link.transport import Transport
 from hardware.storage import atomic
 
@@ -78,7 +77,7 @@ def linked(backend: ChiBioConfig) -> Iterator[tuple[Transport, RealClock]]:
         transport = stack.enter_context(closing(open_transport(backend.transport, url, backend.speed)))
         clock = RealClock(backend.speed)
         if not isinstance(backend, EmulatorConfig):  # that one is this run's own
-            stack.enter_context(lock(f"the device with reactor {identity(transport, clock)}"))
+            stack.enter_context(closing(DeviceLock(f"the device with reactor {identity(transport, clock)}")))
         yield transport, clock
 
 
@@ -112,8 +111,8 @@ def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        content = OmegaConf.to_container(OmegaConf.load(path))
-    except (OSError, YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
+        content = OmegaConf.to_container(files.load_yaml(path))
+    except (OSError, ValueError, OmegaConfBaseException) as error:
         raise frame.UserError(
             f"calibration {path}: not readable ({str(error).splitlines()[0]}); measure again"
         ) from None

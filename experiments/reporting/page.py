@@ -1,11 +1,10 @@
 """A run folder as one self-contained HTML page: tables, figures, configuration.
 
-The page links to nothing: figures stand in it as SVG (or as embedded PNG where there is no SVG), the style too. Its
+The page links to nothing: figures stand in it as images (SVG, or PNG where there is no SVG), the style too. Its
 markup is report.html.j2.
 """
 
 import base64
-import html
 import json
 import platform
 import re
@@ -16,15 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
 
 from experiments.reporting import tables
 from experiments.reporting.tables import Best, Table, number, typeset
 
-__all__ = ["Page", "flat", "inline_svg", "of_runs", "provenance", "save"]
+__all__ = ["Page", "flat", "of_runs", "provenance", "save"]
 
 PACKAGE = "turbidostat-dqn"
 HERE = Path(__file__).parent
+PICTURES = {".svg": ("svg+xml", b"<svg"), ".png": ("png", b"\x89PNG")}  # suffix -> media type, what such a file holds
 
 templates = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
 templates.filters["typeset"] = typeset
@@ -61,29 +60,20 @@ class Page:
         self.add("table", table=table, folded=folded)
 
     def figure(self, path: Path, title: str, caption: str = "") -> None:
-        """Append a figure file, SVG or PNG."""
-        svg, png = "", ""
-        if path.suffix == ".svg":
-            place = f"f{len(self.sections)}-{len(self.sections[-1][1])}-"
-            svg = inline_svg(path.read_text(encoding="utf-8"), place, title)
-        else:
-            png = base64.b64encode(path.read_bytes()).decode()
-        self.add("figure", title=title, caption=caption, svg=svg, png=png)
+        """Append a figure file, SVG or PNG.
+
+        Whoever wrote it: a browser runs no script of an image and follows no address in it.
+        Raises: ValueError for a file that is no picture, OSError for one that cannot be read.
+        """
+        media, mark = PICTURES.get(path.suffix, ("", b""))
+        data = path.read_bytes() if media else b""
+        if not media or mark not in data:
+            raise ValueError(f"figure {path}: not an SVG or PNG; delete it or draw it again")
+        self.add("figure", title=title, caption=caption, media=media, data=base64.b64encode(data).decode())
 
     def html(self) -> str:
         """The whole document."""
         return templates.get_template("report.html.j2").render(page=self)
-
-
-def inline_svg(text: str, prefix: str, title: str) -> Markup:
-    """An SVG file as an element of a page: no prolog, no metadata, no name spaces, ids that meet no other figure's."""
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", text).replace("xlink:href", "href")
-    text = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}\1"', text)
-    text = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}\1"', text)
-    text = re.sub(r"url\(#([^)]+)\)", rf"url(#{prefix}\1)", text)
-    return Markup(text.replace("<svg", f'<svg role="img" aria-label="{html.escape(title)}"', 1))
 
 
 def _version() -> str:
@@ -145,14 +135,15 @@ def _show(value: Any) -> str:
 
 def _results(page: Page, run: Path, prefix: str) -> None:
     """summary.json as tables, whose names begin with `prefix`, and every figure of a run folder."""
-    leaves = dict(flat(json.loads((run / "summary.json").read_text(encoding="utf-8"))))
-    lists = {k: v for k, v in leaves.items() if isinstance(v, list) and v and isinstance(v[0], Mapping)}
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    leaves = dict(flat(summary if isinstance(summary, Mapping) else {"summary": summary}))
+    lists = {k: v for k, v in leaves.items() if isinstance(v, list) and v and all(isinstance(e, Mapping) for e in v)}
     page.add("keys", pairs=[(k, _show(v)) for k, v in leaves.items() if k not in lists])
     for key, value in lists.items():
         entries = [dict(flat(entry)) for entry in value]
         columns = tuple(dict.fromkeys(c for entry in entries for c in entry))
         rows = tuple(tuple(_show(entry.get(c)) for c in columns) for entry in entries)
-        page.table(Table(prefix + key.replace(".", "_"), key.replace("_", " "), columns, rows))
+        page.table(Table(prefix + re.sub(r"\W+", "_", key), key.replace("_", " "), columns, rows))
     for path in (p for folder in (run / "figures", run) for p in sorted(folder.glob("*.*"))):
         if path.suffix == ".svg" or (path.suffix == ".png" and not path.with_suffix(".svg").exists()):
             page.figure(path, path.stem.replace("_", " "))

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from conf.schema import build, check, part, setting
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
-from experiments.cli import frame
+from experiments.cli import files, frame
 
 __all__ = ["TrainConfig", "read_env_file", "variant"]
 
@@ -40,11 +40,9 @@ def read_env_file(path: str) -> EnvConfig:
     """The model a calibration wrote. Raises: UserError naming the file and what is wrong with it."""
     remedy = "give the calibrated.yaml of a calibration run"
     try:
-        content = OmegaConf.load(path)
-    except OSError as error:
-        raise frame.UserError(f"env_file={path}: {error.strerror}; {remedy}") from None
-    except Exception as error:  # whatever PyYAML's parser meets, and text that is no UTF-8
-        raise frame.UserError(f"env_file={path}: not YAML ({str(error).splitlines()[0]}); {remedy}") from None
+        content = files.load_yaml(path)
+    except (OSError, ValueError) as error:
+        raise frame.UserError(f"env_file={path}: {getattr(error, 'strerror', error)}; {remedy}") from None
     if not isinstance(content, DictConfig):
         raise frame.UserError(f"env_file={path}: holds no key: value pairs; {remedy}")
     try:

@@ -2,13 +2,14 @@
 
 One file, Python 3.7 standard library only: it is copied to the BeagleBone as it is (installation: docs/board_agent.md).
 
-Frames (protocol 1, ASCII, one request at a time on the line)
+Frames (protocol 2, ASCII, one request at a time on the line)
 -------------------------------------------------------------
 Request, PC to board, one line of at most 512 bytes including the newline:
 
     >ID METHOD PATH CRC\\n          >17 POST /SetOutputOn/Pump1/0/M0 7b0c9a3e\\n
 
-  ID      decimal, 1 to 4294967295, no sign, no leading zero. 0 is reserved for replies to unreadable requests.
+  ID      decimal, 1 to 4294967295, no sign, no leading zero. 0 is reserved for replies to unreadable requests. The
+          upper 16 bits name the client's session, the lower 16 count its requests and start again at 0.
   METHOD  GET or POST (carried to the device), RAW (GET, the answer not reduced), HELLO, PING or BYE (the agent's own).
   PATH    starts with "/", printable ASCII without space and without ">". "/" for HELLO, PING and BYE.
   CRC     8 lower-case hexadecimal digits: zlib.crc32 of the line from ">" up to, not including, the space before CRC.
@@ -22,7 +23,8 @@ Reply, board to PC, a header line, LENGTH bytes of body and one newline:
             10  the device refused the connection: the request was not carried out;
             11  the device was reached but no complete answer came: it may have acted;
             12  the answer was longer than 262144 bytes;
-            20  unreadable request (CRC, form or length), with ID 0: not carried out, send it again.
+            20  unreadable request (CRC, form or length), with ID 0: not carried out, send it again,
+            21  another client is in charge: not carried out.
   LENGTH  decimal number of body bytes, 0 to 262144.
   CRC     8 lower-case hexadecimal digits: zlib.crc32 of b"<ID STATUS LENGTH" + BODY (no newline, no space before CRC).
   BODY    the device's body; a line of text for status under 100; JSON for HELLO, PING, BYE.
@@ -33,10 +35,9 @@ the one it waits for (ID 0 counts as the answer to the request in flight).
 
 Repeating a request is safe: a request equal to the previous one (same ID, METHOD, PATH) is answered from memory and
 not carried out again. So a PC that got no reply, a damaged one or ID 0 sends the very same line again; it takes a new
-ID for every new request and starts a session with HELLO and an ID drawn at random. HELLO and a trip of the dead-man
-switch clear that memory.
+ID for every new request and starts with HELLO. HELLO and a trip of the dead-man switch clear that memory.
 
-HELLO, PING and BYE answer {"agent": "board_agent", "protocol": 1, "version": "1.0", "deadman_s": 120.0, "silent_s":
+HELLO, PING and BYE answer {"agent": "board_agent", "protocol": 2, "version": "2.0", "deadman_s": 120.0, "silent_s":
 0.0, "armed": true, "trips": 0, "last_trip": "", "url": "http://192.168.7.2:5000"}; silent_s is the silence before
 this request.
 
@@ -44,36 +45,57 @@ GET /getSysdata/ is reduced to the fields that a client needs (under 1 KB): the 
 lists hold their last value only, and "_records" {"time": n, "OD": n, "ThermometerIR": n} holds their lengths, which
 differ for an instant while the device appends; "Terminal.text" is cut to its newest 80 characters. RAW gives it whole.
 
+One client in charge
+--------------------
+A client is named by the line it comes on and its session. The first whose valid request arrives is in charge until its
+BYE, or until the dead-man switch has made its first pass after its silence. Meanwhile every request of another one is
+refused in one line (status 21, over HTTP 409) and is no heartbeat: a second client on the serial line, a second one
+over HTTP, or one on each. A client that was killed and starts again under the same session goes on at once.
+
 Dead man
 --------
-Every valid request is a heartbeat. After `--deadman` seconds without one, Pump1 to Pump4 of every present reactor are
-switched off, read back, and the pass is repeated until it is verified or a heartbeat comes. A reactor whose on-board
-regulation is on (OD.ON = 1) has been handed over deliberately and is left alone. Because the device answers 204 even
-if its bus is dead, each pass ends with MeasureTemp/IR: if the bus hangs, that request makes the server restart itself
-with everything off (docs/device.md, Failures), otherwise it does nothing. It is armed from the start on; BYE disarms it
-(a client that has left everything in order) until the next request that is not BYE. On SIGTERM a live session's pumps
-are switched off before the agent ends.
+Every valid request of the client in charge is a heartbeat. After `--deadman` seconds without one, Pump1 to Pump4 of
+every present reactor are switched off, read back, and the pass is repeated until it is verified or a heartbeat comes. A
+reactor whose on-board regulation is on (OD.ON = 1) has been handed over deliberately and is left alone. Because the
+device answers 204 even if its bus is dead, each pass ends with MeasureTemp/IR: if the bus hangs, that request makes the
+server restart itself with everything off (docs/device.md, Failures), otherwise it does nothing. It is armed from the
+start on; BYE disarms it (a client that has left everything in order) until the next request that is not BYE. On SIGTERM
+a live session's pumps are switched off before the agent ends.
 
 Beside an HTTP link
 -------------------
-`--http ADDRESS:PORT` listens there and carries every HTTP request to the device unchanged, so a client that uses this
-address instead of the device's has the same switch without further ado. Its own routes: GET /_agent/status (the JSON
-of HELLO; no heartbeat), POST /_agent/heartbeat (204) for a client that talks to the device directly, and
-POST /_agent/bye (204). 502 means that the device refused the connection, 504 that no complete answer came.
+`--http ADDRESS:PORT` listens there and carries the requests of a client that knows the token to the device, so a client
+that uses this address instead of the device's has the same switch. A request needs, in this order:
+
+    Host             this address, localhost (an ssh tunnel), or a name given with --host: a web page that has had its
+                     own name resolved to this address is refused (403)
+    no Origin        browsers send one with every POST of a page; the agent serves no page (403)
+    Authorization    Bearer TOKEN, what stands in --token-file; without the file the agent does not listen (401)
+    X-Session        0 to 65535, names the client; 0 if it is left out
+
+No route of the device takes a body, so a POST says Content-Length: 0, once (else 411, 413 or 400). A head is at most
+8192 bytes and must be there within 5 s, and of 33 connections that have not shown the token the oldest is ended. The
+agent's own routes: GET /_agent/status (the JSON of HELLO; no heartbeat, from any session), POST /_agent/heartbeat (204)
+for a client that talks to the device directly, and POST /_agent/bye (204). 502 means that the device refused the
+connection, 504 that no usable answer came. A refusal is one line of text; it was not carried out and is no heartbeat.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import fcntl
+import hmac
 import http.client
-import http.server
 import json
 import logging
 import os
+import re
 import select
 import signal
+import socket
+import socketserver
 import sys
 import termios
 import threading
@@ -81,12 +103,14 @@ import time
 import tty
 import urllib.parse
 import zlib
+from collections.abc import Iterable
+from typing import Any
 
-VERSION = "1.0"
-PROTOCOL = 1
+VERSION = "2.0"
+PROTOCOL = 2
 MAX_LINE = 512
 MAX_BODY = 262144
-REFUSED, NO_ANSWER, TOO_LONG, UNREADABLE = 10, 11, 12, 20
+REFUSED, NO_ANSWER, TOO_LONG, UNREADABLE, NOT_IN_CHARGE = 10, 11, 12, 20, 21
 DEVICE_METHODS = ("GET", "POST", "RAW")
 AGENT_METHODS = ("HELLO", "PING", "BYE")
 PUMPS = ("Pump1", "Pump2", "Pump3", "Pump4")
@@ -94,6 +118,8 @@ PROBE_TIMEOUT_S = 40.0  # longer than the 30 s after which the device's server k
 RETRY_S = (2.0, 60.0)  # first and longest pause between passes of the dead-man switch that were not verified
 WRITE_TIMEOUT_S = 5.0  # without a byte leaving
 BACKOFF_S = (0.2, 5.0)  # first and longest pause before the line is opened again
+HEAD_S, MAX_HEAD, MAX_FIELDS = 5.0, 8192, 64  # of an HTTP request: time to send its head, bytes and fields of it
+CONNECTIONS = 32  # at a time that have not shown the token
 
 log = logging.getLogger("board_agent")
 
@@ -168,6 +194,12 @@ class Unanswered(Exception):
         self.status = status
 
 
+def hang_up(line: socket.socket) -> None:
+    """End both directions; who waits on it wakes up."""
+    with contextlib.suppress(OSError):
+        line.shutdown(socket.SHUT_RDWR)
+
+
 class Device:
     """The device's HTTP server.
 
@@ -183,35 +215,40 @@ class Device:
         self._host, self._port = parts.hostname, parts.port or 80
 
     def request(self, method: str, path: str, timeout_s: float | None = None) -> tuple[int, bytes, str]:
-        """(status, body, content type). Raises: Unanswered."""
-        connection = http.client.HTTPConnection(self._host, self._port, timeout=timeout_s or self.timeout_s)
+        """(status, body, content type); the whole answer within the time-out. Raises: Unanswered."""
+        wait_s = timeout_s or self.timeout_s
+        deadline = time.monotonic() + wait_s
+        connection = http.client.HTTPConnection(self._host, self._port, timeout=wait_s)
         try:
-            try:
-                connection.connect()
-            except OSError as problem:
-                raise Unanswered(REFUSED, f"{self.url}: {problem}") from problem
-            try:
-                headers = {"X-Requested-With": "XMLHttpRequest", "Content-Length": "0", "Connection": "close"}
-                connection.request(method, path, headers=headers)
-                response = connection.getresponse()
-                body = response.read(MAX_BODY + 1)
-                left = response.length
-            except (OSError, http.client.HTTPException) as problem:
-                raise Unanswered(NO_ANSWER, f"{method} {path}: {type(problem).__name__} {problem}") from problem
+            connection.connect()
+        except OSError as problem:
+            raise Unanswered(REFUSED, f"{self.url}: {problem}") from problem
+        late = threading.Timer(wait_s, hang_up, [connection.sock])  # a device that dribbles must not hold the agent
+        late.daemon = True
+        late.start()
+        try:
+            headers = {"X-Requested-With": "XMLHttpRequest", "Content-Length": "0", "Connection": "close"}
+            connection.request(method, path, headers=headers)
+            response = connection.getresponse()
+            body = response.read(MAX_BODY + 1)
+            left = response.length
+        except (OSError, http.client.HTTPException) as problem:
+            raise Unanswered(NO_ANSWER, f"{method} {path}: {type(problem).__name__} {problem}") from problem
         finally:
+            late.cancel()
             connection.close()
         if len(body) > MAX_BODY:
             raise Unanswered(TOO_LONG, f"{method} {path}: more than {MAX_BODY} bytes")
-        if left:
-            raise Unanswered(NO_ANSWER, f"{method} {path}: {left} bytes missing at the end")
-        return response.status, body, response.getheader("Content-Type") or "text/plain"
+        if left or time.monotonic() > deadline:
+            raise Unanswered(NO_ANSWER, f"{method} {path}: not complete after {wait_s:g} s, {left} bytes missing")
+        return response.status, body, " ".join((response.getheader("Content-Type") or "text/plain").split())
 
 
 # -- the switch ----------------------------------------------------------------------------------------------------
 
 
 class Agent:
-    """Carries requests to the device and turns the pumps off when they stop coming.
+    """Carries the requests of one client to the device and turns the pumps off when they stop coming.
 
     Args: device; deadman_s: allowed silence; probe: end a pass with a request that unmasks a dead bus.
     `lock` is held for every request and for the whole of one reactor's pass.
@@ -225,6 +262,8 @@ class Agent:
         self._beat = time.monotonic()
         self._beats = 0
         self._settled = False  # this silence has been dealt with
+        self._master: tuple[str, int] | None = None  # line and session of the client in charge
+        self._door = threading.Lock()  # held while it is decided who that is
         self._memory: tuple[tuple[int, str, str], bytes] | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -233,13 +272,24 @@ class Agent:
         """Start watching."""
         self._thread.start()
 
-    def beat(self, arm: bool = True) -> None:
-        """A sign of life; arm False ends the watch until the next one."""
-        now = time.monotonic()
-        self.silent_s, self._beat = now - self._beat, now
-        self._beats += 1
-        self.armed = self.session = arm
-        self._settled = False
+    def claim(self, line: str, session: int, arm: bool = True) -> str:
+        """A sign of life of the client in charge, "" then; for any other one why it is refused.
+
+        Args: line, session: who asks. arm: False ends the watch until the next one, and whoever comes is in charge.
+        """
+        with self._door:
+            now = time.monotonic()
+            if self._master not in (None, (line, session)):
+                return (
+                    f"another client is in charge (on {self._master[0]}, heard {now - self._beat:.0f} s ago): not "
+                    f"carried out; end it, or wait for {self.deadman_s:g} s of its silence, which switch its pumps off"
+                )
+            self.silent_s, self._beat = now - self._beat, now
+            self._beats += 1
+            self._master = (line, session) if arm else None
+            self.armed = self.session = arm
+            self._settled = False
+        return ""
 
     def status(self) -> bytes:
         """The JSON of HELLO, PING and BYE."""
@@ -258,9 +308,11 @@ class Agent:
         if request is None:
             return encode_reply(0, UNREADABLE, b"unreadable request, not carried out")
         number, method, path = request
+        refusal = self.claim("the serial line", number >> 16, arm=method != "BYE")
+        if refusal:
+            return encode_reply(number, NOT_IN_CHARGE, refusal.encode("ascii"))
         if method == "HELLO":
             self._memory = None
-        self.beat(arm=method != "BYE")
         if self._memory is not None and self._memory[0] == request:
             return self._memory[1]
         if method in AGENT_METHODS:
@@ -295,12 +347,12 @@ class Agent:
         pause = RETRY_S[0]
         while not self._stop.is_set():
             problems = self.sweep(beats)
-            if self._beats != beats:
-                log.warning("a client is back, dead-man pass ended")
-                return
-            if not problems:
-                log.warning("pumps verified off")
-                self._settled = True
+            with self._door:
+                back = self._beats != beats
+                if not back:
+                    self._master, self._settled = None, not problems
+            if back or not problems:
+                log.warning("a client is back, dead-man pass ended" if back else "pumps verified off")
                 return
             log.error("not verified: %s; next try in %.0f s", "; ".join(problems), pause)
             self._stop.wait(pause)
@@ -316,8 +368,8 @@ class Agent:
                 if present[name] == 1 and self._beats == beats:
                     with self.lock:
                         problems += self._switch_off(name)
-        except (Unanswered, ValueError, KeyError, TypeError, AttributeError) as problem:
-            problems.append(f"{type(problem).__name__}: {problem}")
+        except Exception as problem:  # whatever a device answers, the watch goes on
+            problems.append(f"{type(problem).__name__}: {str(problem)[:200]}")
         return problems
 
     def _state(self) -> dict:  # type: ignore[type-arg]
@@ -448,59 +500,200 @@ class SerialPort:
 # -- HTTP ----------------------------------------------------------------------------------------------------------
 
 
-class Proxy(http.server.ThreadingHTTPServer):
-    """The agent beside an HTTP link; see the module's docstring."""
+class Refusal(Exception):
+    """A request that is not carried out; `status` is that of HTTP, the message one line for the client."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+REASONS = {
+    400: "Bad Request", 401: "Unauthorized", 403: "Forbidden", 404: "Not Found", 405: "Method Not Allowed",
+    408: "Request Timeout", 409: "Conflict", 411: "Length Required", 413: "Payload Too Large",
+    431: "Request Header Fields Too Large", 502: "Bad Gateway", 504: "Gateway Timeout",
+}  # fmt: skip
+REQUEST = re.compile(rb"([A-Z]{1,16}) (/[!-~]{0,511}) HTTP/1\.[01]")
+FIELD = re.compile(rb"([!#$%&'*+.^_`|~0-9A-Za-z-]+):[ \t]*([\t -~\x80-\xff]*)")
+OWN_POSTS = ("/_agent/heartbeat", "/_agent/bye")
+
+
+def parse_head(head: bytes) -> tuple[str, str, dict[str, str]]:
+    """METHOD, PATH and fields (names in lower case) of an HTTP request's head, given without the empty line after it.
+
+    Raises: Refusal for what is not one GET or POST without a body, and for a field that comes twice.
+    """
+    first, *lines = head.split(b"\r\n")
+    request = REQUEST.fullmatch(first)
+    if request is None:
+        raise Refusal(400, "unreadable request line: allowed METHOD /PATH HTTP/1.1, a path of 1 to 512 characters")
+    if len(lines) > MAX_FIELDS:
+        raise Refusal(431, f"{len(lines)} header fields: allowed {MAX_FIELDS}")
+    fields: dict[str, str] = {}
+    for line in lines:
+        found = FIELD.fullmatch(line)
+        name = found.group(1).decode("ascii").lower() if found else ""
+        if found is None or name in fields:
+            raise Refusal(400, f"header field {name or 'unreadable'}: allowed NAME: VALUE, each name once")
+        fields[name] = found.group(2).decode("latin-1").strip(" \t")
+    method = request.group(1).decode("ascii")
+    if method not in ("GET", "POST"):
+        raise Refusal(405, f"method {method}: allowed GET and POST")
+    length = fields.get("content-length", "0" if method == "GET" else "")
+    if "transfer-encoding" in fields or not length:
+        raise Refusal(411, "no length: allowed Content-Length: 0 (curl: -d '')")
+    if not re.fullmatch("[0-9]+", length):
+        raise Refusal(400, "unreadable length: allowed Content-Length: 0")
+    if length.strip("0"):
+        raise Refusal(413, "a body: allowed none, Content-Length: 0")
+    return method, request.group(2).decode("ascii"), fields
+
+
+def read_token(path: str | None) -> bytes:
+    """The token that a file holds. Raises: ValueError for one that is missing, open to others or too short."""
+    if not path:
+        raise ValueError("http without token-file: give --token-file FILE (docs/board_agent.md, The token)")
+    try:
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+            mode, token = os.fstat(file.fileno()).st_mode, (file.read(1024) or b"").strip()
+    except OSError as problem:
+        raise ValueError(
+            f"token-file = {path}: {problem.strerror}; make it (docs/board_agent.md, The token)"
+        ) from problem
+    if mode & 0o077:
+        raise ValueError(f"token-file = {path}: others may use it (mode {mode & 0o777:o}); chmod 600 {path}")
+    if not re.fullmatch(rb"[!-~]{32,256}", token):
+        raise ValueError(f"token-file = {path}: allowed one line of 32 to 256 characters without spaces; make it anew")
+    return token
+
+
+class Proxy(socketserver.ThreadingTCPServer):
+    """The agent beside an HTTP link; see the module's docstring.
+
+    Args: address: where to listen; agent; token: what a client must know; names: under which it may be asked for.
+    """
 
     daemon_threads = True
+    allow_reuse_address = True
+    request_queue_size = CONNECTIONS
 
-    def __init__(self, address: tuple[str, int], agent: Agent) -> None:
-        self.agent = agent
+    def __init__(self, address: tuple[str, int], agent: Agent, token: bytes, names: Iterable[str]) -> None:
+        self.agent, self.token = agent, token
+        self.names = {"localhost", "127.0.0.1", address[0].lower(), *(name.lower() for name in names)}
+        self._strangers: dict[socket.socket, None] = {}  # who has not shown the token yet, the oldest first
+        self._list = threading.Lock()
         super().__init__(address, ProxyHandler)
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """In a thread of its own; where too many wait to be let in, the oldest has to go."""
+        with self._list:
+            if len(self._strangers) >= CONNECTIONS:
+                oldest = next(iter(self._strangers))
+                del self._strangers[oldest]
+                hang_up(oldest)
+            self._strangers[request] = None
+        super().process_request(request, client_address)
 
-class ProxyHandler(http.server.BaseHTTPRequestHandler):
-    """One request of the client."""
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """And its place is free again."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.let_in(request)
 
-    protocol_version = "HTTP/1.1"
-    timeout = 30
+    def let_in(self, request: socket.socket) -> None:
+        """It has shown the token, or is gone. Idempotent."""
+        with self._list:
+            self._strangers.pop(request, None)
+
+
+def encode_answer(status: int, body: bytes, kind: str) -> bytes:
+    """An HTTP answer. No header opens it to a page of another origin."""
+    lines = [f"HTTP/1.1 {status} {REASONS.get(status, 'OK')}", f"Server: board_agent/{VERSION}", "Connection: close"]
+    lines += [f"Content-Type: {kind}", "X-Content-Type-Options: nosniff", "Cache-Control: no-store"]
+    lines += [f"Content-Length: {len(body)}"] * (status not in (204, 304))
+    lines += ["WWW-Authenticate: Bearer"] * (status == 401)
+    return "\r\n".join([*lines, "", ""]).encode("latin-1") + body
+
+
+class ProxyHandler(socketserver.BaseRequestHandler):
+    """One request of a client."""
+
     server: Proxy
 
-    def log_message(self, format: str, *args: object) -> None:
-        """Silent: thousands of requests a day."""
-
-    def do_GET(self) -> None:
-        """Any method of the device; the agent's own routes."""
-        agent = self.server.agent
-        length = self.headers.get("Content-Length", "0")
-        self.rfile.read(min(int(length), MAX_BODY) if length.isdigit() else 0)
-        if self.path == "/_agent/status" and self.command == "GET":
-            self._send(200, agent.status(), "application/json")
-        elif self.path in ("/_agent/heartbeat", "/_agent/bye") and self.command == "POST":
-            agent.beat(arm=self.path.endswith("heartbeat"))
-            self._send(204, b"", "text/plain")
-        elif self.path.startswith("/_agent"):
-            self._send(404, b"allowed: GET status, POST heartbeat, POST bye\n", "text/plain")
-        else:
-            agent.beat()
+    def handle(self) -> None:
+        """Read, answer, close."""
+        with contextlib.suppress(OSError):  # the client is gone
             try:
-                with agent.lock:
-                    answer = agent.device.request(self.command, self.path)
-            except Unanswered as problem:
-                status = 504 if problem.status == NO_ANSWER else 502
-                answer = (status, f"{problem}\n".encode("ascii", "replace"), "text/plain")
-            self._send(*answer)
+                answer = self._answer(*parse_head(self._head()))
+            except Refusal as refusal:
+                answer = refusal.status, f"{refusal}\n".encode("ascii", "replace"), "text/plain"
+            self.request.settimeout(WRITE_TIMEOUT_S)
+            self.request.sendall(encode_answer(*answer))
+            self.request.shutdown(socket.SHUT_WR)
+            self.request.settimeout(0.2)
+            deadline = time.monotonic() + 1.0  # a refused body is taken off the line, or a reset overtakes the answer
+            while self.request.recv(65536) and time.monotonic() < deadline:
+                pass
 
-    do_POST = do_GET
+    def _head(self) -> bytes:
+        """Up to the empty line. Raises: Refusal if it does not come in time or is too long."""
+        deadline, data = time.monotonic() + HEAD_S, b""
+        while b"\r\n\r\n" not in data:
+            left = deadline - time.monotonic()
+            self.request.settimeout(max(left, 0.001))
+            try:
+                chunk = self.request.recv(4096)
+            except socket.timeout:  # noqa: UP041 (another class in Python 3.7)
+                left = 0.0
+            if left <= 0.0:
+                raise Refusal(408, f"no whole request within {HEAD_S:g} s")
+            if not chunk:
+                raise Refusal(400, "no whole request")
+            data += chunk
+            if len(data) > MAX_HEAD:
+                raise Refusal(431, f"request head too long: allowed {MAX_HEAD} bytes")
+        return bytes(data.partition(b"\r\n\r\n")[0])
 
-    def _send(self, status: int, body: bytes, kind: str) -> None:
-        self.close_connection = True
-        self.send_response(status)
-        self.send_header("Content-Type", kind)
-        if status != 204:
-            self.send_header("Content-Length", str(len(body)))
-        self.send_header("Connection", "close")
-        self.end_headers()
-        self.wfile.write(body)
+    def _answer(self, method: str, path: str, fields: dict[str, str]) -> tuple[int, bytes, str]:
+        """Status, body and its kind. Raises: Refusal."""
+        agent, session = self.server.agent, self._admit(fields)
+        if (method, path) == ("GET", "/_agent/status"):
+            return 200, agent.status(), "application/json"
+        own = path.startswith("/_agent")
+        if own and (method != "POST" or path not in OWN_POSTS):
+            raise Refusal(404, "allowed: GET /_agent/status, POST /_agent/heartbeat, POST /_agent/bye")
+        refusal = agent.claim("HTTP", session, arm=path != "/_agent/bye")
+        if refusal:
+            raise Refusal(409, refusal)
+        if own:
+            return 204, b"", "text/plain"
+        try:
+            with agent.lock:
+                return agent.device.request(method, path)
+        except Unanswered as problem:
+            raise Refusal(502 if problem.status == REFUSED else 504, str(problem)) from problem
+
+    def _admit(self, fields: dict[str, str]) -> int:
+        """The session of a client that may ask. Raises: Refusal for a web page and for who does not know the token."""
+        host = re.sub(r":[0-9]{1,5}$", "", fields.get("host", "")).lower()
+        if host not in self.server.names and host != self.request.getsockname()[0]:
+            raise Refusal(
+                403, f"Host {host[:80]!r} is not this agent: ask for its address, or start it with --host NAME"
+            )
+        if "origin" in fields:
+            raise Refusal(403, "a request of a web page (it has an Origin): refused; only programs may ask")
+        given = fields.get("authorization", "").encode("latin-1")
+        if not hmac.compare_digest(given, b"Bearer " + self.server.token):
+            raise Refusal(
+                401,
+                "no or wrong token: send Authorization: Bearer TOKEN with the board's (backend.transport.token_file)",
+            )
+        session = fields.get("x-session", "0")
+        if not re.fullmatch("[0-9]{1,5}", session) or int(session) > 0xFFFF:
+            raise Refusal(400, "X-Session: allowed 0 to 65535")
+        self.server.let_in(self.request)
+        return int(session)
 
 
 # -- program -------------------------------------------------------------------------------------------------------
@@ -512,6 +705,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--tty", help="serial line to serve, e.g. /dev/ttyGS0")
     p.add_argument("--baud", type=int, default=115200, help="line rate (default %(default)s)")
     p.add_argument("--http", metavar="ADDRESS:PORT", help="listen here for HTTP requests, e.g. 192.168.7.2:5001")
+    p.add_argument("--token-file", metavar="FILE", help="what an HTTP client must know, mode 600 (needed by --http)")
+    p.add_argument("--host", action="append", default=[], metavar="NAME", help="a name of this board, beside ADDRESS")
     p.add_argument("--url", default="http://192.168.7.2:5000", help="the device's server (default %(default)s)")
     p.add_argument("--deadman", type=float, default=120.0, help="allowed silence, s (default %(default)s)")
     p.add_argument("--http-timeout", type=float, default=18.0, help="wait for the device, s (default %(default)s)")
@@ -536,13 +731,12 @@ def main(argv: list[str] | None = None) -> int:
             host, _, number = arguments.http.rpartition(":")
             if not host or not number.isdigit():
                 raise ValueError(f"http = {arguments.http}: allowed ADDRESS:PORT, e.g. 192.168.7.2:5001")
-            proxy = Proxy((host, int(number)), agent)
+            proxy = Proxy((host, int(number)), agent, read_token(arguments.token_file), arguments.host)
     except (ValueError, OSError, OverflowError) as problem:
         print(f"board_agent: {problem}", file=sys.stderr)
         return 2
-    stop = threading.Event()
-    for name in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(name, lambda *_: stop.set())
+    ends = {signal.SIGTERM, signal.SIGINT}
+    signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # in every thread: a handler waits until the main one is woken
     agent.start()
     if port is not None:
         threading.Thread(target=port.run, daemon=True).start()
@@ -551,7 +745,7 @@ def main(argv: list[str] | None = None) -> int:
     where = [arguments.tty] if arguments.tty else []
     where += [f"http://{arguments.http.rpartition(':')[0]}:{proxy.server_address[1]}"] if proxy else []
     log.info("board_agent %s ready on %s, dead-man %.6g s", VERSION, " and ".join(where), agent.deadman_s)
-    stop.wait()
+    signal.sigwait(ends)
     if port is not None:
         port.stop()
     if proxy is not None:

@@ -1,28 +1,51 @@
 """HTTP, straight to the device's server."""
 
+import contextlib
+import re
 import time
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
 
-from hardware.errors import LinkError, ProtocolError
-from hardware.link.transport import MAX_BODY, Reply, Transport, TransportConfig
+from hardware.errors import LinkError, ProtocolError, ReactorError
+from hardware.link.transport import MAX_BODY, Reply, Transport, TransportConfig, new_session
 
 __all__ = ["HttpTransport"]
 
+AGENT = "board_agent/"  # how the server's name begins where an agent stands before the device
+REFUSED = (401, 403, 409)  # by which the agent says that it did not carry a request out, and why
+
+
+def read_token(path: str) -> str:
+    """The board agent's token. Raises: LinkError naming the file and the remedy; never the token."""
+    remedy = "give backend.transport.token_file a copy of the board's (docs/board_agent.md, The token)"
+    try:
+        mode, token = Path(path).stat().st_mode, Path(path).read_bytes()[:1024].strip()
+    except OSError as error:
+        raise LinkError(f"token_file = {path}: {error.strerror}; {remedy}") from None
+    if mode & 0o077:
+        raise LinkError(f"token_file = {path}: others may use it (mode {mode & 0o777:o}); chmod 600 {path}")
+    if not re.fullmatch(rb"[!-~]{32,256}", token):
+        raise LinkError(f"token_file = {path}: not one line of 32 to 256 characters; {remedy}")
+    return token.decode("ascii")
+
 
 class HttpTransport(Transport):
-    """HTTP to a Chi.Bio server, one connection per request (its gunicorn worker closes each one anyway).
+    """HTTP to a Chi.Bio server, or to the board agent before it; one connection per request, as the server closes each.
 
     Proxies of the environment are ignored, redirects are not followed, compression is not asked for, and the whole
     answer must come within `read_s`, so that a server that dribbles bytes cannot hold the control loop.
 
     Args:
       url: http://host:port of the device; speed: device seconds per real second (1 on the bench).
-    Raises: ValueError for a malformed address; LinkError, ProtocolError from the calls.
+      session: 1 to 65535, by which a board agent knows this client from a second one.
+    Raises: ValueError for a malformed address; LinkError for a token's file; LinkError, ProtocolError from the calls.
     """
 
-    def __init__(self, url: str, speed: float = 1.0, config: TransportConfig | None = None) -> None:
+    def __init__(
+        self, url: str, speed: float = 1.0, config: TransportConfig | None = None, session: int | None = None
+    ) -> None:
         config = config or TransportConfig()
         try:
             parts = urlsplit(url)
@@ -34,12 +57,21 @@ class HttpTransport(Transport):
             raise ValueError(f"url = {url!r}: allowed http://host:port, for instance http://192.168.7.2:5000")
         self.url = url.rstrip("/")
         self._read_s = config.timeout(config.read_s, speed)
+        self._token = read_token(config.token_file) if config.token_file else ""
+        authority = {"Authorization": f"Bearer {self._token}", "X-Session": str(session or new_session())}
         self._client = httpx.Client(
             timeout=httpx.Timeout(self._read_s, connect=config.timeout(config.connect_s, speed)),
             limits=httpx.Limits(max_connections=1, max_keepalive_connections=0),
-            headers={"X-Requested-With": "XMLHttpRequest", "Accept-Encoding": "identity", "Connection": "close"},
+            headers={"X-Requested-With": "XMLHttpRequest", "Accept-Encoding": "identity", "Connection": "close"}
+            | (authority if self._token else {}),
             trust_env=False,
         )
+
+    def disarm(self) -> None:
+        """BYE to the agent, if there is one; its switch then rests until the next request."""
+        if self._token:
+            with contextlib.suppress(ReactorError):
+                self.post("/_agent/bye")
 
     def close(self) -> None:
         """Close the client. Idempotent."""
@@ -56,6 +88,9 @@ class HttpTransport(Transport):
                         raise ProtocolError(f"{method} {path}: the answer is longer than {MAX_BODY} bytes")
                     if time.monotonic() > deadline:
                         raise LinkError(f"{method} {path}: the answer was not complete after {self._read_s:.1f} s")
+                if answer.status_code in REFUSED and answer.headers.get("server", "").startswith(AGENT):
+                    why = body[:300].decode("ascii", "replace").strip()
+                    raise LinkError(f"{method} {path}: the board agent refuses it: {why}")
                 return Reply(answer.status_code, bytes(body), answer.headers.get("date", ""))
         except (httpx.RemoteProtocolError, httpx.DecodingError) as error:
             if "without sending" in str(error):  # closed before the answer was whole: a dying server, not a strange one

@@ -2,58 +2,88 @@
 
 import fcntl
 import hashlib
+import json
 import os
 import tempfile
 from pathlib import Path
-from typing import IO
 
 from hardware.errors import DeviceStateError
 from hardware.link.http import HttpTransport
 from hardware.link.serial import SerialTransport
-from hardware.link.transport import Transport, TransportConfig
+from hardware.link.transport import Reply, Transport, TransportConfig, new_session
 
-__all__ = ["lock", "open_transport"]
+__all__ = ["DeviceLock", "open_transport"]
 
 
-def lock(device: str) -> IO[str]:
+class DeviceLock:
     """A locked file for a device; the kernel frees it when it is closed or the process ends.
+
+    The file keeps the session under which this computer is known to a board agent: who takes over from a client that
+    was killed goes on under its name and is in charge at once.
 
     Args: device: its address, or what else names it: one device may have several names, each is locked.
     Raises: DeviceStateError if another process holds it.
     """
-    name = hashlib.sha256(device.encode()).hexdigest()[:16]
-    file: IO[str] = open(Path(tempfile.gettempdir()) / f"chibio-{name}.lock", "a+")  # noqa: SIM115 (held)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        file.seek(0)
-        holder = file.read().strip() or "unknown"
-        file.close()
-        raise DeviceStateError(f"{device} is already controlled by process {holder}: one client per device") from error
-    file.truncate(0)
-    file.write(str(os.getpid()))
-    file.flush()
-    return file
 
+    def __init__(self, device: str) -> None:
+        name = hashlib.sha256(device.encode()).hexdigest()[:16]
+        self._file = open(Path(tempfile.gettempdir()) / f"chibio-{name}.lock", "a+")  # noqa: SIM115 (held)
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            holder = self._read().get("process", "unknown")
+            self.close()
+            raise DeviceStateError(
+                f"{device} is already controlled by process {holder}: one client per device"
+            ) from error
+        session = self._read().get("session")
+        self.session = session if isinstance(session, int) and 0 < session < 2**16 else new_session()
+        self._file.truncate(0)
+        json.dump({"process": os.getpid(), "session": self.session}, self._file)
+        self._file.flush()
 
-class _OwnedHttp(HttpTransport):
-    """HTTP with the device's lock held as long as the transport is open."""
-
-    def __init__(self, url: str, speed: float, config: TransportConfig) -> None:
-        super().__init__(url, speed, config)
-        self._owner = lock(self.url)
+    def _read(self) -> dict[str, object]:
+        self._file.seek(0)
+        try:
+            found = json.load(self._file)
+        except ValueError:
+            return {}
+        return found if isinstance(found, dict) else {}
 
     def close(self) -> None:
-        super().close()
-        self._owner.close()
+        """Free it. Idempotent."""
+        self._file.close()
+
+
+class _Owned(Transport):
+    """A link with the device's lock held as long as it is open."""
+
+    def __init__(self, link: Transport, lock: DeviceLock) -> None:
+        self._link, self._lock = link, lock
+
+    def _request(self, method: str, path: str) -> Reply:
+        return self._link._request(method, path)
+
+    def disarm(self) -> None:
+        self._link.disarm()
+
+    def close(self) -> None:
+        self._link.close()
+        self._lock.close()
 
 
 def open_transport(config: TransportConfig, url: str, speed: float = 1.0) -> Transport:
     """The configured link, owned exclusively on this computer.
 
-    Raises: ValueError for a malformed address, LinkError if a serial line cannot be opened or its agent does not
-      answer, DeviceStateError if another process holds the device.
+    Raises: ValueError for a malformed address, LinkError if a serial line cannot be opened, its agent does not answer
+      or the token of an agent cannot be read, DeviceStateError if another process holds the device.
     """
-    if config.kind == "serial":
-        return SerialTransport(config.port, speed, config)
-    return _OwnedHttp(url, speed, config)
+    serial = config.kind == "serial"
+    lock = DeviceLock(config.port if serial else url.rstrip("/"))
+    try:
+        if serial:
+            return _Owned(SerialTransport(config.port, speed, config, session=lock.session), lock)
+        return _Owned(HttpTransport(url, speed, config, session=lock.session), lock)
+    except BaseException:
+        lock.close()
+        raise

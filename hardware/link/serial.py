@@ -1,6 +1,6 @@
 """The serial line to the board agent, which carries the requests to the device's server.
 
-Frames are those of protocol 1, described in `hardware/board/board_agent.py`.
+Frames are those of protocol 2, described in `hardware/board/board_agent.py`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hardware.errors import LinkError, ProtocolError
-from hardware.link.transport import MAX_BODY, Reply, Transport, TransportConfig
+from hardware.link.transport import MAX_BODY, Reply, Transport, TransportConfig, new_session
 
 if TYPE_CHECKING:
     import serial
 
 __all__ = ["SerialTransport", "decode_header", "encode_request"]
 
+NOT_IN_CHARGE = 21  # status of a request that the agent refuses, because another client is in charge
 MAX_REQUEST = 512  # bytes of a request line with its newline
 _HEADER = re.compile(rb"^<(\d{1,10}) (\d{1,3}) (\d{1,6}) ([0-9a-f]{8})$")
 
@@ -52,6 +53,11 @@ def decode_header(line: bytes) -> ReplyHeader | None:
     return ReplyHeader(int(match[1]), int(match[2]), int(match[3]), int(match[4], 16)) if match else None
 
 
+def _text(reply: Reply) -> str:
+    """The agent's line about a request that the device did not answer."""
+    return reply.body[:300].decode("ascii", "replace")
+
+
 class SerialTransport(Transport):
     """Framed requests over a serial line to `board_agent.py`; a line that was unplugged is reopened on the next call.
 
@@ -62,14 +68,23 @@ class SerialTransport(Transport):
     Args:
       port: serial device or pyserial URL; speed: device seconds per real second.
       attempts: times one request line is sent before the link counts as lost.
+      session: 1 to 65535, by which the agent knows this client from a second one; the upper half of every ID.
     Raises: LinkError when the line cannot be opened or nothing comes back, ProtocolError when only garbage does.
     """
 
-    def __init__(self, port: str, speed: float = 1.0, config: TransportConfig | None = None, attempts: int = 5) -> None:
+    def __init__(
+        self,
+        port: str,
+        speed: float = 1.0,
+        config: TransportConfig | None = None,
+        attempts: int = 5,
+        session: int | None = None,
+    ) -> None:
         self.port, self._speed, self._attempts = port, speed, attempts
         self._config = config or TransportConfig(kind="serial")
         self._line: serial.Serial | None = None
-        self._id = 0
+        self._session = session or new_session()
+        self._count = 0
         self.hello: dict[str, Any] = {}
         self._open()
 
@@ -94,7 +109,7 @@ class SerialTransport(Transport):
         except (OSError, ValueError) as error:  # SerialException is an OSError
             remedy = "check cable and port name, close other programs"
             raise LinkError(f"serial port {self.port}: {error}; {remedy}") from error
-        self._id = random.SystemRandom().randrange(1, 2**31)  # so that no request repeats an ID of an earlier session
+        self._count = random.SystemRandom().randrange(2**15)  # a late reply to an earlier life has another ID
         try:
             self.hello = self._parse_hello(self._exchange("HELLO", "/"))
         except BaseException:
@@ -108,8 +123,8 @@ class SerialTransport(Transport):
             protocol = hello["protocol"]
         except (ValueError, RecursionError, KeyError, TypeError) as error:
             raise ProtocolError(f"the board agent's greeting is not readable: {reply.body[:80]!r}") from error
-        if protocol != 1:
-            raise ProtocolError(f"the board agent speaks protocol {protocol}, this driver 1: install the same version")
+        if protocol != 2:
+            raise ProtocolError(f"the board agent speaks protocol {protocol}, this driver 2: install the same version")
         return dict(hello)
 
     def _drop(self) -> None:
@@ -124,7 +139,7 @@ class SerialTransport(Transport):
         reply = self._exchange(method, path)
         if reply.status >= 100:
             return reply
-        text = reply.body[:120].decode("ascii", "replace")
+        text = _text(reply)
         if reply.status in (10, 11):
             raise LinkError(f"{method} {path}: the board agent cannot reach the device ({text})")
         raise ProtocolError(f"{method} {path}: the board agent reports status {reply.status} ({text})")
@@ -132,8 +147,9 @@ class SerialTransport(Transport):
     def _exchange(self, method: str, path: str) -> Reply:
         """One request, repeated under the same ID until a whole reply came. Raises: LinkError, ProtocolError."""
         assert self._line is not None
-        self._id = self._id % 4294967295 + 1
-        frame = encode_request(self._id, method, path)
+        self._count = (self._count + 1) % 2**16
+        number = self._session << 16 | self._count
+        frame = encode_request(number, method, path)
         if len(frame) > MAX_REQUEST:
             raise ProtocolError(f"{method} {path[:40]}...: request of {len(frame)} bytes, allowed {MAX_REQUEST}")
         wait_s = self._config.read_s if method in ("GET", "POST") else self._config.connect_s
@@ -147,8 +163,10 @@ class SerialTransport(Transport):
                     if time.monotonic() > last_try:
                         break
                 self._line.write(frame)
-                reply, seen = self._await(time.monotonic() + seconds)
+                reply, seen = self._await(number, time.monotonic() + seconds)
                 garbage += seen
+                if reply is not None and reply.status == NOT_IN_CHARGE:
+                    raise LinkError(f"{method} {path}: the board agent refuses it: {_text(reply)}")
                 if reply is not None:
                     return reply
         except OSError as error:
@@ -161,8 +179,8 @@ class SerialTransport(Transport):
             )
         raise LinkError(f"{method} {path}: no reply on {self.port} in {self._attempts} tries; is the agent running?")
 
-    def _await(self, deadline: float) -> tuple[Reply | None, int]:
-        """The reply to the request in flight, or None when it must be repeated, and how many frames were damaged."""
+    def _await(self, number: int, deadline: float) -> tuple[Reply | None, int]:
+        """The reply to the request `number`, or None when it must be repeated, and how many frames were damaged."""
         damaged = 0
         while (line := self._until_newline(deadline)) is not None:
             header = decode_header(line)
@@ -175,7 +193,7 @@ class SerialTransport(Transport):
                 return None, damaged + 1
             if header.number == 0:
                 return None, damaged + 1  # the agent could not read the request
-            if header.number == self._id:
+            if header.number == number:
                 return Reply(header.status, body), damaged
         return None, damaged
 

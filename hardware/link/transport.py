@@ -3,15 +3,21 @@
 A transport raises `LinkError` when no answer came and `ProtocolError` when it was garbage.
 """
 
+import random
 from dataclasses import dataclass
 from typing import Protocol
 
 from conf.schema import check, setting
 
-__all__ = ["MAX_BODY", "Reply", "Transport", "TransportConfig"]
+__all__ = ["MAX_BODY", "Reply", "Transport", "TransportConfig", "new_session"]
 
 MAX_BODY = 262_144
 """Bytes of the longest answer; a full state is 36 KB (docs/device.md, Routes), the board agent carries at most this."""
+
+
+def new_session() -> int:
+    """A name for a client, 1 to 65535, by which a board agent knows it from a second one."""
+    return random.SystemRandom().randrange(1, 2**16)
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,9 @@ class TransportConfig:
         below=30.0,
     )
     port: str = setting("/dev/ttyACM0", "serial device of this computer")
+    token_file: str = setting(
+        "", "over HTTP through the board agent: file with a copy of the board's token, mode 600; '' without an agent"
+    )
     baud: int = setting(115200, "irrelevant on the USB gadget, right for the debug header", at_least=9600)
 
     def __post_init__(self) -> None:

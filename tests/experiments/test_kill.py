@@ -1,6 +1,10 @@
-"""SIGKILL and resume of a real run on a real emulator; the campaign: `python -m experiments.kill_campaign`."""
+"""SIGKILL and resume of a real run on a real emulator; the campaign: `python -m experiments.kill_campaign`.
+
+KILL_SEED=7 python -m pytest tests/experiments/test_kill.py     kills at other moments
+"""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -10,10 +14,12 @@ from experiments.kill_campaign import kill_campaign
 from experiments.reliability.kills import KillConfig
 from hardware.storage.journal import read_journal
 
+KILL_SEED = int(os.environ.get("KILL_SEED", "0"))
+
 
 def test_killed_six_times_nothing_is_lost_or_doubled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
-    kill_campaign(KillConfig(kills=6, runs=1, workers=1, speed=60.0, longest_s=2.5), tmp_path)
+    kill_campaign(KillConfig(kills=6, runs=1, workers=1, speed=60.0, longest_s=2.5, seed=KILL_SEED), tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["lives"] == 7
     assert summary["rows_lost"] == summary["rows_doubled"] == summary["doses_lost"] == summary["doses_doubled"] == 0

@@ -1,13 +1,16 @@
 """The page: complete, self-contained, and rendered by a real browser; its tables are the summary's numbers."""
 
+import contextlib
 import csv
 import html.parser
 import json
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +92,7 @@ def test_page_is_well_formed_and_points_to_nothing_outside(text):
     for address in page.addresses:
         assert address.startswith(("#", "data:"))
         assert not address.startswith("#") or address[1:] in page.ids
-    assert "http" not in text
+    assert "://" not in text
     assert "@import" not in text
     assert set(re.findall(r"url\((.)", text)) <= {"#"}
 
@@ -98,7 +101,7 @@ def test_page_holds_what_it_must(text, benchmark):
     summary = json.loads((benchmark / "summary.json").read_text())
     for figure in summary["figures"]:
         assert figure["title"].replace("'", "&#39;") in text
-    assert text.count("<svg") == len(summary["figures"]) >= 6
+    assert text.count("data:image/svg+xml;base64,") == len(summary["figures"]) >= 6
     for word in ("What was run", "seed", "turbidostat-dqn", "overrides", "T = 1 min", "T = window",
                  "sensor-noise floor",
                  "control effort", "plant, pump and start are not the paper"):  # fmt: skip
@@ -224,7 +227,7 @@ def test_any_run_gets_a_page(tmp_path):
     page = Strict()
     page.feed(text)
     assert page.open == []
-    assert text.count("<svg") == 1
+    assert text.count("data:image/svg+xml;base64,") == 1
     assert text.count("data:image/png;base64,") == 1
     for word in ("mu.value", "0.0301", "0.02, 0.04", "x &amp; y", "both", "fit", "seed: 7", "&lt;1/min&gt;"):
         assert word in text
@@ -241,8 +244,45 @@ def test_a_folder_of_runs_gets_one_page(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("[]", ["none"]),
+        ("[1, [2, [3.5]], null]", ["1, 2, 3.5, –"]),
+        ("7", ["7"]),
+        ("null", ["–"]),
+        ('[{"a": 1}, {"b": {"c": "x"}}]', ["b.c", "<td>x</td>"]),
+        ('{"mixed": [{"a": 1}, 2, [3]]}', ["mixed", "a", "3"]),
+        ('{"empty": [{}], "e": {}}', ["empty"]),
+        ('{"deep": {"deeper": {"deepest": [[{"a": [1]}]]}}}', ["deep.deeper.deepest"]),
+        ('{"../../out": [{"a": 1}]}', ["../../out"]),
+        ('{"a/b": [{"c": 1}]}', ["a/b"]),
+        ('{"s": Infinity, "t": NaN, "u": 1e999}', ["inf"]),
+    ],
+)
+def test_a_summary_of_any_shape_gets_a_page(content, words, tmp_path):
+    run = tmp_path / "a" / "b" / "run"
+    run.mkdir(parents=True)
+    (run / "summary.json").write_text(content)
+    text = report.write(run).read_text(encoding="utf-8")
+    page = Strict()
+    page.feed(text)
+    assert page.open == []
+    for word in words:
+        assert word in text
+    assert {p.parent for p in tmp_path.rglob("*") if p.is_file()} <= {run, run / "tables"}
+
+
+@pytest.mark.parametrize(
     ("content", "message"),
-    [(None, "no summary.json"), ("{torn", "damaged"), (b"\xff\xfe\x00", "damaged")],
+    [
+        (None, "no summary.json"),
+        ("{torn", "damaged"),
+        (b"\xff\xfe\x00", "damaged"),
+        (200_000 * "[", "damaged"),
+        ('{"half": "\\ud800"}', "damaged"),
+        ('{"beside_paper": 3}', "not the summary.json of a benchmark"),
+        ('{"beside_paper": [], "rows": {}}', "not the summary.json of a benchmark"),
+    ],
 )
 def test_what_is_no_run_ends_in_one_line(content, message, tmp_path):
     if content is not None:
@@ -250,6 +290,14 @@ def test_what_is_no_run_ends_in_one_line(content, message, tmp_path):
         (tmp_path / "summary.json").write_bytes(data)
     with pytest.raises(frame.UserError, match=message):
         report.write(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "content"), [("a.svg", "not drawn"), ("b.png", "<svg>"), ("c.svg", "")])
+def test_a_figure_that_is_none_ends_in_one_line(name, content, tmp_path):
+    run = run_folder(tmp_path / "run", {})
+    (run / name).write_text(content)
+    with pytest.raises(frame.UserError, match=f"{name}: not an SVG or PNG; delete it or draw it again"):
+        report.write(run)
 
 
 def test_latest_is_the_newest_run(tmp_path):
@@ -280,26 +328,72 @@ PROBE = """<script>addEventListener('load', () => {
   const of = (selector) => [...document.querySelectorAll(selector)];
   document.body.dataset.probe = JSON.stringify({
     requests: performance.getEntriesByType('resource').map((e) => e.name).filter((n) => !n.startsWith('data:')),
-    figures: of('svg').map((s) => [s.getBoundingClientRect().width, s.getBoundingClientRect().height]),
-    labels: of('svg text').filter((t) => t.getBoundingClientRect().width > 0).length,
+    figures: of('figure img').map((s) => [s.getBoundingClientRect().width, s.getBoundingClientRect().height]),
+    drawn: of('img').filter((i) => i.complete && i.naturalWidth > 0).length,
     tables: of('table').length,
     sideways: document.documentElement.scrollWidth - document.documentElement.clientWidth,
   });
 });</script></body>"""
 
 
+def probe(folder: Path, page: Path) -> dict:
+    """What a browser makes of a page, by a script that looks; the page forbids all of them, its copy does not."""
+    text = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page.read_text(encoding="utf-8"))
+    (folder / "probed.html").write_text(text.replace("</body>", PROBE), encoding="utf-8")
+    dom = chromium(folder, folder / "probed.html", "--dump-dom")
+    return json.loads(re.search(r'data-probe="([^"]*)"', dom)[1].replace("&quot;", '"'))
+
+
+HOSTILE = """<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" width="400" height="200"
+ onload="top.document.title='owned'"><script>top.document.title='owned'; fetch('ADDRESS/script')</script>
+<script href="ADDRESS/script.js"/><image href="ADDRESS/a.png" width="9" height="9"/>
+<image xlink:href="ADDRESS/b.png" width="9" height="9" onerror="top.document.title='owned'"/>
+<style>@import url(ADDRESS/c.css); rect { fill: url(ADDRESS/d.svg#e) }</style><use href="ADDRESS/f.svg#g"/>
+<foreignObject width="99" height="99"><iframe xmlns="http://www.w3.org/1999/xhtml" src="ADDRESS/h"/></foreignObject>
+<a href="javascript:top.document.title='owned'"><rect id="s0" width="300" height="150"/></a></svg>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)")
+@pytest.mark.parametrize("guarded", [True, False])
+def test_no_figure_runs_a_script_or_asks_for_anything(guarded, tmp_path):
+    """In a browser, with a server that would hear of it: with the page's ban on scripts, and without it."""
+    heard: list[bytes] = []
+    listener = socket.create_server(("127.0.0.1", 0))
+    listener.settimeout(0.05)
+
+    def listen():
+        while listener.fileno() >= 0:
+            with contextlib.suppress(OSError):
+                connection, _ = listener.accept()
+                heard.append(connection.recv(200))
+                connection.close()
+
+    thread = threading.Thread(target=listen)
+    thread.start()
+    run = run_folder(tmp_path / "run", {"<img src=x onerror=document.title='owned'>": "<script>document.title='owned'"})
+    (run / "figures").mkdir()
+    svg = HOSTILE.replace("ADDRESS", f"http://127.0.0.1:{listener.getsockname()[1]}")
+    (run / "figures" / "a.svg").write_text(svg)
+    page = report.write(run)
+    if guarded:
+        dom = chromium(tmp_path, page, "--dump-dom")
+    else:
+        assert probe(tmp_path, page)["figures"] == [[400, 200]]
+        dom = chromium(tmp_path, tmp_path / "probed.html", "--dump-dom")
+    listener.close()
+    thread.join()
+    assert heard == []
+    assert "owned</title>" not in dom
+
+
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)")
 def test_a_browser_shows_the_page(benchmark, tmp_path):
     """Rendered for real: figures have their size, text its width, nothing is asked from anywhere, nothing overflows."""
-    page = tmp_path / "probed.html"
-    page.write_text((benchmark / "report.html").read_text(encoding="utf-8").replace("</body>", PROBE), encoding="utf-8")
-    dom = chromium(tmp_path, page, "--dump-dom")
-    found = json.loads(re.search(r'data-probe="([^"]*)"', dom)[1].replace("&quot;", '"'))
+    found = probe(tmp_path, benchmark / "report.html")
     assert found["requests"] == []
     assert found["sideways"] == 0
     assert found["tables"] >= 5
-    assert found["labels"] > 100
-    assert len(found["figures"]) >= 6
+    assert found["drawn"] == len(found["figures"]) >= 6
     assert all(width > 300 and height > 150 for width, height in found["figures"])
 
     picture = tmp_path / "page.png"

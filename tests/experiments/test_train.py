@@ -1,4 +1,7 @@
-"""Training as a user runs it: real processes, real files, real kills."""
+"""Training as a user runs it: real processes, real files, real kills.
+
+KILL_SEED=7 python -m pytest tests/experiments/test_train.py tests/experiments/test_kill.py     kills at other moments
+"""
 
 import json
 import os
@@ -27,6 +30,7 @@ SHORT = [
     "eval_every=200",
     "checkpoint_every=200",
 ]
+KILL_SEED = int(os.environ.get("KILL_SEED", "0"))
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.xdist_group("train")  # its tests share a run, made once
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
@@ -108,7 +112,7 @@ def test_selection_and_report_share_no_start():
 
 
 def test_killed_at_a_random_moment_and_resumed_gives_the_same_weights(whole, tmp_path):
-    rng = np.random.default_rng(int(time.time()))
+    rng = np.random.default_rng(KILL_SEED)
     folder = tmp_path / "killed"
     process = subprocess.Popen(
         command("train", *SHORT, "n_agents=2", "seed=4", f"hydra.run.dir={folder}"),

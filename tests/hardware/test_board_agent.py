@@ -9,16 +9,18 @@ import contextlib
 import json
 import os
 import pty
+import re
 import select
 import shlex
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 import tty
 import zlib
 from collections.abc import Iterator
-from http.client import HTTPConnection
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,7 @@ from tests.hardware.test_emulator_server import Process
 
 SOURCE = Path(board_agent.__file__)
 PYTHON = os.environ.get("BOARD_PYTHON", sys.executable)
+TOKEN = "0123456789abcdef" * 4
 PATHS = st.text(st.characters(min_codepoint=33, max_codepoint=126, exclude_characters=">"), max_size=60).map(
     "/".__add__
 )
@@ -67,6 +70,10 @@ def test_the_service_file_starts_it_with_arguments_it_understands() -> None:
     assert command[1].endswith("board_agent.py")
     arguments = board_agent.parser().parse_args(command[2:])
     assert arguments.tty == "/dev/ttyGS0"
+    other = re.search(r"^# ExecStart=(.+)$", SOURCE.with_name("board_agent.service").read_text(), re.MULTILINE)
+    assert other
+    arguments = board_agent.parser().parse_args(shlex.split(other[1])[2:])
+    assert (arguments.http, arguments.token_file) == ("192.168.7.2:5001", "/root/board_agent/token")
     assert unit["Service"]["Restart"] == "always"
 
 
@@ -136,6 +143,14 @@ def test_well_summed_nonsense_is_refused(number: int, method: str, path: str) ->
     assert decode_request(encode_request(number, method, path)[:-1]) is None
 
 
+def make_token(folder: Path, text: str = TOKEN, mode: int = 0o600) -> Path:
+    """A token's file as the installation makes it."""
+    path = folder / "token"
+    path.write_text(text + "\n")
+    path.chmod(mode)
+    return path
+
+
 class Recorder(Device):
     """A device that remembers what it was asked."""
 
@@ -173,6 +188,86 @@ def test_a_repeated_request_is_answered_from_memory_until_hello() -> None:
     agent.answer_line(encode_request(9, "HELLO", "/")[:-1])
     agent.answer_line(line)
     assert len(device.asked) == 4
+
+
+def ask(agent: Agent, session: int, method: str, path: str = "/", count: int = 7) -> bytes:
+    return agent.answer_line(encode_request(session << 16 | count, method, path)[:-1])
+
+
+def test_a_second_client_on_the_line_is_refused_until_the_first_says_bye() -> None:
+    device = Recorder()
+    agent = Agent(device, 10.0)
+    assert ask(agent, 3, "HELLO").split(b" ")[1] == b"200"
+    for method, path in (
+        ("HELLO", "/"),
+        ("POST", "/SetOutputOn/Pump1/1/M0"),
+        ("GET", "/x"),
+        ("PING", "/"),
+        ("BYE", "/"),
+    ):
+        head, _, body = ask(agent, 4, method, path).partition(b"\n")
+        assert head.split(b" ")[1] == b"21", method
+        assert b"another client is in charge (on the serial line" in body
+        assert body.count(b"\n") == 1
+    assert device.asked == []
+    assert agent.armed
+    assert ask(agent, 3, "POST", "/x", 8).startswith(b"<196616 204 ")  # 3 * 65536 + 8
+    assert ask(agent, 3, "BYE").split(b" ")[1] == b"200"
+    assert ask(agent, 4, "POST", "/y").split(b" ")[1] == b"204"
+    assert ask(agent, 3, "PING").split(b" ")[1] == b"21"
+    assert device.asked == [("POST", "/x"), ("POST", "/y")]
+
+
+def test_serial_line_and_http_at_once_are_two_clients_even_under_one_session() -> None:
+    agent = Agent(Recorder(), 10.0)
+    assert agent.claim("HTTP", 3) == ""
+    assert ask(agent, 3, "HELLO").split(b" ")[1] == b"21"
+    assert agent.claim("HTTP", 4, arm=False).startswith("another client is in charge (on HTTP, heard 0 s ago)")
+    assert agent.claim("HTTP", 3, arm=False) == ""
+    assert ask(agent, 3, "HELLO").split(b" ")[1] == b"200"
+
+
+class Strange(Recorder):
+    """Its first state is nested deeper than any parser goes."""
+
+    def request(self, method: str, path: str, timeout_s: float | None = None) -> tuple[int, bytes, str]:
+        super().request(method, path)
+        if path != "/getSysdata/":
+            return 204, b"", "text/html"
+        first = len(self.asked) == 1
+        return 200, b"[" * 200_000 if first else b'{"presentDevices": {"M0": 0}}', "application/json"
+
+
+def test_a_state_that_cannot_be_parsed_is_a_pass_that_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(board_agent, "RETRY_S", (0.01, 0.01))
+    device = Strange()
+    agent = Agent(device, 0.05)
+    assert agent.claim("HTTP", 3) == ""
+    agent.start()
+    AgentLab.until(lambda: len(device.asked) == 2)
+    AgentLab.until(lambda: agent.claim("HTTP", 4) == "")  # the silent client has lost its charge
+    agent.stop()
+
+
+def test_a_device_that_dribbles_holds_nobody_longer_than_the_time_out() -> None:
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection, contextlib.suppress(OSError):
+            connection.recv(4096)
+            for byte in b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok":
+                connection.sendall(bytes([byte]))
+                time.sleep(0.02)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    device = Device(f"http://127.0.0.1:{listener.getsockname()[1]}", 0.2)
+    with pytest.raises(board_agent.Unanswered) as caught:
+        device.request("GET", "/getSysdata/")
+    assert caught.value.status == board_agent.NO_ANSWER
+    thread.join()
+    listener.close()
 
 
 # -- reduction -------------------------------------------------------------------------------------------------------
@@ -316,7 +411,7 @@ def test_conversation(lab: AgentLab) -> None:
     status, body = lab.ask("HELLO", "/")
     hello = json.loads(body)
     assert status == 200
-    assert (hello["agent"], hello["protocol"], hello["deadman_s"], hello["trips"]) == ("board_agent", 1, 60.0, 0)
+    assert (hello["agent"], hello["protocol"], hello["deadman_s"], hello["trips"]) == ("board_agent", 2, 60.0, 0)
     assert lab.ask("PING", "/")[0] == 200
     assert lab.ask("POST", "/changeDevice/M1") == (204, b"")
     status, body = lab.ask("GET", "/getSysdata/")
@@ -495,44 +590,7 @@ def test_armed_from_the_start(tmp_path: Path) -> None:
         one.end()
 
 
-# -- beside HTTP -----------------------------------------------------------------------------------------------------
-
-
-def test_http_mode(tmp_path: Path) -> None:
-    one = AgentLab(tmp_path, "--deadman", "1", "--http-timeout", "1", "--http", "127.0.0.1:0", tty_line=False)
-    port = int(one.log.read_text().rsplit("127.0.0.1:", 1)[1].split(",")[0])
-
-    def ask(method: str, path: str) -> tuple[int, bytes]:
-        connection = HTTPConnection("127.0.0.1", port, timeout=5)
-        connection.request(method, path)
-        answer = connection.getresponse()
-        body = answer.read()
-        connection.close()
-        return answer.status, body
-
-    try:
-        assert ask("POST", "/SetOutputTarget/Pump1/M0/1") == (204, b"")
-        assert ask("POST", "/SetOutputOn/Pump1/1/M0") == (204, b"")
-        status, body = ask("GET", "/getSysdata/")
-        assert (status, "AS7341" in json.loads(body)) == (200, True)  # not reduced
-        assert ask("POST", "/changeDevice/M9")[0] == 500
-        for _ in range(8):
-            assert ask("POST", "/_agent/heartbeat") == (204, b"")
-            time.sleep(0.2)
-        assert one.motors() == {"M0/Pump1"}
-        one.until(lambda: not one.motors())
-        one.until(lambda: "pumps verified off" in one.log.read_text())  # the pass has ended, nothing else asks
-        assert json.loads(ask("GET", "/_agent/status")[1])["trips"] == 1
-        assert ask("POST", "/_agent/bye")[0] == 204
-        assert json.loads(ask("GET", "/_agent/status")[1])["armed"] is False
-        assert ask("GET", "/_agent/other")[0] == 404
-        one.emulator.fault("lost_reply/all/1")
-        assert ask("POST", "/changeDevice/M0")[0] == 504
-        one.emulator.fault("crash")
-        time.sleep(0.2)
-        assert ask("GET", "/getSysdata/")[0] == 502
-    finally:
-        one.end()
+# -- start -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -546,13 +604,14 @@ def test_http_mode(tmp_path: Path) -> None:
         ["--tty", "x", "--url", "http://board/path"],
         ["--tty", "x", "--url", "http://board:port"],
         ["--tty", "x", "--baud", "12345"],
-        ["--http", "5001"],
-        ["--http", "203.0.113.1:5001"],
-        ["--http", "127.0.0.1:99999"],
+        ["--http", "5001", "--token-file", "{token}"],
+        ["--http", "203.0.113.1:5001", "--token-file", "{token}"],
+        ["--http", "127.0.0.1:99999", "--token-file", "{token}"],
     ],
 )
-def test_bad_arguments_give_one_line(arguments: list[str]) -> None:
-    done = subprocess.run([PYTHON, str(SOURCE), *arguments], capture_output=True, text=True, timeout=20)
+def test_bad_arguments_give_one_line(arguments: list[str], tmp_path: Path) -> None:
+    given = [word.format(token=make_token(tmp_path)) for word in arguments]
+    done = subprocess.run([PYTHON, str(SOURCE), *given], capture_output=True, text=True, timeout=20)
     assert done.returncode == 2
     assert done.stderr.startswith("board_agent: ")
     assert done.stderr.count("\n") == 1

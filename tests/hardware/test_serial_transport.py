@@ -28,7 +28,7 @@ from hardware.link.transport import Reply, TransportConfig
 from hardware.reactor import Command
 
 AGENT = Path(__file__).parents[2] / "hardware" / "board" / "board_agent.py"
-HELLO = b'{"agent": "board_agent", "protocol": 1}'
+HELLO = b'{"agent": "board_agent", "protocol": 2}'
 
 
 def config(port: Path, **values: float) -> TransportConfig:
@@ -139,7 +139,7 @@ def test_silence_is_a_link_error_in_bounded_time_and_garbage_a_protocol_error(bo
 
 
 def test_a_foreign_or_newer_peer_is_refused(tmp_path: Path) -> None:
-    for body, words in ((b'{"protocol": 2}', "protocol 2"), (b"login:", "not readable"), (b"[1]", "not readable")):
+    for body, words in ((b'{"protocol": 3}', "protocol 3"), (b"login:", "not readable"), (b"[1]", "not readable")):
         b = Board(tmp_path, lambda n, m, p, body=body: encode_reply(n, 200, body))  # type: ignore[misc]
         with pytest.raises(ProtocolError, match=words):
             SerialTransport(str(b.port), config=config(b.port))

@@ -1,0 +1,471 @@
+"""The board agent's HTTP door: who may ask, what a request looks like, one client in charge; over real sockets.
+
+BOARD_PYTHON=python3.7 runs the agent under the interpreter of the board.
+"""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hardware.board import board_agent
+from hardware.board.board_agent import Agent, Device, Proxy
+from hardware.errors import LinkError
+from hardware.link.http import HttpTransport
+from hardware.link.open import open_transport
+from hardware.link.transport import Transport, TransportConfig
+from tests.hardware.test_board_agent import PYTHON, SOURCE, TOKEN, AgentLab, Recorder, make_token
+from tests.hardware.test_http_transport import Server
+
+PUMP = "/SetOutputOn/Pump1/1/M0"
+BEARER = f"Authorization: Bearer {TOKEN}"
+
+
+def talk(port: int, data: bytes) -> tuple[int, str, bytes]:
+    """(status, head, body) that a connection which sends `data` gets; status 0 if nothing comes."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10.0) as line:
+        line.sendall(data)
+        answer = b""
+        while chunk := line.recv(65536):
+            answer += chunk
+    head, _, body = answer.partition(b"\r\n\r\n")
+    return int(head.split(b" ")[1]) if head else 0, head.decode("latin-1").lower(), body
+
+
+def request(port: int, method: str, path: str, *fields: str, host: str = "127.0.0.1:5001", body: str = "") -> bytes:
+    lines = [f"{method} {path} HTTP/1.1", f"Host: {host}", *fields]
+    lines += [f"Content-Length: {len(body)}"] * (method != "GET")
+    return "\r\n".join([*lines, "", body]).encode("latin-1")
+
+
+def ask(port: int, method: str, path: str, *fields: str, host: str = "127.0.0.1:5001") -> tuple[int, bytes]:
+    status, _, body = talk(port, request(port, method, path, *fields, host=host))
+    return status, body
+
+
+# -- who may ask -----------------------------------------------------------------------------------------------------
+
+
+class HttpLab(AgentLab):
+    """Agent with a token before an emulator; `port` is its HTTP port."""
+
+    def __init__(self, folder: Path, deadman_s: float, tty_line: bool = False) -> None:
+        self.token = make_token(folder)
+        words = ["--deadman", str(deadman_s), "--http-timeout", "1", "--http", "127.0.0.1:0"]
+        super().__init__(folder, *words, "--token-file", str(self.token), tty_line=tty_line)
+        self.port = int(self.log.read_text().rsplit("127.0.0.1:", 1)[1].split(",")[0])
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HttpLab]:
+    """One whose client has set a pump's target and gone on living; its session is 1."""
+    one = HttpLab(tmp_path_factory.mktemp("guarded"), 600.0)
+    assert ask(one.port, "POST", "/SetOutputTarget/Pump1/M0/1", BEARER, "X-Session: 1")[0] == 204
+    yield one
+    one.end()
+
+
+@pytest.mark.parametrize("path", [PUMP, "/changeDevice/M1", "/_agent/bye", "/_agent/heartbeat"])
+@pytest.mark.parametrize(
+    ("fields", "host", "status", "words"),
+    [
+        (["Origin: http://evil.example"], "127.0.0.1:5001", 403, b"web page"),
+        (["Origin: null"], "127.0.0.1:5001", 403, b"web page"),
+        (["Origin: http://127.0.0.1:5001", BEARER], "127.0.0.1:5001", 403, b"web page"),
+        (["Origin: http://evil.example", BEARER], "127.0.0.1:5001", 403, b"web page"),
+        ([BEARER], "evil.example", 403, b"evil.example"),
+        ([BEARER], "evil.example:5001", 403, b"--host"),
+        ([BEARER], "127.0.0.1.evil.example:5001", 403, b"--host"),
+        ([BEARER], "127.0.0.1@evil.example", 403, b"--host"),
+        ([BEARER], "", 403, b"--host"),
+        ([], "127.0.0.1:5001", 401, b"token_file"),
+        (["X-Requested-With: XMLHttpRequest"], "127.0.0.1:5001", 401, b"token_file"),
+        (["Authorization: Bearer "], "127.0.0.1:5001", 401, b"token_file"),
+        ([f"Authorization: Bearer {TOKEN[:-1]}"], "127.0.0.1:5001", 401, b"token_file"),
+        ([BEARER + "0"], "127.0.0.1:5001", 401, b"token_file"),
+        ([f"Authorization: Basic {TOKEN}"], "127.0.0.1:5001", 401, b"token_file"),
+        (["Authorization: Bearer \xb2\xff"], "127.0.0.1:5001", 401, b"token_file"),
+        ([BEARER], "127.0.0.1:5001", 409, b"another client is in charge"),  # that of no session
+        ([BEARER, "X-Session: 65536"], "127.0.0.1:5001", 400, b"0 to 65535"),
+        ([BEARER, "X-Session: \xb2"], "127.0.0.1:5001", 400, b"0 to 65535"),
+    ],
+)
+def test_who_may_not_ask_is_refused_in_one_line_and_nothing_runs(
+    guarded: HttpLab, fields: list[str], host: str, status: int, words: bytes, path: str
+) -> None:
+    found, head, body = talk(guarded.port, request(guarded.port, "POST", path, *fields, host=host))
+    assert found == status
+    assert words in body
+    assert body.count(b"\n") == 1
+    assert "access-control" not in head
+    state = json.loads(guarded.emulator.ask("GET", "/getSysdata/")[1])
+    assert (state["UIDevice"], state["Pump1"]["ON"]) == ("M0", 0)
+    assert guarded.motors() == set()
+    assert json.loads(ask(guarded.port, "GET", "/_agent/status", BEARER)[1])["armed"] is True
+
+
+@pytest.mark.parametrize("kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data"])
+def test_what_a_page_may_send_without_asking_first_is_refused(guarded: HttpLab, kind: str) -> None:
+    data = request(guarded.port, "POST", PUMP, f"Content-Type: {kind}", "Origin: http://evil.example", body="a=b")
+    assert talk(guarded.port, data)[0] == 413
+    data = request(guarded.port, "POST", PUMP, f"Content-Type: {kind}")  # an old browser sends no Origin
+    assert talk(guarded.port, data)[0] == 401
+    assert guarded.motors() == set()
+
+
+def test_a_preflight_opens_nothing(guarded: HttpLab) -> None:
+    asks = ["Access-Control-Request-Method: POST", "Access-Control-Request-Headers: authorization",
+            "Access-Control-Request-Private-Network: true"]  # fmt: skip
+    status, head, _ = talk(guarded.port, request(guarded.port, "OPTIONS", PUMP, "Origin: http://evil.example", *asks))
+    assert status == 405
+    assert "access-control" not in head
+
+
+@pytest.mark.parametrize("path", ["/", "/getSysdata/", "/_agent/status"])
+def test_reading_needs_the_token_too(guarded: HttpLab, path: str) -> None:
+    """A read takes the device's only worker, and shows whichever reactor is selected."""
+    assert ask(guarded.port, "GET", path)[0] == 401
+    assert ask(guarded.port, "GET", path, BEARER, host="evil.example")[0] == 403
+    assert ask(guarded.port, "GET", path, BEARER, "X-Session: 1")[0] == 200
+
+
+def test_what_is_refused_is_no_sign_of_life(tmp_path: Path) -> None:
+    lab = HttpLab(tmp_path, 1.0)
+    try:
+        for path in ("/SetOutputTarget/Pump1/M0/1", PUMP):
+            assert ask(lab.port, "POST", path, BEARER, "X-Session: 1")[0] == 204
+        lab.until(lambda: lab.motors() == {"M0/Pump1"})
+
+        def off() -> bool:
+            assert ask(lab.port, "POST", "/_agent/heartbeat")[0] == 401
+            assert ask(lab.port, "GET", "/getSysdata/")[0] == 401
+            assert ask(lab.port, "POST", "/_agent/bye", BEARER, "X-Session: 2")[0] in (204, 409)  # 204: hand-over
+            return not lab.motors()
+
+        lab.until(off)
+    finally:
+        lab.end()
+
+
+def test_only_what_is_carried_gets_the_constant_header_and_the_token_stays_here() -> None:
+    device = Server()
+    proxy = serve(Agent(Device(device.url, 2.0), 600.0))
+    port = proxy.server_address[1]
+    assert ask(port, "POST", PUMP, "X-Requested-With: XMLHttpRequest")[0] == 401
+    assert ask(port, "POST", PUMP, "Origin: http://evil.example", BEARER)[0] == 403
+    assert device.requests == []
+    assert ask(port, "POST", PUMP, BEARER, host="localhost:5001")[0] == 204
+    (sent,) = device.requests
+    assert sent.startswith(b"POST /SetOutputOn/Pump1/1/M0 HTTP/1.1\r\n")
+    assert b"X-Requested-With: XMLHttpRequest\r\n" in sent
+    assert b"uthorization" not in sent
+    assert TOKEN.encode() not in sent
+    close(proxy)
+    device.close()
+
+
+def test_http_mode(tmp_path: Path) -> None:
+    one = HttpLab(tmp_path, 1.0)
+
+    def post(path: str) -> tuple[int, bytes]:
+        return ask(one.port, "POST", path, BEARER)
+
+    def status() -> dict[str, object]:
+        return dict(json.loads(ask(one.port, "GET", "/_agent/status", BEARER)[1]))
+
+    try:
+        assert post("/SetOutputTarget/Pump1/M0/1") == (204, b"")
+        assert post(PUMP) == (204, b"")
+        found, body = ask(one.port, "GET", "/getSysdata/", BEARER)
+        assert (found, "AS7341" in json.loads(body)) == (200, True)  # not reduced
+        assert post("/changeDevice/M9")[0] == 500
+        for _ in range(8):
+            assert post("/_agent/heartbeat") == (204, b"")
+            time.sleep(0.2)
+        assert one.motors() == {"M0/Pump1"}
+        one.until(lambda: not one.motors())
+        one.until(lambda: "pumps verified off" in one.log.read_text())  # the pass has ended, nothing else asks
+        assert status()["trips"] == 1
+        assert post("/_agent/bye")[0] == 204
+        assert status()["armed"] is False
+        assert ask(one.port, "GET", "/_agent/other", BEARER)[0] == 404
+        assert ask(one.port, "GET", "/_agent/bye", BEARER)[0] == 404
+        one.emulator.fault("lost_reply/all/1")
+        assert post("/changeDevice/M0")[0] == 504
+        one.emulator.fault("crash")
+        time.sleep(0.2)
+        assert ask(one.port, "GET", "/getSysdata/", BEARER)[0] == 502
+    finally:
+        one.end()
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "words"),
+    [
+        (None, 0o600, "without token-file"),
+        ("", 0o600, "32 to 256"),
+        ("short", 0o600, "32 to 256"),
+        (TOKEN + " " + TOKEN, 0o600, "32 to 256"),
+        (TOKEN, 0o644, "chmod 600"),
+        (TOKEN, 0o620, "chmod 600"),
+    ],
+)
+def test_without_a_token_it_does_not_listen(text: str | None, mode: int, words: str, tmp_path: Path) -> None:
+    given = [] if text is None else ["--token-file", str(make_token(tmp_path, text, mode))]
+    command = [PYTHON, str(SOURCE), "--http", "127.0.0.1:0", *given]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    assert done.returncode == 2
+    assert done.stderr.startswith("board_agent: ")
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert "short" not in done.stderr
+    assert TOKEN not in done.stderr
+
+
+# -- what a request looks like ---------------------------------------------------------------------------------------
+
+
+def serve(agent: Agent) -> Proxy:
+    proxy = Proxy(("127.0.0.1", 0), agent, TOKEN.encode(), ["board.local"])
+    threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
+    return proxy
+
+
+def close(proxy: Proxy) -> None:
+    proxy.shutdown()
+    proxy.server_close()
+
+
+@pytest.fixture
+def door() -> Iterator[tuple[Proxy, Recorder]]:
+    device = Recorder()
+    proxy = serve(Agent(device, 600.0))
+    yield proxy, device
+    close(proxy)
+
+
+GOOD = f"Host: 127.0.0.1\r\n{BEARER}\r\n".encode()
+POST = b"POST /x HTTP/1.1\r\n" + GOOD
+
+
+@pytest.mark.parametrize(
+    ("data", "status"),
+    [
+        (POST + "Content-Length: ²\r\n\r\n".encode(), 400),
+        (POST + b"Content-Length: \xb2\r\n\r\n", 400),
+        (POST + "Content-Length: ٣\r\n\r\n".encode(), 400),
+        (POST + b"Content-Length: -1\r\n\r\n", 400),
+        (POST + b"Content-Length: +0\r\n\r\n", 400),
+        (POST + b"Content-Length: 0, 0\r\n\r\n", 400),
+        (POST + b"Content-Length: 0x0\r\n\r\n", 400),
+        (POST + b"Content-Length:\r\n\r\n", 411),
+        (POST + b"\r\n", 411),
+        (POST + b"Content-Length: 0\r\nContent-Length: 0\r\n\r\n", 400),
+        (POST + b"Content-Length: 0\r\ncontent-length: 5\r\n\r\nabcde", 400),
+        (POST + b"Transfer-Encoding: chunked\r\n\r\n5\r\nabcde\r\n0\r\n\r\n", 411),
+        (POST + b"Content-Length: 0\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n", 411),
+        (POST + b"Content-Length: 5\r\n\r\nabcde", 413),
+        (POST + b"Content-Length: 5\r\n\r\n", 413),
+        (POST + b"Content-Length: 300000\r\n\r\n" + 300_000 * b"x", 413),
+        (POST + b"Content-Length: " + 5000 * b"9" + b"\r\n\r\n", 413),
+        (b"GET /x HTTP/1.1\r\n" + GOOD + b"Content-Length: 3\r\n\r\nabc", 413),
+        (POST + b"Host: 127.0.0.1\r\nContent-Length: 0\r\n\r\n", 400),
+        (POST + BEARER.encode() + b"\r\nContent-Length: 0\r\n\r\n", 400),
+        (POST + b" folded\r\nContent-Length: 0\r\n\r\n", 400),
+        (POST + b"Content-Length : 0\r\n\r\n", 400),
+        (POST + b"A\0: b\r\nContent-Length: 0\r\n\r\n", 400),
+        (POST + b"A: b\nContent-Length: 0\r\n\r\n", 400),
+        (POST + b"".join(b"A%d: b\r\n" % k for k in range(70)) + b"\r\n", 431),
+        (POST + b"A: " + 9000 * b"b" + b"\r\n\r\n", 431),
+        (b"GET /" + 600 * b"x" + b" HTTP/1.1\r\n" + GOOD + b"\r\n", 400),
+        (b"GET /" + 20_000 * b"x", 431),
+        (b"GET /x\r\n" + GOOD + b"\r\n", 400),
+        (b"GET /x HTTP/3.0\r\n" + GOOD + b"\r\n", 400),
+        (b"GET http://127.0.0.1/x HTTP/1.1\r\n" + GOOD + b"\r\n", 400),
+        (b"GET /\xc2\xb2 HTTP/1.1\r\n" + GOOD + b"\r\n", 400),
+        (b"GET /a b HTTP/1.1\r\n" + GOOD + b"\r\n", 400),
+        (b"PUT /x HTTP/1.1\r\n" + GOOD + b"Content-Length: 0\r\n\r\n", 405),
+        (b"TRACE /x HTTP/1.1\r\n" + GOOD + b"\r\n", 405),
+        (b"CONNECT 127.0.0.1:22 HTTP/1.1\r\n" + GOOD + b"\r\n", 400),
+        (b"\x16\x03\x01\x02\x00\x01\x00\r\n\r\n", 400),
+        (b"\r\n\r\n", 400),
+    ],
+)
+def test_what_is_no_plain_request_gets_one_clean_answer(
+    door: tuple[Proxy, Recorder], data: bytes, status: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    proxy, device = door
+    port = proxy.server_address[1]
+    found, head, body = talk(port, data)
+    assert (found, body.count(b"\n")) == (status, 1)
+    assert f"content-length: {len(body)}" in head
+    assert device.asked == []
+    assert talk(port, POST + b"Content-Length: 0\r\n\r\n")[0] == 204
+    assert device.asked == [("POST", "/x")]
+    assert capfd.readouterr().err == ""
+
+
+def test_names_and_addresses_of_the_board(door: tuple[Proxy, Recorder]) -> None:
+    port = door[0].server_address[1]
+    for host in ("localhost", "LOCALHOST:80", "127.0.0.1", "board.local:5001", "Board.Local"):
+        assert ask(port, "GET", "/x", BEARER, host=host)[0] == 204, host
+    for host in ("192.168.7.2", "board.local.evil.example", "board.local:99:5001", "board", "[::1"):
+        assert ask(port, "GET", "/x", BEARER, host=host)[0] == 403, host
+
+
+def test_who_dribbles_is_sent_away_and_keeps_nobody_out(
+    door: tuple[Proxy, Recorder], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(board_agent, "HEAD_S", 0.3)
+    port = door[0].server_address[1]
+    slow = [socket.create_connection(("127.0.0.1", port), timeout=10.0) for _ in range(board_agent.CONNECTIONS)]
+    for line in slow:
+        line.sendall(b"G")
+    assert ask(port, "GET", "/x", BEARER)[0] == 204  # in the place of the first of them
+    with slow.pop(0) as oldest:
+        assert oldest.recv(65536) == b""
+    began = time.monotonic()
+    while time.monotonic() < began + 0.4:  # no pause between two bytes is as long as the time for all of them
+        for line in slow[:4]:
+            line.sendall(b"E")
+        time.sleep(0.05)
+    for line in slow:
+        assert line.recv(65536).startswith(b"HTTP/1.1 408 ")
+        line.close()
+    AgentLab.until(lambda: ask(port, "GET", "/x", BEARER)[0] == 204)
+
+
+def test_a_connection_that_is_cut_at_any_point_leaves_no_trace(
+    door: tuple[Proxy, Recorder], capfd: pytest.CaptureFixture[str]
+) -> None:
+    port = door[0].server_address[1]
+    whole = POST + b"Content-Length: 0\r\n\r\n"
+    for end in (0, 1, 20, len(whole) - 1):
+        with socket.create_connection(("127.0.0.1", port)) as line:
+            line.sendall(whole[:end])
+            line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # ends with a reset
+    assert talk(port, whole)[0] == 204
+    assert door[1].asked == [("POST", "/x")]
+    assert capfd.readouterr().err == ""
+
+
+# -- one client in charge --------------------------------------------------------------------------------------------
+
+
+def test_serial_and_http_at_once_until_one_hands_over(tmp_path: Path) -> None:
+    lab = HttpLab(tmp_path, 60.0, tty_line=True)
+    try:
+        assert lab.ask("POST", "/SetOutputTarget/Pump1/M0/1")[0] == 204
+        for path in (PUMP, "/_agent/heartbeat", "/_agent/bye"):
+            status, body = ask(lab.port, "POST", path, BEARER)
+            assert (status, b"on the serial line" in body) == (409, True)
+        assert json.loads(ask(lab.port, "GET", "/_agent/status", BEARER)[1])["armed"] is True
+        assert lab.motors() == set()
+        assert lab.ask("BYE", "/")[0] == 200
+        assert ask(lab.port, "POST", PUMP, BEARER)[0] == 204
+        lab.until(lambda: lab.motors() == {"M0/Pump1"})
+        status, body = lab.ask("POST", "/SetOutputOn/Pump1/0/M0")
+        assert (status, b"on HTTP" in body) == (21, True)
+    finally:
+        lab.end()
+
+
+def test_after_silence_the_next_client_finds_the_pumps_off(tmp_path: Path) -> None:
+    lab = HttpLab(tmp_path, 1.0)
+    try:
+        for path in ("/SetOutputTarget/Pump1/M0/1", PUMP):
+            assert ask(lab.port, "POST", path, BEARER, "X-Session: 1")[0] == 204
+        lab.until(lambda: lab.motors() == {"M0/Pump1"})
+        lab.until(lambda: ask(lab.port, "POST", "/_agent/heartbeat", BEARER, "X-Session: 2")[0] == 204)
+        assert lab.motors() == set()
+        assert ask(lab.port, "POST", "/_agent/heartbeat", BEARER, "X-Session: 1")[0] == 409
+    finally:
+        lab.end()
+
+
+@pytest.fixture
+def linked(
+    door: tuple[Proxy, Recorder], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[str, TransportConfig]:
+    """The agent's address and the config of a client that knows its token, on a computer of its own."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return f"http://127.0.0.1:{door[0].server_address[1]}", TransportConfig(token_file=str(make_token(tmp_path)))
+
+
+def test_a_killed_client_goes_on_at_once_and_another_computer_waits(
+    door: tuple[Proxy, Recorder], linked: tuple[str, TransportConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url, config = linked
+
+    def opened() -> Transport:
+        return open_transport(config, url)
+
+    first = opened()
+    assert first.post("/first").status == 204
+    first.close()  # as the kernel does for a killed one: no BYE
+    (tmp_path / "other").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "other"))
+    foreign = opened()
+    with pytest.raises(LinkError, match="another client is in charge"):
+        foreign.post("/foreign")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    resumed = opened()
+    assert resumed.post("/resumed").status == 204
+    resumed.disarm()
+    assert door[0].agent.armed is False
+    assert foreign.post("/foreign").status == 204
+    assert [path for _, path in door[1].asked] == ["/first", "/resumed", "/foreign"]
+    resumed.close()
+    foreign.close()
+
+
+# -- the client's side of the token ----------------------------------------------------------------------------------
+
+
+def test_a_client_without_the_right_token_is_told_what_to_do(
+    linked: tuple[str, TransportConfig], tmp_path: Path
+) -> None:
+    url, _ = linked
+    bare = HttpTransport(url)
+    with pytest.raises(LinkError, match="no or wrong token.*backend.transport.token_file"):
+        bare.post("/changeDevice/M0")
+    bare.disarm()
+    bare.close()
+    wrong = HttpTransport(url, config=TransportConfig(token_file=str(make_token(tmp_path, 64 * "f"))))
+    with pytest.raises(LinkError, match="no or wrong token"):
+        wrong.get("/getSysdata/")
+    wrong.close()
+    for text, mode, words in (("x", 0o600, "32 to 256"), (TOKEN, 0o640, "chmod 600"), ("é" * 40, 0o600, "32 to 256")):
+        with pytest.raises(LinkError, match=words) as caught:
+            HttpTransport(url, config=TransportConfig(token_file=str(make_token(tmp_path, text, mode))))
+        assert TOKEN not in str(caught.value)
+    with pytest.raises(LinkError, match="No such file.*The token"):
+        HttpTransport(url, config=TransportConfig(token_file=str(tmp_path / "nothing")))
+
+
+def test_a_run_through_the_agent_writes_the_token_nowhere(tmp_path: Path) -> None:
+    lab = HttpLab(tmp_path, 60.0)
+    run = tmp_path / "run"
+    link = ["backend=chibio", f"backend.url=http://127.0.0.1:{lab.port}", f"backend.transport.token_file={lab.token}"]
+    scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[2]", "controller=adaptive_inverse"]
+    words = [*scenario, "backend.speed=60", "backend.reactors=[M0,M1]", f"hydra.run.dir={run}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, "-m", "experiments.deploy", *link, *words]
+    try:
+        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert json.loads(ask(lab.port, "GET", "/_agent/status", BEARER)[1])["armed"] is False  # it said BYE
+        written = [path for path in run.rglob("*") if path.is_file()]
+        assert str(lab.token) in (run / "config.yaml").read_text()
+        texts = [done.stdout, done.stderr, lab.log.read_text(), *(path.read_text(errors="replace") for path in written)]
+        assert not any(TOKEN in text for text in texts)
+    finally:
+        lab.end()
