@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from envs.task import EnvConfig, step_factors, tracking_reward
+from envs.task import MAX_OD, EnvConfig, step_factors, tracking_reward
 
 __all__ = ["BioreactorVectorEnv", "EpisodeStreams", "action_space", "observation_space"]
 
@@ -25,9 +25,6 @@ def observation_space() -> spaces.Box:
 def action_space(config: EnvConfig) -> spaces.Discrete:
     """Index into the pump rates, 0 (pump off) to n_actions - 1 (maximum rate)."""
     return spaces.Discrete(config.n_actions)
-
-
-MAX_OD = 1000.0  # keeps a runaway copy finite: 100 steps at mu = 0.1/min from OD 4 reach 1e5, no culture does
 
 
 class EpisodeStreams:

@@ -92,7 +92,7 @@ def test_tensorboard_reads_grouped_scalars_and_figures(whole):
 def test_the_summary_can_be_recomputed_from_the_exported_policy(whole):
     summary = json.loads((whole / "summary.json").read_text())
     config = EnvConfig()
-    report = Evaluation(config, 0.99, report_grid(config))
+    report = Evaluation(config, report_grid(config))
     for i, seed in enumerate(summary["seeds"]):
         learned = policy.load(whole / "policies" / f"seed{seed:04d}.npz")
         score = report(lambda od, s, learned=learned: learned.act(np.stack([od[0], s[0]], axis=1))[None])
