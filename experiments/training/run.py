@@ -102,6 +102,7 @@ def _export(session: Session, score: Score) -> Path:
             "agent": asdict(c.agent),
             "config_hash": _fingerprint(c),
             "trained_steps": int(best.step[i]),
+            "updates": c.agent.updates_at(int(best.step[i])),
             "regret_pct": float(score.regret_pct[i]),
             "steady_abs_error": float(score.steady_abs_error[i]),
         }

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dqn import checkpoint, policy
+from dqn.config import DQNConfig
 from envs.task import EnvConfig
 from experiments.training import build
 from experiments.training.config import TrainConfig
@@ -99,6 +101,19 @@ def test_the_summary_can_be_recomputed_from_the_exported_policy(whole):
         assert score.regret_pct[0] == pytest.approx(summary["regret_pct"][i], rel=1e-3)
 
 
+def test_a_policy_file_says_what_a_reactor_is_told_before_it_runs(whole):
+    """Regret and steady error as in the summary, setpoints, and updates: four a step after step 100."""
+    summary = json.loads((whole / "summary.json").read_text())
+    for i, seed in enumerate(summary["seeds"]):
+        metadata = policy.load(whole / "policies" / f"seed{seed:04d}.npz").metadata
+        assert metadata["updates"] == 4 * (summary["kept_step"][i] - 100)
+        assert metadata["regret_pct"] == summary["regret_pct"][i]
+        assert metadata["steady_abs_error"] == summary["steady_abs_error"][i]
+        assert metadata["steady_abs_error"] == max(summary["steady_abs_error_by_setpoint"][i])
+        assert metadata["model"]["setpoints"] == list(EnvConfig().setpoints)
+    assert DQNConfig(learn_start=100, updates_per_step=4).updates_at(100) == 0
+
+
 def test_selection_and_report_share_no_start():
     config = EnvConfig()
     kept = {(round(a, 9), round(b, 9)) for a, b in zip(*selection_grid(config), strict=True)}
@@ -149,15 +164,21 @@ def test_agent_of_a_population_is_the_same_seed_alone(tmp_path):
     assert not torch.allclose(many.agent.online.flat[2], many.agent.online.flat[3])
 
 
-def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path):
+def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path, caplog):
     from dataclasses import replace
 
     c = TrainConfig()
     c = replace(c, agent=replace(c.agent, total_steps=600, learn_start=100), eval_every=100, checkpoint_every=100)
     (tmp_path / "a").mkdir()
     first = Session(c, tmp_path / "a")
-    first.run()
+    with caplog.at_level("INFO"):
+        first.run()
     first.writer.close()
+    assert caplog.messages[0] == "step 100 of 600: untrained until step 100"
+    assert re.fullmatch(
+        r"step 200 of 600: selection grid: \d+\.\d\d % regret, \d\.\d{4} OD steady error; kept: .*", caplog.messages[1]
+    )
+    assert [step for step, _, _ in first.best.history] == [200, 300, 400, 500, 600]
     half = replace(c, agent=replace(c.agent, total_steps=300))
     (tmp_path / "b").mkdir()
     second = Session(half, tmp_path / "b")
