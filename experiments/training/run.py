@@ -13,6 +13,7 @@ from dqn import policy
 from dqn.checkpoint import CheckpointError
 from dqn.export import export
 from envs.optimum import solve_episode
+from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
 from experiments.reporting import charts
 from experiments.training.config import TrainConfig, read_env_file
@@ -33,6 +34,7 @@ def train(config: TrainConfig, folder: Path) -> float:
         frame.save_config(config, folder)
     if config.device == "cuda" and not torch.cuda.is_available():
         raise frame.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
+    _warn_of_growth(config.env)
     torch.set_num_threads(1)  # of one operation: matrices of this size do not gain from more
     try:
         session = Session(config, folder, resume=config.resume is not None)
@@ -44,6 +46,17 @@ def train(config: TrainConfig, folder: Path) -> float:
     finally:
         session.writer.close()
     return float(np.median(session.best.regret))
+
+
+def _warn_of_growth(env: EnvConfig) -> None:
+    """Say that no policy can hold a culture that the largest rate does not thin: f >= 1 for every action."""
+    if step_factors(env).min() >= 1.0:
+        log.warning(
+            "env.mu = %g 1/min outgrows the pump: with env.tau = %.4g it takes more than mu tau = %.4g mL/s to thin "
+            "the culture, and env.max_pump_rate = %g mL/s; nothing can hold it at a setpoint. Raise env.max_pump_rate, "
+            "or check mu and tau",
+            env.mu, env.tau, env.mu * env.tau, env.max_pump_rate,
+        )  # fmt: skip
 
 
 def _finish(session: Session) -> None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,9 +16,12 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dqn import checkpoint, policy
+from dqn.checkpoint import CheckpointError
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
+from experiments.cli.frame import UserError
 from experiments.training import build
+from experiments.training import run as train_run
 from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Evaluation, report_grid, selection_grid
 from experiments.training.session import Session
@@ -190,6 +194,19 @@ def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path, caplog):
     third.writer.close()
     assert torch.equal(first.agents.weights(), third.agents.weights())
     assert first.best.history == third.best.history
+
+
+@pytest.mark.parametrize(
+    ("mu", "tau", "outgrown"),
+    [(0.03, 1 / 3, False), (0.059, 1 / 3, False), (0.061, 1 / 3, True), (0.03, 0.66, False), (0.03, 0.67, True)],
+)
+def test_a_culture_that_outgrows_the_pump_is_said_before_it_is_trained_on(mu, tau, outgrown, monkeypatch, caplog):
+    """The largest rate, 0.02 mL/s, thins by 0.02 / tau a minute."""
+    monkeypatch.setattr(train_run, "Session", Mock(side_effect=CheckpointError("far enough")))
+    config = TrainConfig(env=EnvConfig(mu=mu, tau=tau))
+    with pytest.raises(UserError, match="far enough"):
+        train_run.train(config, Path())
+    assert [f"env.mu = {mu:g} 1/min outgrows the pump" in m for m in caplog.messages] == [True] * outgrown
 
 
 @pytest.mark.parametrize(
