@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from dqn import checkpoint, policy
 from dqn.checkpoint import CheckpointError
 from dqn.config import DQNConfig
-from envs.task import EnvConfig
+from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
 from experiments.training import build
 from experiments.training import run as train_run
@@ -166,6 +166,21 @@ def test_agent_of_a_population_is_the_same_seed_alone(tmp_path):
     assert torch.equal(ours[:500], theirs[:500])
     np.testing.assert_allclose(many.agent.online.flat[3], alone.agent.online.flat[0], atol=2e-5)
     assert not torch.allclose(many.agent.online.flat[2], many.agent.online.flat[3])
+
+
+def test_what_is_remembered_follows_the_model_also_at_the_end_of_an_episode():
+    """x' = f(u) x towards the same setpoint in every transition of six episodes, and nothing is final."""
+    env = EnvConfig(episode_steps=5)
+    trainer = build.trainer(env, TrainConfig().agent, range(3))
+    trainer._observation, _ = trainer.env.reset()
+    for _ in range(30):
+        trainer._step()
+    x, goal, reached, same, action, reward, continues = trainer.agent.replay.state_dict()["rows"].double().numpy().T
+    np.testing.assert_allclose(reached, x * step_factors(env)[action.astype(int)], rtol=1e-6)
+    np.testing.assert_array_equal(goal, same)
+    np.testing.assert_allclose(reward, -((reached - goal) ** 2), rtol=1e-4, atol=1e-6)
+    assert (continues == 1.0).all()
+    assert len(np.unique(goal)) > 3
 
 
 def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path, caplog):
