@@ -31,7 +31,7 @@ class DeployConfig:
     )
     controller: Any = part(LearnedConfig, "what decides the pump rate")
     policy: str = setting(
-        "latest", "of controller=dqn: a policy.npz, a run folder, or `latest`: of the newest training run under runs/"
+        "latest", "of controller=dqn: a policy.npz, a run folder, or `latest`: what train or demo wrote last"
     )
     poor_regret_pct: float = setting(
         10.0,
