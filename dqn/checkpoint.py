@@ -8,7 +8,7 @@ import torch
 
 __all__ = ["CheckpointError", "load", "save"]
 
-FORMAT = 3
+FORMAT = 4
 
 
 class CheckpointError(Exception):

@@ -79,7 +79,11 @@ class DQNConfig:
             return self.epsilon_end
         return self.epsilon_start + (self.epsilon_end - self.epsilon_start) * step / self.epsilon_steps
 
+    def updates_at(self, step: int) -> int:
+        """Gradient steps done when `step` environment steps have been taken."""
+        return max(0, step - self.learn_start) * self.updates_per_step
+
     @property
     def total_updates(self) -> int:
         """Gradient steps of a whole training run."""
-        return max(0, self.total_steps - self.learn_start) * self.updates_per_step
+        return self.updates_at(self.total_steps)

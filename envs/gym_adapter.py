@@ -4,10 +4,17 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from envs.task import EnvConfig
-from envs.vector_env import BioreactorVectorEnv, action_space, observation_space
+from envs.vector_env import (
+    BioreactorVectorEnv,
+    action_space,
+    checked_actions,
+    observation_space,
+    with_length,
+)  # fmt: skip
 
 __all__ = ["BioreactorEnv", "register"]
 
@@ -18,16 +25,30 @@ class BioreactorEnv(gymnasium.Env[Any, Any]):
     """`BioreactorVectorEnv` with N = 1 and no autoreset; observation, action and reward are specified there.
 
     Version history: v0, the task of the paper.
+
+    Args: config: the task; overrides: values of it. render_mode: None, there is nothing to draw.
+    Raises: ValueError naming what is not allowed.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
 
-    def __init__(self, config: EnvConfig | None = None, **overrides: Any) -> None:
-        self._batch = BioreactorVectorEnv(1, config, **overrides)
+    def __init__(self, config: EnvConfig | None = None, *, render_mode: str | None = None, **overrides: Any) -> None:
+        self._batch = BioreactorVectorEnv(1, config, render_mode=render_mode, **overrides)
+        self.render_mode = None
         self.config = self._batch.config
         self.observation_space = observation_space()
         self.action_space = action_space(self.config)
+        self._spec: EnvSpec | None = None
         self._next: NDArray[np.float32] | None = None  # start of the episode the batch has already begun
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium registers, with the episode's length."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = with_length(value, self.config)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -42,11 +63,10 @@ class BioreactorEnv(gymnasium.Env[Any, Any]):
     def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """One control period; `truncated` after `episode_steps`, after which `reset` must follow.
 
-        Raises: ValueError for an action outside the grid.
+        Raises: ValueError for an action outside the grid, or that is not one integer; RuntimeError before a reset.
         """
-        if not self.action_space.contains(action):
-            raise ValueError(f"action {action!r}: allowed 0 to {self.config.n_actions - 1} (index of a pump rate)")
-        observation, reward, _, truncated, infos = self._batch.step(np.asarray([action]))
+        index = checked_actions(action, (), self.config.n_actions)
+        observation, reward, _, truncated, infos = self._batch.step(index[None])
         if truncated[0]:
             self._next, observation = observation[0], infos["final_obs"]
         return observation[0], float(reward[0]), False, bool(truncated[0]), {}

@@ -1,27 +1,98 @@
-"""The best possible controller of the training model, by dynamic programming: the yardstick of every learned one.
+"""The best possible controllers of the training model, by dynamic programming: the yardstick of every learned one.
 
-For each setpoint s the discounted problem V(x) = min_a [(f_a x - s)^2 + gamma V(f_a x)] is solved on a fine grid of
-log x by policy iteration (Howard 1960): on that grid an action is a shift by log f_a, so evaluating a policy is one
-sparse linear system. V is linear between grid points.
+On a fine grid of log x an action is a shift by log f_a, and V is linear between grid points. Two problems are solved:
+
+- `solve_episode`: the one that is scored, V_k(x) = min_a [(f_a x - s)^2 + V_{k-1}(f_a x)] with V_0 = 0, the least sum
+  of squared errors over the k steps that are left. Backward induction (Bellman 1957), k sweeps over the grid.
+- `solve`: the discounted problem without an end, V(x) = min_a [(f_a x - s)^2 + gamma V(f_a x)], whose values a network
+  learns. Policy iteration (Howard 1960): evaluating a policy is one sparse linear system.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from envs.task import EnvConfig, step_factors
+from envs.task import MAX_OD, SCORED_OD, EnvConfig, step_factors
 
-__all__ = ["OptimalPolicy", "solve"]
+__all__ = ["EpisodeOptimum", "OptimalPolicy", "solve", "solve_episode"]
 
 Array = NDArray[np.float64]
+SPACING = 4.7e-4  # of log OD: eight points to one of the nominal model's 17 actions
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeOptimum:
+    """The best controller of one setpoint for a known number of steps.
+
+    setpoint: s, OD. log_od: uniform grid of log OD, shape (G,). factors: x(t+1) = factors[a] x(t), shape (A,).
+    value: V_k, the least sum of (x - s)^2 over k steps, each taken after the step, shape (K + 1, G).
+    """
+
+    setpoint: float
+    log_od: Array
+    factors: Array
+    value: Array
+
+    def act(self, od: Array, left: int) -> NDArray[np.intp]:
+        """Index of the best action with `left` steps to go, 1 <= left <= K, by one exact look-ahead; (N,) -> (N,)."""
+        after = np.minimum(np.maximum(od, 1e-6)[:, None] * self.factors, MAX_OD)
+        ahead = np.interp(np.log(np.maximum(after, 1e-12)), self.log_od, self.value[left - 1])
+        return np.asarray(np.argmin((after - self.setpoint) ** 2 + ahead, axis=1), dtype=np.intp)
+
+    def rollout(self, od: Array) -> tuple[Array, NDArray[np.intp]]:
+        """K steps from the starts `od`, shape (N,): the OD after each step and the action taken, each (K, N)."""
+        steps = self.value.shape[0] - 1
+        ods, actions = np.empty((steps, od.size)), np.empty((steps, od.size), dtype=np.intp)
+        for k in range(steps):
+            actions[k] = self.act(od, steps - k)
+            ods[k] = od = np.minimum(od * self.factors[actions[k]], MAX_OD)
+        return ods, actions
+
+
+def solve_episode(config: EnvConfig, setpoint: float, spacing: float = SPACING) -> EpisodeOptimum:
+    """The least undiscounted cost of an episode of `config.episode_steps` steps at one setpoint, and how to reach it.
+
+    Args: config: the task; its actions and its integrator are used as they are. setpoint: OD. spacing: of log OD.
+    Raises: nothing.
+    """
+    factors = step_factors(config)
+    log_od = _reach(config, setpoint, factors, spacing)
+    points = log_od.size
+    shift = np.log(np.maximum(factors, 1e-12)) / (log_od[1] - log_od[0])
+    whole = np.floor(shift)
+    part = (shift - whole)[:, None]
+    whole = np.clip(whole, -points, points).astype(np.intp)
+    pad = int(np.abs(whole).max()) + 1  # beyond its ends V is constant
+    stage = (np.minimum(np.exp(log_od) * factors[:, None], MAX_OD) - setpoint) ** 2
+    value = np.zeros((config.episode_steps + 1, points))
+    for before, now in pairwise(value):
+        ahead = np.pad(before, pad, mode="edge")
+        now[:] = np.inf
+        for i, w, cost in zip(pad + whole, part, stage, strict=True):
+            reached = (1.0 - w) * ahead[i : i + points] + w * ahead[i + 1 : i + 1 + points]
+            np.minimum(now, cost + reached, out=now)
+    return EpisodeOptimum(setpoint, log_od, factors, value)
+
+
+def _reach(config: EnvConfig, setpoint: float, factors: Array, spacing: float) -> Array:
+    """Grid of log OD, shape (G,), that holds what an optimal episode can reach from the starts that are scored.
+
+    A culture that outgrows the pump's largest rate keeps growing, up to the cap of the environment.
+    """
+    low = min(config.start_od[0], SCORED_OD[0], setpoint) * 0.8
+    outgrown = config.episode_steps * max(0.0, np.log(np.maximum(factors, 1e-12)).min())
+    high = np.log(max(config.start_od[1], SCORED_OD[1], setpoint) * 1.25) + outgrown
+    high = min(high, np.log(MAX_OD))
+    return np.linspace(np.log(low), high, int((high - np.log(low)) / spacing) + 2)
 
 
 @dataclass(frozen=True, eq=False)
 class OptimalPolicy:
-    """Greedy policy with respect to the optimal value function.
+    """Greedy policy with respect to the optimal value function of the discounted problem.
 
     log_od: uniform grid of log OD, shape (G,). setpoints: shape (M,), sorted.
     value: discounted cost-to-go V, shape (M, G). factors: x(t+1) = factors[a] x(t), shape (A,).
@@ -86,7 +157,7 @@ def _solve_one(
 
 
 def solve(config: EnvConfig, gamma: float = 0.99, setpoints: Array | None = None, grid: int = 6001) -> OptimalPolicy:
-    """Solve the task for every setpoint.
+    """Solve the discounted task without an end for every setpoint.
 
     Args:
       config: the task; its 17 actions and its integrator are used as they are.

@@ -10,13 +10,19 @@ from conf.schema import check, setting
 from envs.growth import DilutedCulture, Exponential
 from envs.integrators import INTEGRATORS
 
-__all__ = ["MAX_PUMP_RATE", "EnvConfig", "pump_rates", "step_factors", "tracking_reward"]
+__all__ = ["MAX_OD", "MAX_PUMP_RATE", "SCORED_OD", "EnvConfig", "pump_rates", "step_factors", "tracking_reward"]
 
 Array = NDArray[np.float64]
 T = TypeVar("T", bound=Any)
 
 MAX_PUMP_RATE = 0.02
 """mL/s. The Chi.Bio's own regulator never exceeds a duty of 0.02 of a 1 mL/s pump (docs/device.md, Regulation)."""
+
+MAX_OD = 1000.0
+"""Keeps a runaway culture finite: 100 steps at mu = 0.1/min from OD 4 reach 1e5, no culture does."""
+
+SCORED_OD = (0.1, 1.1)
+"""Range of the starts from which policies are scored, whatever `start_od` is."""
 
 
 def pump_rates(n: int = 17, maximum: float = MAX_PUMP_RATE) -> Array:

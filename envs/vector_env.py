@@ -1,17 +1,23 @@
 """N training episodes side by side as one `gymnasium.vector.VectorEnv`, without a Python loop over copies."""
 
+import reprlib
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from envs.task import EnvConfig, step_factors, tracking_reward
+from conf.schema import require
+from envs.task import MAX_OD, EnvConfig, step_factors, tracking_reward
 
-__all__ = ["BioreactorVectorEnv", "EpisodeStreams", "action_space", "observation_space"]
+__all__ = [
+    "BioreactorVectorEnv", "EpisodeStreams", "action_space", "checked_actions", "observation_space", "with_length",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 EPISODES_PER_BLOCK = 64
@@ -27,7 +33,20 @@ def action_space(config: EnvConfig) -> spaces.Discrete:
     return spaces.Discrete(config.n_actions)
 
 
-MAX_OD = 1000.0  # keeps a runaway copy finite: 100 steps at mu = 0.1/min from OD 4 reach 1e5, no culture does
+def checked_actions(actions: Any, shape: tuple[int, ...], n_actions: int) -> NDArray[np.intp]:
+    """Actions as an array of `shape`. Raises: ValueError unless they are integers of that shape, 0 to n_actions - 1."""
+    given = np.asarray(actions)
+    if given.shape != shape or given.dtype.kind not in "iu" or given.min() < 0 or given.max() >= n_actions:
+        raise ValueError(
+            f"action {reprlib.repr(given.tolist())} of shape {given.shape} and type {given.dtype}: allowed "
+            f"0 to {n_actions - 1} (index of a pump rate), integers of shape {shape}"
+        )
+    return given
+
+
+def with_length(spec: EnvSpec | None, config: EnvConfig) -> EnvSpec | None:
+    """A spec that says how long episodes are. Environments truncate by themselves, so no time limit is registered."""
+    return None if spec is None else replace(spec, max_episode_steps=config.episode_steps)
 
 
 class EpisodeStreams:
@@ -85,15 +104,36 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
     Reward: -(x - setpoint)^2 of the x reached; in the last step times `final_reward_weight`.
     Start: x uniform in `start_od`, setpoint drawn from `setpoints`, both from the copy's own stream.
     End: never terminated; truncated after `episode_steps` steps (bootstrapping continues).
-    Autoreset: SAME_STEP; the last observation of an ended episode is in infos["final_obs"].
+    Autoreset: SAME_STEP, where the last observation of an ended episode is in infos["final_obs"]; or NEXT_STEP, where
+    the step after it starts the next episode, whatever the action, with reward 0 (Gymnasium's stateful wrappers).
 
-    Args: num_envs: N >= 1. config: the task.
+    Args:
+      num_envs: N >= 1. config: the task; overrides: values of it, `episode_steps=50`.
+      autoreset_mode: SAME_STEP or NEXT_STEP, as `gymnasium.vector.AutoresetMode` or its value.
+      render_mode: None, there is nothing to draw. max_episode_steps: Gymnasium's name; ends episodes that are longer.
+    Raises: ValueError naming what is not allowed.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
 
-    def __init__(self, num_envs: int = 1, config: EnvConfig | None = None, **overrides: Any) -> None:
-        self.config = EnvConfig(**overrides) if config is None else config
+    def __init__(
+        self,
+        num_envs: int = 1,
+        config: EnvConfig | None = None,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        **overrides: Any,
+    ) -> None:
+        config = EnvConfig(**overrides) if config is None else config
+        steps = min(config.episode_steps, max_episode_steps or config.episode_steps)
+        self.config = replace(config, episode_steps=steps)
+        require(render_mode is None, "render_mode", render_mode, "None (there is nothing to draw)")
+        modes = {AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP}
+        allowed = ", ".join(sorted(str(mode) for mode in modes))
+        require(autoreset_mode in modes | {m.value for m in modes}, "autoreset_mode", autoreset_mode, allowed)
+        self.metadata = {**self.metadata, "autoreset_mode": AutoresetMode(autoreset_mode)}
         self.num_envs = num_envs
         self.render_mode = None
         self.single_observation_space = observation_space()
@@ -105,7 +145,18 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
         self.od = np.ones(num_envs)  # true x in full precision
         self.setpoint = np.ones(num_envs)  # of the running episode
         self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._waiting = np.zeros(num_envs, dtype=np.bool_)  # NEXT_STEP: the next step starts an episode
         self._streams: EpisodeStreams | None = None
+        self._spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium registers, with the episode's length."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = with_length(value, self.config)
 
     def seed_streams(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
         """Give every copy its stream; `reset(seed=...)` does this with seed, seed + 1, ..."""
@@ -119,6 +170,7 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
         self.od[copies] = low + (high - low) * numbers[:, 0]
         self.setpoint[copies] = self._setpoints[(numbers[:, 1] * self._setpoints.size).astype(np.intp)]
         self._steps[copies] = 0
+        self._waiting[copies] = False
 
     def _observe(self) -> NDArray[np.float32]:
         observation = np.empty((self.num_envs, 2), dtype=np.float32)
@@ -155,26 +207,34 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
         """One control period in every copy.
 
         Args: actions: indices of pump rates, shape (N,), integers.
-        Returns: observations (N, 2), rewards (N,), terminated (N,) all False, truncated (N,), infos; where an episode
-          ended infos["final_obs"] (N, 2) holds its last observation and infos["_final_obs"] (N,) says where.
-        Raises: RuntimeError before the first reset; IndexError for an action outside the grid.
+        Returns: observations (N, 2), rewards (N,), terminated (N,) all False, truncated (N,), infos; with SAME_STEP,
+          where an episode ended, infos["final_obs"] (N, 2) holds its last observation and infos["_final_obs"] (N,)
+          says where.
+        Raises: RuntimeError before the first reset; ValueError for actions of another shape or outside the grid.
         """
         if self._streams is None:
             raise RuntimeError("step before reset: call reset(seed=...) first")
+        actions = checked_actions(actions, (self.num_envs,), self.config.n_actions)
         np.multiply(self.od, self._factors[actions], out=self.od)
         np.minimum(self.od, MAX_OD, out=self.od)
         reward = tracking_reward(self.od, self.setpoint)
         self._steps += 1
+        if self._waiting.any():
+            reward[self._waiting] = 0.0
+            self._start(np.flatnonzero(self._waiting))
         truncated = self._steps >= self.config.episode_steps
-        infos: dict[str, Any] = {}
-        if truncated.any():
-            reward[truncated] *= self.config.final_reward_weight
-            infos["final_obs"] = self._observe()
-            infos["_final_obs"] = truncated.copy()
-            infos["final_info"] = {}
-            infos["_final_info"] = truncated.copy()
-            self._start(np.flatnonzero(truncated))
+        infos = self._end(truncated, reward) if truncated.any() else {}
         return self._observe(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, infos
+
+    def _end(self, truncated: NDArray[np.bool_], reward: Array) -> dict[str, Any]:
+        """Weigh the last reward of ended episodes, in place, and begin the next ones or let them wait; the infos."""
+        reward[truncated] *= self.config.final_reward_weight
+        if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
+            self._waiting = truncated.copy()
+            return {}
+        infos = {"final_obs": self._observe(), "final_info": {}}
+        self._start(np.flatnonzero(truncated))
+        return {**infos, **{f"_{key}": truncated.copy() for key in infos}}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue to the bit; plain numbers and lists."""
@@ -183,6 +243,7 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
             "od": self.od.tolist(),
             "setpoint": self.setpoint.tolist(),
             "steps": self._steps.tolist(),
+            "waiting": self._waiting.tolist(),
             "streams": self._streams.state_dict(),
         }
 
@@ -192,5 +253,6 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
         self.od[:] = state["od"]
         self.setpoint[:] = state["setpoint"]
         self._steps[:] = state["steps"]
+        self._waiting[:] = state["waiting"]
         self._streams.load_state_dict(state["streams"])
         return self._observe()

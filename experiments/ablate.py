@@ -42,7 +42,7 @@ class AblateConfig:
     threads: int | None = setting(
         None, "groups of 16 agents trained at the same time; null: one per core. No effect on results", at_least=1
     )
-    eval_every: int = setting(250, "between evaluations on the selection grid", "steps", at_least=1)
+    eval_every: int = setting(100, "between evaluations on the selection grid", "steps", at_least=1)
     resume: str | None = setting(None, "a run folder to continue")
 
     def __post_init__(self) -> None:

@@ -80,7 +80,7 @@ def _watch(config: DegradationConfig, name: str) -> list[dict[str, float | str]]
 
     agent = variant(config.agent, name, config.trained[name])
     agents = build.population(config.env, agent, range(config.seed, config.seed + config.n_agents))
-    selection = Evaluation(config.env, agent.gamma, selection_grid(config.env))
+    selection = Evaluation(config.env, selection_grid(config.env))
     optimum = solve(config.env, agent.gamma)
     od, setpoint = selection_grid(config.env)
     value = optimal_q(optimum, od, np.searchsorted(optimum.setpoints, setpoint - 1e-9)).max(-1)
@@ -149,7 +149,7 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
         batch = relabel(batch, torch.from_numpy(np.stack([u[2], u[3]], -1)))
         target = _exact(unit, od, batch.s_t[..., 1].double().numpy(), action, agent.action_gap)
         learner.fit(batch.s_tm1, batch.a_tm1, torch.from_numpy(target * agent.reward_scale).float())
-    report = Evaluation(config.env, agent.gamma, report_grid(config.env))
+    report = Evaluation(config.env, report_grid(config.env))
     score = report(build.act_with(learner.online, learner.online.flat), config.n_agents)
     log.info("%s, fitted to Q*: regret %.2f %% (worst %.2f)", name, np.median(score.regret_pct), score.regret_pct.max())
     return {"regret_pct": score.regret_pct, "steady_abs_error": score.steady_abs_error}

@@ -19,7 +19,7 @@ from experiments.cli import frame
 from experiments.control.config import DeployConfig
 from experiments.control.device import check, linked, load_calibrations
 from experiments.control.loop import ClosedLoop
-from experiments.control.policies import run_policy
+from experiments.control.policies import admit, policy_check, run_policy
 from experiments.control.record import Record
 from experiments.control.recovery import continue_loop
 from experiments.controllers import registry
@@ -40,7 +40,7 @@ class Setup:
 
     scenarios: one per reactor. plant: of the simulated vials; with an `env_file` it grows and is fed as calibrated.
     model: growth model that model-based controllers are given: the calibrated one, else the nominal one.
-    policy: of controller=dqn. resumed: an earlier life of the run is continued.
+    policy: of controller=dqn, None for a preflight. resumed: an earlier life of the run is continued.
     """
 
     config: DeployConfig
@@ -72,8 +72,9 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         plant = replace(plant, growth=growth, pump=pump)
     model = replace(model, control_min=backend.control_min)
     policy = None
-    if config.controller.kind == "dqn":
+    if config.controller.kind == "dqn" and not config.preflight_only:
         policy = run_policy(config.policy, folder, resumed, backend.control_min, config.safety.max_rate)
+        admit(policy, config, scenarios)
     return Setup(config, scenarios, plant, model, policy, resumed)
 
 
@@ -123,8 +124,10 @@ def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
 
 def run_preflight(setup: Setup, folder: Path) -> None:
     """`preflight_only=true`: every check a line with pass or the remedy. Raises: UserError if one failed."""
-    backend = setup.config.backend
+    config, backend = setup.config, setup.config.backend
     if backend.kind == "sim":
         raise frame.UserError("preflight_only=true: a simulated reactor needs no preflight; use backend=chibio")
+    calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
+    policy = [policy_check(config, setup.scenarios)] if config.controller.kind == "dqn" else []
     with linked(backend) as (transport, clock):
-        check(backend, transport, clock, load_calibrations(Path(backend.calibration), backend.reactors), folder)
+        check(backend, transport, clock, calibrations, folder, policy)

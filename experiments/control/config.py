@@ -41,7 +41,16 @@ class DeployConfig:
     )
     controller: Any = part(LearnedConfig, "what decides the pump rate")
     policy: str = setting(
-        "latest", "of controller=dqn: a policy.npz, a run folder, or `latest`: of the newest training run under runs/"
+        "latest", "of controller=dqn: a policy.npz, a run folder, or `latest`: what train or demo wrote last"
+    )
+    poor_regret_pct: float = setting(
+        10.0,
+        "a policy of more regret than this is refused on a device; the worst of 32 seeds of agent=paper has 8",
+        "%",
+        above=0.0,
+    )
+    force_policy: bool = setting(
+        False, "run a policy on a device although it is untrained, poor, or was trained for other setpoints"
     )
     env_file: str | None = setting(None, "a calibrated.yaml whose model the simulated plant takes")
     fsync: bool = setting(True, "every row on the disk before the next command")

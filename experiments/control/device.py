@@ -16,7 +16,7 @@ from experiments.cli import files, frame
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.chibio.connection import identity
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
-from hardware.chibio.preflight import preflight
+from hardware.chibio.preflight import Check, preflight
 from hardware.clock import RealClock
 from hardware.emulator.process import EmulatorProcess
 from hardware.link.open import DeviceLock, open_transport
@@ -82,10 +82,15 @@ def linked(backend: ChiBioConfig) -> Iterator[tuple[Transport, RealClock]]:
 
 
 def check(
-    backend: ChiBioConfig, transport: Transport, clock: RealClock, calibrations: list[ReactorCalibration], folder: Path
+    backend: ChiBioConfig,
+    transport: Transport,
+    clock: RealClock,
+    calibrations: list[ReactorCalibration],
+    folder: Path,
+    others: Sequence[Check] = (),
 ) -> None:
-    """Log the preflight line by line. Raises: UserError if a required check failed."""
-    checks = preflight(transport, clock, backend, calibrations, folder)
+    """Log the preflight line by line, after it `others`. Raises: UserError if a required check failed."""
+    checks = [*preflight(transport, clock, backend, calibrations, folder), *others]
     for one in checks:
         log.log(logging.INFO if one.ok else logging.WARNING, "%s", one)
     failed = [one for one in checks if one.required and not one.ok]

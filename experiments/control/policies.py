@@ -1,25 +1,88 @@
-"""The policy file of a run: finding it, checking it, and keeping a copy with the run."""
+"""The policy file of a run: finding it, checking it, judging whether it may run, and keeping a copy with the run."""
 
 import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from dqn import policy as policies
 from dqn.policy import Policy
+from envs.scenario import Scenario
 from experiments.cli import frame
+from experiments.control.config import DeployConfig
+from hardware.chibio.preflight import Check
 
-__all__ = ["find_policy", "load_policy", "run_policy"]
+__all__ = ["Training", "admit", "find_policy", "load_policy", "policy_check", "run_policy"]
 
 log = logging.getLogger(__name__)
 
-POOR_REGRET_PCT = 25.0
+REHEARSED = ("sim", "emulator")  # backends without a culture; on any other a doubtful policy is refused
+TRAINED = ("train/**/policy.npz", "demo/*/2_train/policy.npz")  # below runs/; other commands keep copies of policies
+FORCE = "force_policy=true runs it all the same"
 
 
-def find_policy(name: str, root: Path = Path("runs/train")) -> Path:
-    """A policy.npz from a path, a run folder or `latest`. Raises: UserError saying what to give instead."""
+class NoPolicyError(frame.UserError):
+    """`policy=latest` without a training run."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a policy file says of its training; nan where a file of an earlier version does not say it.
+
+    control_min: min. regret_pct: per cent. updates: gradient steps before it was exported.
+    setpoints: lowest and highest one, OD.
+    """
+
+    control_min: float
+    regret_pct: float
+    updates: float
+    setpoints: tuple[float, float]
+
+    @classmethod
+    def of(cls, policy: Policy) -> "Training":
+        """Read from the metadata. Raises: TypeError, ValueError, AttributeError, KeyError for damaged ones."""
+        control, regret, updates = (
+            float(policy.metadata.get(key, np.nan)) for key in ("control_min", "regret_pct", "updates")
+        )
+        setpoints = np.asarray(policy.metadata.get("model", {}).get("setpoints", [np.nan]), dtype=np.float64)
+        return cls(control, regret, updates, (float(setpoints.min()), float(setpoints.max())))
+
+    def doubts(self, setpoints: Sequence[float], poor_regret_pct: float) -> list[str]:
+        """Reasons not to let the policy pump, with their remedies; what the file does not say is none."""
+        low, high = self.setpoints
+        outside = sorted({s for s in setpoints if s < low - 1e-9 or s > high + 1e-9})
+        reasons = {
+            "it was exported before the first update (train for more steps than agent.learn_start)": self.updates == 0,
+            f"its regret is {self.regret_pct:.0f} %, more than poor_regret_pct = {poor_regret_pct:g} % "
+            "(train longer or with another seed)": self.regret_pct > poor_regret_pct,
+            f"it was trained for setpoints {low:g} to {high:g}, the scenario asks for "
+            f"{', '.join(f'{s:g}' for s in outside)} (train with env.setpoints that reach there)": bool(outside),
+        }
+        return [reason for reason, holds in reasons.items() if holds]
+
+    def unsaid(self) -> list[str]:
+        """What the file does not say."""
+        said = {"updates": self.updates, "regret": self.regret_pct, "trained setpoints": self.setpoints[0]}
+        return [name for name, value in said.items() if np.isnan(value)]
+
+    def __str__(self) -> str:
+        low, high = self.setpoints
+        said = f"regret {self.regret_pct:.2f} % against the optimum of its model, setpoints {low:g} to {high:g}"
+        missing = self.unsaid()
+        return said if not missing else f"{said}; it does not say {', '.join(missing)}: an earlier version wrote it"
+
+
+def find_policy(name: str, root: Path = Path("runs")) -> Path:
+    """A policy.npz from a path, a run folder or `latest`: the one that `train` or `demo` wrote last under `root`.
+
+    Raises: UserError saying what to give instead.
+    """
     if name == "latest":
-        found = sorted(root.glob("**/policy.npz"), key=lambda p: p.stat().st_mtime)
+        found = sorted((p for pattern in TRAINED for p in root.glob(pattern)), key=lambda p: p.stat().st_mtime)
         if not found:
-            raise frame.UserError(f"policy=latest: no policy.npz under {root}; train one first or give policy=PATH")
+            raise NoPolicyError(f"policy=latest: no training run under {root}/; train one first or give policy=PATH")
         return found[-1]
     path = Path(name)
     return path / "policy.npz" if path.is_dir() else path
@@ -34,28 +97,57 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     path = find_policy(name)
     try:
         policy = policies.load(path)
-        trained = float(policy.metadata.get("control_min", float("nan")))
-        regret = float(policy.metadata.get("regret_pct", float("nan")))
+        training = Training.of(policy)
         fastest = float(policy.pump_rates.max())
     except policies.PolicyError as error:
         raise frame.UserError(str(error)) from None
     except Exception as error:  # whatever a damaged file makes NumPy say
         why = (str(error).splitlines() or [type(error).__name__])[0]
         raise frame.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
-    if not abs(trained - control_min) <= 1e-9:
+    if not abs(training.control_min - control_min) <= 1e-9:
         raise frame.UserError(
-            f"policy {path} was trained for a control period of {trained} min, the backend has {control_min} min; "
-            f"train with env.control_min={control_min}"
+            f"policy {path} was trained for a control period of {training.control_min} min, "
+            f"the backend has {control_min} min; train with env.control_min={control_min}"
         )
     if not fastest <= max_rate + 1e-12:
         raise frame.UserError(
             f"policy {path} pumps up to {fastest} mL/s, the interlock allows {max_rate} mL/s; "
             "train with a smaller env.max_pump_rate or raise safety.max_rate"
         )
-    log.info("policy %s: regret %.2f %% against the optimum of its model", path, regret)
-    if not regret <= POOR_REGRET_PCT:
-        log.warning("this policy is far from optimal (regret %.0f %%): train longer or with another seed", regret)
+    log.info("policy %s: %s", path, training)
     return policy
+
+
+def admit(policy: Policy, config: DeployConfig, scenarios: Sequence[Scenario]) -> None:
+    """Warn of a policy that is doubtful for these scenarios.
+
+    Raises: UserError where a culture is at stake, unless it is forced or an earlier life of the run began with it.
+    """
+    for doubt in (doubts := _doubts(policy, config, scenarios)):
+        log.warning("policy: %s", doubt)
+    if doubts and config.resume is None and _refuses(config):
+        raise frame.UserError(f"policy refused: {'; '.join(doubts)}; {FORCE}")
+
+
+def _doubts(policy: Policy, config: DeployConfig, scenarios: Sequence[Scenario]) -> list[str]:
+    asked = [setpoint for scenario in scenarios for setpoint in scenario.setpoints]
+    return Training.of(policy).doubts(asked, config.poor_regret_pct)
+
+
+def _refuses(config: DeployConfig) -> bool:
+    return config.backend.kind not in REHEARSED and not config.force_policy
+
+
+def policy_check(config: DeployConfig, scenarios: Sequence[Scenario]) -> Check:
+    """The policy's line of a preflight; that none has been trained yet does not stop a look at the device."""
+    try:
+        policy = load_policy(config.policy, config.backend.control_min, config.safety.max_rate)
+    except NoPolicyError as error:
+        return Check("policy", False, str(error), "python -m experiments.train", required=False)
+    except frame.UserError as error:
+        return Check("policy", False, str(error), "give another policy=PATH")
+    doubts = _doubts(policy, config, scenarios)
+    return Check("policy", not doubts, "; ".join(doubts) or str(Training.of(policy)), FORCE, _refuses(config))
 
 
 def run_policy(name: str, folder: Path, resumed: bool, control_min: float, max_rate: float) -> Policy:

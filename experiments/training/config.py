@@ -27,7 +27,7 @@ class TrainConfig:
         None, "groups of 16 agents trained at the same time; null: one per core. No effect on results", at_least=1
     )
     eval_every: int = setting(
-        250, "between evaluations of the greedy policy on the selection grid", "steps", at_least=1
+        100, "between evaluations of the greedy policy on the selection grid: once per episode", "steps", at_least=1
     )
     checkpoint_every: int = setting(1000, "between checkpoints", "steps", at_least=1)
     resume: str | None = setting(None, "a run folder to continue")

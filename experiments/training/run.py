@@ -12,16 +12,19 @@ import torch
 from dqn import policy
 from dqn.checkpoint import CheckpointError
 from dqn.export import export
-from envs.optimum import solve
+from envs.optimum import solve_episode
+from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
 from experiments.reporting import charts
 from experiments.training.config import TrainConfig, read_env_file
-from experiments.training.evaluation import Score, rollout
+from experiments.training.evaluation import Score, best_rollout, rollout
 from experiments.training.session import Session
 
 __all__ = ["train"]
 
 log = logging.getLogger(__name__)
+
+COARSE = 2e-3  # of log OD: enough for a picture
 
 
 def train(config: TrainConfig, folder: Path) -> float:
@@ -31,6 +34,7 @@ def train(config: TrainConfig, folder: Path) -> float:
         frame.save_config(config, folder)
     if config.device == "cuda" and not torch.cuda.is_available():
         raise frame.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
+    _warn_of_growth(config.env)
     torch.set_num_threads(1)  # of one operation: matrices of this size do not gain from more
     try:
         session = Session(config, folder, resume=config.resume is not None)
@@ -42,6 +46,17 @@ def train(config: TrainConfig, folder: Path) -> float:
     finally:
         session.writer.close()
     return float(np.median(session.best.regret))
+
+
+def _warn_of_growth(env: EnvConfig) -> None:
+    """Say that no policy can hold a culture that the largest rate does not thin: f >= 1 for every action."""
+    if step_factors(env).min() >= 1.0:
+        log.warning(
+            "env.mu = %g 1/min outgrows the pump: with env.tau = %.4g it takes more than mu tau = %.4g mL/s to thin "
+            "the culture, and env.max_pump_rate = %g mL/s; nothing can hold it at a setpoint. Raise env.max_pump_rate, "
+            "or check mu and tau",
+            env.mu, env.tau, env.mu * env.tau, env.max_pump_rate,
+        )  # fmt: skip
 
 
 def _finish(session: Session) -> None:
@@ -57,6 +72,7 @@ def _finish(session: Session) -> None:
         "train_seconds": round(session.seconds, 3),
         "regret_pct": kept.regret_pct,
         "steady_abs_error": kept.steady_abs_error,
+        "steady_abs_error_by_setpoint": kept.steady_by_setpoint,
         "regret_pct_last": last.regret_pct,
         "steady_abs_error_last": last.steady_abs_error,
         "kept_step": best.step,
@@ -72,9 +88,10 @@ def _finish(session: Session) -> None:
     }
     session.writer.events.hyper_parameters(numbers, ["eval/regret_pct", "eval/steady_abs_error"])
     log.info(
-        "%d agent(s), %d steps and %d updates each in %.1f s: regret %.2f %% (worst %.2f %%), steady error %.4f OD",
+        "%d agent(s), %d steps and %d updates each in %.1f s; reported grid: regret %.2f %% (worst %.2f %%), "
+        "steady error at the worst setpoint %.4f OD (worst %.4f OD)",
         agents.n_agents, agents.steps, agents.updates, session.seconds, np.median(kept.regret_pct),
-        kept.regret_pct.max(), np.median(kept.steady_abs_error),
+        kept.regret_pct.max(), np.median(kept.steady_abs_error), kept.steady_abs_error.max(),
     )  # fmt: skip
     log.info("policy %s; figures %s; tensorboard --logdir %s", path, session.folder / "figures", session.folder)
 
@@ -98,6 +115,7 @@ def _export(session: Session, score: Score) -> Path:
             "agent": asdict(c.agent),
             "config_hash": _fingerprint(c),
             "trained_steps": int(best.step[i]),
+            "updates": c.agent.updates_at(int(best.step[i])),
             "regret_pct": float(score.regret_pct[i]),
             "steady_abs_error": float(score.steady_abs_error[i]),
         }
@@ -110,7 +128,7 @@ def _export(session: Session, score: Score) -> Path:
 
 def _figures(session: Session, policy_path: Path) -> None:
     """Learning curves, policy map and example trajectories, as files and in TensorBoard."""
-    env, gamma, best = session.config.env, session.config.agent.gamma, session.best
+    env, best = session.config.env, session.best
     rates, factors = env.pump_rates(), session.selection.factors
     learned = policy.load(policy_path)
     history = np.array([[step, *regret] for step, regret, _ in best.history])
@@ -119,10 +137,10 @@ def _figures(session: Session, policy_path: Path) -> None:
     }
 
     od, setpoint = np.linspace(0.05, 1.25, 241), np.linspace(min(env.setpoints), max(env.setpoints), 33)
-    optimum = solve(env, gamma, setpoints=np.append(setpoint, env.setpoints), grid=3001)
     x, s = (a.ravel() for a in np.meshgrid(od, setpoint))
     learned_map = learned.rate(np.stack([x, s], axis=1)).reshape(setpoint.size, od.size)
-    best_map = rates[optimum.act(x, s)].reshape(setpoint.size, od.size)
+    first = [solve_episode(env, float(goal), COARSE).act(od, env.episode_steps) for goal in setpoint]
+    best_map = rates[np.stack(first)]
     drawn["policy_map"] = charts.policy_map(od, setpoint, learned_map, best_map)
 
     goals = np.asarray(env.setpoints)[[0, len(env.setpoints) // 2, -1]]
@@ -130,7 +148,7 @@ def _figures(session: Session, policy_path: Path) -> None:
     ours = rollout(
         lambda a, b: learned.act(np.stack([a[0], b[0]], axis=1))[None], factors, starts, targets, env.episode_steps
     )
-    theirs = rollout(lambda a, b: optimum.act(a[0], b[0])[None], factors, starts, targets, env.episode_steps)
+    theirs = best_rollout(env, starts[0], targets[0])
     drawn["trajectories"] = charts.trajectories(
         np.arange(env.episode_steps + 1, dtype=np.float64) * env.control_min,
         np.concatenate([starts, ours.od[:, 0]]),

@@ -35,7 +35,8 @@ recording, and 0.003 OD is the noise of the sensor."""
 def merit(score: Score) -> NDArray[np.float64]:
     """How far a policy is from what matters, (S,), lower is better: the larger of regret and steady error in units.
 
-    Regret alone does not see a small offset at rest: 0.006 OD for a whole episode is 0.1 % of its cost.
+    Regret alone does not see a small offset at rest: 0.006 OD for a whole episode is 0.1 % of its cost. The steady
+    error is that of the worst setpoint.
     """
     return np.maximum(score.regret_pct / REGRET_UNIT, score.steady_abs_error / STEADY_UNIT)
 
@@ -46,7 +47,8 @@ class Best:
 
     weights: torch.Tensor  # (S, P)
     merit: NDArray[np.float64]  # (S,)
-    regret: NDArray[np.float64]  # of the best by merit, (S,)
+    regret: NDArray[np.float64]  # per cent, of the best by merit, (S,)
+    steady: NDArray[np.float64]  # OD, likewise
     step: NDArray[np.int64]  # (S,)
     history: list[tuple[int, list[float], list[float]]] = field(default_factory=list)
     """Step, regret_pct and steady_abs_error of every evaluation, per agent."""
@@ -55,7 +57,8 @@ class Best:
     def empty(cls, weights: torch.Tensor) -> Best:
         """Nothing scored yet; `weights` (S, P) stand until something is."""
         n = weights.shape[0]
-        return cls(weights.cpu().clone(), np.full(n, np.inf), np.full(n, np.inf), np.zeros(n, dtype=np.int64))
+        worst = np.full((3, n), np.inf)
+        return cls(weights.cpu().clone(), worst[0], worst[1], worst[2], np.zeros(n, dtype=np.int64))
 
     def update(self, step: int, score: Score, weights: torch.Tensor) -> None:
         """Keep what is better than before."""
@@ -66,6 +69,7 @@ class Best:
             self.weights[i] = weights[i].cpu()
         self.merit[better] = value[better]
         self.regret[better] = score.regret_pct[better]
+        self.steady[better] = score.steady_abs_error[better]
         self.step[better] = step
 
     def state_dict(self) -> dict[str, Any]:
@@ -74,6 +78,7 @@ class Best:
             "weights": self.weights,
             "merit": self.merit.tolist(),
             "regret": self.regret.tolist(),
+            "steady": self.steady.tolist(),
             "step": self.step.tolist(),
             "history": self.history,
         }
@@ -83,6 +88,7 @@ class Best:
         self.weights.copy_(state["weights"])
         self.merit[:] = state["merit"]
         self.regret[:] = state["regret"]
+        self.steady[:] = state["steady"]
         self.step[:] = state["step"]
         self.history = [(step, list(regret), list(steady)) for step, regret, steady in state["history"]]
 
@@ -101,7 +107,7 @@ class Session:
         self.folder = folder
         self.seeds: Sequence[int] = range(config.seed, config.seed + config.n_agents)
         self.agents = build.population(config.env, config.agent, self.seeds, config.device, config.threads)
-        self.selection = Evaluation(config.env, config.agent.gamma, selection_grid(config.env))
+        self.selection = Evaluation(config.env, selection_grid(config.env))
         self.best = Best.empty(self.agents.weights())
         self.returns: list[list[float]] = []  # per episode, per agent
         self.seconds = 0.0  # spent training, over all lives
@@ -120,9 +126,20 @@ class Session:
         self.writer.flush()
         return score
 
+    def _news(self, record: TrainRecord) -> str:
+        """Medians over agents on the selection grid, now and of what is kept; nothing is scored before an update."""
+        if not record.updates and record.step < self.config.agent.total_steps:
+            return f"untrained until step {self.config.agent.learn_start}"
+        score, best = self.evaluate(record.step), self.best
+        now, kept = (
+            f"{np.median(regret):.2f} % regret, {np.median(steady):.4f} OD steady error"
+            for regret, steady in ((score.regret_pct, score.steady_abs_error), (best.regret, best.steady))
+        )
+        return f"selection grid: {now}; kept: {kept}"
+
     def report(self) -> tuple[Evaluation, Score, Score]:
         """The reported grid with the scores of the kept policies and of the last iterates on it."""
-        report = Evaluation(self.config.env, self.config.agent.gamma, report_grid(self.config.env))
+        report = Evaluation(self.config.env, report_grid(self.config.env))
         kept, last = (
             report(build.act_with(self.agents.network, weights), self.agents.n_agents)
             for weights in (self.best.weights, self.agents.weights())
@@ -170,8 +187,7 @@ class Session:
                 bar.update(record.step - last)
                 final = record.step == total
                 if final or record.step // c.eval_every > last // c.eval_every:
-                    score = self.evaluate(record.step)
-                    line = f"regret {np.median(score.regret_pct):.2f} %, best {np.median(self.best.regret):.2f} %"
+                    line = self._news(record)
                     bar.set_postfix_str(line)
                     if bar.disable:
                         log.info("step %d of %d: %s", record.step, total, line)

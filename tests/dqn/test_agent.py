@@ -126,6 +126,37 @@ def test_one_update_agrees_with_torch() -> None:
         torch.testing.assert_close(agent.online.flat[i].double(), parameters.detach(), rtol=1e-4, atol=1e-6)
 
 
+def test_the_target_network_is_copied_when_it_is_due_and_stays_in_between() -> None:
+    """Period 4: the target network is that of updates 0, 4, 8, 12 until the next of them."""
+    agent = DQNAgent(DQNConfig(**{**SMALL.__dict__, "target_period": 4}), 3, 3, streams(range(2)))
+    draws = torch.Generator().manual_seed(0)
+    history = [agent.online.flat.clone()]
+    for update in range(1, 14):
+        observation = torch.rand(2, 8, 3, generator=draws)
+        agent.fit(observation, torch.randint(3, (2, 8), generator=draws), torch.rand(2, 8, generator=draws))
+        history.append(agent.online.flat.clone())
+        assert not torch.equal(history[-1], history[-2])
+        assert torch.equal(agent.target.flat, history[[0, 4, 8, 12][update // 4]])
+
+
+def test_rewards_of_replaced_goals_are_scaled_like_those_of_the_environment() -> None:
+    """At gamma 0: Q = 10 * 1 where the environment paid 1, 10 * -2 where half of a minibatch got a goal paying -2."""
+    config = DQNConfig(
+        **{**SMALL.__dict__, "gamma": 0.0, "reward_scale": 10.0, "hindsight_share": 0.5, "learning_rate": 1e-2}
+    )
+
+    def elsewhere(batch: Transition, uniform: torch.Tensor) -> Transition:
+        return batch._replace(s_tm1=batch.s_tm1.flip(-1), r_t=torch.full_like(batch.r_t, -2.0))
+
+    agent = DQNAgent(config, 2, 2, streams(range(2)), elsewhere)
+    here, paid = np.tile(np.array([1.0, 0.0], dtype=np.float32), (2, 1)), np.ones(2)
+    for k in range(400):
+        agent.observe(here, np.full(2, k % 2), paid, here, paid)
+    q = agent.online(torch.eye(2).expand(2, 2, 2))
+    torch.testing.assert_close(q[:, 0], torch.full((2, 2), 10.0), rtol=0.02, atol=0.0)
+    torch.testing.assert_close(q[:, 1], torch.full((2, 2), -20.0), rtol=0.02, atol=0.0)
+
+
 def test_truncation_bootstraps_and_termination_does_not() -> None:
     """All rewards 1 and one observation: Q grows towards 1 / (1 - gamma) only where episodes are truncated."""
     config = DQNConfig(**{**SMALL.__dict__, "total_steps": 10_000, "gamma": 0.9, "target_period": 10})

@@ -46,6 +46,31 @@ def test_a_failed_write_leaves_the_previous_checkpoint(tmp_path: Path) -> None:
     assert checkpoint.load(path) == {"step": 1}
 
 
+def test_a_checkpoint_is_on_the_disk_before_it_takes_the_name_and_its_name_before_the_call_returns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Order of what reaches the disk; otherwise a power cut can leave an empty checkpoint, or the old one's name."""
+    path, order = tmp_path / "checkpoint.pt", []
+    fsync, replace = os.fsync, os.replace
+
+    def synced(file: int) -> None:
+        order.append(("fsync", os.readlink(f"/proc/self/fd/{file}"), os.fstat(file).st_size))
+        fsync(file)
+
+    def renamed(source: Path, target: Path) -> None:
+        order.append(("replace", str(source), str(target)))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", renamed)
+    checkpoint.save(path, {"numbers": torch.arange(10_000)})
+    part, size = str(path) + ".part", path.stat().st_size
+    assert size > 40_000
+    assert [step[:2] for step in order] == [("fsync", part), ("replace", part), ("fsync", str(tmp_path))]
+    assert order[0][2] == size
+    assert order[1][2] == str(path)
+
+
 class _Malicious:
     """Runs a command when unpickled by an unrestricted reader."""
 

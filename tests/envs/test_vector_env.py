@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
 import envs  # registers the environment
 from envs.task import EnvConfig, step_factors
@@ -29,36 +30,111 @@ def test_make_vec_gives_the_native_environment():
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
 
 
+def pair(n, mode, **overrides):
+    """The native environment and Gymnasium's loop over single ones, of the same autoreset mode."""
+    native = gymnasium.make_vec(ID, num_envs=n, autoreset_mode=mode, **overrides)
+    sync = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
+    return native, gymnasium.make_vec(ID, num_envs=n, **sync, **overrides)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
 @pytest.mark.parametrize("overrides", [{}, {"episode_steps": 7, "final_reward_weight": 3.0, "mu": 0.02}])
-def test_native_equals_gymnasiums_sync_step_for_step(overrides):
+def test_native_equals_gymnasiums_sync_step_for_step(overrides, mode):
+    """Rewards, ends and observations of 250 steps, with some copies restarted out of turn on the way."""
     n, steps = 5, 250
-    native = gymnasium.make_vec(ID, num_envs=n, **overrides)
-    sync = gymnasium.make_vec(
-        ID,
-        num_envs=n,
-        vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
-        **overrides,
-    )
-    a, _ = native.reset(seed=11)
-    b, _ = sync.reset(seed=11)
-    np.testing.assert_array_equal(a, b)
+    native, sync = pair(n, mode, **overrides)
+    assert native.metadata["autoreset_mode"] is sync.metadata["autoreset_mode"] is mode
+    np.testing.assert_array_equal(native.reset(seed=11)[0], sync.reset(seed=11)[0])
     rng = np.random.default_rng(0)
     ends = 0
-    for _ in range(steps):
+    for k in range(steps):
+        if k in (3, 7, 14, 100, 101):
+            mask = rng.random(n) < 0.5
+            mask[k % n] = True
+            a, b = (env.reset(options={"reset_mask": mask.copy()})[0] for env in (native, sync))
+            np.testing.assert_array_equal(a, b)
         action = rng.integers(0, 17, n)
-        oa, ra, ta, ua, ia = native.step(action)
-        ob, rb, tb, ub, ib = sync.step(action)
-        np.testing.assert_array_equal(oa, ob)
-        np.testing.assert_array_equal(ra, rb)
-        np.testing.assert_array_equal(ta, tb)
-        np.testing.assert_array_equal(ua, ub)
-        if ua.any():
-            ends += int(ua.sum())
+        *ours, ia = native.step(action)
+        *theirs, ib = sync.step(action)
+        for one, other in zip(ours, theirs, strict=True):
+            np.testing.assert_array_equal(one, other)
+        truncated = ours[3]
+        ends += int(truncated.sum())
+        assert ("final_obs" in ia) == ("final_obs" in ib) == (mode is AutoresetMode.SAME_STEP and truncated.any())
+        if "final_obs" in ia:
             np.testing.assert_array_equal(ia["_final_obs"], ib["_final_obs"])
-            for i in np.flatnonzero(ua):
+            for i in np.flatnonzero(truncated):
                 np.testing.assert_array_equal(ia["final_obs"][i], ib["final_obs"][i])
     assert ends >= n
+
+
+def test_gymnasiums_stateful_wrappers_work():
+    """Observations normalised and episodes counted, both native and in Gymnasium's loop."""
+    native, sync = (
+        RecordEpisodeStatistics(NormalizeObservation(env)) for env in pair(4, AutoresetMode.NEXT_STEP, episode_steps=9)
+    )
+    rng = np.random.default_rng(1)
+    np.testing.assert_array_equal(native.reset(seed=3)[0], sync.reset(seed=3)[0])
+    for _ in range(45):
+        action = rng.integers(0, 17, 4)
+        for one, other in zip(native.step(action)[:4], sync.step(action)[:4], strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert list(native.length_queue) == list(sync.length_queue) == [9] * 16
+    np.testing.assert_array_equal(native.return_queue, sync.return_queue)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode)[:2])
+def test_a_saved_state_remembers_which_copies_wait_for_their_next_episode(mode):
+    env, other = (BioreactorVectorEnv(2, autoreset_mode=mode, episode_steps=5) for _ in range(2))
+    env.reset(seed=0)
+    other.reset(seed=9)
+    for _ in range(5):
+        env.step(np.zeros(2, dtype=int))
+    other.load_state_dict(env.state_dict())
+    for _ in range(7):
+        for one, same in zip(env.step(np.ones(2, dtype=int))[:4], other.step(np.ones(2, dtype=int))[:4], strict=True):
+            np.testing.assert_array_equal(one, same)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.DISABLED, "never"])
+def test_other_modes_are_refused(mode):
+    with pytest.raises(ValueError, match=r"autoreset_mode = .*: allowed AutoresetMode.NEXT_STEP, AutoresetMode.SAME"):
+        BioreactorVectorEnv(2, autoreset_mode=mode)
+
+
+@pytest.mark.parametrize(("arguments", "steps"), [({}, 100), ({"episode_steps": 7}, 7), ({"episode_steps": 130}, 130)])
+def test_a_made_environment_says_and_keeps_its_length(arguments, steps):
+    """One episode ends after `steps`, once, and the next one after as many."""
+    env = gymnasium.make(ID, render_mode=None, **arguments)
+    assert env.spec.max_episode_steps == steps
+    many = gymnasium.make_vec(ID, num_envs=2, render_mode=None, **arguments)
+    assert many.spec.max_episode_steps == steps
+    many.reset(seed=0)
+    assert [bool(many.step(np.zeros(2, dtype=int))[3].any()) for _ in range(2 * steps)] == 2 * [
+        *[False] * (steps - 1),
+        True,
+    ]
+    for seed in (0, None):
+        env.reset(seed=seed)
+        assert [env.step(0)[3] for _ in range(steps)] == [False] * (steps - 1) + [True]
+
+
+def test_gymnasiums_own_time_limit_shortens_episodes():
+    env = gymnasium.make(ID, max_episode_steps=4)
+    many = gymnasium.make_vec(ID, num_envs=2, max_episode_steps=4)
+    assert env.spec.max_episode_steps == many.spec.max_episode_steps == 4
+    many.reset(seed=0)
+    for _ in range(2):
+        env.reset()
+        assert [env.step(0)[3] for _ in range(4)] == [False, False, False, True]
+        assert [many.step(np.zeros(2, dtype=int))[3].all() for _ in range(4)] == [False, False, False, True]
+
+
+@pytest.mark.filterwarnings("ignore:.*render_mode")  # Gymnasium's own
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_a_way_to_draw_that_does_not_exist_is_refused(make):
+    with pytest.raises(ValueError, match="render_mode = human: allowed None"):
+        make(ID, render_mode="human")
 
 
 def test_copies_follow_the_model_and_the_reward():
@@ -137,10 +213,39 @@ def test_partial_reset_touches_only_the_masked_copies():
         env.reset(options={"reset_mask": np.ones(3, dtype=bool)})
 
 
-def test_step_before_reset_and_bad_actions_are_refused():
+def test_step_before_reset_is_refused():
     with pytest.raises(RuntimeError, match="reset"):
         BioreactorVectorEnv(1).step(np.zeros(1, dtype=int))
+
+
+@pytest.mark.parametrize("action", [3, np.int64(3), np.uint8(3), np.array(3)])
+def test_one_action_may_be_any_integer_scalar(action):
+    one, other = (gymnasium.make(ID).unwrapped for _ in range(2))
+    for env in (one, other):
+        env.reset(seed=0)
+    np.testing.assert_array_equal(one.step(action)[0], other.step(3)[0])
+
+
+@pytest.mark.parametrize("action", [17, -1, 2.0, True, None, "3", [3], np.array([3]), np.array([[3]])], ids=repr)
+def test_any_other_action_is_refused_and_changes_nothing(action):
     env = gymnasium.make(ID).unwrapped
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="allowed 0 to 16"):
-        env.step(17)
+    with pytest.raises(
+        ValueError, match=r"action .*: allowed 0 to 16 \(index of a pump rate\), integers of shape \(\)"
+    ):
+        env.step(action)
+    assert env._batch._steps[0] == 0
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [[0, 1, 17], [0, -1, 2], [0.0, 1.0, 2.0], [True, False, True], [1, 2], 1, [[0], [1], [2]], [[0, 1, 2]]],
+    ids=repr,
+)
+def test_actions_of_many_copies_are_refused_together(actions):
+    env = BioreactorVectorEnv(3)
+    env.reset(seed=0)
+    before = env.od.copy()
+    with pytest.raises(ValueError, match=r"action .* of shape .*: allowed 0 to 16 .*, integers of shape \(3,\)"):
+        env.step(np.array(actions))
+    np.testing.assert_array_equal(env.od, before)

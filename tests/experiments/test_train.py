@@ -5,11 +5,13 @@ KILL_SEED=7 python -m pytest tests/experiments/test_train.py tests/experiments/t
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,8 +19,12 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dqn import checkpoint, policy
-from envs.task import EnvConfig
+from dqn.checkpoint import CheckpointError
+from dqn.config import DQNConfig
+from envs.task import EnvConfig, step_factors
+from experiments.cli.frame import UserError
 from experiments.training import build
+from experiments.training import run as train_run
 from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Evaluation, report_grid, selection_grid
 from experiments.training.session import Session
@@ -96,11 +102,24 @@ def test_tensorboard_reads_grouped_scalars_and_figures(whole):
 def test_the_summary_can_be_recomputed_from_the_exported_policy(whole):
     summary = json.loads((whole / "summary.json").read_text())
     config = EnvConfig()
-    report = Evaluation(config, 0.99, report_grid(config))
+    report = Evaluation(config, report_grid(config))
     for i, seed in enumerate(summary["seeds"]):
         learned = policy.load(whole / "policies" / f"seed{seed:04d}.npz")
         score = report(lambda od, s, learned=learned: learned.act(np.stack([od[0], s[0]], axis=1))[None])
         assert score.regret_pct[0] == pytest.approx(summary["regret_pct"][i], rel=1e-3)
+
+
+def test_a_policy_file_says_what_a_reactor_is_told_before_it_runs(whole):
+    """Regret and steady error as in the summary, setpoints, and updates: four a step after step 100."""
+    summary = json.loads((whole / "summary.json").read_text())
+    for i, seed in enumerate(summary["seeds"]):
+        metadata = policy.load(whole / "policies" / f"seed{seed:04d}.npz").metadata
+        assert metadata["updates"] == 4 * (summary["kept_step"][i] - 100)
+        assert metadata["regret_pct"] == summary["regret_pct"][i]
+        assert metadata["steady_abs_error"] == summary["steady_abs_error"][i]
+        assert metadata["steady_abs_error"] == max(summary["steady_abs_error_by_setpoint"][i])
+        assert metadata["model"]["setpoints"] == list(EnvConfig().setpoints)
+    assert DQNConfig(learn_start=100, updates_per_step=4).updates_at(100) == 0
 
 
 def test_selection_and_report_share_no_start():
@@ -153,15 +172,36 @@ def test_agent_of_a_population_is_the_same_seed_alone(tmp_path):
     assert not torch.allclose(many.agent.online.flat[2], many.agent.online.flat[3])
 
 
-def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path):
+def test_what_is_remembered_follows_the_model_also_at_the_end_of_an_episode():
+    """x' = f(u) x towards the same setpoint in every transition of six episodes, and nothing is final."""
+    env = EnvConfig(episode_steps=5)
+    trainer = build.trainer(env, TrainConfig().agent, range(3))
+    trainer._observation, _ = trainer.env.reset()
+    for _ in range(30):
+        trainer._step()
+    x, goal, reached, same, action, reward, continues = trainer.agent.replay.state_dict()["rows"].double().numpy().T
+    np.testing.assert_allclose(reached, x * step_factors(env)[action.astype(int)], rtol=1e-6)
+    np.testing.assert_array_equal(goal, same)
+    np.testing.assert_allclose(reward, -((reached - goal) ** 2), rtol=1e-4, atol=1e-6)
+    assert (continues == 1.0).all()
+    assert len(np.unique(goal)) > 3
+
+
+def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path, caplog):
     from dataclasses import replace
 
     c = TrainConfig()
     c = replace(c, agent=replace(c.agent, total_steps=600, learn_start=100), eval_every=100, checkpoint_every=100)
     (tmp_path / "a").mkdir()
     first = Session(c, tmp_path / "a")
-    first.run()
+    with caplog.at_level("INFO"):
+        first.run()
     first.writer.close()
+    assert caplog.messages[0] == "step 100 of 600: untrained until step 100"
+    assert re.fullmatch(
+        r"step 200 of 600: selection grid: \d+\.\d\d % regret, \d\.\d{4} OD steady error; kept: .*", caplog.messages[1]
+    )
+    assert [step for step, _, _ in first.best.history] == [200, 300, 400, 500, 600]
     half = replace(c, agent=replace(c.agent, total_steps=300))
     (tmp_path / "b").mkdir()
     second = Session(half, tmp_path / "b")
@@ -173,6 +213,19 @@ def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path):
     third.writer.close()
     assert torch.equal(first.agents.weights(), third.agents.weights())
     assert first.best.history == third.best.history
+
+
+@pytest.mark.parametrize(
+    ("mu", "tau", "outgrown"),
+    [(0.03, 1 / 3, False), (0.059, 1 / 3, False), (0.061, 1 / 3, True), (0.03, 0.66, False), (0.03, 0.67, True)],
+)
+def test_a_culture_that_outgrows_the_pump_is_said_before_it_is_trained_on(mu, tau, outgrown, monkeypatch, caplog):
+    """The largest rate, 0.02 mL/s, thins by 0.02 / tau a minute."""
+    monkeypatch.setattr(train_run, "Session", Mock(side_effect=CheckpointError("far enough")))
+    config = TrainConfig(env=EnvConfig(mu=mu, tau=tau))
+    with pytest.raises(UserError, match="far enough"):
+        train_run.train(config, Path())
+    assert [f"env.mu = {mu:g} 1/min outgrows the pump" in m for m in caplog.messages] == [True] * outgrown
 
 
 @pytest.mark.parametrize(

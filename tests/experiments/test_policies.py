@@ -1,0 +1,141 @@
+"""Which policy a run finds, and which ones it lets near a culture."""
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dqn import policy
+from envs.scenario import Scenario
+from experiments import demo
+from experiments.cli.frame import UserError
+from experiments.control import assemble
+from experiments.control.config import DeployConfig
+from experiments.control.policies import find_policy
+from experiments.controllers import registry
+from hardware.chibio.config import ChiBioConfig, EmulatorConfig
+from hardware.emulator.process import EmulatorProcess
+from hardware.simulated import SimulatedConfig
+from tests.experiments.test_deploy import inverse_policy
+
+TRAINED = {"updates": 36_000, "regret_pct": 0.1, "model": {"setpoints": [0.2, 0.6, 1.0]}}
+DOUBTFUL = {
+    "untrained": ({"updates": 0}, r"before the first update \(train for more steps than agent.learn_start\)"),
+    "poor": ({"regret_pct": 127_981.0}, r"its regret is 127981 %, more than poor_regret_pct = 10 %"),
+    "elsewhere": (
+        {"model": {"setpoints": [0.55, 0.7]}},
+        r"trained for setpoints 0.55 to 0.7, the scenario asks for 0.5, 0.8 \(train with env.setpoints",
+    ),
+}
+doubtful = pytest.mark.parametrize(("metadata", "message"), DOUBTFUL.values(), ids=list(DOUBTFUL))
+
+
+def deployed(tmp_path: Path, metadata: dict[str, Any], **changes: Any) -> DeployConfig:
+    """The config of a run at 0.8, 0.65 and 0.5 with a policy of this training."""
+    given = inverse_policy()
+    policy.save(tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, **metadata}))
+    scenario = Scenario((0.8, 0.65, 0.5), (30.0,) * 3, (37.0,) * 3)
+    return DeployConfig(**{"scenario": scenario, "policy": str(tmp_path / "given.npz"), **changes})
+
+
+@doubtful
+def test_a_doubtful_policy_is_kept_from_a_culture(tmp_path: Path, metadata: dict[str, Any], message: str) -> None:
+    config = deployed(tmp_path, metadata, backend=ChiBioConfig())
+    with pytest.raises(UserError, match=rf"policy refused: .*{message}.*; force_policy=true runs it all the same"):
+        assemble.unpack(config, tmp_path)
+
+
+@doubtful
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"backend": SimulatedConfig()},
+        {"backend": EmulatorConfig()},
+        {"backend": ChiBioConfig(), "force_policy": True},
+        {"backend": ChiBioConfig(), "resume": "RUN"},  # its culture is in the vial already
+    ],
+    ids=["sim", "emulator", "forced", "resumed"],
+)
+def test_elsewhere_it_is_warned_of(
+    tmp_path: Path, metadata: dict[str, Any], message: str, changes: dict[str, Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    assert assemble.unpack(deployed(tmp_path, metadata, **changes), tmp_path).policy is not None
+    warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warned) == 1
+    assert re.search(message, warned[0])
+
+
+def test_a_sound_policy_and_a_limit_of_ones_own(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assemble.unpack(deployed(tmp_path, {}, backend=ChiBioConfig()), tmp_path)
+    assemble.unpack(deployed(tmp_path, {"regret_pct": 30.0}, backend=ChiBioConfig(), poor_regret_pct=40.0), tmp_path)
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+
+
+def test_a_file_of_an_earlier_version_runs_and_says_what_is_not_known(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    policy.save(tmp_path / "given.npz", inverse_policy())  # says its regret and its control period
+    config = DeployConfig(backend=ChiBioConfig(), policy=str(tmp_path / "given.npz"))
+    with caplog.at_level("INFO"):
+        assemble.unpack(config, tmp_path)
+    assert "it does not say updates, trained setpoints: an earlier version wrote it" in caplog.text
+
+
+def test_latest_is_what_train_or_demo_wrote_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Copies of policies that runs of a controller keep are none."""
+    monkeypatch.chdir(tmp_path)
+    _, learned, flown, _ = (
+        Path(step[-1].removeprefix("hydra.run.dir=")) / "policy.npz" for step in demo.commands(Path("runs/demo/now"))
+    )
+    swept = Path("runs/train/then_sweep/3/policy.npz")
+    copies = [flown, Path("runs/deploy/later/policy.npz"), Path("runs/benchmark/later/training/paper/policy.npz")]
+    for age, path in enumerate([swept, learned, *copies]):
+        path.parent.mkdir(parents=True)
+        policy.save(path, inverse_policy())
+        os.utime(path, (1e9 + age, 1e9 + age))
+    assert find_policy("latest") == learned
+    os.utime(swept, (2e9, 2e9))
+    assert find_policy("latest") == swept
+
+
+@pytest.fixture(scope="module")
+def device() -> Iterator[ChiBioConfig]:
+    """A device of the kind that runs cultures, as far as the program can see."""
+    with EmulatorProcess(["--reactors", "M0", "--speed", "30", "--od", "0.5"]) as emulator:
+        yield ChiBioConfig(url=emulator.url, speed=30.0)
+
+
+def lines(config: DeployConfig, folder: Path, caplog: pytest.LogCaptureFixture) -> list[str]:
+    """What the preflight says of the policy, after it has been through."""
+    with caplog.at_level("INFO"):
+        assemble.run_preflight(assemble.unpack(config, folder), folder)
+    assert any("M0 present" in record.getMessage() for record in caplog.records)
+    return [line for record in caplog.records if "  policy: " in (line := record.getMessage())]
+
+
+def test_the_device_is_looked_at_before_anything_was_trained(
+    device: ChiBioConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = DeployConfig(backend=device, preflight_only=True)
+    said = lines(config, tmp_path, caplog)
+    assert len(said) == 1
+    assert said[0].startswith("note  policy: policy=latest: no training run under runs/")
+    caplog.clear()
+    assert lines(replace(config, controller=registry.config("pi")), tmp_path, caplog) == []
+
+
+def test_a_preflight_says_that_a_policy_would_be_refused(
+    device: ChiBioConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = deployed(tmp_path, {"regret_pct": 127_981.0}, backend=device, preflight_only=True)
+    with pytest.raises(UserError, match=r"preflight: 1 of \d+ checks failed, the first: FAIL  policy: its regret is"):
+        lines(config, tmp_path, caplog)
+    caplog.clear()
+    assert lines(deployed(tmp_path, {}, backend=device, preflight_only=True), tmp_path, caplog) == [
+        "pass  policy: regret 0.10 % against the optimum of its model, setpoints 0.2 to 1"
+    ]
