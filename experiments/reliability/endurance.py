@@ -15,10 +15,10 @@ import numpy as np
 from conf.schema import check, part, setting
 from envs.scenario import Scenario
 from experiments.controllers.registry import STANDALONE
-from experiments.reliability.audit import audit_doses, audit_rows
+from experiments.reliability.audit import Served, audit_doses, audit_rows
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.chibio.protocol import POSITIONS
-from hardware.emulator.vial import Dose, Sample
+from hardware.emulator.vial import Dose
 from hardware.safety.config import SafetyConfig
 from hardware.storage.journal import read_journal
 
@@ -121,7 +121,7 @@ def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any
     names = POSITIONS[: config.reactors]
     run = rehearsed(names, config.schedule(), config.safety, config.controller_kind)
     r = Rehearsal(folder, run, seed=config.seed)
-    doses, samples = ({name: array("d") for name in names} for _ in range(2))
+    doses, served = {name: array("d") for name in names}, {name: Served() for name in names}
     r.begin()
     meter, part = _Meter(r), min(1.0, config.days)
     end = r.clock.now() + 86400.0 * config.days
@@ -132,29 +132,29 @@ def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any
         for n in np.flatnonzero(step.rows & (step.elapsed % config.phase_min > 20.0)):
             meter.errors.append(abs(float(r.device.vials[names[n]].plant.culture.od[0]) - float(step.setpoint[n])))
         if r.clock.now() >= mark:
-            _collect(r, doses, samples)
+            _collect(r, doses, served)
             days.append(meter.take(part))
             log.info("%s", "  ".join(f"{k} {v}" for k, v in asdict(days[-1]).items()))
             mark += 86400.0 * part
     if meter.samples:
-        _collect(r, doses, samples)
+        _collect(r, doses, served)
         days.append(meter.take((r.clock.now() - mark) / 86400.0 + part))
     r.reactors.stop()
     off = not any(any(r.truth(name)["motors"].values()) for name in names)
     r.close()
-    return {**_audit(r, doses, samples), "pumps_off": off}
+    return {**_audit(r, doses, served), "pumps_off": off}
 
 
-def _collect(r: Rehearsal, doses: Times, samples: Times) -> None:
-    """Move out of the emulator what it would forget after 5000: when the feed pump began, when a sample was stored."""
+def _collect(r: Rehearsal, doses: Times, served: dict[str, Served]) -> None:
+    """Move out of the emulator what it would forget: when the feed pump began, samples and when they were read."""
     for name, bench in r.device.vials.items():
         doses[name].extend(dose.start_s for dose in bench.doses if dose.pump == "Pump1")
-        samples[name].extend(sample.stored_s for sample in bench.samples)
-        bench.doses.clear()
-        bench.samples.clear()
+        served[name].add(bench.samples, bench.reads)
+        for kept in (bench.doses, bench.samples, bench.reads):
+            kept.clear()
 
 
-def _audit(r: Rehearsal, doses: Times, samples: Times) -> dict[str, Any]:
+def _audit(r: Rehearsal, doses: Times, served: dict[str, Served]) -> dict[str, Any]:
     """Minutes, doses and volumes: what the run believes against what the plant knows, per reactor."""
     journal, _ = read_journal(r.folder / "journal.jsonl")
     ledger, fed = r.loop.interlock.budget.volume_ml, r.loop.interlock.budget.fed_ml
@@ -173,8 +173,7 @@ def _audit(r: Rehearsal, doses: Times, samples: Times) -> dict[str, Any]:
             "volume_ml": truth["volume_ml"],
             "peak_ml": truth["peak_ml"],
         }
-    made = {name: [Sample(at, math.nan, math.nan) for at in times] for name, times in samples.items()}
-    missed, lost, twice = audit_rows(r, None, made)
+    missed, lost, twice = audit_rows(r, None, served)
     return {"rows_lost": missed + lost, "rows_doubled": twice, "reactors": reactors}
 
 

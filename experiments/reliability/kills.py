@@ -17,14 +17,16 @@ import numpy as np
 
 from conf.schema import check, require, setting
 from experiments.controllers.registry import STANDALONE
-from experiments.reliability.audit import SEEN_S, audit_doses
+from experiments.reliability.audit import Served, audit_doses, rows_per_sample
 from hardware.emulator.process import EmulatorProcess
-from hardware.emulator.vial import Dose
+from hardware.emulator.vial import Dose, Sample
 from hardware.storage.journal import read_journal
 
 __all__ = ["Findings", "KillConfig", "killed_run"]
 
 BLIND_S = 0.25  # real seconds before a kill in which a sample may not have been asked for yet
+CLOCKS_S = 0.05  # real seconds by which the clocks of client and emulator, compared over HTTP, may be apart
+ANSWER_S = 0.5  # real seconds from a read on the emulator to the time the client gives it, at most
 PATIENCE_S = 60.0  # real seconds for a client to start
 
 
@@ -55,7 +57,7 @@ class Findings:
 
     kills; lives: programs that were started.
     samples: of the device while a client watched. rows: of the recordings. rows_lost: samples that are in no row.
-    rows_doubled: rows that follow another one by less than 30 s.
+    rows_doubled: rows beyond one for each sample: of a sample that has its row, or of none.
     doses: runs of the feed motors. doses_doubled: those without an intent of their own. doses_repeated: those that the
       device repeated by itself, every 63 s, while no client lived.
     doses_not_given: intents without a dose. doses_lost: intents without a dose although the client was not killed
@@ -249,19 +251,22 @@ class _Comparison:
         """Samples made while a client watched against the rows of its CSV."""
         f = self.findings
         with open(self.folder / "recordings" / f"{name}.csv", newline="", encoding="utf-8") as file:
-            rows = np.array([float(row["time_min"]) * 60.0 + self._zero for row in csv.DictReader(file)])
-        f.rows += rows.size
-        f.rows_doubled += int((np.diff(rows) < 30.0).sum())
+            rows = [(float(row["time_min"]) * 60.0 + self._zero, float(row["od"])) for row in csv.DictReader(file)]
+        samples = [Sample(**sample) for sample in self._ask(f"samples/{name}")]
+        served = Served().add(samples, self._ask(f"reads/{name}"))
+        early, late = (real * self.config.speed for real in (CLOCKS_S, ANSWER_S))
+        count, strangers = rows_per_sample([at for at, _ in rows], [od for _, od in rows], served, early, late)
+        f.rows += len(rows)
+        f.rows_doubled += strangers + int((count[count > 1] - 1).sum())
         watching = np.array([self._device_s(r["wall"]) for r in self._journal if r["kind"] == "start"])
         ends = np.array([self._device_s(t) for t in [*self._killed, self._ended]])
-        for sample in self._ask(f"samples/{name}"):
-            at = sample["stored_s"]
+        for at, in_rows in zip(served.stored_s, count, strict=True):
             k = int(np.searchsorted(ends, at))  # the client that watched then, or the one after the pause
             begun = watching[(watching > (ends[k - 1] if k else -np.inf)) & (watching <= at)]
             if begun.size == 0 or k == ends.size or at > ends[k] - BLIND_S * self.config.speed:
                 continue
             f.samples += 1
-            if not ((rows >= at - 3.0) & (rows < at + SEEN_S)).any():
+            if in_rows == 0:
                 f.rows_lost += 1
                 span = f"a client watched from {begun.max():.0f} to {ends[k]:.0f}"
                 f.trouble.append(f"{name}: the sample of device second {at:.0f} is in no row; {span}")

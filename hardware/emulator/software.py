@@ -66,7 +66,10 @@ class Software:
 
     def sysdata(self) -> bytes:
         """Body of getSysdata: the selected reactor, sorted keys, NaN as the bare token."""
-        data, faults = self.apps[self.selected].data, self.computer.faults
+        app, faults = self.apps[self.selected], self.computer.faults
+        data = app.data
+        if app.vial is not None and data["time"]["record"]:
+            app.vial.reads.append(self.computer.now())
         data["presentDevices"] = {name: app.data["present"] for name, app in self.apps.items()}
         if faults.terminal_as_list or faults.terminal_named or faults.extra_fields:
             data = dict(data)
