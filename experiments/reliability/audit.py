@@ -17,7 +17,7 @@ __all__ = ["Served", "audit_doses", "audit_rows", "rows_per_sample"]
 
 DEVICE_PERIOD_S = (60.0, 68.0)  # a pump left on repeats its dose so often
 ON_ITS_WAY_S = 5.0  # from the read that showed a sample to the time of its row, at most: requests before it is judged
-FRESH_S = 30.0  # from the first read that showed a sample to the one that made its row, at most
+FRESH_S = 55.0  # from the first read that showed a sample to the one that made its row, at most; a cycle takes 60
 RISING_S = 30.0  # a program that starts does not watch yet
 LEAVING_S = 5.0  # and one that ends does not any more
 PATIENCE_S = 75.0  # a sample made so long before nothing could be read may be one that could not be read
@@ -99,7 +99,7 @@ def audit_rows(
         count, strangers = rows_per_sample(times[n, :size], ods[n, :size], own)
         doubled += strangers + int((count[count > 1] - 1).sum())
         end = _last_due(r, n, times[n, :size])
-        for at in np.asarray(own.stored_s)[count == 0]:
+        for at in np.asarray(own.stored_s)[count == 0].tolist():
             watched = any(start + RISING_S <= at <= stop - LEAVING_S for start, stop in r.spans)
             if watched and at <= end:
                 unreadable = dark is not None and dark[0] - PATIENCE_S <= at <= dark[1]

@@ -64,12 +64,15 @@ class Software:
         if len(self._reactors) > 1 and rng.random() < faults.foreign_selects:
             self.select(str(rng.choice([m for m in self._reactors if m != self.selected])))
 
+    def shown(self, name: str) -> None:
+        """A client was sent the records of reactor `name`, whole."""
+        app = self.apps[name]
+        if app.vial is not None and app.data["time"]["record"]:
+            app.vial.reads.append(self.computer.now())
+
     def sysdata(self) -> bytes:
         """Body of getSysdata: the selected reactor, sorted keys, NaN as the bare token."""
-        app, faults = self.apps[self.selected], self.computer.faults
-        data = app.data
-        if app.vial is not None and data["time"]["record"]:
-            app.vial.reads.append(self.computer.now())
+        data, faults = self.apps[self.selected].data, self.computer.faults
         data["presentDevices"] = {name: app.data["present"] for name, app in self.apps.items()}
         if faults.terminal_as_list or faults.terminal_named or faults.extra_fields:
             data = dict(data)
