@@ -31,7 +31,7 @@ def one_run(config: KillConfig, folder: Path, run: int) -> Findings:
 
 
 def kill_campaign(config: KillConfig, folder: Path) -> None:
-    """All runs; summary.json. Raises: UserError if anything was lost or doubled."""
+    """All runs; summary.json. Raises: UserError if anything was lost or doubled, or a culture was not held."""
     began = time.monotonic()
     for name in config.reactors:
         for part, pump in (("feed", SOUND.feed), ("waste", SOUND.waste)):
@@ -40,7 +40,7 @@ def kill_campaign(config: KillConfig, folder: Path) -> None:
         found = list(executor.map(lambda run: one_run(config, folder, run), range(config.runs)))
     keys = [k for k, v in asdict(found[0]).items() if isinstance(v, (int, float)) and not isinstance(v, bool)]
     total: dict[str, Any] = {k: sum(getattr(f, k) for f in found) for k in keys}
-    total["schedule_error_s"] = max(f.schedule_error_s for f in found)
+    total |= {key: max(getattr(f, key) for f in found) for key in ("schedule_error_s", "mean_error", "out_min")}
     total |= {"pumps_off": all(f.pumps_off for f in found), "overflowed": any(f.overflowed for f in found)}
     total["wall_s"] = round(time.monotonic() - began, 1)
     files.write_json(folder / "summary.json", {**total, "runs": [asdict(f) for f in found]})
@@ -49,7 +49,9 @@ def kill_campaign(config: KillConfig, folder: Path) -> None:
             log.warning("%s", line)
     log.info("%s", ", ".join(f"{k.replace('_', ' ')} {round(v, 2)}" for k, v in total.items()))
     if not all(f.ok for f in found):
-        raise frame.UserError("something was lost or doubled; see summary.json and the logs beside the runs")
+        raise frame.UserError(
+            "something was lost or doubled, or not held; see summary.json and the logs beside the runs"
+        )
 
 
 main = frame.Command("kill_campaign", KillConfig(), kill_campaign)

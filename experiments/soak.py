@@ -5,6 +5,8 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
+
 from experiments.cli import files, frame
 from experiments.reliability.endurance import Day, SoakConfig, growth, soak_run
 from experiments.reporting.tables import markdown
@@ -12,6 +14,9 @@ from experiments.reporting.tables import markdown
 __all__ = ["soak"]
 
 log = logging.getLogger(__name__)
+
+HELD_OD = 0.015  # five times what noise and dose spread leave of a sound loop
+ASTRAY_MIN = 5.0  # an outlying reading costs a dose, two in a row cost two
 
 
 def soak(config: SoakConfig, folder: Path) -> None:
@@ -30,6 +35,7 @@ def soak(config: SoakConfig, folder: Path) -> None:
     log.info("growth per day %s; %d rows lost; feed booked within %.2f %%, level within %.2f mL; %.0f s", slopes,
              found["rows_lost"], max(errors), max(levels), wall)  # fmt: skip
     doubled = sum(v["doses_doubled"] for v in found["reactors"].values())
+    worst = np.nanmax([d.worst for d in days])
     bad = {
         "rows lost or doubled": found["rows_lost"] + found["rows_doubled"] > 0,
         "doses doubled": doubled > 0,
@@ -37,6 +43,8 @@ def soak(config: SoakConfig, folder: Path) -> None:
         "level not as booked (more than 1 mL)": max(levels) > 1.0,
         "memory grows (more than 5 MB a day)": slopes["memory_mb"] > 5.0,
         "pumps not off": not found["pumps_off"],
+        f"a culture not held (mean error of a day above {HELD_OD:g} OD)": not worst <= HELD_OD,
+        f"a culture astray (for more than {ASTRAY_MIN:g} min)": max(d.out_min for d in days) > ASTRAY_MIN,
     }
     if any(bad.values()):
         raise frame.UserError("; ".join(name for name, is_bad in bad.items() if is_bad))

@@ -1,19 +1,19 @@
 """One fault at one moment of a rehearsed run: watched from then on, judged by what only the emulator knows."""
 
-import math
 import re
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from envs.scenario import Scenario
 from experiments.control.config import DeployConfig
 from experiments.control.loop import Step
+from experiments.controllers.base import Array
 from experiments.reliability.audit import audit_doses, audit_rows
 from experiments.reliability.faults import FAULTY, INF, Fault
 from experiments.reliability.outcome import Outcome, judge
 from experiments.reliability.rehearsal import Killed, Rehearsal
+from experiments.reliability.tracking import BAND_OD, Tracking
 from hardware.emulator.device import DeviceOptions
 from hardware.emulator.vial import VialConfig
 from hardware.errors import ReactorError
@@ -25,42 +25,59 @@ __all__ = ["MOMENTS", "FaultCase"]
 MOMENTS = ("recovery", "steady", "step", "dose")
 QUIET = DeviceOptions(vial=VialConfig(outlier_rate=0.0))
 """No reading jumps for no reason, which could be taken for the fault."""
-HEALTHY_MU, FULL_DILUTION = 0.025, 0.06  # 1/min: the emulator's healthy culture, and the largest feed rate over volume
-OVERGROWN = 4.0  # OD; the plant would grow on, a real culture and its sensor do not
+STOPPED_S = 120.0  # after its detection, within which dosing has to end where no dose is right
 
 
 class _Watch:
-    """Follows a rehearsal from the moment of the fault on: who says what, and where the culture goes.
+    """Follows a rehearsal: who says what from the moment of the fault on, and where the cultures go.
 
     Args: fault: None for a healthy run. result: what is seen goes into it.
-    Attributes: struck_s, clock time of the fault; inf before it.
+    Attributes: struck_s, clock time of the fault, inf before it; tracking, of the true ODs.
     """
 
     def __init__(self, fault: Fault | None, rehearsal: Rehearsal, result: Outcome) -> None:
         self.fault, self.r, self.result = fault, rehearsal, result
-        self.struck_s = math.inf
-        self._reference = math.nan
-        self._at = 0.0
+        self.struck_s = INF
+        self.tracking = Tracking(_bands(fault, len(rehearsal.names)))
+        self.tracking.counting = fault is None
+        self._schedules = rehearsal.config.schedules()
+        self._fed_ml = INF  # by the faulty reactor's pump when it should have stopped
         rehearsal.clock.at(0.0, self._look)
 
     def _look(self) -> None:
-        """Every 15 s: true OD of the faulty reactor against what is asked of it.
-
-        The asked OD falls at most as fast as full dilution can make it: x' = (mu - D_max) x.
-        """
+        """Every 15 s: true ODs against what is asked of them; what is asked does not depend on what is measured."""
         r, now = self.r, self.r.clock.now()
         r.device.run_until(now)
-        minutes, self._at = (now - self._at) / 60.0, now
-        if hasattr(r, "loop") and math.isfinite(r.loop.began[0]) and not r.loop.done[0]:
-            schedule = r.loop.schedules[0]
-            elapsed = np.array([(now - r.spans[0][0]) / 60.0 - r.loop.began[0]])
-            asked = schedule.setpoints[int(max(Scenario.phase(schedule, elapsed)[0], 0))]
-            od = float(r.device.vials[FAULTY].plant.culture.od[0])
-            falling = self._reference * math.exp((HEALTHY_MU - FULL_DILUTION) * minutes)
-            self._reference = max(asked, od if math.isnan(self._reference) else falling)
-            if now >= self.struck_s and elapsed[0] < schedule.total_min:
-                self.result.peak_error = max(self.result.peak_error, min(abs(od - self._reference), OVERGROWN))
+        if hasattr(r, "loop"):
+            elapsed = (now - r.spans[0][0]) / 60.0 - r.loop.began
+            asked = np.array([s.at(elapsed[n : n + 1])[0][0] for n, s in enumerate(self._schedules)])
+            over = r.loop.done | (elapsed >= [s.total_min for s in self._schedules])
+            self.tracking.look(now / 60.0, asked, self._od(), ~over)
+        if now >= self.struck_s + self.result.detected_s + STOPPED_S:
+            fed_ml = float(r.device.vials[FAULTY].plant.feed.delivered_ml[0])
+            self._fed_ml = min(self._fed_ml, fed_ml)
+            self.result.fed_after_ml = fed_ml - self._fed_ml
         r.clock.at(now + 15.0, self._look)
+
+    def _od(self) -> Array:
+        return np.array([vial.plant.culture.od[0] for vial in self.r.device.vials.values()], dtype=np.float64)
+
+    def strike(self) -> None:
+        """The fault begins now; a lasting one leaves the cultures where they are."""
+        self.struck_s, self.tracking.counting = self.r.clock.now(), True
+        self.result.at_min = round(self.struck_s / 60.0, 1)
+        self.over()
+
+    def over(self) -> None:
+        """The fault is over: from here on the cultures have to come back."""
+        self.tracking.restart(self.r.clock.now() / 60.0)
+
+    def close(self) -> None:
+        """What became of the cultures goes into the result."""
+        out, t = self.result, self.tracking
+        out.peak_error, out.neighbour_error = float(t.peak[0]), float(t.peak[1:].max(initial=0.0))
+        out.recovery_min, out.watched_min = float(t.recovery_min[0]), float(t.watched_min[0])
+        out.neighbour_recovery_min = float(t.recovery_min[1:].max(initial=0.0))
 
     def step(self, step: Step) -> None:
         """What interlock and driver said in this pass."""
@@ -86,7 +103,7 @@ class _Watch:
 
     def detect(self, word: str, response: str) -> None:
         """Take a word of the program as the detection, if it is the first that is declared for this fault."""
-        if self.fault is None or self.result.reason or not math.isfinite(self.struck_s):
+        if self.fault is None or self.result.reason or self.struck_s == INF:
             return
         for by in self.fault.by:
             kind, _, text = by.partition(":")
@@ -94,6 +111,14 @@ class _Watch:
                 self.result.detected_s = round(self.r.clock.now() - self.struck_s, 1)
                 self.result.reason, self.result.response = by, response
                 return
+
+
+def _bands(fault: Fault | None, n: int) -> Array:
+    """How near each of `n` cultures is to be held, OD: the faulty one first, neighbours as usual unless it is wide."""
+    bands = np.full(n, BAND_OD)
+    if fault is not None:
+        bands[: None if fault.wide else 1] = fault.band
+    return bands
 
 
 def _is_time(moment: str, r: Rehearsal) -> bool:
@@ -143,23 +168,23 @@ class FaultCase:
         if not hasattr(r, "loop") or not _is_time(self.moment, r):
             r.clock.at(r.clock.now() + 0.25, self._wait_for_it)
             return
-        self.watch.struck_s = r.clock.now()
-        self.result.at_min = round(r.clock.now() / 60.0, 1)
+        r.device.run_until(r.clock.now())
+        self.watch.strike()
         if self.fault is None:
             return
-        r.device.run_until(r.clock.now())
         self._exits = r.device.supervisor.exits
-        if self.fault.end is not None and not self.fault.program and self.fault.minutes < INF:
+        if not self.fault.program and self.fault.minutes < INF:
             r.clock.at(r.clock.now() + 60.0 * self.fault.minutes, self._mend)
         self.fault.begin(r)
 
     def _mend(self) -> None:
-        """The fault's end."""
+        """The fault's end, by itself if nobody ends it."""
         assert self.fault is not None
-        assert self.fault.end is not None
         self.r.device.run_until(self.r.clock.now())
-        self.fault.end(self.r)
-        self._exits = self.r.device.supervisor.exits
+        if self.fault.end is not None:
+            self.fault.end(self.r)
+            self._exits = self.r.device.supervisor.exits
+        self.watch.over()
 
     def _run_and_resume(self) -> None:
         """The program until the schedule is over; after a fault that ends it, resumed."""
@@ -185,6 +210,7 @@ class FaultCase:
             r.wait(60.0 * self.fault.minutes)
             if self.fault.end is not None:
                 self.fault.end(r)
+            self.watch.over()
         given_up = [name for name, s in zip(r.names, r.loop.stopped, strict=True) if s]
         whole = "completed" if r.loop.done.all() else "gave up " + ", ".join(given_up) if given_up else "not finished"
         self.result.outcome = ended or whole
@@ -211,6 +237,7 @@ class FaultCase:
     def _audit(self) -> None:
         """What only the emulator knows, against what was recorded."""
         r, out, fault = self.r, self.result, self.fault
+        self.watch.close()
         for name in r.names:
             truth = r.truth(name)
             out.peak_ml = max(out.peak_ml, truth["peak_ml"]) if out.peak_ml == out.peak_ml else truth["peak_ml"]

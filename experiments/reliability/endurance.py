@@ -14,11 +14,14 @@ import numpy as np
 
 from conf.schema import check, part, setting
 from envs.scenario import Scenario
+from experiments.control.loop import Step
+from experiments.controllers.base import Mask
 from experiments.controllers.registry import STANDALONE
-from experiments.reliability.audit import audit_doses, audit_rows
+from experiments.reliability.audit import Served, audit_doses, audit_rows
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
+from experiments.reliability.tracking import BAND_OD, Tracking
 from hardware.chibio.protocol import POSITIONS
-from hardware.emulator.vial import Dose, Sample
+from hardware.emulator.vial import Dose
 from hardware.safety.config import SafetyConfig
 from hardware.storage.journal import read_journal
 
@@ -27,6 +30,7 @@ __all__ = ["Day", "SoakConfig", "growth", "soak_run"]
 log = logging.getLogger(__name__)
 
 MB = 1024.0 * 1024.0
+SETTLING_MIN = 20.0  # ln(0.6 / 0.4) at the difference between full dilution and growth takes 12 min, upward 16 min
 Times = dict[str, "array[float]"]  # per reactor, device s; a week of them must not look like a leak
 
 
@@ -58,7 +62,8 @@ class SoakConfig:
 class Day:
     """What one part of the run, a day as a rule, cost. Memory is the process's, sizes are of the run folder.
 
-    error: mean distance of the true OD from the setpoint, phases' first 20 min left out.
+    error: mean distance of the true OD from the setpoint, phases' first 20 min left out; worst: of the worst reactor.
+    out_min: longest time that a reactor was farther than `tracking.BAND_OD` from what growth and full dilution allow.
     """
 
     days: float
@@ -70,6 +75,8 @@ class Day:
     state_kb: float
     wall_s: float
     error: float
+    worst: float
+    out_min: float
     alarms: int
 
 
@@ -88,12 +95,25 @@ class _Meter:
 
     def __init__(self, rehearsal: Rehearsal) -> None:
         self.r, self.days = rehearsal, 0.0
+        self._tracking = Tracking(np.full(len(rehearsal.names), BAND_OD))
         self._reset()
 
     def _reset(self) -> None:
         self.samples = self.alarms = 0
-        self.errors: list[float] = []
+        self.errors: list[list[float]] = [[] for _ in self.r.names]
+        self.out_min = 0.0
         self._began = time.perf_counter()
+
+    def step(self, step: Step, settled: Mask) -> None:
+        """Take a pass of the loop. Args: settled: reactors whose phase is so old that they must be at its setpoint."""
+        self.samples += int(step.rows.sum())
+        self.alarms += sum(reason is not None for reason in step.reasons)
+        vials = self.r.device.vials.values()
+        od = np.array([vial.plant.culture.od[0] for vial in vials], dtype=np.float64)
+        for n in np.flatnonzero(step.rows & settled):
+            self.errors[n].append(abs(float(od[n] - step.setpoint[n])))
+        self._tracking.look(step.now_s / 60.0, step.setpoint, od, np.ones(od.size, dtype=np.bool_))
+        self.out_min = max(self.out_min, float(self._tracking.away_min.max()))
 
     def take(self, part_days: float) -> Day:
         """Close this part. Args: part_days: its length."""
@@ -109,7 +129,9 @@ class _Meter:
             events_mb=round(_size_mb(folder, "events*"), 2),
             state_kb=round(_size_mb(folder, "state.json") * 1024.0, 1),
             wall_s=round(time.perf_counter() - self._began, 1),
-            error=round(float(np.mean(self.errors)) if self.errors else np.nan, 4),
+            error=round(float(np.mean([e for errors in self.errors for e in errors] or [np.nan])), 4),
+            worst=round(max((float(np.mean(errors)) for errors in self.errors if errors), default=math.nan), 4),
+            out_min=round(self.out_min, 1),
             alarms=self.alarms,
         )
         self._reset()
@@ -121,40 +143,37 @@ def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any
     names = POSITIONS[: config.reactors]
     run = rehearsed(names, config.schedule(), config.safety, config.controller_kind)
     r = Rehearsal(folder, run, seed=config.seed)
-    doses, samples = ({name: array("d") for name in names} for _ in range(2))
+    doses, served = {name: array("d") for name in names}, {name: Served() for name in names}
     r.begin()
     meter, part = _Meter(r), min(1.0, config.days)
     end = r.clock.now() + 86400.0 * config.days
     mark = r.clock.now() + 86400.0 * part
     for step in r.run(end):
-        meter.samples += int(step.rows.sum())
-        meter.alarms += sum(reason is not None for reason in step.reasons)
-        for n in np.flatnonzero(step.rows & (step.elapsed % config.phase_min > 20.0)):
-            meter.errors.append(abs(float(r.device.vials[names[n]].plant.culture.od[0]) - float(step.setpoint[n])))
+        meter.step(step, step.elapsed % config.phase_min > SETTLING_MIN)
         if r.clock.now() >= mark:
-            _collect(r, doses, samples)
+            _collect(r, doses, served)
             days.append(meter.take(part))
             log.info("%s", "  ".join(f"{k} {v}" for k, v in asdict(days[-1]).items()))
             mark += 86400.0 * part
     if meter.samples:
-        _collect(r, doses, samples)
+        _collect(r, doses, served)
         days.append(meter.take((r.clock.now() - mark) / 86400.0 + part))
     r.reactors.stop()
     off = not any(any(r.truth(name)["motors"].values()) for name in names)
     r.close()
-    return {**_audit(r, doses, samples), "pumps_off": off}
+    return {**_audit(r, doses, served), "pumps_off": off}
 
 
-def _collect(r: Rehearsal, doses: Times, samples: Times) -> None:
-    """Move out of the emulator what it would forget after 5000: when the feed pump began, when a sample was stored."""
+def _collect(r: Rehearsal, doses: Times, served: dict[str, Served]) -> None:
+    """Move out of the emulator what it would forget: when the feed pump began, samples and when they were read."""
     for name, bench in r.device.vials.items():
         doses[name].extend(dose.start_s for dose in bench.doses if dose.pump == "Pump1")
-        samples[name].extend(sample.stored_s for sample in bench.samples)
-        bench.doses.clear()
-        bench.samples.clear()
+        served[name].add(bench.samples, bench.reads)
+        for kept in (bench.doses, bench.samples, bench.reads):
+            kept.clear()
 
 
-def _audit(r: Rehearsal, doses: Times, samples: Times) -> dict[str, Any]:
+def _audit(r: Rehearsal, doses: Times, served: dict[str, Served]) -> dict[str, Any]:
     """Minutes, doses and volumes: what the run believes against what the plant knows, per reactor."""
     journal, _ = read_journal(r.folder / "journal.jsonl")
     ledger, fed = r.loop.interlock.budget.volume_ml, r.loop.interlock.budget.fed_ml
@@ -173,8 +192,7 @@ def _audit(r: Rehearsal, doses: Times, samples: Times) -> dict[str, Any]:
             "volume_ml": truth["volume_ml"],
             "peak_ml": truth["peak_ml"],
         }
-    made = {name: [Sample(at, math.nan, math.nan) for at in times] for name, times in samples.items()}
-    missed, lost, twice = audit_rows(r, None, made)
+    missed, lost, twice = audit_rows(r, None, served)
     return {"rows_lost": missed + lost, "rows_doubled": twice, "reactors": reactors}
 
 

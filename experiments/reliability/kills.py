@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import os
 import signal
 import subprocess
@@ -17,15 +18,27 @@ import numpy as np
 
 from conf.schema import check, require, setting
 from experiments.controllers.registry import STANDALONE
-from experiments.reliability.audit import SEEN_S, audit_doses
+from experiments.reliability.audit import Served, audit_doses, rows_per_sample
+from experiments.reliability.tracking import reachable
 from hardware.emulator.process import EmulatorProcess
-from hardware.emulator.vial import Dose
+from hardware.emulator.vial import Dose, Sample
 from hardware.storage.journal import read_journal
 
 __all__ = ["Findings", "KillConfig", "killed_run"]
 
 BLIND_S = 0.25  # real seconds before a kill in which a sample may not have been asked for yet
+CLOCKS_S = 0.05  # real seconds by which the clocks of client and emulator, compared over HTTP, may be apart
+ANSWER_S = 0.5  # real seconds from a read on the emulator to the time the client gives it, at most
 PATIENCE_S = 60.0  # real seconds for a client to start
+SETPOINT = 0.5  # OD
+LAST_S = 600.0  # device seconds that the last client has
+SETTLING_S = 240.0  # of which the first do not count: the first dose comes up to two minutes after the start
+HELD_OD = 0.05  # mean true error after that; noise and dose spread leave 0.003, the delay of the first dose 0.03
+FAR_OD = 0.1  # three minutes of growth beyond that where full dilution is needed
+LONGEST_OUT_MIN = 3.0  # of clients' time
+
+
+Life = tuple[float, float]  # of a client: begin and end, device s
 
 
 @dataclass(frozen=True)
@@ -42,6 +55,7 @@ class KillConfig:
     early: float = setting(0.2, "share of kills that may fall into the start itself", within=(0, 1))
     reactors: tuple[str, ...] = setting(("M0", "M1", "M2"), "of the runs")
     controller_kind: str = setting("adaptive_inverse", "what decides the pump rate", choices=STANDALONE)
+    overrides: tuple[str, ...] = setting((), "further words of the deploy command, e.g. safety.cooldown=10")
     seed: int = setting(0, "of kill moments and emulators", at_least=0)
 
     def __post_init__(self) -> None:
@@ -55,12 +69,15 @@ class Findings:
 
     kills; lives: programs that were started.
     samples: of the device while a client watched. rows: of the recordings. rows_lost: samples that are in no row.
-    rows_doubled: rows that follow another one by less than 30 s.
+    rows_doubled: rows beyond one for each sample: of a sample that has its row, or of none.
     doses: runs of the feed motors. doses_doubled: those without an intent of their own. doses_repeated: those that the
       device repeated by itself, every 63 s, while no client lived.
     doses_not_given: intents without a dose. doses_lost: intents without a dose although the client was not killed
       between the two, and no note says why none was given.
     open_doses: kills in the middle of a dose.
+    mean_error: mean distance of the true OD, of the worst reactor in the last client's life, its first minutes left
+      out, from what growth and full dilution allowed since its first sample. out_min: longest time in the lives of
+      clients, min, that a true OD was farther than `FAR_OD` from that.
     fed_ml, booked_ml: what the device delivered, and what the journals say.
     schedule_error_s: largest difference between the run time that a sample is dated with and the device's own clock.
     pumps_off, overflowed: at the end. killed_s: run time of the kills. trouble: what went wrong, one line each.
@@ -78,6 +95,8 @@ class Findings:
     doses_doubled: int = 0
     doses_repeated: int = 0
     open_doses: int = 0
+    mean_error: float = math.nan
+    out_min: float = 0.0
     fed_ml: float = 0.0
     booked_ml: float = 0.0
     schedule_error_s: float = 0.0
@@ -88,9 +107,15 @@ class Findings:
 
     @property
     def ok(self) -> bool:
-        """Nothing lost, nothing doubled."""
+        """Nothing lost, nothing doubled, the cultures held."""
         bad = self.rows_lost + self.rows_doubled + self.doses_lost + self.doses_doubled + self.overflowed
-        return bad == 0 and self.pumps_off and not self.trouble and self.schedule_error_s < 5.0
+        sound = bad == 0 and self.pumps_off and not self.trouble and self.schedule_error_s < 5.0
+        return sound and self.held
+
+    @property
+    def held(self) -> bool:
+        """Whether the cultures were brought back to the setpoint in what time the clients had, and kept there."""
+        return self.mean_error <= HELD_OD and self.out_min <= LONGEST_OUT_MIN
 
 
 def killed_run(config: KillConfig, kills: int, folder: Path, seed: int) -> Findings:
@@ -100,7 +125,7 @@ def killed_run(config: KillConfig, kills: int, folder: Path, seed: int) -> Findi
     Raises: LinkError if there is no emulator.
     """
     findings = Findings(kills=kills)
-    arguments = {"reactors": ",".join(config.reactors), "speed": config.speed, "seed": seed, "od": 0.5}
+    arguments = {"reactors": ",".join(config.reactors), "speed": config.speed, "seed": seed, "od": SETPOINT}
     with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
         clients = _Clients(config, device, folder, np.random.default_rng([config.seed, seed]), findings)
         killed = [clients.start_and_kill(k) for k in range(kills)]
@@ -121,11 +146,12 @@ class _Clients:
         c = self.config
         command = [sys.executable, "-m", "experiments.deploy"]
         if first:
-            scenario = ["scenario=hold", "scenario.setpoints=[0.5]", "scenario.minutes=[100000]"]
+            scenario = ["scenario=hold", f"scenario.setpoints=[{SETPOINT}]", "scenario.minutes=[100000]"]
             backend = ["backend=chibio", f"backend.url={self.device.url}", f"backend.speed={c.speed}"]
             names = [f"backend.reactors=[{','.join(c.reactors)}]", f"hydra.run.dir={self.folder}"]
             names += [f"backend.calibration={self.folder.parent / 'calibration'}"]
             command += [*backend, *names, *scenario, f"controller={c.controller_kind}", "safety.silent=100000"]
+            command += c.overrides
         else:
             command.append(f"resume={self.folder}")
         self.findings.lives += 1
@@ -165,10 +191,10 @@ class _Clients:
         return killed
 
     def end(self) -> float:
-        """Resume once more, run a few minutes, end as an operator would; returns the wall time of that, s."""
+        """Resume once more, run ten minutes, end as an operator would; returns the wall time of that, s."""
         client = self._client(first=False)
         if self._until_it_writes(client, self._size()):
-            time.sleep(300.0 / self.config.speed)
+            time.sleep(LAST_S / self.config.speed)
         ended = time.time()
         client.send_signal(signal.SIGINT)
         try:
@@ -222,6 +248,9 @@ class _Comparison:
             self._doses([r for r in journal if r.get("reactor") == name], name)
             self._rows(name)
             f.fed_ml += truth[name]["feed_ml"]
+        if not f.held:
+            far = f"{f.out_min:.0f} min of clients' time farther than {FAR_OD:g} OD (allowed {LONGEST_OUT_MIN:g})"
+            f.trouble.append(f"not held: mean error {f.mean_error:.3f} OD at last (allowed {HELD_OD:g}), {far}")
 
     def _doses(self, journal: Sequence[dict[str, Any]], name: str) -> None:
         """Every run of the feed motor has its intent, every intent its run unless a kill or a note says why not."""
@@ -249,19 +278,65 @@ class _Comparison:
         """Samples made while a client watched against the rows of its CSV."""
         f = self.findings
         with open(self.folder / "recordings" / f"{name}.csv", newline="", encoding="utf-8") as file:
-            rows = np.array([float(row["time_min"]) * 60.0 + self._zero for row in csv.DictReader(file)])
-        f.rows += rows.size
-        f.rows_doubled += int((np.diff(rows) < 30.0).sum())
+            rows = [(float(row["time_min"]) * 60.0 + self._zero, float(row["od"])) for row in csv.DictReader(file)]
+        samples = [Sample(**sample) for sample in self._ask(f"samples/{name}")]
+        served = Served().add(samples, self._ask(f"reads/{name}"))
+        early, late = (real * self.config.speed for real in (CLOCKS_S, ANSWER_S))
+        count, strangers = rows_per_sample([at for at, _ in rows], [od for _, od in rows], served, early, late)
+        f.rows += len(rows)
+        f.rows_doubled += strangers + int((count[count > 1] - 1).sum())
+        lives = [self._life(at) for at in served.stored_s]
+        for at, in_rows, life in zip(served.stored_s, count, lives, strict=True):
+            if life is not None and at <= life[1] - BLIND_S * self.config.speed:
+                f.samples += 1
+                if in_rows == 0:
+                    f.rows_lost += 1
+                    span = f"a client watched from {life[0]:.0f} to {life[1]:.0f}"
+                    f.trouble.append(f"{name}: the sample of device second {at:.0f} is in no row; {span}")
+        self._control(served, lives)
+
+    def _control(self, served: Served, lives: Sequence[Life | None]) -> None:
+        """True ODs while clients lived."""
+        watched = zip(served.stored_s, served.culture_od, lives, strict=True)
+        seen = [(at, od, life) for at, od, life in watched if life is not None]
+        errors = errors_in_lives(seen)
+        last = [e for e, (at, _, life) in zip(errors, seen, strict=True) if self._settled(at, life)]
+        f = self.findings
+        f.out_min = max(f.out_min, longest_out_min(errors))
+        f.mean_error = float(np.fmax(f.mean_error, np.mean(last))) if last else math.inf
+
+    def _life(self, at: float) -> Life | None:
+        """Begin and end, device s, of the life of the client that watched at device time `at`; None if none did."""
         watching = np.array([self._device_s(r["wall"]) for r in self._journal if r["kind"] == "start"])
         ends = np.array([self._device_s(t) for t in [*self._killed, self._ended]])
-        for sample in self._ask(f"samples/{name}"):
-            at = sample["stored_s"]
-            k = int(np.searchsorted(ends, at))  # the client that watched then, or the one after the pause
-            begun = watching[(watching > (ends[k - 1] if k else -np.inf)) & (watching <= at)]
-            if begun.size == 0 or k == ends.size or at > ends[k] - BLIND_S * self.config.speed:
-                continue
-            f.samples += 1
-            if not ((rows >= at - 3.0) & (rows < at + SEEN_S)).any():
-                f.rows_lost += 1
-                span = f"a client watched from {begun.max():.0f} to {ends[k]:.0f}"
-                f.trouble.append(f"{name}: the sample of device second {at:.0f} is in no row; {span}")
+        k = int(np.searchsorted(ends, at))  # the client that watched then, or the one after the pause
+        begun = watching[(watching > (ends[k - 1] if k else -np.inf)) & (watching <= at)]
+        return None if begun.size == 0 or k == ends.size else (float(begun.max()), float(ends[k]))
+
+    def _settled(self, at: float, life: Life) -> bool:
+        return life[1] == self._device_s(self._ended) and at >= life[0] + SETTLING_S
+
+
+def errors_in_lives(seen: Sequence[tuple[float, float, Life]]) -> list[float]:
+    """Distance of each true OD from where the client that lived then could have brought it from its first sample on.
+
+    Args: seen: device time of a sample, s, true OD, and the life of its client.
+    """
+    errors, before, reference = [], (-math.inf, (-math.inf, -math.inf)), np.zeros(1)
+    for at, od, life in seen:
+        if life != before[1]:
+            reference = np.array([od])
+        else:
+            reference = reachable(reference, np.array([SETPOINT]), (at - before[0]) / 60.0)
+        errors.append(abs(od - float(reference[0])))
+        before = at, life
+    return errors
+
+
+def longest_out_min(errors: Sequence[float]) -> float:
+    """Longest stretch of errors, OD, one a minute, that are all larger than `FAR_OD`, min."""
+    longest = now = 0
+    for error in errors:
+        now = now + 1 if error > FAR_OD else 0
+        longest = max(longest, now)
+    return float(longest)

@@ -8,7 +8,10 @@ from typing import Any
 
 from experiments.cli import files
 from experiments.reliability.faults import Fault
+from experiments.reliability.tracking import BAND_OD
 from experiments.reporting.tables import markdown
+
+NOTHING_ML = 0.1  # less than the smallest dose
 
 __all__ = ["Outcome", "declared", "judge", "table", "totals", "write_cases"]
 
@@ -22,7 +25,10 @@ class Outcome:
       it; notes: of the driver.
     peak_ml, overflowed: of the worst vial.
     peak_error: largest distance of the faulty reactor's true OD, after the fault, from what the schedule asks and the
-      pump can do; 4 stands for anything above.
+      pump can do; 4 stands for anything above. recovery_min: from the end of the fault until it stays near what can
+      be reached from there; inf if it was not near at the end of the schedule, watched_min after the fault.
+    neighbour_error, neighbour_recovery_min: the same of the worst neighbour.
+    fed_after_ml: by the faulty reactor's pump from two minutes after the detection on.
     rows_missed: samples nobody could read; rows_lost: samples that could have been read and are in no row;
       rows_doubled.
     doses_doubled: runs of the feed motor beyond one per decision; repeats: those that are the device's own (every
@@ -46,6 +52,11 @@ class Outcome:
     peak_ml: float = math.nan
     overflowed: bool = False
     peak_error: float = 0.0
+    recovery_min: float = 0.0
+    watched_min: float = math.inf
+    neighbour_error: float = 0.0
+    neighbour_recovery_min: float = 0.0
+    fed_after_ml: float = 0.0
     rows_missed: int = 0
     rows_lost: int = 0
     rows_doubled: int = 0
@@ -86,8 +97,27 @@ def judge(out: Outcome, fault: Fault | None) -> list[str]:
         "pumps not off": not out.pumps_off and not (fault and fault.stuck),
         "not detected": fault is not None and bool(fault.by) and not out.reason,
         "false alarm": out.early_alarms + out.neighbour_alarms > 0 or (fault is None and bool(out.kinds)),
+        **_control(out, fault),
     }
     return [name for name, is_wrong in checks.items() if is_wrong]
+
+
+def _control(out: Outcome, fault: Fault | None) -> dict[str, bool]:
+    """Whether true ODs went where they must not, stayed there, or were dosed although no dose was right."""
+    error, recovery = (BAND_OD, 0.0) if fault is None else (fault.error, fault.recovery_min)
+    stops = fault is not None and bool(fault.stops)
+    unheld = fault is not None and bool(fault.unheld)
+    wide = fault is not None and fault.wide
+    gone = fault is not None and fault.gone
+    spared = wide and fault is not None and unheld  # neighbours that suffer the same
+    near, soon = (error, recovery) if wide else (BAND_OD, 0.0)
+    return {
+        "strayed": not (stops or gone) and out.peak_error > error,
+        "not back": not (stops or unheld or gone) and out.recovery_min > recovery < out.watched_min,
+        "dosed": stops and out.fed_after_ml > NOTHING_ML,
+        "neighbour strayed": out.neighbour_error > near,
+        "neighbour not back": not spared and out.neighbour_recovery_min > soon < out.watched_min,
+    }
 
 
 def _span(values: Sequence[float], form: str) -> str:
@@ -99,8 +129,8 @@ def _span(values: Sequence[float], form: str) -> str:
 def table(outcomes: Sequence[Outcome]) -> str:
     """Markdown: one row per fault over all moments; single cases are in cases.csv."""
     head = (
-        "fault", "told after, min", "by", "response", "peak mL", "peak OD error", "rows missed", "rows lost",
-        "doses doubled", "pumps off", "as declared",
+        "fault", "told after, min", "by", "response", "peak mL", "peak OD error", "back after, min", "rows missed",
+        "rows lost", "doses doubled", "pumps off", "as declared",
     )  # fmt: skip
     rows = []
     for name in dict.fromkeys(o.label for o in outcomes):
@@ -115,6 +145,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
             ", ".join(dict.fromkeys(o.response for o in mine if o.response)) or "–",
             _span([o.peak_ml for o in mine], ".1f"),
             _span([o.peak_error for o in mine], ".2f"),
+            _span([o.recovery_min for o in mine], ".0f"),
             str(sum(o.rows_missed for o in mine)),
             str(sum(o.rows_lost + o.rows_doubled for o in mine)),
             str(sum(o.doses_doubled for o in mine)),
@@ -150,6 +181,10 @@ def totals(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "software_ended": sum(o.exits for o in outcomes),
         "neighbours_lost": sum(o.neighbours_lost for o in outcomes),
         "pumps_not_off": sum("pumps not off" in o.wrong for o in outcomes),
+        "strayed": sum(not {"strayed", "neighbour strayed"}.isdisjoint(o.wrong) for o in outcomes),
+        "not_back": sum(not {"not back", "neighbour not back"}.isdisjoint(o.wrong) for o in outcomes),
+        "dosed_though_stopped": sum("dosed" in o.wrong for o in outcomes),
+        "worst_neighbour_error": max((o.neighbour_error for o in outcomes), default=math.nan),
         "false_alarms": sum(o.early_alarms + o.neighbour_alarms for o in outcomes)
         + sum(sum(o.kinds.values()) for o in healthy),
         "healthy_runs": len(healthy),

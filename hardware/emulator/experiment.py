@@ -124,8 +124,10 @@ class Experiment:
             clear_terminal(data, self._position.computer.stamp())
         append_records(data, started)
         if self._position.vial is not None:
-            sample = Sample(self._position.computer.now(), started, float(data["OD"]["current"]))
-            self._position.vial.samples.append(sample)
+            now, vial = self._position.computer.now(), self._position.vial
+            vial.sync(now)
+            culture_od = float(vial.plant.culture.od[0])
+            vial.samples.append(Sample(now, started, float(data["OD"]["current"]), culture_od))
         thin_records(data)
         faults = self._position.computer.faults
         faults.bus_stuck = faults.bus_stuck or faults.disk_full  # a row is written under the bus lock

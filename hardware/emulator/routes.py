@@ -24,7 +24,7 @@ class Exchange:
 
     `answer` is (status, body, headers). `fate` says how it ended without one: "refused" (nobody listens), "reset"
     (connection broken) or "lost" (silence until the client's time-out), else "". `cut` is how many body bytes to leave
-    out.
+    out. `shows` is the reactor whose state the answer holds, readable; "" if none.
     """
 
     method: str
@@ -33,6 +33,7 @@ class Exchange:
     answer: Answer | None = None
     fate: str = ""
     cut: int = 0
+    shows: str = ""
 
     @property
     def done(self) -> bool:
@@ -191,9 +192,9 @@ def answer_request(software: Software, exchange: Exchange) -> Generator[float, N
         return 204, b"", HTML
     if found.path == "/":
         return 200, b"<!doctype html>\n<title>Chi.Bio emulator</title>\n", HTML
-    body = software.sysdata()
+    body, exchange.shows = software.sysdata(), software.selected
     if faults.take("malformed"):
-        body = body[: len(body) // 2] + b'}{"OD":' + body[len(body) // 2 :]
+        body, exchange.shows = body[: len(body) // 2] + b'}{"OD":' + body[len(body) // 2 :], ""
     if faults.take("truncated"):
-        exchange.cut = len(body) // 2
+        exchange.cut, exchange.shows = len(body) // 2, ""
     return 200, body, {"Content-Type": "application/json"}

@@ -123,11 +123,13 @@ class EmulatorServer:
                     return 200, _json({**{m: device.truth(m) for m in device.vials}, **software, **seen})
                 if method == "GET" and parts[0] in ("doses", "samples") and parts[1:] in [[m] for m in device.vials]:
                     return 200, _json([row._asdict() for row in getattr(device.vials[parts[1]], parts[0])])
+                if method == "GET" and parts[0] == "reads" and parts[1:] in [[m] for m in device.vials]:
+                    return 200, _json(list(device.vials[parts[1]].reads))
                 if method == "GET" and parts == ["faults"]:
                     return 200, _json({name: list(entry) for name, entry in FAULTS.items()})
             except ValueError as problem:
                 return 400, f"{problem}\n".encode()
-        return 404, b"allowed: POST fault/<name>/<M>/<value>, GET truth, doses/<M>, samples/<M>, faults\n"
+        return 404, b"allowed: POST fault/<name>/<M>/<value>, GET truth, doses/<M>, samples/<M>, reads/<M>, faults\n"
 
 
 def _json(value: object) -> bytes:

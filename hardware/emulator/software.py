@@ -65,6 +65,12 @@ class Software:
         if len(self._reactors) > 1 and rng.random() < faults.foreign_selects:
             self.select(str(rng.choice([m for m in self._reactors if m != self.selected])))
 
+    def shown(self, name: str) -> None:
+        """A client was sent the records of reactor `name`, whole."""
+        app = self.apps[name]
+        if app.vial is not None and app.data["time"]["record"]:
+            app.vial.reads.append(self.computer.now())
+
     def sysdata(self) -> bytes:
         """Body of getSysdata: the selected reactor, sorted keys, NaN as the bare token."""
         data, faults = self.apps[self.selected].data, self.computer.faults

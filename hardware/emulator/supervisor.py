@@ -73,6 +73,8 @@ class WebWorker:
             exchange.fate = "reset"
         else:
             exchange.answer = answer
+            if exchange.shows:
+                self.software.shown(exchange.shows)
         self._serving = None
         self._serve_next()
 

@@ -26,6 +26,7 @@ SENSOR_STEP_S = 2.0
 STIR_SETTLE_S = 2.0  # readings sooner after the stirrer stopped are still disturbed
 STIR_STOPPED_S = 90.0  # a stirrer off for longer than any still phase has failed: cells settle
 DOSES_KEPT = 5_000  # per reactor; a day of single-shot dosing is 2880
+READS_KEPT = 30_000  # per reactor; a day of the driver's reads is 12000
 
 
 class Dose(NamedTuple):
@@ -39,11 +40,12 @@ class Dose(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """One record of the experiment: when it became readable, the cycle's time as recorded, and the OD recorded."""
+    """One record of the experiment: when it became readable, the cycle's time and OD as recorded, the culture's OD."""
 
     stored_s: float
     sample_s: float
     od: float
+    culture_od: float
 
 
 @dataclass(frozen=True)
@@ -165,8 +167,8 @@ class Vial:
 
     Args:
       plant: a plant of one vial; config: optics and electronics; rng: noise of this reactor; start: device s.
-    `doses` holds what the motors did, `samples` what the software recorded, both also over its restarts; `on_s` the
-    motors' total on-time, `peak_ml` the highest volume.
+    `doses` holds what the motors did, `samples` what the software recorded, `reads` when a client was sent the newest
+    sample (device s), all also over restarts; `on_s` the motors' total on-time, `peak_ml` the highest volume.
     """
 
     def __init__(self, plant: Plant, config: VialConfig, rng: np.random.Generator, start: float = 0.0) -> None:
@@ -175,6 +177,7 @@ class Vial:
         self.spectrometer = Spectrometer(config, self.faults, rng)
         self.doses: deque[Dose] = deque(maxlen=DOSES_KEPT)
         self.samples: deque[Sample] = deque(maxlen=DOSES_KEPT)
+        self.reads: deque[float] = deque(maxlen=READS_KEPT)
         self.on_s = dict.fromkeys((FEED, WASTE, *SPARE), 0.0)
         self.peak_ml = float(plant.vessel.volume_ml[0])
         self.powered = True

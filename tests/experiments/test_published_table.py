@@ -1,0 +1,116 @@
+"""The paper's Table 2 against its numbers typed by hand, and the sides of every table and figure that shows it."""
+
+import numpy as np
+import pytest
+
+from envs.scenario import Scenario
+from experiments.comparison import figures, page
+from experiments.comparison import statistics as comparison
+from experiments.comparison.published import SETTLING_MIN, TABLE_2
+from experiments.comparison.trials import Trial
+
+CONTROLLERS = ("dqn", "pi", "mpc")
+ISE = {
+    ("setpoint_steps", "0.8"): (0.039, 0.046, 0.035),
+    ("setpoint_steps", "0.65"): (0.032, 0.039, 0.092),
+    ("setpoint_steps", "0.5"): (0.051, 0.111, 0.117),
+    ("temperature_switch", "37"): (0.045, 0.033, 0.032),
+    ("temperature_switch", "30"): (0.031, 0.025, 0.042),
+}
+ITAE = {
+    ("setpoint_steps", "0.8"): (12.21, 12.38, 10.44),
+    ("setpoint_steps", "0.65"): (11.90, 10.50, 9.38),
+    ("setpoint_steps", "0.5"): (7.43, 11.49, 12.98),
+    ("temperature_switch", "37"): (12.42, 9.65, 11.60),
+    ("temperature_switch", "30"): (11.84, 9.12, 11.54),
+}
+
+
+def ours(factor: float) -> list[dict[str, object]]:
+    """Rows of a run whose every value is the paper's times `factor`."""
+    return [
+        {
+            "controller": c, "plant": "nominal_noise", "scenario": scenario, "window": window, "n": 3,
+            "ise_mean": factor * ISE[scenario, window][k], "ise_sd": 0.0, "ise_ci95": [np.nan, np.nan],
+            "itae_mean": factor * ITAE[scenario, window][k], "itae_sd": 0.0, "itae_ci95": [np.nan, np.nan],
+        }
+        for scenario, window in ISE
+        for k, c in enumerate(CONTROLLERS)
+    ]  # fmt: skip
+
+
+def test_every_published_value_is_the_papers():
+    found = {(p.scenario, p.window, p.controller): (p.ise, p.itae) for p in TABLE_2}
+    assert found == {(*cell, c): (ISE[cell][k], ITAE[cell][k]) for cell in ISE for k, c in enumerate(CONTROLLERS)}
+    setpoints = {"0.8": 0.8, "0.65": 0.65, "0.5": 0.5, "37": 0.5, "30": 0.5}
+    assert all(p.setpoint == setpoints[p.window] for p in TABLE_2)
+    assert SETTLING_MIN == 10.0
+
+
+def test_published_stands_left_and_ours_right():
+    table = page.table_2(ours(2.0), "ise")
+    assert table.columns == (
+        "window", "dqn, published", "pi, published", "mpc, published", "dqn, here", "pi, here", "mpc, here",
+        "lowest published", "lowest here",
+    )  # fmt: skip
+    assert [str(cell) for cell in table.rows[1]] == [
+        "OD 0.65", "0.032", "0.039", "0.092", "0.064", "0.078", "0.184", "dqn", "dqn",
+    ]  # fmt: skip
+    itae = page.table_2(ours(2.0), "itae")
+    assert [str(cell) for cell in itae.rows[3]] == [
+        "37 °C", "12.42", "9.65", "11.6", "24.8", "19.3", "23.2", "pi", "pi",
+    ]  # fmt: skip
+
+
+def test_the_lowest_is_named_on_its_own_side():
+    rows = ours(1.0)
+    next(r for r in rows if (r["controller"], r["window"]) == ("mpc", "0.5"))["ise_mean"] = 0.01
+    lowest = {str(row[0]): row[-2:] for row in page.table_2(rows, "ise").rows}
+    assert lowest["OD 0.5"] == ("dqn", "mpc")
+    assert lowest["30 °C"] == ("pi", "pi")
+
+
+def test_cell_by_cell_says_whose_is_lower():
+    lower = page.cell_by_cell(ours(0.5))
+    assert [str(cell) for cell in lower.rows[0]] == [
+        "OD 0.8, dqn", "0.039 (0.0013)", "0.0195 (0.00065)", "here", "12.21 (0.407)", "6.11 (0.204)", "here",
+    ]  # fmt: skip
+    assert {row[3] for row in page.cell_by_cell(ours(2.0)).rows} == {"published"}
+
+
+def test_the_figure_is_hollow_where_the_paper_is_and_filled_where_we_are():
+    left, right = figures.published_and_ours(ours(2.0)).axes
+    for ax, published in ((left, ISE), (right, ITAE)):
+        drawn = {True: set(), False: set()}
+        for line in ax.get_lines():
+            if line.get_marker() not in ("", "None", None) and len(line.get_xdata()) == 1:
+                hollow = str(line.get_markerfacecolor()) in ("white", "w", "none")
+                drawn[hollow].add(round(float(line.get_xdata()[0]), 6))
+        values = {v for cell in published.values() for v in cell}
+        assert drawn[True] == {round(v, 6) for v in values}
+        assert drawn[False] == {round(2.0 * v, 6) for v in values}
+
+
+def trial(controller: str, error: tuple[float, ...]) -> Trial:
+    """Two minutes at setpoint 1, the error constant in each replicate."""
+    n = len(error)
+    od = 1.0 + np.array(error)[:, None] * np.ones((n, 3))
+    ones, nothing = np.ones((n, 3)), np.zeros(n)
+    return Trial(
+        controller, "p", "s", Scenario((1.0,), (2.0,), (37.0,)), np.arange(3.0), od, od, 0.01 * ones, 37.0 * ones,
+        ones, nothing, nothing.astype(bool),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("pairs", [comparison.pairs, comparison.total_pairs])
+def test_a_difference_is_the_controllers_minus_the_others(pairs):
+    """Constant |e| over T = 2 min: ITAE = 2 |e|, so 0.02 to 0.03 against 0.05 to 0.06 is 0.06 lower, of 0.11."""
+    found = {
+        p["metric"]: p for p in pairs([trial("good", (0.02, 0.025, 0.03)), trial("bad", (0.05, 0.055, 0.06))], "bad")
+    }
+    itae = found["itae"]
+    assert (itae["controller"], itae["against"], itae["verdict"]) == ("good", "bad", "lower")
+    assert itae["difference"] == pytest.approx(-0.06)
+    assert itae["percent"] == pytest.approx(-100.0 * 0.06 / 0.11)
+    assert found["ise"]["difference"] < 0.0
+    assert max(itae["ci95"]) < 0.0
