@@ -4,14 +4,17 @@ Hydra composes plain YAML; the dataclass of the entry point is the schema. Whate
 wrong type, value out of range, misspelt option) ends as one line on standard error, before a run folder exists.
 """
 
+import errno
 import logging
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from traceback import walk_tb
+from typing import Any, Generic, TextIO, TypeVar, cast
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -24,19 +27,32 @@ from yaml import YAMLError  # type: ignore[import-untyped]
 
 from conf.presets import groups
 from conf.schema import build, old_name
-from experiments.cli import help_page
+from experiments.cli import help_page, stop
 
 __all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config"]
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-logging.getLogger("httpx").setLevel(logging.WARNING)  # it tells of every request; journal and summary do that better
+for talker in ("httpx", "torch"):  # of every request, which journal and summary do better; of its caches at the end
+    logging.getLogger(talker).setLevel(logging.WARNING)
 
 OmegaConf.register_new_resolver("pid", os.getpid)  # makes run folders of processes started in one second differ
 
 
+SPACE, PLACE = "free disk space", "choose a folder that can be written, with hydra.run.dir=FOLDER"
+REFUSALS = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), SPACE),
+    **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG), PLACE),
+}
+"""What a disk answers that will not take a file, and the remedy."""
+
+
 class UserError(Exception):
     """Something the user can mend; the message is one line and is all that is shown."""
+
+
+class _Told(UserError):
+    """A job of a sweep failed, and its line has been shown; the launcher finishes the other jobs first."""
 
 
 def normalise(argv: Sequence[str]) -> list[str]:
@@ -78,6 +94,24 @@ def _one_line(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines()]
     kept = [s for s in lines if s and not s.startswith(("object_type", "reference_type", "Config search path"))]
     return " ".join(kept[:6])
+
+
+def _refusal(error: BaseException | None) -> str | None:
+    """The line about a disk that refused, None for any other error.
+
+    Whoever wrote may have wrapped the system's error in one of its own, as torch and logging do.
+    """
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in REFUSALS:
+            where = f"{error.filename}: " if error.filename else ""
+            return f"{where}{error.strerror}; {REFUSALS[error.errno]}"
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def _silence(stream: TextIO) -> None:
+    """Nothing more goes out there, also not at the interpreter's end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def load(cfg: DictConfig, schema: T, prefix: str = "") -> T:
@@ -135,12 +169,14 @@ class Command(Generic[T]):
     schema: default instance of the entry point's config dataclass; a field `resume` makes it resumable.
     body: called with the checked config and the run folder; a float it returns is the sweep's objective.
     choose: gives the schema that fits a composed config, where it depends on one (a backend has fields of its own).
+    resumes: the file in a run folder without which `resume=` cannot go on, "" for a command that has no `resume=`.
     """
 
     name: str
     schema: T
     body: Callable[[T, Path], float | None]
     choose: Callable[[DictConfig], T] | None = None
+    resumes: str = ""
 
     def fitting(self, cfg: DictConfig) -> T:
         """The schema of a composed config."""
@@ -152,48 +188,82 @@ class Command(Generic[T]):
         return load(cfg, self.fitting(cfg))
 
     def __call__(self) -> None:
-        """Run what the command line says. Exits: 0, or 1 after one line on standard error; 130 on Ctrl-C."""
+        """Run what the command line says. Exits: 0, or 1 after one line on standard error; 130 when stopped."""
+        logging.raiseExceptions = False  # a log that cannot be written costs its line, not the run
         try:
-            given = sys.argv[1:]
-            flags = {a for a in given if a.startswith("-")}
-            plain = [a for a in given if not a.startswith("-")]
-            if flags & {"--help", "-h"}:
-                print(help_page.text(self.name, self.config(plain)), flush=True)
-                return
-            if flags & {"--cfg", "-c"} and "job" in plain:
-                plain.remove("job")
-                print(OmegaConf.to_yaml(asdict(cast(Any, self.config(plain)))))
-                return
-            sys.argv[1:] = [*normalise(given), f"hydra.job.name={self.name}"]
-            if not flags:  # a sweep or another flag is Hydra's to read; a plain run is checked before it has a folder
-                self.config(given)
-                resumed = _resumed(given)
-                others = [a for a in given if not a.startswith(("resume=", "hydra."))]
-                if resumed and others:
-                    raise UserError(f"{others[0]}: a resumed run takes every value from {resumed}/config.yaml; drop it")
-            GlobalHydra.instance().clear()
-            hydra.main(version_base="1.3", config_path="pkg://conf", config_name=self.name)(self._job)()
-        except (UserError, ValueError) as error:  # a ValueError is the schema's own word on a value
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(1)
+            with stop.interrupts():
+                self._answer(sys.argv[1:])
+            sys.stdout.flush()
         except BrokenPipeError:  # `--help | head`: whoever reads has seen enough
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _silence(sys.stdout)
         except KeyboardInterrupt:
-            print("stopped by Ctrl-C", file=sys.stderr)
-            sys.exit(130)
+            print("stopped before anything began", file=sys.stderr)
+            sys.exit(stop.STATUS)
+        except _Told:
+            sys.exit(1)
+        except Exception as error:
+            line = _refusal(error)
+            if line is None and isinstance(error, UserError | ValueError | HydraException | OmegaConfBaseException):
+                line = _one_line(error)  # a ValueError is the schema's own word on a value
+            inside = any(stack.f_code is Command._job.__code__ for stack, _ in walk_tb(error.__traceback__))
+            if line is None or inside:  # a bug of ours, shown whole
+                raise
+            print(f"error: {line}", file=sys.stderr)
+            if isinstance(error, OSError) and error.filename is None:
+                _silence(sys.stdout)  # it was standard output that refused
+            sys.exit(1)
+
+    def _answer(self, given: list[str]) -> None:
+        """Help, the config, or a run or sweep of it."""
+        flags = {a for a in given if a.startswith("-")}
+        plain = [a for a in given if not a.startswith("-")]
+        if flags & {"--help", "-h"}:
+            print(help_page.text(self.name, self.config(plain)), flush=True)
+            return
+        if flags & {"--cfg", "-c"} and "job" in plain:
+            plain.remove("job")
+            print(OmegaConf.to_yaml(asdict(cast(Any, self.config(plain)))))
+            return
+        sys.argv[1:] = [*normalise(given), f"hydra.job.name={self.name}"]
+        if not flags:  # a sweep or another flag is Hydra's to read; a plain run is checked before it has a folder
+            self.config(given)
+            resumed = _resumed(given)
+            others = [a for a in given if not a.startswith(("resume=", "hydra."))]
+            if resumed and others:
+                raise UserError(f"{others[0]}: a resumed run takes every value from {resumed}/config.yaml; drop it")
+        GlobalHydra.instance().clear()
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print; how it is shown is decided above
+        hydra.main(version_base="1.3", config_path="pkg://conf", config_name=self.name)(self._job)()
 
     def _job(self, cfg: DictConfig) -> float | None:
         """One run in its folder."""
+        folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
         try:
-            folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
             if cfg.get("resume"):
                 config = _stored(folder / "config.yaml", str(cfg.resume), self.fitting)
             else:
                 config = load(cfg, self.fitting(cfg))
                 save_config(config, folder)
             return self.body(config, folder)
-        except UserError as error:
+        except KeyboardInterrupt:
+            print(f"stopped; {self._left(folder)}", file=sys.stderr)
+            sys.exit(stop.STATUS)
+        except BrokenPipeError:
+            raise
+        except Exception as error:
+            refused = _refusal(error)
+            if refused is None and not isinstance(error, UserError):
+                raise
+            print(f"error: {f'{refused}; {self._left(folder)}' if refused else error}", file=sys.stderr)
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise  # the launcher finishes the other jobs first
-            print(f"error: {error}", file=sys.stderr)
+                raise _Told from None
             sys.exit(1)
+
+    def _left(self, folder: Path) -> str:
+        """What a run that did not come to its end leaves, and how to go on."""
+        own = (".", "events.", "config.yaml", f"{self.name}.log")
+        names = sorted(p.name + "/" * p.is_dir() for p in folder.glob("*") if not p.name.startswith(own))
+        kept = f"{folder} keeps {', '.join(names)}" if names else f"{folder} keeps no result"
+        if self.resumes and (folder / self.resumes).is_file():
+            return f"{kept}; go on with: python -m experiments.{self.name} resume={shlex.quote(str(folder))}"
+        return f"{kept}; to try again, start anew"
