@@ -10,8 +10,9 @@ import os
 import re
 import shlex
 import sys
+import threading
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any, Generic, TextIO, TypeVar, cast
@@ -49,10 +50,6 @@ REFUSALS = {
 
 class UserError(Exception):
     """Something the user can mend; the message is one line and is all that is shown."""
-
-
-class _Told(UserError):
-    """A job of a sweep failed, and its line has been shown; the launcher finishes the other jobs first."""
 
 
 def normalise(argv: Sequence[str]) -> list[str]:
@@ -103,10 +100,15 @@ def _refusal(error: BaseException | None) -> str | None:
     """
     while error is not None:
         if isinstance(error, OSError) and error.errno in REFUSALS:
-            where = f"{error.filename}: " if error.filename else ""
-            return f"{where}{error.strerror}; {REFUSALS[error.errno]}"
+            return f"{error.filename or 'writing'}: {error.strerror}; {REFUSALS[error.errno]}"
         error = error.__cause__ or error.__context__
     return None
+
+
+def _in_thread(failed: threading.ExceptHookArgs) -> None:
+    """An event writer's thread hands a refusal on to the run, which tells it; everything else is shown."""
+    if _refusal(failed.exc_value) is None:
+        threading.__excepthook__(failed)
 
 
 def _silence(stream: TextIO) -> None:
@@ -177,6 +179,7 @@ class Command(Generic[T]):
     body: Callable[[T, Path], float | None]
     choose: Callable[[DictConfig], T] | None = None
     resumes: str = ""
+    _failed: list[Path] = field(default_factory=list, init=False)  # jobs of a sweep
 
     def fitting(self, cfg: DictConfig) -> T:
         """The schema of a composed config."""
@@ -190,17 +193,18 @@ class Command(Generic[T]):
     def __call__(self) -> None:
         """Run what the command line says. Exits: 0, or 1 after one line on standard error; 130 when stopped."""
         logging.raiseExceptions = False  # a log that cannot be written costs its line, not the run
+        threading.excepthook = _in_thread
         try:
             with stop.interrupts():
                 self._answer(sys.argv[1:])
             sys.stdout.flush()
+            if self._failed:
+                sys.exit(1)
         except BrokenPipeError:  # `--help | head`: whoever reads has seen enough
             _silence(sys.stdout)
         except KeyboardInterrupt:
             print("stopped before anything began", file=sys.stderr)
             sys.exit(stop.STATUS)
-        except _Told:
-            sys.exit(1)
         except Exception as error:
             line = _refusal(error)
             if line is None and isinstance(error, UserError | ValueError | HydraException | OmegaConfBaseException):
@@ -248,21 +252,23 @@ class Command(Generic[T]):
         except KeyboardInterrupt:
             print(f"stopped; {self._left(folder)}", file=sys.stderr)
             sys.exit(stop.STATUS)
-        except BrokenPipeError:
-            raise
+        except BrokenPipeError:  # whoever read has seen enough
+            _silence(sys.stdout)
+            return None
         except Exception as error:
             refused = _refusal(error)
             if refused is None and not isinstance(error, UserError):
                 raise
             print(f"error: {f'{refused}; {self._left(folder)}' if refused else error}", file=sys.stderr)
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise _Told from None
-            sys.exit(1)
+            if HydraConfig.get().mode != RunMode.MULTIRUN:
+                sys.exit(1)
+            self._failed.append(folder)  # the launcher goes on with the other jobs
+            return None
 
     def _left(self, folder: Path) -> str:
         """What a run that did not come to its end leaves, and how to go on."""
-        own = (".", "events.", "config.yaml", f"{self.name}.log")
-        names = sorted(p.name + "/" * p.is_dir() for p in folder.glob("*") if not p.name.startswith(own))
+        own = re.compile(rf"\.|events\.|config\.yaml|{self.name}\.log|.*\.part$")
+        names = sorted(p.name + "/" * p.is_dir() for p in folder.glob("*") if not own.match(p.name))
         kept = f"{folder} keeps {', '.join(names)}" if names else f"{folder} keeps no result"
         if self.resumes and (folder / self.resumes).is_file():
             return f"{kept}; go on with: python -m experiments.{self.name} resume={shlex.quote(str(folder))}"
