@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
-from conf.presets import groups
+from conf import presets
 from conf.schema import build, old_name
 from experiments.cli import help_page, stop
 
@@ -52,23 +52,37 @@ class UserError(Exception):
     """Something the user can mend; the message is one line and is all that is shown."""
 
 
-def normalise(argv: Sequence[str]) -> list[str]:
+def _choose(command: str, group: str, option: str) -> None:
+    """Whether a command can be told `group=option`. Raises: UserError naming what it takes, or the right command."""
+    given, own = f"{group}={option}", presets.chosen(command)
+    known = presets.groups()[group]
+    of = presets.owner(f"{group}/{option}") if option in known else None
+    if of not in (None, command):
+        raise UserError(f"{given}: a recipe of {of}; python -m experiments.{of} +{given}")
+    if group not in own:
+        others = [name for name in presets.commands() if group in presets.chosen(name)]
+        takes = ", ".join(own) or "no group"
+        raise UserError(f"{given}: {command} takes {takes}; {group}= is for {', '.join(others)}")
+    if re.fullmatch(r"[\w./-]+", option) and option not in (*known, "null"):
+        allowed = ", ".join(presets.options(command, group))
+        raise UserError(old_name(given) or f"{given}: no such option; allowed: {allowed}")
+
+
+def normalise(argv: Sequence[str], command: str) -> list[str]:
     """Arguments in the one form that Hydra takes for each of them, whatever the YAML files hold.
 
     A group is chosen by `group=option` or `+group=option`. Every other key is forced in, because a default stands in
     the dataclass and not in YAML, and an unknown key is named by the schema. `resume=RUN` makes RUN the run folder.
-    Raises: UserError for an option that does not exist, naming those that do.
+    Raises: UserError for a group or option that the command does not take, naming those that it does.
     """
-    known = groups()
+    known = presets.groups()
     out: list[str] = []
     for arg in argv:
         match = re.match(r"^\+?([\w/]+)=(.*)$", arg)
         if match and match[1] in known:
             arg = f"{match[1]}={match[2]}"
             for option in match[2].split(","):
-                if re.fullmatch(r"[\w./-]+", option) and option != "null" and option not in known[match[1]]:
-                    now = old_name(f"{match[1]}={option}")
-                    raise UserError(now or f"{arg}: no such option; allowed: {', '.join(known[match[1]])}")
+                _choose(command, match[1], option)
         elif re.split("[@=]", arg.lstrip("+"))[0] not in known and not arg.startswith("hydra."):
             arg = re.sub(r"^\+*(?=\w+[^=]*=)", "++", arg)
         out.append(arg)
@@ -139,7 +153,7 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
     try:
         GlobalHydra.instance().clear()
         with hydra.initialize_config_module("conf", version_base="1.3"):
-            return hydra.compose(name, overrides=[a for a in normalise(overrides) if not a.startswith("hydra.")])
+            return hydra.compose(name, overrides=[a for a in normalise(overrides, name) if not a.startswith("hydra.")])
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra's own checks of a group's name
         raise UserError(_one_line(error)) from None
 
@@ -228,7 +242,7 @@ class Command(Generic[T]):
             plain.remove("job")
             print(OmegaConf.to_yaml(asdict(cast(Any, self.config(plain)))))
             return
-        sys.argv[1:] = [*normalise(given), f"hydra.job.name={self.name}"]
+        sys.argv[1:] = [*normalise(given, self.name), f"hydra.job.name={self.name}"]
         if not flags:  # a sweep or another flag is Hydra's to read; a plain run is checked before it has a folder
             self.config(given)
             resumed = _resumed(given)
