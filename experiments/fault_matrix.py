@@ -79,9 +79,10 @@ def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
 
 
 def run_all(config: FaultMatrixConfig, folder: Path) -> list[Outcome]:
-    """Every case, in order; a bar on a terminal, every 50th case in a log. Stopped, it leaves those done in cases.csv.
+    """Every case, in order; a bar on a terminal, the first and every 50th case in a log.
 
-    Each worker is a fresh process, because a limit on file size, which one fault sets, is the process's.
+    Stopped, it leaves those that are done in cases.csv. Each worker is a fresh process, because a limit on file size,
+    which one fault sets, is the process's.
     """
     cases = all_cases(config)
     with (
@@ -94,10 +95,10 @@ def run_all(config: FaultMatrixConfig, folder: Path) -> list[Outcome]:
             for done, future in enumerate(as_completed(futures), 1):
                 future.result()
                 bar.update()
-                if done % 50 == 0 and bar.disable:
+                if bar.disable and (done == 1 or done % 50 == 0):
                     log.info("%d of %d cases", done, len(cases))
         except KeyboardInterrupt:
-            if ended := [future.result() for future in futures if future.done()]:
+            if ended := [f.result() for f in futures if f.done() and f.exception() is None]:
                 write_cases(folder / "cases.csv", ended)
             raise
         return [future.result() for future in futures]
