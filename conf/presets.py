@@ -1,5 +1,6 @@
 """The presets of conf/ as plain values, for readers that do without Hydra."""
 
+import re
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
-__all__ = ["groups", "load"]
+__all__ = ["chosen", "commands", "groups", "load", "options", "owner"]
 
 ROOT = Path(str(resources.files("conf")))
 
@@ -20,6 +21,33 @@ def groups() -> dict[str, list[str]]:
         if group != ".":
             found.setdefault(group, []).append(path.stem)
     return found
+
+
+def commands() -> list[str]:
+    """Every command that is told by a file of conf/."""
+    return [path.stem for path in sorted(ROOT.glob("*.yaml")) if path.stem != "base"]
+
+
+def chosen(command: str) -> dict[str, str | None]:
+    """The groups that a command composes, in the place they have by themselves, and the option each starts with."""
+    root = yaml.safe_load((ROOT / f"{command}.yaml").read_text(encoding="utf-8")) or {}
+    entries = [entry for entry in root.get("defaults", []) if isinstance(entry, dict)]
+    found = {group: option for entry in entries for group, option in entry.items() if "@" not in group}
+    return found | {inner: None for group in found for inner in groups() if inner.startswith(f"{group}/")}
+
+
+def owner(name: str) -> str | None:
+    """The command that a recipe is for, which a line `# @command NAME` says; None for a preset that serves any.
+
+    Args: name: group and option, "experiment/paper".
+    """
+    found = re.search(r"^# @command (\w+)$", (ROOT / f"{name}.yaml").read_text(encoding="utf-8"), re.MULTILINE)
+    return found[1] if found else None
+
+
+def options(command: str, group: str) -> list[str]:
+    """The presets of a group that a command accepts."""
+    return [option for option in groups()[group] if owner(f"{group}/{option}") in (None, command)]
 
 
 def load(name: str) -> dict[str, Any]:

@@ -2,3 +2,7 @@
 
 A file directly in this folder is a command, `python -m experiments.NAME`, and nobody imports it.
 """
+
+from experiments.cli.start import begin
+
+begin()

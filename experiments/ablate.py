@@ -2,7 +2,7 @@
 
 `python -m experiments.ablate` trains every entry of `ablations` in conf/ablate.yaml: the agent of the command line with
 some of its values replaced. The run folder gets ablation.csv (a row per variant and seed), summary.json, table.md, a
-figure, and one sub-folder per variant with its TensorBoard curves. A stopped run goes on with `resume=RUN`.
+figure, and one sub-folder per variant with its TensorBoard curves. A stopped run goes on with `resume=RUN`, to the bit.
 """
 
 import csv
@@ -66,7 +66,7 @@ class AblateConfig:
         return TrainConfig(
             env=self.env, agent=variant(self.agent, name, self.ablations[name]), seed=self.seed, n_agents=self.n_agents,
             device=self.device, threads=self.threads, eval_every=self.eval_every,
-            checkpoint_every=self.agent.total_steps,
+            checkpoint_every=self.agent.total_steps, resume=self.resume,
         )  # fmt: skip
 
 
@@ -94,11 +94,15 @@ def _read(path: Path) -> list[Row]:
 
 
 def _train(config: TrainConfig, name: str, folder: Path) -> list[Row]:
-    """Train one variant and score it on the reported grid."""
+    """Train one variant and score it on the reported grid; one that was stopped goes on where it was."""
+    from dqn.checkpoint import CheckpointError
     from experiments.training.session import Session
 
     folder.mkdir(parents=True, exist_ok=True)
-    session = Session(config, folder)
+    try:
+        session = Session(config, folder, resume=config.resume is not None and (folder / "checkpoint.pt").is_file())
+    except CheckpointError as error:
+        raise frame.UserError(f"resume={config.resume}: {error}") from None
     try:
         session.run()
     finally:
@@ -190,7 +194,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
     return float(summary[config.names[0]]["regret_pct"]["median"])
 
 
-main = frame.Command("ablate", AblateConfig(), ablate)
+main = frame.Command("ablate", AblateConfig(), ablate, resumes="config.yaml")
 
 
 if __name__ == "__main__":

@@ -183,8 +183,10 @@ def degradation(config: DegradationConfig, folder: Path) -> float:
     if not config.trained:
         raise frame.UserError("trained: no variant; name at least one, as conf/degradation.yaml does")
     torch.set_num_threads(1)
-    rows = [row for name in config.trained for row in _watch(config, name)]
-    files.write_csv(folder / "curves.csv", rows)
+    rows = []
+    for name in config.trained:
+        rows += _watch(config, name)
+        files.write_csv(folder / "curves.csv", rows)  # whole variants, for a run that is stopped
     fitted = {name: _fit(config, name) for name in config.fitted}
     gap = action_gap(solve(config.env, config.agent.gamma))
     log.info("one level beside the best action costs %.1e at the setpoint", gap)

@@ -3,10 +3,14 @@
 Each step is the command a user would type, shown before it runs.
 """
 
+import argparse
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
+
+from experiments.cli import stop
 
 __all__ = ["main"]
 
@@ -24,14 +28,33 @@ def commands(folder: Path) -> list[list[str]]:
     return [["-m", f"experiments.{name}", *overrides] for name, *overrides in steps]
 
 
+def step(arguments: list[str], signals: list[int]) -> int:
+    """Run one command to its end; returns its status, or that of a stopped command.
+
+    It has a session of its own, so that a signal reaches it once, from here, however it was sent.
+    Args: signals: come in here; each is passed on.
+    """
+    process, stopped = subprocess.Popen([sys.executable, *arguments], start_new_session=True), False
+    while process.poll() is None:
+        while signals:
+            process.send_signal(signals.pop(0))
+            stopped = True
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(0.2)
+    return stop.STATUS if stopped else process.returncode
+
+
 def main() -> None:
     """Entry point; exits with the status of the first step that fails."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.demo", description=__doc__)
+    parser.parse_args()
     folder = Path("runs") / "demo" / time.strftime("%Y-%m-%d_%H-%M-%S")
-    for arguments in commands(folder):
-        print("\n$ python", " ".join(arguments), flush=True)
-        status = subprocess.run([sys.executable, *arguments], check=False).returncode
-        if status:
-            sys.exit(status)
+    signals: list[int] = []
+    with stop.handled(lambda number, _: signals.append(number), *stop.SIGNALS):
+        for arguments in commands(folder):
+            print("\n$ python", " ".join(arguments), flush=True)
+            if status := step(arguments, signals):
+                sys.exit(status)
     print(
         f"\npolicy    {folder / '2_train' / 'policy.npz'}"
         f"\nfigures   {folder / '2_train' / 'figures'}, {folder / '3_deploy' / 'figures'}"

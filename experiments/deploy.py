@@ -19,7 +19,7 @@ def _schema(cfg: DictConfig) -> DeployConfig:
     return deploy_schema(str(cfg.backend.kind), str(cfg.controller.kind))
 
 
-main = frame.Command("deploy", DeployConfig(), deploy, _schema)
+main = frame.Command("deploy", DeployConfig(), deploy, _schema, resumes="state.json")
 
 
 if __name__ == "__main__":

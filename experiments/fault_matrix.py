@@ -2,9 +2,8 @@
 
 import logging
 import math
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from conf.schema import check, part, require, setting
 from envs.scenario import Scenario
 from experiments.cli import files, frame
+from experiments.cli.stop import Workers
 from experiments.controllers.registry import STANDALONE
 from experiments.reliability.case import MOMENTS, FaultCase
 from experiments.reliability.faults import FAULTY, by_name
@@ -78,21 +78,29 @@ def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
     return controls + [(name, moment, config.seed, guarded) for name, guarded in rigs for moment in config.moments]
 
 
-def run_all(config: FaultMatrixConfig) -> list[Outcome]:
-    """Every case, in order; a bar on a terminal, every 50th case in a log."""
+def run_all(config: FaultMatrixConfig, folder: Path) -> list[Outcome]:
+    """Every case, in order; a bar on a terminal, the first and every 50th case in a log.
+
+    Stopped, it leaves those that are done in cases.csv. Each worker is a fresh process, because a limit on file size,
+    which one fault sets, is the process's.
+    """
     cases = all_cases(config)
-    fresh = multiprocessing.get_context("spawn")  # a limit on file size, which one fault sets, is the process's
     with (
-        ProcessPoolExecutor(config.workers or None, mp_context=fresh) as executor,
+        Workers(config.workers) as workers,
         logging_redirect_tqdm(),
         tqdm(total=len(cases), disable=None, unit="case") as bar,
     ):
-        futures = [executor.submit(run_case, config, *case) for case in cases]
-        for done, future in enumerate(as_completed(futures), 1):
-            future.result()
-            bar.update()
-            if done % 50 == 0 and bar.disable:
-                log.info("%d of %d cases", done, len(cases))
+        futures = [workers.submit(run_case, config, *case) for case in cases]
+        try:
+            for done, future in enumerate(as_completed(futures), 1):
+                future.result()
+                bar.update()
+                if bar.disable and (done == 1 or done % 50 == 0):
+                    log.info("%d of %d cases", done, len(cases))
+        except KeyboardInterrupt:
+            if ended := [f.result() for f in futures if f.done() and f.exception() is None]:
+                write_cases(folder / "cases.csv", ended)
+            raise
         return [future.result() for future in futures]
 
 
@@ -130,7 +138,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
     """Run the matrix, write cases.csv, table.md, summary.json and the figure. Raises: UserError if it fails."""
     began = time.monotonic()
     faults = [f for f in by_name(config.faults) if config.overflow_pump.pump or not f.of_overflow_pump]
-    outcomes = run_all(config)
+    outcomes = run_all(config, folder)
     if not outcomes:
         raise frame.UserError("nothing to run: give faults or controls")
     write_cases(folder / "cases.csv", outcomes)

@@ -5,6 +5,7 @@ with `resume=RUN`; at the end, what the emulator knows it did is compared with w
 """
 
 import logging
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -21,11 +22,11 @@ __all__ = ["kill_campaign"]
 log = logging.getLogger(__name__)
 
 
-def one_run(config: KillConfig, folder: Path, run: int) -> Findings:
-    """One recording with its share of the kills."""
+def one_run(config: KillConfig, folder: Path, run: int, stop: threading.Event) -> Findings:
+    """One recording with its share of the kills. Raises: Stopped."""
     kills = config.kills // config.runs + (run < config.kills % config.runs)
     began = time.monotonic()
-    findings = killed_run(config, kills, folder / f"run{run}", run)
+    findings = killed_run(config, kills, folder / f"run{run}", run, stop)
     log.info("run %d: %d kills in %.0f s, %s", run, kills, time.monotonic() - began, "ok" if findings.ok else "NOT ok")
     return findings
 
@@ -36,8 +37,17 @@ def kill_campaign(config: KillConfig, folder: Path) -> None:
     for name in config.reactors:
         for part, pump in (("feed", SOUND.feed), ("waste", SOUND.waste)):
             save_calibration(folder / "calibration", name, part, pump.as_dict())
+    found, stop = [], threading.Event()
     with ThreadPoolExecutor(config.workers) as executor:
-        found = list(executor.map(lambda run: one_run(config, folder, run), range(config.runs)))
+        futures = [executor.submit(one_run, config, folder, run, stop) for run in range(config.runs)]
+        try:
+            found = [future.result() for future in futures]
+        except BaseException:  # clients and emulators have sessions of their own: nobody else ends them
+            stop.set()
+            executor.shutdown(cancel_futures=True)
+            ended = [f.result() for f in futures if not f.cancelled() and f.exception() is None]
+            files.write_json(folder / "ended_runs.json", {"runs": [asdict(f) for f in ended]})
+            raise
     keys = [k for k, v in asdict(found[0]).items() if isinstance(v, (int, float)) and not isinstance(v, bool)]
     total: dict[str, Any] = {k: sum(getattr(f, k) for f in found) for k in keys}
     total |= {key: max(getattr(f, key) for f in found) for key in ("schedule_error_s", "mean_error", "out_min")}

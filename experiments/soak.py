@@ -19,17 +19,27 @@ HELD_OD = 0.015  # five times what noise and dose spread leave of a sound loop
 ASTRAY_MIN = 5.0  # an outlying reading costs a dose, two in a row cost two
 
 
+def write_table(days: list[Day], folder: Path) -> None:
+    """table.md: a line per day."""
+    table = markdown(list(asdict(days[0])), (list(asdict(d).values()) for d in days))
+    (folder / "table.md").write_text(table, encoding="utf-8")
+
+
 def soak(config: SoakConfig, folder: Path) -> None:
     """Run, table, summary.json. Raises: UserError if something was lost, grew or drifted."""
     days: list[Day] = []
     began = time.monotonic()
-    found = soak_run(config, folder, days)
+    try:
+        found = soak_run(config, folder, days)
+    except KeyboardInterrupt:
+        if days:
+            write_table(days, folder)
+        raise
     slopes = {key: round(growth(days, key), 2) for key in ("memory_mb", "journal_mb", "csv_mb", "events_mb")}
     wall = round(time.monotonic() - began, 1)
     summary = {**found, "growth_per_day": slopes, "wall_s": wall, "days": [asdict(d) for d in days]}
     files.write_json(folder / "summary.json", summary)
-    table = markdown(list(asdict(days[0])), (list(asdict(d).values()) for d in days))
-    (folder / "table.md").write_text(table, encoding="utf-8")
+    write_table(days, folder)
     errors = [abs(v["fed_error_pct"]) for v in found["reactors"].values()]
     levels = [abs(v["ledger_ml"] - v["volume_ml"]) for v in found["reactors"].values()]
     log.info("growth per day %s; %d rows lost; feed booked within %.2f %%, level within %.2f mL; %.0f s", slopes,

@@ -13,7 +13,7 @@ def train(config: TrainConfig, folder: Path) -> float:
     return run.train(config, folder)
 
 
-main = frame.Command("train", TrainConfig(), train)
+main = frame.Command("train", TrainConfig(), train, resumes="checkpoint.pt")
 
 
 if __name__ == "__main__":

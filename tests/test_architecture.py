@@ -128,7 +128,11 @@ def test_a_package_says_what_it_is_for_and_does_nothing():
             text = ast.get_docstring(tree(module))
             assert text, module
             assert len(text.splitlines()) <= 5, module
-            assert len(tree(module).body) == 1 or module == "envs", f"{module}: code in __init__.py"
+            does = module in (
+                "envs",
+                "experiments",
+            )  # one registers its environment, one checks whose packages these are
+            assert len(tree(module).body) == 1 or does, f"{module}: code in __init__.py"
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
+from conf import presets
 from conf.renamed import REMOVED, RENAMED
 from conf.schema import build, entries
 from dqn.config import DQNConfig
@@ -264,7 +265,7 @@ def test_a_model_file_that_would_take_for_ever_is_refused_in_one_line(content, w
     ],
 )
 def test_every_argument_has_the_form_that_hydra_takes(given, understood):
-    assert frame.normalise([given]) == [understood]
+    assert frame.normalise([given], "deploy" if "transport" in given else "train") == [understood]
 
 
 @pytest.mark.parametrize(
@@ -296,3 +297,60 @@ def test_a_wrong_override_is_one_line_with_key_value_and_what_is_allowed(overrid
     assert "\n" not in message
     for part in parts:
         assert part in message
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_lists_what_the_command_takes_and_every_option_of_it_composes(name, capsys, monkeypatch):
+    command = importlib.import_module(f"experiments.{name}").main
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    command()
+    page = capsys.readouterr().out.partition("Values (key=value)")[0]
+    listed = {}
+    for line in page.splitlines():
+        if group := re.match(r"  ([\w/]+)=(?: |$)", line):
+            listed[group[1]] = []
+        elif option := re.match(r"    (\w+)  ", line):
+            listed[[*listed][-1]].append(option[1])
+    for group, found in listed.items():
+        assert found, group
+        for option in found:
+            if group != "backend/transport":  # stands under a backend that has one
+                command.config([f"{group}={option}"])
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "line"),
+    [
+        (
+            "train",
+            "+experiment=paper",
+            "experiment=paper: a recipe of benchmark; python -m experiments.benchmark +experi",
+        ),
+        (
+            "benchmark",
+            "experiment=smoke",
+            "experiment=smoke: a recipe of train; python -m experiments.train +experiment",
+        ),
+        (
+            "deploy",
+            "+experiment=smoke",
+            "experiment=smoke: a recipe of train; python -m experiments.train +experiment=s",
+        ),
+        ("train", "+experiment=nope", "experiment=nope: no such option; allowed: smoke"),
+        ("train", "plant=bench", "plant=bench: train takes env, agent, experiment; plant= is for deploy"),
+        ("benchmark", "plant=bench", "plant=bench: benchmark takes env, experiment; plant= is for deploy"),
+        ("speed", "agent=tuned", "agent=tuned: speed takes no group; agent= is for ablate, degradation, train"),
+        (
+            "kill_campaign",
+            "+safety=default",
+            "safety=default: kill_campaign takes no group; safety= is for deploy, fault",
+        ),
+    ],
+)
+def test_a_group_or_recipe_of_another_command_names_the_right_one(name, override, line):
+    with pytest.raises(frame.UserError, match=f"^{re.escape(line)}"):
+        importlib.import_module(f"experiments.{name}").main.config([override])
+
+
+def test_a_recipe_says_which_command_it_is_for():
+    assert {presets.owner(f"experiment/{option}") for option in options("experiment")} == {"benchmark", "train"}

@@ -4,14 +4,18 @@ Hydra composes plain YAML; the dataclass of the entry point is the schema. Whate
 wrong type, value out of range, misspelt option) ends as one line on standard error, before a run folder exists.
 """
 
+import errno
 import logging
 import os
 import re
+import shlex
 import sys
+import threading
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from traceback import walk_tb
+from typing import Any, Generic, TextIO, TypeVar, cast
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -21,40 +25,63 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from conf.presets import groups
+from conf import presets
 from conf.schema import build, old_name
-from experiments.cli import files, help_page
+from experiments.cli import files, help_page, stop
 
 __all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config"]
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-logging.getLogger("httpx").setLevel(logging.WARNING)  # it tells of every request; journal and summary do that better
+for talker in ("httpx", "torch"):  # of every request, which journal and summary do better; of its caches at the end
+    logging.getLogger(talker).setLevel(logging.WARNING)
 
 OmegaConf.register_new_resolver("pid", os.getpid)  # makes run folders of processes started in one second differ
+
+
+SPACE, PLACE = "free disk space", "choose a folder that can be written, with hydra.run.dir=FOLDER"
+REFUSALS = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), SPACE),
+    **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG), PLACE),
+}
+"""What a disk answers that will not take a file, and the remedy."""
 
 
 class UserError(Exception):
     """Something the user can mend; the message is one line and is all that is shown."""
 
 
-def normalise(argv: Sequence[str]) -> list[str]:
+def _choose(command: str, group: str, option: str) -> None:
+    """Whether a command can be told `group=option`. Raises: UserError naming what it takes, or the right command."""
+    given, own = f"{group}={option}", presets.chosen(command)
+    known = presets.groups()[group]
+    of = presets.owner(f"{group}/{option}") if option in known else None
+    if of not in (None, command):
+        raise UserError(f"{given}: a recipe of {of}; python -m experiments.{of} +{given}")
+    if group not in own:
+        others = [name for name in presets.commands() if group in presets.chosen(name)]
+        takes = ", ".join(own) or "no group"
+        raise UserError(f"{given}: {command} takes {takes}; {group}= is for {', '.join(others)}")
+    if re.fullmatch(r"[\w./-]+", option) and option not in (*known, "null"):
+        allowed = ", ".join(presets.options(command, group))
+        raise UserError(old_name(given) or f"{given}: no such option; allowed: {allowed}")
+
+
+def normalise(argv: Sequence[str], command: str) -> list[str]:
     """Arguments in the one form that Hydra takes for each of them, whatever the YAML files hold.
 
     A group is chosen by `group=option` or `+group=option`. Every other key is forced in, because a default stands in
     the dataclass and not in YAML, and an unknown key is named by the schema. `resume=RUN` makes RUN the run folder.
-    Raises: UserError for an option that does not exist, naming those that do.
+    Raises: UserError for a group or option that the command does not take, naming those that it does.
     """
-    known = groups()
+    known = presets.groups()
     out: list[str] = []
     for arg in argv:
         match = re.match(r"^\+?([\w/]+)=(.*)$", arg)
         if match and match[1] in known:
             arg = f"{match[1]}={match[2]}"
             for option in match[2].split(","):
-                if re.fullmatch(r"[\w./-]+", option) and option != "null" and option not in known[match[1]]:
-                    now = old_name(f"{match[1]}={option}")
-                    raise UserError(now or f"{arg}: no such option; allowed: {', '.join(known[match[1]])}")
+                _choose(command, match[1], option)
         elif re.split("[@=]", arg.lstrip("+"))[0] not in known and not arg.startswith("hydra."):
             arg = re.sub(r"^\+*(?=\w+[^=]*=)", "++", arg)
         out.append(arg)
@@ -77,6 +104,29 @@ def _one_line(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines()]
     kept = [s for s in lines if s and not s.startswith(("object_type", "reference_type", "Config search path"))]
     return " ".join(kept[:6])
+
+
+def _refusal(error: BaseException | None) -> str | None:
+    """The line about a disk that refused, None for any other error.
+
+    Whoever wrote may have wrapped the system's error in one of its own, as torch and logging do.
+    """
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in REFUSALS:
+            return f"{error.filename or 'writing'}: {error.strerror}; {REFUSALS[error.errno]}"
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def _in_thread(failed: threading.ExceptHookArgs) -> None:
+    """An event writer's thread hands a refusal on to the run, which tells it; everything else is shown."""
+    if _refusal(failed.exc_value) is None:
+        threading.__excepthook__(failed)
+
+
+def _silence(stream: TextIO) -> None:
+    """Nothing more goes out there, also not at the interpreter's end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def load(cfg: DictConfig, schema: T, prefix: str = "") -> T:
@@ -102,7 +152,7 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
     try:
         GlobalHydra.instance().clear()
         with hydra.initialize_config_module("conf", version_base="1.3"):
-            return hydra.compose(name, overrides=[a for a in normalise(overrides) if not a.startswith("hydra.")])
+            return hydra.compose(name, overrides=[a for a in normalise(overrides, name) if not a.startswith("hydra.")])
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra's own checks of a group's name
         raise UserError(_one_line(error)) from None
 
@@ -134,12 +184,15 @@ class Command(Generic[T]):
     schema: default instance of the entry point's config dataclass; a field `resume` makes it resumable.
     body: called with the checked config and the run folder; a float it returns is the sweep's objective.
     choose: gives the schema that fits a composed config, where it depends on one (a backend has fields of its own).
+    resumes: the file in a run folder without which `resume=` cannot go on, "" for a command that has no `resume=`.
     """
 
     name: str
     schema: T
     body: Callable[[T, Path], float | None]
     choose: Callable[[DictConfig], T] | None = None
+    resumes: str = ""
+    _failed: list[Path] = field(default_factory=list, init=False)  # jobs of a sweep
 
     def fitting(self, cfg: DictConfig) -> T:
         """The schema of a composed config."""
@@ -151,48 +204,85 @@ class Command(Generic[T]):
         return load(cfg, self.fitting(cfg))
 
     def __call__(self) -> None:
-        """Run what the command line says. Exits: 0, or 1 after one line on standard error; 130 on Ctrl-C."""
+        """Run what the command line says. Exits: 0, or 1 after one line on standard error; 130 when stopped."""
+        logging.raiseExceptions = False  # a log that cannot be written costs its line, not the run
+        threading.excepthook = _in_thread
         try:
-            given = sys.argv[1:]
-            flags = {a for a in given if a.startswith("-")}
-            plain = [a for a in given if not a.startswith("-")]
-            if flags & {"--help", "-h"}:
-                print(help_page.text(self.name, self.config(plain)), flush=True)
-                return
-            if flags & {"--cfg", "-c"} and "job" in plain:
-                plain.remove("job")
-                print(OmegaConf.to_yaml(asdict(cast(Any, self.config(plain)))))
-                return
-            sys.argv[1:] = [*normalise(given), f"hydra.job.name={self.name}"]
-            if not flags:  # a sweep or another flag is Hydra's to read; a plain run is checked before it has a folder
-                self.config(given)
-                resumed = _resumed(given)
-                others = [a for a in given if not a.startswith(("resume=", "hydra."))]
-                if resumed and others:
-                    raise UserError(f"{others[0]}: a resumed run takes every value from {resumed}/config.yaml; drop it")
-            GlobalHydra.instance().clear()
-            hydra.main(version_base="1.3", config_path="pkg://conf", config_name=self.name)(self._job)()
-        except (UserError, ValueError) as error:  # a ValueError is the schema's own word on a value
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(1)
+            with stop.interrupts():
+                self._answer(sys.argv[1:])
+            sys.stdout.flush()
+            if self._failed:
+                sys.exit(1)
         except BrokenPipeError:  # `--help | head`: whoever reads has seen enough
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _silence(sys.stdout)
         except KeyboardInterrupt:
-            print("stopped by Ctrl-C", file=sys.stderr)
-            sys.exit(130)
+            print("stopped before anything began", file=sys.stderr)
+            sys.exit(stop.STATUS)
+        except Exception as error:
+            line = _refusal(error)
+            if line is None and isinstance(error, UserError | ValueError | HydraException | OmegaConfBaseException):
+                line = _one_line(error)  # a ValueError is the schema's own word on a value
+            inside = any(stack.f_code is Command._job.__code__ for stack, _ in walk_tb(error.__traceback__))
+            if line is None or inside:  # a bug of ours, shown whole
+                raise
+            print(f"error: {line}", file=sys.stderr)
+            if isinstance(error, OSError) and error.filename is None:
+                _silence(sys.stdout)  # it was standard output that refused
+            sys.exit(1)
+
+    def _answer(self, given: list[str]) -> None:
+        """Help, the config, or a run or sweep of it."""
+        flags = {a for a in given if a.startswith("-")}
+        plain = [a for a in given if not a.startswith("-")]
+        if flags & {"--help", "-h"}:
+            print(help_page.text(self.name, self.config(plain)), flush=True)
+            return
+        if flags & {"--cfg", "-c"} and "job" in plain:
+            plain.remove("job")
+            print(OmegaConf.to_yaml(asdict(cast(Any, self.config(plain)))))
+            return
+        sys.argv[1:] = [*normalise(given, self.name), f"hydra.job.name={self.name}"]
+        if not flags:  # a sweep or another flag is Hydra's to read; a plain run is checked before it has a folder
+            self.config(given)
+            resumed = _resumed(given)
+            others = [a for a in given if not a.startswith(("resume=", "hydra."))]
+            if resumed and others:
+                raise UserError(f"{others[0]}: a resumed run takes every value from {resumed}/config.yaml; drop it")
+        GlobalHydra.instance().clear()
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print; how it is shown is decided above
+        hydra.main(version_base="1.3", config_path="pkg://conf", config_name=self.name)(self._job)()
 
     def _job(self, cfg: DictConfig) -> float | None:
         """One run in its folder."""
+        folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
         try:
-            folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
             if cfg.get("resume"):
                 config = _stored(folder / "config.yaml", str(cfg.resume), self.fitting)
             else:
                 config = load(cfg, self.fitting(cfg))
                 save_config(config, folder)
             return self.body(config, folder)
-        except UserError as error:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise  # the launcher finishes the other jobs first
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(1)
+        except KeyboardInterrupt:
+            print(f"stopped; {self._left(folder)}", file=sys.stderr)
+            sys.exit(stop.STATUS)
+        except BrokenPipeError:  # whoever read has seen enough
+            _silence(sys.stdout)
+            return None
+        except Exception as error:
+            refused = _refusal(error)
+            if refused is None and not isinstance(error, UserError):
+                raise
+            print(f"error: {f'{refused}; {self._left(folder)}' if refused else error}", file=sys.stderr)
+            if HydraConfig.get().mode != RunMode.MULTIRUN:
+                sys.exit(1)
+            self._failed.append(folder)  # the launcher goes on with the other jobs
+            return None
+
+    def _left(self, folder: Path) -> str:
+        """What a run that did not come to its end leaves, and how to go on."""
+        own = re.compile(rf"\.|events\.|config\.yaml|{self.name}\.log|.*\.part$")
+        names = sorted(p.name + "/" * p.is_dir() for p in folder.glob("*") if not own.match(p.name))
+        kept = f"{folder} keeps {', '.join(names)}" if names else f"{folder} keeps no result"
+        if self.resumes and (folder / self.resumes).is_file():
+            return f"{kept}; go on with: python -m experiments.{self.name} resume={shlex.quote(str(folder))}"
+        return f"{kept}; to try again, start anew"

@@ -10,12 +10,10 @@ from dataclasses import is_dataclass
 from itertools import takewhile
 from typing import Any
 
-import yaml  # type: ignore[import-untyped]
-
-from conf.presets import ROOT, groups
+from conf.presets import ROOT, chosen, options
 from conf.schema import entries
 
-__all__ = ["chosen", "sentence", "shown", "text"]
+__all__ = ["sentence", "shown", "text"]
 
 WIDTH = 118
 LEFT = 44  # columns of `key = value`
@@ -38,21 +36,13 @@ def _opening(name: str) -> list[str]:
     """The comment at the top of a file of conf/, line by line."""
     lines = (ROOT / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
     first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
-    return [line[1:].removeprefix(" ") for line in lines[:first] if not line.startswith("# @package")]
+    return [line[1:].removeprefix(" ") for line in lines[:first] if not line.startswith("# @")]
 
 
 def sentence(name: str) -> str:
     """The first sentence of the comment at the top of a file of conf/, without the file's own name before it."""
     first = " ".join(takewhile(str.strip, _opening(name))).removeprefix(f"{name.rpartition('/')[2]}: ")
     return re.split(r"(?<=\.)\s(?=[A-Z`])", first)[0]
-
-
-def chosen(name: str) -> dict[str, str | None]:
-    """The groups that a command composes, in the place they have by themselves, and the option each starts with."""
-    root = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
-    entries = [entry for entry in root.get("defaults", []) if isinstance(entry, dict)]
-    found = {group: option for entry in entries for group, option in entry.items() if "@" not in group}
-    return found | {inner: None for group in found for inner in groups() if inner.startswith(f"{group}/")}
 
 
 def _line(left: str, right: str, at: int) -> list[str]:
@@ -100,7 +90,7 @@ def text(name: str, config: Any) -> str:
     choices = []
     for group, start in chosen(name).items():
         choices.append(f"  {group}=" + (f"    (by itself {start})" if start else ""))
-        for option in groups()[group]:
+        for option in options(name, group):
             choices += _line(f"    {option}", sentence(f"{group}/{option}"), 26)
         choices.append("")
     head = ["Choices (group=option)", ""] if choices else []

@@ -11,10 +11,10 @@ from typing import Any, cast, get_args, get_type_hints
 
 import yaml  # type: ignore[import-untyped]
 
-from conf.presets import ROOT, groups
+from conf.presets import ROOT, chosen, commands, groups, owner
 from conf.schema import Entry, entries
 from experiments.cli.frame import Command
-from experiments.cli.help_page import chosen, sentence, shown
+from experiments.cli.help_page import sentence, shown
 from experiments.reporting.page import flat
 from experiments.reporting.tables import markdown
 
@@ -37,14 +37,13 @@ part is written with the part's name before it: `safety.max_rate=0.01`.
 
 def page() -> str:
     """The whole page."""
-    names = [path.stem for path in sorted(ROOT.glob("*.yaml")) if path.stem != "base"]
-    commands: dict[str, Command[Any]] = {n: importlib.import_module(f"experiments.{n}").main for n in names}
+    known: dict[str, Command[Any]] = {n: importlib.import_module(f"experiments.{n}").main for n in commands()}
     parts: dict[type[Any], str] = {}
-    for command in commands.values():
+    for command in known.values():
         for config in _variants(command):
             _collect(config, "", parts)
     lines = [HEAD, "## Commands", ""]
-    for name, command in commands.items():
+    for name, command in known.items():
         taken = ", ".join(f"[`{group}`](#{_anchor(f'presets of {group}')})" for group in chosen(name))
         lines += [f"### {name}", "", sentence(name), "", *((f"Groups: {taken}.", "") if taken else ())]
         lines += _table(command.schema, parts)
@@ -54,9 +53,15 @@ def page() -> str:
         lines += [f"### {name}", "", said, "", *_table(kind(), parts)]
     lines += ["## Presets", "", "Each with the values that differ from the defaults above.", ""]
     for group, options in groups().items():
-        rows = [(f"`{option}`", sentence(f"{group}/{option}"), _changes(f"{group}/{option}")) for option in options]
+        rows = [(f"`{option}`", _said(f"{group}/{option}"), _changes(f"{group}/{option}")) for option in options]
         lines += [f"### Presets of {group}", "", markdown(("preset", "what it is", "what it changes"), rows)]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _said(name: str) -> str:
+    """What a preset is; a recipe with the command that it is for."""
+    of = owner(name)
+    return f"{of}: {sentence(name)}" if of else sentence(name)
 
 
 def _anchor(heading: str) -> str:

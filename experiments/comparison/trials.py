@@ -6,12 +6,10 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from multiprocessing import get_context
 from types import TracebackType
 from typing import Any
 
@@ -24,6 +22,7 @@ from dqn.policy import Policy
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
+from experiments.cli.stop import Workers
 from experiments.comparison.config import BenchmarkConfig
 from experiments.control.loop import ClosedLoop
 from experiments.control.metrics import WindowMetrics, window_metrics
@@ -184,16 +183,14 @@ class Loops:
     """Runs cells in processes of their own, one per core, from `start` on.
 
     Args: config: of the benchmark; `workers` processes, 0 for one per core, 1 for none but this one.
-    A context: leaving it stops what has not begun.
+    A context: leaving it stops what has not begun, and by an exception also what runs.
     """
 
     def __init__(self, config: BenchmarkConfig) -> None:
         self.config = config
         self._waiting: dict[Cell, Policy | None] = {}
         self._running: dict[Future[Trial], Cell] = {}
-        workers = config.workers or os.cpu_count() or 1
-        # Spawned, because a fork would copy torch's threads in whatever state they are.
-        self._pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn")) if workers > 1 else None
+        self._pool = Workers(config.workers) if config.workers != 1 else None
 
     def start(self, cells: Sequence[Cell], policy: Policy | None = None) -> None:
         """Queue cells that all follow `policy`, or none."""
@@ -230,4 +227,4 @@ class Loops:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool.__exit__(kind, error, trace)

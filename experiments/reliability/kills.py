@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Sequence
@@ -24,7 +25,7 @@ from hardware.emulator.process import EmulatorProcess
 from hardware.emulator.vial import Dose, Sample
 from hardware.storage.journal import read_journal
 
-__all__ = ["Findings", "KillConfig", "killed_run"]
+__all__ = ["Findings", "KillConfig", "Stopped", "killed_run"]
 
 BLIND_S = 0.25  # real seconds before a kill in which a sample may not have been asked for yet
 CLOCKS_S = 0.05  # real seconds by which the clocks of client and emulator, compared over HTTP, may be apart
@@ -118,16 +119,23 @@ class Findings:
         return self.mean_error <= HELD_OD and self.out_min <= LONGEST_OUT_MIN
 
 
-def killed_run(config: KillConfig, kills: int, folder: Path, seed: int) -> Findings:
+class Stopped(Exception):
+    """The campaign was stopped before this run was at its end; its processes are gone."""
+
+
+def killed_run(
+    config: KillConfig, kills: int, folder: Path, seed: int, stop: threading.Event | None = None
+) -> Findings:
     """Start, kill, resume; at last end it properly and compare.
 
-    Args: kills: of this run. folder: where it records. seed: of kill moments and emulator.
-    Raises: LinkError if there is no emulator.
+    Args: kills: of this run. folder: where it records. seed: of kill moments and emulator. stop: ends it early.
+    Raises: LinkError if there is no emulator; Stopped.
     """
     findings = Findings(kills=kills)
     arguments = {"reactors": ",".join(config.reactors), "speed": config.speed, "seed": seed, "od": SETPOINT}
     with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
-        clients = _Clients(config, device, folder, np.random.default_rng([config.seed, seed]), findings)
+        rng = np.random.default_rng([config.seed, seed])
+        clients = _Clients(config, device, folder, rng, findings, stop or threading.Event())
         killed = [clients.start_and_kill(k) for k in range(kills)]
         _Comparison(config, device, folder, killed, clients.end(), findings).run()
     return findings
@@ -137,10 +145,16 @@ class _Clients:
     """The client processes of one run, one after another. What goes wrong with them is added to `findings`."""
 
     def __init__(
-        self, config: KillConfig, device: EmulatorProcess, folder: Path, rng: np.random.Generator, findings: Findings
+        self,
+        config: KillConfig,
+        device: EmulatorProcess,
+        folder: Path,
+        rng: np.random.Generator,
+        findings: Findings,
+        stop: threading.Event,
     ) -> None:
         self.config, self.device, self.folder, self.findings = config, device, folder, findings
-        self._rng = rng
+        self._rng, self._stop = rng, stop
 
     def _client(self, first: bool) -> subprocess.Popen[bytes]:
         c = self.config
@@ -166,35 +180,38 @@ class _Clients:
     def _until_it_writes(self, client: subprocess.Popen[bytes], before: int) -> bool:
         deadline = time.monotonic() + PATIENCE_S
         while self._size() <= before and client.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.01)
+            if self._stop.wait(0.01):
+                break
         return client.poll() is None and self._size() > before
 
     def start_and_kill(self, k: int) -> float:
         """Start or resume, and kill at a random moment: after the first row, or already during the start.
 
-        Args: k: number of the kill. Returns: its wall time, s.
+        Args: k: number of the kill. Returns: its wall time, s. Raises: Stopped.
         """
         has_state = (self.folder / "state.json").exists()
         client = self._client(first=not has_state)
         early = has_state and self._rng.random() < self.config.early
         if early:
-            time.sleep(float(self._rng.uniform(0.5, 3.0)))
+            self._stop.wait(float(self._rng.uniform(0.5, 3.0)))
         elif self._until_it_writes(client, self._size()):
-            time.sleep(float(self._rng.uniform(0.0, self.config.longest_s)))
-            while not (self.folder / "state.json").exists() and client.poll() is None:
-                time.sleep(0.05)
+            self._stop.wait(float(self._rng.uniform(0.0, self.config.longest_s)))
+            while not ((self.folder / "state.json").exists() or self._stop.wait(0.05)) and client.poll() is None:
+                pass
         if client.poll() is not None:
             self.findings.trouble.append(f"client {k} ended by itself with status {client.returncode}")
         killed = time.time()
         client.kill()
         client.wait()
+        if self._stop.is_set():
+            raise Stopped
         return killed
 
     def end(self) -> float:
         """Resume once more, run ten minutes, end as an operator would; returns the wall time of that, s."""
         client = self._client(first=False)
         if self._until_it_writes(client, self._size()):
-            time.sleep(LAST_S / self.config.speed)
+            self._stop.wait(LAST_S / self.config.speed)
         ended = time.time()
         client.send_signal(signal.SIGINT)
         try:

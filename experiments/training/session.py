@@ -17,6 +17,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from dqn import checkpoint
 from dqn.trainer import TrainRecord
+from experiments.cli import stop
 from experiments.reporting.tensorboard import PopulationWriter
 from experiments.training import build
 from experiments.training.config import TrainConfig
@@ -176,11 +177,15 @@ class Session:
         self.seconds = state["seconds"]
 
     def run(self) -> None:
-        """Train to the end: log every episode, evaluate, checkpoint, show progress."""
+        """Train to the end: log every episode, evaluate, checkpoint, show progress.
+
+        Raises: KeyboardInterrupt after a signal, with a checkpoint of the episode that was going on.
+        """
         c = self.config
         total, last = c.agent.total_steps, self.agents.steps
         started, earlier = time.perf_counter(), self.seconds
-        with logging_redirect_tqdm(), tqdm(total=total, initial=last, disable=None, unit="step") as bar:
+        bars = tqdm(total=total, initial=last, disable=None, unit="step")
+        with stop.pausing("at the end of this episode") as stopping, logging_redirect_tqdm(), bars as bar:
             for record in self.agents.run():
                 self.seconds = earlier + time.perf_counter() - started
                 self._log(record)
@@ -191,7 +196,10 @@ class Session:
                     bar.set_postfix_str(line)
                     if bar.disable:
                         log.info("step %d of %d: %s", record.step, total, line)
-                if final or record.step // c.checkpoint_every > last // c.checkpoint_every:
+                stopped = stopping()
+                if final or stopped or record.step // c.checkpoint_every > last // c.checkpoint_every:
                     self.seconds = earlier + time.perf_counter() - started
                     self._save()
+                if stopped:
+                    raise KeyboardInterrupt
                 last = record.step

@@ -1,0 +1,41 @@
+"""Before a command imports anything: whether the packages are its own, and what Ctrl-C says until it has begun."""
+
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from types import TracebackType
+
+__all__ = ["begin"]
+
+PACKAGES = ("conf", "dqn", "envs", "hardware")
+HOME = Path(__file__).parents[2]  # where all packages of ours stand side by side
+
+
+def begin() -> None:
+    """Raises: SystemExit with one line for a command that would import other packages, ImportError for a library."""
+    command = sys.argv[:1] == ["-m"]  # the interpreter still looks for the command
+    if line := _other_package():
+        raise SystemExit(f"error: {line}") if command else ImportError(line)
+    if command:
+        sys.excepthook = _shown
+
+
+def _other_package() -> str | None:
+    """A folder `envs/` where a command is started, or another installed package of that name, comes before ours."""
+    for name in PACKAGES:
+        spec = find_spec(name)
+        places = list(spec.submodule_search_locations or [str(spec.origin)]) if spec is not None else []
+        if not places:
+            return f"package {name} is missing, it belongs to {HOME / name}; install the project again"
+        if Path(places[0]).resolve() != (HOME / name).resolve():
+            remedy = "rename that one, or start the command from another folder"
+            return f"package {name} is taken from {places[0]}, not from {HOME / name}; {remedy}"
+    return None
+
+
+def _shown(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Ctrl-C while a command is imported; a traceback through other people's modules tells nobody anything."""
+    if issubclass(kind, KeyboardInterrupt):
+        print("stopped before anything began", file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)

@@ -1,0 +1,131 @@
+"""Every controller of the list through `deploy`, on simulated vials and on the emulated device, to its last file.
+
+The device is the emulator itself behind the driver, in this process and in virtual time; one run takes the real way, a
+process of its own behind a real socket.
+"""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from dqn import policy
+from envs.scenario import Scenario
+from experiments.cli import frame
+from experiments.control import assemble, run
+from experiments.control.config import DeployConfig, deploy_schema
+from experiments.controllers.registry import KINDS
+from hardware.chibio.config import EmulatorConfig
+from hardware.clock import VirtualClock
+from hardware.emulator.device import ChiBioDevice
+from hardware.emulator.transport import EmulatorTransport
+from hardware.storage.journal import read_journal
+from tests.experiments.test_deploy import inverse_policy
+
+ROOT = Path(__file__).parents[2]
+NAMES = ("M0", "M1")
+WHY = {  # what each controller says of a decision: name -> number of values per reactor
+    "dqn": {"q_best": 1, "q_lead": 1},
+    "mpc": {"planned_rate": 5, "predicted_od": 5},  # over its horizon of five minutes
+}
+
+
+def config(kind: str, backend: str, folder: Path) -> DeployConfig:
+    """Three minutes at 0.4 from a culture above it."""
+    policy.save(folder / "given.npz", inverse_policy())
+    schema = deploy_schema(backend, kind)
+    reactors = replace(schema.backend, reactors=NAMES)
+    plant = replace(schema.plant, start_od=0.5)
+    scenario = Scenario((0.4,), (3.0,), (37.0,))
+    return replace(
+        schema, backend=reactors, plant=plant, scenario=scenario, policy=str(folder / "given.npz"), fsync=False
+    )
+
+
+@pytest.fixture
+def emulated(monkeypatch: pytest.MonkeyPatch) -> list[ChiBioDevice]:
+    """`backend=emulator` finds its device in this process; returns those it was given."""
+    devices = []
+
+    @contextmanager
+    def linked(backend: EmulatorConfig) -> Iterator[tuple[EmulatorTransport, VirtualClock]]:
+        clock = VirtualClock()
+        rng = np.random.default_rng(1)
+        devices.append(ChiBioDevice(backend.reactors, clock, rng, od=0.5, temperature=37.0, blanked=True))
+        yield EmulatorTransport(devices[-1]), clock
+
+    monkeypatch.setattr(assemble, "linked", linked)
+    return devices
+
+
+def check(folder: Path, kind: str) -> None:
+    """Everything that a run of three minutes leaves, against what it was asked."""
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["outcome"] == "completed"
+    assert list(summary["reactors"]) == list(NAMES)
+    assert [w["setpoint"] for w in summary["windows"]] == [0.4, 0.4]
+    assert all(np.isfinite(w["ise"]) for w in summary["windows"])
+    for suffix in ("svg", "png"):
+        assert (folder / f"figures/closed_loop.{suffix}").stat().st_size > 5000
+    assert Path(summary["figure"]).name == "closed_loop.png"
+    fed = 0.0
+    for name in NAMES:
+        with open(folder / f"recordings/{name}.csv", newline="") as f:
+            rows = list(csv.DictReader(f))
+        assert len(rows) >= 4
+        assert summary["reactors"][name]["rows"] == len(rows)
+        assert all(0.0 <= float(row["pump_rate_ml_s"]) <= 0.02 for row in rows)
+        fed += sum(float(row["volume_ml"]) for row in rows if row["volume_ml"] not in ("", "nan"))
+    assert summary["volume_ml"] == pytest.approx(fed, abs=1e-3)
+    decisions = [row for row in read_journal(folder / "journal.jsonl")[0] if row["kind"] == "decision"]
+    assert len(decisions) == sum(reactor["rows"] for reactor in summary["reactors"].values())
+    for decision in decisions:
+        found = {key: len(value) if isinstance(value, list) else 1 for key, value in decision["why"].items()}
+        assert WHY.get(kind, found) == found
+    tags = set(EventAccumulator(str(folder)).Reload().Tags()["scalars"])
+    curves = {f"{name}/{tag}" for name in NAMES for tag in ("od", "setpoint", "pump_rate_ml_s")}
+    assert curves <= tags
+    numbers = {tag for tag, values in WHY.get(kind, {}).items() if values == 1}
+    assert {f"M0/{tag}" for tag in numbers} <= tags
+    if kind == "mpc":  # a plan is no curve
+        assert not {tag for tag in tags if "plan" in tag or "predicted" in tag}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_controller_on_simulated_vials(kind: str, tmp_path: Path) -> None:
+    run.deploy(config(kind, "sim", tmp_path), tmp_path)
+    check(tmp_path, kind)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "oracle"])
+def test_every_controller_on_the_emulated_device(kind: str, tmp_path: Path, emulated: list[ChiBioDevice]) -> None:
+    run.deploy(config(kind, "emulator", tmp_path), tmp_path)
+    check(tmp_path, kind)
+    assert not any(on for name in NAMES for on in emulated[0].truth(name)["motors"].values())
+
+
+def test_the_oracle_needs_a_plant_that_it_can_know(tmp_path: Path, emulated: list[ChiBioDevice]) -> None:
+    with pytest.raises(frame.UserError, match=r"^controller = oracle: knows a simulated plant; allowed with backend="):
+        run.deploy(config("oracle", "emulator", tmp_path), tmp_path)
+    assert not any(on for name in NAMES for on in emulated[0].truth(name)["motors"].values())
+
+
+def test_the_paper_s_rival_on_an_emulated_device_behind_a_real_socket(tmp_path: Path) -> None:
+    words: list[Any] = ["controller=mpc", "backend=emulator", "backend.reactors=[M0,M1]", "backend.speed=60"]
+    words += ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[3]", f"hydra.run.dir={tmp_path}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "experiments.deploy", *words]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert done.stderr == ""
+    check(tmp_path, "mpc")

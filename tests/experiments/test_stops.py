@@ -1,0 +1,202 @@
+"""Ctrl-C, SIGTERM and SIGHUP end a command with one line that says what it keeps: real processes, real signals."""
+
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+
+from dqn import checkpoint
+from experiments.ablate import AblateConfig, _read
+from experiments.cli import frame
+from experiments.training.config import TrainConfig
+from experiments.training.session import Session
+
+ROOT = Path(__file__).parents[2]
+SHORT = ["agent=paper", "agent.total_steps=1000", "agent.learn_start=100", "eval_every=200"]
+
+
+class Run:
+    """A command in a folder of its own, known by a mark that all its processes inherit."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        self.folder, self._mark = folder, f"RUN_OF_TEST={uuid4().hex}"
+        name, _, value = self._mark.partition("=")
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), name: value}
+        command = [sys.executable, "-m", *words]
+        with open(folder / "out", "w") as out, open(folder / "err", "w") as err:
+            self.process = subprocess.Popen(
+                command, cwd=folder, env=environment, stdout=out, stderr=err, start_new_session=True
+            )
+
+    def processes(self) -> list[int]:
+        """Every living process of the command, also those in sessions of their own."""
+        found = []
+        for path in Path("/proc").glob("[0-9]*/environ"):
+            try:
+                if self._mark.encode() in path.read_bytes():
+                    found.append(int(path.parent.name))
+            except OSError:  # gone meanwhile, or somebody else's
+                continue
+        return found
+
+    def until_said(self, words: str) -> None:
+        """Wait for standard output to hold `words`."""
+        self._until(lambda: words in (self.folder / "out").read_text())
+
+    def until_there(self, pattern: str) -> None:
+        """Wait for a file with something in it."""
+        self._until(lambda: any(path.stat().st_size for path in self.folder.glob(pattern)))
+
+    def until_processes(self, count: int) -> None:
+        self._until(lambda: len(self.processes()) >= count)
+
+    def _until(self, there) -> None:
+        deadline = time.monotonic() + 60.0
+        while not there():
+            assert time.monotonic() < deadline
+            assert self.process.poll() is None, (self.folder / "err").read_text()
+            time.sleep(0.02)
+
+    def ctrl_c(self) -> None:
+        """As a terminal does: to every process of the foreground group."""
+        os.killpg(self.process.pid, signal.SIGINT)
+
+    def end(self) -> str:
+        """The one line on standard error, after the command has ended as a stopped one and left no process."""
+        status = self.process.wait(60.0)
+        said = (self.folder / "err").read_text()
+        assert status == 130, said
+        assert len(said.splitlines()) == 1, said
+        assert "Traceback" not in (self.folder / "out").read_text()
+        deadline = time.monotonic() + 5.0  # a process that was ended may take a moment
+        while self.processes():
+            assert time.monotonic() < deadline, self.processes()
+            time.sleep(0.02)
+        return said.strip()
+
+
+def go_on(run: Run, line: str) -> None:
+    """Run the command that the line names, as it stands there."""
+    told = re.search(r"go on with: python (-m experiments\.\w+ resume=.+)$", line)
+    assert told, line
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, *shlex.split(told[1])]
+    done = subprocess.run(command, cwd=run.folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_stopped_training_goes_on_to_the_bit_with_the_command_it_names(tmp_path: Path) -> None:
+    run = Run(tmp_path, "experiments.train", *SHORT, "hydra.run.dir=a folder")  # one that needs quotes
+    run.until_there("a folder/progress.csv")
+    run.process.terminate()
+    line = run.end()
+    assert "keeps checkpoint.pt, progress.csv; go on" in line
+    assert "stopping at the end of this episode" in (tmp_path / "out").read_text()
+    go_on(run, line)
+    config = frame.load(frame.compose("train", SHORT), TrainConfig())
+    (tmp_path / "whole").mkdir()
+    whole = Session(config, tmp_path / "whole")
+    whole.run()
+    whole.writer.close()
+    resumed = Session(config, tmp_path / "a folder", resume=True)
+    resumed.writer.close()
+    assert resumed.agents.weights().equal(whole.agents.weights())
+    assert resumed.best.history == whole.best.history
+
+
+def test_an_impatient_user_gets_out_at_once_and_keeps_what_was_saved(tmp_path: Path) -> None:
+    run = Run(tmp_path, "experiments.train", *SHORT, "n_agents=128", "checkpoint_every=100", "hydra.run.dir=run")
+    run.until_there("run/checkpoint.pt")
+    run.process.send_signal(signal.SIGHUP)
+    run.until_said("stopping")
+    run.ctrl_c()
+    assert run.end() == "stopped at once; what was saved before is whole"
+    assert checkpoint.load(tmp_path / "run/checkpoint.pt")["returns"]
+
+
+def test_a_stopped_benchmark_ends_its_workers(tmp_path: Path) -> None:
+    words = ["+experiment=comparison", "workers=2", "replicates=200", "train_seeds=1", "hydra.run.dir=run"]
+    run = Run(tmp_path, "experiments.benchmark", *words)
+    run.until_there("run/training/dqn/progress.csv")
+    os.killpg(run.process.pid, signal.SIGTERM)  # its workers get it too
+    assert run.end() == "stopped; run keeps training/; to try again, start anew"
+    assert (tmp_path / "run/training/dqn/checkpoint.pt").is_file()
+
+
+def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
+    run = Run(tmp_path, "experiments.fault_matrix", "workers=2")
+    run.until_processes(4)  # the command, two workers, and what tracks their semaphores
+    run.process.kill()
+    run.process.wait()
+    deadline = time.monotonic() + 20.0
+    while run.processes():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_a_stopped_ablation_goes_on_in_the_middle_of_a_variant(tmp_path: Path) -> None:
+    run = Run(tmp_path, "experiments.ablate", *SHORT, "only=[tuned]", "n_agents=2", "hydra.run.dir=study")
+    run.until_there("study/tuned/progress.csv")
+    run.ctrl_c()
+    line = run.end()
+    before = (tmp_path / "study/tuned/progress.csv").read_text().splitlines()
+    assert int(before[-1].split(",")[0]) < 1000
+    go_on(run, line)
+    assert (tmp_path / "study/tuned/progress.csv").read_text().splitlines()[: len(before)] == before
+    config = frame.load(frame.compose("ablate", [*SHORT, "only=[tuned]", "n_agents=2"]), AblateConfig())
+    (tmp_path / "whole").mkdir()
+    whole = Session(config.training("tuned"), tmp_path / "whole")
+    whole.run()
+    whole.writer.close()
+    assert [row.regret_pct for row in _read(tmp_path / "study/ablation.csv")] == whole.report()[1].regret_pct.tolist()
+
+
+@pytest.mark.parametrize(
+    ("words", "there", "kept"),
+    [
+        (["degradation", "n_agents=1", "agent.total_steps=100"], "curves.csv", "curves.csv"),
+        (["soak"], "state.json", "journal.jsonl, recordings/, state.json"),
+        (["speed"], "config.yaml", "no result"),
+        (["calibrate", "coverage=1000"], "config.yaml", "no result"),
+        (["fault_matrix", "workers=2"], "fault_matrix.log", "cases.csv"),  # the first case is logged
+    ],
+)
+def test_a_stopped_command_says_what_it_keeps(words: list[str], there: str, kept: str, tmp_path: Path) -> None:
+    run = Run(tmp_path, f"experiments.{words[0]}", *words[1:], "hydra.run.dir=run")
+    run.until_there(f"run/{there}")
+    run.ctrl_c()
+    assert run.end() == f"stopped; run keeps {kept}; to try again, start anew"
+
+
+def test_a_stopped_kill_campaign_leaves_neither_clients_nor_emulators(tmp_path: Path) -> None:
+    run = Run(tmp_path, "experiments.kill_campaign", "kills=4", "runs=2", "longest_s=60", "hydra.run.dir=run")
+    run.until_there("run/run0/journal.jsonl")
+    run.ctrl_c()
+    assert "run keeps calibration/, ended_runs.json, run0.log, run0/" in run.end()
+    assert json.loads((tmp_path / "run/ended_runs.json").read_text()) == {"runs": []}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_demo_is_silent_but_for_its_step(number: int, tmp_path: Path) -> None:
+    run = Run(tmp_path, "experiments.demo")
+    run.until_said("fitting")
+    run.process.send_signal(number)
+    assert "1_calibrate keeps no result" in run.end()
+    assert "experiments.train" not in (tmp_path / "out").read_text()
+
+
+def test_the_demo_explains_itself_and_does_nothing_else(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "experiments.demo", "--help"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "calibrate, train" in done.stdout
+    assert not list(tmp_path.iterdir())
