@@ -1,18 +1,19 @@
-"""The paper's open-loop calibration experiment, simulated: growth, dilution at full rate, then random pump rates."""
+"""Simulated recordings: the paper's open-loop experiment (growth, dilution, random pump rates), or any law's."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from envs.growth import DilutedCulture, Exponential
-from envs.integrators import rk4
 from envs.task import MAX_PUMP_RATE, pump_rates
 
-__all__ = ["OpenLoop", "open_loop"]
+__all__ = ["Decide", "OpenLoop", "OpenLoopLaw", "open_loop", "recordings"]
 
 Array = NDArray[np.float64]
+Decide = Callable[[float, Array], Array]
+"""(minute, readings of shape (N,)) -> pump rates in mL/s, shape (N,), held to the next row."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class OpenLoop:
         0.31, "u/tau is the dilution rate in 1/min; below 0.02/mu, so that the pump outruns growth", above=0.0
     )
     start_od: float = setting(0.12, "at the start", "OD", above=0.0, at_most=2.0)
-    hours: float = setting(6.0, "length of the recording", "h", within=(2, 100))
+    hours: float = setting(6.0, "length of the recording", "h", within=(1, 100))
     control_min: float = setting(1.0, "between rows", "min", within=(0.1, 10))
     growth_min: float = setting(60.0, "growth without feed (paper)", "min", at_least=0.0)
     dilute_to: float = setting(0.3, "then the pump at its maximum until the OD is below (paper)", "OD", above=0.0)
@@ -45,7 +46,12 @@ class OpenLoop:
     )
     noise: float = setting(0.01, "sd of a reading relative to the OD", within=(0, 0.2))
     noise_correlation: float = setting(0.12, "from row to row; median of public Chi.Bio logs", within=(0, 0.95))
-    seed: int = setting(1, "of rates and noise", at_least=0)
+    outlier_share: float = setting(0.0, "share of readings that are off by 10 to 50 %", within=(0, 0.2))
+    dose_cv: float = setting(0.0, "sd of a dose over its size", within=(0, 0.5))
+    growth_cv: float = setting(0.0, "sd of growth that wanders, over mu", within=(0, 0.5))
+    growth_memory_min: float = setting(30.0, "after which wandering growth has forgotten 63 %", "min", within=(1, 1000))
+    late_share: float = setting(0.0, "share of a dose that is seen one row late", within=(0, 1))
+    seed: int = setting(1, "of rates, noise and disturbances", at_least=0)
 
     def __post_init__(self) -> None:
         check(self, "protocol")
@@ -61,50 +67,64 @@ class OpenLoop:
 
 
 def open_loop(config: OpenLoop, rng: np.random.Generator, n: int = 1) -> tuple[Array, Array, Array]:
-    """N recordings of the same experiment with their own noise and their own random pump rates.
+    """N recordings of the open-loop experiment with their own noise and their own random pump rates; see `recordings`.
 
-    The culture is `DilutedCulture(Exponential(mu), tau)` of envs.growth, integrated by RK4 in steps of 0.1 min (error
-    below 1e-10, so that the truth is mu and tau and not an integrator's); decisions are taken on the noisy readings.
-
-    Args: config: protocol, culture and sensor. rng: source of rates and noise. n: number of recordings N.
     Returns: time in min, shape (T,); measured OD, shape (N, T); pump rate in mL/s held to the next row, shape (N, T).
-    Raises: nothing.
     """
-    rows = round(60.0 * config.hours / config.control_min) + 1
-    time = config.control_min * np.arange(rows, dtype=np.float64)
-    culture = DilutedCulture(Exponential(config.mu), config.tau)
-    state = np.stack([np.full(n, config.start_od), np.ones(n)], axis=1)
-    substeps = max(1, round(config.control_min / 0.1))
-    measured, applied = np.empty((n, rows)), np.empty((n, rows))
-    error = rng.standard_normal(n)
-    protocol = _Protocol(config, n)
-    for i, t in enumerate(time):
-        fresh = rng.standard_normal(n)
-        error = config.noise_correlation * error + np.sqrt(1.0 - config.noise_correlation**2) * fresh
-        measured[:, i] = state[:, 0] * (1.0 + config.noise * error)
-        rate = applied[:, i] = protocol.decide(float(t), measured[:, i], rng)
-
-        def derivative(y: Array, u: Array = rate) -> Array:
-            return culture.derivative(y, u)
-
-        state = rk4(derivative, state, config.control_min, substeps)
+    protocol = OpenLoopLaw(config, n, rng)
+    time, measured, applied, _ = recordings(config, protocol.decide, rng, n)
     return time, measured, applied
 
 
-class _Protocol:
+def recordings(
+    config: OpenLoop, decide: Decide, rng: np.random.Generator, n: int = 1
+) -> tuple[Array, Array, Array, Array]:
+    """N recordings of the same culture under a law of pumping that sees the noisy readings.
+
+    From row to row x <- x exp((m - (1 + e) u/tau) dt), m = mu (1 + w), which is exact for rates held between rows; e is
+    the spread of the doses, w wanders as a first-order process. A reading is x, with the last dose's late share not yet
+    in it, times 1 + noise.
+
+    Args: config: culture and sensor. decide: the law. rng: source of noise; disturbances have a stream of their own.
+    Returns: time in min, shape (T,); measured OD, shape (N, T); pump rate in mL/s held to the next row, shape (N, T);
+      mean growth rate over the rows, 1/min, shape (N,).
+    """
+    rows = round(60.0 * config.hours / config.control_min) + 1
+    dt = config.control_min
+    time = dt * np.arange(rows, dtype=np.float64)
+    (disturbance,) = rng.spawn(1)
+    od, last_dose = np.full(n, config.start_od), np.zeros(n)
+    measured, applied, growth = np.empty((n, rows)), np.empty((n, rows)), np.empty((n, rows))
+    error, wander = rng.standard_normal(n), disturbance.standard_normal(n)
+    memory = np.exp(-dt / config.growth_memory_min)
+    for i, t in enumerate(time):
+        error = config.noise_correlation * error + np.sqrt(1.0 - config.noise_correlation**2) * rng.standard_normal(n)
+        reading = od * np.exp(config.late_share * last_dose) * (1.0 + config.noise * error)
+        wrong = disturbance.random(n) < config.outlier_share
+        off = disturbance.choice((-1.0, 1.0), n) * disturbance.uniform(0.1, 0.5, n)
+        measured[:, i] = np.where(wrong, reading * (1.0 + off), reading)
+        rate = applied[:, i] = decide(float(t), measured[:, i])
+        growth[:, i] = config.mu * (1.0 + config.growth_cv * wander)
+        last_dose = dt * rate / config.tau * (1.0 + config.dose_cv * disturbance.standard_normal(n))
+        od = od * np.exp(dt * growth[:, i] - last_dose)
+        wander = memory * wander + np.sqrt(1.0 - memory**2) * disturbance.standard_normal(n)
+    return time, measured, applied, growth[:, :-1].mean(axis=1)
+
+
+class OpenLoopLaw:
     """Which rate each of N experiments applies next: grow, dilute, then random steps."""
 
-    def __init__(self, config: OpenLoop, n: int) -> None:
-        self.config = config
+    def __init__(self, config: OpenLoop, n: int, rng: np.random.Generator) -> None:
+        self.config, self.rng = config, rng
         self.rates = pump_rates()
         self.diluted = np.zeros(n, dtype=np.bool_)
         self.rate = np.zeros(n)
         self.until = np.zeros(n)
 
-    def decide(self, t: float, od: Array, rng: np.random.Generator) -> Array:
+    def decide(self, t: float, od: Array) -> Array:
         """Pump rates from `t` min on, mL/s, shape (N,)."""
         c = self.config
-        pick = rng.random(len(od))
+        pick = self.rng.random(len(od))
         grown = t >= c.growth_min
         self.diluted |= grown & (od < c.dilute_to)
         low, high = od < c.keep_od[0], od > c.keep_od[1]

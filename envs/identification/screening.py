@@ -128,7 +128,7 @@ def _slow_log_od(series: Series) -> Array:
     return slow
 
 
-def _running(values: Array, width: int) -> Array:
+def running_median(values: Array, width: int) -> Array:
     """Running median over `width` (odd) neighbours ignoring nan, shape (n,); nan only where all are."""
     half = width // 2
     padded = np.concatenate([np.full(half, np.nan), values, np.full(half, np.nan)])
@@ -142,7 +142,7 @@ def _running(values: Array, width: int) -> Array:
 def _deviation(series: Series, slow: Array) -> tuple[Array, Array]:
     """Deviation of each reading from its neighbourhood, and the OD expected there; both OD, shape (n,)."""
     trend = np.log(np.maximum(series.od, OD_FLOOR)) - slow
-    expected = np.exp(_running(slow, OUTLIER_WINDOW) + trend)
+    expected = np.exp(running_median(slow, OUTLIER_WINDOW) + trend)
     return series.od - expected, expected
 
 
@@ -173,7 +173,7 @@ def screen(series: Series) -> Screened:
     _check_left(series)
     slow = _slow_log_od(series)
     deviation, expected = _deviation(series, slow)
-    local = 1.4826 * _running(np.abs(deviation), NOISE_WINDOW)
+    local = 1.4826 * running_median(np.abs(deviation), NOISE_WINDOW)
     overall = float(np.nanmedian(local))
     limit = np.maximum(OUTLIER_SD * np.maximum(local, 0.3 * overall), OUTLIER_SHARE * expected)
     series = reject(np.abs(deviation) > limit, f"outlier: more than {OUTLIER_SD:g} sd from its neighbours")

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from envs.identification.calibration import IdentifyConfig, calibrate
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
-from envs.identification.window import IdentifyConfig, calibrate
 from experiments.comparison import figures, statistics
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.published import SETTLING_MIN, TABLE_2
@@ -42,20 +42,20 @@ def calibration(config: BenchmarkConfig) -> tuple[dict[str, Any], Drawing]:
     protocol = OpenLoop(mu=config.env.mu, tau=config.env.tau, control_min=config.env.control_min, seed=config.seed)
     time, od, rate = open_loop(protocol, np.random.default_rng(config.seed))
     raw = Series(time, od[0], rate[0], np.arange(time.size))
-    result = calibrate(raw, IdentifyConfig())
-    mu, tau = result.fit.mu, result.tau
+    result = calibrate(raw, IdentifyConfig(method="free_run"))
+    mu, tau = result.mu, result.tau
     found = {
         "mu": {"value": mu.value, "ci95": [mu.low, mu.high], "truth": protocol.mu},
         "tau": {"value": tau.value, "ci95": [tau.low, tau.high], "truth": protocol.tau},
-        "pmse_pct": result.fit.pmse_pct,
-        "n_used": result.fit.n_used,
+        "pmse_pct": result.pmse_pct,
+        "n_used": result.n_used,
     }
     return found, Drawing(
         "fig2a_calibration",
         fit_figure(raw, result, "open-loop recording and free-running model"),
         "Calibration (the paper's Fig. 2a)",
         f"One simulated open-loop recording of {protocol.hours:g} h, {100 * protocol.noise:g} % sensor noise, and the "
-        f"model fitted to it, run freely from one start. PMSE {result.fit.pmse_pct:.2g} % (paper: 6 % on a real "
+        f"model fitted to it, run freely from one start. PMSE {result.pmse_pct:.2g} % (paper: 6 % on a real "
         "recording).",
     )
 

@@ -5,9 +5,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from envs.identification.fit import Parameter
+from envs.identification.calibration import Calibration
+from envs.identification.drift import Segment
+from envs.identification.model import Parameter
 from envs.identification.screening import Series
-from envs.identification.window import Calibration, Segment
 from experiments.reporting.charts import COLOURS, new_figure
 
 __all__ = ["coverage_figure", "drift_figure", "fit_figure"]
@@ -18,24 +19,29 @@ DATA, MODEL, PUMP, REJECTED, UNUSED = COLOURS[0], COLOURS[1], COLOURS[2], COLOUR
 
 
 def fit_figure(raw: Series, result: Calibration, title: str) -> Figure:
-    """Measured OD with the fitted trajectory, the residuals below, and the pump rate.
+    """Measured OD with the model of the returned method, what it misses below, and the pump rate.
 
-    Args: raw: the recording before screening, at the same positions as `result`'s. result: of `window.calibrate`.
+    prediction_error: the OD that all readings before and the pump predict, and the innovations in their own sd;
+    free_run: the free-running trajectory and its residuals. The free run of the other pair is drawn thin beside.
+    Args: raw: the recording before screening, at the same positions as `result`'s. result: of `calibrate`.
     """
     figure, axes = new_figure(11.0, 7.2, 3, sharex=True, height_ratios=(3.0, 1.3, 0.8))
     top, middle, bottom = axes
     _measured(top, raw, result)
     a, b = result.window
-    top.plot(raw.time[a:b] / 60, result.fit.model, color=MODEL, lw=1.8, label=_model_label(result))
+    hours = raw.time[a:b] / 60
+    found = result.estimate if result.method == "prediction_error" else None
+    free = f"free run of this pair, PMSE {result.pair_pmse_pct:.2g} %"
+    if found is None:
+        top.plot(hours, result.model, color=MODEL, lw=1.8, label=_model_label(result))
+        _residuals(middle, hours, result.inside.od - result.model)
+    else:
+        top.plot(hours, result.model, color="0.35", lw=1.0, ls="--", label=free)
+        top.plot(hours, found.expected, color=MODEL, lw=1.2, label=_model_label(result))
+        _innovations(middle, hours, found.innovation, found.quality.autocorrelation)
     top.set_title(title)
     top.set_ylabel("OD")
     figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=3)
-    middle.axhline(0.0, color="0.6", lw=0.8)
-    middle.plot(raw.time[a:b] / 60, result.fit.residual, ".", ms=3, color=DATA)
-    middle.set_ylabel("measured\nminus model, OD")
-    middle.set_title(
-        f"residuals: rms {result.fit.rms:.4f} OD, correlation from row to row {result.fit.autocorrelation:.2f}"
-    )
     bottom.step(raw.time / 60, 1000.0 * raw.pump_rate, where="post", color=PUMP, lw=1.2)
     bottom.set_ylabel("pump rate,\nµL/s")
     bottom.set_xlabel("time, h")
@@ -44,12 +50,29 @@ def fit_figure(raw: Series, result: Calibration, title: str) -> Figure:
     return figure
 
 
-def _model_label(result: Calibration) -> str:
-    mu, tau = result.fit.mu, result.tau
-    return (
-        f"model: µ = {mu.value:.5f} ± {mu.half_width:.5f} /min, τ = {tau.value:.3f} ± {tau.half_width:.3f}, "
-        f"PMSE {result.fit.pmse_pct:.2g} %"
+def _residuals(ax: Axes, hours: Array, residual: Array) -> None:
+    ax.axhline(0.0, color="0.6", lw=0.8)
+    ax.plot(hours, residual, ".", ms=3, color=DATA)
+    ax.set_ylabel("measured\nminus model, OD")
+    ax.set_title(f"residuals of the free run: rms {np.sqrt(np.nanmean(residual**2)):.4f} OD")
+
+
+def _innovations(ax: Axes, hours: Array, innovation: Array, correlation: float) -> None:
+    """What each reading adds to those before it; two in three lie within 1 sd, 95 % within the band."""
+    ax.axhspan(-1.96, 1.96, color=MODEL, alpha=0.08, lw=0)
+    ax.axhline(0.0, color="0.6", lw=0.8)
+    ax.plot(hours, innovation, ".", ms=3, color=DATA)
+    ax.set_ylabel("innovation,\npredicted sd")
+    inside = 100.0 * float(np.mean(np.abs(innovation[np.isfinite(innovation)]) < 1.96))
+    ax.set_title(
+        f"one-step innovations: {inside:.0f} % in the 95 % band, correlation from row to row {correlation:.2f}"
     )
+
+
+def _model_label(result: Calibration) -> str:
+    mu, tau = result.mu, result.tau
+    what = "one step ahead" if result.method == "prediction_error" else "free run"
+    return f"{what}: µ = {mu.value:.5f} ± {mu.half_width:.5f} /min, τ = {tau.value:.3f} ± {tau.half_width:.3f}"
 
 
 def _measured(axes: Axes, raw: Series, result: Calibration) -> None:
@@ -82,7 +105,7 @@ def drift_figure(result: Calibration, title: str) -> Figure:
     time = result.screened.series.time / 60
     a, b = result.window
     rows = (
-        ("growth rate µ, 1/min", [s.mu for s in result.segments], result.fit.mu, result.drift_mu),
+        ("growth rate µ, 1/min", [s.mu for s in result.segments], result.mu, result.drift_mu),
         ("dilution constant τ", [s.tau for s in result.segments], result.tau, result.drift_tau),
     )
     for ax, (label, values, pair, drift) in zip(axes, rows, strict=True):
@@ -118,29 +141,31 @@ def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list
         middle, value, yerr=[down, up], xerr=across, fmt="o", ms=5, color=DATA, elinewidth=1.1, capsize=2.5,
         label="segment alone, 95 % interval",
     )  # fmt: skip
-    spread = value.max() - value.min() + 0.25 * abs(float(value.mean()))
-    ax.set_ylim(max(0.0, value.min() - spread), value.max() + spread)  # one wide interval must not flatten the rest
+    low, high = value.min(), value.max()
+    reach = max(high - low, 2.0 * float(np.median(down + up)), 0.02 * abs(float(value.mean())))
+    ax.set_ylim(low - 0.6 * reach, high + 0.8 * reach)  # one wide interval must not flatten the rest
     return [float(m) for m in middle]
 
 
-def coverage_figure(mu: Array, tau: Array, truth: tuple[float, float], title: str) -> Figure:
+def coverage_figure(mu: Array, tau: Array, truth: tuple[Array, Array], title: str) -> Figure:
     """Intervals of many simulated recordings against the truth, sorted by estimate; misses in colour.
 
-    Args: mu, tau: (value, low, high) of each recording, shape (N, 3). truth: (mu, tau).
+    Args: mu, tau: (value, low, high) of each recording, shape (N, 3). truth: of mu and of tau, shape (N,) each.
     """
     figure, axes = new_figure(10.5, 4.6, 1, 2)
     figure.suptitle(title, fontsize=10)
-    names = (("growth rate µ, 1/min", mu, truth[0]), ("dilution constant τ", tau, truth[1]))
+    names = (("growth rate µ over its truth", mu, truth[0]), ("dilution constant τ over its truth", tau, truth[1]))
     for ax, (label, data, true) in zip(axes, names, strict=True):
+        data = data / true[:, None]
         data = data[np.argsort(data[:, 0])]
-        hit = (data[:, 1] <= true) & (true <= data[:, 2])
+        hit = (data[:, 1] <= 1.0) & (data[:, 2] >= 1.0)
         for mask, colour, name in ((hit, DATA, "holds the truth"), (~hit, MODEL, "misses it")):
             ax.vlines(
                 np.flatnonzero(mask), data[mask, 1], data[mask, 2], color=colour, lw=1.0,
                 label=f"95 % interval {name}: {mask.sum()} of {len(mask)}",
             )  # fmt: skip
         ax.plot(data[:, 0], ".", ms=2.5, color="black", label="estimate")
-        ax.axhline(true, color=PUMP, lw=1.3, label=f"truth {true:g}")
+        ax.axhline(1.0, color=PUMP, lw=1.3, label="truth")
         ax.set_ylabel(label)
         ax.set_xlabel("simulated recording, sorted by estimate")
         low, high = ax.get_ylim()

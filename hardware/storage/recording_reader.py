@@ -6,7 +6,7 @@
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +20,14 @@ Array = NDArray[np.float64]
 
 TIME = {"exp_time": 1 / 60, "time_min": 1.0, "minutes": 1.0, "min": 1.0, "time_s": 1 / 60, "time_h": 60.0}
 OD = ("od_measured", "od")
-PUMP = ("pump_1_rate", "pump_rate_ml_s", "pump_rate")
+PUMP = ("pump_rate_ml_s", "pump_rate")
+DUTY = "pump_{}_rate"  # the Chi.Bio writes the share of full power, not a flow
+PUMPS = (1, 2, 3, 4)
+WASTE_PUMP = 2  # of the Chi.Bio; it follows the feed pump and does not dilute
 TEMPERATURE = ("media_temp", "temperature_degc", "temperature_c", "temperature")
 
-DUTY_COLUMN = "pump_1_rate"  # the Chi.Bio writes the share of full power, not a flow
-CHIBIO_POSITIONS = (0, 1, 10, 8)  # of exp_time, od_measured, pump_1_rate, media_temp
+CHIBIO_POSITIONS = (0, 1, 8)  # of exp_time, od_measured, media_temp
+CHIBIO_FIRST_PUMP = 10  # position of pump_1_rate; the other three follow
 CHIBIO_COMMON_COLUMNS = 16  # the first 16 columns are the same in every release; later ones were inserted after them
 
 LOWEST_OD = -0.05  # blank error and noise reach this far below zero; a culture does not
@@ -33,6 +36,9 @@ RAW_COUNT_OD = 30.0  # a median above this is a photodetector count
 HIGHEST_PUMP_RATE = 1.0  # mL/s, the Chi.Bio's pump at full power
 RESTART_ROWS = 5  # so many rows in a row behind the clock are a new run, fewer are a glitch
 MIN_READINGS = 10
+BACKWARD_SHARE = 0.05  # more rows with a pump that runs backwards are another unit or another way of working
+CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
+TORN_LINES = 5  # so many lines with control characters are what power cuts leave; a file with more is binary
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,17 +67,36 @@ class Recording:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where time, OD, pump rate and temperature stand, and the factor to house units."""
+    """Where time, OD, temperature and pump rates stand, and the factors of time and pump rates to house units.
+
+    pumps: of the pumps that feed. idle: pump number -> column of those that are not counted.
+    """
 
     source: str
-    index: tuple[int, int, int, int | None]
-    factor: tuple[float, float, float]
+    time: int
+    od: int
+    temperature: int | None
+    pumps: tuple[int, ...]
+    minutes: float
+    ml_s: float
     header: tuple[str, ...] | None
+    idle: dict[int, int] = field(default_factory=dict)
     reactor: int | None = None
+
+    @property
+    def last(self) -> int:
+        """The rightmost column that is needed."""
+        return max(self.time, self.od, self.temperature or 0, *self.pumps)
 
 
 def read_recording(
-    path: str | Path, *, pump_ml_s: float = 1.0, run: int | None = None, reactor: str | None = None
+    path: str | Path,
+    *,
+    pump_ml_s: float = 1.0,
+    pumps: Sequence[int] = (1,),
+    run: int | None = None,
+    reactor: str | None = None,
+    rows: tuple[int, int | None] = (0, None),
 ) -> Recording:
     """Read a recording from a Chi.Bio's own CSV, from `Recorder`'s, or from a tidy three-column file.
 
@@ -83,8 +108,10 @@ def read_recording(
       path: of the file.
       pump_ml_s: flow of the Chi.Bio's feed pump at full power, mL/s, > 0; turns its duty into mL/s. Not used for
         files that hold mL/s.
+      pumps: which of the Chi.Bio's pumps feed the vial, 1 to 4; their flows add up. Not used for other files.
       run: which of several concatenated runs, from 0; None takes the one with most rows.
       reactor: which reactor of a file with a column `reactor`; None takes the first.
+      rows: data rows [first, end) to read, counted from 0; what lies outside is not looked at. None: to the end.
     Raises: RecordingError, one line, when the file is no recording; what can be left out is left out and noted.
     """
     path = Path(path)
@@ -92,14 +119,17 @@ def read_recording(
         raise RecordingError(f"pump_ml_s = {pump_ml_s}: allowed > 0 mL/s (flow of the feed pump at full power)")
     notes: list[str] = []
     table = list(_cells(path, _text(path, notes)))
-    layout = _layout(path, table[0][1], pump_ml_s)
-    values, number, starts = _numbers(path, table, layout, reactor, notes)
+    layout = _layout(path, table[0][1], pump_ml_s, pumps)
+    values, number, starts = _chosen_rows(path, rows, *_numbers(path, table, layout, reactor, notes))
+    _note_idle_pumps(layout, values, number, notes)
     bad = ~(np.isfinite(values[:, 0]) & np.isfinite(values[:, 2]))
     _note(notes, number[bad], "time or pump rate is not a finite number: dropped, the rate before it is taken to go on")
     values, number, starts = values[~bad], number[~bad], starts[~bad]
     if not len(values):
         raise RecordingError(f"{path}: no row has a finite time and pump rate; is it a recording?")
-    _check_pump_rate(path, values[:, 2], number)
+    backward = _backward(path, values[:, 2], number)
+    _note(notes, number[backward], "pump runs backwards: dropped, the rate before it is taken to go on")
+    values, number, starts = values[~backward], number[~backward], starts[~backward]
     runs = _runs(values[:, 0], starts)
     chosen = _choose_run(path, runs, number, run, notes)
     _note(notes, number[chosen.stale], "time does not advance (repeated or backward): dropped")
@@ -125,13 +155,20 @@ def _text(path: Path, notes: list[str]) -> list[str]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
     if not content.strip():
         raise RecordingError(f"{path}: is empty; expected a recording (time, OD and pump rate per row)")
+    whole = content.rstrip(b"\0")
+    if len(whole) < len(content):
+        notes.append(f"the file ends in {len(content) - len(whole)} NUL bytes, as after a power cut: dropped")
     try:
-        text = content.decode("utf-8-sig")
+        text = whole.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = "\0"
-    if "\0" in text:
+    lines = re.split(r"\r\n|\n|\r", text.removesuffix("\n").removesuffix("\r"))
+    torn = [i for i, line in enumerate(lines) if CONTROL.search(line)]
+    if len(torn) > TORN_LINES or len(torn) == len(lines):
         raise RecordingError(f"{path}: is not a text file; expected a recording as CSV in UTF-8")
-    lines = text.splitlines()
+    for i in torn:
+        notes.append(f"line {i + 1}: holds control characters, as after a power cut: dropped")
+        lines[i] = ""
     if not text.endswith(("\n", "\r")) and len(lines) > 1:
         notes.append(f"line {len(lines)}: has no line end, so it may be torn: dropped")
         lines.pop()
@@ -151,42 +188,61 @@ def _cells(path: Path, lines: Sequence[str]) -> Iterator[tuple[int, list[str]]]:
             yield i, [cell.strip().strip('"') for cell in line.split(delimiter)]
 
 
-def _layout(path: Path, first: Sequence[str], pump_ml_s: float) -> _Layout:
+def _layout(path: Path, first: Sequence[str], pump_ml_s: float, pumps: Sequence[int]) -> _Layout:
     """Recognise the columns from the first line. Raises: RecordingError naming what was looked for and found."""
     if not all(_is_number(cell) for cell in first):
-        return _named_layout(path, first, pump_ml_s)
+        return _named_layout(path, first, pump_ml_s, pumps)
     if len(first) == 3:
-        return _Layout("three columns without header (min, OD, mL/s)", (0, 1, 2, None), (1.0, 1.0, 1.0), None)
+        return _Layout("three columns without header (min, OD, mL/s)", 0, 1, None, (2,), 1.0, 1.0, None)
     if len(first) >= CHIBIO_COMMON_COLUMNS:
-        factor = (1 / 60, 1.0, pump_ml_s)
-        return _Layout("Chi.Bio without header, columns by position", CHIBIO_POSITIONS, factor, None)
+        at = {pump: CHIBIO_FIRST_PUMP + pump - 1 for pump in PUMPS}
+        fed, idle = _feeding(path, at, pumps)
+        source = "Chi.Bio without header, columns by position"
+        return _Layout(source, *CHIBIO_POSITIONS, fed, 1 / 60, pump_ml_s, None, idle)
     raise RecordingError(
         f"{path}: has {len(first)} columns and no header; without a header only 3 columns (minutes, OD, mL/s) or the "
         f"Chi.Bio's own (at least {CHIBIO_COMMON_COLUMNS}) are known; add a header such as time_min,od,pump_rate_ml_s"
     )
 
 
-def _named_layout(path: Path, first: Sequence[str], pump_ml_s: float) -> _Layout:
+def _named_layout(path: Path, first: Sequence[str], pump_ml_s: float, pumps: Sequence[int]) -> _Layout:
     names = [re.sub(r"[^a-z0-9]+", "_", cell.lower()).strip("_") for cell in first]
 
     def find(known: Iterable[str]) -> str | None:
         return next((name for name in known if name in names), None)
 
-    found = [find(TIME), find(OD), find(PUMP)]
-    for what, known, name in zip(("time", "OD", "pump rate"), (TIME, OD, PUMP), found, strict=True):
+    duties = {pump: names.index(DUTY.format(pump)) for pump in PUMPS if DUTY.format(pump) in names}
+    pump_columns = (DUTY.format(1), *PUMP)
+    found = [find(TIME), find(OD), DUTY.format(1) if duties else find(PUMP)]
+    for what, known, name in zip(("time", "OD", "pump rate"), (TIME, OD, pump_columns), found, strict=True):
         if name is None:
             raise RecordingError(
                 f"{path}: no column for the {what}; looked for {', '.join(known)}; found {', '.join(first)[:120]}"
             )
     time, od, pump = (str(name) for name in found)
     temperature, at = find(TEMPERATURE), names.index
+    fed, idle = _feeding(path, duties, pumps) if duties else ((at(pump),), {})
     return _Layout(
-        source="Chi.Bio CSV" if pump == DUTY_COLUMN else "recording with header",
-        index=(at(time), at(od), at(pump), None if temperature is None else at(temperature)),
-        factor=(TIME[time], 1.0, pump_ml_s if pump == DUTY_COLUMN else 1.0),
+        source="Chi.Bio CSV" if duties else "recording with header",
+        time=at(time),
+        od=at(od),
+        temperature=None if temperature is None else at(temperature),
+        pumps=fed,
+        minutes=TIME[time],
+        ml_s=pump_ml_s if duties else 1.0,
         header=tuple(first),
-        reactor=names.index("reactor") if "reactor" in names else None,
+        idle=idle,
+        reactor=at("reactor") if "reactor" in names else None,
     )
+
+
+def _feeding(path: Path, at: dict[int, int], pumps: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
+    """Columns of the pumps that feed, and pump number -> column of the others."""
+    absent = [pump for pump in pumps if pump not in at]
+    if absent or not pumps:
+        known = ", ".join(map(str, at))
+        raise RecordingError(f"{path}: pumps = {list(pumps)}: allowed is a selection of {known}, which the file holds")
+    return tuple(at[pump] for pump in pumps), {pump: i for pump, i in at.items() if pump not in pumps}
 
 
 def _is_number(cell: str) -> bool:
@@ -200,7 +256,10 @@ def _is_number(cell: str) -> bool:
 def _numbers(
     path: Path, table: Sequence[tuple[int, list[str]]], layout: _Layout, reactor: str | None, notes: list[str]
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
-    """Values (n, 4) in house units, data row numbers (n,), and True where a new run is announced by a header."""
+    """Values in house units, data row numbers (n,), and True where a new run is announced by a header.
+
+    Values have shape (n, 4 + idle pumps): time, OD, pump rate, temperature, and the rate of each pump not counted.
+    """
     header = layout.header
     width = int(np.median([len(cells) for _, cells in table if tuple(cells) != header] or [0]))
     values: list[list[float]] = []
@@ -214,7 +273,7 @@ def _numbers(
             announced = True
             continue
         row += 1
-        if len(cells) < width or len(cells) <= max(i for i in layout.index if i is not None):
+        if len(cells) < width or len(cells) <= layout.last:
             short.append(row)
             continue
         if layout.reactor is not None:
@@ -222,8 +281,10 @@ def _numbers(
             if cells[layout.reactor] != reactor:
                 others.add(cells[layout.reactor])
                 continue
-        picked = [float("nan") if i is None or not _is_number(cells[i]) else float(cells[i]) for i in layout.index]
-        values.append([v * f for v, f in zip(picked, (*layout.factor, 1.0), strict=True)])
+        rate = layout.ml_s * sum(_cell(cells, i) for i in layout.pumps)
+        picked = [layout.minutes * _cell(cells, layout.time), _cell(cells, layout.od), rate]
+        idle = [layout.ml_s * _cell(cells, i) for i in layout.idle.values()]
+        values.append([*picked, _cell(cells, layout.temperature), *idle])
         number.append(row)
         starts.append(announced)
         announced = False
@@ -233,6 +294,32 @@ def _numbers(
     if not values:
         raise RecordingError(f"{path}: holds no complete data row; expected time, OD and pump rate in every row")
     return np.array(values), np.array(number, dtype=np.int64), np.array(starts)
+
+
+def _cell(cells: Sequence[str], column: int | None) -> float:
+    return float(cells[column]) if column is not None and _is_number(cells[column]) else math.nan
+
+
+def _chosen_rows(
+    path: Path, rows: tuple[int, int | None], values: Array, number: NDArray[np.int64], starts: NDArray[np.bool_]
+) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
+    first, end = rows[0], number[-1] + 1 if rows[1] is None else rows[1]
+    keep = (number >= first) & (number < end)
+    if keep.sum() < MIN_READINGS:
+        raise RecordingError(
+            f"{path}: rows = {first}:{end}: {int(keep.sum())} rows lie there; the file has rows {number[0]}:"
+            f"{number[-1] + 1}; at least {MIN_READINGS} are needed"
+        )
+    return values[keep], number[keep], starts[keep]
+
+
+def _note_idle_pumps(layout: _Layout, values: Array, number: NDArray[np.int64], notes: list[str]) -> None:
+    """Say which other pump ran; the waste pump does beside the feed, and dilutes nothing."""
+    fed = bool((values[:, 2] > 0.0).any())
+    for column, pump in enumerate(layout.idle, start=4):
+        ran = number[values[:, column] != 0.0]
+        if len(ran) and not (pump == WASTE_PUMP and fed):
+            _note(notes, ran, f"pump {pump} ran and is not counted; if it feeds the vial, name it in pumps=[...]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,14 +364,18 @@ def _choose_run(path: Path, runs: Sequence[_Run], number: NDArray[np.int64], run
     return runs[chosen]
 
 
-def _check_pump_rate(path: Path, pump_rate: Array, number: NDArray[np.int64]) -> None:
-    wrong = (pump_rate < 0.0) | (pump_rate > HIGHEST_PUMP_RATE)
+def _backward(path: Path, pump_rate: Array, number: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Rows in which the pump ran backwards, (n,). Raises: RecordingError for many, and for any impossible rate."""
+    backward = pump_rate < 0.0
+    few = backward.mean() <= BACKWARD_SHARE
+    wrong = (pump_rate > HIGHEST_PUMP_RATE) | (backward & ~few)
     if wrong.any():
         i = int(np.argmax(wrong))
         raise RecordingError(
             f"{path}: row {number[i]}: pump rate {pump_rate[i]:g} mL/s: allowed 0 to {HIGHEST_PUMP_RATE:g} mL/s; "
             "a pump run backwards, or another unit such as mL/min?"
         )
+    return backward
 
 
 def _usable_od(path: Path, od: Array, number: NDArray[np.int64], notes: list[str]) -> Array:

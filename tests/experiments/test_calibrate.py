@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
+from envs.identification.calibration import calibrate
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
-from envs.identification.window import calibrate
 from envs.task import EnvConfig
-from experiments.calibrate import CalibrateConfig, environment_yaml
+from experiments.calibration.config import CalibrateConfig
+from experiments.calibration.result import environment_yaml
 from experiments.cli import frame
 from hardware.storage.recording_reader import read_recording
 from tests.real_recording import DITHER, needs_dither

@@ -32,7 +32,9 @@ CHIBIO = CHIBIO_HEADER.split(",")
 
 
 def chibio_lines(names: list[str] = CHIBIO) -> list[str]:
-    known = {"exp_time": 60.0 * T, "od_measured": OD, "pump_1_rate": U, "media_temp": 37.0 + 0.01 * T}
+    still = np.zeros(len(T))
+    known = {"exp_time": 60.0 * T, "od_measured": OD, "media_temp": 37.0 + 0.01 * T}
+    known |= {"pump_1_rate": U, "pump_2_rate": 4.0 * U, "pump_3_rate": still, "pump_4_rate": still}
     table = np.array([known.get(n, np.full(len(T), 7.0)) for n in names]).T
     return [",".join(map(repr, map(float, row))) for row in table]
 
@@ -171,6 +173,51 @@ def test_pump_flow_turns_duty_into_rate_but_leaves_rates_alone(read: Callable[..
     np.testing.assert_allclose(read(tidy(), pump_ml_s=0.8).pump_rate, U)  # type: ignore[attr-defined]
 
 
+def chibio(**columns: np.ndarray) -> str:
+    table = {name: np.zeros(len(T)) for name in CHIBIO} | {"exp_time": 60.0 * T, "od_measured": OD} | columns
+    rows = np.array([table[name] for name in CHIBIO]).T
+    return "\n".join([",".join(CHIBIO), *(",".join(map(repr, map(float, row))) for row in rows)]) + "\n"
+
+
+def test_another_pump_that_ran_is_named_and_can_be_counted(read: Callable[..., object]) -> None:
+    """A file fed by pump 3 does not look like one whose pump never ran; a waste pump beside the feed is no news."""
+    third = read(chibio(pump_3_rate=U))
+    assert [n for n in third.notes if "pump 3 ran and is not counted" in n]  # type: ignore[attr-defined]
+    assert third.pump_rate.max() == 0.0  # type: ignore[attr-defined]
+    both = read(chibio(pump_1_rate=U, pump_2_rate=4 * U, pump_3_rate=0.5 * U), pumps=(1, 3))
+    np.testing.assert_allclose(both.pump_rate, 1.5 * U)  # type: ignore[attr-defined]
+    assert both.notes == ()  # type: ignore[attr-defined]
+    second = read(chibio(pump_2_rate=U))
+    assert any("pump 2 ran" in n for n in second.notes)  # type: ignore[attr-defined]
+    with pytest.raises(RecordingError, match=r"pumps = \[5\]: allowed is a selection of 1, 2, 3, 4"):
+        read(chibio(), pumps=(5,))
+
+
+def test_a_file_cut_by_a_power_loss_is_read_up_to_there(read: Callable[..., object]) -> None:
+    """The file system leaves a block of NUL bytes; rows written after the restart follow it on the same line."""
+    lines = tidy().splitlines(keepends=True)
+    cut = read("".join(lines).encode() + bytes(3000))
+    np.testing.assert_allclose(cut.od, OD)  # type: ignore[attr-defined]
+    assert "3000 NUL bytes" in cut.notes[0]  # type: ignore[attr-defined]
+    went_on = read("".join(lines[:20]).encode() + bytes(500) + "".join(lines[20:]).encode())
+    assert went_on.row.size == 39  # type: ignore[attr-defined]
+    assert any("line 21: holds control characters" in n for n in went_on.notes)  # type: ignore[attr-defined]
+
+
+def test_only_the_asked_rows_are_judged(read: Callable[..., object]) -> None:
+    """A pump run backwards to flush the tubing at the end does not condemn the rows before."""
+    flushed = tidy(u=changed(U, slice(35, 40), -0.02))
+    with pytest.raises(RecordingError, match="row 35: pump rate -0.02"):
+        read(flushed)
+    asked = read(flushed, rows=(0, 35))
+    assert asked.row.tolist() == list(range(35))  # type: ignore[attr-defined]
+    one = read(tidy(u=changed(U, 25, -0.02)))
+    assert one.row.tolist() == [i for i in range(40) if i != 25]  # type: ignore[attr-defined]
+    assert one.notes == ("row 25: pump runs backwards: dropped, the rate before it is taken to go on",)  # type: ignore[attr-defined]
+    with pytest.raises(RecordingError, match="rows = 38:60: 2 rows lie there; the file has rows 0:40"):
+        read(tidy(), rows=(38, 60))
+
+
 @needs_dither
 def test_real_chibio_file() -> None:
     r = read_recording(DITHER)
@@ -273,7 +320,9 @@ def test_torn_last_line_is_dropped_and_reported(read: Callable[..., object]) -> 
         pytest.param(tidy(t=T[::-1]), "only 1 of 1 rows.*time does not advance", id="time-backward"),
         pytest.param(tidy(t=np.zeros(40)), "only 1 of 1 rows.*time does not advance", id="time-still"),
         pytest.param(tidy(t=np.full(40, np.nan)), "no row has a finite time", id="time-nan"),
-        pytest.param(tidy(u=changed(U, 4, -0.01)), "row 4: pump rate -0.01 mL/s: allowed 0 to 1", id="pump-reversed"),
+        pytest.param(
+            tidy(u=changed(U, slice(4, 7), -0.01)), "row 4: pump rate -0.01 mL/s: allowed 0 to 1", id="pump-reversed"
+        ),
         pytest.param(tidy(u=1200 * U), "pump rate 24 mL/s.*mL/min", id="pump-unit"),
     ],
 )

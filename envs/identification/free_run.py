@@ -1,13 +1,8 @@
-"""Growth rate mu and dilution constant tau of x' = (mu - u/tau) x from a recording.
+"""The paper's fit: least squares on the OD of a trajectory that runs freely from a fitted start.
 
-Intervals allow for correlated errors.
-
-With u held from each row to the next, equation (5) of the paper has the exact solution
-
-    x_i = x_0 exp(mu (t_i - t_0) - C_i / tau),    C_i = sum_{j<i} u_j (t_{j+1} - t_j),
-
-so the simulated trajectory, its derivatives and the fit need no integrator. The fit is least squares on the OD of that
-trajectory, run freely from a fitted start. Pure functions of arrays; no file, no clock, no random numbers.
+For open-loop recordings. Its intervals allow for correlated errors of the readings; where the pump answers the readings
+or doses and growth vary, estimates are shrunk and intervals too narrow (docs/calibration.md, Method).
+Pure functions of arrays; no file, no clock, no random numbers.
 """
 
 from collections.abc import Sequence
@@ -16,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.identification.model import NotIdentifiable, Parameter, pmse, trajectory
 from envs.identification.screening import OD_FLOOR, Series, pumped_volume
 
-__all__ = ["Fit", "NotIdentifiable", "Parameter", "check_excitation", "fit", "pmse", "start_level", "trajectory"]
+__all__ = ["Fit", "fit"]
 
 Array = NDArray[np.float64]
 
@@ -26,27 +22,7 @@ CONFIDENCE = 0.95
 HUBER_SD = 3.0
 MAX_REWEIGHTINGS = 20
 WORST_CONDITION = 1e12
-MIN_READINGS = 20
-MIN_STEPS = 3  # rows at a low and at a high pump rate that a fit of tau needs
 WIDEST_TAU = 0.5  # an interval wider than +-50 % is no measurement of tau
-
-
-class NotIdentifiable(ValueError):
-    """The rows cannot tell the parameters; the message says which, why, and what recording could."""
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """An estimate with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-    @property
-    def half_width(self) -> float:
-        """Half the interval's width, in the parameter's unit."""
-        return 0.5 * (self.high - self.low)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,61 +45,6 @@ class Fit:
     rms: float
     n_used: int
     autocorrelation: float
-
-
-def trajectory(time: Array, pump_rate: Array, mu: Array | float, tau: Array | float, start_od: Array | float) -> Array:
-    """x of equation (5) at the rows' times, started at the first row; exact for u held between rows.
-
-    Args:
-      time: min, shape (n,) or (N, n). pump_rate: mL/s, same shape.
-      mu: 1/min. tau: > 0. start_od: OD. Scalars or shape (N,).
-    Returns: shape (n,) for scalars and one recording, else (N, n). Raises: nothing.
-    """
-    mu, tau, start_od = (np.asarray(p, dtype=np.float64)[..., None] for p in (mu, tau, start_od))
-    elapsed = time - time[..., :1]
-    return np.asarray(start_od * np.exp(mu * elapsed - pumped_volume(time, pump_rate) / tau))
-
-
-def pmse(od: Array, model: Array) -> float:
-    """Percentage mean square error, 100 * sum (x - x_model)^2 / sum x^2, over the rows with a reading; in %.
-
-    Args: od: measured, nan where there is none, shape (n,). model: same shape.
-    """
-    used = np.isfinite(od)
-    return float(100.0 * np.sum((od[used] - model[used]) ** 2) / np.sum(od[used] ** 2))
-
-
-def check_excitation(series: Series) -> None:
-    """Refuse rows in which the pump cannot have told dilution from growth.
-
-    tau shows only where the pump rate changes: without any feed 1/tau multiplies zero, and with a constant one only
-    mu - u/tau can be seen.
-
-    Raises: NotIdentifiable.
-    """
-    used = np.flatnonzero(np.isfinite(series.od))
-    where = f"rows {series.row[0]}-{series.row[-1]}"
-    if len(used) < MIN_READINGS:
-        raise NotIdentifiable(f"{where}: {len(used)} usable readings; at least {MIN_READINGS} are needed")
-    rate = series.pump_rate[used[0] : used[-1]]
-    if rate.max() == 0.0:
-        raise NotIdentifiable(
-            f"{where}: the pump never runs, so tau cannot be determined (mu alone could); use a recording with "
-            "dilutions, e.g. the open-loop protocol of generate=true"
-        )
-    low, high = float(rate.min()), float(rate.max())
-    middle = 0.5 * (low + high)
-    if high - low < 1e-3 * high:
-        raise NotIdentifiable(
-            f"{where}: the pump never stops nor changes its rate (always {high:g} mL/s), so growth and dilution cannot "
-            "be told apart (only mu - u/tau could); use a recording in which the pump rests for a while"
-        )
-    on, off = int((rate > middle).sum()), int((rate <= middle).sum())
-    if min(on, off) < MIN_STEPS:
-        raise NotIdentifiable(
-            f"{where}: the pump is above {middle:g} mL/s in {on} rows and below in {off}; at least {MIN_STEPS} of each "
-            "are needed to tell dilution from growth; use a longer recording"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,9 +251,3 @@ def _sum_variance(z: Array) -> float:
     kernel = 3.0 / angle**2 * (np.sin(angle) / angle - np.cos(angle))
     total = float(white @ white + 2.0 * kernel @ covariance)
     return total / (1.0 - rho) ** 2
-
-
-def start_level(series: Series, mu: float, tau: float, readings: int = 5) -> float:
-    """OD at the first row that the first few readings point to under known (mu, tau); median, so one may be wrong."""
-    ratio = series.od / trajectory(series.time, series.pump_rate, mu, tau, 1.0)
-    return float(np.median(ratio[np.isfinite(ratio)][:readings]))

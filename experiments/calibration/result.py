@@ -1,0 +1,174 @@
+"""What a calibration leaves behind in words and numbers: summary.json, environment file, report on the console."""
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from conf.schema import entries
+from envs.identification.calibration import Calibration
+from envs.identification.drift import Drift
+from envs.identification.model import Parameter
+from envs.identification.screening import Series, row_spans
+from envs.task import EnvConfig
+from hardware.storage.recording_reader import Recording
+
+__all__ = ["environment_yaml", "report", "summary"]
+
+PMSE_FORMULA = "100 * sum (od - model)^2 / sum od^2 over the window, least-squares fit run freely from its start"
+
+
+def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str, Any]:
+    """What summary.json holds; rows are [first, end), counted from 0; n_rejected counts readings within `rows`."""
+    row = result.screened.series.row
+    return {
+        "mu": _interval(result.mu),
+        "tau": _interval(result.tau),
+        "method": result.method,
+        "pmse_pct": result.pmse_pct,
+        "pmse_formula": PMSE_FORMULA,
+        "pair_pmse_pct": result.pair_pmse_pct,
+        "rows_used": list(result.window_rows),
+        "n_used": result.n_used,
+        "n_rejected": len(raw.od) - int(np.isfinite(result.screened.series.od).sum()),
+        "warnings": list(result.warnings),
+        "notes": list(recording.notes),
+        "rejected": [
+            {"rows": row_spans(r.rows), "first": int(r.rows[0]), "last": int(r.rows[-1])}
+            | {"n": len(r.rows), "reason": r.reason}
+            for r in result.screened.rejections
+        ],
+        "window": result.window_reason,
+        "rows": [int(raw.row[0]), int(raw.row[-1]) + 1],
+        "source": recording.source,
+        "doubling_min": float(np.log(2.0) / result.mu.value),
+        "prediction_error": _prediction_error(result),
+        "free_run": _free_run(result),
+        "validation": asdict(result.validation),
+        "drift": {"mu": _drift(result.drift_mu), "tau": _drift(result.drift_tau)},
+        "segments": [
+            {
+                "rows": [int(row[s.first]), int(row[s.end - 1]) + 1],
+                "middle_min": s.middle_min,
+                "mu": None if s.mu is None else _interval(s.mu),
+                "tau": None if s.tau is None else _interval(s.tau),
+            }
+            for s in result.segments
+        ],
+    }
+
+
+def _prediction_error(result: Calibration) -> dict[str, Any] | None:
+    found = result.estimate
+    if found is None or found.tau is None:
+        return None
+    innovations = asdict(found.quality)
+    return {"mu": _interval(found.mu), "tau": _interval(found.tau), "innovations": innovations}
+
+
+def _free_run(result: Calibration) -> dict[str, Any] | None:
+    found = result.free_run
+    if found is None or found.tau is None:
+        return None
+    fit = {"pmse_pct": found.pmse_pct, "rms_od": found.rms, "residual_autocorrelation": found.autocorrelation}
+    return {"mu": _interval(found.mu), "tau": _interval(found.tau), **fit, "start_od": float(found.start_od[0])}
+
+
+def _interval(p: Parameter) -> dict[str, Any]:
+    return {"value": p.value, "ci95": [p.low, p.high]}
+
+
+def _drift(d: Drift | None) -> dict[str, Any] | None:
+    if d is None:
+        return None
+    line = {"first": d.first, "last": d.last, "change_pct": d.change_pct, "per_hour": _interval(d.slope_per_h)}
+    return {**line, "significant": d.significant, "segments": d.segments}
+
+
+def environment_yaml(result: Calibration, source: str) -> str:
+    """The environment with the fitted mu and tau, every value with its meaning, and where the two come from.
+
+    Raises: ValueError naming the value that no environment may have.
+    """
+    model = EnvConfig(mu=result.mu.value, tau=result.tau.value)
+    mu, tau = result.mu, result.tau
+    first, end = result.window_rows
+    lines = [
+        "# Training model x' = (mu - u/tau) x, equation (5) of the paper, fitted to a recording by calibrate.",
+        f"# Recording {source}, rows {first}:{end}, {result.n_used} readings, method {result.method}, "
+        f"PMSE {result.pmse_pct:.3g} %.",
+        f"# 95 % intervals: mu {mu.low:.6g} to {mu.high:.6g} 1/min, tau {tau.low:.6g} to {tau.high:.6g}.",
+        *(f"# Warning: {w}." for w in result.warnings),
+    ]
+    for entry in entries(model):
+        comment = ", ".join(filter(None, (entry.said.what, entry.said.unit)))
+        lines.append(f"{entry.name}: {_yaml(entry.value)} # {comment}")
+    return "\n".join(lines) + "\n"
+
+
+def _yaml(value: Any) -> str:
+    """A value as YAML reads it back: 5e-05 would be a string there."""
+    if isinstance(value, float):
+        return np.format_float_positional(value, trim="0")
+    return str(list(value)) if isinstance(value, tuple) else str(value)
+
+
+def report(result: Calibration, recording: Recording, content: dict[str, Any]) -> str:
+    """The result for a human, a dozen lines."""
+    mu, tau, v = result.mu, result.tau, result.validation
+    first, end = result.window_rows
+    lines = [
+        "",
+        f"  mu          {mu.value:.5f} 1/min   95 % {mu.low:.5f} to {mu.high:.5f}   "
+        f"(doubling time {content['doubling_min']:.1f} min)",
+        f"  tau         {tau.value:.4f}          95 % {tau.low:.4f} to {tau.high:.4f}   "
+        f"(dilution {0.02 / tau.value:.4f} 1/min at 0.02 mL/s)",
+        f"  method      {result.method}; window rows {first}:{end} - {result.window_reason}",
+        f"  PMSE        {result.pmse_pct:.3g} %   (100 sum e^2 / sum OD^2 of the free-running least-squares fit, as in "
+        f"the paper; {result.pair_pmse_pct:.3g} % with the returned pair)",
+        *_beside(result),
+    ]
+    if v.holdout_pct is not None and v.early_pct is not None:
+        lines.append(
+            f"  held out    PMSE {v.holdout_pct:.3g} % over the window's last 30 % with the pair of the first 70 %, "
+            f"{v.early_pct:.3g} % over its own rows; an hour ahead each"
+        )
+    if v.outside_pct is not None:
+        lines.append(
+            f"              PMSE {v.outside_pct:.3g} % on {v.outside_n} readings outside the window, started afresh"
+        )
+    for name, drift in (("mu", result.drift_mu), ("tau", result.drift_tau)):
+        if drift is not None:
+            sure = "" if drift.significant else ", within its uncertainty"
+            lines.append(
+                f"  drift       {name} {drift.first:.3g} to {drift.last:.3g} along the recording "
+                f"({drift.change_pct:+.0f} %{sure})"
+            )
+    lines += [f"  rejected    rows {row_spans(r.rows)} ({len(r.rows)}): {r.reason}" for r in result.screened.rejections]
+    lines += [f"  note        {note}" for note in recording.notes]
+    lines += [f"  warning     {warning}" for warning in result.warnings]
+    return "\n".join(lines)
+
+
+def _beside(result: Calibration) -> list[str]:
+    """The other method's pair, and what the disturbances are."""
+    lines = []
+    free, found = result.free_run, result.estimate
+    if result.method == "free_run":
+        other = None if found is None or found.tau is None else (found.mu, found.tau, "prediction_error")
+    else:
+        other = None if free is None or free.tau is None else (free.mu, free.tau, "free_run")
+    if other is not None:
+        mu, tau, name = other
+        lines.append(
+            f"  beside      {name}: mu {mu.value:.5f} ({mu.low:.5f} to {mu.high:.5f}), "
+            f"tau {tau.value:.4f} ({tau.low:.4f} to {tau.high:.4f})"
+        )
+    if found is not None:
+        q = found.quality
+        lines.append(
+            f"  innovations variance {q.variance:.2f}, correlation {q.autocorrelation:+.2f}, kurtosis "
+            f"{q.kurtosis:.1f}; doses spread {100 * q.dose_spread:.0f} % and are seen one row late by "
+            f"{100 * q.late_share:.0f} %, growth wanders {100 * q.growth_spread:.0f} %"
+        )
+    return lines
