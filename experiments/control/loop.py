@@ -124,8 +124,8 @@ class ClosedLoop:
         decided = self.controller.act(m.od, setpoint, minute, rows & (phase >= 0))
         proposed = np.where((phase >= 0) & ~(self.done & (self._at_end != "hold")), decided, 0.0)
         verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
-        sound = rows & (verdict.response == Response.PASS)
-        left = self.done & (self._at_end == "regulate") & sound  # the device would dose by a reading that is not
+        sound = rows & (verdict.response == Response.PASS)  # the device will dose by the same sensor
+        left = self.done & (self._at_end == "regulate") & sound
         self.interlock.latch(Response.REGULATE, left)
         explanation = self.controller.explain() if isinstance(self.controller, Explains) else {}
 
