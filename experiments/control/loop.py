@@ -123,8 +123,10 @@ class ClosedLoop:
 
         decided = self.controller.act(m.od, setpoint, minute, rows & (phase >= 0))
         proposed = np.where((phase >= 0) & ~(self.done & (self._at_end != "hold")), decided, 0.0)
-        self.interlock.latch(Response.REGULATE, self.done & (self._at_end == "regulate"))
         verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
+        sound = rows & (verdict.response == Response.PASS)  # the device will dose by the same sensor
+        left = self.done & (self._at_end == "regulate") & sound
+        self.interlock.latch(Response.REGULATE, left)
         explanation = self.controller.explain() if isinstance(self.controller, Explains) else {}
 
         decision = Step(
@@ -136,7 +138,7 @@ class ClosedLoop:
         faults = m.vitals.faults if m.vitals is not None else (None,) * len(self.done)
         absent = np.array([fault is not None and fault.kind == "absent" for fault in faults])
         self.gone = absent & (verdict.response == Response.STOP)
-        failures = self._respond(verdict)
+        failures = self._respond(verdict, left)
         heat = np.where(verdict.heat_off, np.nan, temperature)
         receipt = self.reactors.actuate(Command(rows, verdict.rate, heat))
         self.interlock.confirm(receipt, now)
@@ -150,8 +152,11 @@ class ClosedLoop:
             self.interlock.confirm(receipt, at_s)
             self.repeated_ml = self.repeated_ml + receipt.volume_ml
 
-    def _respond(self, verdict: Verdict) -> list[str]:
-        """Carry out what the interlock demands beyond not dosing; returns what failed, to be tried again."""
+    def _respond(self, verdict: Verdict, left: Mask) -> list[str]:
+        """Carry out what the interlock demands beyond not dosing; returns what failed, to be tried again.
+
+        Args: left: reactors that are to be left to their own regulation from now on, shape (N,).
+        """
         failed: list[str] = []
         off = verdict.response == Response.PUMPS_OFF
         stop = (verdict.response == Response.STOP) & ~self.stopped
@@ -160,7 +165,7 @@ class ClosedLoop:
         if stop.any():
             failed += self.reactors.give_up(stop)
             self.stopped = self.stopped | (stop & ~self._named(failed))
-        regulate = (verdict.response == Response.REGULATE) & ~self.reactors.handed_over
+        regulate = (left | (verdict.response == Response.REGULATE)) & ~self.reactors.handed_over
         if regulate.any():
             failed += self.reactors.regulate(regulate, verdict.setpoint)
         if verdict.heat_off.any():

@@ -102,11 +102,10 @@ class DoseSequence:
             self._book.tell(f"{plan.carry_ml:.3f} mL is less than the pump can deliver: kept for the next dose")
         if plan.shortfall_ml > 0.0:
             self._book.tell(f"the dose was cut by {plan.shortfall_ml:.3f} mL to the feed limit")
+        if plan.feed_duty > 0.0:  # before it is written down: a signal in between must not leave it without an end
+            self._begun = _Begun(plan, self._book.elapsed())
         self._intend(plan, rate)
-        if plan.feed_duty == 0.0:
-            return DosePlan()
-        self._begun = _Begun(plan, self._book.elapsed())
-        return plan if self._switch_on(plan, appeared_s) else DosePlan()
+        return plan if plan.feed_duty > 0.0 and self._switch_on(plan, appeared_s) else DosePlan()
 
     def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> str:
         """Why no dose may be given for this sample now; "" if nothing stands against it."""

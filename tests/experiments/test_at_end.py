@@ -8,6 +8,7 @@ import pytest
 from envs.scenario import Scenario
 from experiments.control.config import DeployConfig
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
+from hardware.emulator.faults import inject
 from tests.hardware.emulator_lab import quiet
 
 
@@ -48,6 +49,23 @@ def test_it_is_handed_over_to_the_device_and_stays_so(tmp_path: Path) -> None:
     assert run.truth("M0")["od"] == pytest.approx(0.4, abs=0.1)
     assert run.truth("M1")["od"] > 0.6  # nobody doses it after the run
     assert "falls" not in run.record.rows[0].told
+
+
+def test_it_is_not_handed_over_by_a_sensor_that_is_not_believed(tmp_path: Path) -> None:
+    config = rehearsed(("M0", "M1"), Scenario((0.4,), (40.0,), (37.0,)))
+    each = {"M0": {"minutes": [10.0], "at_end": "regulate"}}
+    run = Rehearsal(tmp_path, replace(config, each=each), quiet(mu=0.03), od=0.4)
+    run.begin()
+    for _ in run.run(540.0):
+        pass
+    inject(run.device, "spectrometer_dead", "M0", 1)
+    for _ in run.run(1500.0):
+        assert not run.reactors.handed_over[0]
+    assert run.loop.done[0]
+    inject(run.device, "spectrometer_dead", "M0", 0)
+    for _ in run.run():
+        pass
+    assert run.reactors.handed_over.tolist() == [True, False]
 
 
 def test_the_last_reactor_is_handed_over_too_before_the_run_ends(tmp_path: Path) -> None:
