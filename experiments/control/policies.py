@@ -123,10 +123,11 @@ def admit(policy: Policy, config: DeployConfig, scenarios: Sequence[Scenario]) -
 
     Raises: UserError where a culture is at stake, unless it is forced or an earlier life of the run began with it.
     """
-    for doubt in (doubts := _doubts(policy, config, scenarios)):
-        log.warning("policy: %s", doubt)
+    doubts = _doubts(policy, config, scenarios)
     if doubts and config.resume is None and _refuses(config):
         raise frame.UserError(f"policy refused: {'; '.join(doubts)}; {FORCE}")
+    for doubt in doubts:
+        log.warning("policy: %s", doubt)
 
 
 def _doubts(policy: Policy, config: DeployConfig, scenarios: Sequence[Scenario]) -> list[str]:
@@ -146,8 +147,9 @@ def policy_check(config: DeployConfig, scenarios: Sequence[Scenario]) -> Check:
         return Check("policy", False, str(error), "python -m experiments.train", required=False)
     except frame.UserError as error:
         return Check("policy", False, str(error), "give another policy=PATH")
-    doubts = _doubts(policy, config, scenarios)
-    return Check("policy", not doubts, "; ".join(doubts) or str(Training.of(policy)), FORCE, _refuses(config))
+    doubts, refused = _doubts(policy, config, scenarios), _refuses(config)
+    remedy = FORCE if refused else "a device refuses it without force_policy=true"
+    return Check("policy", not doubts, "; ".join(doubts) or str(Training.of(policy)), remedy, refused)
 
 
 def run_policy(name: str, folder: Path, resumed: bool, control_min: float, max_rate: float) -> Policy:

@@ -43,10 +43,14 @@ def deployed(tmp_path: Path, metadata: dict[str, Any], **changes: Any) -> Deploy
 
 
 @doubtful
-def test_a_doubtful_policy_is_kept_from_a_culture(tmp_path: Path, metadata: dict[str, Any], message: str) -> None:
+def test_a_doubtful_policy_is_kept_from_a_culture(
+    tmp_path: Path, metadata: dict[str, Any], message: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In one line, which is the error."""
     config = deployed(tmp_path, metadata, backend=ChiBioConfig())
     with pytest.raises(UserError, match=rf"policy refused: .*{message}.*; force_policy=true runs it all the same"):
         assemble.unpack(config, tmp_path)
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
 @doubtful

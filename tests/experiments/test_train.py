@@ -26,8 +26,8 @@ from experiments.cli.frame import UserError
 from experiments.training import build
 from experiments.training import run as train_run
 from experiments.training.config import TrainConfig
-from experiments.training.evaluation import Evaluation, report_grid, selection_grid
-from experiments.training.session import Session
+from experiments.training.evaluation import Evaluation, Score, report_grid, selection_grid
+from experiments.training.session import Best, Session
 
 SHORT = [
     "agent.total_steps=1000",
@@ -120,6 +120,16 @@ def test_a_policy_file_says_what_a_reactor_is_told_before_it_runs(whole):
         assert metadata["steady_abs_error"] == max(summary["steady_abs_error_by_setpoint"][i])
         assert metadata["model"]["setpoints"] == list(EnvConfig().setpoints)
     assert DQNConfig(learn_start=100, updates_per_step=4).updates_at(100) == 0
+
+
+def test_a_policy_with_an_offset_at_one_setpoint_gives_way_to_one_without():
+    """0.0005 OD at eight setpoints and 0.012 at one, then 0.0025 at all of them, then the offset again."""
+    offset, even = np.full((1, 9), 0.0005), np.full((1, 9), 0.0025)
+    offset[0, 3] = 0.012
+    best = Best.empty(torch.zeros(1, 2))
+    for step, steady in ((100, offset), (200, even), (300, offset)):
+        best.update(step, Score(np.ones(1), np.full(1, 0.1), steady), torch.full((1, 2), float(step)))
+    assert (best.step.tolist(), best.steady.tolist(), best.weights.tolist()) == ([200], [0.0025], [[200.0, 200.0]])
 
 
 def test_selection_and_report_share_no_start():
