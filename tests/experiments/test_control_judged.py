@@ -232,7 +232,6 @@ def test_a_client_that_doses_no_more_once_it_was_resumed_fails(tmp_path: Path, m
     with pytest.raises(frame.UserError, match="or not held"):
         kill_campaign(config, campaign)
     summary = json.loads((campaign / "summary.json").read_text())
-    assert summary["rows_lost"] == summary["rows_doubled"] == 0
     assert summary["mean_error"] > 0.05
     assert any("not held" in line for line in summary["runs"][0]["trouble"])
 
