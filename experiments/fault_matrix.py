@@ -105,9 +105,9 @@ def run_all(config: FaultMatrixConfig, folder: Path) -> list[Outcome]:
 
 
 def draw(outcomes: list[Outcome], moments: tuple[str, ...], folder: Path) -> None:
-    """Fault by moment: time until it was reported (number, min) over the largest OD error it caused (colour).
+    """Fault by moment: minutes until it was reported | until the culture was back; colour: the largest OD error.
 
-    A dash means that it was not reported; a frame, that the case did not go as declared.
+    A dash means that it was not reported, or not back; a frame, that the case did not go as declared.
     """
     from matplotlib.colors import LogNorm
 
@@ -120,7 +120,10 @@ def draw(outcomes: list[Outcome], moments: tuple[str, ...], folder: Path) -> Non
     for o in outcomes:
         row, column = names.index(o.label), moments.index(o.moment)
         error[row, column] = max(o.peak_error, 0.01)
-        text = f"{o.detected_s / 60.0:.1f}" if math.isfinite(o.detected_s) else "–"
+        told, back = o.detected_s / 60.0, o.recovery_min
+        text = " | ".join(
+            (f"{told:.1f}" if math.isfinite(told) else "–", f"{back:.0f}" if math.isfinite(back) else "–")
+        )
         dark = o.peak_error > 0.4
         ax.text(column, row, text, ha="center", va="center", fontsize=6, color="white" if dark else "black")
         if not o.ok:
@@ -128,7 +131,7 @@ def draw(outcomes: list[Outcome], moments: tuple[str, ...], folder: Path) -> Non
     image = ax.imshow(error, norm=LogNorm(0.02, 2.0), cmap="cividis_r", aspect="auto")
     ax.set_xticks(range(len(moments)), moments, fontsize=8)
     ax.set_yticks(range(len(names)), names, fontsize=7)
-    ax.set_title("minutes until reported (–: not reported)", fontsize=9)
+    ax.set_title("minutes until reported | until back after the fault (–: never)", fontsize=9)
     bar = figure.colorbar(image, ax=ax, shrink=0.4, extend="both")
     bar.set_label("largest OD error of the culture", fontsize=8)
     save(figure, folder / "figures", "fault_matrix")

@@ -11,7 +11,7 @@ from experiments.control.loop import Step
 from experiments.controllers.base import Array
 from experiments.reliability.audit import audit_doses, audit_rows
 from experiments.reliability.faults import FAULTY, INF, Fault
-from experiments.reliability.outcome import Outcome, judge
+from experiments.reliability.outcome import Outcome, allowed, judge
 from experiments.reliability.rehearsal import Killed, Rehearsal
 from experiments.reliability.tracking import BAND_OD, Tracking
 from hardware.emulator.device import DeviceOptions
@@ -149,6 +149,7 @@ class FaultCase:
     def __init__(self, fault: Fault | None, moment: str, config: DeployConfig, seed: int) -> None:
         self.fault, self.moment, self.config, self.seed = fault, moment, config, seed
         self.result = Outcome(fault.name if fault else "none", moment, bool(config.backend.overflow_pump.pump))
+        self.result.allowed_error, self.result.allowed_recovery_min = allowed(fault)
         self._exits = 0  # of the device's software up to the fault, or its end
 
     def run(self) -> Outcome:

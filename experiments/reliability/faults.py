@@ -15,7 +15,7 @@ from conf.schema import old_name
 from envs.scenario import Scenario
 from experiments.controllers.base import Array, Mask
 from experiments.reliability.rehearsal import Rehearsal
-from experiments.reliability.tracking import BAND_OD, TOP_OD, outage, undosed
+from experiments.reliability.tracking import BAND_OD, STEP_OD, TOP_OD, outage, undosed
 from hardware.emulator.faults import inject
 
 __all__ = ["FAULTS", "FAULTY", "Fault", "by_name"]
@@ -272,7 +272,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("link down 5 min", "requests vanish (half-open)", set_("lost_request", -1.0), LINK,
           set_("lost_request", 0.0), 5.0, wide=True, blind=True, error=outage(5.0)),
     Fault("link down 30 min", "requests vanish (half-open)", set_("lost_request", -1.0), LINK,
-          set_("lost_request", 0.0), 30.0, wide=True, blind=True, error=outage(30.0)),
+          set_("lost_request", 0.0), 30.0, wide=True, blind=True, error=outage(30.0) + STEP_OD),
     Fault("answers vanish 5 min", "carried out, never answered", set_("lost_reply", -1.0), LINK,
           set_("lost_reply", 0.0), 5.0, wide=True, blind=True, error=outage(5.0)),
     Fault("connections reset 3 min", "before the request is read", set_("reset_before", -1.0), LINK,
@@ -368,7 +368,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("program killed 2 min", "SIGKILL, resumed after 2 min", Rehearsal.kill, ("repair:", "end:killed"),
           minutes=2.0, wide=True, program=True, error=outage(2.0)),
     Fault("program killed 30 min", "SIGKILL, resumed after 30 min", Rehearsal.kill, ("repair:", "end:killed"),
-          minutes=30.0, wide=True, program=True, error=outage(30.0)),
+          minutes=30.0, wide=True, program=True, error=outage(30.0) + STEP_OD),
     Fault("computer loses power", "torn last rows, resumed after 5 min", Rehearsal.kill, ("repair:torn",), end=torn,
           minutes=5.0, wide=True, program=True, error=outage(5.0)),
     Fault("disk full", "no byte more; freed and resumed after 5 min", full_disk, ("end:journal",), end=free_disk,

@@ -13,7 +13,7 @@ from experiments.reporting.tables import markdown
 
 NOTHING_ML = 0.1  # less than the smallest dose
 
-__all__ = ["Outcome", "declared", "judge", "table", "totals", "write_cases"]
+__all__ = ["Outcome", "allowed", "declared", "judge", "table", "totals", "write_cases"]
 
 
 @dataclass
@@ -27,6 +27,7 @@ class Outcome:
     peak_error: largest distance of the faulty reactor's true OD, after the fault, from what the schedule asks and the
       pump can do; 4 stands for anything above. recovery_min: from the end of the fault until it stays near what can
       be reached from there; inf if it was not near at the end of the schedule, watched_min after the fault.
+    allowed_error, allowed_recovery_min: as declared, inf where it is not judged.
     neighbour_error, neighbour_recovery_min: the same of the worst neighbour.
     fed_after_ml: by the faulty reactor's pump from two minutes after the detection on.
     rows_missed: samples nobody could read; rows_lost: samples that could have been read and are in no row;
@@ -54,6 +55,8 @@ class Outcome:
     peak_error: float = 0.0
     recovery_min: float = 0.0
     watched_min: float = math.inf
+    allowed_error: float = math.inf
+    allowed_recovery_min: float = math.inf
     neighbour_error: float = 0.0
     neighbour_recovery_min: float = 0.0
     fed_after_ml: float = 0.0
@@ -102,21 +105,27 @@ def judge(out: Outcome, fault: Fault | None) -> list[str]:
     return [name for name, is_wrong in checks.items() if is_wrong]
 
 
+def allowed(fault: Fault | None) -> tuple[float, float]:
+    """Largest error, OD, and longest recovery, min, of the faulty culture as declared; inf where it is not judged."""
+    if fault is None:
+        return BAND_OD, 0.0
+    if fault.stops or fault.gone:
+        return math.inf, math.inf
+    return fault.error, math.inf if fault.unheld else fault.recovery_min
+
+
 def _control(out: Outcome, fault: Fault | None) -> dict[str, bool]:
     """Whether true ODs went where they must not, stayed there, or were dosed although no dose was right."""
-    error, recovery = (BAND_OD, 0.0) if fault is None else (fault.error, fault.recovery_min)
-    stops = fault is not None and bool(fault.stops)
-    unheld = fault is not None and bool(fault.unheld)
-    wide = fault is not None and fault.wide
-    gone = fault is not None and fault.gone
-    spared = wide and fault is not None and unheld  # neighbours that suffer the same
-    near, soon = (error, recovery) if wide else (BAND_OD, 0.0)
+    error, recovery = allowed(fault)
+    near, soon = BAND_OD, 0.0
+    if fault is not None and fault.wide:
+        near, soon = fault.error, math.inf if fault.unheld else fault.recovery_min
     return {
-        "strayed": not (stops or gone) and out.peak_error > error,
-        "not back": not (stops or unheld or gone) and out.recovery_min > recovery < out.watched_min,
-        "dosed": stops and out.fed_after_ml > NOTHING_ML,
+        "strayed": out.peak_error > error,
+        "not back": out.recovery_min > recovery < out.watched_min,
+        "dosed": fault is not None and bool(fault.stops) and out.fed_after_ml > NOTHING_ML,
         "neighbour strayed": out.neighbour_error > near,
-        "neighbour not back": not spared and out.neighbour_recovery_min > soon < out.watched_min,
+        "neighbour not back": out.neighbour_recovery_min > soon < out.watched_min,
     }
 
 
@@ -124,6 +133,18 @@ def _span(values: Sequence[float], form: str) -> str:
     """Smallest to largest, one number if they look the same; a dash for what is not finite."""
     low, high = (format(v, form) if math.isfinite(v) else "–" for v in (min(values), max(values)))
     return low if low == high else f"{low} – {high}"
+
+
+def _of(allowed: float, form: str) -> str:
+    """How a cell goes on where a limit is declared."""
+    return f" of {allowed:{form}}" if math.isfinite(allowed) else ""
+
+
+def _back(minutes: Sequence[float]) -> str:
+    """Recoveries, and how many never came."""
+    came = [m for m in minutes if math.isfinite(m)]
+    never = f"{len(minutes) - len(came)} never" if len(came) < len(minutes) else ""
+    return ", ".join(text for text in (_span(came, ".0f") if came else "", never) if text)
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
@@ -144,8 +165,8 @@ def table(outcomes: Sequence[Outcome]) -> str:
             ", ".join(dict.fromkeys(o.reason for o in mine if o.reason)) or "–",
             ", ".join(dict.fromkeys(o.response for o in mine if o.response)) or "–",
             _span([o.peak_ml for o in mine], ".1f"),
-            _span([o.peak_error for o in mine], ".2f"),
-            _span([o.recovery_min for o in mine], ".0f"),
+            _span([o.peak_error for o in mine], ".2f") + _of(mine[0].allowed_error, ".2f"),
+            _back([o.recovery_min for o in mine]) + _of(mine[0].allowed_recovery_min, ".0f"),
             str(sum(o.rows_missed for o in mine)),
             str(sum(o.rows_lost + o.rows_doubled for o in mine)),
             str(sum(o.doses_doubled for o in mine)),

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "BAND_OD", "DILUTION", "FIRST_DOSE_MIN", "GROWTH", "OVERGROWN", "TOP_OD", "Tracking", "outage", "reachable",
-    "undosed",
+    "BAND_OD", "DILUTION", "FIRST_DOSE_MIN", "GROWTH", "OVERGROWN", "STEP_OD", "TOP_OD", "Tracking", "outage",
+    "reachable", "undosed",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -26,6 +26,7 @@ FIRST_DOSE_MIN = 4.0
 sample (75 s), a dose and its effect follow within a minute."""
 OVERGROWN = 4.0  # OD; the plant would grow on, a real culture and its sensor do not
 TOP_OD = 0.8  # the densest setpoint that is rehearsed by default
+STEP_OD = 0.15  # and how far it falls at once
 
 
 def undosed(minutes: float, od: float = TOP_OD) -> float:
@@ -48,7 +49,7 @@ def reachable(reference: Array, asked: Array, minutes: float) -> Array:
 class Tracking:
     """N cultures watched from the first look on.
 
-    Args: band: largest error, OD, of a culture that is held, (N,).
+    Args: band: largest error, OD, of a culture that is held, (N,); of one denser than `TOP_OD`, in proportion.
     Attributes: counting, whether errors count for `peak`. Each (N,): peak, largest error; out_min, time of the last
       look outside the band, min after `restart`, 0 if there was none; outside, whether the last look was; watched_min,
       time of the last look; away_min, for how long the error has been outside the band, measured against what the
@@ -87,7 +88,8 @@ class Tracking:
             self.peak = np.where(rows, np.maximum(self.peak, error), self.peak)
         if minute >= self._since + FIRST_DOSE_MIN:
             self._left_at = np.where(np.isnan(self._left_at), od, self._left_at)
-            self.outside = np.where(rows, np.abs(od - self._left_at) > self.band, self.outside)
+            band = self.band * np.maximum(self._left_at / TOP_OD, 1.0)  # a minute's dose is a fraction of the OD
+            self.outside = np.where(rows, np.abs(od - self._left_at) > band, self.outside)
             self.watched_min = np.where(rows, minute - self._since, self.watched_min)
             self.out_min = np.where(rows & self.outside, minute - self._since, self.out_min)
 

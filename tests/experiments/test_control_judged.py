@@ -16,7 +16,7 @@ from experiments.reliability.case import FaultCase
 from experiments.reliability.endurance import SoakConfig
 from experiments.reliability.faults import FAULTS, Act, Fault, both, by_name, set_
 from experiments.reliability.kills import KillConfig, errors_in_lives, longest_out_min
-from experiments.reliability.outcome import Outcome, judge, totals
+from experiments.reliability.outcome import Outcome, allowed, judge, table, totals
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from experiments.reliability.tracking import Tracking, reachable, undosed
 from experiments.soak import soak
@@ -96,7 +96,7 @@ def test_a_dose_where_none_is_right_is_found() -> None:
 
 def test_every_fault_declares_where_the_culture_may_go() -> None:
     for fault in FAULTS:
-        assert fault.unheld or fault.stops or (fault.error < 1.3 and fault.recovery_min <= 30.0), fault.name
+        assert fault.unheld or fault.stops or (fault.error < 1.5 and fault.recovery_min <= 30.0), fault.name
     with pytest.raises(ValueError, match="`stops` says already"):
         Fault("x", "y", set_("bus_stuck"), ("link",), unheld="so", stops="so")
 
@@ -133,6 +133,20 @@ def test_the_sums_of_a_matrix_that_fails_everywhere() -> None:
         "healthy_peak_error": 0.07, "not_as_declared": 3,
     }  # fmt: skip
     assert totals([bad, healthy, other]) == expected
+
+
+def test_the_table_shows_error_and_recovery_beside_what_is_declared() -> None:
+    first = Outcome("x", "dose", peak_error=0.12, recovery_min=3.0, allowed_error=0.2, allowed_recovery_min=10.0)
+    second = replace(first, moment="step", peak_error=0.25, recovery_min=math.inf)
+    cells = table([first, second]).splitlines()[2].split(" | ")
+    assert (cells[5], cells[6]) == ("0.12 – 0.25 of 0.20", "3, 1 never of 10")
+    loose = replace(first, allowed_error=math.inf, allowed_recovery_min=math.inf)
+    cells = table([loose]).splitlines()[2].split(" | ")
+    assert (cells[5], cells[6]) == ("0.12", "3")
+    assert allowed(None) == (0.06, 0.0)
+    assert allowed(by_name(("OD frozen",))[0]) == (math.inf, math.inf)
+    assert allowed(by_name(("started without a reactor",))[0]) == (math.inf, math.inf)
+    assert allowed(by_name(("growth stops",))[0]) == (0.2, math.inf)
 
 
 # ---------------------------------------------------------------------------------------------------------- tracking
@@ -218,7 +232,6 @@ def test_a_client_that_doses_no_more_once_it_was_resumed_fails(tmp_path: Path, m
     with pytest.raises(frame.UserError, match="or not held"):
         kill_campaign(config, campaign)
     summary = json.loads((campaign / "summary.json").read_text())
-    assert summary["rows_lost"] == summary["rows_doubled"] == 0
     assert summary["mean_error"] > 0.05
     assert any("not held" in line for line in summary["runs"][0]["trouble"])
 
