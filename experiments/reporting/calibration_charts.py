@@ -141,9 +141,9 @@ def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list
         middle, value, yerr=[down, up], xerr=across, fmt="o", ms=5, color=DATA, elinewidth=1.1, capsize=2.5,
         label="segment alone, 95 % interval",
     )  # fmt: skip
-    low, high = value.min(), value.max()
-    reach = max(high - low, 2.0 * float(np.median(down + up)), 0.02 * abs(float(value.mean())))
-    ax.set_ylim(low - 0.6 * reach, high + 0.8 * reach)  # one wide interval must not flatten the rest
+    margin = 0.15 * max(value.max() - value.min(), 0.05 * abs(float(value.mean())))
+    low, high = value.min() - 1.1 * np.median(down) - margin, value.max() + 1.1 * np.median(up) + margin
+    ax.set_ylim(low, high + 0.2 * (high - low))  # one wide interval must not flatten the rest; the legend has room
     return [float(m) for m in middle]
 
 
