@@ -13,12 +13,13 @@ with xi, eta, nu independent standard normal, r = (x/x_mean)^(p-1) (p = 1: noise
 same at every OD; x is a running median, never the reading itself), and g/k the share of a dose that is seen one row
 late. A rate chosen from reading i acts from row i on. For given (p, d, om, T, phi) this is generalised least squares:
 one Kalman filter over the columns ln y, 1, t, -C, c_{i-1} with shared gains. All points of a grid are filtered at once
-and averaged by their restricted likelihood, so there is neither an optimiser nor a local minimum
+and averaged by their restricted likelihood and a prior flat in tau: neither optimiser nor local minimum
 (docs/calibration.md, Method).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -206,18 +207,25 @@ class _Solved:
     """Generalised least squares of every cell.
 
     best: coefficients of the four regressors (M, G, 4). spread: their covariance for sigma = 1 (M, G, 4, 4).
-    rss: (M, G). weight: (M, G), sums to 1. drift: S after the last row of each column (M, G, 5), and its variance
-    for sigma = 1 (M, G). degrees: n - q (M,). condition: of the normal equations, scaled, smallest of the cells (M,).
+    rss: (M, G). score: logarithm of a cell's weight, up to a constant (M, G). drift: S after the last row of each
+    column (M, G, 5), and its variance for sigma = 1 (M, G). degrees: n - q (M,). condition: of the normal equations,
+    scaled, smallest of the cells (M,).
     """
 
     best: Array
     spread: Array
     rss: Array
-    weight: Array
+    score: Array
     drift: Array
     drift_variance: Array
     degrees: Array
     condition: Array
+
+    @cached_property
+    def weight(self) -> Array:
+        """Of each cell, shape (M, G), sums to 1."""
+        weight = np.exp(self.score - self.score.max(axis=1, keepdims=True))
+        return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
 def _solve(batch: _Batch, cells: _Cells) -> _Solved:
@@ -243,12 +251,11 @@ def _solve(batch: _Batch, cells: _Cells) -> _Solved:
     degrees = np.maximum(batch.n_readings - (~absent).sum(axis=-1).max(axis=-1), 1.0)
     determinant = np.log(values).sum(axis=-1) + 2.0 * np.log(size).sum(axis=-1)
     score = -0.5 * (log_variance + determinant + degrees[:, None] * np.log(rss))
-    weight = np.exp(score - score.max(axis=1, keepdims=True))
     return _Solved(
         best=best,
         spread=spread,
         rss=rss,
-        weight=weight / weight.sum(axis=1, keepdims=True),
+        score=score,
         drift=np.moveaxis(run.state[3], 0, -1),
         drift_variance=np.maximum(run.covariance[3, 3], 0.0),
         degrees=degrees,
@@ -309,7 +316,7 @@ def estimate(parts: list[Series]) -> list[Estimate]:
     Raises: ValueError for a series with fewer than ten readings above zero.
     """
     batch = _batch(parts)
-    solved = _solve(batch, GRID)
+    solved = _flat_in_tau(_solve(batch, GRID))
     likeliest = np.argmax(solved.weight, axis=1)
     traces = _traces(batch, GRID.chosen(likeliest))
     found = []
@@ -337,6 +344,23 @@ def estimate(parts: list[Series]) -> list[Estimate]:
             )
         )
     return found
+
+
+def _flat_in_tau(solved: _Solved) -> _Solved:
+    """The same under a prior that is flat in tau = 1/k, that is k^-2; `_solve` is flat in k.
+
+    Flat in k, 1/tau comes out 2 to 4 % too high where its interval is wide (docs/calibration.md). To second order in
+    the relative variance the prior moves the coefficients by -2 cov(., k)/k and multiplies a cell's weight by
+    k^-2 (1 + 3 var k/k^2). A relative variance counts up to 10 %; what is wider is refused.
+    """
+    covariance = solved.spread * (solved.rss / solved.degrees[:, None])[..., None, None]
+    k, variance = solved.best[..., K], covariance[..., K, K]
+    known = (k > 0.0) & (variance > 0.0)
+    k = np.where(known, k, 1.0)
+    counted = np.where(known, np.minimum(1.0, 0.1 * k**2 / np.maximum(variance, TINY)), 0.0)
+    best = solved.best - (2.0 * counted / k)[..., None] * covariance[..., K]
+    score = solved.score - np.where(known, 2.0 * np.log(k) - np.log1p(3.0 * counted * variance / k**2), 0.0)
+    return replace(solved, best=best, score=score)
 
 
 def _mixture(batch: _Batch, solved: _Solved, m: int, column: int) -> Parameter:
