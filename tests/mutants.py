@@ -64,7 +64,7 @@ TABLE = {
     ),
     "storage": (
         [f"{STORAGE}/{name}.py" for name in ("journal", "atomic", "recorder")],
-        ["hardware/test_atomic.py", "hardware/test_journal.py", "hardware/test_recording.py"],
+        ["hardware/test_disk.py", "hardware/test_atomic.py", "hardware/test_journal.py", "hardware/test_recording.py"],
     ),
     "dosing": (
         [f"{CHIBIO}/{name}.py" for name in (

@@ -36,7 +36,9 @@ def test_rows_come_back_in_order_with_number_and_time(tmp_path: Path) -> None:
         again.append("x", {})
 
 
-@pytest.mark.parametrize("torn", [b'{"n":2,"ki', b"\0" * 40, b"\0" * 40 + b"\n", b'{"n":2}', b"[1]\n", b"\xff\n"])
+@pytest.mark.parametrize(
+    "torn", [b'{"n":2,"ki', b"\0" * 40, b"\0" * 40 + b"\n", b'{"n":2}', b"[1]\n", b"\xff\n", b"\n"]
+)
 def test_a_torn_end_is_cut_and_told(tmp_path: Path, torn: bytes) -> None:
     path = tmp_path / "j"
     journal = Journal(path)

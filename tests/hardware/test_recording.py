@@ -1,6 +1,5 @@
 """The recording format: written so that a crash costs one row, read so that nothing bad passes in silence."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -133,17 +132,6 @@ def test_misuse_is_named(tmp_path: Path) -> None:
     recorder.close()
     with pytest.raises(RecordingError, match="closed"):
         recorder.write({"time_min": 0.0, "od": 0.5, "pump_rate_ml_s": 0.0})
-
-
-def test_fsync_per_row_unless_declined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    synced: list[int] = []
-    real = os.fsync
-    monkeypatch.setattr(os, "fsync", lambda fd: (synced.append(fd), real(fd))[1])
-    for fsync, expected in ((True, 1), (False, 0)):
-        with Recorder(tmp_path / f"{fsync}.csv", COLUMNS, fsync=fsync) as recorder:
-            synced.clear()
-            recorder.write({"time_min": 0.0, "od": 0.5, "pump_rate_ml_s": 0.0})
-            assert len(synced) == expected
 
 
 # ---------------------------------------------------------------- reading what is good

@@ -1,0 +1,158 @@
+"""What the disk is asked for, in which order: the calls to the operating system of journal, recording and atomic file.
+
+A power cut keeps what was synced, and a new name only if its folder was synced after it."""
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware.errors import RecordingError
+from hardware.storage import atomic
+from hardware.storage.journal import LANDMARKS, Journal
+from hardware.storage.recorder import Recorder
+
+Tape = list[tuple[Any, ...]]
+
+
+@pytest.fixture
+def tape(monkeypatch: pytest.MonkeyPatch) -> Tape:
+    """Calls in order: a sync with the size that is synced, a folder by the name "."."""
+    calls: Tape = []
+
+    def record(name: str, say: Callable[..., tuple[Any, ...]]) -> None:
+        real = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *given: (calls.append((name, *say(*given))), real(*given))[1])
+
+    def of(fd: int) -> str:
+        path = Path(f"/proc/self/fd/{fd}").resolve()
+        return "." if path.is_dir() else path.name
+
+    record("write", lambda fd, data: (of(fd), data.count(b"\n")))
+    record("ftruncate", lambda fd, size: (of(fd), size))
+    record("fsync", lambda fd: (of(fd), *([] if of(fd) == "." else [os.fstat(fd).st_size])))
+    record("replace", lambda old, new: (old.name, new.name))
+    return calls
+
+
+@pytest.fixture(autouse=True)
+def _no_descriptor_is_left() -> Iterator[None]:
+    before = set(os.listdir("/proc/self/fd"))
+    yield
+    assert set(os.listdir("/proc/self/fd")) <= before
+
+
+def test_an_atomic_file_is_synced_before_it_takes_its_place_and_its_name_after(tmp_path: Path, tape: Tape) -> None:
+    atomic.write(tmp_path / "s", "µm", fsync=False)
+    assert tape == [("replace", "s.part", "s")]
+    tape.clear()
+    atomic.write(tmp_path / "s", "µm")
+    assert tape == [("fsync", "s.part", 3), ("replace", "s.part", "s"), ("fsync", ".")]
+
+
+def test_a_journal_is_synced_row_by_row(tmp_path: Path, tape: Tape) -> None:
+    journal = Journal(tmp_path / "j")
+    assert tape == [("fsync", "j", 0), ("fsync", ".")]
+    tape.clear()
+    for k in (1, 2):
+        journal.append("a", {})
+        assert tape == [("write", "j", 1), ("fsync", "j", journal.path.stat().st_size)] * k or k == 2
+    assert [call[:2] for call in tape] == [("write", "j"), ("fsync", "j")] * 2
+    journal.close()
+    whole = journal.path.stat().st_size
+    journal.path.write_bytes(journal.path.read_bytes() + b'{"n":2')
+    tape.clear()
+    again = Journal(tmp_path / "j", fsync=False)
+    assert tape == [("ftruncate", "j", whole), ("fsync", "j", whole), ("fsync", ".")]
+    tape.clear()
+    again.append("b", {})
+    again.close()
+    assert tape == [("write", "j", 1)]
+    assert journal.path.stat().st_mode & 0o133 == 0
+
+
+def test_a_recording_is_synced_row_by_row(tmp_path: Path, tape: Tape) -> None:
+    row = {"time_min": 1.0}
+    with Recorder(tmp_path / "r", list(row)) as recorder:
+        assert tape == [("write", "r", 1), ("fsync", "r", 9), ("fsync", ".")]
+        recorder.write(row)
+    assert tape[3:] == [("write", "r", 1), ("fsync", "r", 13)]
+    tape.clear()
+    with Recorder(tmp_path / "r", list(row)):
+        assert tape == []
+    with Recorder(tmp_path / "unsynced", list(row), fsync=False) as recorder:
+        recorder.write(row)
+    assert tape == [("write", "unsynced", 1)] * 2
+    assert recorder.path.stat().st_mode & 0o133 == 0
+
+
+def test_a_recording_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(fd: int, data: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    real = os.write
+    with Recorder(tmp_path / "r", ["time_min", "od"]) as recorder:
+        for write, words in (
+            (lambda fd, data: real(fd, data[:3]), "only 3 of 8 bytes"),
+            (refuse, "row not written: No"),
+        ):
+            with monkeypatch.context() as m:
+                m.setattr(os, "write", write)
+                with pytest.raises(RecordingError, match=words):
+                    recorder.write({"time_min": 1.0, "od": 0.5})
+
+
+def test_the_cells_of_a_recording(tmp_path: Path) -> None:
+    row = {"a": 1, "b": True, "c": None, "d": np.nan, "e": np.float64(0.1), "f": 'x,"y"', "g": 1e-7, "h": "ä"}
+    with Recorder(tmp_path / "r", list(row)) as recorder:
+        recorder.write(row)
+    assert recorder.path.read_text().splitlines()[1] == '1,True,,,0.1,"x,""y""",1e-07,ä'
+
+
+def test_the_head_of_a_journal_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.monotonic", lambda: 5.4321987)
+    journal = Journal(tmp_path / "j", wall=lambda: 1000.123456)
+    journal.append("device", {"od": [np.nan, 0.5]})
+    journal.close()
+    assert journal.path.read_bytes() == b'{"n":0,"wall":1000.123,"mono":5.432,"kind":"device","od":[null,0.5]}\n'
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (b'{"wall":1,"kind":"a"}', "without a usable n"),
+        (b'{"n":0,"kind":"a"}', "without a usable wall"),
+        (b'{"n":0,"wall":NaN,"kind":"a"}', "without a usable wall"),
+        (b'{"n":0,"wall":1}', "without a usable kind"),
+        (b"[1]", "line 2: not a row"),
+    ],
+)
+def test_a_row_that_lacks_what_all_rows_have_is_named(tmp_path: Path, line: bytes, words: str) -> None:
+    sound = b'{"n":0,"wall":1.5,"kind":"a"}\n'
+    (tmp_path / "j").write_bytes(sound + line + b"\n" + sound)
+    with pytest.raises(RecordingError, match=words):
+        Journal(tmp_path / "j")
+
+
+def test_a_long_journal_keeps_what_a_naive_reader_keeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first row, the landmarks before the tail, each row that begins in the tail; for each length of the tail."""
+    path = tmp_path / "j"
+    journal = Journal(path, wall=lambda: 1.0, fsync=False)
+    for k in range(12):
+        journal.append("device" if k in (3, 7, 8) else "sample", {"k": k, "pad": "x" * (k % 5)})
+    journal.close()
+    lines = path.read_bytes().splitlines(keepends=True)
+    begins = np.cumsum([0, *map(len, lines)])
+    for tail in range(len(lines[-1]) + 1, begins[-1] + 20, 5):
+        monkeypatch.setattr("hardware.storage.journal.TAIL", tail)
+        cut = max(begins[-1] - tail, 0)
+        kept = [k for k in range(12) if k in (0, 3, 7, 8) or begins[k] > cut or cut == 0]
+        reader = Journal(path, fsync=False)
+        reader.close()
+        assert [row["k"] for row in reader.rows] == kept
+        assert (reader.cut, reader.next_row) == (0, 12)
+    assert all(json.loads(b"{" + mark + b"}")["kind"] in ("device", "temperature", "regulate") for mark in LANDMARKS)
