@@ -1,0 +1,464 @@
+"""The four parts of the interlock against twins in plain Python, one reactor and one sample at a time, and the limits
+at their boundaries by hand."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware.reactor import Fault, Measurement, Receipt, Vitals
+from hardware.safety.budget import FeedBudget
+from hardware.safety.config import REMEDIES, Response, Responses, SafetyConfig
+from hardware.safety.interlock import Interlock
+from hardware.safety.readings import Finding, Heat, Readings
+from hardware.safety.unexplained_change import UnexplainedChange
+
+N = 16
+C = SafetyConfig()
+
+
+def told(findings: list[Finding], rows: int = N) -> list[list[str]]:
+    """Reasons of each reactor, in order; "+" after those that cool down. Every text can be written."""
+    out: list[list[str]] = [[] for _ in range(rows)]
+    for finding in findings:
+        for i in np.flatnonzero(finding.rows):
+            assert finding.text(int(i))
+            out[i].append(finding.kind + ("+" if finding.cool is not None and finding.cool[i] else ""))
+    return out
+
+
+def same(state: dict[str, np.ndarray], twins: list[Any], **names: str) -> None:
+    """What is remembered, twin by twin."""
+    for key, name in names.items():
+        np.testing.assert_allclose(state[key], [getattr(twin, name) for twin in twins], rtol=1e-9, atol=1e-12)
+
+
+# -- feed and level --------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Ledger:
+    """Feed of one reactor as a list of doses (time, mL)."""
+
+    c: SafetyConfig
+    doses: list[tuple[float, float]] = field(default_factory=list)
+    level: float = 20.0
+    owed: float = 0.0
+    unusable: int = 0
+
+    @property
+    def fed(self) -> float:
+        return sum(ml for _, ml in self.doses)
+
+    def judge(self, rate: float, fresh: bool, now: float) -> tuple[float, list[str]]:
+        c, kinds = self.c, []
+        if not fresh:
+            return 0.0, []
+        usable = math.isfinite(rate) and rate >= 0.0
+        self.unusable = 0 if usable else self.unusable + 1
+        wanted = rate if usable else 0.0
+        if not usable:
+            kinds.append("controller_lost" if self.unusable >= c.controller_patience else "controller")
+        if wanted > c.max_rate:
+            kinds.append("limit")
+        if self.owed > 2.0 * c.max_rate * c.period_s:
+            kinds.append("undosed")
+        wanted = min(wanted, c.max_rate)
+        minute = sum(ml for t, ml in self.doses[-4:] if now - t < 60.0)
+        hour = sum(ml for t, ml in self.doses if now // 60.0 - t // 60.0 < 60.0)
+        budget = min(c.ml_per_minute - minute, c.ml_per_hour - hour, c.ml_per_run - self.fed)
+        for kind, room in (("budget", budget), ("bottle", c.bottle_ml - self.fed), ("overflow", 25.0 - self.level)):
+            if wanted * c.period_s > room + 1e-9:
+                kinds.append(kind)
+                wanted = 0.0
+        return wanted, kinds
+
+    def book(self, feed: float, waste: float, now: float) -> None:
+        if feed > 0.0:
+            self.doses.append((now, feed))
+            self.owed = 0.0
+        self.level = max(self.level + feed - waste, 20.0) if waste > 0.0 else self.level + feed
+
+
+@pytest.mark.parametrize(
+    ("limit", "period_s"),
+    [
+        ("ml_per_minute", 30.0),
+        ("ml_per_hour", 60.0),
+        ("ml_per_run", 60.0),
+        ("bottle_ml", 60.0),
+        ("controller_patience", 60.0),
+    ],
+)
+def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> None:
+    rng = np.random.default_rng(0)
+    tight = {"ml_per_minute": 1.9, "ml_per_hour": 14.0, "ml_per_run": 30.0, "bottle_ml": 30.0, "controller_patience": 2}
+    c = SafetyConfig(period_s=period_s, stale_s=100.0, **{limit: tight[limit]})
+    budget, twins, now = FeedBudget(N, c), [Ledger(c) for _ in range(N)], 0.0
+    order = {"controller": 0, "controller_lost": 1, "limit": 2, "undosed": 3, "budget": 4, "bottle": 5, "overflow": 6}
+    for _ in range(200):
+        now += float(
+            rng.choice([5.0, 30.0, 60.0, 61.0, 200.0, 1500.0, 9000.0], p=[0.1, 0.2, 0.4, 0.2, 0.08, 0.01, 0.01])
+        )
+        rate = rng.choice([0.0, 0.004, 0.015, 0.02, 0.0200001, 0.03, -0.001, np.nan, np.inf], N)
+        fresh = rng.random(N) < 0.9
+        allowed, findings = budget.check(rate, fresh, now)
+        expected = [t.judge(r, f, now) for t, r, f in zip(twins, rate, fresh, strict=True)]
+        np.testing.assert_allclose(allowed, [e[0] for e in expected], rtol=1e-12)
+        assert [sorted(kinds, key=order.get) for kinds in told(findings)] == [e[1] for e in expected]
+        budget.grant(allowed)
+        feed = allowed * c.period_s * (rng.random(N) < 0.7)
+        waste = rng.choice([0.0, 0.5, 9.0], N)
+        budget.book(feed, waste, now)
+        for twin, a, f, w in zip(twins, allowed, feed, waste, strict=True):
+            twin.owed += a * c.period_s
+            twin.book(f, w, now)
+        same(budget.state(), twins, volume_ml="level", fed_ml="fed", _owed_ml="owed", _unusable="unusable")
+        if rng.random() < 0.05:
+            saved, budget = budget.state(), FeedBudget(N, c)
+            budget.restore({k: np.where(np.isinf(v), np.nan, v) for k, v in saved.items()})
+
+
+# -- readings --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("od", "raw", "kind"),
+    [
+        (-0.1, 9000.0, "impossible"), (-0.0999, 9000.0, ""), (3.999, 9000.0, ""), (4.0, 9000.0, "impossible"),
+        (10.0, 9000.0, "impossible"), (10.01, 9000.0, "spectrometer"), (0.5, 4.99, "spectrometer"), (0.5, 5.0, ""),
+        (0.5, 65534.0, ""), (0.5, 65535.0, "impossible"), (0.5, np.nan, ""), (np.nan, 9000.0, "impossible"),
+    ],
+)  # fmt: skip
+def test_what_a_sensor_can_read(od: float, raw: float, kind: str) -> None:
+    vitals = Vitals(np.zeros(2), np.array([raw, 9000.0]), (None, None))
+    m = Measurement(np.zeros(2), np.array([od, 0.4]), np.full(2, 37.0), np.array([True, True]), vitals)
+    believed, findings = Readings(2, C).check(m, np.array([True, True]), 0.0)
+    assert told(findings, 2) == [[kind] if kind else [], []]
+    assert believed.tolist() == [kind == "", True]
+    believed, findings = Readings(2, C).check(m, np.array([False, True]), 0.0)
+    assert told(findings, 2) == [[], []]
+    assert believed.tolist() == [False, True]
+
+
+def test_equal_readings_are_counted_over_samples_that_are_new() -> None:
+    readings, new = Readings(1, C), np.array([True])
+    kinds = []
+    for od, fresh in ((0.5, 1), (0.5, 0), (0.5, 1), (0.5, 1), (0.5, 1), (0.6, 1), (0.5, 1), (0.5, 1), (0.5, 0)):
+        m = Measurement(np.zeros(1), np.array([od]), np.zeros(1), new, None)
+        believed, findings = readings.check(m, np.array([bool(fresh)]), 0.0)
+        kinds += told(findings, 1)
+        assert believed[0] == (bool(fresh) and kinds[-1] == [])
+    assert kinds == [[], [], [], ["frozen"], ["frozen"], [], [], [], []]
+
+
+@pytest.mark.parametrize(
+    ("after_s", "driver_s", "kind"),
+    [
+        (100.0, 0.0, ""), (100.1, 0.0, "stale"), (180.0, 0.0, "stale"), (180.1, 0.0, "lost"), (7200.0, 0.0, "lost"),
+        (7200.1, 0.0, "silent"), (10.0, 100.0, ""), (10.0, 100.1, "stale"), (10.0, 7200.1, "silent"),
+    ],
+)  # fmt: skip
+def test_the_age_of_the_newest_sample(after_s: float, driver_s: float, kind: str) -> None:
+    """By this computer's clock, or by what the driver says; a sample that is new has no age."""
+    readings = Readings(2, C)
+    m = Measurement(np.zeros(2), np.array([0.5, 0.4]), np.zeros(2), np.ones(2, bool))
+    readings.check(m, np.array([True, True]), 1000.0)
+    vitals = Vitals(np.full(2, driver_s), np.full(2, 9000.0), (None, None))
+    for fresh, expected in ((False, [kind] if kind else []), (True, [])):
+        m = Measurement(np.zeros(2), np.array([0.6, 0.3]), np.zeros(2), np.ones(2, bool), vitals)
+        findings = readings.check(m, np.array([fresh, True]), 1000.0 + after_s)[1]
+        assert told(findings, 2) == [expected, []]
+        assert "no new sample for" in findings[0].text(0)
+
+
+# -- heat ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Thermostat:
+    """One vial's temperature, sample by sample."""
+
+    target: float = math.nan
+    relief: float = 0.0
+    at: float = math.nan
+    hot: int = 0
+    too_hot: int = 0
+    nonsense: int = 0
+    off: bool = False
+
+    def judge(self, reading: float, fresh: bool, target: float, now: float) -> list[str]:
+        if not fresh or not math.isfinite(target):
+            return []
+        first = math.isnan(self.target)
+        if not math.isfinite(reading):
+            self.nonsense = 0 if first else self.nonsense + 1  # no thermometer at all is none that fell silent
+            return self._blind()
+        if first:
+            self.relief = max(reading - target, 0.0)
+        else:
+            self.relief *= math.exp(-(now - self.at) / 60.0 / 90.0)
+            self.relief += max(self.target - target, 0.0)
+        self.target, self.at = target, now
+        sense = 5.0 < reading < 70.0
+        self.nonsense = 0 if sense else self.nonsense + 1
+        self.hot = self.hot + 1 if sense and reading > target + 2.0 + self.relief else 0
+        self.too_hot = self.too_hot + 1 if sense and reading > 42.0 else 0
+        trip = self.hot >= 3 or self.too_hot >= 2 or (sense and reading > 45.0)
+        self.off |= trip
+        return ["hot"] * int(trip) + self._blind()
+
+    def _blind(self) -> list[str]:
+        self.off |= self.nonsense >= 3
+        return ["thermometer"] * (self.nonsense >= 3)
+
+
+def test_heat_is_judged_as_sample_by_sample() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(8):
+        heat, twins, now = Heat(N, C), [Thermostat() for _ in range(N)], 0.0
+        target = np.where(rng.random(N) < 0.9, 37.0, np.nan)
+        for _ in range(60):
+            now += float(rng.choice([60.0, 61.0, 600.0]))
+            change = rng.random(N) < 0.05
+            target = np.where(change, rng.choice([30.0, 37.0, 40.0, 42.0, np.nan], N), target)
+            odd = rng.choice([5.0, 5.1, 70.0, 69.9, 42.0, 42.1, 45.0, 45.1, np.nan, np.inf, -3.0], N)
+            near = np.nan_to_num(target, nan=37.0) + rng.uniform(-1.0, 2.6, N)
+            reading = np.where(rng.random(N) < 0.15, odd, near)
+            reading = np.where(rng.random(N) < 0.3, np.round(near) + 2.0, reading)
+            fresh = rng.random(N) < 0.9
+            findings = heat.check(reading, fresh, target, now)
+            rows = zip(twins, reading, fresh, target, strict=True)
+            assert told(findings) == [t.judge(r, f, g, now) for t, r, f, g in rows]
+            assert heat.off.tolist() == [t.off for t in twins]
+            same(heat.state(), twins, _relief_c="relief", _target_c="target", _thermo_s="at")
+            if rng.random() < 0.1:
+                saved, heat = heat.state(), Heat(N, C)
+                heat.restore(saved)
+
+
+# -- changes that nothing explains -----------------------------------------------------------------------------------
+
+
+@dataclass
+class Culture:
+    """One culture's readings against growth, doses and noise."""
+
+    od: float = math.nan
+    at: float = math.nan
+    since: float = 0.0
+    suspect: float = math.nan
+    suspect_at: float = math.nan
+    suspects: int = 0
+    mu: float = 0.04
+    excess: float = 0.0
+    deficit: float = 0.0
+    futile: float = 0.0
+    over: list[int] = field(default_factory=lambda: [0, 0, 0])
+
+    def band(self, od: float, minutes: float) -> tuple[float, float]:
+        tolerance = max(0.04, 0.08 * abs(od))
+        low = max(od, 0.0) * math.exp(-1.6 * self.since / 20.0 - 0.005 * minutes)
+        return low - tolerance, max(od, 0.0) * math.exp(min(0.04 * minutes, 5.0)) + tolerance
+
+    def judge(self, od: float, t: float, believed: bool) -> list[str]:
+        if not believed:
+            return []
+        if math.isnan(self.od):
+            return self.take(od, t, [])
+        low, high = self.band(self.od, t - self.at)
+        if low <= od <= high:
+            self.suspects = 0
+            return self.take(od, t, self.accumulate(od, t))
+        near = self.band(self.suspect, t - self.suspect_at) if not math.isnan(self.suspect) else (math.inf, -math.inf)
+        self.suspects = self.suspects + 1 if near[0] <= od <= near[1] else 1
+        self.suspect, self.suspect_at = od, t
+        down = od < low
+        if self.suspects < (3 if down else 6):
+            return ["falls" if down else "jump"]
+        self.excess = self.deficit = 0.0
+        self.suspects = 0
+        return self.take(od, t, ["falls+" if down else "jump"])
+
+    def take(self, od: float, t: float, kinds: list[str]) -> list[str]:
+        self.od, self.at, self.since = od, t, 0.0
+        return kinds
+
+    def accumulate(self, od: float, t: float) -> list[str]:
+        if od <= 0.05 or self.od <= 0.05:
+            return []
+        dt, d, x = max(t - self.at, 1e-3), self.since / 20.0, math.log(od / self.od)
+        rise = x - min(0.04, self.mu + 0.01) * dt + 0.5 * d if d > 0.0 else min(x - 0.04 * dt, 0.0)
+        self.excess = max(self.excess + rise, 0.0)
+        self.deficit = max(self.deficit - x - 1.6 * d - 0.005 * dt, 0.0)
+        self.futile = max(self.futile + x + 0.004 * dt, 0.0) if d / dt >= 0.8 * 0.06 else 0.0
+        self.mu += (1.0 - math.exp(-dt / 60.0)) * (min(max((x + d) / dt, 0.0), 0.04) - self.mu)
+        limit = 0.05 + 6.0 * math.hypot(0.005, 0.005 * od) / od
+        self.over = [
+            k + 1 if s > limit else 0 for k, s in zip(self.over, (self.excess, self.deficit, self.futile), strict=True)
+        ]
+        rising, falling, helpless = (k >= 3 for k in self.over)
+        kinds = ["no_dilution+"] * rising + ["falls+"] * falling + ["cannot_hold"] * (helpless and not rising)
+        self.excess, self.deficit = self.excess * (not rising), self.deficit * (not falling)
+        self.futile *= not (helpless or rising)
+        return kinds
+
+
+def test_changes_are_judged_as_sample_by_sample() -> None:
+    """Cultures that grow, are fed, stand still or die, pumps that give half or twice, steps, bubbles, gaps."""
+    rng = np.random.default_rng(2)
+    seen: set[str] = set()
+    for _ in range(10):
+        change, twins, minute = UnexplainedChange(N, C), [Culture() for _ in range(N)], 0.0
+        true = rng.choice([0.04, 0.055, 0.3, 0.5, 1.2], N)
+        mu, gain = rng.choice([-0.03, -0.008, 0.0, 0.02, 0.035, 0.05], N), rng.choice([0.0, 0.4, 0.6, 1.0, 1.5, 1.8], N)
+        feeds = rng.choice([0.0, 0.5, 0.96, 1.2], N)
+        for _ in range(60):
+            dt = float(rng.choice([0.5, 1.0, 1.0, 1.0, 2.0, 7.0]))
+            feed = feeds * (rng.random(N) < 0.95)
+            change.dosed(feed)
+            for twin, ml in zip(twins, feed, strict=True):
+                twin.since += ml
+            true = np.clip(true * np.exp(mu * dt - gain * feed / 20.0), 0.02, 3.0)
+            true = np.where(rng.random(N) < 0.01, true * rng.choice([0.6, 0.93, 1.07, 1.5], N), true)
+            minute += dt
+            bubble = np.where(rng.random(N) < 0.05, rng.uniform(-0.1, 0.15, N), 0.0)
+            od, believed = true + 0.003 * rng.standard_normal(N) + bubble, rng.random(N) < 0.95
+            findings = told(change.check(od, np.full(N, 60.0 * minute), believed))
+            rows = zip(twins, od, believed, strict=True)
+            expected = [t.judge(o, minute, b) for t, o, b in rows]
+            assert [sorted(kinds) for kinds in findings] == [sorted(kinds) for kinds in expected]
+            seen |= {kind for kinds in expected for kind in kinds}
+            same(
+                change.state(), twins, _od="od", _at="at", _since_ml="since", _suspect="suspect", _mu="mu",
+                _suspect_at="suspect_at", _suspects="suspects", _excess="excess", _deficit="deficit",
+                _futile="futile", _over="over",
+            )  # fmt: skip
+            if rng.random() < 0.05:
+                saved, change = change.state(), UnexplainedChange(N, C)
+                change.restore(saved)
+    assert seen == {"jump", "falls", "falls+", "no_dilution+", "cannot_hold"}
+
+
+# -- conclusions -----------------------------------------------------------------------------------------------------
+
+
+Check = Callable[..., tuple[float, Response, tuple[str, ...], str]]
+
+
+def one(config: SafetyConfig = C) -> tuple[Interlock, Check]:
+    """A reactor, and how to ask about it: minute, OD -> rate, response, kinds, line."""
+    interlock = Interlock(1, config)
+
+    def check(
+        minute: float, od: float, rate: float = 0.01, fresh: bool = True, fault: Fault | None = None, **m: Any
+    ) -> Any:
+        vitals = Vitals(np.zeros(1), np.full(1, 9000.0), (fault,))
+        of = Measurement(np.full(1, 60.0 * minute), np.array([od]), np.full(1, 37.0), np.array([fresh]), vitals)
+        setpoint = np.array([m.get("setpoint", 0.5)])
+        v = interlock.check(of, np.array([rate]), setpoint, np.full(1, 37.0), 60.0 * minute)
+        return v.rate[0], Response(v.response[0]), v.kinds[0], v.reasons[0] or ""
+
+    return interlock, check
+
+
+@pytest.mark.parametrize("response", ["pumps_off", "hold", "stop"])
+def test_after_a_fall_nothing_is_dosed_for_five_minutes(response: str) -> None:
+    _, check = one(SafetyConfig(responses=Responses(falls=response)))
+    assert check(0, 0.5)[:3] == (0.01, Response.PASS, ())
+    for minute, od in ((1, 0.3), (2, 0.301), (3, 0.302)):  # the third is believed, and the pause begins
+        assert check(minute, od)[2] == ("falls",)
+    for minute in (4, 5, 6, 7):
+        rate, code, kinds, line = check(minute, 0.3 + 0.001 * minute)
+        assert (rate, kinds) == (0.0, ("falls",))
+        assert code == (Response.STOP if response == "stop" else Response.HOLD)
+        assert line == f"falls: no dose for another {8.0 - minute:.1f} min after this; no dose; {REMEDIES['falls']}"
+    rate, code, kinds, line = check(8, 0.308)
+    assert kinds == ()
+    assert (rate, code) == ((0.0, Response.STOP) if response == "stop" else (0.01, Response.PASS))
+    assert line == ("stopped earlier in this run" if response == "stop" else "")
+
+
+def test_a_pause_is_not_said_of_samples_that_are_not_new_and_not_twice() -> None:
+    _, check = one()
+    for minute, od in ((0, 0.5), (1, 0.3), (2, 0.301), (3, 0.302)):
+        check(minute, od)
+    assert check(3.5, 0.3, fresh=False) == (0.0, Response.PASS, (), "")
+    assert check(4, 0.1)[1:3] == (Response.PUMPS_OFF, ("falls",))
+
+
+def test_the_worst_reason_counts_and_what_a_device_says_is_passed_on() -> None:
+    _, check = one()
+    fault = Fault("stalled", "no sample", "look at it")
+    assert check(0, 0.5, fault=fault) == (
+        0.0, Response.HOLD, ("stalled",), "stalled: no sample; look at it; no dose"
+    )  # fmt: skip
+    rate, code, kinds, line = check(1, 14.0, fault=Fault("pump", "Pump1 on", "pull it"), rate=0.03)
+    assert (rate, code, kinds) == (0.0, Response.PUMPS_OFF, ("pump", "spectrometer", "limit"))
+    assert line.count(" | ") == 2
+    assert check(2, 0.5, rate=0.03)[:3] == (0.02, Response.PASS, ("limit",))
+
+
+@pytest.mark.parametrize(
+    ("given", "sound", "target"), [(1.5, True, 1.5), (1.51, False, 0.5), (0.0, False, 0.5), (0.01, True, 0.05)]
+)
+def test_the_target_for_the_regulation_on_board_is_a_sane_one(given: float, sound: bool, target: float) -> None:
+    interlock = Interlock(1)
+    m = Measurement(np.zeros(1), np.array([0.5]), np.full(1, 37.0), np.array([True]))
+    verdict = interlock.check(m, np.array([0.01]), np.array([given]), np.full(1, 37.0), 0.0)
+    assert verdict.setpoint[0] == target
+    assert verdict.kinds[0] == (() if sound else ("setpoint",))
+
+
+def test_what_is_latched_is_never_loosened_and_only_the_rows_meant() -> None:
+    interlock = Interlock(2)
+    m = Measurement(np.zeros(2), np.full(2, 0.5), np.full(2, 37.0), np.ones(2, bool))
+    interlock.latch(Response.STOP, np.array([True, False]))
+    interlock.latch(Response.REGULATE, np.array([True, False]))
+    verdict = interlock.check(m, np.full(2, 0.01), np.full(2, 0.5), np.full(2, 37.0), 0.0)
+    assert verdict.response.tolist() == [Response.STOP, Response.PASS]
+    assert verdict.reasons == ["stopped earlier in this run", None]
+
+
+def test_a_receipt_without_waste_leaves_the_level_at_its_tube() -> None:
+    interlock = Interlock(1)
+    for waste, level in ((np.zeros(1), 21.0), (np.full(1, 0.5), 21.5), (None, 20.0)):
+        interlock.confirm(Receipt(np.ones(1), (), waste), 60.0)
+        assert interlock.budget.volume_ml[0] == level
+    assert interlock.budget.fed_ml[0] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("_latched", [0.5], "_latched = .*no such code"),
+        ("_latched", [5.0], "no such code"),
+        ("_hold_kind", [-2.0], "_hold_kind = .*no such code"),
+        ("_hold_kind", [float(len(REMEDIES))], "no such code"),
+        ("fed_ml", ["much"], "fed_ml = .*: expected numbers"),
+        ("fed_ml", [math.nan], "fed_ml = .*: expected finite numbers"),
+        ("fed_ml", [1.0, 2.0], "for 2 reactors, this run has 1"),
+        ("_dose_ml", [[0.0, 0.0]], r"_dose_ml has the shape \(1, 2\), expected \(1, 4\)"),
+        ("fed_ml", 1.0, r"fed_ml has the shape \(\)"),
+    ],
+)
+def test_a_damaged_state_is_named(key: str, value: Any, words: str) -> None:
+    state = Interlock(1).state()
+    with pytest.raises(ValueError, match=rf"saved interlock.*{words}"):
+        Interlock(1).restore({**state, key: value})
+    with pytest.raises(ValueError, match=r"saved interlock: \[\], expected its fields"):
+        Interlock(1).restore([])
+
+
+def test_pause_and_latch_survive_a_restart() -> None:
+    before, check = one()
+    for minute, od in ((0, 0.5), (1, 0.3), (2, 0.301), (3, 0.302)):
+        check(minute, od)
+    before.latch(Response.REGULATE, np.array([True]))
+    after, again = one()
+    after.restore(before.state())
+    assert again(4, 0.303)[1:3] == (Response.REGULATE, ("falls",))
+    assert [again(minute, 0.3 + 0.001 * minute)[2] for minute in (7, 8)] == [("falls",), ()]
