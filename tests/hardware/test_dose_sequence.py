@@ -1,0 +1,269 @@
+"""One dose request by request, on a line that does what it is told at times chosen here."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware.chibio.agenda import Agenda
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import Connection
+from hardware.chibio.dose_sequence import DoseSequence
+from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration
+from hardware.chibio.logbook import Logbook
+from hardware.clock import VirtualClock
+from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
+from hardware.link.transport import Reply
+from tests.hardware.script import DONE, answer, state
+
+OFFS = [f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 2, 3, 4)]
+END = [*OFFS, "/MeasureTemp/IR/M0", "/changeDevice/M0"]
+FEED_ON, WASTE_ON = "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump2/1/M0"
+FEED_DUTY = 0.009523  # 0.6 mL at 1 mL/s in 63 s, cut to six places
+FEED_S = 63.0 * FEED_DUTY
+WASTE_DUTY = math.ceil((4.0 * FEED_S + 4.4) / 63.0 * 1e6) / 1e6
+WASTE_S = 63.0 * WASTE_DUTY
+
+
+class Line:
+    """Transport and device in one: targets and pump flags as they were sent.
+
+    Attributes: posts, (time, path); trouble, called with each path before it is carried out, may raise; lost, paths
+      that are carried out and not answered; slow_s, what a read takes; shown, what a read shows otherwise.
+    """
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.clock, self.posts = clock, []
+        self.trouble: Callable[[str], None] = lambda path: None
+        self.lost: set[str] = set()
+        self.slow_s = 0.0
+        self.shown: dict[str, Any] = {}
+        self.flags: dict[str, Any] = {}
+
+    def post(self, path: str) -> Reply:
+        self.posts.append((round(self.clock.now(), 3), path))
+        self.trouble(path)
+        _, verb, item, *rest = path.split("/")
+        if verb == "SetOutputTarget":
+            self.flags[f"{item}__target"] = float(rest[1])
+        elif verb == "SetOutputOn":
+            self.flags[f"{item}__ON"] = int(rest[0])
+        if path in self.lost:
+            raise LinkError("no answer")
+        return DONE
+
+    def get(self, path: str) -> Reply:
+        self.clock.sleep(self.slow_s)
+        self.trouble(path)
+        return answer(state(**{**self.flags, **self.shown}))
+
+    def disarm(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def sent(self) -> list[str]:
+        return [path for _, path in self.posts]
+
+
+class Bench:
+    """A dose sequence on a line; the clock stands at 1000 s, run time at 0."""
+
+    def __init__(self, calibration: ReactorCalibration | None = None) -> None:
+        self.clock = VirtualClock(1000.0)
+        self.line, self.rows, self.agenda = Line(self.clock), [], Agenda(self.clock)
+        self.connection = Connection("M0", ("M0",), self.line, self.clock, lambda kind, fields: None)
+        self.book = Logbook("M0", self._log, self._log, lambda: self.clock.now() - 1000.0)
+        self.doses = DoseSequence(
+            self.connection, calibration or ReactorCalibration(), ChiBioConfig(), self.agenda, self.book
+        )
+        self.connection.read()
+        self.line.posts.clear()
+
+    def _log(self, kind: str, fields: Any) -> None:
+        self.rows.append({"kind": kind, "posts": len(self.line.posts), **fields})
+
+    def begin(self, rate: float = 0.01, key: Any = (60.0, 2), past_s: float = 0.0, refusal: str = "") -> DosePlan:
+        return self.doses.begin(rate, key, self.clock.now() - past_s, refusal)
+
+    def run(self, seconds: float = math.inf) -> None:
+        """Let the agenda's tasks run at their times."""
+        until = self.clock.now() + seconds
+        while self.agenda.next_due() <= until and self.agenda.next_due() < math.inf:
+            self.clock.sleep(self.agenda.next_due() - self.clock.now())
+            self.agenda.run_due()
+
+    def of(self, kind: str) -> list[dict[str, Any]]:
+        return [row for row in self.rows if row["kind"] == kind]
+
+
+def test_a_dose_is_written_down_set_read_back_and_ended_twice() -> None:
+    bench = Bench()
+    plan = bench.begin()
+    assert (plan.feed_duty, plan.waste_duty) == (FEED_DUTY, WASTE_DUTY)
+    assert bench.doses.running
+    assert bench.line.posts == [
+        (1000.0, f"/SetOutputTarget/Pump2/M0/{WASTE_DUTY:.6f}"),
+        (1000.0, f"/SetOutputTarget/Pump1/M0/{FEED_DUTY:.6f}"),
+        (1000.0, "/changeDevice/M0"),
+        (1000.0, WASTE_ON),
+        (1001.0, FEED_ON),
+    ]
+    [intent] = bench.of("intent")
+    assert intent.pop("posts") == 0  # before anything was sent
+    assert intent == {
+        "kind": "intent", "reactor": "M0", "sample": (60.0, 2), "rate": 0.01, "feed_duty": FEED_DUTY,
+        "waste_duty": WASTE_DUTY, "feed_ml": pytest.approx(FEED_S), "waste_ml": pytest.approx(WASTE_S),
+        "carry_ml": 0.0, "doses": 1, "on_s": 0.0,
+    }  # fmt: skip
+    bench.line.posts.clear()
+    bench.run()
+    due = round(1000.0 + WASTE_S + 2.0, 3)  # the device needs its settling time before it is read back
+    assert bench.line.posts[0] == (round(1001.0 + FEED_S + 2.0, 3), OFFS[0])
+    assert [path for _, path in bench.line.posts[1:]] == END
+    assert {t for t, _ in bench.line.posts[1:5]} == {due}
+    assert not bench.doses.running
+    assert bench.of("dose_end")[0].items() >= {"verified_off": True, "repeated_ml": 0.0}.items()
+    assert bench.book.notes == []
+
+
+@pytest.mark.parametrize(("lost", "sent"), [(WASTE_ON, [WASTE_ON]), (FEED_ON, [WASTE_ON, FEED_ON])])
+def test_a_pump_command_whose_answer_is_lost_is_not_sent_again_and_counts_as_dosed(lost: str, sent: list[str]) -> None:
+    bench = Bench()
+    bench.line.lost = {lost}
+    assert bench.begin().feed_ml == pytest.approx(FEED_S)
+    bench.run()
+    assert [path for path in bench.line.sent() if path in (FEED_ON, WASTE_ON)] == sent
+    assert [OFFS[0], *END] == bench.line.sent()[-7:]
+    assert "counted as dosed" in bench.book.notes[0]
+    assert not bench.doses.running
+
+
+@pytest.mark.parametrize(
+    ("sample", "past_s", "refusal", "words"),
+    [
+        (None, 0.0, "", "no new sample"),
+        ((60.0, 2), math.inf, "", "unknown age"),
+        ((60.0, 2), 38.0 - WASTE_S + 0.01, "", "31 s after its sample appeared it would not end"),
+        ((60.0, 2), 0.0, "being started", "being started"),
+    ],
+)
+def test_what_stands_in_the_way_of_a_dose(sample: Any, past_s: float, refusal: str, words: str) -> None:
+    bench = Bench()
+    assert bench.begin(0.01, sample, past_s, refusal) == DosePlan()
+    assert words in bench.book.notes[0]
+    assert bench.line.posts == []
+    assert bench.of("intent") == []
+    assert bench.begin(past_s=38.0 - WASTE_S).feed_ml > 0.0  # it is not remembered as acted on
+    assert bench.begin(key=(120.0, 3)) == DosePlan()
+    assert "has not ended" in bench.book.notes[1]
+    bench.run()
+    assert bench.begin() == DosePlan()
+    assert "no new sample" in bench.book.notes[2]
+    bench.doses.forget_sample()
+    assert bench.begin().feed_ml > 0.0
+
+
+@pytest.mark.parametrize("late_s", [-0.01, 0.01])
+def test_a_read_back_that_takes_too_long_ends_the_dose_before_a_pump_is_on(late_s: float) -> None:
+    bench = Bench()
+    bench.line.slow_s = 38.0 - 20.0 - WASTE_S + late_s
+    plan = bench.begin(past_s=20.0)
+    begun = late_s < 0.0
+    assert (plan.feed_ml > 0.0, bench.doses.running) == (begun, begun)
+    assert (FEED_ON in bench.line.sent()) == begun
+    bench.line.slow_s = 0.0
+    bench.run()
+    assert bench.line.sent()[-6:] == END
+    assert len(bench.of("dose_end")) == 1
+    assert ("answers too slowly (31 s after the sample)" in "".join(bench.book.notes)) != begun
+
+
+@pytest.mark.parametrize(
+    ("shown", "begun"),
+    [
+        ({}, True),
+        ({"Pump1__target": FEED_DUTY + 0.9e-5}, True),
+        ({"Pump1__target": FEED_DUTY + 1.1e-5}, False),
+        ({"Pump2__target": WASTE_DUTY - 0.9e-5}, True),
+        ({"Pump2__target": WASTE_DUTY - 1.1e-5}, False),
+        ({"Pump3__ON": 1}, False),
+        ({"OD__ON": 1}, False),
+        ({"Experiment__ON": 0}, False),
+    ],
+)
+def test_a_dose_begins_only_where_the_device_shows_what_was_set(shown: dict[str, Any], begun: bool) -> None:
+    bench = Bench()
+    bench.line.shown = shown
+    assert (bench.begin().feed_ml > 0.0) == begun
+    assert (WASTE_ON in bench.line.sent()) == begun
+    bench.line.shown = {}
+    bench.run()
+    assert bench.line.sent()[-6:] == END
+    assert begun or "not as set" in bench.book.notes[0]
+
+
+def test_a_pump_that_stays_on_is_told_and_its_experiment_ended_at_the_fourth_refusal() -> None:
+    bench = Bench()
+    bench.begin()
+    bench.line.shown = {"Pump1__ON": 1}
+    bench.run(WASTE_S + 15.0)
+    assert bench.line.sent().count("/Experiment/0/M0") == 1
+    before_end = bench.line.sent()[: bench.line.sent().index("/Experiment/0/M0")]
+    assert before_end.count("/MeasureTemp/IR/M0") == 4
+    assert "Pump1 still on" in bench.doses.stuck
+    assert bench.doses.running
+    bench.line.shown = {}
+    bench.run()
+    assert bench.doses.stuck == ""
+    assert not bench.doses.running
+
+
+def test_a_reactor_that_is_gone_is_looked_for_every_half_minute() -> None:
+    bench = Bench()
+    bench.begin()
+    bench.line.shown = {"presentDevices": {"M0": 0}}
+    bench.connection.state = None
+    bench.run(100.0)
+    looks = [t for t, path in bench.line.posts if path == "/changeDevice/M0"][1:]
+    assert np.diff(looks).tolist() == pytest.approx([30.0, 30.0, 30.0])
+    assert bench.doses.running
+    assert bench.doses.stuck == ""
+
+
+def test_what_is_kept_for_later_or_cut_off_is_told() -> None:
+    small = Bench()
+    assert small.begin(0.004) == DosePlan()
+    assert "0.240 mL is less than the pump can deliver" in small.book.notes[0]
+    assert small.line.posts == []
+    assert small.begin(0.0, (120.0, 3)) == DosePlan()
+    assert len(small.book.notes) == 1  # nothing was asked for
+    assert small.begin(0.004, (180.0, 4)).feed_ml == pytest.approx(0.48, abs=1e-4)
+    assert [row["doses"] for row in small.of("intent")] == [0, 0, 1]
+    weak = Bench(ReactorCalibration(PumpCalibration(flow_ml_s=0.2)))
+    assert weak.begin(0.02).feed_ml == pytest.approx(0.63)
+    assert weak.book.notes == ["the dose was cut by 0.570 mL to the feed limit"]
+
+
+@pytest.mark.parametrize("error", [LinkError("no answer"), ProtocolError("502"), DeviceStateError("gone")])
+def test_the_feed_is_switched_off_every_two_seconds_until_the_device_has_heard_it(error: ReactorError) -> None:
+    bench = Bench()
+    bench.begin()
+    off_s = bench.clock.now() + FEED_S + 2.0
+    tried: list[float] = []
+
+    def deaf(path: str) -> None:
+        if off_s - 0.1 < bench.clock.now() < off_s + 3.0:
+            tried.append(round(bench.clock.now() - off_s, 3))
+            raise error
+
+    bench.line.trouble = deaf
+    bench.run(off_s + 4.1 - bench.clock.now())
+    assert tried == [0.0, 2.0]
+    assert bench.line.posts[-1] == (round(off_s + 4.0, 3), OFFS[0])
+    assert (bench.book.fault is not None) == (not isinstance(error, DeviceStateError))
+    bench.run()
+    assert bench.line.sent()[-6:] == END
