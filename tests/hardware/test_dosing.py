@@ -62,7 +62,63 @@ def test_a_rate_that_is_none_is_an_error(rate: float) -> None:
         plan_dose(rate, 0.0, 0, ReactorCalibration(), CONFIG)
 
 
-@settings(max_examples=500)
+NOMINAL = PumpCalibration()
+
+
+@pytest.mark.parametrize(
+    ("rate", "carry", "doses", "feed", "waste", "feed_s", "waste_s", "left"),
+    [
+        (0.01, 0.0, 0, NOMINAL, NOMINAL, 0.6, 4.0 * 0.6 + 4.4, (0.0, 0.0)),
+        (0.005, 0.0, 0, NOMINAL, NOMINAL, 0.3, 5.6, (0.0, 0.0)),  # the smallest dose is a dose
+        (0.00499, 0.0, 0, NOMINAL, NOMINAL, 0.0, 0.0, (0.2994, 0.0)),
+        (0.00499, 0.2, 0, NOMINAL, NOMINAL, 0.4994, 6.3976, (0.0, 0.0)),
+        (0.0, 0.5, 0, NOMINAL, NOMINAL, 0.0, 0.0, (0.3, 0.0)),  # no more is kept than one smallest dose
+        (0.01, 0.0, 4, NOMINAL, NOMINAL, 0.6, 15.75, (0.0, 0.0)),
+        (0.02, 0.0, 4, NOMINAL, PumpCalibration(0.1), 1.2, 18.0, (0.0, 0.0)),  # 1.5 times the feed, and a clearing
+        (0.02, 0.0, 0, NOMINAL, PumpCalibration(0.1, -0.5), 1.2, 18.5, (0.0, 0.0)),
+        (0.02, 0.0, 0, NOMINAL, PumpCalibration(0.05), 1.2, 31.5, (0.0, 0.0)),  # half of the period at most
+        (0.02, 0.0, 0, PumpCalibration(0.8, 0.1), NOMINAL, 1.4, 10.0, (0.0, 0.0)),
+        (0.02, 2.4, 0, NOMINAL, NOMINAL, 3.15, 17.0, (0.0, 0.45)),
+        (0.0, 0.0, 0, PumpCalibration(min_on_s=0.0), NOMINAL, 0.0, 0.0, (0.0, 0.0)),
+    ],
+)
+def test_doses_worked_out_by_hand(
+    rate: float, carry: float, doses: int, feed: PumpCalibration, waste: PumpCalibration, feed_s: float,
+    waste_s: float, left: tuple[float, float],
+) -> None:  # fmt: skip
+    plan = plan_dose(rate, carry, doses, ReactorCalibration(feed, waste), CONFIG)
+    assert (plan.feed_s, plan.waste_s) == pytest.approx((feed_s, waste_s), abs=1e-3)
+    assert (plan.carry_ml, plan.shortfall_ml) == pytest.approx(left, abs=1e-9)
+    assert plan.feed_s <= feed_s + 1e-9  # the duty is cut to six places
+    expected = (feed.flow_ml_s * (feed_s + feed.bias_s), waste.flow_ml_s * (waste_s + waste.bias_s))
+    assert feed_s == 0.0 or (plan.feed_ml, plan.waste_ml) == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("key", "low", "high"),
+    [("flow_ml_s", 0.05, 5.0), ("bias_s", -1.0, 1.0), ("spread", 0.0, 1.0), ("min_on_s", 0.0, 2.0)],
+)
+def test_ranges_of_a_pump(key: str, low: float, high: float) -> None:
+    for value in (low, high):
+        PumpCalibration(**{key: value})
+    for value in (low - 1e-6, high + 1e-6, np.nan):
+        with pytest.raises(ValueError, match=f"pump calibration {key} = .*: allowed {low} to {high}; weigh"):
+            PumpCalibration(**{key: value})
+
+
+def test_a_pump_nobody_weighed() -> None:
+    assert NOMINAL.as_dict() == {
+        "flow_ml_s": 1.0, "bias_s": 0.0, "spread": 0.1, "min_on_s": 0.3, "date": "", "device_id": "",
+    }  # fmt: skip
+    weighed = PumpCalibration(date="2026-02-03")
+    pairs = ((NOMINAL, NOMINAL), (weighed, NOMINAL), (NOMINAL, weighed), (weighed, weighed))
+    assert [ReactorCalibration(*pair).calibrated for pair in pairs] == [False, False, False, True]
+    assert PumpCalibration(bias_s=-0.5).volume(0.2) == 0.0
+    assert PumpCalibration(bias_s=0.5).on_time(0.2) == 0.0
+    assert PumpCalibration(bias_s=0.5).volume(-0.1) == 0.0
+
+
+@settings(max_examples=200)
 @given(
     st.floats(0.0, 0.05),
     st.floats(0.0, 0.5),
@@ -98,6 +154,40 @@ def test_weighed_doses_give_back_the_pump() -> None:
     assert abs(errors[:, 1].mean()) < 0.02
 
 
+def test_the_fit_is_that_of_weighted_least_squares_with_its_covariance() -> None:
+    on_s, doses = np.array([0.4, 0.8, 1.6, 2.5]), np.array([40, 20, 10, 5])
+    mean = 0.85 * (on_s + 0.08) + np.array([0.02, -0.03, 0.04, -0.02])
+    fit = fit_pump(on_s, doses, mean * doses, "2026-02-03", "unit")
+    (slope, intercept), cov = np.polyfit(on_s, mean, 1, w=np.sqrt(doses), cov="unscaled")
+    residual = mean - slope * on_s - intercept
+    sigma = np.sqrt(np.sum(doses * residual**2) / 2.0)  # four series less two parameters
+    by_bias = np.array([-intercept / slope**2, 1.0 / slope])  # of bias = intercept / slope, by slope and intercept
+    pump = fit.calibration
+    assert (pump.flow_ml_s, pump.bias_s) == pytest.approx((slope, intercept / slope))
+    assert pump.spread == pytest.approx(sigma / mean.mean())
+    assert fit.flow_se == pytest.approx(sigma * np.sqrt(cov[0, 0]))
+    assert fit.bias_se == pytest.approx(sigma * np.sqrt(by_bias @ cov @ by_bias))
+    assert (pump.min_on_s, pump.date, pump.device_id) == (0.4, "2026-02-03", "unit")
+
+
+@pytest.mark.parametrize(
+    ("on_s", "mean", "smallest"),
+    [
+        ([0.1, 0.9], [0.1, 0.9], 0.3),  # shorter ones deliver, but none under 0.3 s is believed
+        ([0.5, 2.5], [0.5, 2.5], 0.5),
+        ([2.2, 2.9], [2.2, 2.9], 2.0),
+        ([0.4, 0.6, 1.0, 2.0, 4.0], [0.15, 0.34, 1.0, 2.0, 4.0], 0.6),  # 0.68 and 0.78 of the fitted line
+        ([0.4, 0.6, 1.0, 2.0, 4.0], [0.15, 0.30, 1.0, 2.0, 4.0], 0.4),  # 0.72 and 0.71
+    ],
+)
+def test_the_smallest_useful_time(on_s: list[float], mean: list[float], smallest: float) -> None:
+    fit = fit_pump(np.array(on_s), np.ones(len(on_s)), np.array(mean))
+    assert fit.calibration.min_on_s == pytest.approx(smallest)
+    if len(on_s) == 2:  # two series fit exactly: nothing is known of the scatter
+        assert fit.calibration.spread == 0.1
+        assert np.isnan([fit.flow_se, fit.bias_se]).all()
+
+
 def test_a_dead_band_shows_as_a_larger_smallest_dose() -> None:
     on_s = np.array([0.1, 0.4, 0.8, 1.6])
     grams = 20 * np.array([0.001, 0.4, 0.8, 1.6])
@@ -111,16 +201,27 @@ def test_a_dead_band_shows_as_a_larger_smallest_dose() -> None:
         ([1.0, 1.0], [20.0, 21.0], "range"),
         ([0.5, 1.0], [20.0, 10.0], "weighed less"),
         ([0.5, 1.0], [20.0, np.nan], "finite"),
+        ([0.5, 1.0], [20.0, np.inf], "finite"),
         ([0.5, 1.0], [1000.0, 3000.0], "allowed"),
+        ([0.5, 1.0], [20.0, 20.0], "weighed less"),
+        ([0.0, 1.0], [1.0, 20.0], "must be > 0 s"),
+        ([0.5, 1.0], [-0.1, 20.0], "grams >= 0"),
+        ([0.5, 0.65], [10.0, 13.0], "0.50 to 0.65 s: allowed a range"),
+        ([0.5, 1.0], [20.0], "2, 2, 1"),
     ],
 )
 def test_weighings_that_make_no_line_are_refused(on_s: list[float], grams: list[float], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         fit_pump(np.array(on_s), np.full(len(on_s), 20), np.array(grams))
+    sound = np.array([0.5, 0.75]), np.array([20, 1]), np.array([10.0, 0.75])
+    fit_pump(*sound)
+    with pytest.raises(ValueError, match="doses >= 1"):
+        fit_pump(sound[0], np.array([20, 0]), sound[2])
 
 
 def test_a_stored_calibration_reads_back() -> None:
     pump = PumpCalibration(0.9, 0.05, 0.08, 0.4, "2026-02-03", "1000200030004000")
     assert PumpCalibration.from_dict({**pump.as_dict(), "weighings": []}) == pump
-    with pytest.raises(ValueError, match="flow_ml_s"):
-        PumpCalibration.from_dict({"flow_ml_s": 70.0})
+    for wrong in (70.0, None, "fast"):
+        with pytest.raises(ValueError, match=r"flow_ml_s|pump calibration.*weigh|fast"):
+            PumpCalibration.from_dict({"flow_ml_s": wrong})

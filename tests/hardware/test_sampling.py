@@ -4,6 +4,8 @@ import json
 import math
 from dataclasses import replace
 
+import pytest
+
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.protocol import DeviceState, parse_state
 from hardware.chibio.sampling import CYCLE_S, FIRST_SAMPLE_S, Sampling
@@ -54,6 +56,61 @@ def test_only_a_sample_that_was_waited_for_has_a_known_age() -> None:
     take(sampling, clock, sample(120.0, 3))
     assert sampling.late_s == 10.0
     assert sampling.appeared_s == clock.now() - 10.0
+
+
+def test_a_sample_seen_so_late_that_the_next_cycle_had_begun_does_not_hide_the_next_one() -> None:
+    clock = VirtualClock()
+    sampling = Sampling(CONFIG, clock)
+    take(sampling, clock, sample(60.0, 3))
+    assert sampling.look(sample(120.0, 3), 0.0)
+    assert not sampling.look(sample(0.0, 2), 0.0)
+
+
+def test_when_the_next_look_is() -> None:
+    clock = VirtualClock(500.0)
+    sampling = Sampling(CONFIG, clock)
+    assert sampling.next_poll == sampling.arrived_s == 500.0
+    sampling.look(sample(60.0, 2), 510.0)
+    assert sampling.next_poll == 510.0 + CONFIG.poll_s
+    clock.sleep(20.0)
+    sampling.retry_later()
+    assert sampling.next_poll == 520.0 + CONFIG.retry_s
+    sampling.wait_from_now()
+    assert sampling.next_poll == sampling.arrived_s == 520.0
+
+
+def test_lateness_is_measured_against_the_earliest_of_the_last_three_that_were_waited_for() -> None:
+    clock = VirtualClock(0.0)
+    sampling = Sampling(CONFIG, clock)
+    offsets, late = [5.0, 3.0, 6.0, 4.0, 7.0, 2.0], []
+    for k, offset in enumerate(offsets):
+        sampling.not_taken(is_new=False)
+        clock.sleep(60.0 * (k + 1) + offset - clock.now())
+        assert take(sampling, clock, sample(60.0 * (k + 1), k + 1)) == ""
+        late.append(sampling.late_s)
+    assert late == [0.0, 0.0, 3.0, 1.0, 3.0, 0.0]  # against 5, 3, 3, 3, 4, 2
+    for k, (offset, waited, expected) in enumerate(((9.0, False, 7.0), (1.0, False, 0.0), (2.0, True, 1.0)), 7):
+        if waited:
+            sampling.not_taken(is_new=False)
+        clock.sleep(60.0 * k + offset - clock.now())
+        take(sampling, clock, sample(60.0 * k, k))
+        assert sampling.late_s == expected
+    sampling.pass_over(sample(math.nan, 9))
+    assert sampling.key == (540.0, 9)
+    clock.sleep(55.0)
+    take(sampling, clock, sample(600.0, 10))
+    assert sampling.late_s == math.inf  # what was known of the offsets is forgotten
+
+
+@pytest.mark.parametrize(("step_s", "told"), [(64.9, False), (65.0, True), (-29.9, False), (-30.0, True)])
+def test_how_much_lateness_is_a_step_of_a_clock(step_s: float, told: bool) -> None:
+    clock = VirtualClock(1000.0)
+    sampling = Sampling(CONFIG, clock)
+    sampling.expect_first()
+    clock.sleep(FIRST_SAMPLE_S)
+    take(sampling, clock, sample(0.0, 1))
+    clock.sleep(60.0)
+    assert (take(sampling, clock, sample(60.0 - step_s, 2)) != "") == told
 
 
 def test_the_first_sample_of_an_experiment_just_started_has_a_known_age_too() -> None:
