@@ -61,6 +61,15 @@ def test_native_equals_gymnasiums_sync_step_for_step(overrides):
     assert ends >= n
 
 
+def test_the_last_reward_of_an_episode_is_weighted_and_no_other():
+    env = BioreactorVectorEnv(2, EnvConfig(episode_steps=3, final_reward_weight=4.0))
+    env.reset(seed=0)
+    for weight in (1.0, 1.0, 4.0, 1.0, 1.0, 4.0):
+        od, setpoint = env.od.copy() * step_factors(env.config)[3], env.setpoint.copy()
+        reward = env.step(np.array([3, 3]))[1]
+        np.testing.assert_allclose(reward, -weight * (od - setpoint) ** 2, rtol=1e-12)
+
+
 def test_copies_follow_the_model_and_the_reward():
     config = EnvConfig()
     env = BioreactorVectorEnv(64, config)

@@ -143,6 +143,7 @@ def test_the_plan_is_explained() -> None:
     mpc.reset(2)
     rate = mpc.act(np.array([0.6, 0.4]), np.array([0.5, 0.5]), np.zeros(2), np.ones(2, dtype=bool))
     plan = mpc.explain()
+    assert plan["planned_rate"].shape == plan["predicted_od"].shape == (2, 5)  # the paper looks five minutes ahead
     np.testing.assert_array_equal(plan["planned_rate"][:, 0], rate)
     np.testing.assert_allclose(plan["predicted_od"][:, 0], np.array([0.6, 0.4]) * step_factors(MODEL, rate))
 
