@@ -18,15 +18,15 @@ PAGE = (Path(__file__).parent.parent / "docs" / "configuration.md").read_text(en
 @pytest.mark.parametrize(
     ("config", "heading"),
     [
-        (SafetyConfig(), "safety"),
-        (Responses(), "safety.responses"),
-        (DQNConfig(), "agent"),
-        (DosingConfig(), "backend.dosing"),
-        (OverflowPumpConfig(), "backend.overflow_pump"),
+        (SafetyConfig, "safety"),
+        (Responses, "safety.responses"),
+        (DQNConfig, "agent"),
+        (DosingConfig, "backend.dosing"),
+        (OverflowPumpConfig, "backend.overflow_pump"),
     ],
 )
-def test_defaults_units_and_ranges_are_those_of_the_page(config: Any, heading: str) -> None:
+def test_defaults_units_and_ranges_are_those_of_the_page(config: type[Any], heading: str) -> None:
     found = re.search(rf"^### {re.escape(heading)}\n(.*?)(?=^#|\Z)", PAGE, re.MULTILINE | re.DOTALL)
     assert found is not None
     rows = [line for line in found[1].splitlines() if line.startswith("| `")]
-    assert rows == [line for line in _table(config, {Responses: "safety.responses"})[0].splitlines() if "| `" in line]
+    assert rows == [line for line in _table(config(), {Responses: "safety.responses"})[0].splitlines() if "| `" in line]

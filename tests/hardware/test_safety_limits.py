@@ -117,7 +117,7 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
             twin.owed += a * c.period_s
             twin.book(f, w, now)
         same(budget.state(), twins, volume_ml="level", fed_ml="fed", _owed_ml="owed", _unusable="unusable")
-        if rng.random() < 0.05:
+        if rng.random() < 0.3:
             saved, budget = budget.state(), FeedBudget(N, c)
             budget.restore({k: np.where(np.isinf(v), np.nan, v) for k, v in saved.items()})
 
