@@ -130,15 +130,23 @@ def test_a_dose_is_written_down_set_read_back_and_ended_twice() -> None:
     assert bench.book.notes == []
 
 
-@pytest.mark.parametrize(("lost", "sent"), [(WASTE_ON, [WASTE_ON]), (FEED_ON, [WASTE_ON, FEED_ON])])
-def test_a_pump_command_whose_answer_is_lost_is_not_sent_again_and_counts_as_dosed(lost: str, sent: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("lost", "sent", "fed_ml", "words"),
+    [
+        (WASTE_ON, [WASTE_ON], 0.0, "no medium was given"),
+        (FEED_ON, [WASTE_ON, FEED_ON], pytest.approx(FEED_S), "counted as dosed"),
+    ],
+)
+def test_a_pump_command_whose_answer_is_lost_is_not_sent_again(
+    lost: str, sent: list[str], fed_ml: float, words: str
+) -> None:
     bench = Bench()
     bench.line.lost = {lost}
-    assert bench.begin().feed_ml == pytest.approx(FEED_S)
+    assert bench.begin().feed_ml == fed_ml
     bench.run()
     assert [path for path in bench.line.sent() if path in (FEED_ON, WASTE_ON)] == sent
     assert [OFFS[0], *END] == bench.line.sent()[-7:]
-    assert "counted as dosed" in bench.book.notes[0]
+    assert words in bench.book.notes[0]
     assert not bench.doses.running
 
 

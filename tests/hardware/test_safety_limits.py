@@ -130,7 +130,7 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
     [
         (-0.1, 9000.0, "impossible"), (-0.0999, 9000.0, ""), (3.999, 9000.0, ""), (4.0, 9000.0, "impossible"),
         (10.0, 9000.0, "impossible"), (10.01, 9000.0, "spectrometer"), (0.5, 4.99, "spectrometer"), (0.5, 5.0, ""),
-        (0.5, 65534.0, ""), (0.5, 65535.0, "impossible"), (0.5, np.nan, ""), (np.nan, 9000.0, "impossible"),
+        (0.5, 65534.0, ""), (0.5, 65535.0, "impossible"), (0.5, np.nan, "impossible"), (np.nan, 9000.0, "impossible"),
     ],
 )  # fmt: skip
 def test_what_a_sensor_can_read(od: float, raw: float, kind: str) -> None:
@@ -258,21 +258,27 @@ class Culture:
     deficit: float = 0.0
     futile: float = 0.0
     over: list[int] = field(default_factory=lambda: [0, 0, 0])
+    helpless: float = math.nan  # highest OD since full feed was found not to be enough
+    eased: int = 0
 
     def band(self, od: float, minutes: float) -> tuple[float, float]:
         tolerance = max(0.04, 0.08 * abs(od))
         low = max(od, 0.0) * math.exp(-1.6 * self.since / 20.0 - 0.005 * minutes)
         return low - tolerance, max(od, 0.0) * math.exp(min(0.04 * minutes, 5.0)) + tolerance
 
-    def judge(self, od: float, t: float, believed: bool) -> list[str]:
+    def judge(self, od: float, t: float, believed: bool, setpoint: float) -> list[str]:
         if not believed:
             return []
+        kinds = self._judge(od, t, setpoint)
+        return kinds + ["cannot_hold"] * (not math.isnan(self.helpless))
+
+    def _judge(self, od: float, t: float, setpoint: float) -> list[str]:
         if math.isnan(self.od):
             return self.take(od, t, [])
         low, high = self.band(self.od, t - self.at)
         if low <= od <= high:
             self.suspects = 0
-            return self.take(od, t, self.accumulate(od, t))
+            return self.take(od, t, self.accumulate(od, t, setpoint))
         near = self.band(self.suspect, t - self.suspect_at) if not math.isnan(self.suspect) else (math.inf, -math.inf)
         self.suspects = self.suspects + 1 if near[0] <= od <= near[1] else 1
         self.suspect, self.suspect_at = od, t
@@ -287,24 +293,37 @@ class Culture:
         self.od, self.at, self.since = od, t, 0.0
         return kinds
 
-    def accumulate(self, od: float, t: float) -> list[str]:
+    def accumulate(self, od: float, t: float, setpoint: float) -> list[str]:
         if od <= 0.05 or self.od <= 0.05:
             return []
         dt, d, x = max(t - self.at, 1e-3), self.since / 20.0, math.log(od / self.od)
         rise = x - min(0.04, self.mu + 0.01) * dt + 0.5 * d if d > 0.0 else min(x - 0.04 * dt, 0.0)
         self.excess = max(self.excess + rise, 0.0)
         self.deficit = max(self.deficit - x - 1.6 * d - 0.005 * dt, 0.0)
-        self.futile = max(self.futile + x + 0.004 * dt, 0.0) if d / dt >= 0.8 * 0.06 else 0.0
+        full = d / dt >= 0.8 * 0.06
+        short = full and od > 1.05 * setpoint
+        self.futile = max(self.futile + x + 0.004 * dt, 0.0) if full else 0.0
         self.mu += (1.0 - math.exp(-dt / 60.0)) * (min(max((x + d) / dt, 0.0), 0.04) - self.mu)
         limit = 0.05 + 6.0 * math.hypot(0.005, 0.005 * od) / od
         self.over = [
             k + 1 if s > limit else 0 for k, s in zip(self.over, (self.excess, self.deficit, self.futile), strict=True)
         ]
         rising, falling, helpless = (k >= 3 for k in self.over)
-        kinds = ["no_dilution+"] * rising + ["falls+"] * falling + ["cannot_hold"] * (helpless and not rising)
+        kinds = ["no_dilution+"] * rising + ["falls+"] * falling
         self.excess, self.deficit = self.excess * (not rising), self.deficit * (not falling)
-        self.futile *= not (helpless or rising)
+        self.futile *= not ((helpless and short) or rising)
+        self.last(helpless and short and not rising, od, short, limit)
         return kinds
+
+    def last(self, begins: bool, od: float, short: bool, limit: float) -> None:
+        if math.isnan(self.helpless):
+            self.eased, self.helpless = 0, od if begins else math.nan
+            return
+        self.helpless = max(self.helpless, od)
+        falls = math.log(od / self.helpless) < -limit
+        self.eased = 0 if short and not falls else self.eased + 1
+        if self.eased >= 3:
+            self.helpless = math.nan
 
 
 def test_changes_are_judged_as_sample_by_sample() -> None:
@@ -315,10 +334,11 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
         change, twins, minute = UnexplainedChange(N, C), [Culture() for _ in range(N)], 0.0
         true = rng.choice([0.04, 0.055, 0.3, 0.5, 1.2], N)
         mu, gain = rng.choice([-0.03, -0.008, 0.0, 0.02, 0.035, 0.05], N), rng.choice([0.0, 0.4, 0.6, 1.0, 1.5, 1.8], N)
-        feeds = rng.choice([0.0, 0.5, 0.96, 1.2], N)
+        feeds, setpoint = rng.choice([0.0, 0.5, 0.96, 1.2], N), rng.choice([0.04, 0.3, 0.5, 2.0], N)
         for _ in range(60):
             dt = float(rng.choice([0.5, 1.0, 1.0, 1.0, 2.0, 7.0]))
             feed = feeds * (rng.random(N) < 0.95)
+            setpoint = np.where(rng.random(N) < 0.01, 2.0, setpoint)
             change.dosed(feed)
             for twin, ml in zip(twins, feed, strict=True):
                 twin.since += ml
@@ -327,15 +347,15 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
             minute += dt
             bubble = np.where(rng.random(N) < 0.05, rng.uniform(-0.1, 0.15, N), 0.0)
             od, believed = true + 0.003 * rng.standard_normal(N) + bubble, rng.random(N) < 0.95
-            findings = told(change.check(od, np.full(N, 60.0 * minute), believed))
-            rows = zip(twins, od, believed, strict=True)
-            expected = [t.judge(o, minute, b) for t, o, b in rows]
+            findings = told(change.check(od, np.full(N, 60.0 * minute), believed, setpoint))
+            rows = zip(twins, od, believed, setpoint, strict=True)
+            expected = [t.judge(o, minute, b, s) for t, o, b, s in rows]
             assert [sorted(kinds) for kinds in findings] == [sorted(kinds) for kinds in expected]
             seen |= {kind for kinds in expected for kind in kinds}
             same(
                 change.state(), twins, _od="od", _at="at", _since_ml="since", _suspect="suspect", _mu="mu",
                 _suspect_at="suspect_at", _suspects="suspects", _excess="excess", _deficit="deficit",
-                _futile="futile", _over="over",
+                _futile="futile", _over="over", _helpless_od="helpless", _eased="eased",
             )  # fmt: skip
             if rng.random() < 0.05:
                 saved, change = change.state(), UnexplainedChange(N, C)
