@@ -38,10 +38,10 @@ TABLE = {
     ),
     "dosing": (
         [f"{CHIBIO}/{name}.py" for name in (
-            "dosing", "dose_sequence", "sampling", "resume", "agenda", "overflow_pump", "diagnosis",
+            "dosing", "dose_sequence", "ending", "sampling", "resume", "agenda", "overflow_pump", "diagnosis",
         )],
         [f"hardware/test_{name}.py" for name in (
-            "dosing", "dose_sequence", "sampling", "agenda", "diagnosis", "overflow_pump", "reactors",
+            "dosing", "dose_sequence", "ending", "sampling", "agenda", "diagnosis", "overflow_pump", "reactors",
         )] + ["test_settings.py"],
     ),
 }  # fmt: skip

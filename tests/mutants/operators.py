@@ -153,10 +153,10 @@ class Module:
     def __init__(self, path: str) -> None:
         self.path, self.file = path, str(ROOT / path)
         self.name = path.removesuffix(".py").replace("/", ".")
-        self._tree = ast.parse((ROOT / path).read_text())
+        self.tree = ast.parse((ROOT / path).read_text())
         self.mutants: list[Mutant] = []
         self._places: list[tuple[ast.AST, str, int | None, ast.AST]] = []
-        self._visit(self._tree, "module", None, (1, 1))
+        self._visit(self.tree, "module", None, (1, 1))
 
     def _visit(self, parent: ast.AST, where: str, owner: tuple[str, int] | None, lines: tuple[int, int]) -> None:
         for field, value in ast.iter_fields(parent):
@@ -202,6 +202,6 @@ class Module:
         held = getattr(parent, field)
         setattr(parent, field, new if k is None else [*held[:k], new, *held[k + 1 :]])
         try:
-            return compile(ast.fix_missing_locations(copy.deepcopy(self._tree)), self.file, "exec")
+            return compile(ast.fix_missing_locations(copy.deepcopy(self.tree)), self.file, "exec")
         finally:
             setattr(parent, field, held)
