@@ -1,0 +1,131 @@
+"""What training tells of itself, by hand: records, diagnostics, counts; and the network's constant maps."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dqn.agent import DIAGNOSED, DQNAgent
+from dqn.config import DQNConfig
+from dqn.network import QNetwork, action_basis, initial_weights
+from dqn.trainer import Trainer, TrainRecord
+from tests.dqn.problems import IdentityEnv, streams
+
+CONFIG = DQNConfig(
+    hidden=(8,), total_steps=130, epsilon_steps=100, learn_start=20, batch_size=8, updates_per_step=2, target_period=10
+)
+
+
+class Paid(IdentityEnv):
+    """Keeps what it paid."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self.paid: list[np.ndarray] = []
+
+    def step(self, actions: np.ndarray) -> tuple[Any, ...]:
+        answer = super().step(actions)
+        self.paid.append(answer[1])
+        return answer
+
+
+def test_records_come_at_their_steps_and_at_the_end_and_tell_of_the_last_whole_episode() -> None:
+    env = Paid(range(2), length=40)
+    trainer = Trainer(env, DQNAgent(CONFIG, 3, 3, streams(range(2))), interval=30)
+    records = list(trainer.run())
+    assert [r.step for r in records] == [30, 60, 90, 120, 130]
+    assert [r.updates for r in records] == [20, 80, 140, 200, 220]  # two from step 21 on
+    assert [r.epsilon for r in records] == pytest.approx([0.715, 0.43, 0.145, 0.05, 0.05])
+    paid = np.array(env.paid)
+    episodes = [paid[start : start + 40].sum(axis=0) for start in (0, 40, 80)]
+    expected = [[np.nan] * 2, *episodes, [np.nan] * 2]
+    np.testing.assert_array_equal([r.episode_return for r in records], expected)
+    assert [bool((r.q_max > r.q_min).any()) for r in records] == [False, False, True, True, True]
+    assert list(trainer.run()) == []
+
+
+def test_loss_and_range_of_q_are_looked_at_every_hundredth_update() -> None:
+    agent = DQNAgent(DQNConfig(hidden=(8,), batch_size=4, huber=0.5), 3, 3, streams(range(2)))
+    generator = torch.Generator().manual_seed(0)
+    for k in range(1, DIAGNOSED + 2):
+        observation = torch.randn(2, 4, 3, generator=generator)
+        action = torch.randint(0, 3, (2, 4), generator=generator)
+        target = torch.randn(2, 4, generator=generator)
+        q = agent.online(observation).clone()
+        agent.fit(observation, action, target)
+        if k < DIAGNOSED:
+            assert not agent.loss.any()
+            assert not agent.q_range.any()
+        if k == DIAGNOSED == 100:
+            error = q.gather(-1, action.unsqueeze(-1)).squeeze(-1) - target
+            loss = torch.nn.functional.huber_loss(error, torch.zeros(2, 4), reduction="none", delta=0.5).mean(-1)
+            seen = torch.stack([q.flatten(1).min(1).values, q.flatten(1).max(1).values], dim=1)
+    torch.testing.assert_close(agent.loss, loss)
+    torch.testing.assert_close(agent.q_range, seen)
+
+
+def test_records_of_several_trainers_are_joined_in_order() -> None:
+    one, other = (
+        TrainRecord(7, 5, 0.5, *(np.array([10.0 * k + j]) for j in range(4)))  # type: ignore[arg-type]
+        for k in (1, 2)
+    )
+    joined = TrainRecord.joined([one, other])
+    assert (joined.step, joined.updates, joined.epsilon) == (7, 5, 0.5)
+    fields = (joined.episode_return, joined.loss, joined.q_min, joined.q_max)
+    assert [list(field) for field in fields] == [[10.0 + j, 20.0 + j] for j in range(4)]
+
+
+@pytest.mark.parametrize(("total", "start", "each", "updates"), [(100, 30, 2, 140), (20, 30, 2, 0), (31, 30, 1, 1)])
+def test_how_many_updates_a_training_takes(total: int, start: int, each: int, updates: int) -> None:
+    assert DQNConfig(total_steps=total, learn_start=start, updates_per_step=each).total_updates == updates
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"input_matrix": (1.0, 0.0), "input_offset": ()}, "input_matrix has 2 values and agent.input_offset 0"),
+        ({"input_matrix": (), "input_offset": (1.0,)}, "input_matrix has 0 values and agent.input_offset 1"),
+        (
+            {"input_matrix": (1.0, 0.0, 1.0), "input_offset": (0.0, 0.0)},
+            "input_matrix has 3 values and agent.input_offset 2: allowed one row",
+        ),
+        ({"init_mirror": (1,)}, "init_mirror"),
+        ({"input_matrix": (1.0, 0.0), "input_offset": (0.0, 0.0), "init_mirror": (1,)}, "init_mirror"),
+        ({"input_matrix": (1.0, 0.0), "input_offset": (0.0, 0.0), "init_mirror": (1, 2)}, "init_mirror"),
+        ({"input_matrix": (1.0, 0.0), "input_offset": (0.0, 0.0), "init_mirror": (1, -1), "hidden": (4, 5)}, "hidden"),
+    ],
+)
+def test_parts_of_the_input_map_that_do_not_fit_are_refused(changes: dict[str, Any], key: str) -> None:
+    with pytest.raises(ValueError, match=rf"agent\.{key}"):
+        DQNConfig(**changes)
+    DQNConfig(hidden=(5,), input_matrix=(1.0, 0.0, 0.0, 1.0), input_offset=(0.0, 0.0))
+
+
+def test_rows_of_the_action_basis_have_their_lengths_and_rise_at_the_end() -> None:
+    for decay in (0.0, 0.5, 2.0):
+        basis = action_basis(9, decay).double()
+        lengths = np.sqrt(9.0) * (1.0 + np.arange(9.0)) ** -decay
+        np.testing.assert_allclose(basis.norm(dim=1), lengths, rtol=1e-5)
+        assert bool((basis[:, -1] > 0.0).all())
+    linear = action_basis(9, 0.0)[1].double().numpy()
+    np.testing.assert_allclose(np.diff(linear), np.diff(linear)[0], rtol=1e-5)
+
+
+def test_other_weights_keep_maps_and_what_is_exported_is_a_copy() -> None:
+    matrix, offset, basis = torch.tensor([[3.0, -3.0], [0.0, 2.0], [1.0, 0.5]]), torch.ones(3), action_basis(4, 1.0)
+    flat = torch.from_numpy(np.stack([initial_weights((3, 5, 4), np.random.SeedSequence(k)) for k in range(2)]))
+    network = QNetwork(flat[:1], (3, 5, 4), matrix, offset, basis)
+    other = network.with_weights(flat)
+    observation = torch.rand(1, 6, 2)
+    torch.testing.assert_close(other(observation.expand(2, -1, -1))[:1], network(observation))
+    np.testing.assert_array_equal(network.output_map(), basis.numpy())
+    np.testing.assert_array_equal(QNetwork(flat, (3, 5, 4)).output_map(), np.eye(4))
+    for array in (*network.input_map(), network.output_map()):
+        array += 1.0
+    np.testing.assert_array_equal(network.input_map()[0], matrix.numpy())
+    np.testing.assert_array_equal(network.input_map()[1], np.ones(3))
+    np.testing.assert_array_equal(network.output_map(), basis.numpy())
+    plain = QNetwork(flat, (3, 5, 4))
+    np.testing.assert_array_equal(plain.input_map()[0], np.eye(3))
+    np.testing.assert_array_equal(plain.input_map()[1], np.zeros(3))
