@@ -44,6 +44,10 @@ TABLE = {
             "dosing", "dose_sequence", "ending", "sampling", "agenda", "diagnosis", "overflow_pump", "reactors",
         )] + ["test_settings.py"],
     ),
+    "figures": (
+        ["experiments/control/metrics.py", "experiments/comparison/statistics.py"],
+        ["experiments/test_metrics.py", "experiments/test_statistics.py"],
+    ),
 }  # fmt: skip
 """Which tests are asked about which modules; paths of tests are below tests/."""
 

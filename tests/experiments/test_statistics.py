@@ -1,0 +1,125 @@
+"""Numbers of a comparison from two replicates whose errors are constant, all by hand."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import ttest_1samp
+
+from envs.scenario import Scenario
+from experiments.comparison.statistics import Spread, details, pairs, row, rows, total_pairs, totals
+from experiments.comparison.trials import Trial, Window, windows
+
+NAMES = {"controller": "pi", "plant": "quiet", "scenario": "steps"}
+
+
+def trial(controller: str = "pi", error: tuple[float, ...] = (0.1, 0.2), minutes: float = 20.0) -> Trial:
+    """Replicates that stay `error` above the setpoint for two phases; their sensor reads 0.01 too much."""
+    schedule = Scenario((0.5, 0.8), (minutes, minutes), (37.0, 37.0))
+    minute = np.arange(0.0, 2.0 * minutes + 1e-9)
+    setpoint = np.where(minute < minutes, 0.5, 0.8)
+    od = setpoint + np.array(error)[:, None]
+    rate = np.where(minute % 2 == 0, 0.01, 0.012) * np.ones_like(od)
+    media = np.outer(np.arange(1.0, len(error) + 1), minute)  # 1, 2 mL a minute
+    held = np.arange(3.0, 3.0 + len(error))
+    overflowed = np.arange(len(error)) > 0
+    return Trial(
+        controller, "quiet", "steps", schedule, minute, od, od - 0.01, rate, np.full_like(od, 37.0), media, held,
+        overflowed,
+    )  # fmt: skip
+
+
+def test_the_interval_is_students() -> None:
+    values = np.array([0.3, np.nan, 0.5, 0.1, np.inf, 0.7])
+    found, finite = Spread(values), values[np.isfinite(values)]
+    interval = ttest_1samp(finite, 0.0).confidence_interval(0.95)
+    assert (found.n, found.mean) == (4, pytest.approx(0.4))
+    assert found.sd == pytest.approx(math.sqrt((0.01 + 0.01 + 0.09 + 0.09) / 3.0))
+    assert found.ci95 == pytest.approx([interval.low, interval.high])
+    assert found.sign == 0
+    assert [Spread(np.array(v)).sign for v in ([1.0, 1.1, 1.2], [-1.0, -1.1, -1.2], [1.0, -1.0])] == [1, -1, 0]
+    alone, none = Spread(np.array([0.3])), Spread(np.array([np.nan]))
+    assert (alone.n, alone.mean, alone.sign, none.n, none.sign) == (1, 0.3, 0, 0, 0)
+    assert np.isnan([alone.sd, *alone.ci95, none.mean, none.sd]).all()
+    same = Spread(np.array([0.2, 0.2]))
+    assert (same.ci95, same.sign) == ([0.2, 0.2], 1)
+
+
+def test_a_row_tells_means_over_replicates() -> None:
+    one = trial()
+    [first, second] = rows([one])
+    assert str(first) == str(row(one, windows(one.schedule)[0]))  # nan among them
+    assert first.items() >= {**NAMES, "window": "0.5", "setpoint": 0.5, "n": 2}.items()
+    assert (second["window"], second["setpoint"]) == ("0.8", 0.8)
+    # the last sample of a window is the first of the next: there the error is 0.3 more, over half a minute
+    ise = [20.0 * e**2 + 0.5 * ((e + 0.3) ** 2 - e**2) for e in (0.1, 0.2)]
+    itae = [200.0 * e + 0.5 * 20.0 * 0.3 for e in (0.1, 0.2)]
+    for key, expected in (("ise", ise), ("itae", itae)):
+        assert first[f"{key}_mean"] == pytest.approx(np.mean(expected))
+        assert first[f"{key}_sd"] == pytest.approx(abs(expected[1] - expected[0]) / math.sqrt(2.0))
+        half = 12.706204736 * abs(expected[1] - expected[0]) / 2.0  # Student's t with one degree of freedom
+        assert first[f"{key}_ci95"] == pytest.approx([np.mean(expected) - half, np.mean(expected) + half])
+    assert (second["ise_mean"], second["itae_mean"]) == pytest.approx((20.0 * 0.025, 200.0 * 0.15))
+    assert second["steady_abs_error"] == pytest.approx(0.15)
+    assert (first["media_ml"], second["media_ml"]) == (30.0, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("errors", "settling"),
+    [((0.0, 0.0, 0.0), 0.0), ((0.0, 0.0, 0.3), 0.0), ((0.0, 0.3, 0.3), math.nan), ((0.0, 0.3), math.nan)],
+)
+def test_settling_is_the_median_and_never_is_late(errors: tuple[float, ...], settling: float) -> None:
+    one = trial(error=errors)
+    assert row(one, Window("0.8", 0.8, 20.0, 40.0))["settling_min"] == pytest.approx(settling, nan_ok=True)
+
+
+def test_details_tell_the_rest() -> None:
+    [_, second] = details([trial(error=(0.03, 0.2))])
+    means = {"ise": (0.03**2 + 0.2**2) / 2.0, "itae": 0.115, "clean": (0.02**2 + 0.19**2) / 2.0}
+    assert second == {
+        **NAMES, "window": "0.8", "window_min": 20.0,
+        "ise_per_window": pytest.approx(means["ise"]), "itae_per_window": pytest.approx(10.0 * means["itae"]),
+        "clean_ise": pytest.approx(20.0 * means["clean"]), "clean_itae": pytest.approx(200.0 * 0.105),
+        "floor_ise": pytest.approx(20.0 * 1e-4), "floor_itae": pytest.approx(2.0), "effort_ul_s": pytest.approx(2.0),
+        "settled": 1, "overflowed": 1,
+    }  # fmt: skip
+
+
+def test_totals_are_sums_over_windows() -> None:
+    one = trial()
+    [found] = totals([one])
+    both = [[r[key] for r in rows([one])] for key in ("ise_mean", "itae_mean", "media_ml")]
+    assert [found[key] for key in ("ise_mean", "itae_mean", "media_ml")] == pytest.approx([sum(b) for b in both])
+    parts = details([one])
+    for key in ("clean_ise", "clean_itae", "floor_ise", "floor_itae"):
+        assert found[key] == pytest.approx(sum(part[key] for part in parts))
+    assert (found["n"], found["held"], found["effort_ul_s"]) == (2, 3.5, pytest.approx(2.0))
+    # the last eleven samples of the first window have one of the next setpoint among them
+    assert found["clean_steady_abs_error"] == pytest.approx(0.14 + 0.5 * 0.3 / 11.0)
+    uneven = replace(one, rate=np.where(one.minute < 20.0, one.rate, 0.0))
+    assert totals([uneven])[0]["effort_ul_s"] == pytest.approx(1.0)
+    spread = Spread(np.array([sum(s) for s in zip(*(one.score(w).ise for w in windows(one.schedule)), strict=True)]))
+    assert (found["ise_sd"], found["ise_ci95"]) == (pytest.approx(spread.sd), pytest.approx(spread.ci95))
+
+
+def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
+    mine, theirs = trial("mpc", (0.1, 0.2, 0.15)), trial("pi", (0.2, 0.3, 0.26))
+    strange = replace(theirs, plant="noisy", controller="dqn")
+    found = pairs([mine, theirs, strange], "pi")
+    assert [(p["controller"], p["against"], p["window"], p["metric"]) for p in found] == [
+        ("mpc", "pi", window, metric) for window in ("0.5", "0.8") for metric in ("ise", "itae")
+    ]
+    late = found[3]  # the ITAE of the second window: 200 e
+    assert late["difference"] == pytest.approx(200.0 * (0.15 - 0.76 / 3.0))
+    assert late["percent"] == pytest.approx(100.0 * (0.45 / 0.76 - 1.0))
+    assert (late["n"], late["verdict"], late["plant"], late["scenario"]) == (3, "lower", "quiet", "steps")
+    assert late["ci95"] == pytest.approx(Spread(200.0 * np.array([-0.1, -0.1, -0.11])).ci95)
+    whole = total_pairs([mine, theirs], "pi")
+    assert [(p["window"], p["metric"]) for p in whole] == [("all", "ise"), ("all", "itae")]
+    assert whole[1]["difference"] == pytest.approx(found[1]["difference"] + found[3]["difference"])
+    assert total_pairs([mine, theirs], "mpc")[1]["verdict"] == "higher"
+    same = pairs([replace(theirs, controller="dqn"), theirs], "pi")
+    assert {p["verdict"] for p in same} == {"no difference shown"}
+    perfect = replace(theirs, od=np.where(theirs.minute < 20.0, 0.5, 0.8) * np.ones((3, 1)))
+    assert math.isnan(pairs([mine, perfect], "pi")[3]["percent"])
