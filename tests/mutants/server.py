@@ -249,6 +249,8 @@ def run_group(modules: list[Module], tests: list[str], chosen: list[Mutant], tel
     def serve(out: int) -> int:
         def say(mutant: Mutant, result: str) -> None:
             told.append((chosen.index(mutant), result))
+            if os.isatty(shown):
+                os.write(shown, f"\r{len(told)} of {len(chosen)}\r".encode())
 
         server = Server(modules, chosen, say)
         status = pytest.main(options(base, *tests), [server])
