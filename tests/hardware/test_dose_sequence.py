@@ -133,7 +133,7 @@ def test_a_dose_is_written_down_set_read_back_and_ended_twice() -> None:
 @pytest.mark.parametrize(
     ("lost", "sent", "fed_ml", "words"),
     [
-        (WASTE_ON, [WASTE_ON], 0.0, "no medium was given"),
+        (WASTE_ON, [WASTE_ON], 0.0, "no dose was begun"),
         (FEED_ON, [WASTE_ON, FEED_ON], pytest.approx(FEED_S), "counted as dosed"),
     ],
 )
