@@ -41,7 +41,8 @@ TABLE = {
             "dosing", "dose_sequence", "ending", "sampling", "resume", "agenda", "overflow_pump", "diagnosis",
         )],
         [f"hardware/test_{name}.py" for name in (
-            "dosing", "dose_sequence", "ending", "history", "sampling", "agenda", "diagnosis", "overflow_pump", "reactors",
+            "dosing", "dose_sequence", "ending", "history", "sampling", "agenda", "diagnosis", "overflow_pump",
+            "reactors",
         )] + ["test_settings.py"],
     ),
     "figures": (
