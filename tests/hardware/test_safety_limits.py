@@ -112,10 +112,11 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
         budget.grant(allowed)
         feed = allowed * c.period_s * (rng.random(N) < 0.7)
         waste = rng.choice([0.0, 0.5, 9.0], N)
-        budget.book(feed, waste, now)
+        at = now if rng.random() < 0.9 else now - float(rng.choice([70.0, 3000.0, 4000.0]))  # a repeat told late
+        budget.book(feed, waste, at)
         for twin, a, f, w in zip(twins, allowed, feed, waste, strict=True):
             twin.owed += a * c.period_s
-            twin.book(f, w, now)
+            twin.book(f, w, at)
         same(budget.state(), twins, volume_ml="level", fed_ml="fed", _owed_ml="owed", _unusable="unusable")
         if rng.random() < 0.3:
             saved, budget = budget.state(), FeedBudget(N, c)
