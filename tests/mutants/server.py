@@ -26,7 +26,7 @@ from tests.mutants.operators import Module, Mutant
 
 ROOMS = ("conf", "dqn", "envs", "experiments", "hardware", "tests")
 BROKEN = 70  # exit status of a fork in which this tool itself failed
-LIMIT_S = 20.0  # on top of ten times what the tests take unmutated
+LIMIT_S = 10.0  # on top of ten times what the tests take unmutated
 BUDGET_S = 8.0  # of tests for one mutant, as timed under trace: the fastest ones
 
 Tell = Callable[[Mutant, str], None]
