@@ -73,7 +73,7 @@ def main(arguments: list[str]) -> int:
     everything = [m for modules, _ in groups for module in modules for m in module.mutants]
     if "again" in given:
         survivors = json.loads(Path(given["again"]).read_text())["survivors"]
-        everything = [m for m in everything if [*m.key] in survivors]
+        everything = [m for m in everything if [*m.key] in survivors and m.key not in listed()]
     if "sample" in given:
         rng = random.Random(int(given.get("seed", "0")))
         everything = rng.sample(everything, min(int(given["sample"]), len(everything)))
