@@ -1,9 +1,11 @@
 """What the journal's rows say of a dose and of a reactor, row by row."""
 
+from dataclasses import asdict
 from typing import Any
 
 import pytest
 
+from hardware.chibio.ending import Ending
 from hardware.chibio.resume import ReactorHistory, replay
 from hardware.errors import RecordingError
 
@@ -13,6 +15,13 @@ def row(n: int, kind: str, reactor: str = "M0", **fields: Any) -> dict[str, Any]
 
 
 INTENT = {"sample": [60.0, 2], "feed_ml": 0.5, "waste_ml": 6.0, "carry_ml": 0.1, "doses": 1}
+
+
+def test_nothing_is_known_of_a_reactor_without_rows_and_a_dose_may_have_given_nothing() -> None:
+    known = {key: value for key, value in asdict(ReactorHistory()).items() if value == value}  # but for nan
+    assert {key: value for key, value in known.items() if value} == {}
+    assert set(asdict(Ending(10.0)).values()) == {10.0, 0}
+    assert Ending(100.0, 0.5, 6.0, 2, 0).repeats() == [(163.0, 0.5, 0.0), (226.0, 0.5, 0.0)]
 
 
 def test_what_later_rows_say_of_a_dose() -> None:

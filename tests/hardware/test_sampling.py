@@ -97,6 +97,13 @@ def test_lateness_is_measured_against_the_earliest_of_the_last_three_that_were_w
         assert sampling.late_s == expected
     sampling.pass_over(sample(math.nan, 9))
     assert sampling.key == (540.0, 9)
+    stepped = Sampling(CONFIG, clock := VirtualClock())
+    for k, offset in enumerate((3.0, 9.0), 1):
+        stepped.not_taken(is_new=False)
+        clock.sleep(60.0 * k + offset - clock.now())
+        take(stepped, clock, sample(60.0 * k, k))
+    clock.sleep(63.0)  # 72 s after its time, against 3 s of the earliest
+    assert "moved by -69 s" in take(stepped, clock, sample(120.0, 3))
     clock.sleep(55.0)
     take(sampling, clock, sample(600.0, 10))
     assert sampling.late_s == math.inf  # what was known of the offsets is forgotten

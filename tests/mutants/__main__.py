@@ -44,7 +44,7 @@ TABLE = {
         [f"hardware/test_{name}.py" for name in (
             "dosing", "dose_sequence", "ending", "history", "sampling", "agenda", "diagnosis", "overflow_pump",
             "reactors",
-        )] + ["test_settings.py"],
+        )] + ["experiments/test_open_dose.py", "test_settings.py"],
     ),
     "figures": (
         ["experiments/control/metrics.py", "experiments/comparison/statistics.py"],
