@@ -168,7 +168,7 @@ class Server(Deterministic):
         found = defaultdict(list)
         files = {m.file: m.path for m in self._modules.values()}
         for thing in gc.get_objects():
-            if isinstance(thing, types.FunctionType) and thing.__code__.co_filename in files:
+            if type(thing) is types.FunctionType and thing.__code__.co_filename in files:
                 found[files[thing.__code__.co_filename], thing.__code__.co_qualname].append(thing)
         return found
 
