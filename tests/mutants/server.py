@@ -117,9 +117,9 @@ class Deterministic:
 class Server(Deterministic):
     """Plugin in place of pytest's loop: holds the collected tests, and forks for each mutant."""
 
-    def __init__(self, modules: list[Module], chosen: list[Mutant], tell: Tell) -> None:
+    def __init__(self, modules: list[Module], chosen: list[Mutant], tell: Tell, shown: int) -> None:
         self._modules = {m.path: m for m in modules}
-        self._chosen, self._tell = chosen, tell
+        self._chosen, self._tell, self._shown = chosen, tell, shown
         self._lines = Lines({m.file for m in modules})
         self.left: list[Mutant] = []  # to be imported
         self.seconds: dict[str, float] = {}
@@ -130,6 +130,8 @@ class Server(Deterministic):
         """A failure ends a fork at once."""
         self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
         if report.failed:
+            if not self.tests:  # without a mutant
+                os.write(self._shown, f"{report.nodeid} fails without a mutant\n{report.longreprtext}\n".encode())
             os._exit(1)
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
@@ -139,7 +141,7 @@ class Server(Deterministic):
         self._items = {item.nodeid: item for item in session.items}
         status, answer = forked(self._baseline, 1800.0)
         if status:
-            raise SystemExit("the tests fail without a mutant; run them by themselves first")
+            raise pytest.UsageError("the tests fail without a mutant")
         self.seconds, self.tests = pickle.loads(answer)
         self._functions = self._index()
         gc.freeze()
@@ -252,10 +254,8 @@ def run_group(modules: list[Module], tests: list[str], chosen: list[Mutant], tel
             if os.isatty(shown):
                 os.write(shown, f"\r{len(told)} of {len(chosen)}\r".encode())
 
-        server = Server(modules, chosen, say)
-        status = pytest.main(options(base, *tests), [server])
-        if not told and not server.left and chosen:
-            os.write(shown, f"pytest ended with {status}\n".encode())
+        server = Server(modules, chosen, say, shown)
+        if pytest.main(options(base, *tests), [server]):
             return 1
         third_party = [name for name in sys.modules if name.split(".")[0] not in (*ROOMS, "__main__")]
         left = []
