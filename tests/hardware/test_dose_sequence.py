@@ -363,4 +363,5 @@ def test_after_targets_that_could_not_be_set_no_dose_begins_before_the_pumps_are
     assert "has not ended" in bench.book.notes[-1]
     bench.line.trouble = lambda path: None
     bench.run()
+    assert (ended(bench)["feed_ml"], ended(bench)["waste_ml"]) == (0.0, 0.0)
     assert bench.begin(key=(120.0, 3)).feed_ml > 0.0
