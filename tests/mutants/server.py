@@ -26,7 +26,7 @@ from tests.mutants.operators import Module, Mutant
 
 ROOMS = ("conf", "dqn", "envs", "experiments", "hardware", "tests")
 BROKEN = 70  # exit status of a fork in which this tool itself failed
-LIMIT_S = 10.0  # on top of ten times what the tests take unmutated
+LIMIT_S = 10.0  # on top of three times what the tests take unmutated
 BUDGET_S = 20.0  # of the processor for one mutant, as timed under trace: the fastest tests
 
 Tell = Callable[[Mutant, str], None]
@@ -195,7 +195,7 @@ class Server(Deterministic):
             self.left.append(mutant)
             return
         order = self.order(tests)
-        limit = LIMIT_S + 10.0 * sum(self.seconds[t] for t in order)
+        limit = LIMIT_S + 3.0 * sum(self.seconds[t] for t in order)
         self._tell(mutant, outcome(forked(lambda _: self._try(old, new, order), limit)[0]) if order else "not run")
 
     def _try(self, functions: list[types.FunctionType], code: types.CodeType, tests: list[str]) -> int:
@@ -286,5 +286,5 @@ def run_group(modules: list[Module], tests: list[str], chosen: list[Mutant], tel
     of = {m.path: m for m in modules}
     for index, order, seconds in left:
         mutant = chosen[index]
-        status, _ = forked(lambda _, m=mutant, o=order: imported(of[m.path], m, o, base), LIMIT_S + 10.0 * seconds)
+        status, _ = forked(lambda _, m=mutant, o=order: imported(of[m.path], m, o, base), LIMIT_S + 3.0 * seconds)
         tell(mutant, outcome(status) if order else "not run")
