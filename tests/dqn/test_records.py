@@ -129,3 +129,23 @@ def test_other_weights_keep_maps_and_what_is_exported_is_a_copy() -> None:
     plain = QNetwork(flat, (3, 5, 4))
     np.testing.assert_array_equal(plain.input_map()[0], np.eye(3))
     np.testing.assert_array_equal(plain.input_map()[1], np.zeros(3))
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.5])
+def test_the_target_of_an_update_with_and_without_an_action_gap(gap: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One transition in the memory, two features of it: y = r + gamma max Q(s') - gap (max Q(s) - Q(s, a))."""
+    maps = {"input_matrix": (1.0, -1.0, 0.0, 2.0), "input_offset": (0.5, 0.0)}
+    config = DQNConfig(hidden=(8,), batch_size=4, gamma=0.9, action_gap=gap, reward_scale=2.0, **maps)
+    agent = DQNAgent(config, 2, 3, streams(range(2)))
+    np.testing.assert_array_equal(agent.online.input_map()[0], [[1.0, -1.0], [0.0, 2.0]])
+    np.testing.assert_array_equal(agent.online.input_map()[1], [0.5, 0.0])
+    assert agent.sizes == (2, 8, 3)
+    before, after, action = np.full((2, 2), 0.3), np.full((2, 2), 0.7), np.array([1, 2])
+    agent.observe(before, action, np.array([0.25, -0.5]), after, np.ones(2))
+    seen: list[torch.Tensor] = []
+    monkeypatch.setattr(agent, "fit", lambda observation, chosen, target: seen.append(target))
+    agent.learn()
+    q, q_after = (agent.target(torch.full((2, 1, 2), x))[:, 0] for x in (0.3, 0.7))
+    chosen = q[torch.arange(2), torch.tensor(action)]
+    y = torch.tensor([0.5, -1.0]) + 0.9 * q_after.max(1).values - gap * (q.max(1).values - chosen)
+    torch.testing.assert_close(seen[0], y[:, None].expand(2, 4))

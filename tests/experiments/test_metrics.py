@@ -35,6 +35,13 @@ def test_settling_is_the_first_moment_after_which_the_band_is_kept():
     assert m.steady_abs_error[0] == 0.0
 
 
+def test_two_samples_make_a_metric_one_makes_none_and_the_end_needs_a_sample_of_its_own():
+    t = np.array([[0.0, 30.0, np.nan], [29.0, np.nan, np.nan], [0.0, 1.0, 19.9], [0.0, 1.0, 20.0]])
+    m = window_metrics(t, np.where(np.isfinite(t), 0.6, np.nan), 0.5, 0.0, 30.0)
+    np.testing.assert_allclose(m.ise, [0.3, np.nan, 0.199, 0.2])
+    np.testing.assert_allclose(m.steady_abs_error, [0.1, np.nan, np.nan, 0.1])
+
+
 def test_missing_samples_are_bridged():
     """A linear error is integrated exactly by trapezia, however many samples are missing between."""
     t = np.arange(0.0, 31.0)

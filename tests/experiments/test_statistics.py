@@ -103,6 +103,16 @@ def test_totals_are_sums_over_windows() -> None:
     assert (found["ise_sd"], found["ise_ci95"]) == (pytest.approx(spread.sd), pytest.approx(spread.ci95))
 
 
+def test_totals_keep_replicates_and_windows_apart() -> None:
+    [found] = totals([trial(error=(0.1, 0.2, 0.6))])
+    assert (found["n"], found["held"]) == (3, 4.0)
+    assert found["effort_ul_s"] == pytest.approx(2.0)
+    assert found["media_ml"] == pytest.approx(80.0)
+    assert found["clean_steady_abs_error"] == pytest.approx(0.29 + 0.5 * 0.3 / 11.0)
+    small = pairs([trial("mpc", (0.01, 0.011)), trial("pi", (0.02, 0.021))], "pi")
+    assert small[2]["percent"] == pytest.approx(100.0 * (0.01**2 + 0.011**2) / (0.02**2 + 0.021**2) - 100.0)
+
+
 def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
     mine, theirs = trial("mpc", (0.1, 0.2, 0.15)), trial("pi", (0.2, 0.3, 0.26))
     strange = replace(theirs, plant="noisy", controller="dqn")

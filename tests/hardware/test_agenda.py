@@ -26,10 +26,11 @@ def test_steps_run_when_they_are_due_in_order_and_an_error_removes_one_task_only
 
     assert agenda.next_due() == math.inf
     agenda.run_due()
-    agenda.add(task("a", 5.0, 100.0))
+    kept = task("a", 5.0, 100.0), task("d", 0.0, 50.0)  # so that only the agenda can end them
+    agenda.add(kept[0])
     agenda.add(task("b"), 5.0)
     agenda.add(task("c", fails=True))
-    agenda.add(task("d", 0.0, 50.0))
+    agenda.add(kept[1])
     with pytest.raises(RuntimeError, match="c"):
         agenda.run_due()
     assert tape == [("a", 100.0), ("c", 100.0)]

@@ -61,6 +61,12 @@ def test_each_fault_by_itself_and_the_gravest_first(
     assert fault is None or (fault.detail and fault.remedy)
 
 
+def test_the_mode_that_is_on_is_named() -> None:
+    fault = diagnose(replace(SOUND, modes=("Chemostat",)), CONFIG, age_s=0.0, **EXPECTED)
+    assert fault is not None
+    assert fault.detail == "Chemostat: not as this program left it"
+
+
 @pytest.mark.parametrize(
     ("error", "present", "kind"),
     [

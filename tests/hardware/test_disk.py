@@ -106,6 +106,27 @@ def test_a_recording_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pytest.
                     recorder.write({"time_min": 1.0, "od": 0.5})
 
 
+def test_a_file_that_is_refused_is_closed(tmp_path: Path) -> None:
+    (tmp_path / "r").write_text("my shopping list\n")
+    with pytest.raises(RecordingError, match="choose another file"):
+        Recorder(tmp_path / "r", ["time_min"])
+
+
+def test_the_newest_rows_are_read_again_from_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    journal = Journal(tmp_path / "j", fsync=False)
+    for k in range(9):
+        journal.append("sample", {"k": k})
+    journal.close()
+    assert journal.rows == []
+    assert [row["k"] for row in journal.reread()] == list(range(9))
+    size = journal.path.stat().st_size
+    monkeypatch.setattr("hardware.storage.journal.TAIL", size - 1)
+    assert [row["k"] for row in journal.reread()] == list(range(1, 9))
+    journal.path.unlink()
+    with pytest.raises(RecordingError, match="No such file or directory; check folder and disk"):
+        journal.reread()
+
+
 def test_the_cells_of_a_recording(tmp_path: Path) -> None:
     row = {"a": 1, "b": True, "c": None, "d": np.nan, "e": np.float64(0.1), "f": 'x,"y"', "g": 1e-7, "h": "ä"}
     with Recorder(tmp_path / "r", list(row)) as recorder:

@@ -133,7 +133,7 @@ def test_a_dose_is_written_down_set_read_back_and_ended_twice() -> None:
 @pytest.mark.parametrize(
     ("lost", "sent", "fed_ml", "words"),
     [
-        (WASTE_ON, [WASTE_ON], 0.0, "no medium was given"),
+        (WASTE_ON, [WASTE_ON], 0.0, "no dose was begun"),
         (FEED_ON, [WASTE_ON, FEED_ON], pytest.approx(FEED_S), "counted as dosed"),
     ],
 )
@@ -275,3 +275,93 @@ def test_the_feed_is_switched_off_every_two_seconds_until_the_device_has_heard_i
     assert (bench.book.fault is not None) == (not isinstance(error, DeviceStateError))
     bench.run()
     assert bench.line.sent()[-6:] == END
+
+
+def ended(bench: Bench) -> dict[str, Any]:
+    """The row of the end, with numbers of the order of milliseconds and microlitres."""
+    [end] = bench.of("dose_end")
+    keys = ("feed_ml", "waste_ml", "feed_times", "waste_times", "on_s")
+    return {key: round(end[key], 3) for key in keys}
+
+
+@pytest.mark.parametrize(("dead_s", "times"), [(60.0, 0), (65.0, 1), (123.0, 1), (128.0, 2)])
+def test_what_the_device_repeats_until_it_has_heard_the_end_is_told(dead_s: float, times: int) -> None:
+    """The pumps start at run time 1; nothing is heard from then on for so long."""
+    bench = Bench()
+    bench.begin()
+
+    def dead(path: str) -> None:
+        if bench.clock.now() < 1000.0 + dead_s:
+            raise LinkError("no answer")
+
+    bench.line.trouble = dead
+    bench.run()
+    whole = {"feed_ml": round(FEED_S, 3), "waste_ml": round(WASTE_S, 3), "on_s": 1.0}
+    assert ended(bench) == {**whole, "feed_times": times, "waste_times": times}
+    assert [(e.feed_times, e.waste_times) for e in bench.doses.endings] == ([(times, times)] if times else [])
+    assert [f"repeated {times} times" in note for note in bench.book.notes] == [True] * (times > 0)
+    assert bench.book.fault is not None
+
+
+def test_a_feed_pump_that_was_heard_to_be_off_repeats_nothing_while_the_waste_goes_on() -> None:
+    bench = Bench()
+    bench.begin()
+
+    def deaf(path: str) -> None:
+        if path == OFFS[1] and bench.clock.now() < 1130.0:
+            raise LinkError("no answer")
+
+    bench.line.trouble = deaf
+    bench.run(60.0)
+    assert bench.book.fault is not None
+    assert bench.book.fault.kind == "link"
+    bench.run()
+    assert (ended(bench)["feed_times"], ended(bench)["waste_times"]) == (0, 2)
+    assert bench.book.notes == []
+
+
+def test_a_feed_pump_that_answers_off_and_stays_on_has_gone_on() -> None:
+    bench = Bench()
+    bench.begin()
+    bench.line.shown = {"Pump1__ON": 1}
+    bench.run(130.0)
+    bench.line.shown = {}
+    bench.run()
+    assert (ended(bench)["feed_times"], ended(bench)["waste_times"]) == (2, 2)
+
+
+def test_a_device_that_was_restarted_in_a_dose_has_repeated_nothing() -> None:
+    bench = Bench()
+    bench.begin()
+    bench.line.shown = {"Experiment__startTime": "2026-01-01 01:00:00", "Pump1__ON": 1}
+    bench.run(130.0)
+    bench.line.shown = {"Experiment__startTime": "2026-01-01 01:00:00"}
+    bench.run()
+    assert (ended(bench)["feed_times"], ended(bench)["waste_times"]) == (0, 0)
+    assert "the device was restarted in a dose" in bench.book.notes[-1]
+
+
+def test_a_dose_that_is_cut_short_gave_less() -> None:
+    bench = Bench()
+    bench.begin()
+    bench.doses.ended(1.25)
+    assert ended(bench) == {"feed_ml": 0.25, "waste_ml": 0.25, "feed_times": 0, "waste_times": 0, "on_s": 1.0}
+    bench.doses.ended(2.0)
+    assert len(bench.of("dose_end")) == 1
+
+
+def test_after_targets_that_could_not_be_set_no_dose_begins_before_the_pumps_are_verified_off() -> None:
+    bench = Bench()
+
+    def dead(path: str) -> None:
+        raise LinkError("no answer")
+
+    bench.line.trouble = dead
+    assert bench.begin() == DosePlan()
+    bench.run(5.0)
+    assert bench.begin(key=(120.0, 3)) == DosePlan()
+    assert "has not ended" in bench.book.notes[-1]
+    bench.line.trouble = lambda path: None
+    bench.run()
+    assert (ended(bench)["feed_ml"], ended(bench)["waste_ml"]) == (0.0, 0.0)
+    assert bench.begin(key=(120.0, 3)).feed_ml > 0.0

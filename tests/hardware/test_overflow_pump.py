@@ -75,6 +75,7 @@ def test_what_a_read_shows_of_it(on: int, target: float, seen: str) -> None:
     assert PUMP.wrong(found).startswith(seen)
     assert bool(PUMP.wrong(found)) == bool(seen)
     assert not OverflowPumpConfig().wrong(found)
+    assert (OverflowPumpConfig("Pump3", 0.5, 2.0).removes_ml_s, OverflowPumpConfig().removes_ml_s) == (1.0, 0.0)
 
 
 # -- a run -----------------------------------------------------------------------------------------------------------

@@ -112,10 +112,12 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
         budget.grant(allowed)
         feed = allowed * c.period_s * (rng.random(N) < 0.7)
         waste = rng.choice([0.0, 0.5, 9.0], N)
-        budget.book(feed, waste, now)
+        at = now + float(rng.choice([0.0, 40.0, -70.0, -3000.0, -3600.0, -4000.0], p=[0.5, 0.4, *[0.025] * 4]))
+        budget.book(feed, waste, at)  # when it ends, or a repeat that is told of late
+        now = max(now, at)
         for twin, a, f, w in zip(twins, allowed, feed, waste, strict=True):
             twin.owed += a * c.period_s
-            twin.book(f, w, now)
+            twin.book(f, w, at)
         same(budget.state(), twins, volume_ml="level", fed_ml="fed", _owed_ml="owed", _unusable="unusable")
         if rng.random() < 0.3:
             saved, budget = budget.state(), FeedBudget(N, c)
@@ -147,12 +149,26 @@ def test_what_a_sensor_can_read(od: float, raw: float, kind: str) -> None:
 def test_equal_readings_are_counted_over_samples_that_are_new() -> None:
     readings, new = Readings(1, C), np.array([True])
     kinds = []
-    for od, fresh in ((0.5, 1), (0.5, 0), (0.5, 1), (0.5, 1), (0.5, 1), (0.6, 1), (0.5, 1), (0.5, 1), (0.5, 0)):
+    for od, fresh in (
+        (0.5, 1),
+        (0.5, 0),
+        (0.5, 1),
+        (0.5, 1),
+        (0.5, 0),
+        (0.5, 1),
+        (0.6, 1),
+        (0.5, 1),
+        (0.5, 1),
+        (0.5, 0),
+    ):
         m = Measurement(np.zeros(1), np.array([od]), np.zeros(1), new, None)
         believed, findings = readings.check(m, np.array([bool(fresh)]), 0.0)
         kinds += told(findings, 1)
         assert believed[0] == (bool(fresh) and kinds[-1] == [])
-    assert kinds == [[], [], [], ["frozen"], ["frozen"], [], [], [], []]
+        if len(kinds) == 3:
+            saved, readings = readings.state(), Readings(1, C)
+            readings.restore(saved)
+    assert kinds == [[], [], [], ["frozen"], [], ["frozen"], [], [], [], []]
 
 
 @pytest.mark.parametrize(
@@ -234,7 +250,16 @@ def test_heat_is_judged_as_sample_by_sample() -> None:
             rows = zip(twins, reading, fresh, target, strict=True)
             assert told(findings) == [t.judge(r, f, g, now) for t, r, f, g in rows]
             assert heat.off.tolist() == [t.off for t in twins]
-            same(heat.state(), twins, _relief_c="relief", _target_c="target", _thermo_s="at")
+            same(
+                heat.state(),
+                twins,
+                _relief_c="relief",
+                _target_c="target",
+                _thermo_s="at",
+                _hot="hot",
+                _too_hot="too_hot",
+            )
+            same(heat.state(), twins, _nonsense="nonsense")
             if rng.random() < 0.1:
                 saved, heat = heat.state(), Heat(N, C)
                 heat.restore(saved)
@@ -336,7 +361,7 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
         mu, gain = rng.choice([-0.03, -0.008, 0.0, 0.02, 0.035, 0.05], N), rng.choice([0.0, 0.4, 0.6, 1.0, 1.5, 1.8], N)
         feeds, setpoint = rng.choice([0.0, 0.5, 0.96, 1.2], N), rng.choice([0.04, 0.3, 0.5, 2.0], N)
         for _ in range(60):
-            dt = float(rng.choice([0.5, 1.0, 1.0, 1.0, 2.0, 7.0]))
+            dt = float(rng.choice([0.0, 0.5, 1.0, 2.0, 7.0], p=[0.03, 0.1, 0.67, 0.1, 0.1]))
             feed = feeds * (rng.random(N) < 0.95)
             setpoint = np.where(rng.random(N) < 0.01, 2.0, setpoint)
             change.dosed(feed)
@@ -347,6 +372,7 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
             minute += dt
             bubble = np.where(rng.random(N) < 0.05, rng.uniform(-0.1, 0.15, N), 0.0)
             od, believed = true + 0.003 * rng.standard_normal(N) + bubble, rng.random(N) < 0.95
+            od = np.where(np.arange(N) % 2, od, np.round(od, 2))  # 0.05 itself among them
             findings = told(change.check(od, np.full(N, 60.0 * minute), believed, setpoint))
             rows = zip(twins, od, believed, setpoint, strict=True)
             expected = [t.judge(o, minute, b, s) for t, o, b, s in rows]
@@ -361,6 +387,30 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
                 saved, change = change.state(), UnexplainedChange(N, C)
                 change.restore(saved)
     assert seen == {"jump", "falls", "falls+", "no_dilution+", "cannot_hold"}
+
+
+@pytest.mark.parametrize(("reading", "kinds"), [(0.18, []), (0.2, ["jump"])])
+def test_after_a_night_growth_explains_a_factor_of_150_and_no_more(reading: float, kinds: list[str]) -> None:
+    change, one = UnexplainedChange(1, C), np.ones(1)
+    change.check(0.001 * one, 0.0 * one, one > 0.0, one)  # exp(5) = 148, and 0.04 of noise
+    assert told(change.check(reading * one, 6e4 * one, one > 0.0, one), 1) == [kinds]
+
+
+@pytest.mark.parametrize(
+    ("key", "least", "less", "allowed"),
+    [
+        ("max_volume_ml", 20.0, 19.9, "20 to 30"),
+        ("od_max", 1.5, 1.49, "1.5 to 10"),
+        ("stale_s", 66.0, 65.9, "66 to 3600"),
+        ("lost_s", 100.0, 99.9, "100 to 7200"),
+    ],
+)
+def test_limits_that_rest_on_one_another(key: str, least: float, less: float, allowed: str) -> None:
+    SafetyConfig(**{key: least + 1e-9})
+    if key != "stale_s":  # 1.1 periods are not 66 to the last bit
+        SafetyConfig(**{key: least})
+    with pytest.raises(ValueError, match=rf"safety\.{key} = {less}: allowed {allowed}"):
+        SafetyConfig(**{key: less})
 
 
 # -- conclusions -----------------------------------------------------------------------------------------------------
@@ -441,6 +491,21 @@ def test_what_is_latched_is_never_loosened_and_only_the_rows_meant() -> None:
     verdict = interlock.check(m, np.full(2, 0.01), np.full(2, 0.5), np.full(2, 37.0), 0.0)
     assert verdict.response.tolist() == [Response.STOP, Response.PASS]
     assert verdict.reasons == ["stopped earlier in this run", None]
+    other = Interlock(2)
+    other.latch(Response.REGULATE, np.array([False, True]))
+    verdict = other.check(m, np.full(2, 0.01), np.full(2, 0.5), np.full(2, 37.0), 0.0)
+    assert verdict.reasons == [None, "handed over to the on-board regulation earlier in this run"]
+
+
+def test_doses_that_are_allowed_and_never_given_are_told() -> None:
+    _, check = one()
+    assert [check(k, 0.5 + 0.001 * k, rate=0.02)[2] for k in range(4)] == [(), (), (), ("undosed",)]
+
+
+def test_plain_lists_will_do() -> None:
+    interlock = Interlock(1)
+    m = Measurement(np.zeros(1), np.array([0.5]), np.full(1, 37.0), np.array([True]))
+    assert interlock.check(m, [0.01], [1], [37], 0.0).rate[0] == 0.01  # type: ignore[arg-type]
 
 
 def test_a_receipt_without_waste_leaves_the_level_at_its_tube() -> None:
@@ -469,6 +534,9 @@ def test_a_damaged_state_is_named(key: str, value: Any, words: str) -> None:
     state = Interlock(1).state()
     with pytest.raises(ValueError, match=rf"saved interlock.*{words}"):
         Interlock(1).restore({**state, key: value})
+    if isinstance(value, list) and len(value) == 1:  # one damaged reactor of two
+        with pytest.raises(ValueError, match="saved interlock"):
+            Interlock(2).restore({**Interlock(2).state(), key: [state[key][0], value[0]]})
     with pytest.raises(ValueError, match=r"saved interlock: \[\], expected its fields"):
         Interlock(1).restore([])
 

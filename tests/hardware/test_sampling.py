@@ -89,16 +89,31 @@ def test_lateness_is_measured_against_the_earliest_of_the_last_three_that_were_w
         assert take(sampling, clock, sample(60.0 * (k + 1), k + 1)) == ""
         late.append(sampling.late_s)
     assert late == [0.0, 0.0, 3.0, 1.0, 3.0, 0.0]  # against 5, 3, 3, 3, 4, 2
-    for k, (offset, waited, expected) in enumerate(((9.0, False, 7.0), (1.0, False, 0.0), (2.0, True, 1.0)), 7):
+    rest = (
+        (5.0, False, 3.0),
+        (6.0, True, 4.0),
+        (6.5, True, 4.5),
+        (9.0, False, 7.0),
+        (1.0, False, 0.0),
+        (2.0, True, 1.0),
+    )
+    for k, (offset, waited, expected) in enumerate(rest, 7):
         if waited:
             sampling.not_taken(is_new=False)
         clock.sleep(60.0 * k + offset - clock.now())
         take(sampling, clock, sample(60.0 * k, k))
         assert sampling.late_s == expected
-    sampling.pass_over(sample(math.nan, 9))
-    assert sampling.key == (540.0, 9)
+    sampling.pass_over(sample(math.nan, 13))
+    assert sampling.key == (720.0, 12)
+    stepped = Sampling(CONFIG, clock := VirtualClock())
+    for k, offset in enumerate((3.0, 9.0), 1):
+        stepped.not_taken(is_new=False)
+        clock.sleep(60.0 * k + offset - clock.now())
+        take(stepped, clock, sample(60.0 * k, k))
+    clock.sleep(63.0)  # 72 s after its time, against 3 s of the earliest
+    assert "moved by -69 s" in take(stepped, clock, sample(120.2, 3))
     clock.sleep(55.0)
-    take(sampling, clock, sample(600.0, 10))
+    take(sampling, clock, sample(780.0, 13))
     assert sampling.late_s == math.inf  # what was known of the offsets is forgotten
 
 

@@ -3,6 +3,7 @@
     python -m tests.mutants                                       # all of the table, in some minutes
     python -m tests.mutants module=hardware/safety,dqn/agent.py   # some of it
     python -m tests.mutants sample=200 seed=1                     # a sample of it
+    python -m tests.mutants again=runs/mutants.json               # what survived then
 
 For each row of the table one process imports everything and collects the tests. A fork of it runs them once and notes
 which test runs which line, and how long it takes. Then each mutant gets a fork of its own, in which the code object of

@@ -13,6 +13,7 @@ import re
 import sys
 import time
 from collections import Counter, defaultdict
+from pathlib import Path
 
 from tests.mutants.operators import ROOT, Module, Mutant
 from tests.mutants.server import run_group
@@ -41,8 +42,9 @@ TABLE = {
             "dosing", "dose_sequence", "ending", "sampling", "resume", "agenda", "overflow_pump", "diagnosis",
         )],
         [f"hardware/test_{name}.py" for name in (
-            "dosing", "dose_sequence", "ending", "sampling", "agenda", "diagnosis", "overflow_pump", "reactors",
-        )] + ["test_settings.py"],
+            "dosing", "dose_sequence", "ending", "history", "sampling", "agenda", "diagnosis", "overflow_pump",
+            "reactors",
+        )] + ["experiments/test_open_dose.py", "test_settings.py"],
     ),
     "figures": (
         ["experiments/control/metrics.py", "experiments/comparison/statistics.py"],
@@ -64,11 +66,14 @@ def main(arguments: list[str]) -> int:
     os.environ["OMP_NUM_THREADS"] = "1"
     os.chdir(ROOT)
     given = dict(a.partition("=")[::2] for a in arguments)
-    if set(given) - {"module", "sample", "seed"}:
-        raise SystemExit("usage: python -m tests.mutants [module=PREFIX,...] [sample=N] [seed=N]")
+    if set(given) - {"module", "sample", "seed", "again"}:
+        raise SystemExit("usage: python -m tests.mutants [module=PREFIX,...] [sample=N] [seed=N] [again=SCORES.json]")
     wanted = tuple(given.get("module", "").split(","))
     groups = [([Module(p) for p in paths if p.startswith(wanted)], tests) for paths, tests in TABLE.values()]
     everything = [m for modules, _ in groups for module in modules for m in module.mutants]
+    if "again" in given:
+        survivors = json.loads(Path(given["again"]).read_text())["survivors"]
+        everything = [m for m in everything if [*m.key] in survivors and m.key not in listed()]
     if "sample" in given:
         rng = random.Random(int(given.get("seed", "0")))
         everything = rng.sample(everything, min(int(given["sample"]), len(everything)))
@@ -106,7 +111,7 @@ def report(results: list[tuple[Mutant, str]], seconds: float) -> int:
             f"{c['equivalent']:10} {rows[path]['score']:5.1f}%"
         )
     print(f"{len(results)} mutants in {seconds:.0f} s")
-    survivors = [str(mutant) for mutant, result in results if result in ("survived", "not run")]
+    survivors = [mutant.key for mutant, result in results if result in ("survived", "not run")]
     stored = {"date": datetime.date.today().isoformat(), "seconds": round(seconds), "modules": rows}
     (ROOT / "runs").mkdir(exist_ok=True)
     (ROOT / "runs" / "mutants.json").write_text(json.dumps({**stored, "survivors": survivors}, indent=1) + "\n")

@@ -80,7 +80,7 @@ def of_call(node: ast.Call) -> Iterator[ast.AST]:
         other = OPPOSITE[name]
         yield altered(node, func=altered(f, id=other) if isinstance(f, ast.Name) else altered(f, attr=other))
     for k, keyword in enumerate(node.keywords):
-        if keyword.arg and not is_text(keyword.value):
+        if keyword.arg not in (None, "strict") and not is_text(keyword.value):
             yield altered(node, keywords=without(node.keywords, k))
 
 
@@ -107,13 +107,15 @@ def alternatives(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def skipped(parent: ast.AST, field: str, node: ast.AST) -> bool:
-    """What no mutant is made of: texts, annotations, decorators, __all__, assertions, and what is raised."""
+    """What no mutant is made of: texts, annotations, decorators, __all__, assertions, strict=, and what is raised."""
     if field in ("annotation", "returns", "decorator_list", "bases") or isinstance(parent, ast.Raise):
         return True
     if isinstance(node, ast.JoinedStr | ast.Assert | ast.Import | ast.ImportFrom):
         return True
     names = [t.id for t in getattr(node, "targets", ()) if isinstance(t, ast.Name)]
     alias = isinstance(parent, ast.Module) and isinstance(getattr(node, "value", None), ast.BinOp | ast.Subscript)
+    if isinstance(parent, ast.keyword) and parent.arg == "strict":  # zip's guard against a mistake of the program
+        return True
     return "__all__" in names or (alias and names == [n for n in names if n[0].isupper() and not n.isupper()])
 
 

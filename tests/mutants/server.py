@@ -26,8 +26,8 @@ from tests.mutants.operators import Module, Mutant
 
 ROOMS = ("conf", "dqn", "envs", "experiments", "hardware", "tests")
 BROKEN = 70  # exit status of a fork in which this tool itself failed
-LIMIT_S = 20.0  # on top of ten times what the tests take unmutated
-BUDGET_S = 8.0  # of tests for one mutant, as timed under trace: the fastest ones
+LIMIT_S = 10.0  # on top of three times what the tests take unmutated
+BUDGET_S = 20.0  # of the processor for one mutant, as timed under trace: the fastest tests
 
 Tell = Callable[[Mutant, str], None]
 """Takes a mutant and what became of it."""
@@ -117,9 +117,9 @@ class Deterministic:
 class Server(Deterministic):
     """Plugin in place of pytest's loop: holds the collected tests, and forks for each mutant."""
 
-    def __init__(self, modules: list[Module], chosen: list[Mutant], tell: Tell) -> None:
+    def __init__(self, modules: list[Module], chosen: list[Mutant], tell: Tell, shown: int) -> None:
         self._modules = {m.path: m for m in modules}
-        self._chosen, self._tell = chosen, tell
+        self._chosen, self._tell, self._shown = chosen, tell, shown
         self._lines = Lines({m.file for m in modules})
         self.left: list[Mutant] = []  # to be imported
         self.seconds: dict[str, float] = {}
@@ -128,8 +128,9 @@ class Server(Deterministic):
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """A failure ends a fork at once."""
-        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
         if report.failed:
+            if not self.tests:  # without a mutant
+                os.write(self._shown, f"{report.nodeid} fails without a mutant\n{report.longreprtext}\n".encode())
             os._exit(1)
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
@@ -139,7 +140,7 @@ class Server(Deterministic):
         self._items = {item.nodeid: item for item in session.items}
         status, answer = forked(self._baseline, 1800.0)
         if status:
-            raise SystemExit("the tests fail without a mutant; run them by themselves first")
+            raise pytest.UsageError("the tests fail without a mutant")
         self.seconds, self.tests = pickle.loads(answer)
         self._functions = self._index()
         gc.freeze()
@@ -150,8 +151,9 @@ class Server(Deterministic):
     def _run(self, names: list[str]) -> None:
         items = [self._items[name] for name in names]
         for item, following in zip(items, [*items[1:], None], strict=True):
-            self._lines.test = item.nodeid
+            self._lines.test, start = item.nodeid, time.process_time()
             item.ihook.pytest_runtest_protocol(item=item, nextitem=following)
+            self.seconds[item.nodeid] = time.process_time() - start  # whatever else the machine does
 
     def _baseline(self, out: int) -> int:
         """All tests once, under trace; writes durations and lines."""
@@ -168,7 +170,7 @@ class Server(Deterministic):
         found = defaultdict(list)
         files = {m.file: m.path for m in self._modules.values()}
         for thing in gc.get_objects():
-            if isinstance(thing, types.FunctionType) and thing.__code__.co_filename in files:
+            if type(thing) is types.FunctionType and thing.__code__.co_filename in files:
                 found[files[thing.__code__.co_filename], thing.__code__.co_qualname].append(thing)
         return found
 
@@ -193,7 +195,7 @@ class Server(Deterministic):
             self.left.append(mutant)
             return
         order = self.order(tests)
-        limit = LIMIT_S + 10.0 * sum(self.seconds[t] for t in order)
+        limit = LIMIT_S + 3.0 * sum(self.seconds[t] for t in order)
         self._tell(mutant, outcome(forked(lambda _: self._try(old, new, order), limit)[0]) if order else "not run")
 
     def _try(self, functions: list[types.FunctionType], code: types.CodeType, tests: list[str]) -> int:
@@ -252,17 +254,16 @@ def run_group(modules: list[Module], tests: list[str], chosen: list[Mutant], tel
             if os.isatty(shown):
                 os.write(shown, f"\r{len(told)} of {len(chosen)}\r".encode())
 
-        server = Server(modules, chosen, say)
-        status = pytest.main(options(base, *tests), [server])
-        if not told and not server.left and chosen:
-            os.write(shown, f"pytest ended with {status}\n".encode())
+        server = Server(modules, chosen, say, shown)
+        if pytest.main(options(base, *tests), [server]):
             return 1
         third_party = [name for name in sys.modules if name.split(".")[0] not in (*ROOMS, "__main__")]
         left = []
         for mutant in server.left:
             near = {t for t in server.covering(mutant) if t}
             file = server._modules[mutant.path].file
-            whole = {t for (f, _), names in server.tests.items() if f == file for t in names if t}
+            own = {t.split("::")[0] for (f, _), names in server.tests.items() if f == file for t in names if t}
+            whole = {t for t in server.seconds if t.split("::")[0] in own}
             order = server.order(near or whole)
             total: dict[str, float] = defaultdict(float)
             for t in order:
@@ -285,5 +286,5 @@ def run_group(modules: list[Module], tests: list[str], chosen: list[Mutant], tel
     of = {m.path: m for m in modules}
     for index, order, seconds in left:
         mutant = chosen[index]
-        status, _ = forked(lambda _, m=mutant, o=order: imported(of[m.path], m, o, base), LIMIT_S + 10.0 * seconds)
+        status, _ = forked(lambda _, m=mutant, o=order: imported(of[m.path], m, o, base), LIMIT_S + 3.0 * seconds)
         tell(mutant, outcome(status) if order else "not run")
