@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from envs.identification.model import Parameter
 from envs.identification.screening import OD_FLOOR, Series, pumped_volume, running_median
 
-__all__ = ["WORST_CONDITION", "Estimate", "Quality", "enough", "estimate", "outliers"]
+__all__ = ["QUICK", "WORST_CONDITION", "Estimate", "Quality", "enough", "estimate", "outliers"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -77,7 +77,7 @@ def _grid(*axes: tuple[float, ...]) -> _Cells:
 
 
 GRID = _grid(P, DOSE, WANDER, CORRELATION_MIN, PHI)  # T means nothing at om = 0: these cells count three times
-COARSE = _grid(P, (0.0, 0.4, 2.5), (0.0, 0.08, 0.5), (40.0,), (0.0, 0.4))  # enough to find outliers
+QUICK = _grid(P, (0.0, 0.3, 1.0, 3.0), (0.0, 0.05, 0.15, 0.5), (40.0,), (0.0, 0.15, 0.4))  # for segments and outliers
 CONFIDENCE = 0.95
 WORST_CONDITION = 1e8  # of the scaled normal equations
 
@@ -304,21 +304,22 @@ class Estimate:
     n_used: int
 
 
-def estimate(parts: list[Series]) -> list[Estimate]:
+def estimate(parts: list[Series], cells: _Cells = GRID) -> list[Estimate]:
     """Fit each of M series alone; all of them in one pass.
 
     Intervals are quantiles of the mixture of the cells' Student t distributions. mu is the mean of the growth rate over
     the rows, mu + S_end/L with S the integral of w and L the rows' duration: that is what the rows can tell when growth
     wanders as slowly as the recording is long.
 
-    Args: parts: screened series; readings may be nan, time and pump count throughout.
+    Args: parts: screened series; readings may be nan, time and pump count throughout. cells: the grid; QUICK where
+      many short parts are estimated and an interval decides nothing alone.
     Returns: one `Estimate` each, which need not be worth anything: see `calibration.refusal`.
     Raises: ValueError for a series with fewer than ten readings above zero.
     """
     batch = _batch(parts)
-    solved = _flat_in_tau(_solve(batch, GRID))
+    solved = _flat_in_tau(_solve(batch, cells))
     likeliest = np.argmax(solved.weight, axis=1)
-    traces = _traces(batch, GRID.chosen(likeliest))
+    traces = _traces(batch, cells.chosen(likeliest))
     found = []
     for m, part in enumerate(parts):
         cell, rows = likeliest[m], len(part.od)
@@ -339,7 +340,7 @@ def estimate(parts: list[Series]) -> list[Estimate]:
                 condition=float(solved.condition[m]),
                 expected=level,
                 innovation=innovation,
-                quality=_quality(batch, solved, m, part, innovation, sigma, mu.value),
+                quality=_quality(batch, solved, cells, m, part, innovation, sigma, mu.value),
                 n_used=int(seen.sum()),
             )
         )
@@ -416,7 +417,7 @@ def _traces(batch: _Batch, cells: _Cells) -> _Traces:
 
 
 def _quality(
-    batch: _Batch, solved: _Solved, m: int, part: Series, innovation: Array, sigma: float, mu: float
+    batch: _Batch, solved: _Solved, cells: _Cells, m: int, part: Series, innovation: Array, sigma: float, mu: float
 ) -> Quality:
     cell = int(np.argmax(solved.weight[m]))
     z = innovation[np.isfinite(innovation)]
@@ -437,8 +438,8 @@ def _quality(
         autocorrelation=float(np.mean(z[1:] * z[:-1])) / spread,
         kurtosis=float(np.mean(z**4)) / spread**2,
         late_share=late / inverse_tau if diluted > 0.0 else 0.0,
-        dose_spread=float(GRID.dose[cell]) * sigma / diluted if diluted > 0.0 else 0.0,
-        growth_spread=float(GRID.wander[cell]) * sigma / abs(mu),
+        dose_spread=float(cells.dose[cell]) * sigma / diluted if diluted > 0.0 else 0.0,
+        growth_spread=float(cells.wander[cell]) * sigma / abs(mu),
         noise=sigma,
         feedback=feedback,
         answers=bool(abs(feedback) > 2.0 / np.sqrt(len(z))),
@@ -457,8 +458,8 @@ def outliers(parts: list[Series]) -> list[Mask]:
     marked = [np.zeros(len(part.od), dtype=np.bool_) for part in parts]
     for _ in range(OUTLIER_PASSES):
         batch = _batch([part.rejecting(bad) for part, bad in zip(parts, marked, strict=True)])
-        solved = _solve(batch, COARSE)
-        cells = COARSE.chosen(np.argmax(solved.weight, axis=1))
+        solved = _solve(batch, QUICK)
+        cells = QUICK.chosen(np.argmax(solved.weight, axis=1))
         best = solved.best[np.arange(len(parts)), np.argmax(solved.weight, axis=1)]
         residual = _deletion_residuals(batch, cells, best)
         fresh = [_peaks(residual[m, : len(part.od)]) for m, part in enumerate(parts)]
