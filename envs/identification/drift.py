@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from envs.identification.free_run import fit
 from envs.identification.model import NotIdentifiable, Parameter, check_excitation
-from envs.identification.prediction_error import WORST_CONDITION, enough, estimate
+from envs.identification.prediction_error import QUICK, WORST_CONDITION, enough, estimate
 from envs.identification.screening import Screened, Series
 
 __all__ = ["Drift", "Segment", "cuts", "drift", "drifts", "pairs", "segments"]
@@ -58,7 +58,7 @@ def pairs(parts: list[Series], method: str) -> list[Pair]:
     if method == "free_run":
         return [_free_run(part) for part in parts]
     found: list[Pair] = []
-    for e in estimate(parts):
+    for e in estimate(parts, QUICK):
         known = e.condition < WORST_CONDITION and _narrow(e.mu)
         found.append((e.mu, e.tau if e.tau is not None and _narrow(e.inverse_tau) else None) if known else (None, None))
     return found

@@ -10,11 +10,11 @@ in it, and each reading is compared with what all readings before it say about i
     v_{i+1} = phi v_i + sqrt(1 - phi^2) nu_i                          reading noise, correlated from row to row
 
 with xi, eta, nu independent standard normal, r = (x/x_mean)^(p-1) (p = 1: noise in proportion to the OD, p = 0: the
-same at every OD; x is a running median, never the reading itself), and g/k the share of a dose that is seen one row
-late. A rate chosen from reading i acts from row i on. For given (p, d, om, T, phi) this is generalised least squares:
-one Kalman filter over the columns ln y, 1, t, -C, c_{i-1} with shared gains. All points of a grid are filtered at once
-and averaged by their restricted likelihood and a prior flat in tau: neither optimiser nor local minimum
-(docs/calibration.md, Method).
+same at every OD; x is a running median, never the reading itself), and g/k in [0, 1] the share of a dose that is seen
+one row late. A rate chosen from reading i acts from row i on. For given (p, d, om, T, phi, g/k) this is generalised
+least squares: one Kalman filter over the columns ln y, 1, t, -C, c_{i-1} with shared gains. All points of a grid are
+filtered at once and averaged by their restricted likelihood and a prior flat in tau: neither optimiser nor local
+minimum (docs/calibration.md, Method).
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from envs.identification.model import Parameter
 from envs.identification.screening import OD_FLOOR, Series, pumped_volume, running_median
 
-__all__ = ["WORST_CONDITION", "Estimate", "Quality", "enough", "estimate", "outliers"]
+__all__ = ["QUICK", "WORST_CONDITION", "Estimate", "Quality", "enough", "estimate", "outliers"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -44,6 +44,7 @@ WANDER = (
 )  # 0 must be there: without it a quiet recording under feedback is biased by 4 to 9 %
 CORRELATION_MIN = (10.0, 40.0, 160.0)
 PHI = (0.0, 0.15, 0.4, 0.75)
+LATE_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a dose, seen one row late
 LEVEL_ROWS = 5  # of the running median that stands for the OD level
 COLUMNS = 5  # ln y, 1, t, -C, c_{i-1}
 MU, K, LATE = 1, 2, 3  # positions among the four regressors
@@ -77,7 +78,7 @@ def _grid(*axes: tuple[float, ...]) -> _Cells:
 
 
 GRID = _grid(P, DOSE, WANDER, CORRELATION_MIN, PHI)  # T means nothing at om = 0: these cells count three times
-COARSE = _grid(P, (0.0, 0.4, 2.5), (0.0, 0.08, 0.5), (40.0,), (0.0, 0.4))  # enough to find outliers
+QUICK = _grid(P, (0.0, 0.3, 1.0, 3.0), (0.0, 0.05, 0.15, 0.5), (40.0,), (0.0, 0.15, 0.4))  # for segments and outliers
 CONFIDENCE = 0.95
 WORST_CONDITION = 1e8  # of the scaled normal equations
 
@@ -204,11 +205,11 @@ class _Filter:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """Generalised least squares of every cell.
+    """Generalised least squares of every cell with every late share, together L = shares * G cells, shares outermost.
 
-    best: coefficients of the four regressors (M, G, 4). spread: their covariance for sigma = 1 (M, G, 4, 4).
-    rss: (M, G). score: logarithm of a cell's weight, up to a constant (M, G). drift: S after the last row of each
-    column (M, G, 5), and its variance for sigma = 1 (M, G). degrees: n - q (M,). condition: of the normal equations,
+    best: coefficients of the four regressors (M, L, 4). spread: their covariance for sigma = 1 (M, L, 4, 4).
+    rss: (M, L). score: logarithm of a cell's weight, up to a constant (M, L). drift: S after the last row of each
+    column (M, L, 5), and its variance for sigma = 1 (M, L). degrees: n - q (M,). condition: of the normal equations,
     scaled, smallest of the cells (M,).
     """
 
@@ -223,7 +224,7 @@ class _Solved:
 
     @cached_property
     def weight(self) -> Array:
-        """Of each cell, shape (M, G), sums to 1."""
+        """Of each cell, shape (M, L), sums to 1."""
         weight = np.exp(self.score - self.score.max(axis=1, keepdims=True))
         return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
@@ -237,29 +238,36 @@ def _solve(batch: _Batch, cells: _Cells) -> _Solved:
         white = step.innovation / np.sqrt(step.variance)
         products += white[:, None] * white
     gram = np.moveaxis(products, (0, 1), (-2, -1))
-    normal, target = gram[..., 1:, 1:], gram[..., 1:, 0]
+    merged = _with_late_shares(batch)
+    back = merged.swapaxes(-1, -2)
+    normal = back @ gram[:, None, :, 1:, 1:] @ merged
+    target = (back @ gram[:, None, :, 1:, :1])[..., 0]
     size = np.sqrt(np.einsum("...ii->...i", normal))
     absent = size == 0.0  # no pump, no columns of a pump: their coefficients are 0
     size = np.where(absent, 1.0, size)
-    unit = normal / (size[..., :, None] * size[..., None, :]) + absent[..., None] * np.eye(COLUMNS - 1)
+    unit = normal / (size[..., :, None] * size[..., None, :]) + absent[..., None] * np.eye(3)
     values, vectors = np.linalg.eigh(unit)
     values = np.maximum(values, 1e-14)
     vectors = vectors / size[..., :, None]
     spread = (vectors / values[..., None, :]) @ vectors.swapaxes(-1, -2)
     best = (spread @ target[..., None])[..., 0]
-    rss = np.maximum(gram[..., 0, 0] - np.sum(best * target, axis=-1), 1e-12)
-    degrees = np.maximum(batch.n_readings - (~absent).sum(axis=-1).max(axis=-1), 1.0)
+    rss = np.maximum(gram[:, None, :, 0, 0] - np.sum(best * target, axis=-1), 1e-12)
+    degrees = np.maximum(batch.n_readings - (~absent).sum(axis=-1).max(axis=(1, 2)), 1.0)
     determinant = np.log(values).sum(axis=-1) + 2.0 * np.log(size).sum(axis=-1)
-    score = -0.5 * (log_variance + determinant + degrees[:, None] * np.log(rss))
+    score = -0.5 * (log_variance[:, None] + determinant + degrees[:, None, None] * np.log(rss))
+
+    def flat(a: Array) -> Array:
+        return a.reshape(len(a), -1, *a.shape[3:])
+
     return _Solved(
-        best=best,
-        spread=spread,
-        rss=rss,
-        score=score,
-        drift=np.moveaxis(run.state[3], 0, -1),
-        drift_variance=np.maximum(run.covariance[3, 3], 0.0),
+        best=flat((merged @ best[..., None])[..., 0]),
+        spread=flat(merged @ spread @ back),
+        rss=flat(rss),
+        score=flat(score),
+        drift=np.tile(np.moveaxis(run.state[3], 0, -1), (1, len(LATE_SHARES), 1)),
+        drift_variance=np.tile(np.maximum(run.covariance[3, 3], 0.0), (1, len(LATE_SHARES))),
         degrees=degrees,
-        condition=(values[..., -1] / values[..., 0]).min(axis=1),
+        condition=(values[..., -1] / values[..., 0]).min(axis=(1, 2)),
     )
 
 
@@ -304,21 +312,31 @@ class Estimate:
     n_used: int
 
 
-def estimate(parts: list[Series]) -> list[Estimate]:
+def _with_late_shares(batch: _Batch) -> Array:
+    """Matrices (M, shares, 1, 4, 3) that turn coefficients of 1, t, and a dose's whole effect into the regressors'."""
+    merged = np.zeros((len(batch.dt), len(LATE_SHARES), 1, 4, 3))
+    merged[..., range(3), range(3)] = 1.0
+    ratio = batch.scale[:, LATE] / batch.scale[:, K]
+    merged[..., 0, LATE, K] = ratio[:, None] * np.array(LATE_SHARES)
+    return merged
+
+
+def estimate(parts: list[Series], cells: _Cells = GRID) -> list[Estimate]:
     """Fit each of M series alone; all of them in one pass.
 
     Intervals are quantiles of the mixture of the cells' Student t distributions. mu is the mean of the growth rate over
     the rows, mu + S_end/L with S the integral of w and L the rows' duration: that is what the rows can tell when growth
     wanders as slowly as the recording is long.
 
-    Args: parts: screened series; readings may be nan, time and pump count throughout.
+    Args: parts: screened series; readings may be nan, time and pump count throughout. cells: the grid; QUICK where
+      many short parts are estimated and an interval decides nothing alone.
     Returns: one `Estimate` each, which need not be worth anything: see `calibration.refusal`.
     Raises: ValueError for a series with fewer than ten readings above zero.
     """
     batch = _batch(parts)
-    solved = _flat_in_tau(_solve(batch, GRID))
+    solved = _flat_in_tau(_solve(batch, cells))
     likeliest = np.argmax(solved.weight, axis=1)
-    traces = _traces(batch, GRID.chosen(likeliest))
+    traces = _traces(batch, cells.chosen(likeliest % len(cells.p)))
     found = []
     for m, part in enumerate(parts):
         cell, rows = likeliest[m], len(part.od)
@@ -339,7 +357,7 @@ def estimate(parts: list[Series]) -> list[Estimate]:
                 condition=float(solved.condition[m]),
                 expected=level,
                 innovation=innovation,
-                quality=_quality(batch, solved, m, part, innovation, sigma, mu.value),
+                quality=_quality(batch, solved, cells, m, part, innovation, sigma, mu.value),
                 n_used=int(seen.sum()),
             )
         )
@@ -416,14 +434,14 @@ def _traces(batch: _Batch, cells: _Cells) -> _Traces:
 
 
 def _quality(
-    batch: _Batch, solved: _Solved, m: int, part: Series, innovation: Array, sigma: float, mu: float
+    batch: _Batch, solved: _Solved, cells: _Cells, m: int, part: Series, innovation: Array, sigma: float, mu: float
 ) -> Quality:
     cell = int(np.argmax(solved.weight[m]))
     z = innovation[np.isfinite(innovation)]
     z = z - z.mean()
     spread = max(float(np.mean(z**2)), TINY)
     inverse_tau = float(solved.best[m, cell, K] / batch.scale[m, K])
-    late = float(solved.best[m, cell, LATE] / batch.scale[m, LATE])
+    late = float(solved.weight[m] @ np.repeat(LATE_SHARES, len(cells.p)))
     each = part.pump_rate[:-1] * np.diff(part.time)
     size = float(np.sqrt(np.mean(each**2)))
     change = np.diff(part.pump_rate, prepend=part.pump_rate[0])
@@ -436,9 +454,9 @@ def _quality(
         variance=spread,
         autocorrelation=float(np.mean(z[1:] * z[:-1])) / spread,
         kurtosis=float(np.mean(z**4)) / spread**2,
-        late_share=late / inverse_tau if diluted > 0.0 else 0.0,
-        dose_spread=float(GRID.dose[cell]) * sigma / diluted if diluted > 0.0 else 0.0,
-        growth_spread=float(GRID.wander[cell]) * sigma / abs(mu),
+        late_share=late,
+        dose_spread=float(cells.dose[cell % len(cells.p)]) * sigma / diluted if diluted > 0.0 else 0.0,
+        growth_spread=float(cells.wander[cell % len(cells.p)]) * sigma / abs(mu),
         noise=sigma,
         feedback=feedback,
         answers=bool(abs(feedback) > 2.0 / np.sqrt(len(z))),
@@ -457,8 +475,8 @@ def outliers(parts: list[Series]) -> list[Mask]:
     marked = [np.zeros(len(part.od), dtype=np.bool_) for part in parts]
     for _ in range(OUTLIER_PASSES):
         batch = _batch([part.rejecting(bad) for part, bad in zip(parts, marked, strict=True)])
-        solved = _solve(batch, COARSE)
-        cells = COARSE.chosen(np.argmax(solved.weight, axis=1))
+        solved = _solve(batch, QUICK)
+        cells = QUICK.chosen(np.argmax(solved.weight, axis=1) % len(QUICK.p))
         best = solved.best[np.arange(len(parts)), np.argmax(solved.weight, axis=1)]
         residual = _deletion_residuals(batch, cells, best)
         fresh = [_peaks(residual[m, : len(part.od)]) for m, part in enumerate(parts)]
