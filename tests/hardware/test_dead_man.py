@@ -21,7 +21,7 @@ class Wait(threading.Event):
         until = self.now + timeout
         for at in sorted(t for t in self._meanwhile if self.now < t <= until):
             self.now = at
-            self._agent.beat(arm=self._meanwhile[at] == "request")
+            assert not self._agent.claim("a line", 1, arm=self._meanwhile[at] == "request")
         self.now = until
         return self.now >= self._end_s
 
