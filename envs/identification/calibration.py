@@ -30,8 +30,8 @@ PLAUSIBLE_TAU = (0.05, 2.0)
 WIDEST_TAU = 0.3  # half width of 1/tau over its value
 EARLY_MIN = 1440.0  # the held-out check fits at most so much before what it predicts
 REMEDY = (
-    "record with the pump stopped for 10 min every hour (that gives mu within 6 % and tau within 3 %), or use an "
-    "open-loop recording (generate=true)"
+    "record with the pump stopped for 10 min every hour (which tells both within about 5 %), or in open loop as "
+    "generate=true does"
 )
 
 
