@@ -27,6 +27,8 @@ __all__ = ["Best", "Session", "merit"]
 
 log = logging.getLogger(__name__)
 
+TOLD = 20  # lines of progress where there is no terminal
+
 
 REGRET_UNIT, STEADY_UNIT = 0.5, 0.003
 """Per cent of cost and OD that weigh alike when policies are compared: half a per cent of cost is not seen in a
@@ -183,6 +185,7 @@ class Session:
         """
         c = self.config
         total, last = c.agent.total_steps, self.agents.steps
+        told = max(c.eval_every, total // TOLD)
         started, earlier = time.perf_counter(), self.seconds
         bars = tqdm(total=total, initial=last, disable=None, unit="step")
         with stop.pausing("at the end of this episode") as stopping, logging_redirect_tqdm(), bars as bar:
@@ -194,7 +197,7 @@ class Session:
                 if final or record.step // c.eval_every > last // c.eval_every:
                     line = self._news(record)
                     bar.set_postfix_str(line)
-                    if bar.disable:
+                    if bar.disable and (final or record.step // told > last // told):
                         log.info("step %d of %d: %s", record.step, total, line)
                 stopped = stopping()
                 if final or stopped or record.step // c.checkpoint_every > last // c.checkpoint_every:
