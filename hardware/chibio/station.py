@@ -197,6 +197,8 @@ class Station:
             escalated=self.doses.escalated, overflow_trouble=self.overflow_pump.trouble,
         )  # fmt: skip
         self.book.report(fault)
+        if state.running and not self.doses.running:
+            self.doses.escalated = False  # it never reached the device: a later stop is somebody else's
         if fault is not None and self._config.recover and self._recoverable(fault.kind, age):
             self.busy = True
             self._agenda.add(self._recover(fault.kind))

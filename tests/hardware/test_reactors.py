@@ -617,6 +617,24 @@ def test_an_experiment_that_this_program_ended_is_started_again_and_one_that_som
     assert "was stopped by someone" in str(lab.reactors.stations[0].book.fault)
 
 
+def test_a_stop_that_never_reached_the_device_does_not_excuse_a_later_one() -> None:
+    lab = DriverLab()
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    while not lab.of("feed_on"):
+        lab.step()
+    lab.fault("lying", -1)
+    lab.run(2)
+    assert [path for _, path in lab.wire.posts].count("/Experiment/0/M0") == 1
+    lab.fault("lying", 0)
+    lab.run(3)
+    assert lab.reactors.stations[0].book.fault is None
+    lab.device.submit("POST", "/Experiment/0/M0")
+    lab.run(5)
+    assert [path for _, path in lab.wire.posts].count("/Experiment/1/M0") == 1
+    assert "was stopped by someone" in str(lab.reactors.stations[0].book.fault)
+
+
 def test_the_hot_guard_switches_heating_off_for_good() -> None:
     lab = DriverLab()
     lab.reactors.begin()
