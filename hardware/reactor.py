@@ -88,11 +88,14 @@ class Receipt:
       pump was really told: less than the command where a limit cut it or a small dose was put off to the next.
     notes: what differs from the command, one line each.
     waste_ml: what the waste pump was told to be able to remove, mL, shape (N,); None where waste is not modelled.
+    kept_ml: by how much what is put off to the next dose has grown, mL, shape (N,), negative where that was given or
+      lost; None where nothing is put off.
     """
 
     volume_ml: Array
     notes: tuple[str, ...] = field(default=())
     waste_ml: Array | None = None
+    kept_ml: Array | None = None
 
 
 class Reactor(Protocol):

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.scenario import Scenario
-from experiments.controllers.base import Array, Controller, Explains, Mask
-from hardware.reactor import Command, Reactor
+from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask
+from hardware.reactor import Command, Reactor, Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock, Verdict
 
@@ -52,7 +52,8 @@ class Step:
 class ClosedLoop:
     """Controller x interlock x reactors over one schedule per reactor; reactors may be sampled at different moments.
 
-    Each reactor first recovers (grows undiluted until `recovery_od`), then runs its schedule on its own time.
+    Each reactor first recovers (grows undiluted until `recovery_od`), then runs its schedule on its own time. A reading
+    that the interlock does not believe begins no schedule and is not shown to the controller.
 
     Args:
       reactors: N reactors. controller: decides. interlock: of N reactors.
@@ -115,14 +116,16 @@ class ClosedLoop:
         self._book_repeats()
         rows = m.fresh & ~(self.done & (self._at_end == "stop")) & ~self.stopped
         minute = m.time_s / 60.0
-        recovered = (m.od >= self._recovery_od) | (minute >= self._recovery_limit)
+        believed = rows & self.interlock.believes(m)
+        recovered = (believed & (m.od >= self._recovery_od)) | (minute >= self._recovery_limit)
         self.began = np.where(rows & np.isnan(self.began) & recovered, minute, self.began)
         elapsed = minute - self.began
         phase, setpoint, temperature = self._asked(elapsed)
         self.done = self.done | (rows & (elapsed >= self._total - 1e-6))
 
-        decided = self.controller.act(m.od, setpoint, minute, rows & (phase >= 0))
-        proposed = np.where((phase >= 0) & ~(self.done & (self._at_end != "hold")), decided, 0.0)
+        steered = believed & (phase >= 0)
+        decided = self.controller.act(np.where(rows & ~believed, np.nan, m.od), setpoint, minute, steered)
+        proposed = np.where(steered & ~(self.done & (self._at_end != "hold")), decided, 0.0)
         verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
         sound = rows & (verdict.response == Response.PASS)  # the device will dose by the same sensor
         left = self.done & (self._at_end == "regulate") & sound
@@ -141,7 +144,7 @@ class ClosedLoop:
         failures = self._respond(verdict, left)
         heat = np.where(verdict.heat_off, np.nan, temperature)
         receipt = self.reactors.actuate(Command(rows, verdict.rate, heat))
-        self.interlock.confirm(receipt, now)
+        self._book(receipt, now)
         volume = receipt.volume_ml + np.where(rows, self.repeated_ml, 0.0)
         self.repeated_ml = np.where(rows, 0.0, self.repeated_ml)
         return replace(decision, volume_ml=volume, notes=(*failures, *receipt.notes))
@@ -149,8 +152,14 @@ class ClosedLoop:
     def _book_repeats(self) -> None:
         """What the devices dosed by themselves counts when it happened, before the sample after it is judged."""
         for at_s, receipt in self.reactors.repeated():
-            self.interlock.confirm(receipt, at_s)
+            self._book(receipt, at_s)
             self.repeated_ml = self.repeated_ml + receipt.volume_ml
+
+    def _book(self, receipt: Receipt, at_s: float) -> None:
+        """What was dosed counts for the interlock, and for a controller that goes by it."""
+        self.interlock.confirm(receipt, at_s)
+        if isinstance(self.controller, Accounts):
+            self.controller.dosed(receipt.volume_ml + (0.0 if receipt.kept_ml is None else receipt.kept_ml))
 
     def _respond(self, verdict: Verdict, left: Mask) -> list[str]:
         """Carry out what the interlock demands beyond not dosing; returns what failed, to be tried again.

@@ -46,7 +46,8 @@ class AdaptiveInverse:
 
       ln x <- ln x + dt mu - g u h / tau,   mu and g random walks,   y = ln(reading) = ln x + noise
 
-    which is linear for a known u: a time-varying Kalman filter (Kalman 1960), exact without linearising. Then
+    which is linear for a known u: a time-varying Kalman filter (Kalman 1960), exact without linearising. Known is what
+    was dosed, where somebody tells it (`dosed`), else what it decided. Then
 
       u = tau/g (mu + (ln x - ln r)/h), clipped to the pump's range.
 
@@ -65,6 +66,7 @@ class AdaptiveInverse:
         self._started: Mask = np.zeros(n, dtype=bool)
         self._gated = np.zeros(n, dtype=np.int64)
         self._minute, self._rate = np.zeros(n), np.zeros(n)
+        self._given_ml: Array | None = None  # since the newest reading; None while nobody tells
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """See `Controller.act`."""
@@ -76,6 +78,8 @@ class AdaptiveInverse:
             self._predict(idx, np.maximum(minute[idx] - self._minute[idx], 0.0))
             self._update(idx, np.log(reading), variance)
             self._minute[idx] = minute[idx]
+            if self._given_ml is not None:
+                self._given_ml[idx] = 0.0
             log_od, mu, gain = self._mean[idx].T
             gain = np.clip(gain, *GAIN_RANGE)
             error = log_od - np.log(np.maximum(setpoint[idx], LOWEST_OD))
@@ -83,10 +87,16 @@ class AdaptiveInverse:
             self._rate[idx] = np.clip(wanted, 0.0, self.model.max_pump_rate)
         return self._rate.copy()
 
+    def dosed(self, volume_ml: Array) -> None:
+        """See `Accounts.dosed`."""
+        self._given_ml = volume_ml + (0.0 if self._given_ml is None else self._given_ml)
+
     def _predict(self, idx: np.ndarray, dt: Array) -> None:
-        """Advance the rows `idx` by dt minutes and one dose of the last rate."""
+        """Advance the rows `idx` by dt minutes and what was dosed since their newest reading."""
         c, n = self.config, idx.size
-        dose = self._rate[idx] * self.model.control_min / self.model.tau  # ln of the dilution by a sound pump
+        decided_ml = self._rate * 60.0 * self.model.control_min
+        given_ml = decided_ml if self._given_ml is None else self._given_ml
+        dose = given_ml[idx] / (60.0 * self.model.tau)  # ln of the dilution by a sound pump
         step = np.tile(np.eye(3), (n, 1, 1))
         step[:, 0, 1], step[:, 0, 2] = dt, -dose
         noise = np.zeros((n, 3, 3))

@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Controller", "Explains", "Mask", "usable"]
+__all__ = ["Accounts", "Array", "Controller", "Explains", "Mask", "usable"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -26,10 +26,11 @@ class Controller(Protocol):
         """Pump rates for the coming control period, mL/s, shape (N,).
 
         Args:
-          od: newest reading, shape (N,); nan where there is none. setpoint: OD to hold, shape (N,), > 0.
+          od: newest reading, shape (N,); nan where there is none, or none that is believed.
+          setpoint: OD to hold, shape (N,), > 0.
           minute: when the reading was taken, min since the run began, shape (N,).
-          rows: True where the reading is new, shape (N,). Only these rows' internal state advances; what is returned
-            elsewhere is ignored.
+          rows: True where the reading is new and believed, shape (N,). Only these rows' internal state advances; what
+            is returned elsewhere is ignored.
         Raises: nothing for readings of any value.
         """
         ...
@@ -41,6 +42,15 @@ class Explains(Protocol):
 
     def explain(self) -> dict[str, Array]:
         """Name -> value of the last decision, each with leading axis N."""
+        ...
+
+
+@runtime_checkable
+class Accounts(Protocol):
+    """A controller that goes by what was really dosed, which may differ from what it decided."""
+
+    def dosed(self, volume_ml: Array) -> None:
+        """Fresh medium that went in, or was put off to the next dose, since this was last called, mL, shape (N,)."""
         ...
 
 

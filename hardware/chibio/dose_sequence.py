@@ -47,7 +47,8 @@ class DoseSequence:
     repeats its dose every 63 s until it is switched off, so a late end means that more was dosed than planned.
 
     Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
-      not be verified off; endings, of doses that the device has repeated, until somebody books and clears them.
+      not be verified off; escalated, whether the experiment was ended for that, and not started again since; endings,
+      of doses that the device has repeated, until somebody books and clears them.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class DoseSequence:
         self._agenda, self._clock, self._book = agenda, connection.clock, book
         self.running = False
         self.stuck = ""
+        self.escalated = False
         self.endings: list[Ending] = []
         self._begun: _Begun | None = None
         self._acted: tuple[float, int] | None = None  # newest sample a dose was decided for
@@ -75,6 +77,11 @@ class DoseSequence:
         self._acted, self._carry_ml, self._doses = history.sample, history.carry_ml, history.doses
         if history.open:
             self._conclude(*conclude(history, state, self._book.elapsed(), self._config.deadman_s))
+
+    @property
+    def carry_ml(self) -> float:
+        """Asked for and put off to the next dose, because it is less than the pump can deliver, mL."""
+        return self._carry_ml
 
     def forget_sample(self) -> None:
         """The device's records begin anew: no dose was decided for any sample in them."""
@@ -203,6 +210,7 @@ class DoseSequence:
                     if FEED in self._connection.state.running_pumps:
                         self._mark(feed_off_s=math.nan)  # it was answered, not done
                     if refusals == 3:
+                        self.escalated = True
                         self._connection.escalate()
             yield pause
         self.ended(self._book.elapsed())

@@ -167,17 +167,19 @@ class ChiBioReactors:
         Raises: what the log raises when an intent cannot be written (then nothing is dosed); ValueError for a rate
           that is negative or not finite. Trouble with device or link becomes a note.
         """
-        volume, waste = np.zeros(len(self.stations)), np.zeros(len(self.stations))
+        volume, waste, kept = (np.zeros(len(self.stations)) for _ in range(3))
         for i, station in enumerate(self.stations):
             if command.rows[i]:
                 station.set_temperature(float(command.temperature[i]))
+                before_ml = station.doses.carry_ml
                 plan = station.dose(float(command.pump_rate[i]))
                 volume[i], waste[i] = plan.feed_ml, plan.waste_ml
+                kept[i] = station.doses.carry_ml - before_ml
                 self._work()
         notes = tuple(f"{station.name}: {note}" for station in self.stations for note in station.book.notes)
         for station in self.stations:
             station.book.notes.clear()
-        return Receipt(volume, notes, waste)
+        return Receipt(volume, notes, waste, kept)
 
     def repeated(self) -> list[tuple[float, Receipt]]:
         """Doses that the device repeated by itself, not told before: run time, s, and volumes, in order."""

@@ -108,6 +108,7 @@ class Station:
                     self.sampling.expect_first()
                 if not self._heat:  # a start switches the thermostat on
                     self.heat_off()
+            self.doses.escalated = False
             if self.regulation.active:
                 self.regulation.hand_over_again()
             self._start_time = self.overflow_pump.keep_on(self.connection.read()).start_time
@@ -164,10 +165,10 @@ class Station:
             if kind == "stalled":
                 self.connection.post(f"/Experiment/0/{self.name}")
                 yield OLD_CYCLE_S
-            else:
+            elif kind == "restarted":
                 self.sampling.key = None  # the device's records begin anew: any sample is a new one
                 self.doses.forget_sample()
-            yield from self.bring_up(waited=True)
+            yield from self.bring_up(waited=kind != "stopped")
             self.book.tell(f"recovered from: {kind}")
         finally:
             self.busy = False
@@ -193,13 +194,12 @@ class Station:
         fault = diagnose(
             state, self._config, age_s=age, start_time=self._start_time, blank=self._blank,
             setpoint=self.regulation.setpoint, dosing=self.doses.running, stuck=self.doses.stuck,
-            overflow_trouble=self.overflow_pump.trouble,
+            escalated=self.doses.escalated, overflow_trouble=self.overflow_pump.trouble,
         )  # fmt: skip
         self.book.report(fault)
-        recoverable = fault is not None and (
-            fault.kind == "restarted" or (fault.kind == "stalled" and age > self._config.lost_s)
-        )
-        if fault is not None and recoverable and self._config.recover:
+        if state.running and not self.doses.running:
+            self.doses.escalated = False  # it never reached the device: a later stop is somebody else's
+        if fault is not None and self._config.recover and self._recoverable(fault.kind, age):
             self.busy = True
             self._agenda.add(self._recover(fault.kind))
         if is_new and (fault is None or fault.kind in ("mode", "pump", "overflow_pump")):
@@ -207,6 +207,11 @@ class Station:
             return True
         self.sampling.not_taken(is_new)
         return False
+
+    def _recoverable(self, kind: str, age_s: float) -> bool:
+        """Whether a fault is this program's to mend; what somebody else stopped stays so."""
+        own_stop = kind == "stopped" and self.doses.escalated and not self.doses.running
+        return kind == "restarted" or own_stop or (kind == "stalled" and age_s > self._config.lost_s)
 
     def _take(self, state: DeviceState, now: float, elapsed: float) -> None:
         """Deliver a new sample, write it down, and put heater and stirrer right."""

@@ -89,6 +89,16 @@ class Interlock:
         self._add_holds(found, fresh, now)
         return self._conclude(found, allowed, np.where(sound, np.clip(setpoint, 0.05, None), 0.5))
 
+    def believes(self, measurement: Measurement) -> Mask:
+        """Rows whose fresh reading may be acted on, shape (N,); asked before `check`, changes nothing.
+
+        A step that nothing explains may be only where `jump` is no more than reported.
+        """
+        believed = self._readings.believed(measurement, np.asarray(measurement.fresh, dtype=np.bool_))
+        if self._response("jump") is Response.PASS:
+            return believed
+        return believed & self._change.takes(measurement.od, measurement.time_s, believed)
+
     def _response(self, kind: str) -> Response:
         return WORDS[getattr(self.config.responses, kind)]
 

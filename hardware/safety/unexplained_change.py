@@ -39,18 +39,10 @@ class UnexplainedChange:
 
         Args: reading, setpoint: OD, shape (N,). time_s: when it was taken, s, shape (N,).
         """
-        c = self._config
         od, t, before = np.where(believed, reading, math.nan), time_s / 60.0, self._od
-        first = believed & np.isnan(before)
-        with np.errstate(invalid="ignore"):
-            low, high = self._band(before, t - self._at)
-            step = believed & ~first & ~((od >= low) & (od <= high))
-            near_low, near_high = self._band(self._suspect, t - self._suspect_at)
-            consistent = (od >= near_low) & (od <= near_high)
-            down = od < low
-        suspects = np.where(step, np.where(consistent, self._suspects + 1, 1), np.where(believed, 0, self._suspects))
+        step, down, suspects, settled = self._steps(od, t)
         self._suspect, self._suspect_at = np.where(step, od, self._suspect), np.where(step, t, self._suspect_at)
-        settled = step & (suspects >= np.where(down, c.accept_down, c.accept_up))
+        first = believed & np.isnan(before)
         usual = believed & ~step & ~first
         findings = [
             Finding("jump", step & ~down, lambda i: f"OD {before[i]:.3f} to {od[i]:.3f}: growth cannot do that"),
@@ -66,6 +58,26 @@ class UnexplainedChange:
         self._od, self._at = np.where(taken, od, before), np.where(taken, t, self._at)
         self._since_ml = np.where(taken, 0.0, self._since_ml)
         return findings
+
+    def takes(self, reading: Array, time_s: Array, believed: Mask) -> Mask:
+        """The `believed` rows from whose reading `check` would go on; arguments as there, changes nothing."""
+        step, _, _, settled = self._steps(np.where(believed, reading, math.nan), time_s / 60.0)
+        return np.asarray(believed & (~step | settled))
+
+    def _steps(self, od: Array, t: Array) -> tuple[Mask, Mask, Array, Mask]:
+        """Rows with a step, of these those downwards, steps in a row that agree, and rows where they are enough.
+
+        Args: od: believed readings, else nan, shape (N,). t: when they were taken, min, shape (N,).
+        """
+        c, known = self._config, np.isfinite(od)
+        with np.errstate(invalid="ignore"):
+            low, high = self._band(self._od, t - self._at)
+            step = known & ~np.isnan(self._od) & ~((od >= low) & (od <= high))
+            near_low, near_high = self._band(self._suspect, t - self._suspect_at)
+            consistent = (od >= near_low) & (od <= near_high)
+            down = od < low
+        suspects = np.where(step, np.where(consistent, self._suspects + 1, 1), np.where(known, 0, self._suspects))
+        return step, down, suspects, step & (suspects >= np.where(down, c.accept_down, c.accept_up))
 
     def _band(self, od: Array, minutes: Array) -> tuple[Array, Array]:
         """Lowest and highest reading that growth, the doses since the believed one, and noise can make of `od`."""

@@ -13,8 +13,12 @@ from experiments.controllers.adaptive_inverse import AdaptiveInverse, AdaptiveIn
 ONE = np.ones(1, dtype=bool)
 
 
-def test_filter_equals_least_squares_on_all_data() -> None:
-    """Without walks the estimate is the weighted least-squares fit of ln x0, mu, g with their priors."""
+@pytest.mark.parametrize("told", [False, True])
+def test_filter_equals_least_squares_on_all_data(told: bool) -> None:
+    """Without walks the estimate is the weighted least-squares fit of ln x0, mu, g with their priors.
+
+    What it decides is dosed; or it is told what is, which is something else.
+    """
     config = AdaptiveInverseConfig(mu_walk=0.0, gain_walk=0.0, pulse_cv=0.0, growth_cv=0.0, gate_sigma=20.0)
     model = EnvConfig()
     rng = np.random.default_rng(1)
@@ -29,6 +33,10 @@ def test_filter_equals_least_squares_on_all_data() -> None:
         weights.append(reading / np.hypot(config.noise_floor, config.noise_relative * reading))
         setpoint = np.array([0.5 if k < 20 else 0.7])
         u = inverse.act(np.array([reading]), setpoint, np.array([minute]), ONE)[0]
+        if told:
+            u = u * rng.choice([0.0, 0.5, 1.0]) + 0.03 * (k == 25)
+            inverse.dosed(np.array([40.0 * u]))
+            inverse.dosed(np.array([20.0 * u]))  # in two parts, mL of a period
         step = 1.0 if k % 7 else 2.0  # now and then a reading is missed
         log_x += 0.024 * step - 0.9 * u / model.tau
         dosed += u / model.tau

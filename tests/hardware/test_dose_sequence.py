@@ -224,6 +224,7 @@ def test_a_pump_that_stays_on_is_told_and_its_experiment_ended_at_the_fourth_ref
     assert before_end.count("/MeasureTemp/IR/M0") == 4
     assert "Pump1 still on" in bench.doses.stuck
     assert bench.doses.running
+    assert bench.doses.escalated
     bench.line.shown = {}
     bench.run()
     assert bench.doses.stuck == ""

@@ -594,6 +594,47 @@ def test_a_dead_thread_is_restarted_and_the_neighbour_never_notices() -> None:
     assert data["Thermostat"]["ON"] == data["Stir"]["ON"] == 1
 
 
+def test_an_experiment_that_this_program_ended_is_started_again_and_one_that_somebody_ended_is_not() -> None:
+    lab = DriverLab(("M0", "M1"))
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    while not [row for row in lab.of("feed_on") if row["reactor"] == "M0"]:
+        lab.step()
+    lab.fault("foreign_selects", 1.0)  # no read shows this reactor, so the end of the dose cannot be verified
+    lab.run(3)
+    assert [path for _, path in lab.wire.posts].count("/Experiment/0/M0") == 1
+    lab.fault("foreign_selects", 0.0)
+    over_s = lab.clock.now()
+    lab.run(8)
+    starts = [t for t, path in lab.wire.posts if path == "/Experiment/1/M0"]
+    assert len(starts) == 2  # the first one began the run
+    data = lab.device.apps["M0"].data
+    assert data["Experiment"]["ON"] == data["Thermostat"]["ON"] == data["Stir"]["ON"] == 1
+    assert [start for start, _ in doses(lab) if start > over_s]
+    lab.device.submit("POST", "/Experiment/0/M0")
+    lab.run(8)
+    assert [t for t, path in lab.wire.posts if path == "/Experiment/1/M0"] == starts
+    assert "was stopped by someone" in str(lab.reactors.stations[0].book.fault)
+
+
+def test_a_stop_that_never_reached_the_device_does_not_excuse_a_later_one() -> None:
+    lab = DriverLab()
+    fixed(lab, 0.02)
+    lab.reactors.begin()
+    while not lab.of("feed_on"):
+        lab.step()
+    lab.fault("lying", -1)
+    lab.run(2)
+    assert [path for _, path in lab.wire.posts].count("/Experiment/0/M0") == 1
+    lab.fault("lying", 0)
+    lab.run(3)
+    assert lab.reactors.stations[0].book.fault is None
+    lab.device.submit("POST", "/Experiment/0/M0")
+    lab.run(5)
+    assert [path for _, path in lab.wire.posts].count("/Experiment/1/M0") == 1
+    assert "was stopped by someone" in str(lab.reactors.stations[0].book.fault)
+
+
 def test_the_hot_guard_switches_heating_off_for_good() -> None:
     lab = DriverLab()
     lab.reactors.begin()

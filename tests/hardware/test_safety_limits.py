@@ -138,6 +138,7 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
 def test_what_a_sensor_can_read(od: float, raw: float, kind: str) -> None:
     vitals = Vitals(np.zeros(2), np.array([raw, 9000.0]), (None, None))
     m = Measurement(np.zeros(2), np.array([od, 0.4]), np.full(2, 37.0), np.array([True, True]), vitals)
+    assert Readings(2, C).believed(m, np.array([True, True])).tolist() == [kind == "", True]
     believed, findings = Readings(2, C).check(m, np.array([True, True]), 0.0)
     assert told(findings, 2) == [[kind] if kind else [], []]
     assert believed.tolist() == [kind == "", True]
@@ -162,7 +163,9 @@ def test_equal_readings_are_counted_over_samples_that_are_new() -> None:
         (0.5, 0),
     ):
         m = Measurement(np.zeros(1), np.array([od]), np.zeros(1), new, None)
+        foreseen = [readings.believed(m, np.array([bool(fresh)]))[0] for _ in range(5)]  # asking changes nothing
         believed, findings = readings.check(m, np.array([bool(fresh)]), 0.0)
+        assert foreseen == [believed[0]] * 5
         kinds += told(findings, 1)
         assert believed[0] == (bool(fresh) and kinds[-1] == [])
         if len(kinds) == 3:
@@ -373,7 +376,9 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
             bubble = np.where(rng.random(N) < 0.05, rng.uniform(-0.1, 0.15, N), 0.0)
             od, believed = true + 0.003 * rng.standard_normal(N) + bubble, rng.random(N) < 0.95
             od = np.where(np.arange(N) % 2, od, np.round(od, 2))  # 0.05 itself among them
+            takes = change.takes(od, np.full(N, 60.0 * minute), believed)
             findings = told(change.check(od, np.full(N, 60.0 * minute), believed, setpoint))
+            assert takes.tolist() == (change.state()["_at"] == minute).tolist()
             rows = zip(twins, od, believed, setpoint, strict=True)
             expected = [t.judge(o, minute, b, s) for t, o, b, s in rows]
             assert [sorted(kinds) for kinds in findings] == [sorted(kinds) for kinds in expected]
@@ -506,6 +511,16 @@ def test_plain_lists_will_do() -> None:
     interlock = Interlock(1)
     m = Measurement(np.zeros(1), np.array([0.5]), np.full(1, 37.0), np.array([True]))
     assert interlock.check(m, [0.01], [1], [37], 0.0).rate[0] == 0.01  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("jump", "believed"), [("hold", [False, True, False]), ("report", [True, True, False])])
+def test_a_step_is_acted_on_only_where_it_is_no_more_than_reported(jump: str, believed: list[bool]) -> None:
+    interlock = Interlock(3, SafetyConfig(responses=Responses(jump=jump)))
+    for minute, od, fresh in ((0, [0.5, 0.5, 0.5], True), (1, [0.8, 0.51, 0.51], np.array([True, True, False]))):
+        of = Measurement(np.full(3, 60.0 * minute), np.array(od), np.full(3, 37.0), np.full(3, True) & fresh)
+        answer = interlock.believes(of).tolist()
+        interlock.check(of, np.full(3, 0.01), np.full(3, 0.5), np.full(3, 37.0), 60.0 * minute)
+    assert answer == believed
 
 
 def test_a_receipt_without_waste_leaves_the_level_at_its_tube() -> None:
