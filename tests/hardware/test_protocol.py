@@ -98,7 +98,7 @@ VALUES = st.one_of(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=300, deadline=None)
 @given(st.sampled_from(PATHS), VALUES)
 def test_any_value_in_any_field_parses_or_is_refused(path: tuple[str, str], value: Any) -> None:
     data = state()
@@ -110,7 +110,7 @@ def test_any_value_in_any_field_parses_or_is_refused(path: tuple[str, str], valu
     assert all(isinstance(flag, bool) for flag in (*found.pumps_on, found.running, found.regulating))
 
 
-@settings(max_examples=300)
+@settings(max_examples=300, deadline=None)
 @given(st.data())
 def test_damaged_bytes_parse_or_are_refused(data: st.DataObject) -> None:
     body = bytearray(json.dumps(state()).encode())
@@ -225,7 +225,7 @@ WORDS = st.sampled_from(
 )
 
 
-@settings(max_examples=2000)
+@settings(max_examples=2000, deadline=None)
 @given(st.lists(WORDS, max_size=6), st.sampled_from(["", "Pump1", "Pump3"]))
 def test_no_combination_of_words_pumps_too_much_or_reaches_another_reactor(words: list[str], pump: str) -> None:
     path = "/" + "/".join(words)

@@ -378,7 +378,8 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
             od = np.where(np.arange(N) % 2, od, np.round(od, 2))  # 0.05 itself among them
             takes = change.takes(od, np.full(N, 60.0 * minute), believed)
             findings = told(change.check(od, np.full(N, 60.0 * minute), believed, setpoint))
-            assert takes.tolist() == (change.state()["_at"] == minute).tolist()
+            if dt:  # a second sample of the same minute leaves the time as it was
+                assert takes.tolist() == (change.state()["_at"] == minute).tolist()
             rows = zip(twins, od, believed, setpoint, strict=True)
             expected = [t.judge(o, minute, b, s) for t, o, b, s in rows]
             assert [sorted(kinds) for kinds in findings] == [sorted(kinds) for kinds in expected]
