@@ -108,7 +108,7 @@ def test_a_reply_of_the_agent_is_read_by_the_driver(number: int, status: int, bo
     assert not header.fits(body + b"x")
 
 
-@settings(max_examples=3000)
+@settings(max_examples=3000, deadline=None)
 @given(st.integers(1, 2**32 - 1), PATHS, st.data())
 def test_a_damaged_frame_is_never_taken_for_another(number: int, path: str, data: st.DataObject) -> None:
     line = bytearray(encode_request(number, "POST", path)[:-1])
@@ -117,7 +117,7 @@ def test_a_damaged_frame_is_never_taken_for_another(number: int, path: str, data
     assert decode_request(bytes(line)) in (None, (number, "POST", path))
 
 
-@settings(max_examples=3000)
+@settings(max_examples=3000, deadline=None)
 @given(st.binary(max_size=700))
 def test_garbage_is_never_a_request(line: bytes) -> None:
     assert decode_request(line) is None
@@ -305,7 +305,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=1000)
+@settings(max_examples=1000, deadline=None)
 @given(st.one_of(st.binary(max_size=200), JSON.map(lambda x: json.dumps(x).encode())))
 def test_reduction_of_anything_else_leaves_it_alone_or_reduces_it(body: bytes) -> None:
     reduced = reduce_sysdata(body)

@@ -118,7 +118,7 @@ def test_a_pump_nobody_weighed() -> None:
     assert PumpCalibration(bias_s=0.5).volume(-0.1) == 0.0
 
 
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 @given(
     st.floats(0.0, 0.05),
     st.floats(0.0, 0.5),

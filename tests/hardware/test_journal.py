@@ -56,7 +56,7 @@ def test_a_torn_end_is_cut_and_told(tmp_path: Path, torn: bytes) -> None:
     assert [row["kind"] for row in read_journal(path)[0]] == ["a", "b", "c"]
 
 
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.integers(0, 400))
 def test_a_file_cut_anywhere_keeps_every_whole_row(tmp_path: Path, cut: int) -> None:
     path = tmp_path / "j"
