@@ -324,8 +324,9 @@ FAULTS: tuple[Fault, ...] = (
     Fault("board's clock +1 h", "set forward; a pump that runs repeats its dose at once", set_("clock_step", 3600.0),
           ("note:clock",), wide=True, minutes=3.0, rogue=True,
           blind=True),
-    Fault("board's clock -10 min", "set back: the cycle stalls that long", set_("clock_step", -600.0),
-          ("stale", "stalled", "note:clock"), wide=True, minutes=15.0, blind=True),
+    Fault("board's clock -10 min", "set back: a cycle that is going on stalls that long, of any reactor of the board",
+          set_("clock_step", -600.0), ("stale", "stalled", "note:clock"), wide=True, minutes=15.0, blind=True,
+          error=outage(5.0)),  # to that reactor it is a measuring thread that died
     # ---- other clients
     Fault("foreign selections", "another page selects, every third request, 10 min",
           set_("foreign_selects", 0.3), end=set_("foreign_selects", 0.0), minutes=10.0, wide=True, blind=True,
