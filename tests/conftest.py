@@ -1,0 +1,7 @@
+"""What holds for every test."""
+
+import signal
+
+for _number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
+    if signal.getsignal(_number) is signal.SIG_IGN:  # a suite in the background; programs started by it would be deaf
+        signal.signal(_number, signal.default_int_handler if _number == signal.SIGINT else signal.SIG_DFL)
