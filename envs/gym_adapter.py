@@ -4,16 +4,15 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from envs.task import EnvConfig
 from envs.vector_env import (
     BioreactorVectorEnv,
+    EpisodeSpec,
     action_space,
     checked_actions,
     observation_space,
-    with_length,
 )  # fmt: skip
 
 __all__ = ["BioreactorEnv", "register"]
@@ -21,7 +20,7 @@ __all__ = ["BioreactorEnv", "register"]
 ENV_ID = "Bioreactor-v0"
 
 
-class BioreactorEnv(gymnasium.Env[Any, Any]):
+class BioreactorEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
     """`BioreactorVectorEnv` with N = 1 and no autoreset; observation, action and reward are specified there.
 
     Version history: v0, the task of the paper.
@@ -38,17 +37,7 @@ class BioreactorEnv(gymnasium.Env[Any, Any]):
         self.config = self._batch.config
         self.observation_space = observation_space()
         self.action_space = action_space(self.config)
-        self._spec: EnvSpec | None = None
         self._next: NDArray[np.float32] | None = None  # start of the episode the batch has already begun
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """What Gymnasium registers, with the episode's length."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        self._spec = with_length(value, self.config)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

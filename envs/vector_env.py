@@ -16,7 +16,7 @@ from conf.schema import require
 from envs.task import MAX_OD, EnvConfig, step_factors, tracking_reward
 
 __all__ = [
-    "BioreactorVectorEnv", "EpisodeStreams", "action_space", "checked_actions", "observation_space", "with_length",
+    "BioreactorVectorEnv", "EpisodeSpec", "EpisodeStreams", "action_space", "checked_actions", "observation_space",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -44,9 +44,23 @@ def checked_actions(actions: Any, shape: tuple[int, ...], n_actions: int) -> NDA
     return given
 
 
-def with_length(spec: EnvSpec | None, config: EnvConfig) -> EnvSpec | None:
-    """A spec that says how long episodes are. Environments truncate by themselves, so no time limit is registered."""
-    return None if spec is None else replace(spec, max_episode_steps=config.episode_steps)
+class EpisodeSpec:
+    """`spec` of an environment with a `config`: what Gymnasium registers, with how long episodes are.
+
+    Environments truncate by themselves, so no time limit is registered.
+    """
+
+    config: EnvConfig
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium registers, with the episode's length."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = None if value is None else replace(value, max_episode_steps=self.config.episode_steps)
 
 
 class EpisodeStreams:
@@ -90,7 +104,7 @@ class EpisodeStreams:
         self._position[:] = state["position"]
 
 
-class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
+class BioreactorVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any]):
     """A culture held at a setpoint by choosing a pump rate every control period (paper, sections 2 and 3).
 
     Dynamics: x' = (mu - u/tau) x, integrated with `substeps` steps of `integrator` per control period.
@@ -147,16 +161,6 @@ class BioreactorVectorEnv(VectorEnv[Any, Any, Any]):
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._waiting = np.zeros(num_envs, dtype=np.bool_)  # NEXT_STEP: the next step starts an episode
         self._streams: EpisodeStreams | None = None
-        self._spec: EnvSpec | None = None
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """What Gymnasium registers, with the episode's length."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        self._spec = with_length(value, self.config)
 
     def seed_streams(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
         """Give every copy its stream; `reset(seed=...)` does this with seed, seed + 1, ..."""

@@ -104,7 +104,7 @@ def _draw(folder: Path, raw: Series, result: Calibration, name: str, segment_min
 
 def _generate(config: CalibrateConfig, folder: Path) -> None:
     protocol = config.protocol
-    path = Path(config.out) if config.out else folder / "open_loop.csv"
+    path = Path(config.out) if config.out else folder / f"{config.law}.csv"
     if path.exists():
         raise frame.UserError(f"out={path}: exists; remove it or choose another file")
     time, od, pump_rate, _ = simulated(config, 1)

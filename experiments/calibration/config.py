@@ -33,7 +33,7 @@ class CalibrateConfig:
     )
     identify: IdentifyConfig = part(IdentifyConfig, "how mu and tau are estimated and what is reported")
     generate: bool = setting(False, "simulate the paper's open-loop protocol and write it as a recording")
-    out: str | None = setting(None, "where to; null: RUN/open_loop.csv")
+    out: str | None = setting(None, "where to; null: RUN/LAW.csv")
     coverage: int = setting(
         0,
         "simulate so many recordings and count how often the 95 % intervals hold the truth; 0: no study",

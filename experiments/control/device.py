@@ -2,7 +2,6 @@
 
 import logging
 import math
-import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from experiments.cli import files, frame
+from experiments.cli import files, frame, stop
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.chibio.connection import identity
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
@@ -35,7 +34,6 @@ def one_interrupt() -> Iterator[None]:
     """Ctrl-C, SIGTERM (a service manager, a shutting-down PC) or SIGHUP (a closed terminal) raise KeyboardInterrupt.
 
     Only the first of them: what comes after it does not cut short the switching off of the pumps, nor the summary.
-    Signals that are ignored on purpose (nohup) stay so.
     """
     told: list[int] = []
 
@@ -45,15 +43,8 @@ def one_interrupt() -> Iterator[None]:
             raise KeyboardInterrupt
         log.warning("the pumps are being switched off and verified; this takes up to a minute")
 
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {n: old for n in signals if (old := signal.getsignal(n)) is not signal.SIG_IGN}
-    for number in before:
-        signal.signal(number, answer)
-    try:
+    with stop.handled(answer, *stop.SIGNALS):
         yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
 
 
 @contextmanager
