@@ -27,7 +27,9 @@ class DQNAgent:
     """Deep Q-learning (Mnih 2015) of S agents that share nothing but the machine.
 
     One update (`learn`): draw a minibatch, form y = r + gamma max_a Q_target(s', a), take one Adam step on
-    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates copy the weights to the target network. Keys of the
+    mean (Q(s, a) - y)^2 / 2, and every `target_period` updates copy the weights to the target network. The updates of
+    one step draw from the same memory, and between two copies the target network stays, so their minibatches and
+    targets are made in one go. Keys of the
     config change three of these: `hindsight_share` the minibatch, `action_gap` the target y, `huber` the loss.
 
     Args:
@@ -64,15 +66,15 @@ class DQNAgent:
         self.target = self.online.with_weights(weights.clone())
         self._adam = Adam(weights, self.online.grad, config.learning_rate)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
-        self._explore = UniformStream(streams["explore"], 2, torch.device("cpu"))
-        self._draws = UniformStream(streams["replay"], config.batch_size, self.device)
+        self._explore = UniformStream(streams["explore"], 2)
+        self._draws = UniformStream(streams["replay"], config.batch_size)
         self._relabelled = round(config.hindsight_share * config.batch_size)
-        self._goals = UniformStream(streams["hindsight"], max(1, 2 * self._relabelled), self.device)
-        self._relabel = relabel
         if self._relabelled and relabel is None:
             raise ValueError(
                 f"agent.hindsight_share = {config.hindsight_share}: this task has no goal to replace; set it to 0"
             )
+        self._relabel = relabel
+        self._goals = UniformStream(streams["hindsight"], max(1, 2 * self._relabelled), self._drawn)
         self._parts: dict[str, Adam | Replay | UniformStream] = {
             "adam": self._adam, "replay": self.replay,
             "explore": self._explore, "draws": self._draws, "goals": self._goals,
@@ -89,7 +91,7 @@ class DQNAgent:
 
     def act(self, observation: Array) -> NDArray[np.int64]:
         """Epsilon-greedy actions for one observation per agent, (S, O) -> (S,)."""
-        u = self._explore.next().numpy()
+        u: NDArray[np.float64] = self._explore.take(1)[:, 0]
         action = (u[:, 1] * self.n_actions).astype(np.int64)
         greedy = u[:, 0] >= self.epsilon
         if greedy.any():
@@ -103,41 +105,58 @@ class DQNAgent:
         self.replay.add(s_tm1, a_tm1, r_t * self.config.reward_scale, s_t, continues)
         self.steps += 1
         if self.steps > self.config.learn_start:
-            for _ in range(self.config.updates_per_step):
-                self.learn()
+            self.learn(self.config.updates_per_step)
 
-    def _minibatch(self) -> Transition:
-        """B transitions per agent, the first ones with another goal."""
-        batch = self.replay.sample(self._draws.next())
-        n = self._relabelled
-        if n:
+    def _drawn(self, uniform: Array) -> torch.Tensor:
+        """What the relabelling makes of its random numbers, a block at a time: (S, calls, 2 m) -> (S, calls, m, 2)."""
+        assert self._relabel is not None
+        numbers = torch.from_numpy(uniform).to(self.device)
+        return self._relabel.drawn(numbers.view(*numbers.shape[:2], -1, 2))
+
+    def _minibatches(self, most: int) -> Transition:
+        """n <= `most` minibatches of B transitions per agent, (S, n, B), the first of each with another goal.
+
+        Their observations are the network's features already, (S, n, B, F): the map is the same for every update.
+        """
+        batch = self.replay.sample(self._draws.take(most))
+        if self._relabelled:
             assert self._relabel is not None
-            numbers = self._goals.next().view(self.n_agents, n, 2)
-            changed = self._relabel(Transition(*(field[:, :n] for field in batch)), numbers)
-            changed = changed._replace(r_t=changed.r_t * self.config.reward_scale)
-            batch = Transition(*(torch.cat([a, b[:, n:]], dim=1) for a, b in zip(changed, batch, strict=True)))
-        return batch
+            first = Transition(*(field[:, :, : self._relabelled] for field in batch))
+            self._relabel.replace(first, self._goals.take(most))
+            first.r_t.mul_(self.config.reward_scale)
+        features = self.online.features
+        return batch._replace(s_tm1=features(batch.s_tm1), s_t=features(batch.s_t))
+
+    def _q_target(self, features: torch.Tensor) -> torch.Tensor:
+        """Q of the target network, (S, n, B, F) -> (S, n, B, A)."""
+        agents, n, b, f = features.shape
+        return self.target.forward(features.view(agents, n * b, f))[0].view(agents, n, b, self.n_actions)
 
     def _td_target(self, batch: Transition) -> torch.Tensor:
-        """y of every transition, shape (S, B)."""
+        """y of every transition, shape (S, n, B)."""
         c = self.config
-        target = q_target(batch.r_t, batch.continues, c.gamma, self.target(batch.s_t))
+        target = q_target(batch.r_t, batch.continues, c.gamma, self._q_target(batch.s_t))
         if c.action_gap:
-            target = advantage_target(target, c.action_gap, self.target(batch.s_tm1), batch.a_tm1)
+            target = advantage_target(target, c.action_gap, self._q_target(batch.s_tm1), batch.a_tm1)
         return target
 
-    def learn(self) -> None:
-        """One update of every agent."""
-        batch = self._minibatch()
-        self.fit(batch.s_tm1, batch.a_tm1, self._td_target(batch))
+    def learn(self, updates: int = 1) -> None:
+        """So many updates of every agent, in several goes where the target network is copied between two of them."""
+        while updates:
+            due = self.config.target_period - self.updates % self.config.target_period
+            batch = self._minibatches(min(updates, due))
+            target = self._td_target(batch)
+            for one in zip(batch.s_tm1.unbind(1), batch.a_tm1.unbind(1), target.unbind(1), strict=True):
+                self.fit(*one)
+            updates -= target.shape[1]
 
-    def fit(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> None:
-        """One Adam step towards Q(observation, action) = target; then, where due, the copy and a look at the loss.
+    def fit(self, features: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> None:
+        """One Adam step towards Q(features, action) = target; then, where due, the copy and a look at the loss.
 
-        Args: observation: (S, B, O). action: (S, B) int64. target: (S, B).
+        Args: features: of the observations, (S, B, F). action: (S, B) int64. target: (S, B).
         """
         c = self.config
-        q, inputs = self.online.forward(observation)
+        q, inputs = self.online.forward(features)
         td_error, gradient = loss_gradient(q, action, target, c.huber)
         self.online.backward(inputs, gradient)
         self._adam.step()

@@ -8,7 +8,7 @@ import torch
 
 __all__ = ["CheckpointError", "load", "save"]
 
-FORMAT = 4
+FORMAT = 5
 
 
 class CheckpointError(Exception):

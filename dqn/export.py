@@ -7,21 +7,26 @@ import torch
 from numpy.typing import NDArray
 
 from dqn.network import QNetwork
-from dqn.policy import FORMAT, OBSERVATION, Policy
+from dqn.policy import FORMAT, Policy
 
 __all__ = ["export"]
 
 
 def export(
-    network: QNetwork, agent: int, flat: torch.Tensor, pump_rates: NDArray[np.float64], metadata: dict[str, Any]
+    network: QNetwork,
+    agent: int,
+    flat: torch.Tensor,
+    actions: NDArray[np.float64],
+    limits: tuple[NDArray[np.float64], NDArray[np.float64]],
+    metadata: dict[str, Any],
 ) -> Policy:
     """The greedy policy of one agent; a basis of the outputs is multiplied into the last layer.
 
     Args:
       network: gives layer sizes and input map. agent: index into `flat`.
       flat: weights of all agents, shape (S, P); not necessarily the network's own (the best ones, say).
-      pump_rates: the action grid, mL/s, shape (A,).
-      metadata: control_min, model, config_hash and whatever else a bench should check or show.
+      actions: the action grid, shape (A,). limits: of the observation, low and high, each (O,).
+      metadata: observation, model, config_hash and whatever else a bench should check or show.
     """
     own = QNetwork(flat[agent : agent + 1].detach().cpu().clone(), network.sizes)
     weights = [weight[0].numpy().copy() for weight, _ in own.layers]
@@ -33,6 +38,8 @@ def export(
         biases=tuple(biases),
         input_matrix=matrix,
         input_offset=offset,
-        pump_rates=np.asarray(pump_rates, dtype=np.float64),
-        metadata={"format": FORMAT, "observation": list(OBSERVATION), **metadata},
+        actions=np.asarray(actions, dtype=np.float64),
+        low=np.asarray(limits[0], dtype=np.float32),
+        high=np.asarray(limits[1], dtype=np.float32),
+        metadata={"format": FORMAT, **metadata},
     )

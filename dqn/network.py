@@ -93,13 +93,15 @@ class QNetwork:
         self.flat = flat
         self.sizes = tuple(sizes)
         self.layers = self._views(flat)
-        self._last = [view.transpose(1, 2) for view in self.layers[-1]]  # W3^T (S, A, in), b3^T (S, A, 1)
+        self._transposed = [(weight.transpose(1, 2), bias.transpose(1, 2)) for weight, bias in self.layers]
         self.grad = torch.zeros_like(flat)
         self._grads = self._views(self.grad)
+        self._grad_last = self._grads[-1][0].transpose(1, 2)  # (S, A, in)
         self._matrix = torch.eye(self.sizes[0], device=flat.device) if matrix is None else matrix
         self._offset = torch.zeros(self.sizes[0], device=flat.device) if offset is None else offset
         self._mapped = matrix is not None
         self._basis = basis
+        self._mix = None if basis is None else basis.T.expand(flat.shape[0], -1, -1)  # C^T for every agent
 
     def _views(self, flat: torch.Tensor) -> list[Layer]:
         """(W, b) of each layer as views: W (S, in, out), b (S, 1, out)."""
@@ -118,7 +120,7 @@ class QNetwork:
         return QNetwork(flat, self.sizes, matrix, offset, self._basis)
 
     def features(self, observation: torch.Tensor) -> torch.Tensor:
-        """f = M observation + c; observation (S, B, observations) -> (S, B, features)."""
+        """f = M observation + c; observation (S, ..., B, observations) -> (S, ..., B, F)."""
         if self._mapped:
             return torch.matmul(observation, self._matrix.T).add_(self._offset)
         return observation
@@ -131,33 +133,31 @@ class QNetwork:
         """C (A, A) as a NumPy array."""
         return np.eye(self.sizes[-1], dtype=np.float32) if self._basis is None else self._basis.cpu().numpy().copy()
 
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """Q values, shape (S, B, A), and the inputs of each layer, for `backward`."""
-        h = self.features(observation)
-        inputs = []
+    def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Q values, shape (S, B, A), of features (S, B, F), and the inputs of each layer, for `backward`."""
+        h = features
+        inputs = [h]
         for weight, bias in self.layers[:-1]:
-            inputs.append(h)
             h = torch.baddbmm(bias, h, weight).relu_()
-        inputs.append(h)
-        weight, bias = self._last
-        z = torch.baddbmm(bias, weight, h.transpose(1, 2)).transpose(1, 2)
-        return z if self._basis is None else torch.matmul(z, self._basis), inputs
+            inputs.append(h)
+        weight, bias = self._transposed[-1]
+        q = torch.baddbmm(bias, weight, h.transpose(1, 2))
+        if self._mix is not None:
+            q = torch.bmm(self._mix, q)
+        return q.transpose(1, 2), inputs
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
         """Q values only; observation (S, B, observations) -> (S, B, A)."""
-        return self.forward(observation)[0]
+        return self.forward(self.features(observation))[0]
 
     def backward(self, inputs: list[torch.Tensor], grad_q: torch.Tensor) -> None:
         """Fill `grad` with the gradient of a loss whose derivative by Q is `grad_q`, shape (S, B, A)."""
-        delta = grad_q if self._basis is None else torch.matmul(grad_q, self._basis.T)
-        last = len(self.layers) - 1
-        for k in range(last, -1, -1):
-            grad_weight, grad_bias = self._grads[k]
-            if k == last:
-                torch.bmm(delta.transpose(1, 2), inputs[k], out=grad_weight.transpose(1, 2))
-            else:
-                torch.bmm(inputs[k].transpose(1, 2), delta, out=grad_weight)
+        delta = grad_q if self._mix is None else torch.bmm(grad_q, self._mix)
+        torch.bmm(delta.transpose(1, 2), inputs[-1], out=self._grad_last)
+        torch.sum(delta, 1, keepdim=True, out=self._grads[-1][1])
+        for k in range(len(self.layers) - 1, 0, -1):
+            back = torch.bmm(delta, self._transposed[k][0])
+            delta = torch.ops.aten.threshold_backward(back, inputs[k], 0.0)  # relu's derivative, in one pass
+            grad_weight, grad_bias = self._grads[k - 1]
+            torch.bmm(inputs[k - 1].transpose(1, 2), delta, out=grad_weight)
             torch.sum(delta, 1, keepdim=True, out=grad_bias)
-            if k > 0:
-                back = torch.bmm(delta, self.layers[k][0].transpose(1, 2))
-                delta = torch.ops.aten.threshold_backward(back, inputs[k], 0.0)  # relu's derivative, in one pass

@@ -1,10 +1,17 @@
 """The greedy policy as plain arrays: read from policy.npz and evaluated with NumPy alone, where torch is absent.
 
-Format 1 of policy.npz: arrays `w0, b0, w1, b1, ...` (float32, layer k maps h to relu(h @ wk + bk), the last without
-relu), `input_matrix` (F, O) and `input_offset` (F,), `pump_rates` (A,) in mL/s, and `metadata`, a JSON text with
-{format, observation: names, control_min, model: {mu, tau, ...}, config_hash, ...}. No pickled objects.
+Format 2 of policy.npz: arrays `w0, b0, w1, b1, ...` (float32, layer k maps h to relu(h @ wk + bk), the last without
+relu), `input_matrix` (F, O) and `input_offset` (F,), `observation_low` and `observation_high` (O,), `actions` (A,), and
+`metadata`, a JSON text with {format, observation: names, model: {...}, config_hash, ...}. No pickled objects. Format 1
+is read, too: it has `pump_rates` for `actions` and no limits of the observation.
+
+| observation | what it is | actions |
+|---|---|---|
+| od, setpoint | OD x and setpoint r | pump rates, mL/s |
+| error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | shares of it |
 """
 
+import hashlib
 import json
 import zipfile
 from dataclasses import dataclass
@@ -14,10 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FORMAT", "OBSERVATION", "Policy", "PolicyError", "load", "save"]
+__all__ = ["ABSOLUTE", "FORMAT", "RELATIVE", "Policy", "PolicyError", "fingerprint", "load", "save"]
 
-FORMAT = 1
-OBSERVATION = ("od", "setpoint")
+FORMAT = 2
+ABSOLUTE = ("od", "setpoint")
+RELATIVE = ("error", "growth_share")
+READABLE = (1, 2)
 
 
 class PolicyError(Exception):
@@ -26,22 +35,31 @@ class PolicyError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """pump rate = rates[argmax_a Q(M [od, setpoint] + c, a)].
+    """actions[argmax_a Q(M o + c, a)] for an observation o, clipped to the range that was trained.
 
     weights, biases: per layer (in, out) and (out,), float32. input_matrix: M (F, O); input_offset: c (F,).
-    pump_rates: (A,), mL/s. metadata: as in the module's description.
+    actions: (A,), in the unit that belongs to the observation. low, high: limits of the observation, (O,).
+    metadata: as in the module's description.
     """
 
     weights: tuple[NDArray[np.float32], ...]
     biases: tuple[NDArray[np.float32], ...]
     input_matrix: NDArray[np.float32]
     input_offset: NDArray[np.float32]
-    pump_rates: NDArray[np.float64]
+    actions: NDArray[np.float64]
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
     metadata: dict[str, Any]
+
+    @property
+    def observation(self) -> tuple[str, ...]:
+        """Names of the inputs, `ABSOLUTE` or `RELATIVE`."""
+        return tuple(self.metadata["observation"])
 
     def q_values(self, observation: NDArray[Any]) -> NDArray[np.float32]:
         """Q(observation, .), (N, O) -> (N, A), in the scale the agent was trained in."""
-        h = observation.astype(np.float32) @ self.input_matrix.T + self.input_offset
+        seen = np.clip(observation.astype(np.float32), self.low, self.high)
+        h = seen @ self.input_matrix.T + self.input_offset
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             h = np.maximum(h @ weight + bias, 0.0)
         return np.asarray(h @ self.weights[-1] + self.biases[-1], dtype=np.float32)
@@ -50,21 +68,38 @@ class Policy:
         """Index of the greedy action, (N, O) -> (N,)."""
         return np.asarray(self.q_values(observation).argmax(axis=-1))
 
-    def rate(self, observation: NDArray[Any]) -> NDArray[np.float64]:
-        """Greedy pump rate in mL/s, (N, O) -> (N,)."""
-        return self.pump_rates[self.act(observation)]
+    def chosen(self, observation: NDArray[Any]) -> NDArray[np.float64]:
+        """The greedy action itself: a pump rate in mL/s or a share of the largest, (N, O) -> (N,)."""
+        return self.actions[self.act(observation)]
+
+
+def _arrays(policy: Policy) -> dict[str, NDArray[Any]]:
+    """Every array of a policy file but its metadata, by name."""
+    arrays: dict[str, NDArray[Any]] = {
+        "input_matrix": policy.input_matrix,
+        "input_offset": policy.input_offset,
+        "actions": policy.actions,
+        "observation_low": policy.low,
+        "observation_high": policy.high,
+    }
+    for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        arrays[f"w{k}"], arrays[f"b{k}"] = weight, bias
+    return arrays
+
+
+def fingerprint(policy: Policy) -> str:
+    """SHA-256 over everything that decides which action is chosen and what it means: arrays, observation, model."""
+    said = {key: policy.metadata.get(key) for key in ("observation", "control_min", "model")}
+    digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
+    for name, array in sorted(_arrays(policy).items()):
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def save(path: Path, policy: Policy) -> None:
     """Write policy.npz atomically."""
-    arrays: dict[str, NDArray[Any]] = {
-        "input_matrix": policy.input_matrix,
-        "input_offset": policy.input_offset,
-        "pump_rates": policy.pump_rates,
-        "metadata": np.array(json.dumps(policy.metadata, sort_keys=True)),
-    }
-    for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-        arrays[f"w{k}"], arrays[f"b{k}"] = weight, bias
+    arrays = {**_arrays(policy), "metadata": np.array(json.dumps(policy.metadata, sort_keys=True))}
     temporary = path.with_suffix(".part.npz")
     np.savez(temporary, **arrays)  # type: ignore[arg-type]
     temporary.replace(path)
@@ -86,24 +121,34 @@ def load(path: Path) -> Policy:
         raise PolicyError(f"policy {path}: not a policy file ({reason}); {remedy}") from None
     try:
         metadata = json.loads(str(arrays["metadata"]))
-        if metadata.get("format") != FORMAT:
-            raise PolicyError(f"policy {path}: format {metadata.get('format')}: allowed {FORMAT}; export it anew")
-        if tuple(metadata.get("observation", ())) != OBSERVATION:
-            raise PolicyError(f"policy {path}: observation {metadata.get('observation')}: allowed {list(OBSERVATION)}")
+        if metadata.get("format") not in READABLE:
+            allowed = ", ".join(map(str, READABLE))
+            raise PolicyError(f"policy {path}: format {metadata.get('format')}: allowed {allowed}; export it anew")
+        if tuple(metadata.get("observation", ())) not in (ABSOLUTE, RELATIVE):
+            allowed = f"{list(ABSOLUTE)} or {list(RELATIVE)}"
+            raise PolicyError(f"policy {path}: observation {metadata.get('observation')}: allowed {allowed}")
+        first = metadata["format"] == 1
         layers = sum(name.startswith("w") for name in arrays)
         policy = Policy(
             weights=tuple(arrays[f"w{k}"] for k in range(layers)),
             biases=tuple(arrays[f"b{k}"] for k in range(layers)),
             input_matrix=arrays["input_matrix"],
             input_offset=arrays["input_offset"],
-            pump_rates=arrays["pump_rates"],
-            metadata=metadata,
+            actions=arrays["pump_rates" if first else "actions"],
+            low=np.full(2, -np.inf, dtype=np.float32) if first else arrays["observation_low"],
+            high=np.full(2, np.inf, dtype=np.float32) if first else arrays["observation_high"],
+            metadata={**metadata, "format": FORMAT},  # which `save` writes
         )
         q = policy.q_values(np.array([[0.5, 0.5]]))
     except (KeyError, IndexError, ValueError, AttributeError) as error:
         raise PolicyError(f"policy {path}: incomplete or of mismatched shapes ({error}); {remedy}") from None
-    if q.shape != (1, policy.pump_rates.size) or not np.isfinite(q).all():
+    if q.shape != (1, policy.actions.size) or not np.isfinite(q).all():
         raise PolicyError(
-            f"policy {path}: {q.shape[-1]} Q values, {policy.pump_rates.size} pump rates, or not finite; {remedy}"
+            f"policy {path}: {q.shape[-1]} Q values, {policy.actions.size} actions, or not finite; {remedy}"
+        )
+    if not (policy.low < policy.high).all():
+        raise PolicyError(
+            f"policy {path}: limits of the observation {policy.low.tolist()} to {policy.high.tolist()}: allowed low < "
+            f"high; {remedy}"
         )
     return policy

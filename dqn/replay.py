@@ -13,10 +13,11 @@ Array = NDArray[Any]
 
 
 class Transition(NamedTuple):
-    """A minibatch of B steps of each of S agents: observation before, action, reward, observation after.
+    """Minibatches of B steps of each of S agents: observation before, action, reward, observation after.
 
-    s_tm1, s_t: (S, B, O) float32. a_tm1: (S, B) int64. r_t: (S, B) float32.
-    continues: (S, B) float32, 0 where the episode terminated (no bootstrapping), 1 also where it was truncated.
+    s_tm1, s_t: (S, ..., B, O) float32. a_tm1: (S, ..., B) int64. r_t: (S, ..., B) float32. One minibatch has no axis
+    more, several have one.
+    continues: (S, ..., B) float32, 0 where the episode terminated (no bootstrapping), 1 also where it was truncated.
     """
 
     s_tm1: torch.Tensor
@@ -29,7 +30,7 @@ class Transition(NamedTuple):
 class Replay:
     """The last `capacity` transitions of each of S agents.
 
-    A transition is one row of 2 O + 3 float32 numbers, so that remembering one is one copy and drawing a minibatch one
+    A transition is one row of 2 O + 3 float32 numbers, so that remembering one is one copy and drawing minibatches one
     gather.
 
     Args: agents: S. capacity: transitions per agent. observations: O. device: where they are kept.
@@ -39,8 +40,9 @@ class Replay:
         self._widths = [observations, observations, 1, 1, 1]
         self._rows = torch.zeros(agents, capacity, sum(self._widths), device=device)
         self._flat = self._rows.view(-1, self._rows.shape[-1])
-        self._first = (torch.arange(agents, device=device) * capacity)[:, None]
+        self._first = np.arange(agents)[:, None] * capacity
         self._new = np.zeros((agents, sum(self._widths)), dtype=np.float32)
+        self._added = torch.from_numpy(self._new)
         self.capacity = capacity
         self.added = 0  # transitions ever added, per agent
 
@@ -60,20 +62,20 @@ class Replay:
         self._new[:, 2 * o] = a_tm1
         self._new[:, 2 * o + 1] = r_t
         self._new[:, 2 * o + 2] = continues
-        self._rows[:, self.added % self.capacity].copy_(torch.from_numpy(self._new))
+        self._rows[:, self.added % self.capacity].copy_(self._added)
         self.added += 1
 
-    def sample(self, uniform: torch.Tensor) -> Transition:
+    def sample(self, uniform: Array) -> Transition:
         """Uniform draws with replacement.
 
-        Args: uniform: numbers in [0, 1), shape (S, B); number v picks row floor(v * size).
-        Returns: a minibatch, copies. Raises: ValueError while the memory is empty.
+        Args: uniform: float64 in [0, 1), shape (S, ..., B); number v picks row floor(v * size).
+        Returns: minibatches, copies. Raises: ValueError while the memory is empty.
         """
         if self.added == 0:
             raise ValueError("replay memory is empty: add transitions before sampling")
-        index = torch.mul(uniform, self.size).long().add_(self._first)
-        rows = self._flat.index_select(0, index.view(-1)).view(*uniform.shape, -1)
-        s_tm1, s_t, a_tm1, r_t, continues = torch.split(rows, self._widths, dim=-1)
+        index = (uniform * self.size).astype(np.int64).reshape(len(self._first), -1) + self._first
+        rows = self._flat.index_select(0, torch.from_numpy(index.ravel()).to(self._flat.device))
+        s_tm1, s_t, a_tm1, r_t, continues = rows.view(*uniform.shape, -1).split_with_sizes(self._widths, dim=-1)
         return Transition(s_tm1, a_tm1.squeeze(-1).long(), r_t.squeeze(-1), s_t, continues.squeeze(-1))
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,10 +1,10 @@
 """Random numbers for a population: agent i draws the same ones whether it is trained alone or among others."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 
 __all__ = ["UniformStream"]
 
@@ -15,35 +15,39 @@ class UniformStream:
     """Uniform numbers in [0, 1), `width` per agent and call, each agent from a generator of its own.
 
     Each generator draws the numbers of CALLS_PER_BLOCK calls at once, a block, so that most calls need no Python loop
-    over agents. What is saved is the place in the block and the generators as they were before they drew it, from which
-    the block is drawn again. Once the block is used up, the generators are saved as they are.
+    over agents, and what follows from the numbers alone is computed once a block. What is saved is the place in the
+    block and the generators as they were before they drew it, from which the block is drawn again. Once the block is
+    used up, the generators are saved as they are.
 
     Args:
       seeds: one per agent, S. width: numbers per agent and call.
-      device: where the numbers go; a block at a time travels there.
+      into: what becomes of a block, float64 (S, calls, width) -> an array or tensor (S, calls, ...).
     """
 
-    def __init__(self, seeds: Sequence[np.random.SeedSequence], width: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        seeds: Sequence[np.random.SeedSequence],
+        width: int,
+        into: Callable[[NDArray[np.float64]], Any] = lambda block: block,
+    ) -> None:
         self._generators = [np.random.default_rng(seed) for seed in seeds]
         self._width = width
-        self._device = device
+        self._into = into
         self._position = CALLS_PER_BLOCK
         self._states = [g.bit_generator.state for g in self._generators]
-        self._block = torch.empty(0)
+        self._block: Any = None
 
     def _refill(self) -> None:
         self._states = [g.bit_generator.state for g in self._generators]
-        numbers = np.stack([g.random((CALLS_PER_BLOCK, self._width)) for g in self._generators], axis=1)
-        self._block = torch.from_numpy(numbers).to(self._device)
+        self._block = self._into(np.stack([g.random((CALLS_PER_BLOCK, self._width)) for g in self._generators]))
         self._position = 0
 
-    def next(self) -> torch.Tensor:
-        """The next numbers, shape (S, width), float64."""
+    def take(self, calls: int) -> Any:
+        """What the block holds for the next calls, (S, n, ...), n = `calls` or as many as are left in the block."""
         if self._position == CALLS_PER_BLOCK:
             self._refill()
-        numbers = self._block[self._position]
-        self._position += 1
-        return numbers
+        start, self._position = self._position, min(self._position + calls, CALLS_PER_BLOCK)
+        return self._block[:, start : self._position]
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue; plain numbers."""

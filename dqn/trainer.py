@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from dqn.agent import DQNAgent
@@ -82,10 +83,15 @@ class Trainer:
             self._observation, _ = self.env.reset()
         total = self.agent.config.total_steps
         while self.agent.steps < total:
+            self._until(min(total, self.agent.steps - self.agent.steps % self.interval + self.interval))
+            yield self._record()
+            self._finished[:] = np.nan
+
+    @torch.inference_mode()  # gradients are written out by hand: torch need not be ready for any
+    def _until(self, step: int) -> None:
+        """Train until so many environment steps are done."""
+        while self.agent.steps < step:
             self._step()
-            if self.agent.steps % self.interval == 0 or self.agent.steps == total:
-                yield self._record()
-                self._finished[:] = np.nan
 
     def _step(self) -> None:
         """One environment step of every agent, and its updates."""

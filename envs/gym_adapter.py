@@ -36,7 +36,7 @@ class BioreactorEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
         self.render_mode = None
         self.config = self._batch.config
         self.observation_space = observation_space()
-        self.action_space = action_space(self.config)
+        self.action_space = action_space(self.config.n_actions)
         self._next: NDArray[np.float32] | None = None  # start of the episode the batch has already begun
 
     def reset(

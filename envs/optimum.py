@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
 
+from envs.relative import RelativeConfig
 from envs.task import MAX_OD, SCORED_OD, EnvConfig, step_factors
 
-__all__ = ["EpisodeOptimum", "OptimalPolicy", "solve", "solve_episode"]
+__all__ = ["EpisodeOptimum", "OptimalPolicy", "RelativeOptimum", "solve", "solve_episode", "solve_relative"]
 
 Array = NDArray[np.float64]
 SPACING = 4.7e-4  # of log OD: eight points to one of the nominal model's 17 actions
@@ -61,21 +62,68 @@ def solve_episode(config: EnvConfig, setpoint: float, spacing: float = SPACING) 
     """
     factors = step_factors(config)
     log_od = _reach(config, setpoint, factors, spacing)
-    points = log_od.size
     shift = np.log(np.maximum(factors, 1e-12)) / (log_od[1] - log_od[0])
+    stage = (np.minimum(np.exp(log_od) * factors[:, None], MAX_OD) - setpoint) ** 2
+    return EpisodeOptimum(setpoint, log_od, factors, _backward(stage, shift, config.episode_steps))
+
+
+def _backward(stage: Array, shift: Array, steps: int) -> Array:
+    """V_k = min_a [stage_a + V_{k-1} moved by shift_a], V_0 = 0, shape (steps + 1, G).
+
+    Args: stage: cost of the step from each grid point, (A, G). shift: what an action moves, in grid points, (A,).
+    """
+    points = stage.shape[1]
     whole = np.floor(shift)
     part = (shift - whole)[:, None]
     whole = np.clip(whole, -points, points).astype(np.intp)
     pad = int(np.abs(whole).max()) + 1  # beyond its ends V is constant
-    stage = (np.minimum(np.exp(log_od) * factors[:, None], MAX_OD) - setpoint) ** 2
-    value = np.zeros((config.episode_steps + 1, points))
+    value = np.zeros((steps + 1, points))
     for before, now in pairwise(value):
         ahead = np.pad(before, pad, mode="edge")
         now[:] = np.inf
         for i, w, cost in zip(pad + whole, part, stage, strict=True):
             reached = (1.0 - w) * ahead[i : i + points] + w * ahead[i + 1 : i + 1 + points]
             np.minimum(now, cost + reached, out=now)
-    return EpisodeOptimum(setpoint, log_od, factors, value)
+    return value
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeOptimum:
+    """The best controller of e' = e + s - v (`envs/relative.py`) at one growth share for a known number of steps.
+
+    growth_share: s. error: uniform grid of e, (G,). levels: v, (A,). value: V_k, least sum of e^2, (K + 1, G).
+    """
+
+    growth_share: float
+    error: Array
+    levels: Array
+    value: Array
+
+    def act(self, error: Array, left: int) -> NDArray[np.intp]:
+        """Index of the best action with `left` steps to go, by one exact look-ahead; (N,) -> (N,)."""
+        after = error[:, None] + self.growth_share - self.levels
+        return np.asarray(np.argmin(after**2 + np.interp(after, self.error, self.value[left - 1]), axis=1))
+
+    def rollout(self, error: Array) -> tuple[Array, NDArray[np.intp]]:
+        """K steps from the starts, shape (N,): the error after each step and the action taken, each (K, N)."""
+        steps = self.value.shape[0] - 1
+        errors, actions = np.empty((steps, error.size)), np.empty((steps, error.size), dtype=np.intp)
+        for k in range(steps):
+            actions[k] = self.act(error, steps - k)
+            errors[k] = error = error + self.growth_share - self.levels[actions[k]]
+        return errors, actions
+
+
+def solve_relative(
+    config: RelativeConfig, growth_share: float, steps: int, spacing: float = 1 / 256
+) -> RelativeOptimum:
+    """The least sum of e^2 over `steps` steps at one growth share. Args: spacing: of the grid of e."""
+    levels = config.levels()
+    reach = config.largest_error + 1.0
+    error = np.linspace(-reach, reach, round(2.0 * reach / spacing) + 1)
+    moved = growth_share - levels
+    value = _backward((error + moved[:, None]) ** 2, moved / (error[1] - error[0]), steps)
+    return RelativeOptimum(growth_share, error, levels, value)
 
 
 def _reach(config: EnvConfig, setpoint: float, factors: Array, spacing: float) -> Array:

@@ -1,9 +1,10 @@
 """N training episodes side by side as one `gymnasium.vector.VectorEnv`, without a Python loop over copies."""
 
 import reprlib
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from gymnasium import spaces
@@ -16,10 +17,12 @@ from conf.schema import require
 from envs.task import MAX_OD, EnvConfig, step_factors, tracking_reward
 
 __all__ = [
-    "BioreactorVectorEnv", "EpisodeSpec", "EpisodeStreams", "action_space", "checked_actions", "observation_space",
+    "BioreactorVectorEnv", "EpisodeSpec", "EpisodeStreams", "EpisodeVectorEnv", "action_space", "checked_actions",
+    "observation_space",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
+C = TypeVar("C", bound=Any)  # the task's config dataclass
 EPISODES_PER_BLOCK = 64
 
 
@@ -28,9 +31,9 @@ def observation_space() -> spaces.Box:
     return spaces.Box(low=0.0, high=np.array([MAX_OD, 2.0], dtype=np.float32), shape=(2,), dtype=np.float32)
 
 
-def action_space(config: EnvConfig) -> spaces.Discrete:
+def action_space(n_actions: int) -> spaces.Discrete:
     """Index into the pump rates, 0 (pump off) to n_actions - 1 (maximum rate)."""
-    return spaces.Discrete(config.n_actions)
+    return spaces.Discrete(n_actions)
 
 
 def checked_actions(actions: Any, shape: tuple[int, ...], n_actions: int) -> NDArray[np.intp]:
@@ -50,7 +53,7 @@ class EpisodeSpec:
     Environments truncate by themselves, so no time limit is registered.
     """
 
-    config: EnvConfig
+    config: Any
     _spec: EnvSpec | None = None
 
     @property
@@ -104,20 +107,11 @@ class EpisodeStreams:
         self._position[:] = state["position"]
 
 
-class BioreactorVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any]):
-    """A culture held at a setpoint by choosing a pump rate every control period (paper, sections 2 and 3).
+class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
+    """N copies of a task whose episodes have a fixed length; a task says how they begin and how they advance.
 
-    Dynamics: x' = (mu - u/tau) x, integrated with `substeps` steps of `integrator` per control period.
-
-    | observation | meaning                       | range      | unit |
-    |-------------|-------------------------------|------------|------|
-    | 0           | optical density x             | [0, 1000]  | -    |
-    | 1           | setpoint of this episode      | (0, 2]     | -    |
-
-    Action: index a of the pump rate u = a / (n_actions - 1) * max_pump_rate, mL/s.
-    Reward: -(x - setpoint)^2 of the x reached; in the last step times `final_reward_weight`.
-    Start: x uniform in `start_od`, setpoint drawn from `setpoints`, both from the copy's own stream.
-    End: never terminated; truncated after `episode_steps` steps (bootstrapping continues).
+    `state` (N, 2) holds every copy's observation in full precision: what changes, and the goal or parameter that stays.
+    End: never terminated; truncated after `config.episode_steps` steps (bootstrapping continues).
     Autoreset: SAME_STEP, where the last observation of an ended episode is in infos["final_obs"]; or NEXT_STEP, where
     the step after it starts the next episode, whatever the action, with reward 0 (Gymnasium's stateful wrappers).
 
@@ -129,18 +123,20 @@ class BioreactorVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any]):
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
+    default: type[C]
+    config: C
 
     def __init__(
         self,
         num_envs: int = 1,
-        config: EnvConfig | None = None,
+        config: C | None = None,
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         **overrides: Any,
     ) -> None:
-        config = EnvConfig(**overrides) if config is None else config
+        config = self.default(**overrides) if config is None else config
         steps = min(config.episode_steps, max_episode_steps or config.episode_steps)
         self.config = replace(config, episode_steps=steps)
         require(render_mode is None, "render_mode", render_mode, "None (there is nothing to draw)")
@@ -150,17 +146,35 @@ class BioreactorVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any]):
         self.metadata = {**self.metadata, "autoreset_mode": AutoresetMode(autoreset_mode)}
         self.num_envs = num_envs
         self.render_mode = None
-        self.single_observation_space = observation_space()
-        self.single_action_space = action_space(self.config)
+        self.single_observation_space = self.observations(self.config)
+        self.single_action_space = action_space(self.config.n_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._factors = step_factors(self.config)
-        self._setpoints = np.asarray(self.config.setpoints)
-        self.od = np.ones(num_envs)  # true x in full precision
-        self.setpoint = np.ones(num_envs)  # of the running episode
+        self.state = np.ones((num_envs, 2))
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._waiting = np.zeros(num_envs, dtype=np.bool_)  # NEXT_STEP: the next step starts an episode
         self._streams: EpisodeStreams | None = None
+        self._prepare()
+
+    @staticmethod
+    @abstractmethod
+    def observations(config: C) -> spaces.Box:
+        """Space of one copy's observations."""
+
+    def _prepare(self) -> None:
+        """What a task computes once."""
+
+    @abstractmethod
+    def _begun(self, numbers: Array) -> Array:
+        """State (K, 2) of new episodes from two uniform numbers each, (K, 2)."""
+
+    @abstractmethod
+    def _advance(self, actions: NDArray[np.intp]) -> Array:
+        """Change `state` by one control period; the rewards (N,)."""
+
+    def _weigh(self, last: Array) -> Array:
+        """Rewards of the last steps of episodes, (K,)."""
+        return last
 
     def seed_streams(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
         """Give every copy its stream; `reset(seed=...)` does this with seed, seed + 1, ..."""
@@ -169,18 +183,12 @@ class BioreactorVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any]):
     def _start(self, copies: NDArray[np.intp]) -> None:
         """Begin a new episode in `copies`."""
         assert self._streams is not None
-        numbers = self._streams.take(copies)
-        low, high = self.config.start_od
-        self.od[copies] = low + (high - low) * numbers[:, 0]
-        self.setpoint[copies] = self._setpoints[(numbers[:, 1] * self._setpoints.size).astype(np.intp)]
+        self.state[copies] = self._begun(self._streams.take(copies))
         self._steps[copies] = 0
         self._waiting[copies] = False
 
     def _observe(self) -> NDArray[np.float32]:
-        observation = np.empty((self.num_envs, 2), dtype=np.float32)
-        observation[:, 0] = self.od
-        observation[:, 1] = self.setpoint
-        return observation
+        return self.state.astype(np.float32)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -219,9 +227,7 @@ class BioreactorVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any]):
         if self._streams is None:
             raise RuntimeError("step before reset: call reset(seed=...) first")
         actions = checked_actions(actions, (self.num_envs,), self.config.n_actions)
-        np.multiply(self.od, self._factors[actions], out=self.od)
-        np.minimum(self.od, MAX_OD, out=self.od)
-        reward = tracking_reward(self.od, self.setpoint)
+        reward = self._advance(actions)
         self._steps += 1
         if self._waiting.any():
             reward[self._waiting] = 0.0
@@ -232,7 +238,7 @@ class BioreactorVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any]):
 
     def _end(self, truncated: NDArray[np.bool_], reward: Array) -> dict[str, Any]:
         """Weigh the last reward of ended episodes, in place, and begin the next ones or let them wait; the infos."""
-        reward[truncated] *= self.config.final_reward_weight
+        reward[truncated] = self._weigh(reward[truncated])
         if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
             self._waiting = truncated.copy()
             return {}
@@ -244,8 +250,7 @@ class BioreactorVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any]):
         """Everything needed to continue to the bit; plain numbers and lists."""
         assert self._streams is not None, "reset before state_dict"
         return {
-            "od": self.od.tolist(),
-            "setpoint": self.setpoint.tolist(),
+            "state": self.state.tolist(),
             "steps": self._steps.tolist(),
             "waiting": self._waiting.tolist(),
             "streams": self._streams.state_dict(),
@@ -254,9 +259,58 @@ class BioreactorVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any]):
     def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
         """Continue as saved; returns the current observations (N, 2)."""
         assert self._streams is not None, "seed_streams before load_state_dict"
-        self.od[:] = state["od"]
-        self.setpoint[:] = state["setpoint"]
+        self.state[:] = state["state"]
         self._steps[:] = state["steps"]
         self._waiting[:] = state["waiting"]
         self._streams.load_state_dict(state["streams"])
         return self._observe()
+
+
+class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
+    """A culture held at a setpoint by choosing a pump rate every control period (paper, sections 2 and 3).
+
+    Dynamics: x' = (mu - u/tau) x, integrated with `substeps` steps of `integrator` per control period.
+
+    | observation | meaning                       | range      | unit |
+    |-------------|-------------------------------|------------|------|
+    | 0           | optical density x             | [0, 1000]  | -    |
+    | 1           | setpoint of this episode      | (0, 2]     | -    |
+
+    Action: index a of the pump rate u = a / (n_actions - 1) * max_pump_rate, mL/s.
+    Reward: -(x - setpoint)^2 of the x reached; in the last step times `final_reward_weight`.
+    Start: x uniform in `start_od`, setpoint drawn from `setpoints`, both from the copy's own stream.
+    End and autoreset: as `EpisodeVectorEnv`. Args, raises: as there.
+    """
+
+    default = EnvConfig
+
+    @staticmethod
+    def observations(config: EnvConfig) -> spaces.Box:
+        """As `observation_space`."""
+        return observation_space()
+
+    def _prepare(self) -> None:
+        self._factors = step_factors(self.config)
+        self._setpoints = np.asarray(self.config.setpoints)
+
+    @property
+    def od(self) -> Array:
+        """True x, (N,)."""
+        return self.state[:, 0]
+
+    @property
+    def setpoint(self) -> Array:
+        """Of the running episode, (N,)."""
+        return self.state[:, 1]
+
+    def _begun(self, numbers: Array) -> Array:
+        low, high = self.config.start_od
+        setpoint = self._setpoints[(numbers[:, 1] * self._setpoints.size).astype(np.intp)]
+        return np.stack([low + (high - low) * numbers[:, 0], setpoint], axis=1)
+
+    def _advance(self, actions: NDArray[np.intp]) -> Array:
+        np.minimum(self.od * self._factors[actions], MAX_OD, out=self.od)
+        return tracking_reward(self.od, self.setpoint)
+
+    def _weigh(self, last: Array) -> Array:
+        return last * self.config.final_reward_weight

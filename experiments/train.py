@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+from omegaconf import DictConfig
+
 from experiments.cli import frame
-from experiments.training.config import TrainConfig
+from experiments.training.config import TrainConfig, env_schema
 
 
 def train(config: TrainConfig, folder: Path) -> float:
@@ -13,7 +15,12 @@ def train(config: TrainConfig, folder: Path) -> float:
     return run.train(config, folder)
 
 
-main = frame.Command("train", TrainConfig(), train, resumes="checkpoint.pt")
+def _schema(cfg: DictConfig) -> TrainConfig:
+    """An environment's config is that of its kind."""
+    return TrainConfig(env=env_schema(str(cfg.env.get("kind", "density"))))
+
+
+main = frame.Command("train", TrainConfig(), train, _schema, resumes="checkpoint.pt")
 
 
 if __name__ == "__main__":

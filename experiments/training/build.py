@@ -7,15 +7,13 @@ import torch
 
 from dqn.agent import STREAMS, DQNAgent
 from dqn.config import DQNConfig
-from dqn.hindsight import Relabel, goal_relabel
 from dqn.network import QNetwork
 from dqn.population import GROUP, Population
 from dqn.trainer import Trainer
-from envs.task import EnvConfig, tracking_reward
-from envs.vector_env import BioreactorVectorEnv
 from experiments.training.evaluation import Act
+from experiments.training.tasks import Task
 
-__all__ = ["act_with", "hindsight", "population", "streams", "trainer"]
+__all__ = ["act_with", "population", "streams", "trainer"]
 
 
 def streams(seeds: Sequence[int], names: Sequence[str]) -> dict[str, list[np.random.SeedSequence]]:
@@ -29,34 +27,27 @@ def streams(seeds: Sequence[int], names: Sequence[str]) -> dict[str, list[np.ran
 
 
 def population(
-    env: EnvConfig, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu", threads: int | None = None
+    task: Task, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu", threads: int | None = None
 ) -> Population:
     """Agents with the given seeds in groups of a size that suits the device; arguments as `Population`."""
     size = GROUP if device == "cpu" else len(seeds)
     groups = [seeds[k : k + size] for k in range(0, len(seeds), size)]
-    return Population([trainer(env, agent, group, device) for group in groups], threads)
+    return Population([trainer(task, agent, group, device) for group in groups], threads)
 
 
-def trainer(env: EnvConfig, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu") -> Trainer:
+def trainer(task: Task, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu") -> Trainer:
     """One group of agents with the given seeds, each in its own copy of the environment; one record per episode."""
     own = streams(seeds, (*STREAMS, "env"))
-    copies = BioreactorVectorEnv(len(seeds), env)
-    copies.seed_streams(own["env"])
-    learner = DQNAgent(agent, 2, env.n_actions, own, hindsight(env, agent), device)
-    return Trainer(copies, learner, interval=env.episode_steps)
-
-
-def hindsight(env: EnvConfig, agent: DQNConfig) -> Relabel:
-    """Goals of replayed transitions: the task's range of setpoints and its reward."""
-    return goal_relabel(agent, (min(env.setpoints), max(env.setpoints)), tracking_reward)
+    learner = DQNAgent(agent, 2, task.actions.size, own, task.hindsight(agent), device)
+    return Trainer(task.copies(own["env"]), learner, interval=task.config.episode_steps)
 
 
 def act_with(network: QNetwork, flat: torch.Tensor) -> Act:
     """The greedy policies of weights (S, P) as a function on NumPy grids."""
     network = network.with_weights(flat)
 
-    def act(od: np.ndarray, setpoint: np.ndarray) -> np.ndarray:
-        observation = torch.from_numpy(np.stack([od, setpoint], axis=-1).astype(np.float32)).to(flat.device)
+    def act(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        observation = torch.from_numpy(np.stack([first, second], axis=-1).astype(np.float32)).to(flat.device)
         return network(observation).argmax(-1).cpu().numpy()
 
     return act

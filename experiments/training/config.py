@@ -7,17 +7,28 @@ from omegaconf import DictConfig
 
 from conf.schema import build, check, part, setting
 from dqn.config import DQNConfig
+from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 from experiments.cli import files, frame
 
-__all__ = ["TrainConfig", "read_env_file", "variant"]
+__all__ = ["ENVS", "TrainConfig", "env_schema", "read_env_file", "variant"]
+
+
+ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig}
+
+
+def env_schema(kind: str) -> Any:
+    """The default config of an environment of this kind. Raises: ValueError naming the kinds there are."""
+    if kind not in ENVS:
+        raise ValueError(f"env.kind = {kind}: allowed {', '.join(ENVS)}")
+    return ENVS[kind]()
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """`python -m experiments.train`. Raises: ValueError naming key, value and allowed range."""
 
-    env: EnvConfig = part(EnvConfig, "the training model and its episodes")
+    env: Any = part(EnvConfig, "the training model and its episodes")
     agent: DQNConfig = part(DQNConfig, "the agent's hyper-parameters")
     env_file: str | None = setting(None, "a calibrated.yaml; replaces env")
     seed: int = setting(0, "of the first agent", at_least=0)
@@ -28,6 +39,12 @@ class TrainConfig:
     )
     eval_every: int = setting(
         100, "between evaluations of the greedy policy on the selection grid: once per episode", "steps", at_least=1
+    )
+    stop_within: float | None = setting(
+        None,
+        "ends training once the kept policies of all agents are within so many times the limits of their task, 0.5 % "
+        "regret and 0.003 OD steady error for env=sim, on the selection grid; null: after agent.total_steps",
+        above=0.0,
     )
     checkpoint_every: int = setting(1000, "between checkpoints", "steps", at_least=1)
     resume: str | None = setting(None, "a run folder to continue")

@@ -12,19 +12,17 @@ import torch
 from dqn import policy
 from dqn.checkpoint import CheckpointError
 from dqn.export import export
-from envs.optimum import solve_episode
 from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
+from experiments.controllers.estimator import EstimatorConfig
 from experiments.reporting import charts
 from experiments.training.config import TrainConfig, read_env_file
-from experiments.training.evaluation import Score, best_rollout, rollout
+from experiments.training.evaluation import Score
 from experiments.training.session import Session
 
-__all__ = ["train"]
+__all__ = ["fingerprint", "train"]
 
 log = logging.getLogger(__name__)
-
-COARSE = 2e-3  # of log OD: enough for a picture
 
 
 def train(config: TrainConfig, folder: Path) -> float:
@@ -34,7 +32,8 @@ def train(config: TrainConfig, folder: Path) -> float:
         frame.save_config(config, folder)
     if config.device == "cuda" and not torch.cuda.is_available():
         raise frame.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
-    _warn_of_growth(config.env)
+    if isinstance(config.env, EnvConfig):
+        _warn_of_growth(config.env)
     torch.set_num_threads(1)  # of one operation: matrices of this size do not gain from more
     try:
         session = Session(config, folder, resume=config.resume is not None)
@@ -63,12 +62,14 @@ def _finish(session: Session) -> None:
     """Score on the reported grid, export, draw, write summary.json."""
     c, agents, best = session.config, session.agents, session.best
     report, kept, last = session.report()
+    myopic = report(session.task.myopic)
     path = _export(session, kept)
     _figures(session, path)
     summary = {
         "seeds": list(session.seeds),
         "env_steps": agents.steps,
         "updates": agents.updates,
+        "ended": session.ended,
         "train_seconds": round(session.seconds, 3),
         "regret_pct": kept.regret_pct,
         "steady_abs_error": kept.steady_abs_error,
@@ -78,25 +79,29 @@ def _finish(session: Session) -> None:
         "kept_step": best.step,
         "optimum_cost": report.optimum_cost,
         "optimum_steady_abs_error": report.optimum_steady,
+        "myopic_regret_pct": float(myopic.regret_pct[0]),
+        "myopic_steady_abs_error": float(myopic.steady_abs_error[0]),
         "policy": str(path),
         "policy_seed": session.seeds[int(best.merit.argmin())],
-        "config_hash": _fingerprint(c),
+        "config_hash": fingerprint(c),
     }
     files.write_json(session.folder / "summary.json", summary)
-    numbers = {
-        k: v for k, v in {**asdict(c.agent), "mu": c.env.mu, "tau": c.env.tau}.items() if isinstance(v, int | float)
-    }
+    numbers = {k: v for k, v in (asdict(c.env) | asdict(c.agent)).items() if isinstance(v, int | float)}
     session.writer.events.hyper_parameters(numbers, ["eval/regret_pct", "eval/steady_abs_error"])
     log.info(
         "%d agent(s), %d steps and %d updates each in %.1f s; reported grid: regret %.2f %% (worst %.2f %%), "
-        "steady error at the worst setpoint %.4f OD (worst %.4f OD)",
+        "steady error at its worst %.4f %s (worst seed %.4f)",
         agents.n_agents, agents.steps, agents.updates, session.seconds, np.median(kept.regret_pct),
-        kept.regret_pct.max(), np.median(kept.steady_abs_error), kept.steady_abs_error.max(),
+        kept.regret_pct.max(), np.median(kept.steady_abs_error), session.task.unit, kept.steady_abs_error.max(),
+    )  # fmt: skip
+    log.info(
+        "the one-line law that looks one period ahead: regret %.2f %%, steady error %.4f %s",
+        abs(myopic.regret_pct[0]), myopic.steady_abs_error[0], session.task.unit,
     )  # fmt: skip
     log.info("policy %s; figures %s; tensorboard --logdir %s", path, session.folder / "figures", session.folder)
 
 
-def _fingerprint(config: TrainConfig) -> str:
+def fingerprint(config: TrainConfig) -> str:
     """Short hash of everything that shapes the policy."""
     relevant = {"env": asdict(config.env), "agent": asdict(config.agent)}
     return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:12]
@@ -104,22 +109,23 @@ def _fingerprint(config: TrainConfig) -> str:
 
 def _export(session: Session, score: Score) -> Path:
     """Every agent's best policy under policies/, the best agent's as policy.npz."""
-    c, best = session.config, session.best
+    c, best, task = session.config, session.best, session.task
     folder = session.folder / "policies"
     folder.mkdir(exist_ok=True)
     for i, seed in enumerate(session.seeds):
         metadata = {
             "seed": seed,
-            "control_min": c.env.control_min,
-            "model": asdict(c.env),
+            "observation": list(task.observation),
+            **task.model(),
+            **({"estimator": asdict(EstimatorConfig())} if task.observation == policy.RELATIVE else {}),
             "agent": asdict(c.agent),
-            "config_hash": _fingerprint(c),
+            "config_hash": fingerprint(c),
             "trained_steps": int(best.step[i]),
             "updates": c.agent.updates_at(int(best.step[i])),
             "regret_pct": float(score.regret_pct[i]),
             "steady_abs_error": float(score.steady_abs_error[i]),
         }
-        exported = export(session.agents.network, i, best.weights, c.env.pump_rates(), metadata)
+        exported = export(session.agents.network, i, best.weights, task.actions, task.limits, metadata)
         policy.save(folder / f"seed{seed:04d}.npz", exported)
         if i == int(best.merit.argmin()):
             policy.save(session.folder / "policy.npz", exported)
@@ -128,35 +134,10 @@ def _export(session: Session, score: Score) -> Path:
 
 def _figures(session: Session, policy_path: Path) -> None:
     """Learning curves, policy map and example trajectories, as files and in TensorBoard."""
-    env, best = session.config.env, session.best
-    rates, factors = env.pump_rates(), session.selection.factors
-    learned = policy.load(policy_path)
+    best = session.best
     history = np.array([[step, *regret] for step, regret, _ in best.history])
-    drawn = {
-        "learning": charts.learning(np.array(session.returns), history[:, 0], history[:, 1:], best.step.astype(float))
-    }
-
-    od, setpoint = np.linspace(0.05, 1.25, 241), np.linspace(min(env.setpoints), max(env.setpoints), 33)
-    x, s = (a.ravel() for a in np.meshgrid(od, setpoint))
-    learned_map = learned.rate(np.stack([x, s], axis=1)).reshape(setpoint.size, od.size)
-    first = [solve_episode(env, float(goal), COARSE).act(od, env.episode_steps) for goal in setpoint]
-    best_map = rates[np.stack(first)]
-    drawn["policy_map"] = charts.policy_map(od, setpoint, learned_map, best_map)
-
-    goals = np.asarray(env.setpoints)[[0, len(env.setpoints) // 2, -1]]
-    starts, targets = np.repeat(env.start_od, goals.size)[None], np.tile(goals, 2)[None]
-    ours = rollout(
-        lambda a, b: learned.act(np.stack([a[0], b[0]], axis=1))[None], factors, starts, targets, env.episode_steps
-    )
-    theirs = best_rollout(env, starts[0], targets[0])
-    drawn["trajectories"] = charts.trajectories(
-        np.arange(env.episode_steps + 1, dtype=np.float64) * env.control_min,
-        np.concatenate([starts, ours.od[:, 0]]),
-        np.concatenate([starts, theirs.od[:, 0]]),
-        targets[0],
-        rates[ours.action[:, 0]],
-        rates[theirs.action[:, 0]],
-    )
+    curves = (np.array(session.returns), history[:, 0], history[:, 1:], best.step.astype(float))
+    drawn = {"learning": charts.learning(*curves), **session.task.figures(policy.load(policy_path))}
     for name, figure in drawn.items():
-        charts.save(figure, session.folder / "figures", name)
-        session.writer.events.figure(f"figures/{name}", figure, session.agents.steps)
+        path = charts.save(figure, session.folder / "figures", name)
+        session.writer.events.picture(f"figures/{name}", path, session.agents.steps)

@@ -19,9 +19,10 @@ from dqn import checkpoint
 from dqn.trainer import TrainRecord
 from experiments.cli import stop
 from experiments.reporting.tensorboard import PopulationWriter
-from experiments.training import build
+from experiments.training import build, tasks
 from experiments.training.config import TrainConfig
-from experiments.training.evaluation import Evaluation, Score, report_grid, selection_grid
+from experiments.training.evaluation import Evaluation, Score
+from experiments.training.tasks import Task
 
 __all__ = ["Best", "Session", "merit"]
 
@@ -30,18 +31,13 @@ log = logging.getLogger(__name__)
 TOLD = 20  # lines of progress where there is no terminal
 
 
-REGRET_UNIT, STEADY_UNIT = 0.5, 0.003
-"""Per cent of cost and OD that weigh alike when policies are compared: half a per cent of cost is not seen in a
-recording, and 0.003 OD is the noise of the sensor."""
-
-
-def merit(score: Score) -> NDArray[np.float64]:
+def merit(score: Score, task: Task) -> NDArray[np.float64]:
     """How far a policy is from what matters, (S,), lower is better: the larger of regret and steady error in units.
 
     Regret alone does not see a small offset at rest: 0.006 OD for a whole episode is 0.1 % of its cost. The steady
     error is that of the worst setpoint.
     """
-    return np.maximum(score.regret_pct / REGRET_UNIT, score.steady_abs_error / STEADY_UNIT)
+    return np.maximum(score.regret_pct / task.regret_unit, score.steady_abs_error / task.steady_unit)
 
 
 @dataclass
@@ -63,10 +59,9 @@ class Best:
         worst = np.full((3, n), np.inf)
         return cls(weights.cpu().clone(), worst[0], worst[1], worst[2], np.zeros(n, dtype=np.int64))
 
-    def update(self, step: int, score: Score, weights: torch.Tensor) -> None:
-        """Keep what is better than before."""
+    def update(self, step: int, score: Score, value: NDArray[np.float64], weights: torch.Tensor) -> None:
+        """Keep what has a lower merit `value`, (S,), than before."""
         self.history.append((step, score.regret_pct.tolist(), score.steady_abs_error.tolist()))
-        value = merit(score)
         better = value < self.merit
         for i in better.nonzero()[0]:
             self.weights[i] = weights[i].cpu()
@@ -109,8 +104,9 @@ class Session:
         self.config = config
         self.folder = folder
         self.seeds: Sequence[int] = range(config.seed, config.seed + config.n_agents)
-        self.agents = build.population(config.env, config.agent, self.seeds, config.device, config.threads)
-        self.selection = Evaluation(config.env, selection_grid(config.env))
+        self.task = tasks.of(config.env)
+        self.agents = build.population(self.task, config.agent, self.seeds, config.device, config.threads)
+        self.selection = Evaluation(self.task, self.task.selection_grid())
         self.best = Best.empty(self.agents.weights())
         self.returns: list[list[float]] = []  # per episode, per agent
         self.seconds = 0.0  # spent training, over all lives
@@ -122,27 +118,40 @@ class Session:
         """Score the greedy policies on the selection grid, keep the best, log."""
         weights = self.agents.weights()
         score = self.selection(build.act_with(self.agents.network, weights), self.agents.n_agents)
-        self.best.update(step, score, weights)
+        self.best.update(step, score, merit(score, self.task), weights)
         self.writer.scalars(
             step, {"eval/regret_pct": score.regret_pct, "eval/steady_abs_error": score.steady_abs_error}
         )
         self.writer.flush()
         return score
 
+    def met(self) -> bool:
+        """Whether every kept policy is as good as `stop_within` asks for."""
+        within = self.config.stop_within
+        return within is not None and bool((self.best.merit <= within).all())
+
+    @property
+    def ended(self) -> str:
+        """Why training ended, in words."""
+        if not self.met():
+            return "agent.total_steps"
+        limits = f"{self.task.regret_unit:g} % regret and {self.task.steady_unit:g} {self.task.unit} steady error"
+        return f"every kept policy is within {self.config.stop_within:g} times {limits} on the selection grid"
+
     def _news(self, record: TrainRecord) -> str:
         """Medians over agents on the selection grid, now and of what is kept; nothing is scored before an update."""
         if not record.updates and record.step < self.config.agent.total_steps:
             return f"untrained until step {self.config.agent.learn_start}"
-        score, best = self.evaluate(record.step), self.best
+        score, best, unit = self.evaluate(record.step), self.best, self.task.unit
         now, kept = (
-            f"{np.median(regret):.2f} % regret, {np.median(steady):.4f} OD steady error"
+            f"{np.median(regret):.2f} % regret, {np.median(steady):.4f} {unit} steady error"
             for regret, steady in ((score.regret_pct, score.steady_abs_error), (best.regret, best.steady))
         )
         return f"selection grid: {now}; kept: {kept}"
 
     def report(self) -> tuple[Evaluation, Score, Score]:
         """The reported grid with the scores of the kept policies and of the last iterates on it."""
-        report = Evaluation(self.config.env, report_grid(self.config.env))
+        report = Evaluation(self.task, self.task.report_grid())
         kept, last = (
             report(build.act_with(self.agents.network, weights), self.agents.n_agents)
             for weights in (self.best.weights, self.agents.weights())
@@ -179,11 +188,13 @@ class Session:
         self.seconds = state["seconds"]
 
     def run(self) -> None:
-        """Train to the end: log every episode, evaluate, checkpoint, show progress.
+        """Train to the end, or until the limits are met: log every episode, evaluate, checkpoint, show progress.
 
         Raises: KeyboardInterrupt after a signal, with a checkpoint of the episode that was going on.
         """
         c = self.config
+        if self.met():  # resumed after its end
+            return
         total, last = c.agent.total_steps, self.agents.steps
         told = max(c.eval_every, total // TOLD)
         started, earlier = time.perf_counter(), self.seconds
@@ -197,6 +208,7 @@ class Session:
                 if final or record.step // c.eval_every > last // c.eval_every:
                     line = self._news(record)
                     bar.set_postfix_str(line)
+                    final = final or self.met()
                     if bar.disable and (final or record.step // told > last // told):
                         log.info("step %d of %d: %s", record.step, total, line)
                 stopped = stopping()
@@ -205,4 +217,7 @@ class Session:
                     self._save()
                 if stopped:
                     raise KeyboardInterrupt
+                if self.met():
+                    log.info("step %d of %d: ended, %s", record.step, total, self.ended)
+                    break
                 last = record.step

@@ -32,13 +32,18 @@ EVERYTHING: dict[str, Any] = {
 }
 
 
-def _flip(batch: Transition, uniform: torch.Tensor) -> Transition:
+class Shifted:
     """A goal replacement of no meaning that uses its random numbers."""
-    return batch._replace(r_t=batch.r_t + uniform[..., 0].to(torch.float32))
+
+    def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
+        return uniform
+
+    def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
+        batch.r_t.add_(drawn[..., 0])
 
 
 def _trainer(config: DQNConfig, seeds: range) -> Trainer:
-    agent = DQNAgent(config, 3, 3, streams(seeds), _flip)
+    agent = DQNAgent(config, 3, 3, streams(seeds), Shifted())
     return Trainer(IdentityEnv(seeds), agent, interval=50)
 
 
@@ -126,6 +131,48 @@ def test_one_update_agrees_with_torch() -> None:
         torch.testing.assert_close(agent.online.flat[i].double(), parameters.detach(), rtol=1e-4, atol=1e-6)
 
 
+def _filled(config: DQNConfig, seeds: range) -> DQNAgent:
+    """An agent with 40 transitions in its memory and no update yet."""
+    agent, rng = DQNAgent(config, 3, 3, streams(seeds), Shifted()), np.random.default_rng(0)
+    for _ in range(40):
+        before, after = (rng.random((len(seeds), 3), dtype=np.float32) for _ in range(2))
+        agent.replay.add(before, rng.integers(0, 3, len(seeds)), rng.random(len(seeds)), after, rng.random(3) < 0.9)
+    return agent
+
+
+@pytest.mark.parametrize("changes", [{}, EVERYTHING], ids=["plain", "everything"])
+@pytest.mark.parametrize("together", [4, 5, 200])
+def test_updates_of_one_step_are_those_that_are_made_one_by_one(changes: dict[str, Any], together: int) -> None:
+    """200 updates, more than a block of random numbers holds, with copies after every 23: in groups and one by one."""
+    config = DQNConfig(**{**SMALL.__dict__, "target_period": 23, **changes})
+    one, many = _filled(config, range(3)), _filled(config, range(3))
+    for _ in range(200):
+        one.learn()
+    for _ in range(200 // together):
+        many.learn(together)
+    assert one.updates == many.updates == 200
+    for name, value in one.state_dict().items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, many.state_dict()[name]), name
+    assert one.state_dict()["draws"] == many.state_dict()["draws"]
+    assert one.state_dict()["goals"] == many.state_dict()["goals"]
+
+
+def test_the_target_network_is_asked_once_for_all_updates_between_two_copies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Period 6, eight updates a step: of the second step four come before the copy after update 12, and four after."""
+    agent = _filled(DQNConfig(**{**SMALL.__dict__, "target_period": 6}), range(3))
+    forward, asked = agent.target.forward, []
+
+    def counted(features: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        asked.append((agent.updates, tuple(features.shape)))
+        return forward(features)
+
+    monkeypatch.setattr(agent.target, "forward", counted)
+    for _ in range(2):
+        agent.learn(8)
+    assert asked == [(0, (3, 96, 3)), (6, (3, 32, 3)), (8, (3, 64, 3)), (12, (3, 64, 3))]
+
+
 def test_the_target_network_is_copied_when_it_is_due_and_stays_in_between() -> None:
     """Period 4: the target network is that of updates 0, 4, 8, 12 until the next of them."""
     agent = DQNAgent(DQNConfig(**{**SMALL.__dict__, "target_period": 4}), 3, 3, streams(range(2)))
@@ -145,10 +192,12 @@ def test_rewards_of_replaced_goals_are_scaled_like_those_of_the_environment() ->
         **{**SMALL.__dict__, "gamma": 0.0, "reward_scale": 10.0, "hindsight_share": 0.5, "learning_rate": 1e-2}
     )
 
-    def elsewhere(batch: Transition, uniform: torch.Tensor) -> Transition:
-        return batch._replace(s_tm1=batch.s_tm1.flip(-1), r_t=torch.full_like(batch.r_t, -2.0))
+    class Elsewhere(Shifted):
+        def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
+            batch.s_tm1.copy_(batch.s_tm1.flip(-1))
+            batch.r_t.fill_(-2.0)
 
-    agent = DQNAgent(config, 2, 2, streams(range(2)), elsewhere)
+    agent = DQNAgent(config, 2, 2, streams(range(2)), Elsewhere())
     here, paid = np.tile(np.array([1.0, 0.0], dtype=np.float32), (2, 1)), np.ones(2)
     for k in range(400):
         agent.observe(here, np.full(2, k % 2), paid, here, paid)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dqn.config import DQNConfig
-from dqn.hindsight import goal_relabel
+from dqn.hindsight import GoalRelabel, ShiftRelabel
 from dqn.replay import Transition
 
 AGENTS, BATCH = 4, 500
@@ -24,7 +24,9 @@ def _batch(od: float | None = None) -> Transition:
 def _relabel(near: float, batch: Transition, width: tuple[float, float] = (1e-3, 0.8)) -> Transition:
     uniform = torch.rand(AGENTS, BATCH, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     config = DQNConfig(hindsight_near=near, hindsight_width=width)
-    return goal_relabel(config, (0.2, 1.0), lambda x, goal: -((x - goal) ** 2))(batch, uniform)
+    relabel = GoalRelabel(config, (0.2, 1.0), lambda x, goal: -((x - goal) ** 2))
+    relabel.replace(batch, relabel.drawn(uniform))
+    return batch
 
 
 @pytest.mark.parametrize("near", [0.0, 0.5, 1.0])
@@ -68,3 +70,43 @@ def test_a_state_outside_all_setpoints_gets_a_far_goal() -> None:
     goal = _relabel(1.0, _batch(od=5.0)).s_t[..., 1]
     assert float(goal.max()) <= 1.0
     assert float(goal.std()) > 0.2
+
+
+def _shifted(near: float) -> tuple[Transition, Transition]:
+    """A batch of e' = e + s - v and the same with other setpoints."""
+    batches = []
+    for _ in range(2):
+        generator = torch.Generator().manual_seed(2)
+        before = torch.rand(AGENTS, BATCH, 2, generator=generator)
+        action = torch.randint(0, 17, (AGENTS, BATCH), generator=generator)
+        after = before.clone()
+        after[..., 0] += before[..., 1] - action / 16.0
+        batches.append(Transition(before, action, -(after[..., 0] ** 2), after, torch.ones(AGENTS, BATCH)))
+    relabel = ShiftRelabel(DQNConfig(hindsight_near=near, hindsight_width=(0.01, 0.3)), 1.2, lambda e: -e * e)
+    uniform = torch.rand(AGENTS, BATCH, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    relabel.replace(batches[1], relabel.drawn(uniform))
+    return batches[0], batches[1]
+
+
+@pytest.mark.parametrize("near", [0.0, 0.4, 1.0])
+def test_a_shifted_error_is_as_true_as_the_one_that_was_seen(near: float) -> None:
+    old, new = _shifted(near)
+    assert torch.equal(old.a_tm1, new.a_tm1)
+    for one, other in ((old.s_tm1, new.s_tm1), (old.s_t, new.s_t)):
+        assert torch.equal(one[..., 1], other[..., 1])
+    torch.testing.assert_close(new.s_t[..., 0], new.s_tm1[..., 0] + new.s_tm1[..., 1] - new.a_tm1 / 16.0)
+    torch.testing.assert_close(new.r_t, -(new.s_t[..., 0] ** 2))
+    n = round(near * BATCH)
+    close = new.s_t[:, :n, 0].abs()
+    assert ((close > 0.0099) & (close < 0.3001)).all()
+    far = new.s_tm1[:, n:, 0].numpy().ravel()
+    if far.size:
+        np.testing.assert_allclose(np.quantile(far, [0.25, 0.5, 0.75]), [-0.6, 0.0, 0.6], atol=0.1)
+        assert np.abs(far).max() <= 1.2001
+
+
+def test_distances_to_the_new_setpoint_cover_every_order_of_magnitude_on_both_sides() -> None:
+    error = _shifted(1.0)[1].s_t[..., 0].numpy().ravel()
+    count, _ = np.histogram(np.log(np.abs(error)), bins=4, range=(np.log(0.01), np.log(0.3)))
+    assert ((count - 500.0) ** 2 / 500.0).sum() < 16.3  # 99.9 % quantile with 3 degrees of freedom
+    assert np.mean(error > 0) == pytest.approx(0.5, abs=0.05)

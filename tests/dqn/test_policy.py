@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from dqn.network import QNetwork, action_basis, initial_weights
 
 SIZES = (3, 64, 64, 17)
 RATES = np.linspace(0.0, 0.02, 17)
+ANY = (np.full(2, -np.inf), np.full(2, np.inf))
 MATRIX = torch.tensor([[3.0, -3.0], [0.0, 3.0], [1.0, 1.0]])
 OFFSET = torch.tensor([0.0, -1.8, 0.5])
 
@@ -28,7 +30,8 @@ def _network(decay: float = 0.0) -> QNetwork:
 
 def _policy(agent: int = 1, decay: float = 0.0) -> policy.Policy:
     network = _network(decay)
-    return export(network, agent, network.flat, RATES, {"control_min": 1.0, "model": {"mu": 0.03, "tau": 1 / 3}})
+    metadata = {"observation": ["od", "setpoint"], "control_min": 1.0, "model": {"mu": 0.03, "tau": 1 / 3}}
+    return export(network, agent, network.flat, RATES, ANY, metadata)
 
 
 def _observations() -> np.ndarray:
@@ -46,7 +49,7 @@ def test_numpy_policy_agrees_with_torch(tmp_path: Path, agent: int, decay: float
     action = expected.argmax(1)
     assert len(set(action.tolist())) > 1
     np.testing.assert_array_equal(read.act(observation), action)
-    np.testing.assert_array_equal(read.rate(observation), RATES[action])
+    np.testing.assert_array_equal(read.chosen(observation), RATES[action])
 
 
 def test_metadata_returns(tmp_path: Path) -> None:
@@ -59,7 +62,7 @@ def test_metadata_returns(tmp_path: Path) -> None:
 
 def test_export_does_not_share_memory_with_the_agent() -> None:
     network = _network()
-    exported = export(network, 0, network.flat, RATES, {})
+    exported = export(network, 0, network.flat, RATES, ANY, {})
     before = exported.q_values(_observations()).copy()
     network.flat += 1.0
     np.testing.assert_array_equal(exported.q_values(_observations()), before)
@@ -71,10 +74,10 @@ def test_reading_needs_no_torch(tmp_path: Path) -> None:
         "import sys; sys.modules['torch'] = None\n"
         "from pathlib import Path\n"
         "from dqn import policy\n"
-        f"print(policy.load(Path({str(tmp_path / 'policy.npz')!r})).rate(__import__('numpy').array([[0.9, 0.3]]))[0])"
+        f"print(policy.load(Path({str(tmp_path / 'policy.npz')!r})).chosen(__import__('numpy').array([[0.9, 0.3]]))[0])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    assert float(done.stdout) == _policy().rate(np.array([[0.9, 0.3]]))[0]
+    assert float(done.stdout) == _policy().chosen(np.array([[0.9, 0.3]]))[0]
 
 
 def _change(path: Path, **changes: Any) -> None:
@@ -99,9 +102,9 @@ def _metadata(**changes: Any) -> np.ndarray:
         ({"w1": None}, "incomplete or of mismatched shapes"),
         ({"b0": np.zeros(5, np.float32)}, "incomplete or of mismatched shapes"),
         ({"metadata": np.array("not json")}, "incomplete or of mismatched shapes"),
-        ({"metadata": _metadata(format=2)}, "format 2: allowed 1"),
+        ({"metadata": _metadata(format=3)}, "format 3: allowed 1, 2"),
         ({"metadata": _metadata(observation=["od"])}, "observation"),
-        ({"pump_rates": np.zeros(16)}, "17 Q values, 16 pump rates"),
+        ({"actions": np.zeros(16)}, "17 Q values, 16 actions"),
         ({"b2": np.full(17, np.nan, np.float32)}, "not finite"),
     ],
 )
@@ -132,3 +135,33 @@ def test_pickled_objects_are_refused(tmp_path: Path) -> None:
     _change(path, w0=np.array([{"a": 1}], dtype=object))
     with pytest.raises(policy.PolicyError, match="not a policy file"):
         policy.load(path)
+
+
+def test_an_observation_beyond_the_limits_is_seen_at_them(tmp_path: Path) -> None:
+    limited = replace(_policy(), low=np.array([-1.0, 0.1], np.float32), high=np.array([1.0, 0.9], np.float32))
+    policy.save(tmp_path / "policy.npz", limited)
+    read = policy.load(tmp_path / "policy.npz")
+    beyond = np.array([[5.0, 0.5], [-7.0, 2.0], [0.3, -1.0]])
+    at = np.array([[1.0, 0.5], [-1.0, 0.9], [0.3, 0.1]])
+    np.testing.assert_array_equal(read.q_values(beyond), _policy().q_values(at))
+    assert (_policy().q_values(beyond) != _policy().q_values(at)).any()
+
+
+def test_a_file_of_the_first_format_is_read_without_limits(tmp_path: Path) -> None:
+    policy.save(tmp_path / "policy.npz", _policy())
+    with np.load(tmp_path / "policy.npz") as content:
+        arrays = {k: content[k] for k in content.files if not k.startswith("observation_")}
+    arrays["pump_rates"] = arrays.pop("actions")
+    arrays["metadata"] = _metadata(format=1)
+    np.savez(tmp_path / "old.npz", **arrays)
+    old = policy.load(tmp_path / "old.npz")
+    far = np.array([[3.0, 0.2], [0.01, 1.4]])
+    np.testing.assert_array_equal(old.q_values(far), _policy().q_values(far))
+    np.testing.assert_array_equal(old.actions, RATES)
+
+
+def test_limits_that_hold_nothing_are_refused(tmp_path: Path) -> None:
+    wrong = replace(_policy(), low=np.array([1.0, 0.0], np.float32), high=np.array([1.0, 1.0], np.float32))
+    policy.save(tmp_path / "policy.npz", wrong)
+    with pytest.raises(policy.PolicyError, match="allowed low < high"):
+        policy.load(tmp_path / "policy.npz")

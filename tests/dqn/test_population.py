@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from dqn.agent import DQNAgent
+from dqn.config import DQNConfig
 from dqn.population import Population
 from dqn.trainer import Trainer, TrainRecord
 from tests.dqn.problems import IdentityEnv, streams
@@ -69,3 +70,18 @@ def test_an_error_in_one_group_ends_the_run() -> None:
     population.groups[1] = Broken(broken.env, broken.agent, 50)
     with pytest.raises(RuntimeError, match="vial 3 is missing"):
         list(population.run())
+
+
+def test_no_running_mean_stays_too_small_for_the_processor() -> None:
+    """Units that are never on have gradient 0, and 0.9^k of an earlier one falls below 1e-38 within 900 updates."""
+    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 1200, "hidden": (8,), "learning_rate": 0.05})
+    agent = DQNAgent(config, 3, 3, streams(range(4)))
+    agent.online.flat[:, 24:28] = -10.0  # biases of the first four units
+    earlier = agent.state_dict()
+    earlier["adam"]["mean"].fill_(1e-3)
+    agent.load_state_dict(earlier)
+    population = Population([Trainer(IdentityEnv(range(4)), agent, interval=100)])
+    for _ in population.run():
+        pass
+    mean = population.state_dict()["groups"][0]["agent"]["adam"]["mean"][:, 24:28]
+    assert not ((mean != 0) & (mean.abs() < torch.finfo(torch.float32).tiny)).any()

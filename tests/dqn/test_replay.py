@@ -40,7 +40,7 @@ def test_holds_the_last_ones_like_a_list(capacity: int, added: int, seed: int) -
         else:
             naive[k % capacity] = step
     assert replay.size == len(naive)
-    uniform = torch.from_numpy(rng.random((AGENTS, 16)))
+    uniform = rng.random((AGENTS, 16))
     batch = replay.sample(uniform)
     for i in range(AGENTS):
         for j in range(16):
@@ -52,7 +52,7 @@ def test_holds_the_last_ones_like_a_list(capacity: int, added: int, seed: int) -
 def test_types_of_a_minibatch() -> None:
     replay = Replay(AGENTS, 4, OBSERVATIONS, CPU)
     replay.add(**_step(np.random.default_rng(0)))
-    batch = replay.sample(torch.zeros(AGENTS, 5, dtype=torch.float64))
+    batch = replay.sample(np.zeros((AGENTS, 5)))
     assert batch.a_tm1.dtype == torch.int64
     assert [tuple(field.shape) for field in batch] == [(3, 5, 2), (3, 5), (3, 5), (3, 5, 2), (3, 5)]
 
@@ -61,8 +61,18 @@ def test_the_largest_number_below_one_stays_inside() -> None:
     replay = Replay(AGENTS, 7, OBSERVATIONS, CPU)
     for _ in range(7):
         replay.add(**_step(np.random.default_rng(1)))
-    batch = replay.sample(torch.full((AGENTS, 1), np.nextafter(1.0, 0.0), dtype=torch.float64))
+    batch = replay.sample(np.full((AGENTS, 1), np.nextafter(1.0, 0.0)))
     assert batch.s_t.shape == (AGENTS, 1, OBSERVATIONS)
+
+
+def test_several_minibatches_at_once_are_the_same_rows() -> None:
+    rng = np.random.default_rng(5)
+    replay = Replay(AGENTS, 7, OBSERVATIONS, CPU)
+    for _ in range(5):
+        replay.add(**_step(rng))
+    uniform = rng.random((AGENTS, 4, 6))
+    for several, *each in zip(replay.sample(uniform), *(replay.sample(uniform[:, k]) for k in range(4)), strict=True):
+        assert torch.equal(several, torch.stack(each, dim=1))
 
 
 def test_uniform_frequencies() -> None:
@@ -71,7 +81,7 @@ def test_uniform_frequencies() -> None:
     replay = Replay(1, 10, OBSERVATIONS, CPU)
     for k in range(10):
         replay.add(**{**_step(rng, 1), "r_t": np.array([float(k)])})
-    rows = replay.sample(torch.from_numpy(rng.random((1, 20_000)))).r_t.long()
+    rows = replay.sample(rng.random((1, 20_000))).r_t.long()
     count = torch.bincount(rows[0], minlength=10).numpy()
     assert ((count - 2000.0) ** 2 / 2000.0).sum() < 27.9  # 99.9 % quantile with 9 degrees of freedom
 
@@ -79,14 +89,14 @@ def test_uniform_frequencies() -> None:
 def test_minibatch_is_a_copy() -> None:
     replay = Replay(AGENTS, 4, OBSERVATIONS, CPU)
     replay.add(**_step(np.random.default_rng(3)))
-    zero = torch.zeros(AGENTS, 1, dtype=torch.float64)
+    zero = np.zeros((AGENTS, 1))
     replay.sample(zero).s_t.add_(100.0)
     assert replay.sample(zero).s_t.abs().max() < 50.0
 
 
 def test_empty_memory_is_refused() -> None:
     with pytest.raises(ValueError, match="replay memory is empty"):
-        Replay(AGENTS, 4, OBSERVATIONS, CPU).sample(torch.zeros(AGENTS, 1))
+        Replay(AGENTS, 4, OBSERVATIONS, CPU).sample(np.zeros((AGENTS, 1)))
 
 
 @pytest.mark.parametrize("added", [3, 11])
@@ -99,6 +109,6 @@ def test_state_continues(added: int) -> None:
     step = _step(rng)
     one.add(**step)
     other.add(**step)
-    uniform = torch.from_numpy(rng.random((AGENTS, 8)))
+    uniform = rng.random((AGENTS, 8))
     for a, b in zip(one.sample(uniform), other.sample(uniform), strict=True):
         assert torch.equal(a, b)

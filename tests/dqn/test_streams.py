@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-import torch
+from numpy.typing import NDArray
 
 from dqn.streams import CALLS_PER_BLOCK, UniformStream
-
-CPU = torch.device("cpu")
 
 
 def _seeds(numbers: range) -> list[np.random.SeedSequence]:
@@ -14,35 +12,60 @@ def _seeds(numbers: range) -> list[np.random.SeedSequence]:
 
 
 def test_agent_of_a_population_equals_the_agent_alone() -> None:
-    many = UniformStream(_seeds(range(8)), 3, CPU)
-    alone = [UniformStream(_seeds(range(i, i + 1)), 3, CPU) for i in range(8)]
+    many = UniformStream(_seeds(range(8)), 3)
+    alone = [UniformStream(_seeds(range(i, i + 1)), 3) for i in range(8)]
     for _ in range(2 * CALLS_PER_BLOCK + 5):
-        together = many.next()
-        assert together.shape == (8, 3)
+        together = many.take(1)
+        assert together.shape == (8, 1, 3)
         for i in range(8):
-            assert torch.equal(together[i], alone[i].next()[0])
+            np.testing.assert_array_equal(together[i], alone[i].take(1)[0])
 
 
 def test_numbers_are_those_of_the_generator() -> None:
-    stream = UniformStream(_seeds(range(1)), 2, CPU)
+    stream = UniformStream(_seeds(range(1)), 2)
     rng = np.random.default_rng(np.random.SeedSequence(0))
     expected = rng.random((CALLS_PER_BLOCK + 1, 2))
-    drawn = torch.cat([stream.next() for _ in range(CALLS_PER_BLOCK + 1)])
-    np.testing.assert_array_equal(drawn.numpy(), expected)
+    drawn = np.concatenate([stream.take(1)[0] for _ in range(CALLS_PER_BLOCK + 1)])
+    np.testing.assert_array_equal(drawn, expected)
+
+
+@pytest.mark.parametrize("calls", [3, CALLS_PER_BLOCK, 10 * CALLS_PER_BLOCK])
+def test_several_calls_at_once_are_the_same_numbers(calls: int) -> None:
+    """Block by block: a call that is told more than the block still holds gets what is left of it."""
+    one, many = UniformStream(_seeds(range(2)), 2), UniformStream(_seeds(range(2)), 2)
+    expected = np.concatenate([one.take(1) for _ in range(3 * CALLS_PER_BLOCK)], axis=1)
+    parts = [many.take(calls)]
+    while sum(part.shape[1] for part in parts) < 3 * CALLS_PER_BLOCK:
+        parts.append(many.take(calls))
+    np.testing.assert_array_equal(np.concatenate(parts, axis=1), expected)
+    assert {part.shape[1] for part in parts} == {min(calls, CALLS_PER_BLOCK), *([2] if calls == 3 else [])}
+
+
+def test_what_follows_from_a_block_is_computed_once() -> None:
+    shapes: list[tuple[int, ...]] = []
+
+    def doubled(block: NDArray[np.float64]) -> NDArray[np.float64]:
+        shapes.append(block.shape)
+        return 2.0 * block
+
+    plain, stream = UniformStream(_seeds(range(2)), 3), UniformStream(_seeds(range(2)), 3, doubled)
+    for _ in range(CALLS_PER_BLOCK + 1):
+        np.testing.assert_array_equal(2.0 * plain.take(1), stream.take(1))
+    assert shapes == [(2, CALLS_PER_BLOCK, 3)] * 2
 
 
 def test_seeds_differ() -> None:
-    stream = UniformStream(_seeds(range(2)), 4, CPU)
-    numbers = stream.next()
-    assert not torch.equal(numbers[0], numbers[1])
+    stream = UniformStream(_seeds(range(2)), 4)
+    numbers = stream.take(1)
+    assert not np.array_equal(numbers[0], numbers[1])
 
 
 @pytest.mark.parametrize("calls", [0, 1, CALLS_PER_BLOCK - 1, CALLS_PER_BLOCK, CALLS_PER_BLOCK + 1])
 def test_continues_from_its_state(calls: int) -> None:
-    one = UniformStream(_seeds(range(3)), 2, CPU)
+    one = UniformStream(_seeds(range(3)), 2)
     for _ in range(calls):
-        one.next()
-    other = UniformStream(_seeds(range(10, 13)), 2, CPU)
+        one.take(1)
+    other = UniformStream(_seeds(range(10, 13)), 2)
     other.load_state_dict(one.state_dict())
     for _ in range(CALLS_PER_BLOCK + 3):
-        assert torch.equal(one.next(), other.next())
+        np.testing.assert_array_equal(one.take(1), other.take(1))

@@ -60,3 +60,22 @@ def test_what_follows_a_cut_episode_is_what_it_reached_and_not_where_the_next_on
     torch.testing.assert_close(q[:, 1], torch.full((4, 2), 5.0), rtol=0.05, atol=0.0)
     torch.testing.assert_close(q[:, 0], torch.full((4, 2), 4.0), rtol=0.05, atol=0.0)
     assert set(returns.ravel().tolist()) <= {0.0, 1.0}
+
+
+def test_torch_keeps_no_graph_while_it_trains_and_goes_on_when_it_is_used_afterwards() -> None:
+    class Asked(Chain):
+        kept: bool = False
+
+        def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+            self.kept |= not torch.is_inference_mode_enabled()
+            return super().step(actions)
+
+    config = DQNConfig(hidden=(8,), total_steps=40, learn_start=10, batch_size=4, target_period=7, replay_size=50)
+    env = Asked(2)
+    trainer = Trainer(env, DQNAgent(config, 2, 2, streams(range(2))), interval=15)
+    assert [record.step for record in trainer.run()] == [15, 30, 40]
+    assert not env.kept
+    before = trainer.agent.online.flat.clone()
+    trainer.agent.learn()
+    assert not torch.equal(before, trainer.agent.online.flat)
+    trainer.agent.load_state_dict(trainer.agent.state_dict())

@@ -7,14 +7,15 @@ import pytest
 
 from envs.optimum import solve, solve_episode
 from envs.task import EnvConfig, step_factors
-from experiments.training.evaluation import Evaluation, report_grid
+from experiments.training.density import Density
+from experiments.training.evaluation import Evaluation
 from experiments.training.session import merit
 
 
 @pytest.fixture(scope="module")
 def evaluation():
     config = EnvConfig()
-    return Evaluation(config, report_grid(config))
+    return Evaluation(Density(config), Density(config).report_grid())
 
 
 def test_cost_and_steady_error_of_the_nominal_task(evaluation):
@@ -56,8 +57,8 @@ def tables(rng, actions):
 def test_nothing_beats_the_optimum(model):
     """Also of a culture that outgrows the pump (the last four); 0.002 % is left since V is linear in each cell."""
     config = EnvConfig(**model, setpoints=(0.2, 0.6, 1.0))
-    score, rng = Evaluation(config, report_grid(config)), np.random.default_rng(0)
-    factors, endless = score.factors, solve(config, grid=3001)
+    score, rng = Evaluation(Density(config), Density(config).report_grid()), np.random.default_rng(0)
+    factors, endless = step_factors(config), solve(config, grid=3001)
     rivals = {
         "one step ahead": aiming(factors),
         **{f"at {m} s": aiming(factors, lambda s, m=m: m * s) for m in (0.99, 0.95, 0.9, 0.7, 0.6, 0.5, 0.1)},
@@ -85,22 +86,22 @@ def test_short_episodes_agree_with_all_sequences_of_actions(model):
 
 def test_an_offset_at_one_setpoint_shows(evaluation):
     """A law that aims at 0.212 where 0.2 is asked for, and at the setpoint everywhere else."""
-    score = evaluation(aiming(evaluation.factors, lambda setpoint: np.where(setpoint < 0.25, 0.212, setpoint)))
+    score = evaluation(aiming(step_factors(EnvConfig()), lambda setpoint: np.where(setpoint < 0.25, 0.212, setpoint)))
     assert score.steady_by_setpoint.shape == (1, 9)
     assert score.steady_by_setpoint[0, 0] == pytest.approx(0.012, abs=0.001)
     assert score.steady_by_setpoint[0, 1:].max() < 0.002
     assert score.steady_abs_error[0] == score.steady_by_setpoint[0, 0]
-    assert merit(score)[0] == pytest.approx(0.012 / 0.003, rel=0.1)
+    assert merit(score, Density(EnvConfig()))[0] == pytest.approx(0.012 / 0.003, rel=0.1)
 
 
 def test_starts_too_far_for_a_slow_pump_do_not_count_as_offsets():
     """At tau = 0.6 the culture thins by 0.3 % a minute: from 1.1 the setpoint 0.2 is eight hours away."""
     config = EnvConfig(tau=0.6)
-    evaluation = Evaluation(config, report_grid(config))
+    evaluation = Evaluation(Density(config), Density(config).report_grid())
     assert evaluation.optimum_steady < 0.001
-    exact = evaluation(aiming(evaluation.factors))
+    exact = evaluation(aiming(step_factors(config)))
     assert exact.steady_abs_error[0] < 0.001
-    offset = evaluation(aiming(evaluation.factors, lambda setpoint: np.where(setpoint < 0.25, 0.212, setpoint)))
+    offset = evaluation(aiming(step_factors(config), lambda setpoint: np.where(setpoint < 0.25, 0.212, setpoint)))
     assert offset.steady_abs_error[0] == pytest.approx(0.012, abs=0.001)
 
 

@@ -1,0 +1,71 @@
+"""What a training run needs to know of a task; `of` finds it from the config of an environment."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from dqn.config import DQNConfig
+from dqn.hindsight import Relabel
+from dqn.policy import Policy
+from dqn.trainer import TrainingEnv
+from envs.relative import RelativeConfig
+from experiments.training.density import Density
+from experiments.training.evaluation import Evaluated
+from experiments.training.relative import Relative
+
+__all__ = ["Task", "of"]
+
+Array = NDArray[np.float64]
+
+
+class Task(Evaluated, Protocol):
+    """A task with two observed numbers: what an agent acts in, is scored on and exports.
+
+    config: of the environment. observation: names, as in the policy file. actions: the grid, (A,).
+    limits: of the observation in the policy file, low and high, each (2,). regret_unit, steady_unit: per cent of cost
+    and steady error that weigh alike when policies are compared.
+    """
+
+    config: Any
+    observation: tuple[str, str]
+    actions: Array
+    limits: tuple[Array, Array]
+    unit: str
+    regret_unit: float
+    steady_unit: float
+
+    def copies(self, seeds: Sequence[np.random.SeedSequence]) -> TrainingEnv:
+        """One copy of the environment per seed."""
+        ...
+
+    def hindsight(self, agent: DQNConfig) -> Relabel:
+        """How replayed transitions are given another goal."""
+        ...
+
+    def selection_grid(self) -> tuple[Array, Array]:
+        """First and second observation, (G,) each, on which policies are compared during training."""
+        ...
+
+    def report_grid(self) -> tuple[Array, Array]:
+        """The reported grid; shares no point with `selection_grid`."""
+        ...
+
+    def myopic(self, first: Array, second: Array) -> NDArray[np.intp]:
+        """The one-line law: the action whose next error is smallest, shape of both observations."""
+        ...
+
+    def model(self) -> dict[str, Any]:
+        """What a policy file says of what it was trained on."""
+        ...
+
+    def figures(self, policy: Policy) -> dict[str, Figure]:
+        """Policy map and example trajectories beside the optimum's."""
+        ...
+
+
+def of(config: Any) -> Task:
+    """The task of an environment's config."""
+    return Relative(config) if isinstance(config, RelativeConfig) else Density(config)

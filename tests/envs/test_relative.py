@@ -1,0 +1,96 @@
+"""The task in relative coordinates: it is the growth model in other units, and its optimum is the one-line law."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from envs.optimum import solve_relative
+from envs.relative import RelativeConfig, RelativeVectorEnv, nearest_level
+from envs.task import EnvConfig, step_factors
+from experiments.training.evaluation import Evaluation
+from experiments.training.relative import Relative
+
+CONFIG = RelativeConfig()
+
+
+@pytest.mark.parametrize(
+    "overrides", [{}, {"mu": 0.011, "tau": 0.55}, {"control_min": 5.0, "max_pump_rate": 0.05, "tau": 0.6}]
+)
+def test_a_step_is_a_period_of_the_growth_model(overrides: dict[str, float]) -> None:
+    """x' = (mu - u/tau) x over one period, finely integrated, from three OD towards two setpoints, for every level."""
+    model = EnvConfig(integrator="rk4", **overrides)  # type: ignore[arg-type]
+    od, setpoint = (a.ravel() for a in np.meshgrid([0.3, 0.5, 0.8], [0.4, 0.7]))
+    full_pump = model.max_pump_rate * model.control_min / model.tau
+    error, share = np.log(od / setpoint) / full_pump, model.mu * model.control_min / full_pump
+    env = RelativeVectorEnv(od.size, RelativeConfig(growth_shares=(0.01, 0.999)))
+    env.reset(seed=0)
+    for action in range(17):
+        env.state[:] = np.stack([error, np.full(od.size, share)], axis=1)
+        _, reward, *_ = env.step(np.full(od.size, action))
+        reached = od * step_factors(model)[action]
+        np.testing.assert_allclose(setpoint * np.exp(full_pump * env.state[:, 0]), reached, rtol=1e-6)
+        np.testing.assert_allclose(reward, -((np.log(reached / setpoint) / full_pump) ** 2), rtol=1e-5, atol=1e-9)
+
+
+def test_starts_cover_the_range_and_depend_on_the_seed_of_their_copy_alone() -> None:
+    many, one = RelativeVectorEnv(2000), RelativeVectorEnv(1)
+    start = many.reset(seed=3)[0]
+    low, high = CONFIG.growth_shares
+    for k, (least, most) in enumerate([(-1.2, 1.2), (low, high)]):
+        quarters = np.quantile(start[:, k], [0.25, 0.5, 0.75])
+        np.testing.assert_allclose(quarters, np.linspace(least, most, 5)[1:4], atol=0.07)
+    np.testing.assert_array_equal(one.reset(seed=3 + 41)[0][0], start[41])
+
+
+def test_episodes_end_and_begin_again_as_gymnasium_asks() -> None:
+    env = RelativeVectorEnv(3, episode_steps=4)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    env.reset(seed=1)
+    before = env.state[:, 1].copy()
+    for k in range(4):
+        observation, _, terminated, truncated, infos = env.step(np.full(3, 8))
+        assert not terminated.any()
+        assert truncated.all() == (k == 3)
+    np.testing.assert_allclose(infos["final_obs"][:, 1], before, rtol=1e-6)
+    assert (observation[:, 1] != infos["final_obs"][:, 1]).all()
+    saved = env.state_dict()
+    other = RelativeVectorEnv(3, episode_steps=4)
+    other.reset(seed=9)
+    np.testing.assert_array_equal(other.load_state_dict(saved), observation)
+    for _ in range(9):
+        np.testing.assert_array_equal(env.step(np.full(3, 5))[0], other.step(np.full(3, 5))[0])
+    assert gymnasium.make_vec("Bioreactor-v0", num_envs=1)  # the paper's task is registered beside it
+
+
+def test_the_nearest_level_by_hand() -> None:
+    error = np.array([-2.0, 0.0, 0.03, 0.04, 0.2, 0.5, 2.0])
+    #              clip(e + s) 16:  0   8   8.48  8.64  11.2  16  16
+    assert nearest_level(error, np.full(7, 0.5)).tolist() == [0, 8, 8, 9, 11, 16, 16]
+
+
+def test_nothing_beats_the_optimum_and_the_one_line_law_is_it() -> None:
+    task = Relative(CONFIG)
+    evaluation = Evaluation(task, task.report_grid())
+    law = evaluation(task.myopic)
+    assert abs(law.regret_pct[0]) < 1e-5  # the optimum's values are interpolated
+    rng = np.random.default_rng(0)
+    for change in (0.02, 0.1, 0.5):  # a law that is off by so much
+        off = evaluation(lambda e, s, change=change: nearest_level(e + change * rng.standard_normal(e.shape), s))
+        assert off.regret_pct[0] > law.regret_pct[0]
+    assert evaluation(lambda e, s: nearest_level(e + 0.03, s)).regret_pct[0] > 0.1
+
+
+def test_a_finer_grid_finds_the_same_optimum() -> None:
+    starts = np.linspace(-1.2, 1.2, 13)
+    for share in (0.05, 0.317, 0.6, 0.98):
+        coarse, fine = (solve_relative(CONFIG, share, 40, spacing) for spacing in (1 / 256, 1 / 1024))
+        costs = [np.square(o.rollout(starts)[0]).sum() for o in (coarse, fine)]
+        assert costs[0] == pytest.approx(costs[1], rel=2e-4)
+
+
+def test_ranges() -> None:
+    with pytest.raises(ValueError, match=r"env.growth_shares = \[0.5, 0.2\]"):
+        RelativeConfig(growth_shares=(0.5, 0.2))
+    with pytest.raises(ValueError, match=r"env.largest_error = 1.0 periods of full pump: allowed 1.1 to 100"):
+        RelativeConfig(largest_error=1.0)
