@@ -8,9 +8,11 @@ from pathlib import Path
 
 from envs.identification.calibration import Calibration, calibrate
 from envs.identification.screening import Series
+from envs.identification.twin import Twin, twin
 from experiments.calibration.config import CalibrateConfig
 from experiments.calibration.result import environment_yaml, report, summary
 from experiments.calibration.study import coverage, simulated
+from experiments.calibration.twin_file import twin_yaml
 from experiments.cli import files, frame
 from hardware.errors import RecordingError
 from hardware.storage.recorder import Recorder
@@ -63,10 +65,22 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
         environment.write_text(environment_yaml(result, name), encoding="utf-8")
     except ValueError as error:
         raise frame.UserError(f"{source}: no model to train on: {error}; {folder}/summary.json has the fit") from None
-    _draw(folder, raw, result, name, config.identify.segment_min)
+    behind = twin(raw, result, config.identify.segment_min)
+    written = _write_twin(folder / "twin.yaml", behind, name)
+    _draw(folder, raw, result, behind, name, config.identify.segment_min)
     print(report(result, recording, content))
-    print(f"\n  files       {environment}\n              {folder}/{{summary.json, figures/}}")
+    print(f"\n  files       {environment}\n              {written}\n              {folder}/{{summary.json, figures/}}")
     return result.pmse_pct
+
+
+def _write_twin(path: Path, behind: Twin, source: str) -> str:
+    """Write the plant; returns what to say of it. A recording may show what no plant here can do."""
+    try:
+        text = twin_yaml(behind, source)
+    except ValueError as error:
+        return f"no {path.name}: {error}"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
 
 
 def _rows(rows: str | None) -> tuple[int, int | None]:
@@ -75,15 +89,16 @@ def _rows(rows: str | None) -> tuple[int, int | None]:
     return int(low or 0), int(high) if high else None
 
 
-def _draw(folder: Path, raw: Series, result: Calibration, name: str, segment_min: float) -> None:
+def _draw(folder: Path, raw: Series, result: Calibration, behind: Twin, name: str, segment_min: float) -> None:
     """Figures, as files and for TensorBoard, and its scalars."""
-    from experiments.reporting.calibration_charts import drift_figure, fit_figure
+    from experiments.reporting.calibration_charts import drift_figure, fit_figure, twin_figure
     from experiments.reporting.charts import save
     from experiments.reporting.tensorboard import Events
 
     figures = {
         "fit": fit_figure(raw, result, f"{name}: measured and model"),
         "drift": drift_figure(result, f"{name}: segments of about {segment_min:g} min, fitted alone"),
+        "twin": twin_figure(raw, result, behind, f"{name}: its twin"),
     }
     events = Events(folder)
     for tag, value in (
@@ -97,8 +112,7 @@ def _draw(folder: Path, raw: Series, result: Calibration, name: str, segment_min
             if parameter is not None:
                 events.scalar(f"drift/{name}", parameter.value, i)
     for key, figure in figures.items():
-        save(figure, folder / "figures", key)
-        events.figure(f"calibration/{key}", figure, 0)
+        events.picture(f"calibration/{key}", save(figure, folder / "figures", key), 0)
     events.close()
 
 

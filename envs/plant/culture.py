@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from conf.schema import check, setting
+from conf.schema import check, require, setting
 from envs.growth import Arrhenius, Cardinal, Exponential, GrowthLaw, Monod, relative_to_37
 from envs.integrators import Integrator
+from envs.plant.course import allowed, along, rises
 from envs.plant.noise import Streams, spread
 
 __all__ = ["Culture", "GrowthConfig"]
@@ -31,6 +32,15 @@ class GrowthConfig:
     mu_cv: float = setting(0.0, "its relative spread between cultures", within=(0, 0.3))
     drift_sd_per_h: float = setting(0.0, "random walk of ln mu: sd after 1 h", "1/sqrt(h)", within=(0, 0.2))
     ramp_per_h: float = setting(0.0, "relative change of mu per hour (burden, pH, oxygen)", "1/h", within=(-0.5, 0.5))
+    knots_min: tuple[float, ...] = setting(
+        (), "ages at which `knots_mu` gives mu; empty: mu is constant", "min", at_least=0.0
+    )
+    knots_mu: tuple[float, ...] = setting(
+        (),
+        "mu at those ages, straight between them, the last one from there on; in place of `mu`",
+        "1/min",
+        within=(0, 0.1),
+    )
     temperature_law: str = setting("none", "how mu follows temperature", choices=TEMPERATURE_LAWS)
     activation_kj_mol: float = setting(
         56.0,
@@ -57,6 +67,9 @@ class GrowthConfig:
 
     def __post_init__(self) -> None:
         check(self, "plant.growth")
+        fits = rises(self.knots_min) and len(self.knots_mu) == len(self.knots_min)
+        require(fits, "plant.growth.knots_mu", self.knots_mu, allowed(self.knots_min))
+        require(self.mu > 0.0 or not self.knots_mu, "plant.growth.mu", self.mu, "> 0 beside knots_mu, e.g. their mean")
 
 
 def _response(config: GrowthConfig) -> Callable[[Array], Array]:
@@ -113,11 +126,11 @@ class Culture:
         """Water evaporated: concentrations rise by `factor`, shape (N,)."""
         self.od, self.substrate = self.od * factor, self.substrate * factor
 
-    def grow(self, minutes: float, dilution: Array, temperature: Array, age_min: float) -> None:
+    def grow(self, minutes: float, dilution: Array, temperature: Array, age_min: Array) -> None:
         """Integrate x, s, w over an interval in which temperature and dilution rate are constant.
 
         Args:
-          dilution: 1/min; temperature: degC; both shape (N,). age_min: time since reset, min.
+          dilution: 1/min; temperature: degC; age_min: of the culture, min; all of shape (N,).
         """
         g = self.config
         response = self._phi(temperature)
@@ -141,13 +154,15 @@ class Culture:
         """Integration steps in an interval of `minutes`."""
         return max(1, int(np.ceil(minutes / self._substep_min - 1e-9)))
 
-    def specific_rate(self, age_min: float) -> Array:
-        """Specific growth rate at this moment, 1/min, shape (N,)."""
+    def specific_rate(self, age_min: Array) -> Array:
+        """Specific growth rate at this moment, 1/min, of a culture of `age_min` min; both shape (N,)."""
         return self._law.specific_rate(self.substrate) * self._relative_rate(age_min)
 
-    def _relative_rate(self, age_min: float) -> Array:
+    def _relative_rate(self, age_min: Array) -> Array:
         """What temperature, drift, stirring and `mu_factor` now make of the growth law's rate, shape (N,)."""
-        drift = np.exp(self._log_drift) * max(1.0 + self.config.ramp_per_h * age_min / 60.0, 0.0)
+        g = self.config
+        course = along(g.knots_min, g.knots_mu, g.mu, age_min)
+        drift = np.exp(self._log_drift) * np.maximum(1.0 + g.ramp_per_h * age_min / 60.0, 0.0) * course
         stirred = UNSTIRRED_GROWTH + (1.0 - UNSTIRRED_GROWTH) * self.stir_factor
         return np.asarray(self._adapted * drift * stirred * self.mu_factor)
 

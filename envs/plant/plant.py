@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from conf.schema import check, part, setting
 from envs.integrators import INTEGRATORS
 from envs.plant.culture import Culture, GrowthConfig
-from envs.plant.noise import Streams, Tape, streams
+from envs.plant.noise import Streams, Tape, streams, uniform
 from envs.plant.pump import FeedPump, PumpConfig
 from envs.plant.sensor import OdSensor, SensorConfig
 from envs.plant.thermal import Thermal, ThermalConfig
@@ -34,6 +34,15 @@ class PlantConfig:
     thermal: ThermalConfig = part(ThermalConfig, "heater and surroundings")
     start_od: float = setting(
         0.5, "suspended biomass at reset unless the scenario says otherwise", "OD", within=(0, 10)
+    )
+    start_min: float = setting(
+        0.0, "age of culture and pump at reset, from which their drifts and knots go on", "min", at_least=0.0
+    )
+    start_spread_min: float = setting(
+        0.0,
+        "each vial is older by a uniform draw from 0 to this, so that vials meet different hours",
+        "min",
+        at_least=0.0,
     )
     integrator: str = setting("euler", "scheme of the mass balances", choices=tuple(INTEGRATORS))
     substep_min: float = setting(0.1, "longest integration step (paper)", "min", within=(1e-3, 1))
@@ -68,8 +77,8 @@ class Plant:
         if n < 1:
             raise ValueError(f"number of vials = {n}: allowed >= 1")
         self.config, self.n = config, n
-        parts = [r.spawn(3) for r in streams(rng, n)]
-        once, process, reading = ([p[k] for p in parts] for k in range(3))
+        parts = [r.spawn(4) for r in streams(rng, n)]
+        once, process, reading, start = ([p[k] for p in parts] for k in range(4))
         # The parts draw from the same streams: their order belongs to what a seed means.
         self.culture = Culture(config.growth, once, INTEGRATORS[config.integrator], config.substep_min)
         self.vessel = Vessel(config.vessel, config.pump, once)
@@ -78,6 +87,7 @@ class Plant:
         self.thermal = Thermal(config.thermal, n)
         self.feed.media_left_ml[:] = config.vessel.media_ml
         self.draws = self.culture.draws | self.vessel.draws | self.feed.draws | self.sensor.draws
+        self.draws["start_min"] = uniform(start, config.start_min, config.start_min + config.start_spread_min)
         self._tape = Tape(process, normals=3, uniforms=2)
         self.reset()
 
@@ -141,7 +151,7 @@ class Plant:
         """At most one minute: this minute's draws, doses, heat, growth, evaporation."""
         self._draw_minutes()
         volume = self.vessel.volume_ml
-        fresh = self.feed.deliver(np.maximum(feed_s, 0.0), minutes, self.minutes)
+        fresh = self.feed.deliver(np.maximum(feed_s, 0.0), minutes, self.age_min)
         kept = self.vessel.exchange(fresh, waste_s, overflow_s)
         self.vessel.draw_out(self.feed.drawn_back(np.maximum(-feed_s, 0.0)))
         if self.config.pump.dosing == "pulse":
@@ -150,7 +160,7 @@ class Plant:
         else:
             dilution = fresh / volume / minutes
         self.thermal.advance(minutes, kept)
-        self.culture.grow(minutes, dilution, self.thermal.mean, self.minutes)
+        self.culture.grow(minutes, dilution, self.thermal.mean, self.age_min)
         self.culture.concentrate(self.vessel.evaporate(minutes))
         self.culture.settle(minutes)
         self.minutes += minutes
@@ -174,13 +184,18 @@ class Plant:
           minutes: length of the interval, min, at most 1.
           feed_s: on-times of the feed pump to compare, s, shape (A, N).
         """
-        rate = self.culture.specific_rate(self.minutes)
-        dose = self.feed.expected(feed_s, self.minutes) / self.vessel.volume_ml
+        rate = self.culture.specific_rate(self.age_min)
+        dose = self.feed.expected(feed_s, self.age_min) / self.vessel.volume_ml
         steps = self.culture.substeps(minutes)
         continuous = self.config.pump.dosing == "continuous"
         change = (rate * minutes - (dose if continuous else 0.0)) / steps
         grown = (1.0 + change) ** steps if self.config.integrator == "euler" else np.exp(steps * change)
         return np.asarray(self.culture.od * grown * (1.0 if continuous else np.exp(-dose)))
+
+    @property
+    def age_min(self) -> Array:
+        """Age of culture and pump, `start_min` and the time since reset, min, shape (N,)."""
+        return self.draws["start_min"] + self.minutes
 
     def read_od(self) -> Array:
         """One averaged reading of every sensor, with all that is configured or switched on, OD, shape (N,)."""

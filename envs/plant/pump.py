@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
+from envs.plant.course import allowed, along, rises
 from envs.plant.noise import Streams, spread
 
 __all__ = ["FeedPump", "PumpConfig"]
@@ -25,7 +26,17 @@ class PumpConfig:
     gain_ml_s: float = setting(1.0, "mean flow at full power (vendor: up to 1)", "mL/s", within=(0.05, 5))
     gain_cv: float = setting(0.0, "its relative spread between heads", within=(0, 0.3))
     gain_drift_per_h: float = setting(0.0, "relative change of the flow (tube wear)", "1/h", within=(-0.2, 0.2))
-    pulse_cv: float = setting(0.0, "relative spread of a minute's dose", within=(0, 0.5))
+    knots_min: tuple[float, ...] = setting(
+        (), "ages at which `knots_ml_s` gives the flow; empty: it is constant", "min", at_least=0.0
+    )
+    knots_ml_s: tuple[float, ...] = setting(
+        (),
+        "mean flow at full power at those ages, straight between them, the last one from there on; in place of "
+        "`gain_ml_s`",
+        "mL/s",
+        within=(0.05, 5),
+    )
+    pulse_cv: float = setting(0.0, "relative spread of a minute's dose", within=(0, 1))
     pulse_ar: float = setting(0.0, "its correlation with the minute before", within=(0, 0.95))
     dead_time_s: float = setting(0.0, "start of each pulse that delivers nothing", "s", within=(0, 0.5))
     min_pulse_s: float = setting(0.0, "pulses shorter than this deliver nothing", "s", within=(0, 1))
@@ -45,6 +56,8 @@ class PumpConfig:
 
     def __post_init__(self) -> None:
         check(self, "plant.pump")
+        fits = rises(self.knots_min) and len(self.knots_ml_s) == len(self.knots_min)
+        require(fits, "plant.pump.knots_ml_s", self.knots_ml_s, allowed(self.knots_min))
         highest = f"0 to prime_high = {self.prime_high}; lower it"
         require(self.prime_low <= self.prime_high, "plant.pump.prime_low", self.prime_low, highest)
         per_pulse = self.dead_time_s + self.min_pulse_s + self.timing_error_s + self.back_leak_ml
@@ -104,26 +117,27 @@ class FeedPump:
         moves = (on_s > 0.0) & (on_s >= c.min_pulse_s)
         return np.where(moves, np.maximum(on_s + longer_s - c.dead_time_s, 0.0), 0.0)
 
-    def _flow(self, clock_min: float) -> Array:
-        """Mean flow at full power of heads that are `clock_min` min old, mL/s, shape (N,)."""
-        drift = 1.0 + self.config.gain_drift_per_h * clock_min / 60.0
+    def _flow(self, age_min: Array) -> Array:
+        """Mean flow at full power of heads that are `age_min` min old, mL/s; both shape (N,)."""
+        c = self.config
+        drift = (1.0 + c.gain_drift_per_h * age_min / 60.0) * along(c.knots_min, c.knots_ml_s, c.gain_ml_s, age_min)
         return self.draws["pump_gain_ml_s"] * self.gain_factor * drift
 
-    def expected(self, on_s: Array, clock_min: float) -> Array:
+    def expected(self, on_s: Array, age_min: Array) -> Array:
         """Mean dose of one pulse of `on_s` s by a primed head, mL; on_s and the result end in (N,). Changes nothing.
 
         Args: as `deliver`.
         """
         moving = self._effective(on_s, 0.5 * self.config.timing_error_s)
-        return np.asarray(np.clip(self._flow(clock_min) * moving - self.back_leak_ml, 0.0, self.media_left_ml))
+        return np.asarray(np.clip(self._flow(age_min) * moving - self.back_leak_ml, 0.0, self.media_left_ml))
 
-    def deliver(self, on_s: Array, minutes: float, clock_min: float) -> Array:
+    def deliver(self, on_s: Array, minutes: float, age_min: Array) -> Array:
         """Run forward for `on_s` s at the start of an interval; volume of fresh medium delivered, mL, shape (N,).
 
         Args:
           on_s: seconds at full power, shape (N,), >= 0.
           minutes: length of the interval, min; on_s that fills it leaves the pulse open.
-          clock_min: age of the head, min, for its drift.
+          age_min: of the head, min, for its drift, shape (N,).
         """
         pulsing = on_s > 0.0
         start = pulsing & ~self._running
@@ -131,7 +145,7 @@ class FeedPump:
         self._pulse_prime = np.where(start, primed, self._pulse_prime)
         for store in (self._on_s, self._moved_ml, self._dosed_ml):
             store[start] = 0.0
-        flow = np.maximum(self._flow(clock_min) * (1.0 + self.config.pulse_cv * self._noise), 0.0) * self._pulse_prime
+        flow = np.maximum(self._flow(age_min) * (1.0 + self.config.pulse_cv * self._noise), 0.0) * self._pulse_prime
         before, self._on_s = self._effective(self._on_s, self._timing), self._on_s + on_s
         self._moved_ml += flow * np.maximum(self._effective(self._on_s, self._timing) - before, 0.0)
         dose = np.maximum(self._moved_ml - self.back_leak_ml, 0.0) - self._dosed_ml

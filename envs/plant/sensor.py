@@ -33,6 +33,8 @@ class SensorConfig:
     curvature: float = setting(0.0, "c is drawn uniformly between this and 0", "1/OD", within=(-0.3, 0))
     blank_error: float = setting(0.0, "offset, uniform in +- this", "OD", within=(0, 0.2))
     drift_per_h: float = setting(0.0, "rise of the offset", "OD/h", within=(-0.05, 0.05))
+    shift_od: float = setting(0.0, "sudden change of the offset at `shift_min`", "OD", within=(-0.2, 0.2))
+    shift_min: float = setting(0.0, "age of the blank at which that happens", "min", at_least=0.0)
     wall_gain: float = setting(0.0, "OD seen per OD-equivalent on the wall", within=(0, 1))
     outlier_rate: float = setting(0.0, "per reading: an isolated jump of more than 0.04, 54 % upward", within=(0, 0.2))
     bubble_rate: float = setting(0.0, "per reading: a bubble adds 0.05 to 0.3 for 1 to 5 readings", within=(0, 0.2))
@@ -110,7 +112,8 @@ class OdSensor:
         """
         d = self.draws
         optical = d["sensor_gain"] * (od + d["sensor_curvature"] * od * od)
-        offset = d["sensor_offset"] + self.config.drift_per_h * minutes / 60.0 + self.extra_offset
+        shift = self.config.shift_od * (minutes >= self.config.shift_min)
+        offset = d["sensor_offset"] + self.config.drift_per_h * minutes / 60.0 + shift + self.extra_offset
         return np.asarray(optical + self.config.wall_gain * wall + offset)
 
     def read(self, od: Array, wall: Array, minutes: float) -> Array:

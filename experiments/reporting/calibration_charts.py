@@ -9,9 +9,10 @@ from envs.identification.calibration import Calibration
 from envs.identification.drift import Segment
 from envs.identification.model import Parameter
 from envs.identification.screening import Series
+from envs.identification.twin import Twin
 from experiments.reporting.charts import COLOURS, new_figure
 
-__all__ = ["coverage_figure", "drift_figure", "fit_figure"]
+__all__ = ["coverage_figure", "drift_figure", "fit_figure", "twin_figure"]
 
 Array = NDArray[np.float64]
 
@@ -171,4 +172,39 @@ def coverage_figure(mu: Array, tau: Array, truth: tuple[Array, Array], title: st
         low, high = ax.get_ylim()
         ax.set_ylim(low, high + 0.32 * (high - low))
         ax.legend(loc="upper left")
+    return figure
+
+
+def twin_figure(raw: Series, result: Calibration, behind: Twin, title: str) -> Figure:
+    """mu(t) and tau(t) of the twin with their 95 % bands, above the trustworthy readings.
+
+    Args: raw, result: as `fit_figure`. behind: the twin of both.
+    """
+    figure, axes = new_figure(9.5, 7.2, 3, sharex=True, height_ratios=(1.2, 1.2, 1.0))
+    clean, (a, b) = result.screened.series, result.window
+    start = clean.time[np.searchsorted(clean.row, behind.rows[0])]
+    hours = (behind.knot_min + start) / 60
+    rows = (
+        ("growth rate µ, 1/min", behind.mu, [s.mu for s in result.segments], result.mu),
+        ("dilution constant τ", behind.tau, [s.tau for s in result.segments], result.tau),
+    )
+    for ax, (label, course, values, pair) in zip(axes, rows, strict=False):
+        ax.fill_between(hours, course.low, course.high, color=MODEL, alpha=0.18, lw=0, label="its 95 % band")
+        ax.plot(hours, course.value, "o-", ms=4, color=MODEL, lw=1.6, label="twin")
+        ax.plot(raw.time[[a, b - 1]] / 60, [pair.value] * 2, color="0.35", lw=1.0, ls="--", label="returned pair")
+        known = [(s.middle_min / 60, v.value) for s, v in zip(result.segments, values, strict=True) if v is not None]
+        if known:
+            ax.plot(*zip(*known, strict=True), "s", ms=4, color=DATA, mfc="none", label="segment alone")
+        ax.set_ylim(0.0, 1.3 * max(float(course.high.max()), *(v for _, v in known), 0.0))
+        ax.set_ylabel(label)
+        ax.legend(loc="upper left", ncols=4)
+    noise = behind.noise
+    axes[0].set_title(title)
+    axes[2].plot(clean.time / 60, clean.od, ".", ms=2.5, color=DATA)
+    axes[2].set_ylabel("OD")
+    axes[2].set_xlabel("time, h")
+    axes[2].set_title(
+        f"reading: sd hypot({noise.floor:.4f}, {100 * noise.relative:.1f} % of OD), correlation {noise.lag1:.2f}; "
+        f"doses spread {100 * noise.dose_cv:.0f} %; outliers {100 * noise.outlier_rate:.2f} %"
+    )
     return figure

@@ -374,3 +374,71 @@ def test_reset_starts_a_new_culture_in_the_same_reactor() -> None:
 def test_what_is_out_of_range_is_named(make: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+KNOTS = PlantConfig(
+    growth=GrowthConfig(mu=0.03, knots_min=(0.0, 60.0), knots_mu=(0.02, 0.04)),
+    pump=PumpConfig(dosing="pulse", knots_min=(0.0, 60.0), knots_ml_s=(1.0, 0.5)),
+    integrator="rk4",
+)
+
+
+def test_growth_follows_its_knots_and_stays_at_the_last() -> None:
+    p = plant(KNOTS)
+    p.advance(60.0, np.zeros(1))
+    assert np.log(p.culture.od[0] / 0.5) == pytest.approx(60 * 0.03, rel=0.01)  # mean of the line, from minute starts
+    before = p.culture.od[0]
+    p.advance(10.0, np.zeros(1))
+    assert np.log(p.culture.od[0] / before) == pytest.approx(10 * 0.04, rel=1e-6)
+    np.testing.assert_allclose(p.culture.specific_rate(np.array([30.0])), 0.03)
+
+
+def test_the_pump_follows_its_knots() -> None:
+    p = plant(KNOTS)
+    for minute, dose in ((0, 1.2), (30, 0.9), (60, 0.6), (600, 0.6)):
+        p.reset()
+        p.minutes = float(minute)
+        np.testing.assert_allclose(p.feed.expected(np.array([1.2]), p.age_min), dose)
+        p.advance(1.0, np.array([1.2]))
+        assert p.feed.delivered_ml[0] == pytest.approx(dose)
+
+
+def test_vials_begin_at_ages_of_their_own() -> None:
+    p = plant(replace(KNOTS, start_min=15.0, start_spread_min=30.0), 400)
+    starts = p.draws["start_min"]
+    assert 15.0 <= starts.min() < 16.0
+    assert 44.0 < starts.max() <= 45.0
+    np.testing.assert_allclose(p.culture.specific_rate(p.age_min), 0.02 + 0.02 * starts / 60.0)
+    once = plant(replace(KNOTS, start_min=30.0))
+    once.advance(1.0, np.array([1.2]))
+    assert once.culture.od[0] == pytest.approx(0.5 * np.exp(-0.9 / 20.0 + 0.03), rel=1e-9)
+
+
+def test_ages_move_no_other_draw() -> None:
+    """A vial that begins later has the same pump, sensor and noise."""
+    now, later = (plant(replace(preset("bench"), start_spread_min=s), 3, seed=7) for s in (0.0, 600.0))
+    for key in set(now.draws) - {"start_min"}:
+        np.testing.assert_array_equal(now.draws[key], later.draws[key])
+    np.testing.assert_array_equal(now.read_od(), later.read_od())
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: GrowthConfig(knots_min=(0.0, 5.0), knots_mu=(0.01,)),
+            r"plant.growth.knots_mu = \[0.01\]: allowed one",
+        ),
+        (
+            lambda: GrowthConfig(knots_min=(5.0, 5.0), knots_mu=(0.01, 0.02)),
+            r"knots_min = \[5.0, 5.0\], which must rise",
+        ),
+        (lambda: GrowthConfig(mu=0.0, knots_min=(0.0,), knots_mu=(0.01,)), r"plant.growth.mu = 0.0: allowed > 0"),
+        (lambda: GrowthConfig(knots_min=(0.0,), knots_mu=(0.5,)), r"plant.growth.knots_mu = .*0 to 0.1"),
+        (lambda: PumpConfig(knots_min=(0.0,)), r"plant.pump.knots_ml_s = \[\]: allowed one value for each"),
+        (lambda: PlantConfig(start_min=-1.0), r"plant.start_min = -1.0 min: allowed"),
+    ],
+)
+def test_knots_that_do_not_fit_are_one_line(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -20,6 +20,7 @@ from envs.task import EnvConfig
 from experiments.calibration.config import CalibrateConfig
 from experiments.calibration.result import environment_yaml
 from experiments.cli import frame
+from experiments.control.plant_file import read_plant_file
 from hardware.storage.recording_reader import read_recording
 from tests.real_recording import DITHER, needs_dither
 
@@ -75,7 +76,7 @@ def test_shipped_recording_from_the_command_line(cli: Cli, tmp_path: Path) -> No
     assert content["pmse_pct"] < 0.05
     for word in ("mu ", "tau ", "PMSE", "window", "held out", "doubling", "calibrated.yaml"):
         assert word in done.stdout
-    for figure in ("figures/fit.png", "figures/drift.png"):
+    for figure in ("figures/fit.png", "figures/drift.png", "figures/twin.png"):
         assert (run / figure).read_bytes().startswith(b"\x89PNG")
     assert list(run.glob("events.out.tfevents.*"))
     nominal = OmegaConf.create(asdict(EnvConfig()))
@@ -83,6 +84,11 @@ def test_shipped_recording_from_the_command_line(cli: Cli, tmp_path: Path) -> No
     assert list(fitted) == list(nominal)
     assert {k for k in nominal if nominal[k] != fitted[k]} == {"mu", "tau"}
     assert (fitted.mu, fitted.tau) == (content["mu"]["value"], content["tau"]["value"])
+    plant = read_plant_file(str(run / "twin.yaml"))
+    assert plant.growth.mu == pytest.approx(0.028, rel=0.02)
+    assert 20.0 / (60.0 * plant.pump.gain_ml_s) == pytest.approx(0.31, rel=0.02)
+    assert np.hypot(plant.sensor.noise_floor / 0.5, plant.sensor.noise_relative) == pytest.approx(0.01, rel=0.2)
+    assert plant.sensor.outlier_rate == 0.0
 
 
 def test_shipped_recording_is_what_the_generator_makes(cli: Cli, tmp_path: Path) -> None:
@@ -115,6 +121,15 @@ def test_real_recording_from_the_command_line(cli: Cli, tmp_path: Path, rows: st
         assert any("tau drifts" in w for w in content["warnings"])
         assert any("mu drifts" in w for w in content["warnings"])
         assert "sensor broken" in done.stdout
+        plant = read_plant_file(str(tmp_path / "run" / "twin.yaml"))
+        mu, tau = np.array(plant.growth.knots_mu), 1.0 / (3.0 * np.array(plant.pump.knots_ml_s))
+        assert plant.growth.knots_min[-1] == pytest.approx(1157, abs=2)
+        # slopes of single swings, by hand: tau 0.29 to 0.42, growth 0.010 to 0.014
+        assert 0.27 < tau[0] < 0.31
+        assert 0.38 < tau[-1] < 0.46
+        assert 0.0095 < mu[3:5].mean() < 0.0115
+        assert 0.0125 < mu[-3:].mean() < 0.0145
+        assert 0.008 < np.hypot(plant.sensor.noise_floor, 0.4 * plant.sensor.noise_relative) < 0.012
 
 
 @pytest.mark.parametrize(

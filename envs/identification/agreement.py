@@ -1,0 +1,201 @@
+"""What a model predicted against what happened: growth, pump and the next reading along a run, and until when it held.
+
+The model is the pair (mu, tau) that a run was planned with. Three things are compared with it, segment by segment: the
+growth rate and the pump's gain, each estimated from the segment alone, and the mean error of its predictions one row
+ahead,
+
+    e_i = ln y_{i+1} - ln y_i - (mu - u_i/tau) dt_i,
+
+which shows what mu - u/tau misses also where a regulated culture hides the one behind the other. Its interval is that
+narrow that one segment decides; of the others two in a row have to, since one in twenty is wrong by chance.
+"""
+
+from dataclasses import dataclass
+from itertools import takewhile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.identification.drift import NOTABLE_DRIFT_PCT, Drift, Segment, cuts, drift, segments
+from envs.identification.model import Parameter
+from envs.identification.screening import OD_FLOOR, Screened, Series, screen
+from envs.identification.window import SHORTEST_WINDOW_MIN
+
+__all__ = ["Agreement", "Compared", "agreement"]
+
+Array = NDArray[np.float64]
+
+SEGMENT_MIN = 120.0
+LAGS = 10  # rows over which errors are correlated: noise of a reading is in two of them
+FEWEST_ERRORS = 20
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A parameter along a run against the model's value; what is not identifiable in a segment is None.
+
+    first_min, end_min, found: of each segment, in order. expected: the model's value. scale: what 10 % refer to.
+    segments: how many in a row have to exclude the model's value. line: through all, where there are enough of them.
+    """
+
+    name: str
+    first_min: tuple[float, ...]
+    end_min: tuple[float, ...]
+    found: tuple[Parameter | None, ...]
+    expected: float
+    scale: float
+    segments: int = 2
+    line: Drift | None = None
+
+    @property
+    def left_min(self) -> float | None:
+        """The minute from which on the model's value is wrong, to the end of the run; None if it holds.
+
+        It is wrong in a segment whose interval excludes it and whose estimate is off by 10 % or more.
+        """
+        known = [(t, p) for t, p in zip(self.first_min, self.found, strict=True) if p is not None]
+        outside = list(takewhile(lambda tp: self._wrong(tp[1]), reversed(known)))
+        return outside[-1][0] if len(outside) >= self.segments else None
+
+    def _wrong(self, found: Parameter) -> bool:
+        return not found.low <= self.expected <= found.high and abs(self.off_pct(found)) >= NOTABLE_DRIFT_PCT
+
+    def off_pct(self, found: Parameter) -> float:
+        """By how many per cent of the scale an estimate differs from the model's value."""
+        return 100.0 * (found.value - self.expected) / self.scale
+
+    @property
+    def latest(self) -> Parameter | None:
+        """The last estimate that there is."""
+        return next((p for p in reversed(self.found) if p is not None), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """A run against its model.
+
+    growth: mu, 1/min. gain: the pump's flow over the model's, tau_model/tau. net: mean of e per minute, 1/min.
+    predicted: OD one row ahead of the readings, nan where there is none, (n,); rms, attainable: of its error in OD, and
+    what is left of it without the mean of each segment. minutes: from the first to the last trustworthy reading.
+    """
+
+    series: Series
+    growth: Compared
+    gain: Compared
+    net: Compared
+    predicted: Array
+    rms: float
+    attainable: float
+    minutes: float
+
+    @property
+    def long_enough(self) -> bool:
+        """Whether anything can be said."""
+        return self.minutes >= SHORTEST_WINDOW_MIN
+
+    @property
+    def left(self) -> list[Compared]:
+        """What no longer holds at the end of the run, the earliest first."""
+        found = [c for c in (self.growth, self.gain, self.net) if c.left_min is not None]
+        return sorted(found, key=lambda c: c.left_min or 0.0)
+
+    def verdict(self) -> str:
+        """One sentence: whether to calibrate again, and why."""
+        if not self.long_enough:
+            return (
+                f"Too short to tell: {self.minutes:.0f} min of trustworthy readings, at least "
+                f"{SHORTEST_WINDOW_MIN:.0f} are needed."
+            )
+        if self.left:
+            return f"Recalibrate: {'; '.join(_words(c) for c in self.left)}{self._which()}."
+        unknown = " and ".join(c.name for c in (self.growth, self.gain) if c.latest is None)
+        but = f"; {unknown} cannot be told from these readings alone" if unknown else ""
+        return f"No need to recalibrate: the model held to the end of the run{but}."
+
+    def _which(self) -> str:
+        """Where only their balance is known to be wrong, the two that it may come from."""
+        if self.left != [self.net] or self.net.latest is None:
+            return ""
+        faster, weaker = ("faster", "weaker") if self.net.latest.value > 0.0 else ("slower", "stronger")
+        return f"; the culture grows {faster} or the pump is {weaker}, which this run alone cannot tell"
+
+
+def _words(c: Compared) -> str:
+    assert c.left_min is not None
+    assert c.latest is not None
+    since = "throughout" if c.left_min <= c.first_min[0] else f"since hour {c.left_min / 60.0:.1f}"
+    return f"{c.name} is off by 10 % or more {since}, by {c.off_pct(c.latest):+.0f} % at the end"
+
+
+def agreement(raw: Series, mu: float, tau: float, segment_min: float = SEGMENT_MIN) -> Agreement:
+    """Compare a run with the model (mu in 1/min, tau) that it was planned with.
+
+    Raises: ValueError when no trustworthy readings are left.
+    """
+    screened = screen(raw)
+    clean = screened.series
+    along = segments(screened, segment_min, "prediction_error")
+    used = np.flatnonzero(np.isfinite(clean.od))
+    log_change, error = _one_ahead(clean, screened, mu, tau)
+    predicted = np.full(len(clean.od), np.nan)
+    predicted[1:] = clean.od[:-1] * np.exp(log_change)
+    pieces = [p for first, end in screened.stretches for p in cuts(clean, first, end, segment_min)]
+    means, left = [], np.full(len(error), np.nan)
+    for a, b in pieces:
+        means.append(_mean(error[a : b - 1], clean.time[a:b]))
+        left[a : b - 1] = error[a : b - 1] - np.nanmean(error[a : b - 1]) if means[-1] else error[a : b - 1]
+    times = (tuple(float(clean.time[a]) for a, _ in pieces), tuple(float(clean.time[b - 1]) for _, b in pieces))
+    return Agreement(
+        series=clean,
+        growth=_of_segments("growth", clean, along, [s.mu for s in along], mu),
+        gain=_of_segments("the pump's gain", clean, along, [_gain(s.tau, tau) for s in along], 1.0),
+        net=Compared("the predicted net growth", *times, tuple(means), 0.0, mu, segments=1),
+        predicted=predicted,
+        rms=_rms(clean.od[1:] * -np.expm1(-error)),
+        attainable=_rms(clean.od[1:] * -np.expm1(-left)),
+        minutes=float(clean.time[used[-1]] - clean.time[used[0]]),
+    )
+
+
+def _one_ahead(clean: Series, screened: Screened, mu: float, tau: float) -> tuple[Array, Array]:
+    """Predicted change of ln y from each row to the next, and e; e is nan without two readings in one stretch."""
+    step = np.diff(clean.time)
+    predicted = (mu - clean.pump_rate[:-1] / tau) * step
+    log_od = np.log(np.where(clean.od > OD_FLOOR, clean.od, np.nan))
+    error = np.diff(log_od) - predicted
+    for _, end in screened.stretches:
+        if end - 1 < len(error):
+            error[end - 1] = np.nan
+    return predicted, error
+
+
+def _mean(error: Array, time: Array) -> Parameter | None:
+    """Mean of e per minute with its 95 % interval (Newey and West 1987, Econometrica 55:703), None for too few."""
+    seen = np.isfinite(error)
+    n = int(seen.sum())
+    if n < FEWEST_ERRORS:
+        return None
+    rate = float(np.mean(np.diff(time)))
+    mean = float(error[seen].mean())
+    centred = np.where(seen, error - mean, 0.0)
+    moments = [float(centred[lag:] @ centred[: len(centred) - lag]) / n for lag in range(LAGS + 1)]
+    variance = moments[0] + 2.0 * sum((1.0 - k / (LAGS + 1)) * m for k, m in enumerate(moments) if k > 0)
+    half = 1.96 * float(np.sqrt(max(variance, 0.05 * moments[0]) / n))
+    return Parameter(mean / rate, (mean - half) / rate, (mean + half) / rate)
+
+
+def _gain(tau: Parameter | None, model: float) -> Parameter | None:
+    return None if tau is None else Parameter(model / tau.value, model / tau.high, model / tau.low)
+
+
+def _of_segments(
+    name: str, clean: Series, along: tuple[Segment, ...], found: list[Parameter | None], expected: float
+) -> Compared:
+    first = tuple(float(clean.time[s.first]) for s in along)
+    end = tuple(float(clean.time[s.end - 1]) for s in along)
+    return Compared(name, first, end, tuple(found), expected, expected, line=drift(along, found))
+
+
+def _rms(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

@@ -1,0 +1,264 @@
+"""The plant a recording came from: mu(t) and tau(t) as they drifted, noise of the sensor, spread of doses, outliers.
+
+k(t) = 1/tau(t) is a smooth curve through the estimates of the segments, which hold whatever moved the pump. With k(t),
+what is left of the readings is growth alone,
+
+    g_i = ln y_i + sum over j < i of k(t_j) c_j = b + integral of mu + s_i + v_i,     c_j = u_j dt_j
+
+where doses that spread make s a random walk and v is the noise of the readings. Both are taken from the fast motion of
+g, and mu(t) is a smooth curve as k(t) is: a line plus a random walk, as large as the recording makes likely.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.identification.calibration import Calibration
+from envs.identification.model import Parameter
+from envs.identification.screening import OD_FLOOR, Series
+
+__all__ = ["Course", "Noise", "Twin", "twin"]
+
+Array = NDArray[np.float64]
+
+FEWEST_SEGMENTS = 4  # with a tau of their own; of fewer no drift can be told, and tau is the returned one throughout
+WANDER = np.concatenate([[0.0], np.geomspace(0.005, 0.3, 12)])  # of a curve about its line: sd after 1 h over its mean
+FLAT = 25.0  # variance of levels, and of a line's two coefficients over the mean: far beyond what a recording leaves
+BLOCKS = 400  # of rows at most, whose means are compared with mu(t)
+EXACT = 1e-8  # variance of ln y that is left to a reading without noise: 0.01 % of the OD
+BANDS = 200  # of frequencies at most
+PHI = np.linspace(0.0, 0.95, 39)  # a plant's `lag1` goes so far
+RATIO = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 60)])  # variance of a row's dose over that of a reading
+LONGEST_PERIOD = 20.0  # rows; slower motion of g is growth that wanders and an error of k
+CLIP_SD = 4.5
+START_READINGS = 5
+OUTLIER_OD = 0.04  # least deviation of an outlier (docs/biology.md, Sensor)
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """A parameter at the knots with its 95 % band, straight between them; shape (J,) each."""
+
+    value: Array
+    low: Array
+    high: Array
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What lies between a plant without noise and the readings.
+
+    The sd of a reading is hypot(floor, relative * OD), its correlation from row to row lag1. dose_cv: sd of a dose over
+    its mean. outlier_rate: share of readings off by more than 0.04 OD.
+    """
+
+    floor: float
+    relative: float
+    lag1: float
+    dose_cv: float
+    outlier_rate: float
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A recording as a plant; knot_min counts from its first trustworthy row, shape (J,); rows are [first, end).
+
+    start_od: OD at the first row. row_min: median time between rows. drifts: whether tau was free to.
+    """
+
+    knot_min: Array
+    mu: Course
+    tau: Course
+    noise: Noise
+    start_od: float
+    rows: tuple[int, int]
+    row_min: float
+    drifts: bool
+
+
+def twin(raw: Series, result: Calibration, knot_every_min: float) -> Twin:
+    """The plant behind all trustworthy rows of a calibrated recording, with a knot about every `knot_every_min` min.
+
+    Args: raw: the recording before screening, at the same positions as `result`'s.
+    """
+    edges = result.screened.stretches
+    first, end = edges[0][0], edges[-1][1]
+    part = result.screened.series.part(first, end)
+    minutes = float(part.time[-1] - part.time[0])
+    knots = np.linspace(0.0, minutes, max(2, round(minutes / knot_every_min) + 1))
+    k, k_cov, drifts = _inverse_tau(result, knots + part.time[0])
+    rows = _Rows(part, [a - first for a, _ in edges], knots)
+    noise = _noise(rows, k, _outliers(rows, k, raw.part(first, end)))
+    mu, mu_cov = _growth(rows, k, k_cov, noise, result.mu.value)
+    mu_sd, k_sd = (1.96 * np.sqrt(np.maximum(np.diag(c), 0.0)) for c in (mu_cov, k_cov))
+    started = (rows.grown(k) - rows.elapsed @ mu)[rows.seen][:START_READINGS]
+    return Twin(
+        knot_min=knots,
+        mu=Course(mu, mu - mu_sd, mu + mu_sd),
+        tau=Course(1.0 / k, 1.0 / (k + k_sd), 1.0 / np.maximum(k - k_sd, 0.2 * k)),
+        noise=noise,
+        start_od=float(np.exp(np.median(started))),
+        rows=(int(part.row[0]), int(part.row[-1]) + 1),
+        row_min=float(np.median(np.diff(part.time))),
+        drifts=drifts,
+    )
+
+
+class _Rows:
+    """Screened rows, n of them, and the integrals of the knots' hat functions up to each, shape (n, J).
+
+    elapsed: of the hat itself, min. pumped: of the pump rate times it, mL/s min. stretch: number of each row's stretch.
+
+    Args: part: the rows. starts: positions at which a stretch begins. knots: min after the first row, (J,).
+    """
+
+    def __init__(self, part: Series, starts: list[int], knots: Array) -> None:
+        self.part = part
+        time = part.time - part.time[0]
+        self.step = np.diff(time, append=time[-1])
+        self.hats = np.stack([np.interp(time + 0.5 * self.step, knots, h) for h in np.eye(len(knots))], axis=1)
+        self.knot_h = knots / 60.0
+        self.elapsed = _summed(self.step[:, None] * self.hats)
+        self.pumped = _summed((part.pump_rate * self.step)[:, None] * self.hats)
+        self.stretch = np.searchsorted(starts, np.arange(len(time)), side="right") - 1
+        self.seen = part.od > OD_FLOOR
+        self.log_od = np.log(np.where(self.seen, part.od, 1.0))
+        size = -(-len(time) // BLOCKS)
+        self.blocks = np.unique(np.concatenate([starts, np.arange(0, len(time), size)]))
+        count = np.add.reduceat(self.seen, self.blocks, dtype=np.float64)
+        self.full, self.count = count > 0.0, count[count > 0.0]
+
+    def means(self, values: Array) -> Array:
+        """Means of (n, C) values over the readings of each block that has any, shape (blocks, C)."""
+        sums = np.add.reduceat(np.where(self.seen[:, None], values, 0.0), self.blocks, axis=0)
+        return np.asarray(sums[self.full] / self.count[:, None])
+
+    def grown(self, k: Array) -> Array:
+        """g of the module's docstring, between readings on a straight line, shape (n,)."""
+        at = np.flatnonzero(self.seen)
+        return np.asarray(np.interp(np.arange(len(self.seen)), at, (self.log_od + self.pumped @ k)[at]))
+
+    def doses(self, k: Array) -> Array:
+        """By how much each row's dose lowers ln y, shape (n,)."""
+        return np.asarray(self.part.pump_rate * self.step * (self.hats @ k))
+
+
+def _summed(steps: Array) -> Array:
+    """The sum of what all earlier rows add, shape (n, J)."""
+    return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps[:-1], axis=0)])
+
+
+def _curve(at_h: Array, mean: float, seen: Array, towards: Array, noise: Array) -> tuple[Array, Array, Array]:
+    """A line plus a random walk at P points from n linear observations of it, averaged over the walk's likely sizes.
+
+    Args: at_h: hours, (P,). mean: scale of the curve. seen: observations, (n,). towards: their weights on the points,
+      (n, P). noise: covariance of their errors, (n, n).
+    Returns: the curve (P,), its covariance (P, P), and how it follows from `seen`, (P, n).
+    """
+    since = at_h - at_h.min()
+    scores, gains, left = [], [], []
+    for wander in WANDER:
+        prior = mean**2 * (FLAT * (1.0 + np.outer(since, since)) + wander**2 * np.minimum.outer(since, since))
+        own = towards @ prior @ towards.T + noise
+        gain = np.linalg.solve(own, towards @ prior).T
+        surprise = seen - mean * towards.sum(axis=1)
+        scores.append(-0.5 * (np.linalg.slogdet(own)[1] + surprise @ np.linalg.solve(own, surprise)))
+        gains.append(gain)
+        left.append(prior - gain @ towards @ prior)
+    share = np.exp(np.array(scores) - max(scores))
+    share /= share.sum()
+    curves = [mean + gain @ surprise for gain in gains]
+    gain = np.tensordot(share, gains, 1)
+    curve = share @ np.array(curves)
+    spread = [c + np.outer(each - curve, each - curve) for c, each in zip(left, curves, strict=True)]
+    return curve, np.tensordot(share, spread, 1), gain
+
+
+def _inverse_tau(result: Calibration, at: Array) -> tuple[Array, Array, bool]:
+    """k at times in min, shape (J,), its covariance (J, J), and whether its drift could be told.
+
+    Before the first and after the last segment with a tau of its own k stays.
+    """
+    known = [(s.middle_min, s.tau) for s in result.segments if s.tau is not None]
+    if len(known) < FEWEST_SEGMENTS:
+        constant, sd = _inverse(result.tau)
+        return np.full(len(at), constant), np.full((len(at), len(at)), sd**2), False
+    middle = np.array([m for m, _ in known])
+    value, deviation = np.array([_inverse(p) for _, p in known]).T
+    points = np.concatenate([middle, np.clip(at, middle[0], middle[-1])]) / 60.0
+    towards = np.eye(len(middle), len(points))
+    mean = float(np.average(value, weights=deviation**-2.0))
+    k, spread, _ = _curve(points, mean, value, towards, np.diag(deviation**2))
+    return k[len(middle) :], spread[len(middle) :, len(middle) :], True
+
+
+def _inverse(tau: Parameter) -> tuple[float, float]:
+    """1/tau and its sd."""
+    return 1.0 / tau.value, (1.0 / tau.low - 1.0 / tau.high) / 3.92
+
+
+def _growth(rows: _Rows, k: Array, k_cov: Array, noise: Noise, mean: float) -> tuple[Array, Array]:
+    """mu at the knots, shape (J,), and its covariance, that of k included; rows count as means of blocks."""
+    walked = rows.means(_summed(((noise.dose_cv * rows.doses(k)) ** 2)[:, None]))[:, 0]
+    reading = np.hypot(noise.floor / np.where(rows.seen, rows.part.od, 1.0), noise.relative)
+    longer = (1.0 + noise.lag1) / (1.0 - noise.lag1)
+    level = rows.means((rows.stretch[:, None] == np.arange(rows.stretch.max() + 1)).astype(np.float64))
+    error = FLAT * level @ level.T + np.minimum.outer(walked, walked)
+    error += np.diag(longer * rows.means(reading[:, None] ** 2)[:, 0] / rows.count + EXACT)
+    grown = rows.grown(k)
+    mu, spread, gain = _curve(
+        rows.knot_h, mean, rows.means((grown - grown.mean())[:, None])[:, 0], rows.means(rows.elapsed), error
+    )
+    by_k = gain @ rows.means(rows.pumped)
+    return mu, spread + by_k @ k_cov @ by_k.T
+
+
+def _outliers(rows: _Rows, k: Array, raw: Series) -> float:
+    """Share of readings that the screening rejected and that are far from what those around them say."""
+    rejected = np.isfinite(raw.od) & ~np.isfinite(rows.part.od)
+    far = np.abs(raw.od - np.exp(rows.grown(k) - rows.pumped @ k)) >= OUTLIER_OD
+    return float((rejected & far).sum() / np.isfinite(raw.od).sum())
+
+
+def _noise(rows: _Rows, k: Array, outlier_rate: float) -> Noise:
+    """Noise of the readings and spread of the doses from the fast motion of g.
+
+    Steps of g have the spectrum q + v |1 - z|^2 (1 - phi^2) / |1 - phi z|^2, z = exp(-i omega): q by doses that spread,
+    v and phi by the readings. They are averaged over a grid by their Whittle likelihood, of periods up to 20 rows.
+    """
+    steps = np.diff(rows.grown(k))
+    steps -= np.median(steps)
+    limit = CLIP_SD * 1.4826 * float(np.median(np.abs(steps)))
+    steps = np.clip(steps, -limit, limit)
+    power = np.abs(np.fft.rfft(steps)) ** 2 / len(steps) + EXACT
+    omega = 2.0 * np.pi * np.fft.rfftfreq(len(steps))
+    kept = np.flatnonzero(omega > 2.0 * np.pi / LONGEST_PERIOD)
+    bands = np.array_split(kept, min(BANDS, len(kept)))
+    power, omega = (np.array([values[band].mean() for band in bands]) for values in (power, omega))
+    z, phi = np.exp(-1j * omega), PHI[:, None]
+    reading = np.abs(1.0 - z) ** 2 * (1.0 - phi**2) / np.abs(1.0 - phi * z) ** 2
+    shape = RATIO[:, None, None] + reading  # (ratios, phis, bands)
+    variance = np.mean(power / shape, axis=-1)
+    score = len(kept) * (-np.log(shape).mean(axis=-1) - np.log(variance))
+    share = np.exp(score - score.max())
+    share /= share.sum()
+    v, q = float(np.sum(share * variance)), float(np.sum(share * variance * RATIO[:, None]))
+    floor, relative = _split(rows, steps, v)
+    dose = float(np.mean(rows.doses(k)[:-1] ** 2))
+    cv = float(np.sqrt(q / dose)) if dose > 0.0 else 0.0
+    return Noise(floor, relative, float(np.sum(share * PHI)), cv, outlier_rate)
+
+
+def _split(rows: _Rows, steps: Array, v: float) -> tuple[float, float]:
+    """Floor (OD) and relative part of a noise whose mean variance in ln y is v.
+
+    Second differences of g, in which the noise prevails, follow floor^2 / y^2 + relative^2.
+    """
+    from scipy.optimize import nnls
+
+    level = np.interp(np.arange(len(rows.seen)), np.flatnonzero(rows.seen), rows.part.od[rows.seen])[1:-1]
+    columns = np.stack([level**-2.0, np.ones_like(level)], axis=1)
+    shares, _ = nnls(columns * level[:, None] ** 2, np.diff(steps) ** 2 * level**2)
+    scale = v / float(np.mean(columns @ shares)) if shares.any() else 0.0
+    return float(np.sqrt(scale * shares[0])), float(np.sqrt(scale * shares[1]))

@@ -1,0 +1,168 @@
+"""The twin of a recording against the plant that made the recording, and against the twin's own recording."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from conf.schema import build
+from envs.identification.calibration import Calibration, calibrate
+from envs.identification.model import pmse
+from envs.identification.open_loop import OpenLoop, open_loop
+from envs.identification.screening import Series
+from envs.identification.twin import Twin, twin
+from envs.plant.culture import GrowthConfig
+from envs.plant.plant import Plant, PlantConfig
+from envs.plant.pump import PumpConfig
+from envs.plant.sensor import SensorConfig
+from experiments.calibration.twin_file import plant_of, twin_yaml
+from experiments.controllers.baselines import Threshold, ThresholdConfig
+from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig
+
+Array = NDArray[np.float64]
+
+MINUTES = 840  # 14 h, in which mu rises by 40 % and tau from 0.29 to 0.42
+FLOW = (20.0 / 60.0 / 0.29, 20.0 / 60.0 / 0.42)
+TRUTH = PlantConfig(
+    growth=GrowthConfig(mu=0.02, knots_min=(0.0, MINUTES), knots_mu=(0.02, 0.028)),
+    pump=PumpConfig(dosing="pulse", knots_min=(0.0, MINUTES), knots_ml_s=FLOW, pulse_cv=0.1),
+    sensor=SensorConfig(noise_floor=0.0033, noise_relative=0.003, lag1=0.3, outlier_rate=0.006),
+    integrator="rk4",
+)
+LAWS = {"threshold": (0.5,), "pi": (0.6, 0.4, 0.7, 0.5, 0.65, 0.45, 0.6)}  # setpoints, each for an equal time
+SEEDS = 4
+
+
+def record(config: PlantConfig, law: str, seed: int, n: int = 1) -> tuple[Array, Array, Array]:
+    """Minutes (T,), OD and pump rate (N, T) of vials under a law, as a device would record them."""
+    plant, goals = Plant(config, n, np.random.default_rng(seed)), LAWS[law]
+    controller = ChiBioPI(ChiBioPIConfig()) if law == "pi" else Threshold(ThresholdConfig())
+    controller.reset(n)
+    time = np.arange(MINUTES + 1.0)
+    od, rate = np.empty((n, time.size)), np.empty((n, time.size))
+    for i, minute in enumerate(time):
+        goal = goals[min(i * len(goals) // MINUTES, len(goals) - 1)]
+        od[:, i] = plant.read_od()
+        rate[:, i] = controller.act(od[:, i], np.full(n, goal), np.full(n, minute), np.ones(n, dtype=np.bool_))
+        plant.advance(1.0, 60.0 * rate[:, i])
+    return time, od, rate
+
+
+def found(time: Array, od: Array, rate: Array) -> tuple[Calibration, Twin]:
+    raw = Series(time, od, rate, np.arange(time.size))
+    result = calibrate(raw)
+    return result, twin(raw, result, 120.0)
+
+
+@cache
+def twins(law: str) -> list[Twin]:
+    time, od, rate = record(TRUTH, law, 1, SEEDS)
+    return [found(time, y, u)[1] for y, u in zip(od, rate, strict=True)]
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_growth_and_pump_drift_as_the_plants_did(law: str) -> None:
+    held = {"mu": [], "tau": []}
+    for each in twins(law):
+        assert each.drifts
+        mu = 0.02 + 0.008 * each.knot_min / MINUTES
+        tau = 1.0 / (1.0 / 0.29 + (1.0 / 0.42 - 1.0 / 0.29) * each.knot_min / MINUTES)
+        for name, course, true in (("mu", each.mu, mu), ("tau", each.tau, tau)):
+            assert np.sqrt(np.mean((course.value / true - 1.0) ** 2)) < 0.1, name
+            held[name].append((course.low <= true) & (true <= course.high))
+        assert each.mu.value[-1] / each.mu.value[0] == pytest.approx(1.4, abs=0.2)
+        assert each.tau.value[-1] / each.tau.value[0] == pytest.approx(0.42 / 0.29, abs=0.2)
+    assert np.mean(held["mu"]) > 0.8
+    assert np.mean(held["tau"]) > 0.8
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_noise_is_the_plants(law: str) -> None:
+    noise = [each.noise for each in twins(law)]
+    true_sd = np.hypot(0.0033, 0.003 * 0.5)
+    assert np.mean([np.hypot(n.floor, n.relative * 0.5) for n in noise]) == pytest.approx(true_sd, rel=0.15)
+    assert np.mean([n.lag1 for n in noise]) == pytest.approx(0.3, abs=0.1)
+    assert np.mean([n.dose_cv for n in noise]) == pytest.approx(0.1, abs=0.05)
+    assert np.mean([n.outlier_rate for n in noise]) == pytest.approx(0.006, abs=0.002)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_twin_fed_as_the_recording_was_runs_along_it(law: str) -> None:
+    """Fourteen hours from one start: an error of 1 % in mu alone would end 20 % off."""
+    time, od, rate = record(TRUTH, law, 1)
+    result, own = found(time, od[0], rate[0])
+    config = plant_of(own)
+    quiet = replace(config, pump=replace(config.pump, pulse_cv=0.0), sensor=SensorConfig())
+    plant, seen = Plant(quiet, 1, np.random.default_rng(0)), np.empty(time.size)
+    for i in range(time.size):
+        seen[i] = plant.culture.od[0]
+        plant.advance(1.0, 60.0 * rate[:, i])
+    assert pmse(result.screened.series.od, seen) < 1.0
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_twin_of_a_twin_is_the_twin(law: str) -> None:
+    time, od, rate = record(TRUTH, law, 2)
+    _, first = found(time, od[0], rate[0])
+    _, od_again, rate_again = record(plant_of(first), law, 52)
+    for a, b in ((od, od_again), (1000.0 * rate, 1000.0 * rate_again)):
+        for before, after in zip(np.array_split(a[0], 3), np.array_split(b[0], 3), strict=True):
+            assert after.mean() == pytest.approx(before.mean(), rel=0.03)
+            assert after.std() == pytest.approx(before.std(), rel=0.3)
+    _, again = found(time, od_again[0], rate_again[0])
+    np.testing.assert_allclose(again.mu.value, first.mu.value, rtol=0.1)
+    np.testing.assert_allclose(again.tau.value, first.tau.value, rtol=0.1)
+    ratio = np.hypot(again.noise.floor, again.noise.relative / 2) / np.hypot(
+        first.noise.floor, first.noise.relative / 2
+    )
+    assert ratio == pytest.approx(1.0, abs=0.25)
+
+
+def test_the_file_is_the_plant_with_its_bands_beside_it() -> None:
+    own = twins("threshold")[0]
+    text = twin_yaml(own, "some.csv")
+    assert build(PlantConfig(), yaml.safe_load(text), "plant") == plant_of(own)
+    assert max(map(len, text.splitlines()[:8])) <= 120
+    flat = " ".join(line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
+    for part in ("some.csv, rows 0:841, 14.0 h", "dead time", f"{own.mu.low[0]:.3g} to {own.mu.high[0]:.3g}"):
+        assert part in flat
+    flow = build(PlantConfig(), yaml.safe_load(text)).pump.knots_ml_s
+    np.testing.assert_allclose(20.0 / (60.0 * np.array(flow)), own.tau.value, rtol=1e-4)
+
+
+def test_a_short_recording_has_one_tau_and_says_so() -> None:
+    time, od, rate = record(TRUTH, "threshold", 1)
+    result, own = found(time[:300], od[0, :300], rate[0, :300])
+    assert not own.drifts
+    np.testing.assert_allclose(own.tau.value, result.tau.value)
+    assert "does not show its drift" in twin_yaml(own, "a.csv").replace("\n# ", " ")
+    assert plant_of(own).pump.knots_min == ()
+
+
+def test_a_pause_in_the_recording_is_not_bridged() -> None:
+    """Eight hours, of which nobody recorded the fifth: the culture was diluted by half meanwhile."""
+    time, od, rate = record(TRUTH, "threshold", 3)
+    kept = (time < 240.0) | ((time >= 300.0) & (time < 540.0))
+    od = np.where(time < 300.0, od[0], 0.5 * od[0])[kept]
+    _, own = found(time[kept], od, rate[0][kept])
+    assert own.knot_min[-1] == 539.0
+    np.testing.assert_allclose(own.mu.value, 0.02 + 0.008 * own.knot_min / MINUTES, rtol=0.2)
+
+
+def test_outliers_are_counted_only_where_they_are_far() -> None:
+    time, od, rate = record(replace(TRUTH, sensor=replace(TRUTH.sensor, outlier_rate=0.0)), "threshold", 4)
+    assert found(time, od[0], rate[0])[1].noise.outlier_rate == 0.0
+    od[0, 50:840:100] += 0.1
+    assert found(time, od[0], rate[0])[1].noise.outlier_rate == pytest.approx(8 / 841)
+
+
+def test_a_recording_without_noise_has_the_truth_as_its_twin() -> None:
+    time, od, rate = open_loop(OpenLoop(noise=0.0, hours=4.0), np.random.default_rng(2))
+    _, own = found(time, od[0], rate[0])
+    np.testing.assert_allclose(own.mu.value, 0.028, rtol=1e-3)
+    np.testing.assert_allclose(own.tau.value, 0.31, rtol=1e-3)
+    assert own.start_od == pytest.approx(0.12, rel=1e-3)
+    assert np.hypot(own.noise.floor, own.noise.relative) < 2e-4
