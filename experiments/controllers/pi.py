@@ -1,12 +1,13 @@
 """PI control of OD: the Chi.Bio's on-board law as it is, and one that is tuned."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from conf.schema import check, setting
 from envs.task import MAX_PUMP_RATE, EnvConfig
-from experiments.controllers.base import Array, Mask, usable
+from experiments.controllers.base import Array, Mask, put_back, saved, usable
 
 __all__ = ["ChiBioPI", "ChiBioPIConfig", "TunedPI", "TunedPIConfig"]
 
@@ -39,6 +40,8 @@ class ChiBioPI:
       u  = clip(P + I1 + I2, 0, 0.02); 0 if x - x' > 0.04 (noise guard); 0 in the first two cycles
     """
 
+    _memory = ("_cycles", "_before", "_times", "_p", "_i1", "_i2", "_rate")
+
     def __init__(self, config: ChiBioPIConfig) -> None:
         self.config = config
         self.reset(1)
@@ -49,6 +52,14 @@ class ChiBioPI:
         self._before = np.zeros(n)
         self._times = np.zeros((2, n))  # of the last two recorded cycles, older first
         self._p, self._i1, self._i2, self._rate = (np.zeros(n) for _ in range(4))
+
+    def state(self) -> dict[str, Any]:
+        """See `Remembers.state`."""
+        return saved(self, self._memory)
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """See `Remembers.restore`."""
+        put_back(self, self._memory, state)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """See `Controller.act`."""
@@ -110,6 +121,8 @@ class TunedPI:
     Args: config: the rule's two times; model: mu, tau, control period and the largest pump rate.
     """
 
+    _memory = ("_integral", "_p", "_rate")
+
     def __init__(self, config: TunedPIConfig, model: EnvConfig) -> None:
         self.config, self.model = config, model
         self.gain = 1.0 / (config.closed_loop_min + config.delay_min)  # 1/min
@@ -120,6 +133,14 @@ class TunedPI:
         """See `Controller.reset`."""
         self._integral = np.full(n, self.model.mu if self.config.feed_forward else 0.0)
         self._p, self._rate = np.zeros(n), np.zeros(n)
+
+    def state(self) -> dict[str, Any]:
+        """See `Remembers.state`."""
+        return saved(self, self._memory)
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """See `Remembers.restore`."""
+        put_back(self, self._memory, state)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """See `Controller.act`."""

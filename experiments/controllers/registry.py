@@ -7,22 +7,23 @@ from conf.schema import old_name
 from dqn.policy import Policy
 from envs.plant.plant import Plant
 from envs.task import EnvConfig
-from experiments.controllers.adaptive_inverse import AdaptiveInverse, AdaptiveInverseConfig
+from experiments.certification.bounds import EstimateBounds
 from experiments.controllers.base import Controller
 from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
-from experiments.controllers.learned import LearnedConfig, LearnedController
+from experiments.controllers.inverse import Inverse, InverseConfig
+from experiments.controllers.learned import LearnedConfig, learned
 from experiments.controllers.mpc import Mpc, MpcConfig
 from experiments.controllers.oracle import Oracle, OracleConfig
 from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 
-__all__ = ["STANDALONE", "build", "config"]
+__all__ = ["ON_DEVICE", "build", "config"]
 
 KINDS: dict[str, tuple[type[Any], Callable[..., Controller], tuple[str, ...]]] = {
-    "dqn": (LearnedConfig, LearnedController, ("policy",)),
+    "dqn": (LearnedConfig, learned, ("config", "policy", "model", "bounds")),
     "pi": (ChiBioPIConfig, ChiBioPI, ("config",)),
     "pi_tuned": (TunedPIConfig, TunedPI, ("config", "model")),
     "mpc": (MpcConfig, Mpc, ("config", "model")),
-    "adaptive_inverse": (AdaptiveInverseConfig, AdaptiveInverse, ("config", "model")),
+    "inverse": (InverseConfig, Inverse, ("config", "model")),
     "threshold": (ThresholdConfig, Threshold, ("config",)),
     "hold": (HoldConfig, Hold, ("config", "model")),
     "oracle": (OracleConfig, Oracle, ("config", "plant", "model", "flow_ml_s")),
@@ -31,8 +32,8 @@ MISSING = {
     "policy": "needs a policy; give policy=RUN/policy.npz",
     "plant": "knows a simulated plant; allowed with backend=sim only",
 }
-STANDALONE = tuple(kind for kind, (_, _, parts) in KINDS.items() if not MISSING.keys() & set(parts))
-"""Kinds that run anywhere: they need neither a policy file nor a simulated plant."""
+ON_DEVICE = tuple(kind for kind, (_, _, parts) in KINDS.items() if "plant" not in parts)
+"""Kinds that can run a device: they need no simulated plant. dqn, the program's own, is first."""
 
 
 def config(kind: str) -> Any:
@@ -43,7 +44,12 @@ def config(kind: str) -> Any:
 
 
 def build(
-    config: Any, model: EnvConfig, policy: Policy | None = None, plant: Plant | None = None, flow_ml_s: float = 1.0
+    config: Any,
+    model: EnvConfig,
+    policy: Policy | None = None,
+    plant: Plant | None = None,
+    flow_ml_s: float = 1.0,
+    bounds: EstimateBounds | None = None,
 ) -> Controller:
     """The controller that a config describes.
 
@@ -51,6 +57,7 @@ def build(
       config: as `config` gives it; `kind` names the controller.
       model: the calibrated growth model, control period and largest pump rate, for those that use a model.
       policy: what `dqn` follows. plant: the vials that `oracle` knows; only a simulation has it.
+      bounds: within which the certificate of `policy` lets it act; None where it has none, and nobody supervises.
       flow_ml_s: what the backend believes its pumps deliver (the oracle must know what a rate becomes).
     Raises: ValueError naming what is missing for this kind of controller.
     """
@@ -58,7 +65,8 @@ def build(
         raise ValueError(f"controller.kind = {config.kind}: no such controller")
     _, make, parts = KINDS[config.kind]
     given = {"config": config, "model": model, "policy": policy, "plant": plant, "flow_ml_s": flow_ml_s}
+    given["bounds"] = bounds
     for part in parts:
-        if given[part] is None:
+        if given[part] is None and part in MISSING:
             raise ValueError(f"controller = {config.kind}: {MISSING[part]}")
     return make(**{part: given[part] for part in parts})

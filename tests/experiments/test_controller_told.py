@@ -7,8 +7,8 @@ import pytest
 
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.controllers.adaptive_inverse import AdaptiveInverse, AdaptiveInverseConfig
 from experiments.controllers.base import Array, Mask
+from experiments.controllers.inverse import Inverse, InverseConfig
 from hardware.emulator.device import DeviceOptions
 from hardware.emulator.vial import VialConfig
 from tests.hardware.driver_lab import DriverLab, Law
@@ -99,7 +99,7 @@ def test_a_controller_is_told_what_was_given_put_off_refused_and_repeated() -> N
 def test_half_an_hour_without_a_dose_teaches_nothing_wrong() -> None:
     """Growth and pump are as the model says; doses that were asked for are not given."""
     model = EnvConfig(mu=0.025)
-    inverse = AdaptiveInverse(AdaptiveInverseConfig(), model)
+    inverse = Inverse(InverseConfig(), model)
     inverse.reset(1)
     one, setpoint, log_od, given = np.ones(1, dtype=bool), np.array([0.8]), np.log(0.8), 0.0
     for minute in [*range(10), *range(40, 80)]:

@@ -9,9 +9,9 @@ import pytest
 from conf import presets
 from conf.schema import build
 from envs.task import EnvConfig
-from experiments.controllers.adaptive_inverse import AdaptiveInverse, AdaptiveInverseConfig
 from experiments.controllers.base import Controller, Explains
 from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
+from experiments.controllers.inverse import Inverse, InverseConfig
 from experiments.controllers.mpc import Mpc, MpcConfig
 from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 from experiments.controllers.pso import SwarmConfig
@@ -21,7 +21,7 @@ QUICK = SwarmConfig(particles=6, iterations=8)
 MAKERS: dict[str, Callable[[], Controller]] = {
     "pi": lambda: ChiBioPI(ChiBioPIConfig()),
     "pi_tuned": lambda: TunedPI(TunedPIConfig(), MODEL),
-    "adaptive_inverse": lambda: AdaptiveInverse(AdaptiveInverseConfig(), MODEL),
+    "inverse": lambda: Inverse(InverseConfig(), MODEL),
     "mpc": lambda: Mpc(MpcConfig(swarm=QUICK), MODEL),
     "threshold": lambda: Threshold(ThresholdConfig(hysteresis=0.02)),
     "hold": lambda: Hold(HoldConfig(), MODEL),
@@ -29,7 +29,7 @@ MAKERS: dict[str, Callable[[], Controller]] = {
 CONFIGS = {
     "pi": ChiBioPIConfig(),
     "pi_tuned": TunedPIConfig(),
-    "adaptive_inverse": AdaptiveInverseConfig(),
+    "inverse": InverseConfig(),
     "mpc": MpcConfig(),
     "threshold": ThresholdConfig(),
     "hold": HoldConfig(),
@@ -85,7 +85,7 @@ def test_reset_forgets(name: str) -> None:
     assert run() == run()
 
 
-@pytest.mark.parametrize("name", ["pi", "pi_tuned", "adaptive_inverse", "mpc"])
+@pytest.mark.parametrize("name", ["pi", "pi_tuned", "inverse", "mpc"])
 def test_explanations_have_one_row_per_reactor(name: str) -> None:
     controller = MAKERS[name]()
     controller.reset(5)
@@ -118,7 +118,7 @@ def test_threshold_and_hold_by_hand() -> None:
         ThresholdConfig(hysteresis=-0.1)
 
 
-@pytest.mark.parametrize("name", ["pi", "pi_tuned", "adaptive_inverse"])
+@pytest.mark.parametrize("name", ["pi", "pi_tuned", "inverse"])
 def test_ninety_minutes_of_64_replicates_in_well_under_a_second(name: str) -> None:
     controller = MAKERS[name]()
     controller.reset(64)

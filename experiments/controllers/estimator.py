@@ -1,0 +1,244 @@
+"""What a run knows of one vial: a Kalman filter for OD, growth rate, pump gain and what temperature does to growth."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from conf.schema import check, setting
+from envs.task import EnvConfig
+from experiments.controllers.base import Array, Mask, put_back, saved, usable
+
+__all__ = ["LOWEST_OD", "Estimator", "EstimatorConfig"]
+
+LOWEST_OD = 0.005  # below it the logarithm of a reading says nothing
+GAIN_RANGE = (0.2, 3.0)  # of the relative pump gain; a head outside is broken, not slow
+NOISE_RANGE = (0.1, 25.0)  # of the learned variance over the assumed one
+TREND_WEIGHT = 0.4  # of the newest surprise in their running mean
+TREND_SD = (TREND_WEIGHT / (2.0 - TREND_WEIGHT)) ** 0.5  # of that mean while the model holds
+CALM = 1.5  # a mean within so many of its sd is no sign of a change
+LOG_OD, MU, GAIN, WARMTH = range(4)
+MEMORY = (
+    "mean", "cov", "_minute", "_thermometer", "_warm", "_first_warm", "_given_ml", "_idle_min", "_heard", "_noise",
+    "_learned", "_far", "_far_surprise", "_trend",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EstimatorConfig:
+    """What the filter believes about sensor and plant before it has seen them, and which of its parts are on.
+
+    Measured noise of a reading is 0.0033 OD at the floor; 0.005 is what the device's makers put into their own filter.
+    mu of one medium spans 0.018 to 0.032 1/min in the literature. Heads of a pump differ up to 50 %; the measured
+    spread of a dose is 0.05 to 0.30. Growth falls by up to 40 % from 37 to 30 degC.
+    """
+
+    noise_floor: float = setting(0.005, "sd of a reading = hypot(floor, relative * OD)", "OD", within=(1e-4, 0.1))
+    noise_relative: float = setting(0.003, "see noise_floor", within=(0, 0.1))
+    noise_memory: float = setting(
+        40.0, "readings over which the noise level is learned; 0: it stays as assumed", "readings", within=(0, 10_000)
+    )
+    mu_sd: float = setting(0.012, "sd of the first guess of mu, around the model's", "1/min", within=(1e-5, 0.1))
+    mu_walk: float = setting(2e-4, "random walk of mu", "1/min per sqrt(min)", within=(0, 0.01))
+    gain_sd: float = setting(0.25, "sd of the first guess of the pump's flow over the calibrated one", within=(0, 1))
+    gain_walk: float = setting(2e-3, "its random walk", "per sqrt(min)", within=(0, 0.1))
+    warmth: float = setting(
+        0.025, "growth per degree, as a share of the model's mu: 0 to 40 % over 7 degrees", "1/degC", within=(0, 0.2)
+    )
+    warmth_sd: float = setting(
+        0.02, "sd of that first guess; 0 with warmth = 0: temperature is not used", "1/degC", within=(0, 0.2)
+    )
+    pulse_cv: float = setting(0.15, "spread of a dose", within=(0, 1))
+    first_dose: float = setting(0.7, "share of the first dose after a pause that arrives: 0.3 to 1", within=(0.1, 1))
+    first_dose_sd: float = setting(0.25, "its sd", within=(0, 1))
+    pause_min: float = setting(10.0, "rest after which a dose counts as a first one", "min", within=(1, 1440))
+    growth_cv: float = setting(0.05, "spread of the growth within a minute, relative to mu (assumption)", within=(0, 1))
+    gate_sigma: float = setting(5.0, "a reading further off than this is an outlier ...", "sigma", within=(2, 20))
+    gate_max: int = setting(6, "... unless so many in a row agree; bubbles last up to 5", "readings", within=(1, 20))
+    gate_od: float = setting(
+        0.025,
+        "a jump is believed after one agreeing reading per so much OD, at least 2, at most gate_max; 0: gate_max",
+        "OD",
+        within=(0, 1),
+        note="the smaller it is, the less harm following it does",
+    )
+    hurry: float = setting(
+        150.0,
+        "walks are faster while surprises agree in sign: variance times 1 + hurry (m - 1.5)^2 where their running mean "
+        "is m > 1.5 of its sd; 0: never",
+        within=(0, 10_000),
+    )
+    recovery: bool = setting(True, "readings before the schedule begins are used")
+    told: bool = setting(True, "doses are those that were given, not those that were decided")
+
+    def __post_init__(self) -> None:
+        check(self, "controller.estimator")
+
+
+class Estimator:
+    """State z = [ln x, mu, g, w]: OD x, growth rate mu at the first temperature T0, relative pump gain g, w = dmu/dT.
+
+    dt minutes after a dose V mL over the nominal volume 60 tau of the model (tau for a pump of 1 mL/s)
+
+      ln x <- ln x + dt (mu + w (T - T0)) - g V/(60 tau),   mu and g random walks,   y = ln(reading) = ln x + noise
+
+    which is linear for a known dose and temperature: a time-varying Kalman filter (Kalman 1960), exact without
+    linearising. Beyond it: the level of the noise is learned from the surprises; a reading further off than
+    `gate_sigma` is left out unless the next one agrees with it, and then only OD is set anew; the first dose after a
+    pause is expected smaller; mu and g may walk faster while surprises agree in sign.
+
+    Args: config: beliefs and parts; model: mu, tau, control period and largest pump rate, the first guess.
+    """
+
+    def __init__(self, config: EstimatorConfig, model: EnvConfig) -> None:
+        self.config, self.model = config, model
+        self.reset(1)
+
+    def reset(self, n: int) -> None:
+        """Forget everything; N rows."""
+        c, mu = self.config, self.model.mu
+        self.mean = np.tile([0.0, mu, 1.0, c.warmth * mu], (n, 1))
+        self.cov = np.tile(np.diag([0.0, c.mu_sd**2, c.gain_sd**2, (c.warmth_sd * mu) ** 2]), (n, 1, 1))
+        self._minute, self._thermometer, self._warm, self._first_warm = (np.full(n, np.nan) for _ in range(4))
+        self._given_ml, self._idle_min = np.zeros(n), np.zeros(n)
+        self._heard = False  # somebody tells what was dosed
+        self._noise, self._learned = np.ones(n), np.zeros(n)
+        self._far, self._far_surprise = np.zeros(n, dtype=np.int64), np.zeros(n)
+        self._trend = np.zeros(n)  # running mean of the surprises in units of their sd
+
+    def dosed(self, volume_ml: Array) -> None:
+        """Fresh medium that went in since this was last called, mL, (N,)."""
+        if self.config.told:
+            self._given_ml, self._heard = volume_ml + (self._given_ml if self._heard else 0.0), True
+
+    def decided(self, rate: Array) -> None:
+        """Pump rates decided, mL/s, (N,); they count as given as long as nobody tells what was."""
+        if not self._heard:
+            self._given_ml = 60.0 * self.model.control_min * rate
+
+    def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
+        """Temperatures now, and, with `recovery`, the readings of `rows`; arguments as `see`."""
+        self._thermometer = np.where(np.isfinite(temperature), temperature, self._thermometer)
+        if self.config.recovery:
+            self.see(od, minute, rows)
+
+    def see(self, od: Array, minute: Array, rows: Mask) -> None:
+        """Take the readings of `rows` that were not taken yet, each shape (N,); nan is no reading."""
+        idx = np.flatnonzero(usable(od, rows) & ~(minute <= self._minute))
+        if not idx.size:
+            return
+        reading = np.maximum(od[idx], LOWEST_OD)
+        assumed = np.hypot(self.config.noise_floor, self.config.noise_relative * reading) ** 2 / reading**2
+        began = ~np.isnan(self._minute[idx])
+        dt = np.where(began, minute[idx] - np.where(began, self._minute[idx], 0.0), 0.0)
+        self._predict(idx, dt, self._warmer(idx))
+        self._update(idx, np.log(reading), assumed, began)
+        self._minute[idx] = minute[idx]
+        if self._heard:
+            self._given_ml[idx] = 0.0
+
+    def _warmer(self, idx: NDArray[np.intp]) -> Array:
+        """Mean temperature since the reading before, over the first one, degC; 0 where none was ever measured."""
+        now = self._thermometer[idx]
+        before = np.where(np.isfinite(self._warm[idx]), self._warm[idx], now)
+        self._first_warm[idx] = np.where(np.isfinite(self._first_warm[idx]), self._first_warm[idx], now)
+        self._warm[idx] = now
+        return np.asarray(np.nan_to_num(0.5 * (now + before) - self._first_warm[idx]))
+
+    def _predict(self, idx: NDArray[np.intp], dt: Array, warmer: Array) -> None:
+        """Advance the rows `idx` by dt minutes, what was dosed, and the warmth."""
+        c, n = self.config, idx.size
+        dose = self._given_ml[idx] / (60.0 * self.model.tau)  # ln of the dilution by a sound pump
+        first = (self._idle_min[idx] >= c.pause_min) & (dose > 0.0)
+        self._idle_min[idx] = np.where(dose > 0.0, 0.0, self._idle_min[idx] + dt)
+        arrives = np.where(first, c.first_dose, 1.0)
+        spread = np.hypot(c.pulse_cv, np.where(first, c.first_dose_sd, 0.0))
+        step = np.tile(np.eye(4), (n, 1, 1))
+        step[:, LOG_OD, MU], step[:, LOG_OD, GAIN], step[:, LOG_OD, WARMTH] = dt, -dose * arrives, dt * warmer
+        faster = 1.0 + c.hurry * np.maximum(np.abs(self._trend[idx]) / TREND_SD - CALM, 0.0) ** 2
+        noise = np.zeros((n, 4, 4))
+        noise[:, LOG_OD, LOG_OD] = (spread * dose) ** 2 + (c.growth_cv * self.model.mu) ** 2 * dt
+        noise[:, MU, MU], noise[:, GAIN, GAIN] = c.mu_walk**2 * dt * faster, c.gain_walk**2 * dt * faster
+        self.mean[idx] = np.einsum("nij,nj->ni", step, self.mean[idx])
+        self.cov[idx] = np.einsum("nij,njk,nlk->nil", step, self.cov[idx], step) + noise
+
+    def _update(self, idx: NDArray[np.intp], y: Array, assumed: Array, began: Mask) -> None:
+        """Take y = ln OD with the assumed variances into the rows `idx`."""
+        c, mean, cov = self.config, self.mean[idx], self.cov[idx]
+        surprise = y - mean[:, LOG_OD]
+        variance = assumed * self._noise[idx]
+        total = cov[:, LOG_OD, LOG_OD] + variance
+        far = (np.abs(surprise) > c.gate_sigma * np.sqrt(total)) & began
+        agrees = np.abs(surprise - self._far_surprise[idx]) < c.gate_sigma * np.sqrt(2.0 * variance)
+        self._far[idx] = np.where(far, np.where(agrees, self._far[idx], 0) + 1, 0)
+        self._far_surprise[idx] = surprise
+        # A first reading, or a jump that stays, sets the OD anew and teaches nothing about the rest.
+        jump = np.abs(np.expm1(surprise)) * np.exp(mean[:, LOG_OD])
+        asked = np.clip(np.ceil(jump / c.gate_od), 2, c.gate_max) if c.gate_od else c.gate_max
+        anew = ~began | (self._far[idx] >= asked)
+        kalman = cov[:, :, LOG_OD] / total[:, None]
+        better = np.where(far[:, None], mean, mean + kalman * surprise[:, None])
+        smaller = np.where(far[:, None, None], cov, cov - kalman[:, :, None] * cov[:, None, LOG_OD, :])
+        better[anew, LOG_OD], better[anew, MU:] = y[anew], mean[anew, MU:]
+        fresh = cov.copy()
+        fresh[:, LOG_OD, :], fresh[:, :, LOG_OD] = 0.0, 0.0
+        fresh[:, LOG_OD, LOG_OD] = variance
+        self.mean[idx] = better
+        self.cov[idx] = np.where(anew[:, None, None], fresh, smaller)
+        self._far[idx] = np.where(anew, 0, self._far[idx])
+        self._learn(idx[~far & began], (surprise**2 - cov[:, LOG_OD, LOG_OD])[~far & began] / assumed[~far & began])
+        trend = self._trend[idx] + TREND_WEIGHT * (surprise / np.sqrt(total) - self._trend[idx])
+        self._trend[idx] = np.where(anew, 0.0, np.where(far, self._trend[idx], trend))
+
+    def _learn(self, idx: NDArray[np.intp], observed: Array) -> None:
+        """The noise variance over the assumed one, as an average that begins with five readings' weight of 1."""
+        if not self.config.noise_memory:
+            return
+        self._learned[idx] += 1.0
+        weight = 1.0 / np.minimum(self._learned[idx] + 5.0, self.config.noise_memory)
+        level = self._noise[idx] + weight * (np.clip(observed, 0.0, NOISE_RANGE[1]) - self._noise[idx])
+        self._noise[idx] = np.clip(level, *NOISE_RANGE)
+
+    def state(self) -> dict[str, Any]:
+        """See `Remembers.state`."""
+        return saved(self, MEMORY)
+
+    def restore(self, state: object) -> None:
+        """See `Remembers.restore`."""
+        put_back(self, MEMORY, state)
+
+    @property
+    def gain(self) -> Array:
+        """Relative pump gain within what a pump can be, (N,)."""
+        return np.asarray(np.clip(self.mean[:, GAIN], *GAIN_RANGE))
+
+    @property
+    def full_pump(self) -> Array:
+        """B = g u_max h / tau: what one period of full pump takes off ln x, (N,)."""
+        m = self.model
+        return np.asarray(self.gain * m.max_pump_rate * m.control_min / m.tau)
+
+    def relative(self, setpoint: Array) -> tuple[Array, Array]:
+        """Error e = ln(x/r)/B and growth share s = mu h / B now (`envs/relative.py`), each (N,)."""
+        warmer = np.nan_to_num(self._warm - self._first_warm)
+        mu = self.mean[:, MU] + self.mean[:, WARMTH] * warmer
+        error = self.mean[:, LOG_OD] - np.log(np.maximum(setpoint, LOWEST_OD))
+        return error / self.full_pump, mu * self.model.control_min / self.full_pump
+
+    def doubt(self, setpoint: Array) -> tuple[Array, Array]:
+        """Standard deviations of the error e and of the growth share s of `relative`, by the filter itself, each (N,).
+
+        Of s = mu h / B to first order, with what mu and g have in common: at rest mu = g u / tau is known better than
+        either. B is taken as known for e.
+        """
+        warmer = np.nan_to_num(self._warm - self._first_warm)
+        period, share = self.model.control_min / self.full_pump, self.relative(setpoint)[1]
+        slope = np.stack([np.zeros_like(share), period, -share / self.gain, period * warmer], axis=1)
+        variance = np.einsum("ni,nij,nj->n", slope, self.cov, slope)
+        return np.sqrt(self.cov[:, LOG_OD, LOG_OD]) / self.full_pump, np.sqrt(np.maximum(variance, 0.0))
+
+    def explain(self) -> dict[str, Array]:
+        """The estimates: OD, growth rate (1/min), relative pump gain, sd of a reading over the assumed one."""
+        od, mu, gain = np.exp(self.mean[:, LOG_OD]), self.mean[:, MU].copy(), self.mean[:, GAIN].copy()
+        return {"od_estimate": od, "mu": mu, "gain": gain, "noise": np.sqrt(self._noise)}

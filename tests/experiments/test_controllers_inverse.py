@@ -1,0 +1,123 @@
+"""Inverse control: its filter against least squares on all data at once, what each part does, what it learns."""
+
+import numpy as np
+import pytest
+
+from envs.plant.culture import GrowthConfig
+from envs.plant.plant import Plant, PlantConfig
+from envs.plant.pump import PumpConfig
+from envs.plant.sensor import SensorConfig
+from envs.task import EnvConfig
+from experiments.controllers.estimator import EstimatorConfig
+from experiments.controllers.inverse import Inverse, InverseConfig
+
+ONE = np.ones(1, dtype=bool)
+PLAIN = {"noise_memory": 0.0, "warmth": 0.0, "warmth_sd": 0.0, "first_dose": 1.0, "first_dose_sd": 0.0, "hurry": 0.0}
+
+
+def law(model: EnvConfig | None = None, **beliefs: float) -> Inverse:
+    """Inverse control on a filter with these beliefs."""
+    return Inverse(InverseConfig(estimator=EstimatorConfig(**beliefs)), model or EnvConfig())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_filter_equals_least_squares_on_all_data(told: bool) -> None:
+    """Without walks the estimate is the weighted least-squares fit of ln x0, mu, g with their priors.
+
+    What it decides is dosed; or it is told what is, which is something else.
+    """
+    model = EnvConfig()
+    still = {"mu_walk": 0.0, "gain_walk": 0.0, "pulse_cv": 0.0, "growth_cv": 0.0, "gate_sigma": 20.0}
+    inverse = law(model, **PLAIN, **still)
+    config = inverse.estimator.config
+    rng = np.random.default_rng(1)
+    inverse.reset(1)
+    log_x, dosed, minute = np.log(0.6), 0.0, 0.0
+    rows, values, weights = [], [], []
+    for k in range(40):
+        reading = np.exp(log_x) + 0.005 * rng.standard_normal()
+        rows.append([1.0, minute, -dosed])
+        values.append(np.log(reading))
+        weights.append(reading / np.hypot(config.noise_floor, config.noise_relative * reading))
+        setpoint = np.array([0.5 if k < 20 else 0.7])
+        u = inverse.act(np.array([reading]), setpoint, np.array([minute]), ONE)[0]
+        if told:
+            u = u * rng.choice([0.0, 0.5, 1.0]) + 0.03 * (k == 25)
+            inverse.dosed(np.array([40.0 * u]))
+            inverse.dosed(np.array([20.0 * u]))  # in two parts, mL of a period
+        step = 1.0 if k % 7 else 2.0  # now and then a reading is missed
+        log_x += 0.024 * step - 0.9 * u / model.tau
+        dosed += u / model.tau
+        minute += step
+    a = np.vstack([np.array(rows), [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]])
+    b = np.append(values, [model.mu, 1.0])
+    w = np.append(weights, [1.0 / config.mu_sd, 1.0 / config.gain_sd])
+    x0, mu, gain = np.linalg.lstsq(a * w[:, None], b * w, rcond=None)[0]
+    seen = inverse.explain()
+    assert seen["mu"][0] == pytest.approx(mu, rel=1e-8)
+    assert seen["gain"][0] == pytest.approx(gain, rel=1e-8)
+    assert np.log(seen["od_estimate"][0]) == pytest.approx(np.dot([x0, mu, gain], rows[-1]), rel=1e-8)
+
+
+def test_it_learns_growth_and_pump_of_a_plant_it_was_not_told() -> None:
+    n = 32
+    plant = Plant(
+        PlantConfig(
+            growth=GrowthConfig(mu=0.02),
+            pump=PumpConfig(dosing="pulse", gain_ml_s=0.75, pulse_cv=0.1),
+            sensor=SensorConfig(noise_floor=0.0033, noise_relative=0.003),
+        ),
+        n,
+        np.random.default_rng(0),
+    )
+    plant.reset(0.8)
+    inverse = law(EnvConfig(mu=0.03))
+    inverse.reset(n)
+    errors = []
+    for minute in range(90):
+        setpoint = np.full(n, (0.8, 0.65, 0.5)[minute // 30])
+        reading = plant.read_od()
+        plant.advance(1.0, 60.0 * inverse.act(reading, setpoint, np.full(n, float(minute)), np.ones(n, dtype=bool)))
+        if minute >= 80:
+            errors.append(plant.culture.od - 0.5)
+    seen = inverse.explain()
+    assert seen["mu"].mean() == pytest.approx(0.02, abs=0.003)
+    assert seen["gain"].mean() == pytest.approx(0.75, abs=0.1)
+    assert np.mean(np.abs(errors)) < 0.005
+    assert abs(np.mean(errors)) < 0.002
+
+
+def steady(inverse: Inverse, minutes: int) -> None:
+    for k in range(minutes):
+        inverse.act(np.array([0.5]), np.array([0.5]), np.array([float(k)]), ONE)
+
+
+def test_an_outlier_changes_nothing_and_a_lasting_jump_is_believed() -> None:
+    inverse = law()
+    inverse.reset(1)
+    steady(inverse, 30)
+    before = inverse.explain()
+    usual = inverse.act(np.array([0.5]), np.array([0.5]), np.array([30.0]), ONE)[0]
+    for k in range(5):  # a bubble of five readings
+        rate = inverse.act(np.array([0.7]), np.array([0.5]), np.array([31.0 + k]), ONE)[0]
+        assert rate == pytest.approx(usual, rel=0.05)
+    rate = inverse.act(np.array([0.7]), np.array([0.5]), np.array([36.0]), ONE)[0]
+    assert rate == 0.02
+    assert inverse.explain()["mu"][0] == pytest.approx(before["mu"][0], rel=0.05)
+    assert inverse.explain()["od_estimate"][0] == pytest.approx(0.7)
+
+
+def test_the_law_inverts_the_model() -> None:
+    """With the truth known exactly the next OD is the setpoint, or the pump is at a bound."""
+    model = EnvConfig(mu=0.025, tau=0.3)
+    inverse = law(model, mu_sd=1e-5, gain_sd=0.0, gain_walk=0.0, mu_walk=0.0)
+    od = np.array([0.51, 0.49, 0.9, 0.2])
+    inverse.reset(4)
+    u = inverse.act(od, np.full(4, 0.5), np.zeros(4), np.ones(4, dtype=bool))
+    np.testing.assert_allclose((od * np.exp(0.025 - u / 0.3))[:2], 0.5, rtol=1e-9)
+    np.testing.assert_array_equal(u[2:], [0.02, 0.0])
+
+
+def test_ranges() -> None:
+    with pytest.raises(ValueError, match=r"controller.estimator.noise_floor = 0.0 OD: allowed 0.0001 to 0.1"):
+        EstimatorConfig(noise_floor=0.0)

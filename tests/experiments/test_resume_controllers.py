@@ -1,0 +1,265 @@
+"""A run that is stopped or killed and resumed: its controller decides what one that never stopped decides."""
+
+import json
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conf import presets
+from conf.schema import build
+from envs.plant.plant import Plant, PlantConfig
+from envs.scenario import Scenario
+from envs.task import EnvConfig
+from experiments.certification import certificate
+from experiments.cli import files
+from experiments.control.loop import ClosedLoop, Step
+from experiments.control.policies import find_policy, load_policy
+from experiments.control.recovery import load_state
+from experiments.controllers import registry
+from experiments.controllers.base import Array, Controller, Mask, Remembers
+from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
+from hardware.safety.interlock import Interlock
+from hardware.simulated import SimulatedConfig, SimulatedReactors
+from hardware.storage.journal import read_journal
+from tests.hardware.emulator_lab import quiet
+
+NAMES = ("M0", "M1", "M2")
+KINDS = ("pi", "pi_tuned", "mpc", "inverse", "dqn", "threshold")
+SCHEDULE = Scenario((0.5, 0.35), (20.0, 40.0), (37.0, 30.0), recovery_od=0.5)
+LENGTH, CUT = 44, 26
+HOLD = Scenario((0.5,), (600.0,), (37.0,))
+REQUESTS = {  # what a program is killed at -> whether the dose under way was given
+    "/SetOutputTarget/Pump1/M0/": False,
+    "/SetOutputOn/Pump2/1/M0": False,
+    "/SetOutputOn/Pump1/1/M0": True,
+    "/SetOutputOn/Pump1/0/M0": True,
+}
+
+
+def controller(kind: str) -> Controller:
+    config = registry.config(kind)
+    if kind == "threshold":
+        config = type(config)(hysteresis=0.05)
+    policy = load_policy("shipped", 1.0, 0.02)
+    bounds = certificate.bounds(policy, find_policy("shipped"))
+    return registry.build(config, EnvConfig(), policy, bounds=bounds)
+
+
+def vials() -> SimulatedReactors:
+    """Three vials, each with its own growth, pump and optics, whose doses and readings scatter."""
+    plant = build(PlantConfig(start_od=0.45), presets.load("plant/bench"), "plant")
+    return SimulatedReactors(Plant(plant, 3, np.random.default_rng(3)), SimulatedConfig(reactors=NAMES))
+
+
+def loop(kind: str, reactors: SimulatedReactors) -> ClosedLoop:
+    return ClosedLoop(reactors, controller(kind), Interlock(len(NAMES)), SCHEDULE)
+
+
+def decisions(steps: list[Step]) -> list[list[float]]:
+    return [step.proposed.tolist() for step in steps]
+
+
+def cut_and_continued(kind: str, folder: Path, forgets: bool = False) -> list[Step]:
+    """`LENGTH` steps of which the last ones are of another loop, which got the first one's state by way of its file."""
+    reactors = vials()
+    first = loop(kind, reactors)
+    steps = [first.step() for _ in range(CUT)]
+    files.write_json(folder / "state.json", {"journal_row": 0, **first.state()}, False, indent=None)
+    second, state = loop(kind, reactors), load_state(folder / "state.json")
+    if forgets:
+        del state["controller"]
+    second.restore(state)
+    return steps + [second.step() for _ in range(LENGTH - CUT)]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted() -> dict[str, list[Step]]:
+    found = {}
+    for kind in KINDS:
+        whole = loop(kind, vials())
+        found[kind] = [whole.step() for _ in range(LENGTH)]
+    return found
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_resumed_run_decides_what_one_without_a_pause_decides(
+    kind: str, uninterrupted: dict[str, list[Step]], tmp_path: Path
+) -> None:
+    whole, continued = uninterrupted[kind], cut_and_continued(kind, tmp_path)
+    assert decisions(continued) == decisions(whole)
+    assert len({rate for rates in decisions(whole[CUT:]) for rate in rates}) > (1 if kind == "threshold" else 3)
+    for one, other in zip(whole, continued, strict=True):
+        for key, value in one.explanation.items():
+            np.testing.assert_array_equal(value, other.explanation[key], key)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_without_its_memory_it_decides_something_else(
+    kind: str, uninterrupted: dict[str, list[Step]], tmp_path: Path
+) -> None:
+    cold = cut_and_continued(kind, tmp_path, forgets=True)
+    assert decisions(cold)[:CUT] == decisions(uninterrupted[kind])[:CUT]
+    assert decisions(cold) != decisions(uninterrupted[kind])
+
+
+def parts(state: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Every array of a controller's state by its keys."""
+    for key, value in state.items():
+        yield from parts(value, (*path, key)) if isinstance(value, dict) else [(*path, key)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_part_of_a_memory_is_asked_for_and_one_that_is_damaged_is_named(kind: str) -> None:
+    law = controller(kind)
+    law.reset(3)
+    kept = json.loads(json.dumps(law.state()))
+    assert kept
+    for *path, last in parts(kept):
+        for wrong in (None, "x", [1.0], [[1.0, 2.0]] * 7):
+            state = json.loads(json.dumps(kept))
+            part = state
+            for name in path:
+                part = part[name]
+            if wrong is None:
+                del part[last]
+            else:
+                part[last] = wrong
+            with pytest.raises(ValueError, match=f"^controller.{last}") as caught:
+                law.restore(state)
+            assert "\n" not in str(caught.value)
+
+
+def test_a_program_that_is_stopped_takes_up_the_memory_that_it_wrote(tmp_path: Path) -> None:
+    """The policy that ships, with driver, interlock and record, on the emulated device."""
+    r = Rehearsal(tmp_path, rehearsed(("M0", "M1"), SCHEDULE), od=0.45, seed=5)
+    for until in (930.0, 1290.0):
+        r.begin()
+        steps = list(r.run(until))
+        r.reactors.stop()
+        r.close()
+        assert any(step.proposed.any() for step in steps)
+    kept = json.loads((tmp_path / "state.json").read_text())["controller"]
+    assert kept["estimator"]["learned"][0] > 12  # readings since the run began
+    r.begin()
+    assert isinstance(r.loop.controller, Remembers)
+    assert json.loads(json.dumps(r.loop.controller.state())) == kept
+    r.close()
+
+
+class Counting:
+    """Asks for a fixed rate, and remembers how much it was told was dosed."""
+
+    def __init__(self, rate: float) -> None:
+        self.rate, self.told = rate, np.zeros(1)
+
+    def reset(self, n: int) -> None:
+        self.told = np.zeros(n)
+
+    def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
+        return np.full(od.shape, self.rate)
+
+    def dosed(self, volume_ml: Array) -> None:
+        self.told = self.told + volume_ml
+
+    def state(self) -> dict[str, Any]:
+        return {"told": self.told.tolist()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.told = np.array(state["told"])
+
+
+class Cut(Rehearsal):
+    """One reactor at a fixed rate; the program is killed at a request of the dose after minute 6, and resumed."""
+
+    def __init__(self, folder: Path, request: str, rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(registry, "build", lambda *_: Counting(rate))
+        super().__init__(folder, rehearsed(("M0",), HOLD), quiet(mu=0.03), od=0.8)
+        self.begin()
+        list(self.run(360.0))
+        self.request, whole = request, self.device.submit
+
+        def submit(method: str, path: str, *rest: Any) -> Any:
+            exchange = whole(method, path, *rest)
+            if path.startswith(request):
+                self.device.submit = whole  # type: ignore[method-assign]
+                self.clock.sleep(0.3)
+                self.kill()
+            return exchange
+
+        self.device.submit = submit  # type: ignore[method-assign]
+        with pytest.raises(Killed):
+            list(self.run(900.0))
+        self.close()
+
+    def told_ml(self) -> float:
+        law = self.loop.controller
+        assert isinstance(law, Counting)
+        return float(law.told[0])
+
+    def asked_ml(self) -> float:
+        """By every decision that came to a dose or was put off."""
+        rows = read_journal(self.folder / "journal.jsonl")[0]
+        return sum(60.0 * row["rate"] for row in rows if row["kind"] == "intent")
+
+    def put_off_ml(self) -> float:
+        return float(self.reactors.stations[0].doses.carry_ml)
+
+
+@pytest.mark.parametrize("request_", REQUESTS)
+@pytest.mark.parametrize(("away_s", "again"), [(0.0, False), (400.0, True)])
+def test_a_dose_that_a_kill_interrupted_is_told_once_with_what_the_device_repeated(
+    request_: str, again: bool, away_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """again: it dies once more before its first sample. away_s: a pump left on repeats its dose every 63 s."""
+    run = Cut(tmp_path, request_, 0.02, monkeypatch)
+    run.wait(away_s)
+    for _ in range(1 + again):
+        run.begin()
+        run.close()
+    run.begin()
+    list(run.run(run.clock.now() + 240.0))
+    run.wait(5.0)
+    fed_ml = float(run.truth("M0")["feed_ml"])
+    assert run.told_ml() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]), abs=1e-6)
+    assert run.told_ml() == pytest.approx(fed_ml, abs=1.0)  # a dose is 1.2 mL; one cut short counts whole
+    run.close()
+
+
+@pytest.mark.parametrize("request_", REQUESTS)
+def test_what_is_put_off_is_told_once_across_a_kill(
+    request_: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """0.24 mL are less than the pump can deliver: every second dose gives them together."""
+    run = Cut(tmp_path, request_, 0.004, monkeypatch)
+    run.begin()
+    assert run.told_ml() == pytest.approx(run.asked_ml() - (0.0 if REQUESTS[request_] else 0.48), abs=1e-3)
+    list(run.run(run.clock.now() + 240.0))
+    assert run.told_ml() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]) + run.put_off_ml(), abs=1e-3)
+    run.close()
+
+
+def test_a_state_of_an_earlier_version_is_resumed_and_its_controller_begins_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = Rehearsal(tmp_path, rehearsed(("M0",), HOLD), quiet(mu=0.03), od=0.5)
+    run.begin()
+    list(run.run(1200.0))
+    run.reactors.stop()
+    run.close()
+    path = tmp_path / "state.json"
+    state = json.loads(path.read_text())
+    del state["controller"]
+    path.write_text(json.dumps(state))
+    with caplog.at_level(logging.WARNING):
+        run.begin()
+    (said,) = [record.getMessage() for record in caplog.records if "controller" in record.getMessage()]
+    assert said == f"{path}: an earlier version wrote it, without the controller's memory: the controller begins anew"
+    steps = [step for step in run.run(2700.0) if step.rows[0]]
+    assert steps[0].proposed[0] > 0.0
+    assert abs(run.truth("M0")["od"] - 0.5) < 0.02
+    run.close()
+    assert "controller" in json.loads(path.read_text())
