@@ -1,0 +1,56 @@
+"""Within which errors of an estimator a policy that sees (error, growth share) is proven; what a supervisor watches."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["EstimateBounds"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EstimateBounds:
+    """Bounds on the errors of the estimates of e = ln(x/r)/B and s = mu h / B (envs/relative.py).
+
+    full_pump: B, what one period of full pump takes off ln x, of the model that was certified.
+    error: smallest bound of e's error. od: bound of the OD estimate's error, OD, which rules at a low OD.
+    growth_share: bound of s's error. gain: relative error of a dose's effect.
+    proven: range of s within which the band is proven. setpoints: likewise, OD.
+    """
+
+    full_pump: float
+    error: float
+    od: float
+    growth_share: float
+    gain: float
+    proven: tuple[float, float]
+    setpoints: tuple[float, float]
+
+    def error_bound(self, od: Array) -> Array:
+        """Largest |error of e| allowed at an estimated OD: max(error, ln(1 + od_error / OD) / B), shape of `od`."""
+        ratio = np.divide(self.od, od, out=np.full_like(od, np.inf), where=od > 0.0)
+        return np.maximum(self.error, np.log1p(ratio) / self.full_pump)
+
+    def hold(self, od: Array, error: Array, growth_share: Array, share_error: Array) -> NDArray[np.bool_]:
+        """Whether errors of these sizes, of e and of s, are within the bounds at this OD and this s; all (N,).
+
+        nan is never within.
+        """
+        low, high = self.proven
+        inside = (growth_share >= low) & (growth_share <= high)
+        return np.asarray((error <= self.error_bound(od)) & (share_error <= self.growth_share) & inside)
+
+    def plain(self) -> dict[str, Any]:
+        """As it stands in a certificate."""
+        return asdict(self)
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> "EstimateBounds":
+        """From a certificate. Raises: KeyError, TypeError, ValueError for damaged ones."""
+        numbers = (float(values[key]) for key in ("full_pump", "error", "od", "growth_share", "gain"))
+        pairs = ((float(low), float(high)) for low, high in (values["proven"], values["setpoints"]))
+        return cls(*numbers, *pairs)  # type: ignore[arg-type]

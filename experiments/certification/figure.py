@@ -1,0 +1,53 @@
+"""The figure of a certificate: bands, entry times, low doses, and the polygons that they follow from."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from experiments.certification.judge import Certificate
+from experiments.reporting.charts import COLOURS, new_figure
+
+__all__ = ["figure"]
+
+
+def figure(found: Certificate) -> Figure:
+    """Four panels over the setpoint (or the growth share)."""
+    made, (polygons, widths, entries, doses) = new_figure(11.0, 7.0, 2, 2)
+    _polygons(polygons, found)
+    asked = found.question
+    middle = (asked.loop.low + asked.loop.high) / 2.0
+    for k, proof in enumerate(found.proofs):
+        colour, name = COLOURS[k % len(COLOURS)], proof.case.name
+        shown = np.where(proof.holdable, 1.0, np.nan)
+        widths.plot(middle, shown * proof.half_width, color=colour, linewidth=1.3, label=name)
+        widths.plot(middle, shown * proof.law_half_width, color=colour, linewidth=0.9, linestyle=":")
+        entries.plot(middle, shown * proof.entry, color=colour, linewidth=1.3, label=name)
+    widths.set(xlabel=asked.what, ylabel=f"half-width, {asked.unit}", ylim=(0.0, None))
+    widths.set_title("Band that is entered and never left (dotted: the one-line law)")
+    widths.set(yscale="log", ylim=(0.7 * widths.dataLim.y0, 8.0 * widths.dataLim.y1))
+    widths.legend(ncols=2)
+    entries.set(xlabel=asked.what, ylabel="entry time over the pump's own")
+    entries.set_title("Time into the band, from anywhere in the range of starts")
+    for colour, level, depth in zip(COLOURS, found.levels, found.doses, strict=False):
+        doses.plot(middle, depth, color=colour, linewidth=1.3, label=f"action {level} and higher")
+    doses.set(xlabel=asked.what, ylabel="periods of growth", ylim=(0, None))
+    doses.set_title("How far below the setpoint a dose may still be given")
+    doses.legend()
+    return made
+
+
+def _polygons(ax: Axes, found: Certificate) -> None:
+    """The exact regions of the actions."""
+    regions = found.regions
+    first = np.unique(regions.owner, return_index=True)[1]
+    corners = np.split(regions.edges[:, 0], first[1:])
+    drawn = PolyCollection([np.asarray(c) for c in corners], cmap="viridis", edgecolor="face", linewidth=0.2)
+    drawn.set_array(regions.action.astype(np.float64))
+    drawn.set_rasterized(True)
+    ax.add_collection(drawn)
+    (x0, x1), (y0, y1) = found.question.box
+    ax.set(xlim=(x0, x1), ylim=(y0, y1), ylabel=found.question.what)
+    ax.set_xlabel("reading, OD" if found.question.bounds is None else "estimate of e")
+    ax.set_title(f"{len(corners)} polygons, coloured by action")
+    ax.grid(False)

@@ -1,0 +1,176 @@
+"""Sets of states as intervals: where each action may be chosen, and what a control period makes of them.
+
+The state is one number d per strip of setpoints, and an action only shifts it: d' = d + shift(action). An interval of
+states has an interval as image, however many actions its states may meet.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.certification.network import Array
+from experiments.certification.polygons import Regions
+
+__all__ = ["Band", "Index", "Mask", "Pieces", "Points", "States", "crossings", "drops", "images", "points_in_strips"]
+
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+States = Callable[[Array, Array], tuple[Array, Array]]
+
+OUTWARD = 1e-12  # every image is wider by this much: more than double precision loses in adding
+ENTERED = 1e-9  # as close to the limit as this counts as inside
+MAX_PERIODS = 5000
+SAME = 1e-12  # corners closer than this are one corner
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Intervals of states in which an action may be chosen, P per strip; an empty one has low > high.
+
+    low, high: (N, P). action: (N, P).
+    """
+
+    low: Array
+    high: Array
+    action: Index
+
+    @classmethod
+    def of(cls, strip: Index, action: Index, low: Array, high: Array, strips: int) -> "Pieces":
+        """From one list of intervals, each with the strip that it belongs to."""
+        order = np.argsort(strip, kind="stable")
+        row = strip[order]
+        column = np.arange(row.size) - np.searchsorted(row, row)
+        shape = (strips, int(column.max()) + 1)
+        made = cls(np.full(shape, np.inf), np.full(shape, -np.inf), np.zeros(shape, np.intp))
+        for target, source in ((made.low, low), (made.high, high), (made.action, action)):
+            target[row, column] = source[order]
+        return made
+
+    def lowest(self, action: int) -> Array:
+        """The lowest state in which this action or a higher one may be chosen, (N,); inf where none is."""
+        return np.asarray(np.where(self.action >= action, self.low, np.inf).min(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """What the closed loop enters and never leaves, for each strip, (N,).
+
+    invariant: the image of the start lies inside it. low, high: of the limit of images; nan where there is none.
+    periods: after this many the state is inside, wherever it began.
+    """
+
+    invariant: Mask
+    low: Array
+    high: Array
+    periods: Index
+
+
+def images(pieces: Pieces, shift: Array, start: Array) -> Band:
+    """The limit of F^k(start), F(I) = hull of the union over the pieces of (piece and I) + shift of its action.
+
+    F(I) is part of F(J) for I inside J. So if F(start) is part of the start, every F^k(start) is part of the one before
+    it and is never left again; k periods are enough to reach it.
+
+    Args: shift: [low, high] that an action adds to the state, (N, A, 2). start: [low, high], (N, 2).
+    """
+    row = np.arange(len(start))[:, None]
+    low, high = np.moveaxis(shift[row, pieces.action], -1, 0) + np.array([-OUTWARD, OUTWARD])[:, None, None]
+    reached = [start]
+    active = np.arange(len(start))
+    invariant = np.ones(len(start), dtype=bool)
+    while active.size and len(reached) <= MAX_PERIODS:
+        now = reached[-1][active]
+        first = np.maximum(pieces.low[active], now[:, :1])
+        last = np.minimum(pieces.high[active], now[:, 1:])
+        met = first <= last
+        image = np.stack(
+            [
+                np.where(met, first + low[active], np.inf).min(axis=1),
+                np.where(met, last + high[active], -np.inf).max(axis=1),
+            ],
+            axis=1,
+        )
+        inside = (image[:, 0] >= now[:, 0]) & (image[:, 1] <= now[:, 1])
+        invariant[active] &= inside  # by induction only the first image can be outside
+        following = reached[-1].copy()
+        following[active[inside]] = image[inside]
+        reached.append(following)
+        active = active[inside & (np.abs(image - now).max(axis=1) > ENTERED)]
+    limit = np.where(invariant[:, None], reached[-1], np.nan)
+    outside = [(np.abs(r - reached[-1]) > ENTERED).any(axis=1) for r in reached]
+    return Band(invariant, limit[:, 0], limit[:, 1], np.sum(outside, axis=0))
+
+
+def _spread(first: Index, last: Index) -> tuple[Index, Index]:
+    """Every pair (k, j) with first[k] <= j < last[k]."""
+    count = np.maximum(last - first, 0)
+    k = np.repeat(np.arange(count.size), count)
+    return k, np.arange(k.size) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points of polygons, each with its polygon and the strip or line that it lies in; all of shape (K,)."""
+
+    polygon: Index
+    strip: Index
+    x: Array
+    y: Array
+
+    def pieces(self, action: Index, states: States, strips: int) -> Pieces:
+        """The states of each polygon in each strip: least and largest of `states` over its points.
+
+        Args: action: of each polygon. states: (x, y) to [least, largest] state, each (K,); over a convex polygon both
+        have their extremes at corners. strips: how many there are.
+        """
+        key = self.polygon * strips + self.strip
+        order = np.argsort(key, kind="stable")
+        found, at = np.unique(key[order], return_index=True)
+        low, high = states(self.x[order], self.y[order])
+        least, largest = np.minimum.reduceat(low, at), np.maximum.reduceat(high, at)
+        return Pieces.of(found % strips, action[found // strips], least, largest, strips)
+
+
+def crossings(regions: Regions, lines: Array) -> Points:
+    """Where the edges of the polygons meet lines of constant second coordinate, given in rising order."""
+    (x0, y0), (x1, y1) = np.moveaxis(regions.edges, (1, 2), (0, 1))
+    first = np.searchsorted(lines, np.minimum(y0, y1), "left")
+    edge, line = _spread(first, np.searchsorted(lines, np.maximum(y0, y1), "right"))
+    rise = (y1 - y0)[edge]
+    y = lines[line]
+    share = np.divide(y - y0[edge], rise, out=np.zeros_like(rise), where=rise != 0.0)
+    return Points(regions.owner[edge], line, x0[edge] + share * (x1 - x0)[edge], y)
+
+
+def points_in_strips(regions: Regions, low: Array, high: Array) -> Points:
+    """The corners of every polygon cut to every strip low <= y <= high, (S,) each and rising."""
+    corner = regions.edges[:, 0]
+    first = np.searchsorted(high, corner[:, 1], "left")
+    k, strip = _spread(first, np.searchsorted(low, corner[:, 1], "right"))
+    parts = [Points(regions.owner[k], strip, corner[k, 0], corner[k, 1])]
+    parts += [crossings(regions, lines) for lines in (low, high)]
+    return Points(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("polygon", "strip", "x", "y")))
+
+
+def drops(regions: Regions) -> list[tuple[float, float, int, int]]:
+    """Where the action becomes smaller as the first coordinate rises: (first, second coordinate, from, to), exactly.
+
+    Between two neighbouring ordinates of corners a line of constant second coordinate meets the same polygons in the
+    same order, so one line between them stands for all.
+    """
+    ordinates = np.unique(regions.edges[:, 0, 1])
+    lines = ((ordinates[1:] + ordinates[:-1]) / 2.0)[np.diff(ordinates) > SAME]
+    met = crossings(regions, lines)
+    order = np.lexsort((met.x, met.polygon, met.strip))  # two crossings of each polygon, side by side
+    line, polygon, x = (a[order].reshape(-1, 2) for a in (met.strip, met.polygon, met.x))
+    order = np.lexsort((x.sum(axis=1), line[:, 0]))
+    line, action, left = line[order, 0], regions.action[polygon[order, 0]], x[order, 0]
+    k = np.flatnonzero((line[1:] == line[:-1]) & (action[1:] < action[:-1]))
+    pairs = np.stack([polygon[order, 0][k], polygon[order, 0][k + 1]], axis=1)
+    k = k[np.unique(pairs, axis=0, return_index=True)[1]]
+    return [
+        (float(a), float(b), int(c), int(d))
+        for a, b, c, d in zip(left[k + 1], lines[line[k]], action[k], action[k + 1], strict=True)
+    ]

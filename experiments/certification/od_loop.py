@@ -1,0 +1,97 @@
+"""The closed loop of a policy that sees (OD, setpoint), in d = ln(x / r): d' = d + h (mu - u / tau)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from experiments.certification.intervals import Pieces, States
+from experiments.certification.network import Array
+
+__all__ = ["OdCase", "OdLoop"]
+
+
+@dataclass(frozen=True)
+class OdCase:
+    """What may differ from the nominal: growth rate and pump constant within +- `share` of it, changing from period
+    to period, and a reading within +- `noise` OD of the culture.
+    """
+
+    name: str
+    share: float
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class OdLoop:
+    """Model, pump rates and strips of setpoints.
+
+    mu: 1/min. tau, control_min: min. rates: mL/s, rising from 0, (A,). start: OD from which the band is entered.
+    low, high: setpoints of each strip, (S,).
+    """
+
+    mu: float
+    tau: float
+    control_min: float
+    rates: Array
+    start: tuple[float, float]
+    low: Array
+    high: Array
+
+    @property
+    def growth(self) -> Array:
+        """What a period of nominal growth adds to d, (S,)."""
+        return np.full(self.low.size, self.mu * self.control_min)
+
+    def at(self, setpoints: Array) -> "OdLoop":
+        """The same for single setpoints in place of strips."""
+        return replace(self, low=setpoints, high=setpoints)
+
+    def shift(self, case: OdCase) -> Array:
+        """[least, largest] change of d by each action in a period, (S, A, 2).
+
+        Least: the smallest mu with the smallest tau, which dilutes most; largest: the other way round.
+        """
+        factor = 1.0 + case.share * np.array([-1.0, 1.0])
+        change = self.control_min * (self.mu * factor - self.rates[:, None] / (self.tau * factor))
+        return np.broadcast_to(change, (self.low.size, *change.shape))
+
+    def range(self) -> Array:
+        """The start as d, for every setpoint of each strip, (S, 2)."""
+        return np.log(np.stack([self.start[0] / self.high, self.start[1] / self.low], axis=1))
+
+    def seen(self, case: OdCase) -> tuple[Array, Array]:
+        """Setpoints that the policy is shown in each strip."""
+        return self.low, self.high
+
+    def states(self, case: OdCase) -> States:
+        """States behind a reading y at setpoint r: d of y -+ noise. Linear-fractional, so extreme at corners."""
+        return lambda y, r: (_log((y - case.noise) / r), _log((y + case.noise) / r))
+
+    def law(self, case: OdCase) -> Pieces:
+        """The one-line law of the nominal model: the rate nearest to tau (mu + ln(y / r) / h)."""
+        middle = (self.rates[1:] + self.rates[:-1]) / 2.0
+        reading = np.exp(self.control_min * (middle / self.tau - self.mu))  # y / r between two rates
+        off = case.noise / self.low[:, None]
+        ends = np.full((self.low.size, 1), np.inf)
+        action = np.broadcast_to(np.arange(self.rates.size), (self.low.size, self.rates.size))
+        return Pieces(np.hstack([-ends, _log(reading - off)]), np.hstack([_log(reading + off), ends]), action)
+
+    def half_width(self, low: Array, high: Array) -> Array:
+        """Largest |x - r| of a band in d, OD, (S,)."""
+        return self.high * np.maximum(np.expm1(high), -np.expm1(low))
+
+    def attack(self, case: OdCase, state: Array, second: Array, push: Array) -> tuple[Array, Array]:
+        """What the policy is shown, (N, 2), and what a period adds to d for each action, (N, A), under disturbances.
+
+        Args: state d (N,); second: setpoints (N,). push: share of each disturbance's bound, in [-1, 1], (N, 3): of
+        reading, mu and tau.
+        """
+        reading = second * np.exp(state) + push[:, 0] * case.noise
+        mu, tau = (nominal * (1.0 + case.share * push[:, k]) for k, nominal in ((1, self.mu), (2, self.tau)))
+        change = self.control_min * (mu[:, None] - self.rates / tau[:, None])
+        return np.stack([reading, second], axis=1), change
+
+
+def _log(ratio: Array) -> Array:
+    """ln, -inf for an OD that is not above zero."""
+    return np.log(ratio, out=np.full_like(ratio, -np.inf), where=ratio > 0.0)

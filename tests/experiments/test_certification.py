@@ -1,0 +1,288 @@
+"""The proof against what it does not use: brute force, single precision itself, formulas, and planted faults."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dqn.policy import Policy
+from envs.task import EnvConfig
+from experiments.certification.boxes import contradictions, possible
+from experiments.certification.config import CertifyConfig
+from experiments.certification.intervals import Pieces, drops, images, points_in_strips
+from experiments.certification.judge import Certificate, certify, recheck
+from experiments.certification.line import on_lines
+from experiments.certification.network import Network, q_values, rounding
+from experiments.certification.od_loop import OdCase, OdLoop
+from experiments.certification.polygons import Regions, area, partition
+from experiments.certification.question import CertificationError, question
+from experiments.certification.verdict import escapes, prove
+from tests.experiments import laws
+
+BOX = ((-0.02, 1.52), (0.4, 0.8))
+FAST = CertifyConfig(trajectories=0)
+LARGEST = 0.06  # what the full pump takes off ln x in a minute: 0.02 / (1/3)
+
+
+def found(policy: Policy, config: CertifyConfig = FAST) -> Certificate:
+    return certify(policy, config)
+
+
+def inside(regions: Regions, point: Any) -> set[int]:
+    """Actions of the polygons that hold a point, by the sign of the cross product with every edge."""
+    a, b = regions.edges[:, 0], regions.edges[:, 1]
+    cross = (b - a)[:, 0] * (point - a)[:, 1] - (b - a)[:, 1] * (point - a)[:, 0]
+    n = regions.action.size
+    least, most = np.full(n, np.inf), np.full(n, -np.inf)
+    np.minimum.at(least, regions.owner, cross)
+    np.maximum.at(most, regions.owner, cross)
+    return set(regions.action[(least >= -1e-15) | (most <= 1e-15)].tolist())
+
+
+@pytest.mark.parametrize("policy", [laws.law(), laws.random(3), laws.random(4)], ids=["law", "random 3", "random 4"])
+def test_the_polygons_tile_the_rectangle_and_name_the_best_action(policy: Policy) -> None:
+    network = Network.of(policy)
+    exact, wider = partition(network, BOX)
+    assert area(exact).sum() == pytest.approx(1.54 * 0.4, abs=1e-12)
+    points = np.random.default_rng(0).uniform(*np.transpose(BOX), (200, 2))
+    lead = np.sort(q_values(network, points), axis=1)
+    for point, q, gap in zip(points, policy.q_values(points), lead[:, -1] - lead[:, -2], strict=True):
+        best = {int(q.argmax())}
+        assert best <= inside(wider, point)
+        assert inside(exact, point) == best or gap < 1e-4
+    assert contradictions(network, exact, (64, 64)) == 0
+
+
+@pytest.mark.parametrize("policy", [laws.law(), laws.random(5)], ids=["law", "random"])
+def test_single_precision_stays_within_the_bound_and_the_bound_is_no_guess(policy: Policy) -> None:
+    points = np.random.default_rng(1).uniform(*np.transpose(BOX), (50_000, 2))
+    network = Network.of(policy)
+    off, bound = np.abs(policy.q_values(points) - q_values(network, points)), rounding(network, points)
+    assert (off <= bound).all()
+    assert bound.max() < 300.0 * off.max()
+
+
+def test_where_single_precision_swaps_two_actions_the_wider_polygons_hold_both() -> None:
+    """Readings beside a switch, one float32 apart, among which some get the other action."""
+    policy = laws.random(6)
+    network = Network.of(policy)
+    exact, wider = partition(network, BOX)
+    corner = exact.edges[:, 0][(exact.edges[:, 0, 0] > 0.0) & (exact.edges[:, 0, 0] < 1.5)]
+    ulp = np.arange(-8, 9)[:, None] * np.spacing(corner[:, 0].astype(np.float32)).astype(np.float64)
+    points = np.stack([(corner[:, 0] + ulp).ravel(), np.tile(corner[:, 1], 17)], axis=1)
+    points = points[(points[:, 1] > 0.4) & (points[:, 1] < 0.8)]
+    swapped = np.flatnonzero(policy.act(points) != q_values(network, points).argmax(axis=1))
+    assert swapped.size > 0
+    for k in swapped[:50]:
+        assert int(policy.act(points[k : k + 1])[0]) in inside(wider, points[k])
+
+
+def test_a_label_that_is_wrong_is_contradicted_by_the_boxes() -> None:
+    network = Network.of(laws.law())
+    exact, _ = partition(network, BOX)
+    wrong = Regions(exact.edges, exact.owner, np.where(exact.action == 16, 15, exact.action))
+    assert contradictions(network, wrong, (64, 64)) > 0
+    short = Regions(exact.edges[exact.owner > 0], exact.owner[exact.owner > 0] - 1, exact.action[1:])
+    assert contradictions(network, short, (64, 64)) > 0
+
+
+def test_boxes_bound_what_is_chosen_inside() -> None:
+    policy = laws.random(7)
+    rng = np.random.default_rng(2)
+    low = rng.uniform([0, 0.4], [1.4, 0.7], (500, 2))
+    allowed = possible(Network.of(policy), low, low + 0.02)
+    chosen = policy.act((low[:, None] + rng.uniform(0, 0.02, (500, 20, 2))).reshape(-1, 2)).reshape(500, 20)
+    assert np.take_along_axis(allowed, chosen, axis=1).all()
+    assert (allowed.sum(axis=1) == 1).mean() > 0.5
+
+
+def test_the_limit_of_images_against_sets_of_points() -> None:
+    """Random overlapping pieces; the points of a fine grid under every action and both ends of its shift."""
+    rng = np.random.default_rng(3)
+    for _ in range(8):
+        edges = np.sort(rng.uniform(-1, 1, 6))
+        low = np.concatenate([[-2.0], edges - rng.uniform(0, 0.05, 6)])
+        high = np.concatenate([edges, [2.0]])
+        middle = np.linspace(0.2, -0.2, 7) + rng.uniform(-0.05, 0.05, 7)
+        middle[[0, -1]] = 0.2, -0.2
+        shift = np.stack([middle - 0.01, middle + 0.01], axis=1)
+        band = images(Pieces(low[None], high[None], np.arange(7)[None]), shift[None], np.array([[-1.5, 1.5]]))
+        grid = np.linspace(-1.5, 1.5, 15_001)
+        now = (-1.5, 1.5)
+        for _ in range(400):
+            x = grid[(grid >= now[0]) & (grid <= now[1])]
+            met = (x[:, None] >= low) & (x[:, None] <= high)
+            after = np.concatenate([(x[:, None] + shift[:, k])[met] for k in (0, 1)])
+            now = (after.min(), after.max())
+        assert band.invariant[0]
+        assert (band.low[0], band.high[0]) == pytest.approx(now, abs=6e-4)
+
+
+def test_a_map_that_leaves_its_start_has_no_band() -> None:
+    whole = Pieces(np.array([[-9.0]]), np.array([[9.0]]), np.array([[0]]))
+    band = images(whole, np.array([[[0.1, 0.1]]]), np.array([[-1.0, 1.0]]))
+    assert not band.invariant[0]
+    assert np.isnan(band.low[0])
+
+
+def loop(low: float, high: float) -> OdLoop:
+    return OdLoop(0.03, 1 / 3, 1.0, laws.RATES, (0.05, 1.5), np.array([low]), np.array([high]))
+
+
+def test_bands_of_the_one_line_law_by_hand() -> None:
+    """r = 1. Nominal: mu tau is level 8, which is dosed while |d| < B/32: the band.
+
+    Noise n: level 8 may be dosed up to exp(B/32) + n; a lower level, chosen as much lower by a reading n too low, lets
+    a culture grow to at most exp(B/32) + n exp(B/2).
+    Uncertain by 30 %: level 13 is the last that may let the culture grow, 0.039 > 0.06 (13/16) / 1.3, and is dosed up
+    to d = B (13.5/16 - 0.5); level 14 is dosed from there on and may take 0.06 (14/16) / 0.7 with a growth of 0.021.
+    """
+    one, q, n = loop(1.0, 1.0), 0.3, 0.0108
+    bands = [images(one.law(case), one.shift(case), one.range()) for case in
+             (OdCase("", 0, 0), OdCase("", 0, n), OdCase("", q, 0))]  # fmt: skip
+    assert one.half_width(bands[0].low, bands[0].high)[0] == pytest.approx(np.expm1(LARGEST / 32), abs=1e-9)
+    highest = np.exp(LARGEST / 32)
+    assert highest + n <= np.exp(bands[1].high[0]) <= highest + n * np.exp(LARGEST / 2)
+    switch = LARGEST * (13.5 / 16 - 0.5)
+    assert bands[2].high[0] == pytest.approx(switch + 0.039 - 0.06 * 13 / 16 / 1.3, abs=1e-9)
+    assert bands[2].low[0] == pytest.approx(switch + 0.021 - 0.06 * 14 / 16 / 0.7, abs=1e-9)
+
+
+def test_the_band_is_that_of_the_worst_simulated_culture() -> None:
+    """Extremes of mu, tau and noise in every combination of two alternating values, 400 periods from far off."""
+    policy, r, share, noise = laws.law(), 0.6, 0.3, 0.0108
+    regions = partition(Network.of(policy), BOX)[1]
+    line, case = loop(r, r), OdCase("", share, noise)
+    proof = prove(line, points_in_strips(regions, line.low, line.high), regions.action, case)
+    corners = np.array(np.meshgrid(*[[-1, 1]] * 6)).reshape(6, -1)
+    x = np.repeat(np.linspace(0.05, 1.5, 200)[:, None], corners.shape[1], axis=1)
+    seen = [np.inf, -np.inf]
+    for k in range(400):
+        mu, tau, off = corners[:3] if k % 2 else corners[3:]
+        rate = laws.RATES[policy.act(np.stack([x + noise * off, np.full_like(x, r)], axis=-1).reshape(-1, 2))]
+        x = x * np.exp(0.03 * (1 + share * mu) - rate.reshape(x.shape) * 3 / (1 + share * tau))
+        if k > 300:
+            seen = [min(seen[0], x.min()), max(seen[1], x.max())]
+    low, high = r * np.exp(proof.band.low[0]), r * np.exp(proof.band.high[0])
+    assert low <= seen[0]
+    assert seen[1] <= high
+    assert max(seen[0] - low, high - seen[1]) < 0.15 * (high - low) / 2.0
+
+
+def test_lines_and_polygons_prove_the_same() -> None:
+    policy, asked = laws.random(8), question(laws.random(8), FAST)
+    network, r = Network.of(policy), np.array([0.47, 0.6, 0.71])
+    narrow = asked.loop.at(r)
+    _, wider = partition(network, asked.box)
+    for case in asked.cases:
+        first = prove(narrow, points_in_strips(wider, narrow.low, narrow.high), wider.action, case)
+        second = prove(narrow, *on_lines(network, asked.box[0], r), case)
+        np.testing.assert_array_equal(first.band.invariant, second.band.invariant)
+        np.testing.assert_allclose(first.half_width, second.half_width, atol=1e-4)
+        np.testing.assert_array_equal(first.grows, second.grows)
+
+
+def test_the_law_passes_and_no_trajectory_leaves_its_band() -> None:
+    certificate = found(laws.law(), CertifyConfig())
+    assert CertifyConfig().trajectories == 20_000
+    assert certificate.passed, [str(check) for check in certificate.checks]
+    assert certificate.cannot_hold() == []
+    assert certificate.drops == []
+
+
+def test_a_band_that_is_too_narrow_is_left() -> None:
+    policy = laws.law()
+    certificate = found(policy)
+    proof = certificate.proofs[-1]
+    narrow = replace(proof, band=replace(proof.band, low=0.9 * proof.band.low, high=0.9 * proof.band.high))
+    assert escapes(policy, certificate.question.loop, proof, 5000) == 0
+    assert escapes(policy, certificate.question.loop, narrow, 5000) > 0
+
+
+FAULTS: dict[str, tuple[Callable[[], Policy], str]] = {
+    "random": (lambda: laws.random(0), "half-width over"),
+    "random, other weights": (lambda: laws.random(1), "half-width over"),
+    "flipped sign": (lambda: laws.law(gain=-laws.GAIN), "washed out"),
+    "reversed actions": (lambda: laws.law(order=-1), "washed out"),
+    "law of tau x 2": (lambda: laws.law(share=1.0, gain=2 * laws.GAIN), "half-width over"),
+    "full dose in the low corner": (laws.low_corner, "washed out"),
+    "no dose in the high corner": (laws.high_corner, "entry time"),
+    "spike": (laws.spike, "half of the largest dose below"),
+}
+
+
+@pytest.mark.parametrize(("make", "failing"), FAULTS.values(), ids=list(FAULTS))
+def test_a_planted_fault_fails(make: Callable[[], Policy], failing: str) -> None:
+    certificate = found(make())
+    failed = [check.name for check in certificate.checks if not check.holds]
+    assert any(failing in name for name in failed), failed
+    assert not certificate.passed
+
+
+def test_a_million_samples_do_not_see_the_spike() -> None:
+    points = np.random.default_rng(4).uniform([0.05, 0.4], [1.5, 0.8], (1_000_000, 2))
+    near = points[np.abs(points[:, 1] - laws.SPIKE) < 1e-5]  # all others are alike by construction
+    np.testing.assert_array_equal(laws.spike().act(near), laws.law().act(near))
+    where = np.array([[0.45, laws.SPIKE]])
+    assert laws.spike().act(where)[0] == 16
+    assert laws.law().act(where)[0] == 0
+    assert recheck(laws.spike(), FAST, [0.4, 0.5, 0.6, 0.7, 0.8]) == []
+
+
+def test_a_swap_of_one_level_is_listed_and_does_no_harm() -> None:
+    certificate = found(laws.swapped_level())
+    assert certificate.passed
+    assert {drop[2:] for drop in certificate.drops} == {(16, 15)}
+    first, second = certificate.drops[0][:2]
+    assert first + second > 2.2 - 1e-9
+
+
+def test_drops_are_found_between_all_corners() -> None:
+    """A strip of lower action, a millionth wide, that no setpoint of a grid meets."""
+    polygons = [([[0, 0], [1, 0], [1, 0.3], [0, 0.3]], 2), ([[0, 0.300001], [1, 0.300001], [1, 1], [0, 1]], 2)]
+    polygons += [([[0, 0.3], [0.5, 0.3], [0.5, 0.300001], [0, 0.300001]], 3)]
+    polygons += [([[0.5, 0.3], [1, 0.3], [1, 0.300001], [0.5, 0.300001]], 1)]
+    listed = drops(Regions.of([(np.array(corners, dtype=float), action) for corners, action in polygons]))
+    assert listed == [(0.5, pytest.approx(0.3000005), 3, 1)]
+
+
+def test_what_the_pump_cannot_hold_is_said_and_not_judged() -> None:
+    """(1 + q)^2 mu tau > u_max from q = 0.414 on."""
+    certificate = found(laws.law(), replace(FAST, uncertainty=0.42))
+    assert certificate.passed
+    assert certificate.cannot_hold() == [
+        f"{name}: from setpoint 0.4 to 0.8 no pump rate holds the culture"
+        for name in ("uncertain", "noise and uncertain")
+    ]
+    assert found(laws.law(), replace(FAST, uncertainty=0.41)).cannot_hold() == []
+    lost = found(laws.law(), replace(FAST, env=EnvConfig(mu=0.061)))
+    assert not lost.passed
+    assert str(lost.checks[1]) == "nominal: strips that the pump cannot hold: 80, allowed 0 (setpoint 0.4 to 0.8)"
+
+
+def test_a_line_finds_what_a_setpoint_fails() -> None:
+    assert recheck(laws.law(), FAST, [0.4, 0.65, 0.8]) == []
+    failed = recheck(laws.spike(), FAST, [0.5, laws.SPIKE])
+    assert failed
+    assert all("0.5235" in check.where for check in failed)
+
+
+def test_the_plane_holds_every_reading_of_every_state_that_is_carried() -> None:
+    """A strip carries d up to ln(1.5 / low) for all its setpoints: an OD of 1.5 high / low, and noise on it."""
+    asked = question(laws.law(), FAST)
+    largest = (asked.loop.high * np.exp(asked.loop.range()[:, 1])).max()
+    assert largest > 1.518
+    assert asked.box[0][0] <= -FAST.noise
+    assert asked.box[0][1] >= largest + FAST.noise
+
+
+def test_policies_that_cannot_be_asked_say_why() -> None:
+    policy = laws.law()
+    with pytest.raises(CertificationError, match=r"does not say which model it was trained on; give env\.mu=MU"):
+        question(replace(policy, metadata={**policy.metadata, "model": {}}), FAST)
+    with pytest.raises(CertificationError, match=r"acts every 1 min, env\.control_min = 2; give env\.control_min=1"):
+        question(policy, replace(FAST, env=EnvConfig(control_min=2.0)))
+    with pytest.raises(ValueError, match=r"setpoints = \[0.5, 0.5\]: allowed \[low, high\] with low < high"):
+        CertifyConfig(setpoints=(0.5, 0.5))
