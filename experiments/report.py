@@ -38,6 +38,7 @@ def write(folder: Path) -> Path:
     one) a section for each. Raises: frame.UserError where there is nothing to report on.
     """
     from experiments.comparison import page as comparison
+    from experiments.control import aftermath
     from experiments.reporting import page
 
     runs = [folder] if (folder / "summary.json").is_file() else sorted(p.parent for p in folder.glob("*/summary.json"))
@@ -46,7 +47,9 @@ def write(folder: Path) -> Path:
     summaries = [_summary(run) for run in runs]
     compared = runs == [folder] and isinstance(summaries[0], dict) and "beside_paper" in summaries[0]
     try:
-        return page.save(comparison.of_benchmark(folder) if compared else page.of_runs(folder, runs), folder)
+        return page.save(
+            comparison.of_benchmark(folder) if compared else page.of_runs(folder, runs, aftermath.write), folder
+        )
     except (OSError, ValueError, RecursionError) as error:
         raise frame.UserError(f"run={folder}: {error}") from None
     except (LookupError, TypeError, AttributeError) as error:

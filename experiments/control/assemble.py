@@ -15,10 +15,13 @@ from dqn.policy import Policy
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
+from experiments.certification import certificate
+from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
 from experiments.control.config import DeployConfig
 from experiments.control.device import check, linked, load_calibrations
 from experiments.control.loop import ClosedLoop
+from experiments.control.plant_file import read_plant_file
 from experiments.control.policies import admit, policy_check, run_policy
 from experiments.control.record import Record
 from experiments.control.recovery import continue_loop
@@ -38,9 +41,11 @@ __all__ = ["Setup", "close_loop", "opened", "run_preflight", "unpack"]
 class Setup:
     """What a deploy config comes to.
 
-    scenarios: one per reactor. plant: of the simulated vials; with an `env_file` it grows and is fed as calibrated.
+    scenarios: one per reactor. plant: of the simulated vials, that of a `plant_file` where there is one; with an
+      `env_file` it grows and is fed as calibrated.
     model: growth model that model-based controllers are given: the calibrated one, else the nominal one.
-    policy: of controller=dqn, None for a preflight. resumed: an earlier life of the run is continued.
+    policy: of controller=dqn, None for a preflight. bounds: of its certificate. resumed: an earlier life of the run is
+      continued.
     """
 
     config: DeployConfig
@@ -48,6 +53,7 @@ class Setup:
     plant: PlantConfig
     model: EnvConfig
     policy: Policy | None
+    bounds: EstimateBounds | None
     resumed: bool
 
 
@@ -65,17 +71,21 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     if resumed and backend.kind == "sim":
         raise frame.UserError(f"resume={config.resume}: a simulated run takes a second; run it again")
     plant, model = config.plant, EnvConfig()
+    if config.plant_file is not None:
+        plant = read_plant_file(config.plant_file)
     if config.env_file is not None:
         model = read_env_file(config.env_file)
         gain = plant.vessel.volume_ml / (60.0 * model.tau)  # tau = V / (60 g)
         growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
         plant = replace(plant, growth=growth, pump=pump)
-    model = replace(model, control_min=backend.control_min)
-    policy = None
+    fastest = min(model.max_pump_rate, config.safety.max_rate)
+    model = replace(model, control_min=backend.control_min, max_pump_rate=fastest)
+    policy = bounds = None
     if config.controller.kind == "dqn" and not config.preflight_only:
         policy = run_policy(config.policy, folder, resumed, backend.control_min, config.safety.max_rate)
-        admit(policy, config, scenarios)
-    return Setup(config, scenarios, plant, model, policy, resumed)
+        admit(policy, folder / "policy.npz", config, scenarios)
+        bounds = certificate.bounds(policy, folder / "policy.npz")
+    return Setup(config, scenarios, plant, model, policy, bounds, resumed)
 
 
 def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
@@ -88,7 +98,7 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     if isinstance(reactors, SimulatedReactors):
         plant, flow = reactors.plant, reactors.config.pump_ml_s
     try:
-        controller = registry.build(setup.config.controller, setup.model, setup.policy, plant, flow)
+        controller = registry.build(setup.config.controller, setup.model, setup.policy, plant, flow, setup.bounds)
     except ValueError as error:
         raise frame.UserError(str(error)) from None
     interlock = Interlock(len(reactors.names), setup.config.safety)

@@ -41,7 +41,9 @@ class DeployConfig:
     )
     controller: Any = part(LearnedConfig, "what decides the pump rate")
     policy: str = setting(
-        "latest", "of controller=dqn: a policy.npz, a run folder, or `latest`: what train or demo wrote last"
+        "shipped",
+        "of controller=dqn: `shipped`, the policy that comes with the program and needs no calibration; a policy.npz; "
+        "a run folder; or `latest`: what train or demo wrote last",
     )
     poor_regret_pct: float = setting(
         10.0,
@@ -50,15 +52,21 @@ class DeployConfig:
         above=0.0,
     )
     force_policy: bool = setting(
-        False, "run a policy on a device although it is untrained, poor, or was trained for other setpoints"
+        False, "run a policy on a device although it is not certified, poor, or was trained for other setpoints"
     )
     env_file: str | None = setting(None, "a calibrated.yaml whose model the simulated plant takes")
+    plant_file: str | None = setting(None, "a twin.yaml of calibrate, in place of `plant`; backend=sim")
     fsync: bool = setting(True, "every row on the disk before the next command")
     preflight_only: bool = setting(False, "check the device and stop")
     resume: str | None = setting(None, "a run folder to continue after a crash")
 
     def __post_init__(self) -> None:
         check(self)
+        if self.plant_file is not None:
+            require(
+                self.env_file is None, "env_file", self.env_file, "null beside plant_file, which has a model already"
+            )
+            require(self.backend.kind == "sim", "backend.kind", self.backend.kind, "sim with plant_file")
 
     def schedules(self) -> list[Scenario]:
         """One schedule per reactor. Raises: ValueError naming reactor, key and what is allowed."""

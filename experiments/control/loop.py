@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.scenario import Scenario
-from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask
+from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Remembers, Watches
 from hardware.reactor import Command, Reactor, Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock, Verdict
@@ -124,6 +124,8 @@ class ClosedLoop:
         self.done = self.done | (rows & (elapsed >= self._total - 1e-6))
 
         steered = believed & (phase >= 0)
+        if isinstance(self.controller, Watches):
+            self.controller.watch(m.od, m.temperature, minute, believed)
         decided = self.controller.act(np.where(rows & ~believed, np.nan, m.od), setpoint, minute, steered)
         proposed = np.where(steered & ~(self.done & (self._at_end != "hold")), decided, 0.0)
         verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
@@ -144,7 +146,7 @@ class ClosedLoop:
         failures = self._respond(verdict, left)
         heat = np.where(verdict.heat_off, np.nan, temperature)
         receipt = self.reactors.actuate(Command(rows, verdict.rate, heat))
-        self._book(receipt, now)
+        self.book(receipt, now)
         volume = receipt.volume_ml + np.where(rows, self.repeated_ml, 0.0)
         self.repeated_ml = np.where(rows, 0.0, self.repeated_ml)
         return replace(decision, volume_ml=volume, notes=(*failures, *receipt.notes))
@@ -152,11 +154,11 @@ class ClosedLoop:
     def _book_repeats(self) -> None:
         """What the devices dosed by themselves counts when it happened, before the sample after it is judged."""
         for at_s, receipt in self.reactors.repeated():
-            self._book(receipt, at_s)
+            self.book(receipt, at_s)
             self.repeated_ml = self.repeated_ml + receipt.volume_ml
 
-    def _book(self, receipt: Receipt, at_s: float) -> None:
-        """What was dosed counts for the interlock, and for a controller that goes by it."""
+    def book(self, receipt: Receipt, at_s: float) -> None:
+        """What was dosed counts for the interlock, and for a controller that goes by it. Args: at_s: run time, s."""
         self.interlock.confirm(receipt, at_s)
         if isinstance(self.controller, Accounts):
             self.controller.dosed(receipt.volume_ml + (0.0 if receipt.kept_ml is None else receipt.kept_ml))
@@ -186,12 +188,16 @@ class ClosedLoop:
         return np.array([any(line.startswith(f"{name}:") for line in failures) for name in self.reactors.names])
 
     def state(self) -> dict[str, Any]:
-        """Where each reactor's schedule and the interlock stand; plain numbers and lists."""
+        """Where each reactor's schedule, the interlock and the controller stand; plain numbers and lists."""
         known = {"began": self.began, "done": self.done, "stopped": self.stopped}
-        return {**{key: values.tolist() for key, values in known.items()}, "interlock": self.interlock.state()}
+        state = {**{key: values.tolist() for key, values in known.items()}, "interlock": self.interlock.state()}
+        return state | ({"controller": self.controller.state()} if isinstance(self.controller, Remembers) else {})
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit."""
+        """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit.
+
+        A state without `controller` is of a version that did not save it: then the controller begins anew.
+        """
         number = (int, float, type(None))
         for key, kinds, what in (
             ("began", number, "numbers"), ("done", bool, "true or false"), ("stopped", bool, "true or false")
@@ -205,3 +211,7 @@ class ClosedLoop:
         self.done = np.array(state["done"], dtype=np.bool_)
         self.stopped = np.array(state["stopped"], dtype=np.bool_)
         self.interlock.restore(state.get("interlock", "missing"))
+        if isinstance(self.controller, Remembers) and "controller" in state:
+            if not isinstance(state["controller"], dict):
+                raise ValueError(f"controller: {str(state['controller'])[:40]}, expected keys and values")
+            self.controller.restore(state["controller"])

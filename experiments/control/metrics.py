@@ -27,7 +27,7 @@ class WindowMetrics:
     """One window of N reactors; each array (N,), nan where there are fewer than two samples.
 
     settling_min: nan where the band is not reached for good within the window.
-    steady_abs_error: mean |e| over the last 10 min.
+    steady_abs_error: mean |e| over the last 10 min. abs_error: over the window.
     """
 
     setpoint: float
@@ -37,6 +37,7 @@ class WindowMetrics:
     itae_mean: Array
     settling_min: Array
     steady_abs_error: Array
+    abs_error: Array
 
 
 def _carry_forward(values: Array, valid: NDArray[np.bool_]) -> Array:
@@ -87,4 +88,5 @@ def window_metrics(minute: Array, od: Array, setpoint: float, start: float, end:
         itae_mean=known(itae / length),
         settling_min=known(settled),
         steady_abs_error=known(steady, enough & tail.any(axis=1)),
+        abs_error=known(np.trapezoid(np.abs(e), t, axis=1) / length),
     )

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,18 @@ import numpy as np
 from dqn import policy as policies
 from dqn.policy import Policy
 from envs.scenario import Scenario
+from experiments.certification import certificate
 from experiments.cli import frame
 from experiments.control.config import DeployConfig
 from hardware.chibio.preflight import Check
+from hardware.storage import atomic
 
 __all__ = ["Training", "admit", "find_policy", "load_policy", "policy_check", "run_policy"]
 
 log = logging.getLogger(__name__)
 
 REHEARSED = ("sim", "emulator")  # backends without a culture; on any other a doubtful policy is refused
+SHIPPED = Path(str(resources.files("dqn"))) / "shipped" / "policy.npz"
 TRAINED = ("train/**/policy.npz", "demo/*/2_train/policy.npz")  # below runs/; other commands keep copies of policies
 FORCE = "force_policy=true runs it all the same"
 
@@ -32,13 +36,14 @@ class Training:
     """What a policy file says of its training; nan where a file of an earlier version does not say it.
 
     control_min: min. regret_pct: per cent. updates: gradient steps before it was exported.
-    setpoints: lowest and highest one, OD.
+    setpoints: lowest and highest one, OD. relative: it serves any control period and setpoint.
     """
 
     control_min: float
     regret_pct: float
     updates: float
     setpoints: tuple[float, float]
+    relative: bool
 
     @classmethod
     def of(cls, policy: Policy) -> "Training":
@@ -47,7 +52,8 @@ class Training:
             float(policy.metadata.get(key, np.nan)) for key in ("control_min", "regret_pct", "updates")
         )
         setpoints = np.asarray(policy.metadata.get("model", {}).get("setpoints", [np.nan]), dtype=np.float64)
-        return cls(control, regret, updates, (float(setpoints.min()), float(setpoints.max())))
+        limits = (float(setpoints.min()), float(setpoints.max()))
+        return cls(control, regret, updates, limits, policy.observation == policies.RELATIVE)
 
     def doubts(self, setpoints: Sequence[float], poor_regret_pct: float) -> list[str]:
         """Reasons not to let the policy pump, with their remedies; what the file does not say is none."""
@@ -64,21 +70,27 @@ class Training:
 
     def unsaid(self) -> list[str]:
         """What the file does not say."""
-        said = {"updates": self.updates, "regret": self.regret_pct, "trained setpoints": self.setpoints[0]}
+        said = {"updates": self.updates, "regret": self.regret_pct}
+        said |= {} if self.relative else {"trained setpoints": self.setpoints[0]}
         return [name for name, value in said.items() if np.isnan(value)]
 
     def __str__(self) -> str:
         low, high = self.setpoints
-        said = f"regret {self.regret_pct:.2f} % against the optimum of its model, setpoints {low:g} to {high:g}"
+        where = (
+            "any growth rate, pump, control period and setpoint" if self.relative else f"setpoints {low:g} to {high:g}"
+        )
+        said = f"regret {self.regret_pct:.2g} % against the optimum of its model, {where}"
         missing = self.unsaid()
         return said if not missing else f"{said}; it does not say {', '.join(missing)}: an earlier version wrote it"
 
 
 def find_policy(name: str, root: Path = Path("runs")) -> Path:
-    """A policy.npz from a path, a run folder or `latest`: the one that `train` or `demo` wrote last under `root`.
+    """A policy.npz from a path, a run folder, `shipped`, or `latest`: what `train` or `demo` wrote last under `root`.
 
     Raises: UserError saying what to give instead.
     """
+    if name == "shipped":
+        return SHIPPED
     if name == "latest":
         found = sorted((p for pattern in TRAINED for p in root.glob(pattern)), key=lambda p: p.stat().st_mtime)
         if not found:
@@ -98,13 +110,13 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     try:
         policy = policies.load(path)
         training = Training.of(policy)
-        fastest = float(policy.pump_rates.max())
+        fastest = 0.0 if training.relative else float(policy.actions.max())
     except policies.PolicyError as error:
         raise frame.UserError(str(error)) from None
     except Exception as error:  # whatever a damaged file makes NumPy say
         why = (str(error).splitlines() or [type(error).__name__])[0]
         raise frame.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
-    if not abs(training.control_min - control_min) <= 1e-9:
+    if not (training.relative or abs(training.control_min - control_min) <= 1e-9):
         raise frame.UserError(
             f"policy {path} was trained for a control period of {training.control_min} min, "
             f"the backend has {control_min} min; train with env.control_min={control_min}"
@@ -118,21 +130,25 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     return policy
 
 
-def admit(policy: Policy, config: DeployConfig, scenarios: Sequence[Scenario]) -> None:
-    """Warn of a policy that is doubtful for these scenarios.
+def admit(policy: Policy, file: Path, config: DeployConfig, scenarios: Sequence[Scenario]) -> None:
+    """Warn of a policy that is doubtful for these scenarios, on a device also of one that is not certified.
 
+    Args: file: of the policy, beside which its certificate lies.
     Raises: UserError where a culture is at stake, unless it is forced or an earlier life of the run began with it.
     """
-    doubts = _doubts(policy, config, scenarios)
+    doubts = _doubts(policy, file, config, scenarios)
     if doubts and config.resume is None and _refuses(config):
         raise frame.UserError(f"policy refused: {'; '.join(doubts)}; {FORCE}")
     for doubt in doubts:
         log.warning("policy: %s", doubt)
 
 
-def _doubts(policy: Policy, config: DeployConfig, scenarios: Sequence[Scenario]) -> list[str]:
+def _doubts(policy: Policy, file: Path, config: DeployConfig, scenarios: Sequence[Scenario]) -> list[str]:
     asked = [setpoint for scenario in scenarios for setpoint in scenario.setpoints]
-    return Training.of(policy).doubts(asked, config.poor_regret_pct)
+    doubts = Training.of(policy).doubts(asked, config.poor_regret_pct)
+    if config.backend.kind not in REHEARSED:
+        doubts += certificate.doubts(policy, file, asked, config.policy)
+    return doubts
 
 
 def _refuses(config: DeployConfig) -> bool:
@@ -147,13 +163,13 @@ def policy_check(config: DeployConfig, scenarios: Sequence[Scenario]) -> Check:
         return Check("policy", False, str(error), "python -m experiments.train", required=False)
     except frame.UserError as error:
         return Check("policy", False, str(error), "give another policy=PATH")
-    doubts, refused = _doubts(policy, config, scenarios), _refuses(config)
+    doubts, refused = _doubts(policy, find_policy(config.policy), config, scenarios), _refuses(config)
     remedy = FORCE if refused else "a device refuses it without force_policy=true"
     return Check("policy", not doubts, "; ".join(doubts) or str(Training.of(policy)), remedy, refused)
 
 
 def run_policy(name: str, folder: Path, resumed: bool, control_min: float, max_rate: float) -> Policy:
-    """The policy of a run, of which the run folder keeps a copy; a resumed run goes on with that copy.
+    """The policy of a run, of which the run folder keeps a copy with its certificate; a resumed run goes on with it.
 
     The copy is written from the policy as it was read: whatever has been trained meanwhile, both are the same.
     Raises: UserError as `load_policy`, and if the copy cannot be written.
@@ -161,9 +177,12 @@ def run_policy(name: str, folder: Path, resumed: bool, control_min: float, max_r
     kept = folder / "policy.npz"
     if resumed and kept.is_file():
         return load_policy(str(kept), control_min, max_rate)
-    policy = load_policy(name, control_min, max_rate)
+    source = find_policy(name)
+    policy = load_policy(str(source), control_min, max_rate)
     try:
         policies.save(kept, policy)
+        if certificate.beside(source).is_file():
+            atomic.write(certificate.beside(kept), certificate.beside(source).read_text(encoding="utf-8"), fsync=False)
     except OSError as error:
         raise frame.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free the disk") from None
     return policy

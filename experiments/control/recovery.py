@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.control.loop import ClosedLoop, Step
-from hardware.chibio.resume import dosed
+from experiments.controllers.base import Accounts, Remembers
+from hardware.chibio.resume import dosed, replay
 from hardware.errors import RecordingError
 from hardware.reactor import Receipt
 from hardware.safety.config import Response
@@ -215,6 +216,8 @@ def _no_state(path: Path, why: str) -> RecordingError:
 def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
     """Put the loop where its state was saved, and book the doses and hand-overs begun after that.
 
+    Those doses are told to the controller too, and what the driver has put off to the next dose since then.
+
     Args: journal: of the run. path: of state.json.
     Raises: RecordingError for a state that is damaged or does not fit.
     """
@@ -224,12 +227,25 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
         loop.restore(state)
     except ValueError as error:
         raise _no_state(path, str(error)) from None
+    if isinstance(loop.controller, Remembers) and "controller" not in state:
+        log.warning(
+            "%s: an earlier version wrote it, without the controller's memory: the controller begins anew", path
+        )
     loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
     decided = {row["reactor"]: row["n"] for row in journal.rows if row["kind"] == "decision"}
     for dose in doses:
         mine = np.array([name == dose.reactor for name in loop.reactors.names])
-        loop.interlock.confirm(Receipt(mine * dose.feed_ml, (), mine * dose.waste_ml), dose.at_s)
+        loop.book(Receipt(mine * dose.feed_ml, (), mine * dose.waste_ml), dose.at_s)
         if dose.again and dose.n > decided.get(dose.reactor, -1):  # in no row yet
             loop.repeated_ml += mine * dose.feed_ml
+    if isinstance(loop.controller, Accounts):
+        before = [row for row in journal.rows if row["n"] < state["journal_row"]]
+        loop.controller.dosed(_put_off(journal.rows, loop) - _put_off(before, loop))
     minute = loop.reactors.elapsed() / 60.0
     log.info("resumed at minute %.1f; %d dose(s) booked from the journal", minute, len(doses))
+
+
+def _put_off(rows: Sequence[Mapping[str, Any]], loop: ClosedLoop) -> Array:
+    """What the driver last put off to the next dose by these rows of a journal, mL, (N,)."""
+    known = replay(rows)
+    return np.array([known[name].carry_ml if name in known else 0.0 for name in loop.reactors.names])

@@ -63,7 +63,7 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
     try:
         figure = figure_of(record, setup.scenarios, f"{config.backend.kind}: {outcome}")
         path = charts.save(figure, folder / "figures", "closed_loop")
-        record.events.figure("figures/closed_loop", figure, record.series("time_min").shape[1])
+        record.events.picture("figures/closed_loop", path, record.series("time_min").shape[1])
         roles = [config.role(name) for name in record.names]
         summary = {**summarise(record, setup.scenarios, roles, outcome), "figure": str(path)}
         files.write_json(folder / "summary.json", summary)

@@ -32,12 +32,13 @@ FORMATS = {  # of the metrics of a window
 
 
 class ChangeLog:
-    """Logs what changes, once: phases, words of the interlock, notes of the reactors."""
+    """Logs what changes, once: phases, who decides, words of the interlock, notes of the reactors."""
 
     def __init__(self, loop: ClosedLoop) -> None:
         self._names = loop.reactors.names
         self._phase = [-2] * len(self._names)
         self._reason: list[str | None] = [None] * len(self._names)
+        self._supervised = [False] * len(self._names)
         self._noted: set[str] = set()
 
     def __call__(self, step: Step) -> None:
@@ -47,6 +48,8 @@ class ChangeLog:
                 self._phase[n] = int(step.phase[n])
                 what = "recovery" if self._phase[n] < 0 else f"setpoint {step.setpoint[n]:g}"
                 log.info("%s: %s from minute %.0f, OD %.3f", name, what, step.minute[n], step.od[n])
+            if step.rows[n]:
+                self._who_decides(step, n)
             reason = step.reasons[n] or ""
             if not step.rows[n] and (not reason or reason.endswith("earlier in this run")):
                 continue  # what a sample was refused for is not over because there is no new one yet
@@ -59,6 +62,14 @@ class ChangeLog:
             if kind not in self._noted:  # the journal has every one of them
                 self._noted.add(kind)
                 log.info("%s (noted once here, every time in the journal)", note)
+
+    def _who_decides(self, step: Step, n: int) -> None:
+        """Where a supervisor stands over the policy: from when on its law acts, and until when."""
+        supervised = bool(step.explanation.get("supervised", np.zeros(len(self._names)))[n])
+        if supervised != self._supervised[n]:
+            self._supervised[n] = supervised
+            who = "the supervisor's law acts, the estimate is in doubt," if supervised else "the policy acts again"
+            log.info("%s: %s from minute %.0f", self._names[n], who, step.minute[n])
 
 
 def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:

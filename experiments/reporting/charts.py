@@ -10,10 +10,15 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
-__all__ = ["COLOURS", "closed_loop", "learning", "new_figure", "policy_map", "save", "scaling", "seeds", "trajectories"]
+__all__ = [
+    "COLOURS", "closed_loop", "learning", "new_figure", "policy_map", "relative_map", "relative_trajectories", "save",
+    "scaling", "seeds", "trajectories",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -49,8 +54,15 @@ def save(figure: Figure, folder: Path, name: str) -> Path:
     """Write folder/name.svg and folder/name.png; returns the path of the PNG."""
     folder.mkdir(parents=True, exist_ok=True)
     figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+    figure.set_layout_engine(None)  # everything has found its place, which takes longer than to draw it
     figure.savefig(folder / f"{name}.png", dpi=150)
     return folder / f"{name}.png"
+
+
+def _plain(axis: Axis) -> None:
+    """0.01 instead of a power of ten at the ticks of a logarithmic axis: superscripts cost more than all the rest."""
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
 
 
 def _population(ax: Axes, x: Array, curves: Array, colour: str, label: str) -> None:
@@ -97,6 +109,8 @@ def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_st
         right.axvline(best_step[0], color=COLOURS[2], linewidth=1, linestyle="--", label="policy kept")
     right.set(xlabel="environment step", ylabel="regret against the optimum, %", yscale="log")
     right.set_title("Greedy policy on the selection grid")
+    _plain(left.yaxis)
+    _plain(right.yaxis)
     right.legend()
     return figure
 
@@ -146,6 +160,48 @@ def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates:
     axes[0].legend()
     axes[0].set_ylabel("OD")
     axes[goals.size].set_ylabel("pump rate, µL/s")
+    return figure
+
+
+def relative_map(error: Array, share: Array, learned: Array, optimal: Array) -> Figure:
+    """Share of the largest pump rate over error and growth share, learned beside optimal.
+
+    Args: error (X,), periods of full pump; share (Y,); learned and optimal (Y, X), 0 to 1.
+    """
+    figure, axes = new_figure(9.0, 3.6, 1, 2, sharey=True)
+    for ax, level, title in zip(
+        axes, (learned, optimal), ("learned policy", "optimum (dynamic programming)"), strict=True
+    ):
+        mesh = ax.pcolormesh(error, share, level, cmap="viridis", vmin=0.0, vmax=1.0, rasterized=True)
+        ax.axvline(0.0, color="white", linewidth=1, linestyle="--")
+        ax.set(xlabel="error e, periods of full pump")
+        ax.set_title(title)
+        ax.grid(False)
+    axes[0].set_ylabel("growth's share of the pump, s")
+    figure.colorbar(mesh, ax=axes, label="dose, share of full pump")
+    return figure
+
+
+def relative_trajectories(error: Array, best: Array, share: Array, levels: Array, best_levels: Array) -> Figure:
+    """Noise-free closed loops in relative coordinates, a column per growth share.
+
+    Args: error, best: e including the start, (K + 1, G). share: (G,). levels, best_levels: (K, G), 0 to 1.
+    """
+    shares = np.unique(share)
+    figure, axes = new_figure(3.4 * shares.size, 4.6, 2, shares.size, sharex=True, sharey="row", height_ratios=[2, 1])
+    shown = 40  # periods; what comes after is rest
+    for column, each in enumerate(shares):
+        top, bottom = axes[column], axes[shares.size + column]
+        for k, g in enumerate(np.flatnonzero(share == each)):
+            top.plot(error[:shown, g], color=COLOURS[k], linewidth=1.5, label=f"learned, from {error[0, g]:g}")
+            top.plot(best[:shown, g], color="black", linewidth=1.0, linestyle=":", label=None if k else "optimum")
+            bottom.step(range(shown), levels[:shown, g], where="post", color=COLOURS[k], linewidth=1.0)
+            bottom.step(range(shown), best_levels[:shown, g], "k:", where="post", linewidth=0.8)
+        top.set_title(f"growth takes {each:g} of the pump")
+        bottom.set(xlabel="control periods", ylim=(-0.03, 1.03))
+    axes[0].legend()
+    axes[0].set_ylabel("error e, periods of full pump")
+    axes[shares.size].set_ylabel("dose, share of full pump")
     return figure
 
 

@@ -8,7 +8,7 @@ import base64
 import json
 import platform
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -149,14 +149,19 @@ def _results(page: Page, run: Path, prefix: str) -> None:
             page.figure(path, path.stem.replace("_", " "))
 
 
-def of_runs(folder: Path, runs: Sequence[Path]) -> Page:
-    """The page of any command's run: what it found, and what was run. `runs` is the folder itself or runs below it."""
+def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str], None] | None = None) -> Page:
+    """The page of any command's run: what it found, and what was run. `runs` is the folder itself or runs below it.
+
+    Args: after: adds to the page what only some runs have; it is given the run and its name on a page of several.
+    """
     name = folder.resolve()
     page = Page(f"{name.parent.name}, {name.name}", f"{PACKAGE} {_version()}")
     for run in runs:
         label = re.sub(r"^\d+_", "", run.name).capitalize() if run != folder else ""
         page.section(f"{label}: results" if label else "Results")
         _results(page, run, f"{run.name}_" if label else "")
+        if after is not None:
+            after(page, run, label)
         page.section(f"{label}: what was run" if label else "What was run")
         provenance(page, run)
     return page

@@ -6,11 +6,9 @@ TensorBoard's own event writer is used, so that a bench without torch can show a
 from __future__ import annotations
 
 import csv
-import io
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +16,6 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.plugins.hparams import summary_v2
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["Events", "PopulationWriter", "interquartile_mean"]
 
@@ -49,11 +44,9 @@ class Events:
         """One point of a curve."""
         self._add(Summary(value=[Summary.Value(tag=tag, simple_value=value)]), step)
 
-    def figure(self, tag: str, figure: Figure, step: int) -> None:
-        """A picture under TensorBoard's images."""
-        png = io.BytesIO()
-        figure.savefig(png, format="png", dpi=110)
-        image = Summary.Image(encoded_image_string=png.getvalue(), colorspace=3, height=1, width=1)
+    def picture(self, tag: str, png: Path, step: int) -> None:
+        """A PNG file under TensorBoard's images. Raises: OSError for one that cannot be read."""
+        image = Summary.Image(encoded_image_string=png.read_bytes(), colorspace=3, height=1, width=1)
         self._add(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
 
     def hyper_parameters(self, values: Mapping[str, float | str | bool], metrics: Sequence[str]) -> None:

@@ -11,12 +11,18 @@ import pytest
 
 from dqn import policy
 from envs.scenario import Scenario
+from envs.task import EnvConfig
 from experiments import demo
+from experiments.certification import certificate
+from experiments.certification.config import CertifyConfig, Limits
+from experiments.certification.judge import certify
+from experiments.cli import files, frame
 from experiments.cli.frame import UserError
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
 from experiments.control.policies import find_policy
 from experiments.controllers import registry
+from experiments.training.config import TrainConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.emulator.process import EmulatorProcess
 from hardware.simulated import SimulatedConfig
@@ -34,10 +40,18 @@ DOUBTFUL = {
 doubtful = pytest.mark.parametrize(("metadata", "message"), DOUBTFUL.values(), ids=list(DOUBTFUL))
 
 
+def certified(path: Path, given: policy.Policy) -> None:
+    """Save a policy with a certificate of whatever its band is."""
+    policy.save(path, given)
+    anything = Limits(excess=1.0, excess_uncertain=1.0, entry=100.0, low_dose=100.0)
+    asked = CertifyConfig(env=EnvConfig(), setpoints=(0.2, 1.0), strip=0.1, trajectories=0, limits=anything)
+    files.write_json(certificate.beside(path), certificate.content(given, asked, certify(given, asked)))
+
+
 def deployed(tmp_path: Path, metadata: dict[str, Any], **changes: Any) -> DeployConfig:
-    """The config of a run at 0.8, 0.65 and 0.5 with a policy of this training."""
+    """The config of a run at 0.8, 0.65 and 0.5 with a certified policy of this training."""
     given = inverse_policy()
-    policy.save(tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, **metadata}))
+    certified(tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, **metadata}))
     scenario = Scenario((0.8, 0.65, 0.5), (30.0,) * 3, (37.0,) * 3)
     return DeployConfig(**{"scenario": scenario, "policy": str(tmp_path / "given.npz"), **changes})
 
@@ -82,11 +96,19 @@ def test_a_sound_policy_and_a_limit_of_ones_own(tmp_path: Path, caplog: pytest.L
 def test_a_file_of_an_earlier_version_runs_and_says_what_is_not_known(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    policy.save(tmp_path / "given.npz", inverse_policy())  # says its regret and its control period
+    certified(tmp_path / "given.npz", inverse_policy())  # says its regret and its control period
     config = DeployConfig(backend=ChiBioConfig(), policy=str(tmp_path / "given.npz"))
     with caplog.at_level("INFO"):
         assemble.unpack(config, tmp_path)
     assert "it does not say updates, trained setpoints: an earlier version wrote it" in caplog.text
+
+
+def test_the_demo_trains_until_the_policy_is_within_the_limits() -> None:
+    _, train, *_ = demo.commands(Path("runs/demo/now"))
+    assert train[:2] == ["-m", "experiments.train"]
+    given = [word for word in train[2:] if not word.startswith(("hydra.", "env_file="))]
+    config = frame.load(frame.compose("train", given), TrainConfig())
+    assert config.stop_within == 1.0
 
 
 def test_latest_is_what_train_or_demo_wrote_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,7 +147,7 @@ def test_the_device_is_looked_at_before_anything_was_trained(
     device: ChiBioConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    config = DeployConfig(backend=device, preflight_only=True)
+    config = DeployConfig(backend=device, preflight_only=True, policy="latest")
     said = lines(config, tmp_path, caplog)
     assert len(said) == 1
     assert said[0].startswith("note  policy: policy=latest: no training run under runs/")
@@ -141,5 +163,5 @@ def test_a_preflight_says_that_a_policy_would_be_refused(
         lines(config, tmp_path, caplog)
     caplog.clear()
     assert lines(deployed(tmp_path, {}, backend=device, preflight_only=True), tmp_path, caplog) == [
-        "pass  policy: regret 0.10 % against the optimum of its model, setpoints 0.2 to 1"
+        "pass  policy: regret 0.1 % against the optimum of its model, setpoints 0.2 to 1"
     ]

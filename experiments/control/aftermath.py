@@ -1,0 +1,196 @@
+"""After a run: what its model predicted beside what the recordings show, as a section of the run's page."""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from omegaconf import DictConfig
+
+from dqn import policy as policies
+from envs.identification.agreement import Agreement, Compared, agreement
+from envs.identification.model import Parameter
+from envs.identification.screening import Series
+from envs.task import EnvConfig
+from experiments.cli import files, frame
+from experiments.reporting.agreement_chart import agreement_figure
+from experiments.reporting.charts import save
+from experiments.reporting.page import Page
+from experiments.reporting.tables import Table, number
+from experiments.training.config import read_env_file
+from hardware.errors import RecordingError
+from hardware.storage.recording_reader import read_recording
+
+__all__ = ["Believed", "believed", "told", "write"]
+
+Array = NDArray[np.float64]
+
+DECISION = '"kind":"decision"'
+ESTIMATES = ("mu", "gain")  # what a controller may believe of culture and pump
+COLUMNS = ("hours", "growth rate, 1/min", "pump gain, 1 = the model's", "net growth beyond the model's, 1/min")
+
+
+@dataclass(frozen=True)
+class Believed:
+    """The model a run was planned with, and where it is from."""
+
+    mu: float
+    tau: float
+    source: str
+
+
+def believed(run: Path) -> Believed:
+    """The model of the policy, else of the `env_file`, else the nominal one, in a deployment's folder."""
+    config, nominal = _config(run), EnvConfig()
+    controller = config.get("controller")
+    learned = isinstance(controller, Mapping) and controller.get("kind") == "dqn"
+    if learned and (run / "policy.npz").is_file():
+        try:
+            model = policies.load(run / "policy.npz").metadata["model"]
+            return Believed(float(model["mu"]), float(model["tau"]), "the policy's training model")
+        except (policies.PolicyError, KeyError, TypeError, ValueError):
+            pass  # exported without its model, or damaged: another one was believed as well
+    if path := config.get("env_file"):
+        try:
+            env = read_env_file(str(path))
+            return Believed(env.mu, env.tau, f"env_file {path}")
+        except frame.UserError:
+            return Believed(nominal.mu, nominal.tau, f"nominal, since env_file {path} cannot be read any more")
+    return Believed(nominal.mu, nominal.tau, "nominal")
+
+
+def _config(run: Path) -> Mapping[str, Any]:
+    try:
+        config = files.load_yaml(run / "config.yaml")
+    except (OSError, ValueError):
+        return {}
+    return config if isinstance(config, DictConfig) else {}
+
+
+def told(run: Path, reactor: str) -> dict[str, Array]:
+    """What the journal says of each decision for a reactor: `minute`, `supervised` and the controller's estimates.
+
+    A key that no decision has is left out; one that some lack is nan there. All of shape (K,).
+    """
+    rows = list(_decisions(run / "journal.jsonl", reactor))
+    keys = [key for key in ("supervised", *ESTIMATES) if any(key in why for _, why in rows)]
+    found = {key: np.array([_real(why.get(key)) for _, why in rows]) for key in keys}
+    return {"minute": np.array([minute for minute, _ in rows]), **found}
+
+
+def _decisions(path: Path, reactor: str) -> Iterator[tuple[float, Mapping[str, Any]]]:
+    """Minute and reasons of every decision for a reactor; a line that a power cut tore is left out."""
+    if not path.is_file():
+        return
+    with path.open(encoding="utf-8", errors="replace") as f:
+        for line in f:
+            if DECISION not in line[:120]:
+                continue
+            try:
+                row = json.loads(line)
+                if row["reactor"] == reactor:
+                    yield float(row["row"]["time_min"]), row.get("why") or {}
+            except (ValueError, KeyError, TypeError, AttributeError):
+                continue
+
+
+def _real(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def write(page: Page, run: Path, label: str = "") -> None:
+    """Add the section of a deployment to a page; its figures are files in RUN/report. Other runs have none.
+
+    Args: label: how the run is called on a page of several.
+    """
+    if not ((run / "recordings").is_dir() and (run / "config.yaml").is_file()):
+        return
+    model, summary = believed(run), json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    reactors = summary.get("reactors") if isinstance(summary, Mapping) else None
+    page.section(f"{label}: predicted and measured" if label else "Predicted and measured")
+    page.text(
+        f"The model: growth {number(model.mu, 4)} 1/min, tau {number(model.tau, 4)} ({model.source}). Growth and pump "
+        "gain are estimated from segments of about two hours, each alone. Net growth is what a sample grew or shrank "
+        "beyond the prediction from the one before; it shows also where growth and pump hide one behind the other. A "
+        "value no longer holds from where on the intervals exclude it and it is off by 10 % or more."
+    )
+    for path in sorted((run / "recordings").glob("*.csv")):
+        known = reactors.get(path.stem) if isinstance(reactors, Mapping) else None
+        _reactor(page, run, path, model, known if isinstance(known, Mapping) else {}, f"{run.name}_" if label else "")
+
+
+def _reactor(page: Page, run: Path, path: Path, model: Believed, summary: Mapping[str, Any], prefix: str) -> None:
+    name = path.stem
+    page.add("subheading", text=name)
+    why = told(run, name)
+    supervised = why["minute"][why["supervised"] > 0.0] if "supervised" in why else np.empty(0)
+    try:
+        recording = read_recording(path)
+        series = Series(recording.time_min, recording.od, recording.pump_rate, recording.row)
+        found = agreement(series, model.mu, model.tau)
+    except (RecordingError, ValueError) as error:
+        page.text(f"Not compared: {error}")
+    else:
+        page.add("verdict", claim=found.verdict(), items=_facts(found), remark=_acted(summary, supervised))
+        page.table(_segments(found, f"{prefix}after_{name}", name))
+        estimates = {key: values for key, values in why.items() if key != "supervised"}
+        figure = agreement_figure(found, estimates, supervised, f"{name}: growth and pump along the run")
+        page.figure(save(figure, run / "report", name).with_suffix(".svg"), f"{name}, predicted and measured")
+
+
+def _facts(found: Agreement) -> list[str]:
+    """Until when what held, and how well the next sample was predicted."""
+    facts = [f"{c.name}: {_fact(c)}" for c in (found.growth, found.gain, found.net)]
+    gap = f"{found.rms:.4f} OD; {found.attainable:.4f} OD without the error of net growth"
+    return [*facts, f"the next sample was predicted within {gap} (rms)"]
+
+
+def _fact(c: Compared) -> str:
+    """The last estimate against the model's value, and how the estimates drift."""
+    if c.latest is None:
+        return "not identifiable"
+    last = f"last {_shown(c.latest)}, the model's {number(c.expected)}"
+    if c.left_min is not None:
+        last += f", which no longer holds from hour {c.left_min / 60:.1f} on"
+    elif not c.latest.low <= c.expected <= c.latest.high:
+        last += ", outside in too few segments, or by too little, to say more"
+    if c.line is not None and c.line.significant and c.expected > 0.0:
+        last += f"; a line through the segments changes by {c.line.change_pct:+.0f} %"
+    return last
+
+
+def _acted(summary: Mapping[str, Any], supervised: Array) -> str:
+    """What the interlock and a supervisor did."""
+    reasons = summary.get("reasons")
+    kinds = "; ".join(
+        f"{kind} in {t['rows']} rows, minute {number(t['first_min'])} to {number(t['last_min'])}"
+        for kind, t in (reasons.items() if isinstance(reasons, Mapping) else ())
+        if isinstance(t, Mapping) and {"rows", "first_min", "last_min"} <= t.keys()
+    )
+    interlock = f"The interlock spoke in {summary.get('interlock', 0)} of {summary.get('rows', 0)} rows"
+    acted = f"A supervisor acted on {len(supervised)} rows"
+    if len(supervised):
+        acted += f", minute {supervised[0]:.0f} to {supervised[-1]:.0f}"
+    return f"{interlock}{': ' if kinds else ''}{kinds}. {acted}."
+
+
+def _segments(found: Agreement, name: str, reactor: str) -> Table:
+    """Every segment: the hours it covers and the three estimates with their intervals."""
+    spans = sorted({s for c in (found.growth, found.net) for s in zip(c.first_min, c.end_min, strict=True)})
+    rows = []
+    for first, end in spans:
+        cells = [_at(c, first) for c in (found.growth, found.gain, found.net)]
+        rows.append((f"{first / 60:.1f} to {end / 60:.1f}", *cells))
+    return Table(name, f"{reactor}: estimates along the run with their 95 % intervals", COLUMNS, tuple(rows))
+
+
+def _at(c: Compared, first: float) -> str:
+    found = dict(zip(c.first_min, c.found, strict=True)).get(first)
+    return "–" if found is None else _shown(found)
+
+
+def _shown(p: Parameter) -> str:
+    return f"{number(p.value)} ({number(p.low)} to {number(p.high)})"

@@ -1,0 +1,152 @@
+"""The page of a deployment says what was predicted, what happened, and whether to calibrate again."""
+
+import csv
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dqn import policy as policies
+from experiments import deploy, report
+from experiments.cli import frame
+from experiments.control import run
+from experiments.control.aftermath import believed, told
+from tests.experiments.test_deploy import inverse_policy
+
+pytestmark = pytest.mark.xdist_group("aftermath")  # its tests share runs, made once
+
+
+def deployed(folder: Path, *overrides: str) -> Path:
+    """A run as `python -m experiments.deploy` leaves it."""
+    config = deploy.main.config(["fsync=false", *overrides])
+    folder.mkdir()
+    frame.save_config(config, folder)
+    run.deploy(config, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def drifting(tmp_path_factory):
+    """Six hours of two vials that grow faster by 6 % every hour, under a controller that estimates as it goes."""
+    return deployed(
+        tmp_path_factory.mktemp("aftermath") / "run", "controller=adaptive_inverse", "backend.reactors=[M0,M1]",
+        "scenario.minutes=[120,120,120]", "plant.growth.ramp_per_h=0.06",
+    )  # fmt: skip
+
+
+@pytest.fixture
+def copy(drifting, tmp_path):
+    shutil.copytree(drifting, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def sections(folder: Path) -> str:
+    """The page's text without markup."""
+    page = report.write(folder).read_text(encoding="utf-8")
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", re.sub(r'src="[^"]*"', "", page)))
+
+
+def test_a_drifting_run_is_told_to_calibrate_again(copy):
+    text = sections(copy)
+    assert "Predicted and measured" in text
+    assert "growth 0.03 1/min, tau 0.3333 (nominal)" in text
+    assert len(re.findall(r"Recalibrate: .*?the predicted net growth is off by 10 % or more since hour", text)) == 2
+    assert "The interlock spoke in 0 of" in text
+    assert "A supervisor acted on 0 rows." in text
+    for name in ("M0", "M1"):
+        assert (copy / "report" / f"{name}.svg").is_file()
+        with open(copy / "tables" / f"after_{name}.csv", newline="") as f:
+            rows = list(csv.reader(f))
+        net = [float(row[3].split(" (")[0]) for row in rows[1:]]
+        # by hand: 6 % an hour of 0.03 1/min, in the middle of each two hours
+        np.testing.assert_allclose(net, [0.03 * 0.06 * h for h in (1.0, 3.0, 5.0)], atol=0.0015)
+    assert sections(copy) == text  # a second report finds the same run
+
+
+def test_the_controllers_own_estimates_are_read_from_the_journal(drifting):
+    why = told(drifting, "M0")
+    assert set(why) == {"minute", "mu", "gain"}
+    with open(drifting / "recordings" / "M0.csv", newline="") as f:
+        minutes = [float(row["time_min"]) for row in csv.DictReader(f)]
+    np.testing.assert_array_equal(why["minute"], minutes)
+    lines = [json.loads(line) for line in (drifting / "journal.jsonl").read_text().splitlines()]
+    mine = [r["why"]["mu"] for r in lines if r["kind"] == "decision" and r["reactor"] == "M0"]
+    np.testing.assert_array_equal(why["mu"], mine)
+    assert why["mu"][-1] > 1.1 * why["mu"][0]
+
+
+def test_rows_on_which_a_supervisor_acted_are_counted(copy):
+    """As its explanation says, 0 or 1 beside the others; a row without it counts as none."""
+    lines = (copy / "journal.jsonl").read_text().splitlines()
+    rows = [json.loads(line) for line in lines]
+    for row in rows:
+        if row["kind"] == "decision" and row["reactor"] == "M1" and row["row"]["time_min"] >= 50:
+            row["why"]["supervised"] = float(100 <= row["row"]["time_min"] < 140)
+    torn = '{"n":99,"kind":"decision","reactor":"M1","ro'
+    (copy / "journal.jsonl").write_text("\n".join([*map(json.dumps, rows), torn]).replace(": ", ":").replace(", ", ","))
+    text = sections(copy)
+    assert text.count("A supervisor acted on 0 rows.") == 1
+    assert text.count("A supervisor acted on 40 rows, minute 100 to 139.") == 1
+
+
+def test_what_the_interlock_did_stands_beside_it(copy):
+    summary = json.loads((copy / "summary.json").read_text())
+    summary["reactors"]["M0"] |= {
+        "interlock": 7, "reasons": {"stale": {"rows": 7, "first_min": 31.0, "last_min": 40.0}},
+    }  # fmt: skip
+    (copy / "summary.json").write_text(json.dumps(summary))
+    rows = summary["reactors"]["M0"]["rows"]
+    assert f"The interlock spoke in 7 of {rows} rows: stale in 7 rows, minute 31 to 40." in sections(copy)
+
+
+def test_a_short_run_is_not_judged(tmp_path):
+    run_folder = deployed(tmp_path / "run", "controller=pi", "scenario.minutes=[8,8,8]")
+    assert "Too short to tell: " in sections(run_folder)
+
+
+def test_a_recording_that_cannot_be_compared_says_why(copy):
+    path = copy / "recordings" / "M1.csv"
+    path.write_text("\n".join(path.read_text().splitlines()[:5]) + "\n")
+    text = sections(copy)
+    assert text.count("Not compared: ") == 1
+    assert text.count("Recalibrate: ") == 1
+
+
+def test_the_model_is_the_runs(copy, tmp_path):
+    config = (copy / "config.yaml").read_text()
+    assert believed(copy).source == "nominal"
+    fitted = tmp_path / "calibrated.yaml"
+    fitted.write_text("mu: 0.02\ntau: 0.4\n")
+    (copy / "config.yaml").write_text(config.replace("env_file: null", f"env_file: {fitted}"))
+    assert (believed(copy).mu, believed(copy).tau, believed(copy).source) == (0.02, 0.4, f"env_file {fitted}")
+    fitted.unlink()
+    assert believed(copy).mu == 0.03
+    assert "cannot be read any more" in believed(copy).source
+    own = inverse_policy()
+    policies.save(copy / "policy.npz", replace(own, metadata={**own.metadata, "model": {"mu": 0.025, "tau": 0.3}}))
+    assert believed(copy).mu == 0.03  # another controller's run has nothing from it
+    (copy / "config.yaml").write_text(config.replace("kind: inverse", "kind: dqn"))
+    assert (believed(copy).mu, believed(copy).source) == (0.025, "the policy's training model")
+    policies.save(copy / "policy.npz", own)
+    assert believed(copy).source == "nominal"
+    (copy / "policy.npz").write_bytes(b"torn")
+    assert believed(copy).source == "nominal"
+
+
+def test_other_runs_have_no_such_section(tmp_path):
+    (tmp_path / "summary.json").write_text('{"mu": 0.03}')
+    assert "Predicted and measured" not in sections(tmp_path)
+
+
+def test_a_folder_of_runs_names_the_deployment(drifting, tmp_path):
+    (tmp_path / "1_calibrate").mkdir()
+    (tmp_path / "1_calibrate" / "summary.json").write_text('{"mu": 0.03}')
+    shutil.copytree(drifting, tmp_path / "3_deploy")
+    text = sections(tmp_path)
+    assert "Deploy: predicted and measured" in text
+    assert "Calibrate: predicted" not in text
+    assert (tmp_path / "tables" / "3_deploy_after_M0.csv").is_file()
