@@ -3,13 +3,12 @@
 __all__ = ["REMOVED", "RENAMED"]
 
 RENAMED: dict[str, str] = {  # old dotted key, or group=option, or key=choice -> the new one
+    "policy": "policies.dqn",  # of a benchmark
     "agent.action_smoothness": "agent.output_basis_decay",
     "agent.relabel": "agent.hindsight_share",
     "agent.relabel_near": "agent.hindsight_near",
     "agent.relabel_width": "agent.hindsight_width",
-    "controller=inverse": "controller=adaptive_inverse",
-    "controller_kind=inverse": "controller_kind=adaptive_inverse",
-    "controllers.inverse": "controllers.adaptive_inverse",
+    "controller_kind=adaptive_inverse": "controller_kind=inverse",
     "backend.guard": "backend.overflow_pump",
     "backend.guard.duty": "backend.overflow_pump.duty",
     "backend.guard.flow_ml_s": "backend.overflow_pump.flow_ml_s",

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,13 @@ import numpy as np
 from omegaconf import DictConfig
 
 from dqn import policy as policies
-from dqn.policy import Policy
+from envs.plant.plant import PlantConfig
+from experiments.certification import certificate
 from experiments.cli import files, frame
-from experiments.comparison.config import BenchmarkConfig
-from experiments.comparison.trials import Loops, Trial, cells
-from experiments.control.policies import load_policy
+from experiments.comparison.config import TWIN, BenchmarkConfig
+from experiments.comparison.trials import Followed, Loops, Trial, cells
+from experiments.control.plant_file import read_plant_file
+from experiments.control.policies import find_policy, load_policy
 from experiments.controllers import registry
 from experiments.training.config import TrainConfig
 
@@ -23,26 +25,27 @@ log = logging.getLogger(__name__)
 
 def learned(
     config: BenchmarkConfig, wanted: set[str], folder: Path
-) -> tuple[dict[str, Policy], dict[str, Any], list[dict[str, str]]]:
+) -> tuple[dict[str, Followed], dict[str, Any], list[dict[str, str]]]:
     """Policies of the learned controllers, where each comes from, and the figures of those trained here."""
     from experiments.training.run import train  # torch, only where agents are trained
 
-    found: dict[str, Policy] = {}
+    found: dict[str, Followed] = {}
     agents: dict[str, Any] = {}
     figures = []
-    if config.policy is not None and "dqn" in wanted:
-        found["dqn"] = load_policy(config.policy, config.env.control_min, config.env.max_pump_rate)
-        agents["dqn"] = {"policy": config.policy, "regret_pct": found["dqn"].metadata.get("regret_pct")}
+    for name in sorted(wanted):
+        if name in config.policies or name not in config.agents:
+            where = config.policies.get(name, "shipped")
+            policy = load_policy(where, config.env.control_min, config.env.max_pump_rate)
+            found[name] = policy, certificate.bounds(policy, find_policy(where))
+            agents[name] = {"policy": where, "regret_pct": policy.metadata.get("regret_pct")}
     for name in sorted(wanted - set(found)):
-        if name not in config.agents:
-            raise frame.UserError(f"controller {name}: learned, and agents holds only {', '.join(config.agents)}")
         log.info("training %s: %d seeds", name, config.train_seeds)
         run = folder / "training" / name
         run.mkdir(parents=True)
         setup = TrainConfig(env=config.env, agent=config.agents[name], seed=config.seed, n_agents=config.train_seeds)
         frame.save_config(setup, run)
         train(setup, run)
-        found[name] = policies.load(run / "policy.npz")
+        found[name] = policies.load(run / "policy.npz"), None
         summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
         keys = ("seeds", "env_steps", "updates", "regret_pct", "steady_abs_error", "policy_seed", "config_hash")
         agents[name] = {"policy": f"training/{name}/policy.npz", **{key: summary[key] for key in keys}}
@@ -68,12 +71,45 @@ def _store(trials: list[Trial], folder: Path) -> None:
     np.savez_compressed(folder / "trajectories.npz", **arrays)
 
 
+def with_twin(config: BenchmarkConfig) -> BenchmarkConfig:
+    """With the plant of `plant_file`: its vials begin anywhere in the recording, at the OD of all other plants.
+
+    Raises: frame.UserError.
+    """
+    if config.plant_file is None:
+        return config
+    twin = read_plant_file(config.plant_file)
+    last = max((*twin.growth.knots_min, *twin.pump.knots_min), default=0.0)
+    twin = replace(twin, start_spread_min=max(last - twin.start_min, 0.0), start_od=PlantConfig().start_od)
+    return replace(config, plants={**config.plants, TWIN: twin})
+
+
+def with_seeds(config: BenchmarkConfig) -> BenchmarkConfig:
+    """With a controller of its own for each seed where `policies` names several. Raises: frame.UserError."""
+    for name, where in config.policies.items():
+        if name not in config.controllers or config.controllers[name].kind != "dqn":
+            known = [n for n, c in config.controllers.items() if c.kind == "dqn"]
+            raise frame.UserError(f"policies.{name}: no learned controller; allowed {', '.join(known)}")
+        seeds = {f"{name}_{path.stem}": path for path in sorted(Path(where).glob("seed*.npz"))}
+        if not seeds:
+            continue
+        given = {n: w for n, w in config.policies.items() if n != name} | {n: str(path) for n, path in seeds.items()}
+        laws = config.controllers | {n: config.controllers[name] for n in seeds}
+        studies = {
+            key: replace(s, controllers=tuple(n for c in s.controllers for n in (seeds if c == name else (c,))))
+            for key, s in config.studies.items()
+        }
+        config = replace(config, policies=given, controllers=laws, studies=studies)
+    return config
+
+
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     """Calibrate, train, run every closed loop, compare, draw, report."""
     from experiments.comparison import page as pages
     from experiments.comparison import studies
     from experiments.reporting import charts, page
 
+    config = with_seeds(with_twin(config))
     wanted = cells(config)
     if not (wanted or config.training or config.calibration):
         raise frame.UserError("nothing to run: choose a recipe, e.g. +experiment=paper or +experiment=setpoint_steps")

@@ -76,13 +76,15 @@ def _watch(config: DegradationConfig, name: str) -> list[dict[str, float | str]]
     import torch
 
     from experiments.training import build
-    from experiments.training.evaluation import Evaluation, selection_grid
+    from experiments.training.density import Density
+    from experiments.training.evaluation import Evaluation
 
     agent = variant(config.agent, name, config.trained[name])
-    agents = build.population(config.env, agent, range(config.seed, config.seed + config.n_agents))
-    selection = Evaluation(config.env, selection_grid(config.env))
+    task = Density(config.env)
+    agents = build.population(task, agent, range(config.seed, config.seed + config.n_agents))
+    selection = Evaluation(task, task.selection_grid())
     optimum = solve(config.env, agent.gamma)
-    od, setpoint = selection_grid(config.env)
+    od, setpoint = task.selection_grid()
     value = optimal_q(optimum, od, np.searchsorted(optimum.setpoints, setpoint - 1e-9)).max(-1)
     rows: list[dict[str, float | str]] = []
     observation = torch.from_numpy(np.stack([od, setpoint], -1).astype(np.float32)).expand(config.n_agents, -1, -1)
@@ -130,11 +132,13 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
     from dqn.agent import STREAMS, DQNAgent
     from dqn.replay import Transition
     from experiments.training import build
-    from experiments.training.evaluation import Evaluation, report_grid
+    from experiments.training.density import Density
+    from experiments.training.evaluation import Evaluation
 
     agent = variant(config.agent, name, config.fitted[name])
     seeds = range(config.seed, config.seed + config.n_agents)
-    relabel = build.hindsight(config.env, agent)
+    task = Density(config.env)
+    relabel = task.hindsight(agent)
     learner = DQNAgent(agent, 2, config.env.n_actions, build.streams(seeds, STREAMS), relabel)
     unit = solve(replace(config.env, start_od=(0.04, 3.9)), agent.gamma, setpoints=np.array([0.5]), grid=9001)
     numbers = [np.random.default_rng(seed) for seed in seeds]
@@ -145,11 +149,12 @@ def _fit(config: DegradationConfig, name: str) -> dict[str, Any]:
         u = np.stack([rng.random((4, agent.batch_size)) for rng in numbers], axis=1)
         od, action = low + (high - low) * u[0], (u[1] * config.env.n_actions).astype(np.intp)
         pair = [torch.from_numpy(np.stack([x, zero], -1).astype(np.float32)) for x in (od, od * unit.factors[action])]
-        batch = Transition(pair[0], torch.from_numpy(action), zero, pair[1], zero)
-        batch = relabel(batch, torch.from_numpy(np.stack([u[2], u[3]], -1)))
+        batch = Transition(pair[0], torch.from_numpy(action), torch.empty(shape), pair[1], zero)
+        relabel.replace(batch, relabel.drawn(torch.from_numpy(np.stack([u[2], u[3]], -1))))
         target = _exact(unit, od, batch.s_t[..., 1].double().numpy(), action, agent.action_gap)
-        learner.fit(batch.s_tm1, batch.a_tm1, torch.from_numpy(target * agent.reward_scale).float())
-    report = Evaluation(config.env, report_grid(config.env))
+        features = learner.online.features(batch.s_tm1)
+        learner.fit(features, batch.a_tm1, torch.from_numpy(target * agent.reward_scale).float())
+    report = Evaluation(task, task.report_grid())
     score = report(build.act_with(learner.online, learner.online.flat), config.n_agents)
     log.info("%s, fitted to Q*: regret %.2f %% (worst %.2f)", name, np.median(score.regret_pct), score.regret_pct.max())
     return {"regret_pct": score.regret_pct, "steady_abs_error": score.steady_abs_error}

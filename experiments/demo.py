@@ -21,7 +21,7 @@ def commands(folder: Path) -> list[list[str]]:
     policy = folder / "2_train" / "policy.npz"
     steps = [
         ["calibrate", f"hydra.run.dir={folder / '1_calibrate'}"],
-        ["train", f"env_file={calibrated}", f"hydra.run.dir={folder / '2_train'}"],
+        ["train", f"env_file={calibrated}", "stop_within=1", f"hydra.run.dir={folder / '2_train'}"],
         ["deploy", f"policy={policy}", f"env_file={calibrated}", f"hydra.run.dir={folder / '3_deploy'}"],
         ["report", f"run={folder}", f"hydra.run.dir={folder / '4_report'}"],
     ]

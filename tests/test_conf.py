@@ -15,10 +15,12 @@ from conf.renamed import REMOVED, RENAMED
 from conf.schema import build, entries
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
+from envs.relative import RelativeConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame, reference
 from experiments.control.config import deploy_schema
+from experiments.train import main
 from experiments.training.config import TrainConfig, read_env_file, variant
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.link.transport import TransportConfig
@@ -33,7 +35,7 @@ def options(group: str) -> list[str]:
 
 
 def load_train(*overrides: str) -> TrainConfig:
-    return frame.load(frame.compose("train", overrides), TrainConfig())
+    return main.config(overrides)
 
 
 def load_deploy(*overrides: str):
@@ -48,14 +50,16 @@ def test_both_forms_of_choosing_an_environment(form):
 
 @pytest.mark.parametrize("option", options("env"))
 def test_every_environment_composes(option):
-    assert load_train(f"env={option}").env.mu > 0
+    env = load_train(f"env={option}").env
+    assert type(env).__name__ == {"sim": "EnvConfig", "relative": "RelativeConfig"}[option]
 
 
 @pytest.mark.parametrize("option", options("agent"))
 def test_every_agent_composes(option):
     agent = load_train(f"agent={option}").agent
     assert tuple(agent.hidden) == (64, 64)
-    assert (agent.gamma, agent.learning_rate, agent.total_steps) == (0.99, 1e-3, 10_000)
+    papers = (0.0, 5e-4, 15_000) if option == "relative" else (0.99, 1e-3, 10_000)
+    assert (agent.gamma, agent.learning_rate, agent.total_steps) == papers
 
 
 def test_the_papers_agent_adds_nothing_to_a_plain_dqn():
@@ -120,7 +124,9 @@ def test_a_preset_holds_only_what_differs_from_the_dataclass(name):
     group = name.rpartition("/")[0]
     own = yaml.safe_load((CONF / f"{name}.yaml").read_text()) or {}
     own.pop("defaults", None)
-    if name in STATED:
+    if name == "env/relative":
+        assert own == {"kind": RelativeConfig().kind}
+    elif name in STATED:
         assert build(STATED[name], own) == STATED[name]
     else:
         assert repeated(own, ROOTS[group]()) == []
@@ -336,7 +342,7 @@ def test_help_lists_what_the_command_takes_and_every_option_of_it_composes(name,
             "+experiment=smoke",
             "experiment=smoke: a recipe of train; python -m experiments.train +experiment=s",
         ),
-        ("train", "+experiment=nope", "experiment=nope: no such option; allowed: smoke"),
+        ("train", "+experiment=nope", "experiment=nope: no such option; allowed: shipped, smoke"),
         ("train", "plant=bench", "plant=bench: train takes env, agent, experiment; plant= is for deploy"),
         ("benchmark", "plant=bench", "plant=bench: benchmark takes env, experiment; plant= is for deploy"),
         ("speed", "agent=tuned", "agent=tuned: speed takes no group; agent= is for ablate, degradation, train"),

@@ -57,7 +57,8 @@ def _choose(command: str, group: str, option: str) -> None:
     known = presets.groups()[group]
     of = presets.owner(f"{group}/{option}") if option in known else None
     if of not in (None, command):
-        raise UserError(f"{given}: a recipe of {of}; python -m experiments.{of} +{given}")
+        what = "recipe" if group == "experiment" else "preset"
+        raise UserError(f"{given}: a {what} of {of}; python -m experiments.{of} +{given}")
     if group not in own:
         others = [name for name in presets.commands() if group in presets.chosen(name)]
         takes = ", ".join(own) or "no group"

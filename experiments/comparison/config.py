@@ -3,13 +3,15 @@
 from dataclasses import dataclass
 from typing import Any
 
-from conf.schema import check, part, setting
+from conf.schema import check, part, require, setting
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 
-__all__ = ["BenchmarkConfig", "StudyConfig"]
+__all__ = ["TWIN", "BenchmarkConfig", "StudyConfig"]
+
+TWIN = "twin"  # the plant of a plant_file
 
 
 @dataclass(frozen=True)
@@ -39,10 +41,18 @@ class BenchmarkConfig:
     workers: int = setting(
         0, "processes for the closed loops; 0: one per core, 1: this one only. No effect on results", within=(0, 256)
     )
-    policy: str | None = setting(None, "a policy.npz or a training's run folder for `dqn`, in place of training here")
+    policies: dict[str, str] = setting(
+        {},
+        "policies of learned controllers by name, in place of training: a policy.npz, a run folder, `shipped`, or "
+        "a folder policies/ of a training, each of whose seeds is a row; without one, a controller that no agent is "
+        "named after follows `shipped`",
+    )
     calibration: bool = setting(False, "simulate the open-loop protocol and fit it (Fig. 2a)")
     training: bool = setting(False, "train all agents even if no study needs them (Fig. 2b)")
     plants: dict[str, PlantConfig] = setting({}, "plants by name")
+    plant_file: str | None = setting(
+        None, "a twin.yaml of calibrate, as plant `twin`; each vial begins at an hour of its own, drawn over its knots"
+    )
     scenarios: dict[str, Scenario] = setting({}, "scenarios by name")
     controllers: dict[str, Any] = setting({}, "controllers by name")
     studies: dict[str, StudyConfig] = setting({}, "what is compared, by name; the recipes of experiment/ fill it")
@@ -51,7 +61,12 @@ class BenchmarkConfig:
         check(self)
         for name, study in self.studies.items():
             for key in ("scenarios", "plants", "controllers"):
-                known = getattr(self, key)
+                known = [*getattr(self, key)]
+                if key == "plants":
+                    known += [TWIN if self.plant_file else f"{TWIN} (with plant_file=FILE)"]
                 for given in getattr(study, key):
                     if given not in known:
                         raise ValueError(f"studies.{name}.{key}: {given} is none of {', '.join(known)}")
+        met = any(TWIN in study.plants for study in self.studies.values())
+        wanted = f"null, or a study on it, as studies.NAME.plants=[nominal,{TWIN}]"
+        require(met or self.plant_file is None, "plant_file", self.plant_file, wanted)

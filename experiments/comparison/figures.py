@@ -26,6 +26,8 @@ NOISELESS = 1e-5  # scores below are those of a plant without noise
 MARKS = {
     "dqn": (COLOURS[0], "o"),
     "dqn_paper": (COLOURS[4], "o"),
+    "dqn_adaptive": ("#003f6b", "h"),
+    "inverse": ("#8c3f73", "D"),
     "pi": (COLOURS[1], "s"),
     "mpc": (COLOURS[2], "^"),
     "pi_tuned": (COLOURS[5], "s"),

@@ -237,6 +237,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
     for against, heading in (
         ("oracle", "Distance from the oracle"),
         ("dqn", "Paired difference to the learned policy"),
+        ("dqn_adaptive", "Paired difference to the adaptive policy"),
     ):
         for metric in METRICS:
             chosen = [p for p in pairs if p["against"] == against and p["metric"] == metric]
@@ -251,6 +252,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
                 )
                 out.table(table, folded=f"{heading}, {metric.upper()}: {scenario}")
     extra = (
+        ("itae_median", "ITAE of the measured OD (OD min²), sum over the windows, median over vials", True),
         ("clean_itae", "ITAE of the noise-free OD (OD min²), sum over the windows", True),
         ("clean_steady_abs_error", "Steady error of the noise-free OD", True),
         ("effort_ul_s", "Control effort (µL/s per minute)", False),

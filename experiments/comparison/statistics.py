@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binom
 from scipy.stats import t as student
 
 from experiments.comparison.trials import Trial, Window, windows
@@ -17,7 +18,7 @@ NEGLIGIBLE = 1e-6  # a difference is not stated in percent of a mean below this
 
 
 class Spread:
-    """Mean, standard deviation and Student's 95 % interval of the mean over replicates; nan are left out.
+    """Mean, median and standard deviation over replicates, 95 % intervals of mean (Student's) and median; nan left out.
 
     With one replicate there is no deviation and no interval (nan).
     """
@@ -27,7 +28,9 @@ class Spread:
         finite = finite[np.isfinite(finite)]
         self.n = int(finite.size)
         self.mean = float(finite.mean()) if self.n else float("nan")
+        self.median = float(np.median(finite)) if self.n else float("nan")
         self.sd = float(finite.std(ddof=1)) if self.n > 1 else float("nan")
+        self.median_ci95 = _around_median(np.sort(finite))
         half = float(student.ppf(0.975, self.n - 1)) * self.sd / self.n**0.5 if self.n > 1 else float("nan")
         self.ci95 = [self.mean - half, self.mean + half]
 
@@ -36,6 +39,13 @@ class Spread:
         """-1 or 1 where the interval excludes zero, else 0. Without any spread the sign of the mean counts."""
         low, high = self.ci95
         return -1 if high < 0.0 else 1 if low > 0.0 else 0
+
+
+def _around_median(ordered: Array) -> list[float]:
+    """95 % interval of the median whatever the distribution: order statistics, by the binomial of a sign test."""
+    n = ordered.size
+    below = int(binom.ppf(0.025, n, 0.5)) if n else 0
+    return [float(ordered[below - 1]), float(ordered[n - below])] if below else [float("nan")] * 2
 
 
 def _median_or_never(settling: Array) -> float:
@@ -60,6 +70,8 @@ def row(trial: Trial, window: Window) -> dict[str, Any]:
         "ise_sd": ise.sd,
         "itae_mean": itae.mean,
         "itae_sd": itae.sd,
+        "ise_median": ise.median,
+        "itae_median": itae.median,
         "ise_ci95": ise.ci95,
         "itae_ci95": itae.ci95,
         "settling_min": _median_or_never(score.settling_min),
@@ -88,6 +100,7 @@ def details(trials: Sequence[Trial]) -> list[dict[str, Any]]:
                     "itae_per_window": Spread(measured.itae_mean).mean,
                     "clean_ise": Spread(clean.ise).mean,
                     "clean_itae": Spread(clean.itae).mean,
+                    "clean_abs_error": Spread(clean.abs_error).mean,
                     "floor_ise": Spread(floor.ise).mean,
                     "floor_itae": Spread(floor.itae).mean,
                     "effort_ul_s": Spread(trial.effort(window)).mean,
@@ -112,6 +125,7 @@ def totals(trials: Sequence[Trial]) -> list[dict[str, Any]]:
         for metric in METRICS:
             value = Spread(_total(trial, metric))
             entry |= {f"{metric}_mean": value.mean, f"{metric}_sd": value.sd, f"{metric}_ci95": value.ci95}
+            entry[f"{metric}_median"] = value.median
             entry[f"clean_{metric}"] = Spread(_total(trial, metric, "score_clean")).mean
             entry[f"floor_{metric}"] = Spread(_total(trial, metric, "score_floor")).mean
         parts = windows(trial.schedule)
@@ -137,6 +151,8 @@ def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, their
         "n": found.n,
         "difference": found.mean,
         "ci95": found.ci95,
+        "median": found.median,
+        "median_ci95": found.median_ci95,
         "percent": 100.0 * found.mean / mean if mean > NEGLIGIBLE else float("nan"),
         "verdict": ("lower", "no difference shown", "higher")[found.sign + 1],
     }

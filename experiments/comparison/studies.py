@@ -83,14 +83,15 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) 
             f"{config.replicates}. Red: what the sensor's noise alone would score on a culture exactly on the "
             "setpoint. `hold` is off the scale and left out.",
         )
-        against = [e for e in summary["paired_totals"] if e["scenario"] == scenario and e["against"] == "dqn"]
+        learned = "dqn_adaptive" if any(e["controller"] == "dqn_adaptive" for e in totals) else "dqn"
+        against = [e for e in summary["paired_totals"] if e["scenario"] == scenario and e["against"] == learned]
         if against:
             yield Drawing(
                 f"differences_{scenario}",
-                figures.differences(against, "dqn"),
-                f"Difference to the learned policy, {scenario}",
+                figures.differences(against, learned),
+                f"Difference to {learned}, {scenario}",
                 f"Paired over {config.replicates} replicates with the same vials, pumps and noise: mean and 95 % "
-                "interval, in % of the learned policy's mean. Left of zero: better than the learned policy. "
+                f"interval, in % of {learned}'s mean. Left of zero: better than {learned}. "
                 "`hold` is off the scale and left out.",
             )
 
@@ -133,7 +134,7 @@ def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
     plants, controllers = list(config.plants), list(config.controllers)
     ordered = sorted(trials, key=lambda t: (plants.index(t.plant), controllers.index(t.controller)))
     names = {t.controller for t in trials}
-    against = [name for name in ("dqn", "oracle") if name in names]
+    against = [name for name in ("dqn", "dqn_adaptive", "oracle") if name in names]
     rows = statistics.rows(trials)
     return {
         "rows": rows,

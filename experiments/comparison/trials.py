@@ -22,6 +22,7 @@ from dqn.policy import Policy
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
+from experiments.certification.bounds import EstimateBounds
 from experiments.cli.stop import Workers
 from experiments.comparison.config import BenchmarkConfig
 from experiments.control.loop import ClosedLoop
@@ -32,7 +33,7 @@ from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 
-__all__ = ["Cell", "Loops", "Trial", "Window", "cells", "run_cell", "run_trial", "windows"]
+__all__ = ["Cell", "Followed", "Loops", "Trial", "Window", "cells", "run_cell", "run_trial", "windows"]
 
 log = logging.getLogger(__name__)
 
@@ -167,12 +168,17 @@ def cells(config: BenchmarkConfig) -> list[Cell]:
     return list(wanted)
 
 
-def run_cell(config: BenchmarkConfig, cell: Cell, policy: Policy | None) -> Trial:
+Followed = tuple[Policy, EstimateBounds | None]
+"""A policy, and within which errors of its estimator its certificate lets it act."""
+
+
+def run_cell(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Trial:
     """One closed loop of a benchmark; all it needs is in its arguments, so it is the same in any process."""
     name, plant, scenario = cell
+    policy, bounds = followed or (None, None)
 
     def make(vials: Plant) -> Controller:
-        return registry.build(config.controllers[name], config.env, policy, vials)
+        return registry.build(config.controllers[name], config.env, policy, vials, bounds=bounds)
 
     return run_trial(
         cell, config.plants[plant], config.scenarios[scenario], make, config.env, config.replicates, config.seed
@@ -188,22 +194,22 @@ class Loops:
 
     def __init__(self, config: BenchmarkConfig) -> None:
         self.config = config
-        self._waiting: dict[Cell, Policy | None] = {}
+        self._waiting: dict[Cell, Followed | None] = {}
         self._running: dict[Future[Trial], Cell] = {}
         self._pool = Workers(config.workers) if config.workers != 1 else None
 
-    def start(self, cells: Sequence[Cell], policy: Policy | None = None) -> None:
-        """Queue cells that all follow `policy`, or none."""
+    def start(self, cells: Sequence[Cell], followed: Followed | None = None) -> None:
+        """Queue cells that all follow one policy, or none."""
         for cell in cells:
             if self._pool is None:
-                self._waiting[cell] = policy
+                self._waiting[cell] = followed
             else:
-                self._running[self._pool.submit(run_cell, self.config, cell, policy)] = cell
+                self._running[self._pool.submit(run_cell, self.config, cell, followed)] = cell
 
     def _finished(self) -> Iterator[tuple[Cell, Trial]]:
         """Every cell with its trial, as they come."""
-        for cell, policy in self._waiting.items():
-            yield cell, run_cell(self.config, cell, policy)
+        for cell, followed in self._waiting.items():
+            yield cell, run_cell(self.config, cell, followed)
         for future in as_completed(self._running):
             yield self._running[future], future.result()
 

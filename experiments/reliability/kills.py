@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from conf.schema import check, require, setting
-from experiments.controllers.registry import STANDALONE
+from experiments.controllers.registry import ON_DEVICE
 from experiments.reliability.audit import Served, audit_doses, rows_per_sample
 from experiments.reliability.tracking import reachable
 from hardware.emulator.process import EmulatorProcess
@@ -55,7 +55,7 @@ class KillConfig:
     )
     early: float = setting(0.2, "share of kills that may fall into the start itself", within=(0, 1))
     reactors: tuple[str, ...] = setting(("M0", "M1", "M2"), "of the runs")
-    controller_kind: str = setting("adaptive_inverse", "what decides the pump rate", choices=STANDALONE)
+    controller_kind: str = setting("dqn", "what decides the pump rate; dqn is the policy that ships", choices=ON_DEVICE)
     overrides: tuple[str, ...] = setting((), "further words of the deploy command, e.g. safety.cooldown=10")
     seed: int = setting(0, "of kill moments and emulators", at_least=0)
 

@@ -74,7 +74,7 @@ def rehearsed(
     names: Sequence[str],
     scenario: Scenario,
     safety: SafetyConfig | None = None,
-    controller: str = "adaptive_inverse",
+    controller: str = "dqn",
     overflow_pump: OverflowPumpConfig | None = None,
 ) -> DeployConfig:
     """The config of a run that is to be rehearsed: reactors at `names`, all with one scenario."""

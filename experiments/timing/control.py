@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from dqn.policy import Policy
+from dqn.policy import ABSOLUTE, Policy
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
@@ -44,7 +44,7 @@ def loops() -> Iterator[Measurement]:
             loop(config, 1, int(seed))
 
     what = f"{REPLICATES} vials x 90 min after recovery"
-    for kind in ("pi", "dqn", "adaptive_inverse"):
+    for kind in ("pi", "dqn", "inverse"):
         chosen = registry.config(kind)
         yield Measurement(f"closed loop, {kind}", what, "as many vials one after another",
                           partial(loop, chosen, REPLICATES, 0), partial(one_by_one, chosen), limit=1.0)  # fmt: skip
@@ -61,7 +61,9 @@ def _untrained_policy(model: EnvConfig) -> Policy:
     sizes = (2, 64, 64, model.n_actions)
     weights = tuple(rng.normal(0.0, 0.3, (a, b)).astype(np.float32) for a, b in pairwise(sizes))
     biases = tuple(np.zeros(b, dtype=np.float32) for b in sizes[1:])
-    return Policy(weights, biases, np.eye(2, dtype=np.float32), np.zeros(2, np.float32), model.pump_rates(), {})
+    unit, limit = np.eye(2, dtype=np.float32), np.full(2, np.inf, dtype=np.float32)
+    metadata = {"observation": list(ABSOLUTE)}
+    return Policy(weights, biases, unit, np.zeros(2, np.float32), model.pump_rates(), -limit, limit, metadata)
 
 
 def mpc() -> Iterator[Measurement]:

@@ -36,9 +36,10 @@ def _one_thread(work: Callable[[], object], times: int = 1) -> None:
 def _train(agents: int, config: DQNConfig) -> None:
     """The schedule from scratch, no evaluation, no files: what the rivals do, too."""
     from experiments.training import build
+    from experiments.training.density import Density
 
     def run() -> None:
-        for _ in build.population(EnvConfig(), config, range(agents)).run():
+        for _ in build.population(Density(EnvConfig()), config, range(agents)).run():
             pass
 
     _one_thread(run)
@@ -105,13 +106,18 @@ def update() -> Iterator[Measurement]:
 
 
 def _warm_update(agents: int, config: DQNConfig) -> Callable[[], None]:
-    """The update of one group of agents whose replay memory is full."""
-    from experiments.training import build
+    """The update of one group of agents whose replay memory is full, as a population's thread makes it."""
+    import torch
 
-    trainer = build.trainer(EnvConfig(), replace(config, learn_start=config.total_steps), range(agents))
+    from dqn.population import fast_arithmetic
+    from experiments.training import build
+    from experiments.training.density import Density
+
+    trainer = build.trainer(Density(EnvConfig()), replace(config, learn_start=config.total_steps), range(agents))
     for _ in trainer.run():
         pass
-    return trainer.agent.learn
+    fast_arithmetic()
+    return torch.inference_mode()(trainer.agent.learn)
 
 
 def environment() -> Iterator[Measurement]:

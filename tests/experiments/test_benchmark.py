@@ -13,8 +13,9 @@ import pytest
 from scipy import stats
 
 from dqn import policy as policies
+from envs.plant.plant import Plant
 from envs.scenario import Scenario
-from experiments.benchmark import _schema
+from experiments.benchmark import _schema, with_seeds
 from experiments.cli import frame
 from experiments.comparison import statistics as comparison
 from experiments.comparison.config import BenchmarkConfig
@@ -28,7 +29,7 @@ EVERY = ("dqn", "pi", "pi_tuned", "mpc", "adaptive_inverse", "threshold", "hold"
 FEEDBACK = ("dqn", "pi_tuned", "mpc", "adaptive_inverse")
 ROW_KEYS = {
     "controller", "plant", "scenario", "window", "setpoint", "n", "ise_mean", "ise_sd", "itae_mean", "itae_sd",
-    "ise_ci95", "itae_ci95", "settling_min", "steady_abs_error", "media_ml",
+    "ise_median", "itae_median", "ise_ci95", "itae_ci95", "settling_min", "steady_abs_error", "media_ml",
 }  # fmt: skip
 
 
@@ -177,6 +178,7 @@ def test_rows_by_hand():
     assert set(row) == ROW_KEYS
     assert row["n"] == 3
     assert row["ise_mean"] == pytest.approx(np.mean(2 * offset**2))
+    assert row["itae_median"] == pytest.approx(2 * 0.02)
     assert row["itae_sd"] == pytest.approx(np.std(2 * offset, ddof=1))
     interval = stats.t.interval(0.95, 2, np.mean(2 * offset), stats.sem(2 * offset))
     assert row["itae_ci95"] == pytest.approx(interval)
@@ -203,6 +205,54 @@ def test_pairs_by_hand():
     assert found["c", "itae"]["ci95"][0] < 0 < found["c", "itae"]["ci95"][1]
 
 
+@pytest.mark.parametrize(("n", "low", "high"), [(10, 2, 9), (25, 8, 18), (64, 24, 41)])
+def test_the_interval_of_a_median_is_that_of_the_sign_test(n, low, high):
+    """Ranks of order statistics as tables print them (Conover 1999, Table A3), whatever the values are."""
+    values = np.random.default_rng(n).permutation(np.arange(1.0, n + 1.0) ** 3)
+    assert comparison.Spread(values).median_ci95 == [low**3, high**3]
+    outlier = np.where(values == n**3, 1e9, values)
+    assert comparison.Spread(outlier).median_ci95 == [low**3, high**3]
+    assert np.isnan(comparison.Spread(values[:5]).median_ci95).all()  # five values have no such interval
+
+
+def test_each_seed_of_a_folder_of_policies_is_a_row(tmp_path):
+    for seed in (0, 3):
+        policies.save(tmp_path / f"seed{seed:04d}.npz", inverse_policy())
+    asked = load("+experiment=robust", f"policies.dqn_adaptive={tmp_path}")
+    wide = with_seeds(asked)
+    names = [f"dqn_adaptive_seed{seed:04d}" for seed in (0, 3)]
+    assert [c for c in wide.studies["robust"].controllers if "adaptive_seed" in c] == names
+    assert "dqn_adaptive" not in wide.studies["robust"].controllers
+    assert [wide.policies[name] for name in names] == [str(tmp_path / f"seed{seed:04d}.npz") for seed in (0, 3)]
+    with pytest.raises(frame.UserError, match=r"policies.pi: no learned controller; allowed dqn, dqn_paper, dqn_adap"):
+        with_seeds(load("+experiment=robust", f"policies.pi={tmp_path}"))
+
+
+def test_a_sensor_that_shifts_and_a_pump_and_a_culture_that_change_do_so_at_their_minute():
+    """On `bench` and its three upsets: alike up to minute 20, then what the preset says and nothing else."""
+    plants = load("+experiment=robust").plants
+    names = ("bench", "upset_growth", "upset_pump", "upset_sensor")
+    vials = [Plant(plants[name], 3, np.random.default_rng(0)) for name in names]
+    for minute in range(20):
+        apparent = np.array([v.apparent_od for v in vials])
+        np.testing.assert_allclose(apparent, np.broadcast_to(apparent[0], apparent.shape), rtol=1e-12)
+        for v in vials:
+            v.advance(1.0, np.full(3, 0.5 if minute else 1.0))
+    same, growth, _, sensor = vials
+    np.testing.assert_allclose(sensor.apparent_od - same.apparent_od, 0.04, rtol=1e-9)
+    for v in vials:
+        v.advance(1.0, np.zeros(3))
+    assert (growth.culture.specific_rate(growth.age_min) / same.culture.specific_rate(same.age_min)) == pytest.approx(
+        0.5
+    )
+    before = [v.feed.delivered_ml.copy() for v in vials]
+    for v in vials:
+        v.advance(1.0, np.full(3, 1.0))
+    given = [v.feed.delivered_ml - b for v, b in zip(vials, before, strict=True)]
+    np.testing.assert_allclose(given[2] / given[0], 0.5, rtol=1e-9)
+    np.testing.assert_allclose(given[1], given[0], rtol=1e-12)
+
+
 def test_one_replicate_has_no_interval():
     spread = comparison.Spread(np.array([2.0]))
     assert (spread.n, spread.mean) == (1, 2.0)
@@ -210,7 +260,7 @@ def test_one_replicate_has_no_interval():
     assert spread.sign == 0
 
 
-@pytest.mark.parametrize(("controller", "limit"), [("pi", 1.0), ("dqn", 1.0), ("adaptive_inverse", 1.0), ("mpc", 20.0)])
+@pytest.mark.parametrize(("controller", "limit"), [("pi", 1.0), ("dqn", 1.0), ("inverse", 1.0), ("mpc", 20.0)])
 def test_sixty_four_loops_of_ninety_minutes_are_quick(controller, limit):
     start = time.process_time()
     assert trial(controller, "nominal_noise", "setpoint_steps", 64, seed=5).od.shape == (64, 91)
@@ -226,8 +276,12 @@ def test_paper_is_all_recipes_and_each_loop_runs_once():
     wanted = {cell for name in recipes for cell in cells(load(f"+experiment={name}"))}
     assert set(cells(paper)) == wanted
     assert len(cells(paper)) == len(wanted)
-    # `healthy` is what the emulator runs on by default
-    assert {plant for _, plant, _ in wanted} == {p.stem for p in (ROOT / "conf" / "plant").glob("*.yaml")} - {"healthy"}
+    wanted |= set(cells(load("+experiment=robust")))
+    # `healthy` is what the emulator runs on by default, `mixed` what it is tried on without a calibration
+    assert {plant for _, plant, _ in wanted} == {p.stem for p in (ROOT / "conf" / "plant").glob("*.yaml")} - {
+        "healthy",
+        "mixed",
+    }
 
 
 def test_published_table_is_complete():
@@ -243,11 +297,16 @@ def test_published_table_is_complete():
         (["+experiment=setpoint_steps", "studies.setpoint_steps.plants=[moon]"], ["plants: moon", "nominal, "]),
         (
             ["+experiment=setpoint_steps", "studies.setpoint_steps.controllers=[pid]"],
-            ["controllers: pid", "dqn, dqn_paper, pi"],
+            ["controllers: pid", "dqn, dqn_paper, dqn_adaptive, inverse, pi"],
         ),
         (["plants.bench.growth.mew=1"], ["mew"]),
         (["plants.bench.growth.mu=fast"], ["plants.bench.growth.mu", "fast"]),
         (["controllers.mpc.horizon=0"], ["controller.horizon = 0", "1 to 60"]),
+        (["+experiment=comparison", "studies.comparison.plants=[twin]"], ["twin (with plant_file=FILE)"]),
+        (
+            ["+experiment=comparison", "plant_file=a.yaml"],
+            ["plant_file = a.yaml", "studies.NAME.plants=[nominal,twin]"],
+        ),
         (["+experiment=papers"], ["experiment=papers", "no such option", "paper"]),
     ],
 )
@@ -270,7 +329,7 @@ def test_command_line_twice_gives_the_same_summary(tmp_path):
     policies.save(tmp_path / "policy.npz", inverse_policy())
     texts = []
     for name, seed, workers in (("a", 0, 1), ("b", 0, 2), ("c", 1, 1)):
-        done = run("+experiment=setpoint_steps", f"policy={tmp_path / 'policy.npz'}", f"seed={seed}",
+        done = run("+experiment=setpoint_steps", f"policies.dqn={tmp_path / 'policy.npz'}", f"seed={seed}",
                    f"workers={workers}", "studies.setpoint_steps.controllers=[dqn,pi]",
                    f"hydra.run.dir={tmp_path / name}")  # fmt: skip
         assert done.returncode == 0, done.stderr

@@ -30,7 +30,7 @@ NERVOUS = replace(STUCK, mu_max=0.001, drift=0.01, noise_od=0.0, noise_fraction=
 
 
 def run(
-    fault: Fault | None, safety: SafetyConfig | None = None, controller: str = "adaptive_inverse", moment: str = "dose"
+    fault: Fault | None, safety: SafetyConfig | None = None, controller: str = "inverse", moment: str = "dose"
 ) -> Outcome:
     return FaultCase(fault, moment, rehearsed(("M0", "M1"), SCHEDULE, safety, controller), 3).run()
 

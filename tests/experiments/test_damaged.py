@@ -91,6 +91,17 @@ def of(key: str, value: Any) -> Change:
         (of("fed_ml", [1.0, 2.0]), "saved interlock is for 2 reactors, this run has 1"),
         (of("_latched", [7]), "saved interlock: _latched = [7]: no such code"),
         (of("_hold_kind", [99]), "saved interlock: _hold_kind = [99]: no such code"),
+        (lambda s: s.update(controller="warm"), "controller: warm, expected keys and values"),
+        (lambda s: s.update(controller=None), "controller: None, expected keys and values"),
+        (lambda s: s.update(controller={}), "controller.mean: missing"),
+        (lambda s: s["controller"].update(estimator=[1]), "controller.mean: missing"),
+        (lambda s: s["controller"]["estimator"].pop("cov"), "controller.cov: missing"),
+        (
+            lambda s: s["controller"]["estimator"].update(mean=[[0.0]]),
+            "controller.mean has shape (1, 1), this run needs",
+        ),
+        (lambda s: s["controller"]["estimator"].update(far=[None]), "controller.far: [None], expected numbers"),
+        (lambda s: s["controller"].update(rate=[10**400]), "controller.rate: [1000"),
     ],
 )
 def test_a_state_that_was_damaged(run: Rehearsal, change: str | Change, why: str) -> None:

@@ -55,9 +55,16 @@ def inverse_policy(control_min: float = 1.0) -> policy.Policy:
     w0[:, :n], w0[:, n:] = np.array([[-0.1], [0.1]]), np.array([[0.1], [-0.1]])
     b0 = np.concatenate([rates - 0.01, 0.01 - rates]).astype(np.float32)
     w1 = -np.concatenate([np.eye(n), np.eye(n)]).astype(np.float32)
-    metadata = {"format": 1, "observation": ["od", "setpoint"], "control_min": control_min, "regret_pct": 1.0}
+    metadata = {"format": 2, "observation": ["od", "setpoint"], "control_min": control_min, "regret_pct": 1.0}
     return policy.Policy(
-        (w0, w1), (b0, np.zeros(n, np.float32)), np.eye(2, dtype=np.float32), np.zeros(2, np.float32), rates, metadata
+        (w0, w1),
+        (b0, np.zeros(n, np.float32)),
+        np.eye(2, dtype=np.float32),
+        np.zeros(2, np.float32),
+        rates,
+        np.full(2, -np.inf, np.float32),
+        np.full(2, np.inf, np.float32),
+        metadata,
     )
 
 
@@ -152,7 +159,7 @@ def test_another_control_period_is_refused_with_both_values(tmp_path):
     assert "1.0 min" in done.stderr
 
 
-@pytest.mark.parametrize("kind", [*registry.STANDALONE, "oracle"])
+@pytest.mark.parametrize("kind", registry.KINDS)
 def test_every_controller_runs_and_is_recorded(kind, tmp_path):
     config = DeployConfig(scenario=Scenario((0.3,), (3.0,), (37.0,)), controller=registry.config(kind), fsync=False)
     with closing(Record(tmp_path, config.backend.reactors, config.fsync)) as record:

@@ -23,15 +23,15 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 SPEED = 30.0
 BROKEN = """
 import experiments.deploy
-from experiments.controllers.adaptive_inverse import AdaptiveInverse
-whole = AdaptiveInverse.act
+from experiments.controllers.inverse import Inverse
+whole = Inverse.act
 calls = []
 def act(self, *arguments):
     calls.append(0)
     if len(calls) > 8:
         raise RuntimeError("the controller failed")
     return whole(self, *arguments)
-AdaptiveInverse.act = act
+Inverse.act = act
 experiments.deploy.main()
 """
 

@@ -208,7 +208,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert (tmp_path / "figures" / "fault_matrix.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("override", ["moments=[noon]", "reactors=[M1]", "controller_kind=dqn", "faults=[nonsense]"])
+@pytest.mark.parametrize("override", ["moments=[noon]", "reactors=[M1]", "controller_kind=oracle", "faults=[nonsense]"])
 def test_bad_values_are_named(override: str) -> None:
     with pytest.raises(frame.UserError, match="allowed|nonsense"):
         frame.load(frame.compose("fault_matrix", [override]), FaultMatrixConfig())

@@ -22,14 +22,14 @@ from tests.experiments.test_exits import SPEED, Bench
 LOST = """
 import experiments.deploy
 import numpy as np
-from experiments.controllers.adaptive_inverse import AdaptiveInverse
-whole = AdaptiveInverse.act
+from experiments.controllers.inverse import Inverse
+whole = Inverse.act
 calls = []
 def act(self, *arguments):
     calls.append(0)
     rate = whole(self, *arguments)
     return np.where([len(calls) > 2, False], np.nan, rate)
-AdaptiveInverse.act = act
+Inverse.act = act
 experiments.deploy.main()
 """
 

@@ -16,7 +16,7 @@ def test_half_the_flow_is_told_at_its_beginning_at_its_end_and_in_every_row_betw
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     scenario = Scenario((0.5,), (130.0,), (37.0,))
-    run = Rehearsal(tmp_path, rehearsed(("M0",), scenario), quiet(mu=0.032), od=0.7)
+    run = Rehearsal(tmp_path, rehearsed(("M0",), scenario, controller="threshold"), quiet(mu=0.032), od=0.7)
     inject(run.device, "pump_gain_factor", "M0", 0.5)
     run.begin()
     log_changes = ChangeLog(run.loop)

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from dqn import policy as policies
 from experiments import report
@@ -41,7 +42,7 @@ def benchmark(tmp_path_factory):
     done = subprocess.run(
         [
             sys.executable, "-m", "experiments.benchmark", "+experiment=beyond", "replicates=4", "workers=1",
-            "calibration=true", f"policy={folder / 'policy.npz'}", f"hydra.run.dir={folder / 'run'}",
+            "calibration=true", f"policies.dqn={folder / 'policy.npz'}", f"hydra.run.dir={folder / 'run'}",
             "studies.beyond.plants=[nominal,bench]",
             "studies.beyond.controllers=[dqn,pi,adaptive_inverse,threshold,oracle]",
             "+studies.setpoint_steps={scenarios:[setpoint_steps],plants:[nominal_noise],controllers:[dqn,pi,mpc]}",
@@ -234,6 +235,23 @@ def test_any_run_gets_a_page(tmp_path):
     assert list(csv.reader((run / "tables" / "w.csv").read_text().splitlines())) == [
         ["reactor", "ise", "note"], ["M0", "0.25", "–"], ["M1", "–", "x & y"]
     ]  # fmt: skip
+
+
+def test_a_figure_is_laid_out_once_for_both_of_its_files(tmp_path, monkeypatch):
+    layouts = []
+    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda self, drawn: layouts.append(drawn))
+    drawn = figure()
+    charts.save(drawn, tmp_path, "both")
+    assert layouts == [drawn]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["both.png", "both.svg"]
+
+
+def test_powers_of_ten_are_written_as_numbers(tmp_path):
+    """Episodes that cost 0.2 and 30, regrets of 0.02 and 40 %."""
+    drawn = charts.learning(-np.array([[0.2], [30.0]]), np.array([1.0, 2.0]), np.array([[0.02], [40.0]]), np.ones(1))
+    charts.save(drawn, tmp_path, "learning")
+    texts = re.findall(r">([^<>]+)</text>", (tmp_path / "learning.svg").read_text(encoding="utf-8"))
+    assert {"0.1", "1", "10"} <= set(texts)
 
 
 def test_a_folder_of_runs_gets_one_page(tmp_path):

@@ -37,14 +37,14 @@ def test_pairs_alternate_and_the_first_is_thrown_away():
 
 def test_every_measurement_names_its_rival_and_does_its_work():
     measurements = [m for name in ("controllers", "mpc") for m in GROUPS[name]()]
-    assert {m.name for m in measurements} >= {"closed loop, pi", "closed loop, dqn", "closed loop, adaptive_inverse",
+    assert {m.name for m in measurements} >= {"closed loop, pi", "closed loop, dqn", "closed loop, inverse",
                                               "closed loop, mpc", "mpc solve, single"}  # fmt: skip
     assert all(m.rival for m in measurements)
     limits = {m.name: m.limit for m in measurements if m.name.startswith("closed loop")}
     assert limits == {
         "closed loop, pi": 1.0,
         "closed loop, dqn": 1.0,
-        "closed loop, adaptive_inverse": 1.0,
+        "closed loop, inverse": 1.0,
         "closed loop, mpc": 20.0,
     }
     found = [measure(m, 5) for m in measurements if m.name == "mpc solve, single"]

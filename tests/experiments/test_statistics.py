@@ -81,6 +81,7 @@ def test_details_tell_the_rest() -> None:
         **NAMES, "window": "0.8", "window_min": 20.0,
         "ise_per_window": pytest.approx(means["ise"]), "itae_per_window": pytest.approx(10.0 * means["itae"]),
         "clean_ise": pytest.approx(20.0 * means["clean"]), "clean_itae": pytest.approx(200.0 * 0.105),
+        "clean_abs_error": pytest.approx(0.105),
         "floor_ise": pytest.approx(20.0 * 1e-4), "floor_itae": pytest.approx(2.0), "effort_ul_s": pytest.approx(2.0),
         "settled": 1, "overflowed": 1,
     }  # fmt: skip

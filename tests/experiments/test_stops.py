@@ -163,7 +163,7 @@ def test_a_stopped_ablation_goes_on_in_the_middle_of_a_variant(tmp_path: Path) -
     ("words", "there", "kept"),
     [
         (["degradation", "n_agents=1", "agent.total_steps=100"], "curves.csv", "curves.csv"),
-        (["soak"], "state.json", "journal.jsonl, recordings/, state.json"),
+        (["soak"], "state.json", "certificate.json, journal.jsonl, policy.npz, recordings/, state.json"),
         (["speed"], "config.yaml", "no result"),
         (["calibrate", "coverage=1000"], "config.yaml", "no result"),
         (["fault_matrix", "workers=2"], "fault_matrix.log", "cases.csv"),  # the first case is logged

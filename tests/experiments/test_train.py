@@ -21,13 +21,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from dqn import checkpoint, policy
 from dqn.checkpoint import CheckpointError
 from dqn.config import DQNConfig
+from envs.optimum import solve_episode
 from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
 from experiments.training import build
 from experiments.training import run as train_run
 from experiments.training.config import TrainConfig
-from experiments.training.evaluation import Evaluation, Score, report_grid, selection_grid
-from experiments.training.session import Best, Session
+from experiments.training.density import Density, first_actions
+from experiments.training.evaluation import Evaluation, Score
+from experiments.training.session import Best, Session, merit
 
 SHORT = [
     "agent.total_steps=1000",
@@ -94,7 +96,9 @@ def test_tensorboard_reads_grouped_scalars_and_figures(whole):
     for tag in ("train/return", "train/loss", "q/min", "q/max", "eval/regret_pct", "eval/steady_abs_error"):
         assert {f"{tag}/iqm", f"{tag}/min", f"{tag}/max"} <= tags
     assert {"train/epsilon", "speed/steps_per_s"} <= tags
-    assert {"figures/learning", "figures/policy_map", "figures/trajectories"} <= set(events.Tags()["images"])
+    for name in ("learning", "policy_map", "trajectories"):  # drawn once: TensorBoard has the PNG of the folder
+        (image,) = events.Images(f"figures/{name}")
+        assert image.encoded_image_string == (whole / "figures" / f"{name}.png").read_bytes()
     single = EventAccumulator(str(whole / "agents" / "seed0005")).Reload()
     assert [e.step for e in single.Scalars("train/return")] == list(range(100, 1001, 100))
 
@@ -102,7 +106,8 @@ def test_tensorboard_reads_grouped_scalars_and_figures(whole):
 def test_the_summary_can_be_recomputed_from_the_exported_policy(whole):
     summary = json.loads((whole / "summary.json").read_text())
     config = EnvConfig()
-    report = Evaluation(config, report_grid(config))
+    task = Density(config)
+    report = Evaluation(task, task.report_grid())
     for i, seed in enumerate(summary["seeds"]):
         learned = policy.load(whole / "policies" / f"seed{seed:04d}.npz")
         score = report(lambda od, s, learned=learned: learned.act(np.stack([od[0], s[0]], axis=1))[None])
@@ -128,14 +133,63 @@ def test_a_policy_with_an_offset_at_one_setpoint_gives_way_to_one_without():
     offset[0, 3] = 0.012
     best = Best.empty(torch.zeros(1, 2))
     for step, steady in ((100, offset), (200, even), (300, offset)):
-        best.update(step, Score(np.ones(1), np.full(1, 0.1), steady), torch.full((1, 2), float(step)))
+        score = Score(np.ones(1), np.full(1, 0.1), steady)
+        best.update(step, score, merit(score, Density(EnvConfig())), torch.full((1, 2), float(step)))
     assert (best.step.tolist(), best.steady.tolist(), best.weights.tolist()) == ([200], [0.0025], [[200.0, 200.0]])
+
+
+def _limits(history) -> list[float]:
+    """Of every evaluation, how far the kept policy of the slower agent is from the limits, in units of them."""
+    each = [[max(r / 0.5, s / 0.003) for r, s in zip(*scores, strict=True)] for _, *scores in history]
+    return np.minimum.accumulate(np.array(each), axis=0).max(axis=1).tolist()
+
+
+def test_training_ends_when_every_agent_has_met_the_limits(whole, tmp_path):
+    """Where it ends follows from the history of the run that was not to end; up to there it is the same run."""
+    full = checkpoint.load(whole / "checkpoint.pt")["best"]
+    far = _limits(full["history"])
+    k = next(k for k in range(1, len(far)) if far[k] < far[0])
+    within = (far[k - 1] + far[k]) / 2
+    assert [step for step, *_ in full["history"]] == [200, 400, 600, 800, 1000]
+    options = [*SHORT, "n_agents=2", "seed=4", f"stop_within={within}", f"hydra.run.dir={tmp_path / 'run'}"]
+    done = run("train", *options)
+    assert done.returncode == 0, done.stderr
+    early = checkpoint.load(tmp_path / "run" / "checkpoint.pt")["best"]
+    assert early["history"] == full["history"][: k + 1]
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["env_steps"] == full["history"][k][0]
+    assert summary["updates"] == 4 * (summary["env_steps"] - 100)
+    assert summary["ended"] == (
+        f"every kept policy is within {within:g} times 0.5 % regret and 0.003 OD steady error on the selection grid"
+    )
+    assert json.loads((whole / "summary.json").read_text())["ended"] == "agent.total_steps"
+    assert len(summary["regret_pct"]) == len(summary["regret_pct_last"]) == 2  # on the reported grid, as always
+    again = run("train", f"resume={tmp_path / 'run'}")
+    assert again.returncode == 0, again.stderr
+    assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
+
+
+def test_limits_of_nothing_are_refused(tmp_path):
+    done = run("train", "stop_within=0", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (1, "error: stop_within = 0.0: allowed greater than 0, or null\n")
+
+
+def test_the_optimums_map_is_that_of_each_setpoint_solved_alone():
+    """Three setpoints on a grid four times as fine: other actions in less than 1 % of the cells, by one level."""
+    env = EnvConfig(mu=0.025)
+    od, setpoint = np.linspace(0.05, 1.25, 241), np.array([0.2, 0.55, 1.0])
+    x, s = (a.ravel() for a in np.meshgrid(od, setpoint))
+    expected = np.concatenate([solve_episode(env, float(goal), 5e-4).act(od, env.episode_steps) for goal in setpoint])
+    difference = np.abs(first_actions(env, x, s) - expected)
+    assert difference.max() <= 1
+    assert np.mean(difference > 0) < 0.01
+    assert len(np.unique(expected)) > 12
 
 
 def test_selection_and_report_share_no_start():
     config = EnvConfig()
-    kept = {(round(a, 9), round(b, 9)) for a, b in zip(*selection_grid(config), strict=True)}
-    reported = {(round(a, 9), round(b, 9)) for a, b in zip(*report_grid(config), strict=True)}
+    kept = {(round(a, 9), round(b, 9)) for a, b in zip(*Density(config).selection_grid(), strict=True)}
+    reported = {(round(a, 9), round(b, 9)) for a, b in zip(*Density(config).report_grid(), strict=True)}
     assert len(reported) == 41 * 9
     assert not kept & reported
 
@@ -170,8 +224,8 @@ def test_killed_at_a_random_moment_and_resumed_gives_the_same_weights(whole, tmp
 def test_agent_of_a_population_is_the_same_seed_alone(tmp_path):
     """Same episodes, exploration and minibatches; same weights up to rounding over the first updates."""
     config = TrainConfig().agent
-    many = build.trainer(EnvConfig(), config, range(10, 18))
-    alone = build.trainer(EnvConfig(), config, [13])
+    many = build.trainer(Density(EnvConfig()), config, range(10, 18))
+    alone = build.trainer(Density(EnvConfig()), config, [13])
     for trainer in (many, alone):
         trainer._observation, _ = trainer.env.reset()
         for _ in range(config.learn_start + 5):
@@ -185,7 +239,7 @@ def test_agent_of_a_population_is_the_same_seed_alone(tmp_path):
 def test_what_is_remembered_follows_the_model_also_at_the_end_of_an_episode():
     """x' = f(u) x towards the same setpoint in every transition of six episodes, and nothing is final."""
     env = EnvConfig(episode_steps=5)
-    trainer = build.trainer(env, TrainConfig().agent, range(3))
+    trainer = build.trainer(Density(env), TrainConfig().agent, range(3))
     trainer._observation, _ = trainer.env.reset()
     for _ in range(30):
         trainer._step()
@@ -243,7 +297,7 @@ def test_a_culture_that_outgrows_the_pump_is_said_before_it_is_trained_on(mu, ta
     [
         (["env.mu=abc"], "env.mu = abc: allowed a number"),
         (["resume=nowhere"], "resume=nowhere: no run folder"),
-        (["+env=simm"], "env=simm: no such option; allowed: sim"),
+        (["+env=simm"], "env=simm: no such option; allowed: relative, sim"),
     ],
 )
 def test_bad_input_ends_in_one_line(arguments, message, tmp_path):
