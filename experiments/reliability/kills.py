@@ -27,9 +27,7 @@ from hardware.storage.journal import read_journal
 
 __all__ = ["Findings", "KillConfig", "Stopped", "killed_run"]
 
-BLIND_S = 0.25  # real seconds before a kill in which a sample may not have been asked for yet
-CLOCKS_S = 0.05  # real seconds by which the clocks of client and emulator, compared over HTTP, may be apart
-ANSWER_S = 0.5  # real seconds from a read on the emulator to the time the client gives it, at most
+CLOCKS_S = 0.05  # real seconds by which the clocks of client and emulator, compared over HTTP, are apart at least
 PATIENCE_S = 60.0  # real seconds for a client to start
 SETPOINT = 0.5  # OD
 LAST_S = 600.0  # device seconds that the last client has
@@ -54,6 +52,9 @@ class KillConfig:
         3.0, "real time from a client's first written row to its kill, at most; drawn evenly", "s", within=(0.1, 3600)
     )
     early: float = setting(0.2, "share of kills that may fall into the start itself", within=(0, 1))
+    answer_s: float = setting(
+        0.5, "real time a client needs to ask for a sample and to date its answer, at most", "s", within=(0.1, 10)
+    )
     reactors: tuple[str, ...] = setting(("M0", "M1", "M2"), "of the runs")
     controller_kind: str = setting("dqn", "what decides the pump rate; dqn is the policy that ships", choices=ON_DEVICE)
     overrides: tuple[str, ...] = setting((), "further words of the deploy command, e.g. safety.cooldown=10")
@@ -242,7 +243,9 @@ class _Comparison:
         self._killed, self._ended = killed, ended
         before = time.time()
         self._truth = self._ask("truth")
-        self._wall_zero = (before + time.time()) / 2.0 - self._truth[config.reactors[0]]["device_s"] / config.speed
+        after = time.time()
+        self._clocks_s = max(CLOCKS_S, (after - before) / 2.0)
+        self._wall_zero = (before + after) / 2.0 - self._truth[config.reactors[0]]["device_s"] / config.speed
         self._journal, _ = read_journal(folder / "journal.jsonl")
         self._zero = self._device_s(self._journal[0]["wall"])
 
@@ -298,13 +301,13 @@ class _Comparison:
             rows = [(float(row["time_min"]) * 60.0 + self._zero, float(row["od"])) for row in csv.DictReader(file)]
         samples = [Sample(**sample) for sample in self._ask(f"samples/{name}")]
         served = Served().add(samples, self._ask(f"reads/{name}"))
-        early, late = (real * self.config.speed for real in (CLOCKS_S, ANSWER_S))
+        early, late = (real * self.config.speed for real in (self._clocks_s, self.config.answer_s))
         count, strangers = rows_per_sample([at for at, _ in rows], [od for _, od in rows], served, early, late)
         f.rows += len(rows)
         f.rows_doubled += strangers + int((count[count > 1] - 1).sum())
         lives = [self._life(at) for at in served.stored_s]
         for at, in_rows, life in zip(served.stored_s, count, lives, strict=True):
-            if life is not None and at <= life[1] - BLIND_S * self.config.speed:
+            if life is not None and at <= life[1] - self.config.answer_s * self.config.speed:
                 f.samples += 1
                 if in_rows == 0:
                     f.rows_lost += 1
