@@ -74,7 +74,8 @@ class DQNAgent:
                 f"agent.hindsight_share = {config.hindsight_share}: this task has no goal to replace; set it to 0"
             )
         self._relabel = relabel
-        self._goals = UniformStream(streams["hindsight"], max(1, 2 * self._relabelled), self._drawn)
+        numbers = self._relabelled * relabel.numbers if relabel else 0
+        self._goals = UniformStream(streams["hindsight"], max(1, numbers), self._drawn)
         self._parts: dict[str, Adam | Replay | UniformStream] = {
             "adam": self._adam, "replay": self.replay,
             "explore": self._explore, "draws": self._draws, "goals": self._goals,
@@ -108,10 +109,10 @@ class DQNAgent:
             self.learn(self.config.updates_per_step)
 
     def _drawn(self, uniform: Array) -> torch.Tensor:
-        """What the relabelling makes of its random numbers, a block at a time: (S, calls, 2 m) -> (S, calls, m, 2)."""
+        """What the relabelling makes of its random numbers, block by block: (S, calls, W m) -> (S, calls, m, any)."""
         assert self._relabel is not None
         numbers = torch.from_numpy(uniform).to(self.device)
-        return self._relabel.drawn(numbers.view(*numbers.shape[:2], -1, 2))
+        return self._relabel.drawn(numbers.view(*numbers.shape[:2], -1, self._relabel.numbers))
 
     def _minibatches(self, most: int) -> Transition:
         """n <= `most` minibatches of B transitions per agent, (S, n, B), the first of each with another goal.

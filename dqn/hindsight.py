@@ -9,18 +9,23 @@ import torch
 from dqn.config import DQNConfig
 from dqn.replay import Transition
 
-__all__ = ["GoalRelabel", "Relabel", "ShiftRelabel"]
+__all__ = ["GoalRelabel", "ProgramRelabel", "Relabel", "ShiftRelabel"]
 
 
 class Relabel(Protocol):
-    """Another goal for the transitions of a minibatch, in two parts: what needs only random numbers, and the rest."""
+    """Another goal for the transitions of a minibatch, in two parts: what needs only random numbers, and the rest.
+
+    numbers: W, uniform numbers per transition.
+    """
+
+    numbers: int
 
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
-        """What the random numbers say, (..., B, 2) -> (..., B, 2). Drawn for many minibatches at once."""
+        """What the random numbers say, (..., B, W) -> (..., B, any). Drawn for many minibatches at once."""
         ...
 
     def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
-        """Give transitions (..., B) the goals that were drawn, (..., B, 2), in place."""
+        """Give transitions (..., B) the goals that were drawn, (..., B, any), in place."""
         ...
 
 
@@ -36,6 +41,8 @@ class GoalRelabel:
       config: its keys `hindsight_*`. goals: lowest and highest goal of the task.
       reward: (x', goal) -> reward, all of one shape.
     """
+
+    numbers = 2
 
     def __init__(
         self,
@@ -71,6 +78,8 @@ class ShiftRelabel:
     Args: config: its keys `hindsight_*`. span: of errors. reward: of the error reached, any shape.
     """
 
+    numbers = 2
+
     def __init__(self, config: DQNConfig, span: float, reward: Callable[[torch.Tensor], torch.Tensor]) -> None:
         self._config, self._span, self._reward = config, span, reward
 
@@ -87,6 +96,64 @@ class ShiftRelabel:
         before += shift
         after += shift
         batch.r_t.copy_(self._reward(after))
+
+
+class ProgramRelabel:
+    """The same where the observation is [x, ..., setpoint] or [x, ..., setpoint, next setpoint, time to it].
+
+    x is an integrator: what a step adds to it depends on neither x nor the goals. So x before and after is shifted to a
+    place drawn uniformly, and a setpoint is given as above, near the x reached or anywhere. With an announced change,
+    the next setpoint is drawn anywhere and its time uniformly from the periods of the preview; for a share
+    `unannounced` nothing is announced. After the step the change is a period nearer, or has come.
+
+    Args:
+      config: its keys `hindsight_*`. span: x lies within plus and minus this. goals: lowest and highest setpoint, as x.
+      spread: maps uniform numbers to setpoints. reward: (x', setpoint) -> reward. period, preview: of a decision and of
+      the announcement, in units of the time column; preview 0: there are no such columns.
+    """
+
+    def __init__(
+        self,
+        config: DQNConfig,
+        span: float,
+        spread: Callable[[torch.Tensor], torch.Tensor],
+        reward: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
+        column: int,
+        period: float = 1.0,
+        preview: float = 0.0,
+        unannounced: float = 0.2,
+    ) -> None:
+        self._config, self._span, self._spread, self._reward = config, span, spread, reward
+        self._column, self._period, self._preview, self._unannounced = column, period, preview, unannounced
+        self.numbers = 5 if preview else 3
+
+    def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
+        """x after the step, a setpoint, its distance from x (infinite: anywhere), next setpoint, its time."""
+        x = self._span * (2.0 * uniform[..., 0] - 1.0)
+        parts = [x, self._spread(uniform[..., 1]), _distance(self._config, uniform[..., 2])]
+        if self._preview:
+            known = ((uniform[..., 4] - self._unannounced) / (1.0 - self._unannounced)).clamp(min=-1e-9)
+            time = self._period * torch.floor(1.0 + known * (self._preview / self._period))
+            parts += [self._spread(uniform[..., 3]), time]
+        return torch.stack(parts, dim=-1)
+
+    def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
+        """x, setpoints, times and rewards of a batch, in place."""
+        x, setpoint, distance, *announced = drawn.to(batch.s_t.dtype).unbind(-1)
+        batch.s_tm1[..., 0] += x - batch.s_t[..., 0]
+        batch.s_t[..., 0] = x
+        low, high = self._spread(torch.tensor([0.0, 1.0])).to(x)
+        near = x + distance
+        setpoint = torch.where(near.clamp(low, high) == near, near, setpoint)
+        batch.s_tm1[..., self._column] = batch.s_t[..., self._column] = setpoint
+        if announced:
+            following, time = announced
+            following = torch.where(time > 0.0, following, setpoint)
+            left = (time - self._period).clamp(min=0.0)
+            batch.s_tm1[..., -2] = batch.s_t[..., -2] = following
+            batch.s_tm1[..., -1], batch.s_t[..., -1] = time, left
+            batch.s_t[..., self._column] = torch.where(left > 0.0, setpoint, following)
+        batch.r_t.copy_(self._reward(x, setpoint))
 
 
 def _distance(config: DQNConfig, uniform: torch.Tensor) -> torch.Tensor:

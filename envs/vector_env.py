@@ -67,16 +67,16 @@ class EpisodeSpec:
 
 
 class EpisodeStreams:
-    """Two uniform numbers per episode and copy (start OD, setpoint), each copy from a generator of its own.
+    """Uniform numbers for each episode of each copy (start, setpoint), each copy from a generator of its own.
 
     Copy i draws the same numbers whatever N is. Numbers are drawn in blocks, so that a reset of thousands of copies
     costs no Python loop; the state is that of the generators before their block, and how far into it each copy is.
     """
 
-    def __init__(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
+    def __init__(self, seeds: Sequence[int | np.random.SeedSequence], numbers: int = 2) -> None:
         self._generators = [np.random.default_rng(seed) for seed in seeds]
         self._states: list[Any] = [None] * len(seeds)
-        self._block = np.empty((len(seeds), EPISODES_PER_BLOCK, 2))
+        self._block = np.empty((len(seeds), EPISODES_PER_BLOCK, numbers))
         self._position = np.zeros(len(seeds), dtype=np.intp)
         self._refill(np.arange(len(seeds)))
 
@@ -87,7 +87,7 @@ class EpisodeStreams:
         self._position[copies] = 0
 
     def take(self, copies: NDArray[np.intp]) -> Array:
-        """Two numbers in [0, 1) for each of `copies`, shape (len(copies), 2)."""
+        """Numbers in [0, 1) for each of `copies`, shape (len(copies), numbers)."""
         used_up = copies[self._position[copies] == EPISODES_PER_BLOCK]
         if used_up.size:
             self._refill(used_up)
@@ -110,7 +110,7 @@ class EpisodeStreams:
 class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
     """N copies of a task whose episodes have a fixed length; a task says how they begin and how they advance.
 
-    `state` (N, 2) holds every copy's observation in full precision: what changes, and the goal or parameter that stays.
+    `state` (N, O) holds every copy's observation in full precision: what changes, and the goal or parameter.
     End: never terminated; truncated after `config.episode_steps` steps (bootstrapping continues).
     Autoreset: SAME_STEP, where the last observation of an ended episode is in infos["final_obs"]; or NEXT_STEP, where
     the step after it starts the next episode, whatever the action, with reward 0 (Gymnasium's stateful wrappers).
@@ -124,6 +124,9 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
     default: type[C]
+    numbers = 2
+    """Uniform numbers that an episode begins from."""
+
     config: C
 
     def __init__(
@@ -150,7 +153,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         self.single_action_space = action_space(self.config.n_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.state = np.ones((num_envs, 2))
+        self.state = np.ones((num_envs, *self.single_observation_space.shape))
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._waiting = np.zeros(num_envs, dtype=np.bool_)  # NEXT_STEP: the next step starts an episode
         self._streams: EpisodeStreams | None = None
@@ -166,7 +169,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
 
     @abstractmethod
     def _begun(self, numbers: Array) -> Array:
-        """State (K, 2) of new episodes from two uniform numbers each, (K, 2)."""
+        """State (K, O) of new episodes from uniform numbers, (K, numbers)."""
 
     @abstractmethod
     def _advance(self, actions: NDArray[np.intp]) -> Array:
@@ -178,7 +181,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
 
     def seed_streams(self, seeds: Sequence[int | np.random.SeedSequence]) -> None:
         """Give every copy its stream; `reset(seed=...)` does this with seed, seed + 1, ..."""
-        self._streams = EpisodeStreams(seeds)
+        self._streams = EpisodeStreams(seeds, self.numbers)
 
     def _start(self, copies: NDArray[np.intp]) -> None:
         """Begin a new episode in `copies`."""
@@ -198,7 +201,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         Args:
           seed: an integer (copy i gets seed + i), one integer or None per copy, or None to go on with the streams.
           options: {"reset_mask": bool array (N,)} restarts only some copies.
-        Returns: observations (N, 2), {}.
+        Returns: observations (N, O), {}.
         Raises: ValueError if the mask has another shape.
         """
         if isinstance(seed, int):
@@ -219,8 +222,8 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         """One control period in every copy.
 
         Args: actions: indices of pump rates, shape (N,), integers.
-        Returns: observations (N, 2), rewards (N,), terminated (N,) all False, truncated (N,), infos; with SAME_STEP,
-          where an episode ended, infos["final_obs"] (N, 2) holds its last observation and infos["_final_obs"] (N,)
+        Returns: observations (N, O), rewards (N,), terminated (N,) all False, truncated (N,), infos; with SAME_STEP,
+          where an episode ended, infos["final_obs"] (N, O) holds its last observation and infos["_final_obs"] (N,)
           says where.
         Raises: RuntimeError before the first reset; ValueError for actions of another shape or outside the grid.
         """
@@ -257,7 +260,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> NDArray[np.float32]:
-        """Continue as saved; returns the current observations (N, 2)."""
+        """Continue as saved; returns the current observations (N, O)."""
         assert self._streams is not None, "seed_streams before load_state_dict"
         self.state[:] = state["state"]
         self._steps[:] = state["steps"]

@@ -84,10 +84,11 @@ def _watch(config: DegradationConfig, name: str) -> list[dict[str, float | str]]
     agents = build.population(task, agent, range(config.seed, config.seed + config.n_agents))
     selection = Evaluation(task, task.selection_grid())
     optimum = solve(config.env, agent.gamma)
-    od, setpoint = task.selection_grid()
+    grid = task.selection_grid()
+    od, setpoint = grid.T
     value = optimal_q(optimum, od, np.searchsorted(optimum.setpoints, setpoint - 1e-9)).max(-1)
     rows: list[dict[str, float | str]] = []
-    observation = torch.from_numpy(np.stack([od, setpoint], -1).astype(np.float32)).expand(config.n_agents, -1, -1)
+    observation = torch.from_numpy(grid.astype(np.float32)).expand(config.n_agents, -1, -1)
     for record in agents.run():
         if record.step % config.eval_every and record.step != agent.total_steps:
             continue

@@ -60,7 +60,9 @@ def kill_campaign(config: KillConfig, folder: Path) -> None:
     log.info("%s", ", ".join(f"{k.replace('_', ' ')} {round(v, 2)}" for k, v in total.items()))
     if not all(f.ok for f in found):
         first = next((line for f in found for line in f.trouble), "see the counts in summary.json")
-        raise frame.UserError(f"something was lost or doubled, or not held: {first}; summary.json and the logs have all")
+        raise frame.UserError(
+            f"something was lost or doubled, or not held: {first}; summary.json and the logs have all"
+        )
 
 
 main = frame.Command("kill_campaign", KillConfig(), kill_campaign)

@@ -38,7 +38,7 @@ def population(
 def trainer(task: Task, agent: DQNConfig, seeds: Sequence[int], device: str = "cpu") -> Trainer:
     """One group of agents with the given seeds, each in its own copy of the environment; one record per episode."""
     own = streams(seeds, (*STREAMS, "env"))
-    learner = DQNAgent(agent, 2, task.actions.size, own, task.hindsight(agent), device)
+    learner = DQNAgent(agent, len(task.observation), task.actions.size, own, task.hindsight(agent), device)
     return Trainer(task.copies(own["env"]), learner, interval=task.config.episode_steps)
 
 
@@ -46,8 +46,7 @@ def act_with(network: QNetwork, flat: torch.Tensor) -> Act:
     """The greedy policies of weights (S, P) as a function on NumPy grids."""
     network = network.with_weights(flat)
 
-    def act(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        observation = torch.from_numpy(np.stack([first, second], axis=-1).astype(np.float32)).to(flat.device)
-        return network(observation).argmax(-1).cpu().numpy()
+    def act(observation: np.ndarray) -> np.ndarray:
+        return network(torch.from_numpy(observation.astype(np.float32)).to(flat.device)).argmax(-1).cpu().numpy()
 
     return act

@@ -16,7 +16,7 @@ from envs.optimum import EpisodeOptimum, solve_episode
 from envs.task import MAX_OD, SCORED_OD, EnvConfig, step_factors, tracking_reward
 from envs.vector_env import BioreactorVectorEnv
 from experiments.reporting import charts
-from experiments.training.evaluation import Rollout, rollout
+from experiments.training.evaluation import Rollout, each, pairs, rollout
 
 __all__ = ["Density", "first_actions"]
 
@@ -30,6 +30,7 @@ class Density:
     observation = ABSOLUTE
     unit = "OD"
     arrived = 0.01  # OD
+    steady_steps = 30
     regret_unit, steady_unit = 0.5, 0.003
     """Half a per cent of cost is not seen in a recording, and 0.003 OD is the noise of the sensor."""
 
@@ -51,38 +52,40 @@ class Density:
         setpoints = self.config.setpoints
         return GoalRelabel(agent, (min(setpoints), max(setpoints)), tracking_reward)
 
-    def selection_grid(self) -> tuple[Array, Array]:
+    def selection_grid(self) -> Array:
         """20 start ODs x setpoints."""
         return self._grid(np.linspace(0.1125, 1.0875, 20))
 
-    def report_grid(self) -> tuple[Array, Array]:
+    def report_grid(self) -> Array:
         """linspace(0.1, 1.1, 41) x setpoints."""
         return self._grid(np.linspace(*SCORED_OD, 41))
 
-    def _grid(self, starts: Array) -> tuple[Array, Array]:
-        od, setpoint = np.meshgrid(starts, np.unique(self.config.setpoints), indexing="ij")
-        return od.ravel(), setpoint.ravel()
+    def _grid(self, starts: Array) -> Array:
+        return pairs(starts, np.unique(self.config.setpoints))
 
-    def advance(self, state: Array, second: Array, action: NDArray[Any]) -> Array:
-        """x <- f_a x."""
-        return np.asarray(np.minimum(state * self._factors[action], MAX_OD))
+    def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
+        """x <- f_a x; x - setpoint."""
+        setpoint = observation[..., 1]
+        od = np.minimum(observation[..., 0] * self._factors[action], MAX_OD)
+        return np.stack([od, setpoint], axis=-1), od - setpoint
 
-    def error(self, state: Array, second: Array) -> Array:
-        """x - setpoint."""
-        return state - second
+    def asked(self, start: Array) -> Array:
+        """The setpoint."""
+        return start[:, 1]
 
-    def best(self, first: Array, second: Array) -> Rollout:
+    def best(self, start: Array) -> Rollout:
         """By backward induction."""
-        shape = (self.steps, 1, first.size)
-        best = Rollout(np.empty(shape), np.empty(shape, dtype=np.intp))
-        for s in np.unique(second):
-            here = second == s
-            best.state[:, 0, here], best.action[:, 0, here] = _optimum(self.config, float(s)).rollout(first[here])
-        return best
+        od, setpoint = start.T
+        state, action = np.empty((self.steps, 1, len(start))), np.empty((self.steps, 1, len(start)), dtype=np.intp)
+        for s in np.unique(setpoint):
+            here = setpoint == s
+            state[:, 0, here], action[:, 0, here] = _optimum(self.config, float(s)).rollout(od[here])
+        return Rollout(state, state - setpoint, action)
 
-    def myopic(self, first: Array, second: Array) -> NDArray[np.intp]:
+    def myopic(self, observation: Array) -> NDArray[np.intp]:
         """argmin_a |f_a x - s|."""
-        return np.asarray(np.abs(first[..., None] * self._factors - second[..., None]).argmin(axis=-1))
+        after = observation[..., :1] * self._factors
+        return np.asarray(np.abs(after - observation[..., 1:]).argmin(axis=-1))
 
     def model(self) -> dict[str, Any]:
         """Control period and the whole model."""
@@ -96,16 +99,15 @@ class Density:
         learned = policy.chosen(np.stack([x, s], axis=1)).reshape(setpoint.size, od.size)
         best = self.actions[first_actions(env, x, s)].reshape(learned.shape)
         goals = np.asarray(env.setpoints)[[0, len(env.setpoints) // 2, -1]]
-        starts, targets = np.repeat(env.start_od, goals.size)[None], np.tile(goals, 2)[None]
-        ours = rollout(lambda a, b: policy.act(np.stack([a[0], b[0]], axis=1))[None], self, starts, targets)
-        theirs = self.best(starts[0], targets[0])
+        start = pairs(np.array(env.start_od), goals)
+        ours, theirs = rollout(each(policy), self, start[None]), self.best(start)
         return {
             "policy_map": charts.policy_map(od, setpoint, learned, best),
             "trajectories": charts.trajectories(
                 np.arange(env.episode_steps + 1, dtype=np.float64) * env.control_min,
-                np.concatenate([starts, ours.state[:, 0]]),
-                np.concatenate([starts, theirs.state[:, 0]]),
-                targets[0],
+                np.concatenate([start[:, 0][None], ours.state[:, 0]]),
+                np.concatenate([start[:, 0][None], theirs.state[:, 0]]),
+                start[:, 1],
                 self.actions[ours.action[:, 0]],
                 self.actions[theirs.action[:, 0]],
             ),

@@ -7,20 +7,21 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Act", "Evaluated", "Evaluation", "Rollout", "Score", "rollout"]
+from dqn.policy import Policy
+
+__all__ = ["Act", "Evaluated", "Evaluation", "Rollout", "Score", "each", "pairs", "rollout"]
 
 Array = NDArray[np.float64]
-Act = Callable[[Array, Array], NDArray[np.intp]]
-"""(first, second observation), each (S, G) -> action indices (S, G)."""
-
-STEADY_STEPS = 30  # the last steps of an evaluation rollout, over which the steady error is taken
+Act = Callable[[Array], NDArray[np.intp]]
+"""Observations (S, G, O) -> action indices (S, G)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """state: first observation after each step, shape (K, S, G); action: taken in each step, (K, S, G)."""
+    """After each step, shape (K, S, G): `state`, the first number of the observation, and `error`; `action` in it."""
 
     state: Array
+    error: Array
     action: NDArray[np.intp]
 
 
@@ -28,12 +29,14 @@ class Rollout:
 class Score:
     """Per agent, shape (S,): cost J, regret in per cent of the optimum's, steady error at the worst setpoint.
 
-    steady_by_setpoint: the same at each setpoint (or whatever the second observation is), shape (S, M).
+    steady_by_setpoint: the same at each setpoint (or whatever `asked` is), shape (S, M).
+    mean_abs_error: over all steps and starts, shape (S,).
     """
 
     cost: Array
     regret_pct: Array
     steady_by_setpoint: Array
+    mean_abs_error: Array
 
     @property
     def steady_abs_error(self) -> Array:
@@ -42,33 +45,49 @@ class Score:
 
 
 class Evaluated(Protocol):
-    """What an evaluation needs of a task. steps: of a rollout. arrived: error within which the optimum is at rest."""
+    """What an evaluation needs of a task.
+
+    steps: of a rollout; steady_steps: the last of them, over which the steady error is taken.
+    arrived: error within which the optimum is at rest.
+    """
 
     steps: int
+    steady_steps: int
     arrived: float
 
-    def advance(self, state: Array, second: Array, action: NDArray[Any]) -> Array:
-        """The first observation after one step, shape of all three."""
+    def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
+        """Observation after one step, (..., O), and the error whose square is its cost, (...)."""
         ...
 
-    def error(self, state: Array, second: Array) -> Array:
-        """Whose square is the cost of a step."""
+    def asked(self, start: Array) -> Array:
+        """What the steady errors of episodes with starts (G, O) are grouped by, e.g. the setpoint, (G,)."""
         ...
 
-    def best(self, first: Array, second: Array) -> Rollout:
-        """The optimum of each episode from starts of shape (G,), as the only policy (S = 1) of a rollout."""
+    def best(self, start: Array) -> Rollout:
+        """The optimum of each episode from starts (G, O), as the only policy (S = 1) of a rollout."""
         ...
 
 
-def rollout(act: Act, task: Evaluated, first: Array, second: Array) -> Rollout:
-    """Noise-free closed loop of S policies from G starts. Args: act: the policies. first, second: starts, (S, G)."""
-    states = np.empty((task.steps, *first.shape))
-    actions = np.empty((task.steps, *first.shape), dtype=np.intp)
-    state = first
+def pairs(first: Array, second: Array) -> Array:
+    """Every pair of two lists of numbers, the first slowest, (A B, 2)."""
+    return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def each(policy: Policy) -> Act:
+    """A policy file as the only policy (S = 1) of a rollout."""
+    return lambda observation: policy.act(observation[0])[None]
+
+
+def rollout(act: Act, task: Evaluated, start: Array) -> Rollout:
+    """Noise-free closed loop of S policies from G starts. Args: act: the policies. start: (S, G, O)."""
+    shape = (task.steps, *start.shape[:-1])
+    run = Rollout(np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.intp))
+    observation = start
     for k in range(task.steps):
-        actions[k] = act(state, second)
-        states[k] = state = task.advance(state, second, actions[k])
-    return Rollout(states, actions)
+        run.action[k] = act(observation)
+        observation, run.error[k] = task.advance(observation, run.action[k])
+        run.state[k] = observation[..., 0]
+    return run
 
 
 class Evaluation:
@@ -76,34 +95,34 @@ class Evaluation:
 
     J = mean over the grid of sum over the steps of error^2 taken after each step (the start's own error is not
     counted); regret_pct = 100 (J / J* - 1); steady_abs_error = the largest over the setpoints of the median over starts
-    and last 30 steps of |error|. Starts are left out from which the optimum is still on its way then, further than
-    `arrived` (and than from the best start) from the setpoint: a slow pump does not thin 1.1 to 0.2 in time.
+    and last `steady_steps` of |error|. Starts are left out from which the optimum is still on its way then, further
+    than `arrived` (and than from the best start) from the setpoint: a slow pump does not thin 1.1 to 0.2 in time.
 
-    Args: task: what is scored. grid: first and second observation at the start, each (G,).
+    Args: task: what is scored. start: observations at the start, (G, O).
     """
 
-    def __init__(self, task: Evaluated, grid: tuple[Array, Array]) -> None:
-        self.task = task
-        self.first, self.second = grid
-        run = task.best(self.first, self.second)
-        furthest = np.abs(task.error(run.state[-STEADY_STEPS:, 0], self.second)).max(axis=0)
-        at = [self.second == s for s in np.unique(self.second)]
+    def __init__(self, task: Evaluated, start: Array) -> None:
+        self.task, self.start = task, start
+        run = task.best(start)
+        furthest = np.abs(run.error[-task.steady_steps :, 0]).max(axis=0)
+        asked = task.asked(start)
+        at = [asked == s for s in np.unique(asked)]
         self._resting = [here & (furthest <= max(task.arrived, furthest[here].min())) for here in at]
         self.optimum_cost = float(self._cost(run)[0])
         self.optimum_steady = float(self._steady(run)[0].max())
+        self.optimum_abs_error = float(np.abs(run.error).mean())
 
     def _cost(self, run: Rollout) -> Array:
-        return np.asarray(np.square(self.task.error(run.state, self.second)).sum(axis=0).mean(axis=-1))
+        return np.asarray(np.square(run.error).sum(axis=0).mean(axis=-1))
 
     def _steady(self, run: Rollout) -> Array:
         """Median of each setpoint, shape (S, M)."""
-        last = np.abs(self.task.error(run.state[-STEADY_STEPS:], self.second))
+        last = np.abs(run.error[-self.task.steady_steps :])
         return np.stack([np.median(last[..., there], axis=(0, 2)) for there in self._resting], axis=-1)
 
     def __call__(self, act: Act, agents: int = 1) -> Score:
         """Score S = `agents` policies."""
-        shape = (agents, self.first.size)
-        first, second = np.broadcast_to(self.first, shape), np.broadcast_to(self.second, shape)
-        run = rollout(act, self.task, first, second)
+        run = rollout(act, self.task, np.broadcast_to(self.start, (agents, *self.start.shape)))
         cost = self._cost(run)
-        return Score(cost, 100.0 * (cost / self.optimum_cost - 1.0), self._steady(run))
+        regret = 100.0 * (cost / self.optimum_cost - 1.0)
+        return Score(cost, regret, self._steady(run), np.abs(run.error).mean(axis=(0, 2)))

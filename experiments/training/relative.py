@@ -15,7 +15,7 @@ from dqn.policy import RELATIVE, Policy
 from envs.optimum import RelativeOptimum, solve_relative
 from envs.relative import RelativeConfig, RelativeVectorEnv, nearest_level, relative_reward
 from experiments.reporting import charts
-from experiments.training.evaluation import Rollout, rollout
+from experiments.training.evaluation import Rollout, each, pairs, rollout
 
 __all__ = ["Relative"]
 
@@ -31,7 +31,7 @@ class Relative:
     regret_unit, steady_unit = 0.01, 0.1
     """Its own steady error is half the spacing of the levels and hardly tells policies apart: regret does."""
 
-    steps = 100
+    steps, steady_steps = 100, 30
 
     def __init__(self, config: RelativeConfig) -> None:
         self.config = config
@@ -51,43 +51,42 @@ class Relative:
         """Another setpoint shifts the error."""
         return ShiftRelabel(agent, self.config.largest_error, relative_reward)
 
-    def selection_grid(self) -> tuple[Array, Array]:
+    def selection_grid(self) -> Array:
         """20 errors x 25 growth shares."""
         return self._grid(20, 25, 0.3)
 
-    def report_grid(self) -> tuple[Array, Array]:
+    def report_grid(self) -> Array:
         """41 errors x 48 growth shares."""
         return self._grid(41, 48, 0.5)
 
-    def _grid(self, errors: int, shares: int, place: float) -> tuple[Array, Array]:
+    def _grid(self, errors: int, shares: int, place: float) -> Array:
         """Midpoints (or other places) of equal cells, so that no two grids share a point."""
         (low, high), span = self.config.growth_shares, self.config.largest_error
         e = span * (2.0 * (np.arange(errors) + place) / errors - 1.0)
-        s = low + (high - low) * (np.arange(shares) + place) / shares
-        first, second = np.meshgrid(e, s, indexing="ij")
-        return first.ravel(), second.ravel()
+        return pairs(e, low + (high - low) * (np.arange(shares) + place) / shares)
 
-    def advance(self, state: Array, second: Array, action: NDArray[Any]) -> Array:
-        """e <- e + s - v."""
-        return np.asarray(state + second - self.actions[action])
+    def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
+        """e <- e + s - v; e itself."""
+        s = observation[..., 1]
+        error = observation[..., 0] + s - self.actions[action]
+        return np.stack([error, s], axis=-1), error
 
-    def error(self, state: Array, second: Array) -> Array:
-        """e itself."""
-        return state
+    def asked(self, start: Array) -> Array:
+        """The growth share."""
+        return start[:, 1]
 
-    def best(self, first: Array, second: Array) -> Rollout:
+    def best(self, start: Array) -> Rollout:
         """By backward induction."""
-        shape = (self.steps, 1, first.size)
-        best = Rollout(np.empty(shape), np.empty(shape, dtype=np.intp))
-        for s in np.unique(second):
-            here = second == s
+        error, action = np.empty((self.steps, 1, len(start))), np.empty((self.steps, 1, len(start)), dtype=np.intp)
+        for s in np.unique(start[:, 1]):
+            here = start[:, 1] == s
             optimum = _optimum(self.config, float(s), self.steps)
-            best.state[:, 0, here], best.action[:, 0, here] = optimum.rollout(first[here])
-        return best
+            error[:, 0, here], action[:, 0, here] = optimum.rollout(start[here, 0])
+        return Rollout(error, error, action)
 
-    def myopic(self, first: Array, second: Array) -> NDArray[np.intp]:
+    def myopic(self, observation: Array) -> NDArray[np.intp]:
         """The level nearest to e + s."""
-        return nearest_level(first, second, self.actions.size)
+        return nearest_level(observation[..., 0], observation[..., 1], self.actions.size)
 
     def model(self) -> dict[str, Any]:
         """The range of what it was trained on."""
@@ -101,15 +100,14 @@ class Relative:
         learned = policy.chosen(np.stack([e, s], axis=1)).reshape(share.size, error.size)
         best = np.stack([_optimum(self.config, float(x), self.steps).act(error, self.steps) for x in share])
         shares = np.array([0.1, 0.5, 0.9])
-        starts, given = np.repeat([-span, span], shares.size)[None], np.tile(shares, 2)[None]
-        ours = rollout(lambda a, b: policy.act(np.stack([a[0], b[0]], axis=1))[None], self, starts, given)
-        theirs = self.best(starts[0], given[0])
+        start = pairs(np.array([-span, span]), shares)
+        ours, theirs = rollout(each(policy), self, start[None]), self.best(start)
         return {
             "policy_map": charts.relative_map(error, share, learned, self.actions[best]),
             "trajectories": charts.relative_trajectories(
-                np.concatenate([starts, ours.state[:, 0]]),
-                np.concatenate([starts, theirs.state[:, 0]]),
-                given[0],
+                np.concatenate([start[:, 0][None], ours.state[:, 0]]),
+                np.concatenate([start[:, 0][None], theirs.state[:, 0]]),
+                start[:, 1],
                 self.actions[ours.action[:, 0]],
                 self.actions[theirs.action[:, 0]],
             ),

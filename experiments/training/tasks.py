@@ -22,15 +22,15 @@ Array = NDArray[np.float64]
 
 
 class Task(Evaluated, Protocol):
-    """A task with two observed numbers: what an agent acts in, is scored on and exports.
+    """What an agent acts in, is scored on and exports.
 
-    config: of the environment. observation: names, as in the policy file. actions: the grid, (A,).
-    limits: of the observation in the policy file, low and high, each (2,). regret_unit, steady_unit: per cent of cost
+    config: of the environment. observation: O names, as in the policy file. actions: the grid, (A,).
+    limits: of the observation in the policy file, low and high, each (O,). regret_unit, steady_unit: per cent of cost
     and steady error that weigh alike when policies are compared.
     """
 
     config: Any
-    observation: tuple[str, str]
+    observation: tuple[str, ...]
     actions: Array
     limits: tuple[Array, Array]
     unit: str
@@ -45,16 +45,16 @@ class Task(Evaluated, Protocol):
         """How replayed transitions are given another goal."""
         ...
 
-    def selection_grid(self) -> tuple[Array, Array]:
-        """First and second observation, (G,) each, on which policies are compared during training."""
+    def selection_grid(self) -> Array:
+        """Starts, (G, O), on which policies are compared during training."""
         ...
 
-    def report_grid(self) -> tuple[Array, Array]:
+    def report_grid(self) -> Array:
         """The reported grid; shares no point with `selection_grid`."""
         ...
 
-    def myopic(self, first: Array, second: Array) -> NDArray[np.intp]:
-        """The one-line law: the action whose next error is smallest, shape of both observations."""
+    def myopic(self, observation: Array) -> NDArray[np.intp]:
+        """The one-line law: the action whose next error is smallest, (..., O) -> (...)."""
         ...
 
     def model(self) -> dict[str, Any]:

@@ -35,6 +35,8 @@ EVERYTHING: dict[str, Any] = {
 class Shifted:
     """A goal replacement of no meaning that uses its random numbers."""
 
+    numbers = 2
+
     def drawn(self, uniform: torch.Tensor) -> torch.Tensor:
         return uniform
 

@@ -27,6 +27,11 @@ def test_cost_and_steady_error_of_the_nominal_task(evaluation):
     assert evaluation.optimum_steady == pytest.approx(0.0037 / 4, abs=1e-4)
 
 
+def of(law):
+    """A law of OD and setpoint as a policy of observations."""
+    return lambda observation: law(observation[..., 0], observation[..., 1])
+
+
 def aiming(factors, at=lambda setpoint: setpoint):
     """The law that aims at `at(setpoint)` in one step."""
     return lambda od, setpoint: np.abs(od[..., None] * factors - at(setpoint)[..., None]).argmin(-1)
@@ -67,7 +72,7 @@ def test_nothing_beats_the_optimum(model):
         "without an end": lambda od, setpoint: endless.act(od[0], setpoint[0])[None],
         **{f"table {k}": tables(rng, config.n_actions) for k in range(5)},
     }
-    regret = {name: float(score(rival).regret_pct[0]) for name, rival in rivals.items()}
+    regret = {name: float(score(of(rival)).regret_pct[0]) for name, rival in rivals.items()}
     assert min(regret.values()) >= -0.002, regret
 
 
@@ -86,7 +91,9 @@ def test_short_episodes_agree_with_all_sequences_of_actions(model):
 
 def test_an_offset_at_one_setpoint_shows(evaluation):
     """A law that aims at 0.212 where 0.2 is asked for, and at the setpoint everywhere else."""
-    score = evaluation(aiming(step_factors(EnvConfig()), lambda setpoint: np.where(setpoint < 0.25, 0.212, setpoint)))
+    score = evaluation(
+        of(aiming(step_factors(EnvConfig()), lambda setpoint: np.where(setpoint < 0.25, 0.212, setpoint)))
+    )
     assert score.steady_by_setpoint.shape == (1, 9)
     assert score.steady_by_setpoint[0, 0] == pytest.approx(0.012, abs=0.001)
     assert score.steady_by_setpoint[0, 1:].max() < 0.002
@@ -99,16 +106,16 @@ def test_starts_too_far_for_a_slow_pump_do_not_count_as_offsets():
     config = EnvConfig(tau=0.6)
     evaluation = Evaluation(Density(config), Density(config).report_grid())
     assert evaluation.optimum_steady < 0.001
-    exact = evaluation(aiming(step_factors(config)))
+    exact = evaluation(of(aiming(step_factors(config))))
     assert exact.steady_abs_error[0] < 0.001
-    offset = evaluation(aiming(step_factors(config), lambda setpoint: np.where(setpoint < 0.25, 0.212, setpoint)))
+    offset = evaluation(of(aiming(step_factors(config), lambda setpoint: np.where(setpoint < 0.25, 0.212, setpoint))))
     assert offset.steady_abs_error[0] == pytest.approx(0.012, abs=0.001)
 
 
 def test_random_and_constant_policies_lose_clearly(evaluation):
     rng = np.random.default_rng(0)
-    random = evaluation(lambda od, setpoint: rng.integers(0, 17, od.shape))
-    constant = evaluation(lambda od, setpoint: np.full(od.shape, 8))
+    random = evaluation(of(lambda od, setpoint: rng.integers(0, 17, od.shape)))
+    constant = evaluation(of(lambda od, setpoint: np.full(od.shape, 8)))
     assert random.regret_pct[0] > 100.0
     assert constant.regret_pct[0] > 100.0
 

@@ -76,7 +76,9 @@ def test_nothing_beats_the_optimum_and_the_one_line_law_is_it() -> None:
     assert abs(law.regret_pct[0]) < 1e-5  # the optimum's values are interpolated
     rng = np.random.default_rng(0)
     for change in (0.02, 0.1, 0.5):  # a law that is off by so much
-        off = evaluation(lambda e, s, change=change: nearest_level(e + change * rng.standard_normal(e.shape), s))
+        off = evaluation(
+            lambda o, by=change: nearest_level(o[..., 0] + by * rng.standard_normal(o.shape[:-1]), o[..., 1])
+        )
         assert off.regret_pct[0] > law.regret_pct[0]
     assert evaluation(lambda e, s: nearest_level(e + 0.03, s)).regret_pct[0] > 0.1
 

@@ -28,7 +28,7 @@ from experiments.training import build
 from experiments.training import run as train_run
 from experiments.training.config import TrainConfig
 from experiments.training.density import Density, first_actions
-from experiments.training.evaluation import Evaluation, Score
+from experiments.training.evaluation import Evaluation, Score, each
 from experiments.training.session import Best, Session, merit
 
 SHORT = [
@@ -110,7 +110,7 @@ def test_the_summary_can_be_recomputed_from_the_exported_policy(whole):
     report = Evaluation(task, task.report_grid())
     for i, seed in enumerate(summary["seeds"]):
         learned = policy.load(whole / "policies" / f"seed{seed:04d}.npz")
-        score = report(lambda od, s, learned=learned: learned.act(np.stack([od[0], s[0]], axis=1))[None])
+        score = report(each(learned))
         assert score.regret_pct[0] == pytest.approx(summary["regret_pct"][i], rel=1e-3)
 
 
@@ -188,8 +188,8 @@ def test_the_optimums_map_is_that_of_each_setpoint_solved_alone():
 
 def test_selection_and_report_share_no_start():
     config = EnvConfig()
-    kept = {(round(a, 9), round(b, 9)) for a, b in zip(*Density(config).selection_grid(), strict=True)}
-    reported = {(round(a, 9), round(b, 9)) for a, b in zip(*Density(config).report_grid(), strict=True)}
+    kept = {(round(a, 9), round(b, 9)) for a, b in Density(config).selection_grid()}
+    reported = {(round(a, 9), round(b, 9)) for a, b in Density(config).report_grid()}
     assert len(reported) == 41 * 9
     assert not kept & reported
 

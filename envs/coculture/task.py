@@ -1,0 +1,171 @@
+"""The composition of two species as a control task: the temperature decides which of them grows faster.
+
+Dilution removes both alike, so that with r the share of P. putida in e + p only the growth rates move it:
+
+  d logit(r)/dt = m_p - mu_e(T),     m_p' = (mu_p(T) - m_p) / 1 h,     T heats by 2 degC/min and cools passively
+
+E. coli follows the temperature within 2 min, which is taken as at once. The share's logit is an integrator of limited
+rate, +.30 per hour at 29 degC and -.63 at 36, and what it needs hours for is worth beginning before it is asked for.
+Sources of the rates: envs/coculture/rates.py.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from conf.schema import check, require, setting
+from envs.coculture.rates import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
+from envs.vector_env import EpisodeVectorEnv
+
+__all__ = ["CocultureConfig", "CocultureVectorEnv", "advance", "logit", "passed", "share"]
+
+Array = NDArray[np.float64]
+
+LOGIT, TEMPERATURE, RATE, SETPOINT, NEXT, TIME = range(6)
+"""Columns of an observation; the last two where changes are announced."""
+
+
+@dataclass(frozen=True)
+class CocultureConfig:
+    """`env=coculture` and `env=coculture_preview`. Raises: ValueError naming key, value and allowed range."""
+
+    kind: str = setting("coculture", "which task")
+    n_actions: int = setting(17, "temperatures, equally spaced", within=(2, 1001))
+    temperatures: tuple[float, float] = setting(
+        (T_MIN, T_MAX), "coldest and warmest", "degC", within=(T_MIN, T_MAX), interval=True
+    )
+    control_min: float = setting(10.0, "between decisions, whole minutes", "min", within=(1, 240))
+    episode_steps: int = setting(72, "decisions per episode, ended by truncation", at_least=1)
+    preview_min: float = setting(
+        0.0, "how long before it a change of the setpoint is announced; 0: never", "min", within=(0, 1440)
+    )
+    setpoints: tuple[float, float] = setting(
+        (0.1, 0.9), "range of the share asked for", above=0.0, below=1.0, interval=True
+    )
+    start_share: tuple[float, float] = setting(
+        (0.05, 0.95), "range of the share at the start", above=0.0, below=1.0, interval=True
+    )
+    scale_e: float = setting(1.0, "of E. coli's growth curve", within=(0.5, 2))
+    scale_p: float = setting(1.0, "of P. putida's", within=(0.5, 2))
+    heating_c_per_min: float = setting(2.0, "fastest rise of a heated vial", "degC/min", within=(0.1, 10))
+    cooling_min: float = setting(39.0, "time constant of passive cooling", "min", within=(1, 600))
+    ambient_c: float = setting(24.0, "temperature an unheated vial cools to", "degC", within=(0, 28.9))
+
+    def __post_init__(self) -> None:
+        check(self, "env")
+        require(self.control_min % 1.0 == 0.0, "env.control_min", self.control_min, "whole minutes")
+        even = self.preview_min % self.control_min == 0.0
+        require(even, "env.preview_min", self.preview_min, f"a multiple of env.control_min = {self.control_min:g}")
+
+    def targets(self) -> Array:
+        """The temperatures one can choose, degC, shape (A,)."""
+        return np.linspace(*self.temperatures, self.n_actions)
+
+    @property
+    def columns(self) -> int:
+        """Numbers of an observation: 4, or 6 where changes are announced."""
+        return 6 if self.preview_min else 4
+
+
+def logit(r: Any) -> Any:
+    """ln(r / (1 - r)) of a share."""
+    return np.log(r / (1.0 - np.asarray(r)))
+
+
+def share(x: Any) -> Any:
+    """1 / (1 + exp(-x)), the share of a logit."""
+    return 1.0 / (1.0 + np.exp(-np.asarray(x)))
+
+
+def advance(config: CocultureConfig, state: Array, target: Array, minutes: float) -> Array:
+    """State (..., 3) - logit of the share, degC, m_p in 1/h - after `minutes` (whole) at a thermostat target.
+
+    One step a minute, rates at the mean temperature of the step. Args: target: degC, broadcastable to (...).
+    """
+    x, temperature, rate = (state[..., k] for k in range(3))
+    kept, follow = np.exp(-1.0 / config.cooling_min), -np.expm1(-1.0 / LAG_P_MIN)
+    for _ in range(round(minutes)):
+        cooled = config.ambient_c + (temperature - config.ambient_c) * kept
+        reached = np.maximum(cooled, np.minimum(target, cooled + config.heating_c_per_min))
+        mean = 0.5 * (temperature + reached)
+        faster = rate + (config.scale_p * p_putida_rate(mean) - rate) * follow
+        x = x + (0.5 * (rate + faster) - config.scale_e * e_coli_rate(mean)) / 60.0
+        temperature, rate = reached, faster
+    return np.stack(np.broadcast_arrays(x, temperature, rate), axis=-1)
+
+
+def passed(config: CocultureConfig, goal: Array) -> Array:
+    """Goal columns (..., 1) or (..., 3) after one decision: an announced change comes nearer, or has come.
+
+    Where nothing is announced, the next setpoint is the present one and the time 0.
+    """
+    if goal.shape[-1] == 1:
+        return goal
+    now, following, time = (goal[..., k] for k in range(3))
+    left = np.maximum(time - config.control_min, 0.0)
+    return np.stack([np.where(left > 0.0, now, following), following, left], axis=-1)
+
+
+def at_rest(config: CocultureConfig, x: Array, temperature: Array | float = EQUAL_RATES_C) -> Array:
+    """State (..., 3) of a culture that has been at one temperature for long."""
+    t = np.broadcast_to(np.asarray(temperature, dtype=np.float64), np.shape(x))
+    return np.stack([x, t, config.scale_p * p_putida_rate(t)], axis=-1)
+
+
+class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
+    """The share of P. putida held at a setpoint by choosing the vial's temperature (module's description).
+
+    | observation | meaning                                                     | range           | unit |
+    |-------------|-------------------------------------------------------------|-----------------|------|
+    | 0           | logit of the share r                                        | any             | -    |
+    | 1           | temperature of the vial                                     | 24 to 36        | degC |
+    | 2           | growth rate m_p of P. putida, which lags the temperature    | 0.4 to 1        | 1/h  |
+    | 3           | logit of the setpoint                                       | `setpoints`     | -    |
+    | 4           | logit of the next setpoint; the present one if none is known| `setpoints`     | -    |
+    | 5           | time to that change; 0 if none is known                     | 0 to `preview_min` | min |
+
+    Columns 4 and 5 with `preview_min` > 0 only. Action: index of a thermostat target, equally spaced.
+    Reward: -(r - setpoint)^2 of the share reached and the setpoint that was in force.
+    Start: r, temperature, setpoints and the time of the change uniform, from the copy's own stream; m_p as if the
+    temperature had been that for long. End and autoreset: as `EpisodeVectorEnv`. Args, raises: as there.
+    """
+
+    default = CocultureConfig
+    numbers = 5
+
+    @staticmethod
+    def observations(config: CocultureConfig) -> spaces.Box:
+        """As in the table, float32."""
+        low, high = limits(config)
+        return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+    def _prepare(self) -> None:
+        self._targets = self.config.targets()
+
+    def _begun(self, numbers: Array) -> Array:
+        c = self.config
+        spans = np.array([c.start_share, c.temperatures, c.setpoints, c.setpoints])
+        drawn = spans[:, 0] + (spans[:, 1] - spans[:, 0]) * numbers[:, :4]
+        state = at_rest(c, logit(drawn[:, 0]), drawn[:, 1])
+        goal = logit(drawn[:, 2:])
+        if not c.preview_min:
+            return np.concatenate([state, goal[:, :1]], axis=1)
+        time = c.control_min * (1.0 + np.floor(numbers[:, 4:] * (c.preview_min / c.control_min)))
+        return np.concatenate([state, goal, time], axis=1)
+
+    def _advance(self, actions: NDArray[np.intp]) -> Array:
+        wanted = self.state[:, SETPOINT].copy()
+        self.state[:, :3] = advance(self.config, self.state[:, :3], self._targets[actions], self.config.control_min)
+        self.state[:, 3:] = passed(self.config, self.state[:, 3:])
+        return -np.square(share(self.state[:, LOGIT]) - share(wanted))
+
+
+def limits(config: CocultureConfig) -> tuple[Array, Array]:
+    """Lowest and highest of every number of an observation, each (O,)."""
+    goal = logit(np.array(config.setpoints))
+    low = np.array([-np.inf, config.ambient_c, 0.4 * config.scale_p, goal[0], goal[0], 0.0])
+    high = np.array([np.inf, T_MAX, 1.0 * config.scale_p, goal[1], goal[1], config.preview_min])
+    return low[: config.columns], high[: config.columns]
