@@ -160,7 +160,8 @@ class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
         wanted = self.state[:, SETPOINT].copy()
         self.state[:, :3] = advance(self.config, self.state[:, :3], self._targets[actions], self.config.control_min)
         self.state[:, 3:] = passed(self.config, self.state[:, 3:])
-        return -np.square(share(self.state[:, LOGIT]) - share(wanted))
+        reward: Array = -np.square(share(self.state[:, LOGIT]) - share(wanted))
+        return reward
 
 
 def limits(config: CocultureConfig) -> tuple[Array, Array]:

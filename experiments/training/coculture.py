@@ -109,7 +109,8 @@ class Coculture:
         """By backward induction over the program of each start."""
         model = transitions(self.config, FINE)
         programs, which = np.unique(start[:, 3:].round(9), axis=0, return_inverse=True)
-        run = Rollout(*(np.empty((self.steps, 1, len(start)), dtype=t) for t in (np.float64, np.float64, np.intp)))
+        shape = (self.steps, 1, len(start))
+        run = Rollout(np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.intp))
         for k in range(0, len(programs), 24):  # so many at a time bound the memory
             self._solve(
                 model, programs[k : k + 24], np.flatnonzero((which >= k) & (which < k + 24)), which - k, start, run
@@ -144,7 +145,7 @@ class Coculture:
         grid = self.selection_grid()
         picked = grid[np.linspace(0, len(grid) - 1, 6).astype(int)]
         ours, theirs = rollout(each(policy), self, picked[None]), self.best(picked)
-        hours = np.arange(1, self.steps + 1) * self.config.control_min / 60.0
+        hours = np.arange(1.0, self.steps + 1.0) * (self.config.control_min / 60.0)
         change = picked[:, TIME] / 60.0 if self.config.preview_min else np.zeros(len(picked))
         last = share(picked[:, NEXT if self.config.preview_min else SETPOINT])
         wanted = np.where(hours[:, None] <= change, share(picked[:, SETPOINT]), last)
