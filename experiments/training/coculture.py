@@ -17,6 +17,7 @@ from envs.coculture.task import (
     LOGIT,
     NEXT,
     SETPOINT,
+    TEMPERATURE,
     TIME,
     CocultureConfig,
     CocultureVectorEnv,
@@ -52,6 +53,8 @@ class Coculture:
         self.observation: tuple[str, ...] = COCULTURE_PREVIEW if config.preview_min else COCULTURE
         self.actions = config.targets()
         self.limits = limits(config)
+        for end, span, temperature in zip(self.limits, (-SPAN, SPAN), config.temperatures, strict=True):
+            end[LOGIT], end[TEMPERATURE] = span, temperature  # beyond what is trained a policy sees the end of it
 
     def copies(self, seeds: Sequence[np.random.SeedSequence]) -> CocultureVectorEnv:
         """Environments."""
