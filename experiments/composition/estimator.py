@@ -14,9 +14,9 @@ from experiments.controllers.base import put_back, saved
 
 __all__ = ["CompositionEstimator", "CompositionEstimatorConfig"]
 
-LOG_E, LOG_P, LOG_F, BIAS_E, BIAS_P, FACTOR, OFFSET = range(7)
+LOGIT, LOG_OD, LOG_F, BIAS_E, BIAS_P, FACTOR, OFFSET = range(7)
 CONSIDERED = (FACTOR, OFFSET)
-SPECIES, PIGMENT = slice(LOG_E, LOG_F), slice(LOG_E, BIAS_E)  # what growth moves; what a dose dilutes
+DILUTED = slice(LOG_OD, BIAS_E)
 LOWEST_OD = 0.005  # below it a first reading says nothing
 LOWEST_LIGHT = 1.0  # counts; what the logarithm of the pigment begins from at least
 ITERATIONS = 3  # of an update, about the newest estimate
@@ -59,15 +59,18 @@ class CompositionEstimatorConfig:
 
 
 class CompositionEstimator:
-    """State z = [ln e, ln p, ln f, b_e, b_p, k, o]: OD of E. coli and of P. putida, pigment f, errors of the two growth
-    curves, factor k and offset o of the light sensor. Over h hours in which v of V mL were replaced
+    """State z = [x, ln S, ln f, b_e, b_p, k, o]: logit of the share of P. putida, OD of both species, pigment, errors of
+    the two growth curves, factor and offset of the light sensor. With e = S/(1 + exp x) and p = S - e, and over h hours
+    in which v of V mL were replaced
 
-      ln e <- ln e + h (1 + b_e) m_e - v/V            ln p <- ln p + h (1 + b_p) m_p - v/V
-      ln f <- ln f + ln(1 + h g p/f) - v/V            b_e, b_p random walks
-      OD = e + p + noise                              FL = k (f + 150 (e + p)) + o + noise
+      x <- x + h (1 + b_p) m_p - h (1 + b_e) m_e      b_e, b_p random walks
+      ln S <- ln(e exp(h (1 + b_e) m_e) + p exp(h (1 + b_p) m_p)) - v/V
+      ln f <- ln(f + h g p) - v/V
+      OD = S + noise                                  FL = k (f + 150 S) + o + noise
 
     with m_e, m_p the curves' rates, 1/h, lagging the measured temperature by 2 and 60 min, and g the production of
-    pigment, whose delayed answer to temperature is known (docs/plant.md, Two species).
+    pigment, whose delayed answer to temperature is known (docs/plant.md, Two species). In these coordinates the OD says
+    nothing of the share at once, however unsure that is; in ln e and ln p a linearised filter soon believes too much.
 
     An extended Kalman filter, iterated about the newest estimate (Bell, Cathey 1993), in Joseph's form. k and o are
     considered and not estimated (Schmidt 1966): how unsure they are counts in every gain, but no reading changes them,
@@ -131,12 +134,12 @@ class CompositionEstimator:
         self._lagged[idx] = np.stack([e_coli_rate(warm), p_putida_rate(warm)], axis=1)
         self._production[idx] = steady_production(warm)
         self._past[idx] = self._production[idx, None]
-        p = c.share * od
-        made = np.maximum(self._production[idx] * p / self._lagged[idx, 1], LOWEST_LIGHT)
-        self.mean[idx, :3] = np.stack([np.log(od - p), np.log(p), np.log(made)], axis=1)
-        by_share = c.share_sd * np.array([-c.share, 1.0 - c.share, 1.0 - c.share])
-        by_od = c.od_sd / od
-        self.cov[idx, :3, :3] = np.outer(by_share, by_share) + by_od[:, None, None] ** 2
+        made = np.maximum(self._production[idx] * c.share * od / self._lagged[idx, 1], LOWEST_LIGHT)
+        self.mean[idx, LOGIT] = np.log(c.share / (1.0 - c.share))
+        self.mean[idx, LOG_OD], self.mean[idx, LOG_F] = np.log(od), np.log(made)
+        by_share = c.share_sd * np.array([1.0, 0.0, 1.0 - c.share])
+        by_od = (c.od_sd / od)[:, None] * np.array([0.0, 1.0, 1.0])
+        self.cov[idx, :3, :3] = np.outer(by_share, by_share) + by_od[:, :, None] * by_od[:, None, :]
         self.cov[idx, LOG_F, LOG_F] += c.pigment_first_sd**2
 
     def _elapse(self, idx: NDArray[np.intp], minutes: Array, temperature: Array) -> None:
@@ -160,19 +163,25 @@ class CompositionEstimator:
         self._lagged[idx] = before + (steady - before) * -np.expm1(-minutes[:, None] / lag)
         grown = 0.5 * hours[:, None] * (before + self._lagged[idx])  # of each curve itself, (N, 2)
         growth = grown * (1.0 + z[:, BIAS_E:FACTOR])
-        made = hours * self._production[idx] * np.exp(z[:, LOG_P] + 0.5 * growth[:, 1] - z[:, LOG_F])
+        share = 1.0 / (1.0 + np.exp(-z[:, LOGIT]))
+        parts = np.stack([1.0 - share, share], axis=1) * np.exp(growth)
+        total = parts.sum(axis=1)
+        later = parts / total[:, None]  # both species' shares at the end
+        made = hours * self._production[idx] * share * np.exp(z[:, LOG_OD] + 0.5 * growth[:, 1] - z[:, LOG_F])
         new = made / (1.0 + made)  # share of the pigment that is of this step
-        z[:, SPECIES] += growth
-        z[:, LOG_F] += np.log1p(made)
-        z[:, PIGMENT] -= dose[:, None]
+        z[:, LOGIT] += growth[:, 1] - growth[:, 0]
+        z[:, LOG_OD] += np.log(total) - dose
+        z[:, LOG_F] += np.log1p(made) - dose
         self.mean[idx] = z
         step = np.tile(np.eye(7), (idx.size, 1, 1))
-        step[:, LOG_E, BIAS_E], step[:, LOG_P, BIAS_P] = grown[:, 0], grown[:, 1]
-        step[:, LOG_F, LOG_P], step[:, LOG_F, LOG_F] = new, 1.0 - new
-        step[:, LOG_F, BIAS_P] = 0.5 * new * grown[:, 1]
+        step[:, LOGIT, BIAS_E], step[:, LOGIT, BIAS_P] = -grown[:, 0], grown[:, 1]
+        step[:, LOG_OD, LOGIT] = later[:, 1] - share
+        step[:, LOG_OD, BIAS_E:FACTOR] = later * grown
+        step[:, LOG_F, LOGIT], step[:, LOG_F, LOG_OD] = new * (1.0 - share), new
+        step[:, LOG_F, LOG_F], step[:, LOG_F, BIAS_P] = 1.0 - new, 0.5 * new * grown[:, 1]
         cov = step @ self.cov[idx] @ step.swapaxes(1, 2)
-        cov[:, PIGMENT, PIGMENT] += ((c.dose_cv * dose) ** 2)[:, None, None]
-        for k, sd in enumerate((c.growth_sd, c.growth_sd, c.pigment_sd, c.bias_walk, c.bias_walk)):
+        cov[:, DILUTED, DILUTED] += ((c.dose_cv * dose) ** 2)[:, None, None]
+        for k, sd in enumerate((2.0**0.5 * c.growth_sd, c.growth_sd, c.pigment_sd, c.bias_walk, c.bias_walk)):
             cov[:, k, k] += sd**2 * minutes
         self.cov[idx] = cov
         self._produce(idx, minutes, last)
@@ -186,14 +195,14 @@ class CompositionEstimator:
 
     def _seen(self, z: Array, which: int) -> tuple[Array, Array]:
         """Expected reading of states (N, 7) and its slope, (N,) and (N, 7). Args: which: 0 OD, 1 fluorescence."""
-        e, p, f = (np.exp(z[:, k]) for k in range(3))
+        od, f, k = np.exp(z[:, LOG_OD]), np.exp(z[:, LOG_F]), z[:, FACTOR]
         slope = np.zeros_like(z)
         if which == 0:
-            slope[:, LOG_E], slope[:, LOG_P] = e, p
-            return e + p, slope
-        light, k = f + self.config.od_term * (e + p), z[:, FACTOR]
-        slope[:, LOG_E], slope[:, LOG_P] = k * self.config.od_term * e, k * self.config.od_term * p
-        slope[:, LOG_F], slope[:, FACTOR], slope[:, OFFSET] = k * f, light, 1.0
+            slope[:, LOG_OD] = od
+            return od, slope
+        light = f + self.config.od_term * od
+        slope[:, LOG_OD], slope[:, LOG_F] = k * self.config.od_term * od, k * f
+        slope[:, FACTOR], slope[:, OFFSET] = light, 1.0
         return k * light + z[:, OFFSET], slope
 
     def _take(self, idx: NDArray[np.intp], which: int, reading: Array) -> None:
@@ -215,7 +224,7 @@ class CompositionEstimator:
     def _anew(self, idx: NDArray[np.intp], which: int) -> None:
         """Nothing is known any more of the density (0) or of the pigment (1); the share stays as it is."""
         if which == 0:
-            self.cov[idx, PIGMENT, PIGMENT] += 1.0
+            self.cov[idx, DILUTED, DILUTED] += 1.0
             return
         self.cov[idx, LOG_F, :], self.cov[idx, :, LOG_F] = 0.0, 0.0
         self.cov[idx, LOG_F, LOG_F] = 1.0
@@ -237,10 +246,9 @@ class CompositionEstimator:
 
     def estimate(self) -> Estimate:
         """Share, temperature and rate as they are believed; before the first reading the first guess."""
-        x = self.mean[:, LOG_P] - self.mean[:, LOG_E]
-        variance = self.cov[:, LOG_P, LOG_P] + self.cov[:, LOG_E, LOG_E] - 2.0 * self.cov[:, LOG_P, LOG_E]
+        sd = np.sqrt(np.maximum(self.cov[:, LOGIT, LOGIT], 0.0))
         rate = self._lagged[:, 1] * (1.0 + self.mean[:, BIAS_P])
-        return Estimate(x, np.sqrt(np.maximum(variance, 0.0)), self._temperature.copy(), rate)
+        return Estimate(self.mean[:, LOGIT].copy(), sd, self._temperature.copy(), rate)
 
     def explain(self) -> dict[str, Array]:
         """Share with its 95 % band, relative errors of the growth curves, density, pigment in counts, each (N,)."""
@@ -252,7 +260,7 @@ class CompositionEstimator:
             "ratio_high": high,
             "bias_e": self.mean[:, BIAS_E].copy(),
             "bias_p": self.mean[:, BIAS_P].copy(),
-            "composition_od": np.exp(self.mean[:, SPECIES]).sum(axis=1),
+            "composition_od": np.exp(self.mean[:, LOG_OD]),
             "pigment": np.exp(self.mean[:, LOG_F]),
         }
 
