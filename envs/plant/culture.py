@@ -1,17 +1,17 @@
 """The culture: suspended cells, their substrate, and what grows on the wall."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from envs.growth import Arrhenius, Cardinal, Exponential, GrowthLaw, Monod, relative_to_37
+from envs.growth import Exponential, GrowthLaw, Monod
 from envs.integrators import Integrator
 from envs.plant.course import allowed, along, rises
-from envs.plant.noise import Streams, spread
+from envs.plant.noise import Streams, spread, uniform
+from envs.plant.species import TEMPERATURE_LAWS, SecondSpeciesConfig, response
 
 __all__ = ["Culture", "GrowthConfig"]
 
@@ -20,8 +20,6 @@ Array = NDArray[np.float64]
 SETTLED_FRACTION = 0.08  # of the OD lost from the light path when the stirrer stands still (docs/biology.md, Stirring)
 SETTLING_MIN = 1.5  # min, so that it is lost within about three readings (docs/biology.md, Stirring)
 UNSTIRRED_GROWTH = 0.5  # relative growth without stirring (docs/biology.md, Stirring)
-
-TEMPERATURE_LAWS = ("none", "arrhenius", "cardinal")
 
 
 @dataclass(frozen=True)
@@ -72,47 +70,80 @@ class GrowthConfig:
         require(self.mu > 0.0 or not self.knots_mu, "plant.growth.mu", self.mu, "> 0 beside knots_mu, e.g. their mean")
 
 
-def _response(config: GrowthConfig) -> Callable[[Array], Array]:
-    """phi(T) / phi(37 degC) of the configured temperature law."""
-    laws: dict[str, Callable[[Array], Array]] = {
-        "none": np.ones_like,
-        "arrhenius": Arrhenius(config.activation_kj_mol),
-        "cardinal": Cardinal(),
-    }
-    return relative_to_37(laws[config.temperature_law])
-
-
 class Culture:
-    """N cultures: suspended biomass x, relative substrate s and wall biomass w (OD or relative to fresh medium).
+    """N cultures of S species: suspended biomass x, relative substrate s, wall biomass w (OD or relative to medium).
 
-      x' = (m - D) x - ka x + kd w        s' = D (1 - s) - m x / Y        w' = ka x + r m w (1 - w/W) - kd w
-      m  = mu(s) phi(T), times drift, stirring and `mu_factor`; D = fresh medium per minute / volume
+      x_i' = (m_i - D) x_i - ka x_i + kd w_i        s' = D (1 - s) - sum_i m_i x_i / Y
+      w_i' = ka x_i + r m_i w_i (1 - sum_i w_i / W) - kd w_i
+      m_i  = mu_i(s) phi_i(T), times drift, stirring and `mu_factor`; D = fresh medium per minute / volume
 
     Args:
       config: how cells grow; rngs: one stream per vial, for its growth rate.
       integrate, substep_min: integrator and longest integration step, min.
-    State, shape (N,): `od` (true suspended biomass), `substrate`, `wall`. Fault switches, shape (N,): `mu_factor`, and
-    `stir_factor` (1 turning, 0 stopped; for a stirrer that fails, not for the still phase of each cycle).
+      second: another species beside that of `config`, S = 2; second_rngs: one stream per vial, for its draws.
+    State: `biomass` (true, suspended), shape (N, S); `substrate`, shape (N,). Fault switches, shape (N,): `mu_factor`,
+    and `stir_factor` (1 turning, 0 stopped; for a stirrer that fails, not for the still phase of each cycle).
     """
 
-    def __init__(self, config: GrowthConfig, rngs: Streams, integrate: Integrator, substep_min: float) -> None:
+    def __init__(
+        self,
+        config: GrowthConfig,
+        rngs: Streams,
+        integrate: Integrator,
+        substep_min: float,
+        second: SecondSpeciesConfig,
+        second_rngs: Streams,
+    ) -> None:
         self.config, self._n = config, len(rngs)
         self._integrate, self._substep_min = integrate, substep_min
-        mu = spread(rngs, config.mu, config.mu_cv)
-        self.draws: dict[str, Array] = {"mu": mu}
+        self.draws: dict[str, Array] = {"mu": spread(rngs, config.mu, config.mu_cv)}
+        species: list[GrowthConfig | SecondSpeciesConfig] = [config]
+        rates = [self.draws["mu"]]
+        if second.present:
+            species.append(second)
+            rates.append(spread(second_rngs, second.mu, second.mu_cv))
+            self.draws |= {"second_mu": rates[1], "second_share": uniform(second_rngs, *second.start_share)}
+        mu = np.stack(rates, axis=1)
         # Quoted for fresh medium: Monod's rate at s = 1 is mu_max / (1 + k_s).
         endless = np.isinf(config.yield_od)
         self._law: GrowthLaw = Exponential(mu) if endless else Monod(mu * (1.0 + config.k_s), config.k_s)
-        self._phi = _response(config)
+        self._responses = [response(a.temperature_law, a.activation_kj_mol) for a in species]
+        self._lags_min = [a.adaptation_min for a in species]
         self.mu_factor, self.stir_factor = np.ones(self._n), np.ones(self._n)
 
-    def reset(self, od: Array, temperature: Array) -> None:
-        """A new culture in balance with the medium it grew from. Args: OD and degC, scalar or shape (N,)."""
-        self.od: Array = np.broadcast_to(od, (self._n,)).copy()
-        self.substrate: Array = np.maximum(1.0 - self.od / self.config.yield_od, 0.0)
-        self.wall: Array = np.zeros(self._n)
-        self._adapted = self._phi(temperature)
+    def reset(self, od: Array, temperature: Array, share: Array | float | None = None) -> None:
+        """A new culture in balance with the medium it grew from.
+
+        Args: OD and degC, scalar or shape (N,). share: of the second species, as `od`; None = as drawn.
+        """
+        total = np.broadcast_to(od, (self._n,)).copy()
+        shares = [total]
+        if len(self._responses) > 1:
+            r = np.broadcast_to(self.draws["second_share"] if share is None else share, (self._n,))
+            shares = [total * (1.0 - r), total * r]
+        self.biomass: Array = np.stack(shares, axis=1)
+        self.substrate: Array = np.maximum(1.0 - total / self.config.yield_od, 0.0)
+        self._wall = np.zeros_like(self.biomass)
+        self._adapted = self._phi(np.broadcast_to(temperature, (self._n,)))
         self._log_drift, self._settled = np.zeros(self._n), np.zeros(self._n)
+
+    @property
+    def od(self) -> Array:
+        """True suspended biomass of all species, OD, shape (N,)."""
+        return np.asarray(self.biomass.sum(axis=1))
+
+    @property
+    def wall(self) -> Array:
+        """Biomass of all species on the wall, OD-equivalent, shape (N,)."""
+        return np.asarray(self._wall.sum(axis=1))
+
+    @property
+    def share(self) -> Array:
+        """x_2 / (x_1 + x_2), the share of the second species, shape (N,); nan where there is none, or no biomass."""
+        if len(self._responses) == 1:
+            return np.full(self._n, np.nan)
+        od = self.od
+        return np.asarray(np.divide(self.biomass[:, 1], od, out=np.full(self._n, np.nan), where=od > 0.0))
 
     def new_minute(self, z: Array) -> None:
         """Take this minute's draw: standard normal, shape (N,)."""
@@ -120,11 +151,11 @@ class Culture:
 
     def dilute(self, kept: Array) -> None:
         """Fresh medium left the share `kept`, shape (N,), of what was in the vial."""
-        self.od, self.substrate = self.od * kept, 1.0 - (1.0 - self.substrate) * kept
+        self.biomass, self.substrate = self.biomass * kept[:, None], 1.0 - (1.0 - self.substrate) * kept
 
     def concentrate(self, factor: Array) -> None:
         """Water evaporated: concentrations rise by `factor`, shape (N,)."""
-        self.od, self.substrate = self.od * factor, self.substrate * factor
+        self.biomass, self.substrate = self.biomass * factor[:, None], self.substrate * factor
 
     def grow(self, minutes: float, dilution: Array, temperature: Array, age_min: Array) -> None:
         """Integrate x, s, w over an interval in which temperature and dilution rate are constant.
@@ -132,39 +163,53 @@ class Culture:
         Args:
           dilution: 1/min; temperature: degC; age_min: of the culture, min; all of shape (N,).
         """
-        g = self.config
-        response = self._phi(temperature)
-        follow = 1.0 if g.adaptation_min == 0.0 else -np.expm1(-minutes / g.adaptation_min)
-        self._adapted = self._adapted + (response - self._adapted) * follow
+        g, d = self.config, dilution[:, None]
+        follow = [1.0 if lag == 0.0 else -np.expm1(-minutes / lag) for lag in self._lags_min]
+        self._adapted = self._adapted + (self._phi(temperature) - self._adapted) * np.array(follow)
         relative = self._relative_rate(age_min)
+        species = len(follow)
 
         def derivative(y: Array) -> Array:
-            x, s, w = y
-            rate = self._law.specific_rate(s) * relative
+            x, s, w = y[:, :species], y[:, species : species + 1], y[:, species + 1 :]
+            rate = self._law.specific_rate(np.broadcast_to(s, x.shape)) * relative
             exchange = g.wall_attach_per_min * x - g.wall_detach_per_min * w
-            grown = g.wall_growth_ratio * rate * w * (1.0 - w / g.wall_capacity_od)
-            dx, ds = (rate - dilution) * x - exchange, dilution * (1.0 - s) - rate * x / g.yield_od
-            return np.stack([dx, ds, exchange + grown])
+            crowded = 1.0 - w.sum(axis=1, keepdims=True) / g.wall_capacity_od
+            grown = g.wall_growth_ratio * rate * w * crowded
+            dx = (rate - d) * x - exchange
+            ds = d * (1.0 - s) - (rate * x).sum(axis=1, keepdims=True) / g.yield_od
+            return np.concatenate([dx, ds, exchange + grown], axis=1)
 
-        state = np.stack([self.od, self.substrate, self.wall])
-        state = self._integrate(derivative, state, minutes, self.substeps(minutes))
-        self.od, self.substrate, self.wall = np.maximum(state, 0.0)
+        state = np.concatenate([self.biomass, self.substrate[:, None], self._wall], axis=1)
+        state = np.maximum(self._integrate(derivative, state, minutes, self.substeps(minutes)), 0.0)
+        self.biomass, self.substrate, self._wall = state[:, :species], state[:, species], state[:, species + 1 :]
 
     def substeps(self, minutes: float) -> int:
         """Integration steps in an interval of `minutes`."""
         return max(1, int(np.ceil(minutes / self._substep_min - 1e-9)))
 
+    def rates(self, age_min: Array) -> Array:
+        """Specific growth rate of each species at this moment, 1/min, shape (N, S).
+
+        Args: age_min: of the culture, min, shape (N,).
+        """
+        substrate = np.broadcast_to(self.substrate[:, None], self.biomass.shape)
+        return self._law.specific_rate(substrate) * self._relative_rate(age_min)
+
     def specific_rate(self, age_min: Array) -> Array:
-        """Specific growth rate at this moment, 1/min, of a culture of `age_min` min; both shape (N,)."""
-        return self._law.specific_rate(self.substrate) * self._relative_rate(age_min)
+        """Specific growth rate of the first species, 1/min, shape (N,); arguments as `rates`."""
+        return self.rates(age_min)[:, 0]
+
+    def _phi(self, temperature: Array) -> Array:
+        """phi_i(T) of every species, shape (N, S)."""
+        return np.stack([phi(temperature) for phi in self._responses], axis=1)
 
     def _relative_rate(self, age_min: Array) -> Array:
-        """What temperature, drift, stirring and `mu_factor` now make of the growth law's rate, shape (N,)."""
+        """What temperature, drift, stirring and `mu_factor` now make of the growth laws' rates, shape (N, S)."""
         g = self.config
         course = along(g.knots_min, g.knots_mu, g.mu, age_min)
         drift = np.exp(self._log_drift) * np.maximum(1.0 + g.ramp_per_h * age_min / 60.0, 0.0) * course
         stirred = UNSTIRRED_GROWTH + (1.0 - UNSTIRRED_GROWTH) * self.stir_factor
-        return np.asarray(self._adapted * drift * stirred * self.mu_factor)
+        return np.asarray(self._adapted * drift[:, None] * stirred[:, None] * self.mu_factor[:, None])
 
     def settle(self, minutes: float) -> None:
         """Cells sink where the stirrer stands still, and rise again where it turns."""

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from conf.schema import check, part, setting
 from envs.integrators import INTEGRATORS
 from envs.plant.culture import Culture, GrowthConfig
+from envs.plant.fluorescence import Fluorescence, FluorescenceConfig
 from envs.plant.noise import Streams, Tape, streams, uniform
 from envs.plant.pump import FeedPump, PumpConfig
 from envs.plant.sensor import OdSensor, SensorConfig
+from envs.plant.species import SecondSpeciesConfig
 from envs.plant.thermal import Thermal, ThermalConfig
 from envs.plant.vessel import Vessel, VesselConfig
 
@@ -32,8 +34,13 @@ class PlantConfig:
     sensor: SensorConfig = part(SensorConfig, "what an averaged OD reading adds to the truth")
     vessel: VesselConfig = part(VesselConfig, "the vial and its bottle")
     thermal: ThermalConfig = part(ThermalConfig, "heater and surroundings")
+    second: SecondSpeciesConfig = part(SecondSpeciesConfig, "a second species in the vial")
+    fluorescence: FluorescenceConfig = part(FluorescenceConfig, "light that the second species gives, and its sensor")
     start_od: float = setting(
         0.5, "suspended biomass at reset unless the scenario says otherwise", "OD", within=(0, 10)
+    )
+    start_temperature: float = setting(
+        37.0, "of vial and thermostat at reset unless somebody says otherwise", "degC", within=(0, 60)
     )
     start_min: float = setting(
         0.0, "age of culture and pump at reset, from which their drifts and knots go on", "min", at_least=0.0
@@ -52,7 +59,7 @@ class PlantConfig:
 
 
 class Plant:
-    """N vials, advanced together: parts `culture`, `vessel`, `thermal`, `feed` (the pump) and `sensor`.
+    """N vials, advanced together: parts `culture`, `vessel`, `thermal`, `feed` (the pump), `sensor`, `fluorescence`.
 
     With `dosing = pulse` the dose enters at the start of an interval: x <- x F, s <- 1 - (1 - s) F, and the dilution
     rate is 0 after it; F = exp(-v/V) for what feed and waste pump exchange at constant volume, V/(V + v) for what stays
@@ -77,38 +84,54 @@ class Plant:
         if n < 1:
             raise ValueError(f"number of vials = {n}: allowed >= 1")
         self.config, self.n = config, n
-        parts = [r.spawn(4) for r in streams(rng, n)]
-        once, process, reading, start = ([p[k] for p in parts] for k in range(4))
+        parts = [r.spawn(6) for r in streams(rng, n)]
+        once, process, reading, start, second, light = ([p[k] for p in parts] for k in range(6))
         # The parts draw from the same streams: their order belongs to what a seed means.
-        self.culture = Culture(config.growth, once, INTEGRATORS[config.integrator], config.substep_min)
+        integrate = INTEGRATORS[config.integrator]
+        self.culture = Culture(config.growth, once, integrate, config.substep_min, config.second, second)
         self.vessel = Vessel(config.vessel, config.pump, once)
         self.feed = FeedPump(config.pump, once)
         self.sensor = OdSensor(config.sensor, once, reading)
         self.thermal = Thermal(config.thermal, n)
         self.feed.media_left_ml[:] = config.vessel.media_ml
         self.draws = self.culture.draws | self.vessel.draws | self.feed.draws | self.sensor.draws
+        self.fluorescence = Fluorescence(config.fluorescence, light) if config.second.present else None
+        if self.fluorescence is not None:
+            self.draws |= self.fluorescence.draws
         self.draws["start_min"] = uniform(start, config.start_min, config.start_min + config.start_spread_min)
         self._tape = Tape(process, normals=3, uniforms=2)
         self.reset()
 
-    def reset(self, od: Array | float | None = None, temperature: float = 37.0) -> None:
+    def reset(
+        self,
+        od: Array | float | None = None,
+        temperature: float | None = None,
+        share: Array | float | None = None,
+    ) -> None:
         """A new culture at the waste tube's level, in balance with the medium it grew from.
 
         Args:
           od: suspended biomass, OD, scalar or shape (N,), >= 0; None = `start_od` of the config.
-          temperature: of vial and thermostat, degC.
-        Fault switches, what the bottle holds and the drawn parameters stay. Raises: ValueError for an OD below 0.
+          temperature: of vial and thermostat, degC; None = `start_temperature` of the config.
+          share: of the second species, if there is one, scalar or shape (N,), 0 to 1; None = as drawn.
+        Fault switches, what the bottle holds and the drawn parameters stay. Raises: ValueError for an OD below
+        0 or a share outside 0 to 1.
         """
         start = np.asarray(self.config.start_od if od is None else od, dtype=np.float64)
         if not np.all(start >= 0.0):
             raise ValueError(f"start OD = {start}: allowed >= 0")
-        self.thermal.reset(temperature)
-        self.culture.reset(start, self.thermal.temperature)
+        if share is not None and not (np.all(np.asarray(share) >= 0.0) and np.all(np.asarray(share) <= 1.0)):
+            raise ValueError(f"start share = {share}: allowed 0 to 1")
+        self.thermal.reset(self.config.start_temperature if temperature is None else temperature)
+        self.culture.reset(start, self.thermal.temperature, share)
         self.vessel.reset()
         self.feed.reset()
         self.sensor.reset()
         self.minutes = 0.0
         self._minute = -1
+        if self.fluorescence is not None:
+            growth = self.culture.rates(self.age_min)[:, 1]
+            self.fluorescence.reset(self.culture.biomass[:, 1], growth, self.thermal.temperature)
 
     def advance(
         self,
@@ -160,8 +183,14 @@ class Plant:
         else:
             dilution = fresh / volume / minutes
         self.thermal.advance(minutes, kept)
+        before = self.culture.biomass
         self.culture.grow(minutes, dilution, self.thermal.mean, self.age_min)
-        self.culture.concentrate(self.vessel.evaporate(minutes))
+        concentrated = self.vessel.evaporate(minutes)
+        if self.fluorescence is not None:
+            washed_out = kept if self.config.pump.dosing == "pulse" else np.ones(self.n)
+            producers = 0.5 * (before + self.culture.biomass)[:, 1]
+            self.fluorescence.advance(minutes, producers, washed_out, dilution, concentrated)
+        self.culture.concentrate(concentrated)
         self.culture.settle(minutes)
         self.minutes += minutes
 
@@ -172,25 +201,27 @@ class Plant:
             self.feed.new_minute(z_pump, u_timing, u_prime)
             self.culture.new_minute(z_mu)
             self.thermal.new_minute(z_ripple)
+            if self.fluorescence is not None:
+                self.fluorescence.new_minute(self.thermal.temperature)
             self._minute += 1
 
     def expected_od(self, minutes: float, feed_s: Array) -> Array:
         """Suspended biomass after an interval without surprises, OD, (A, N); changes nothing.
 
-        x grows at the rate of this moment (substrate, temperature, drift and stirring as they are) and is diluted by
-        the mean dose of a primed pump. What is drawn during the interval, priming and the wall are left out.
+        Each species grows at the rate of this moment (substrate, temperature, drift and stirring as they are) and is
+        diluted by the mean dose of a primed pump. What is drawn during the interval, priming and the wall are left out.
 
         Args:
           minutes: length of the interval, min, at most 1.
           feed_s: on-times of the feed pump to compare, s, shape (A, N).
         """
-        rate = self.culture.specific_rate(self.age_min)
-        dose = self.feed.expected(feed_s, self.age_min) / self.vessel.volume_ml
+        rate = self.culture.rates(self.age_min)
+        dose = (self.feed.expected(feed_s, self.age_min) / self.vessel.volume_ml)[..., None]
         steps = self.culture.substeps(minutes)
         continuous = self.config.pump.dosing == "continuous"
         change = (rate * minutes - (dose if continuous else 0.0)) / steps
         grown = (1.0 + change) ** steps if self.config.integrator == "euler" else np.exp(steps * change)
-        return np.asarray(self.culture.od * grown * (1.0 if continuous else np.exp(-dose)))
+        return np.asarray((self.culture.biomass * grown * (1.0 if continuous else np.exp(-dose))).sum(axis=-1))
 
     @property
     def age_min(self) -> Array:
@@ -205,3 +236,9 @@ class Plant:
     def apparent_od(self) -> Array:
         """What a noise-free sensor would show now, OD, shape (N,)."""
         return self.sensor.apparent(self.culture.in_light_path, self.culture.wall, self.minutes)
+
+    def read_fluorescence(self) -> Array:
+        """One reading of every fluorescence sensor, counts, shape (N,); nan where there is no second species."""
+        if self.fluorescence is None:
+            return np.full(self.n, np.nan)
+        return self.fluorescence.read(self.culture.od, self.minutes)

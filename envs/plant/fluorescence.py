@@ -1,0 +1,140 @@
+"""Pyoverdine, the fluorescent pigment of P. putida, and the sensor that counts its light.
+
+Source of the equations and numbers: Lee, Morlock, Allan, Steel, Cell Reports Methods 5:101009 (2025); its public model
+Janmorlock/CompEst3000 (MIT). Light is counted as the device's base times its first emission: counts of one band.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from conf.schema import check, setting
+from envs.coculture.rates import T_MAX, T_MIN
+from envs.plant.noise import Streams, Tape, uniform
+from envs.plant.sensor import FULL_SCALE
+
+__all__ = ["Fluorescence", "FluorescenceConfig", "steady_production"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Highest power first: the other order would reach 900 000 at 29 and at 36 degC and a valley of 100 between.
+POLYNOMIAL = (44.49572512791427, 31.820479677943325, -917.5864128224449, -886.6854718162117, 6318.711894680335)
+CENTRE_C = 32.5  # degC
+LEAST = 20.0  # counts per OD and hour
+FOLLOW_PER_H = 1.6  # 1/h
+DELAY_MIN = 30
+DAY_MIN = 1440.0
+
+
+def steady_production(temperature: Array | float) -> Array:
+    """g_ss(T) = max(20, sum_k c_k (T - 32.5)^k), counts per hour and OD of P. putida; shape of `temperature`.
+
+    T is cut to [29, 36] degC: 3495 at 29, a peak of 6531 near 32, 5270 at 33.2, 602 at 35, 20 at 36.
+    """
+    t = np.clip(temperature, T_MIN, T_MAX)
+    return np.maximum(np.polyval(np.array(POLYNOMIAL), t - CENTRE_C), LEAST)
+
+
+@dataclass(frozen=True)
+class FluorescenceConfig:
+    """The sensor: y = k (f + od_term OD) + offset with pigment f; the defaults are a calibrated reactor, with noise.
+
+    Seventeen real reactors had k 0.75 to 1.19 (mean 0.99) and offsets of 151 to 339 (mean 214).
+    """
+
+    factor: tuple[float, float] = setting(
+        (1.0, 1.0), "k of a reactor is drawn uniformly between these", within=(0.1, 10), interval=True
+    )
+    offset: tuple[float, float] = setting(
+        (214.0, 214.0), "offset of a reactor, likewise", "counts", within=(0, 5000), interval=True
+    )
+    od_term: float = setting(150.0, "light that any cells scatter into the band", "counts/OD", within=(0, 5000))
+    noise_sd: float = setting(30.0, "sd of a reading", "counts", within=(0, 1000))
+    drift_per_day: float = setting(
+        0.0, "relative change of k per day is drawn uniformly in +- this", "1/day", within=(0, 0.5)
+    )
+    ageing_per_day: float = setting(0.0, "relative loss of the lamp's light", "1/day", within=(0, 0.5))
+    saturation: float = setting(
+        FULL_SCALE, "highest reading, full scale of the converter", "counts", within=(100, FULL_SCALE)
+    )
+
+    def __post_init__(self) -> None:
+        check(self, "plant.fluorescence")
+
+
+class Fluorescence:
+    """N vials' pigment and sensors.
+
+      f' = g p - D f                        pigment; p is the OD of P. putida, D the dilution rate
+      g' = 1.6 / h (g_ss(T) - g(t - 30 min)),  g >= 20      its production rate, a damped oscillation about g_ss
+
+    g takes one step per minute. f is exact for constant p and D over the interval.
+
+    Args:
+      config: the sensor; rngs: one stream per vial, for what is drawn once and for the readings.
+    State, shape (N,): `pigment` (counts), `production` (counts per hour and OD). Fault switches, bool, shape (N,), in
+    rising precedence: `dead` (reads 0), `saturated`, `frozen`.
+    """
+
+    def __init__(self, config: FluorescenceConfig, rngs: Streams) -> None:
+        self.config, n = config, len(rngs)
+        parts = [r.spawn(2) for r in rngs]
+        once, reading = ([p[k] for p in parts] for k in range(2))
+        self.draws: dict[str, Array] = {
+            "fluorescence_factor": uniform(once, *config.factor),
+            "fluorescence_offset": uniform(once, *config.offset),
+            "fluorescence_drift_per_day": uniform(once, -config.drift_per_day, config.drift_per_day),
+        }
+        self.dead, self.saturated, self.frozen = (np.zeros(n, dtype=bool) for _ in range(3))
+        self._tape = Tape(reading, normals=1, uniforms=0)
+
+    def reset(self, producers: Array, growth: Array, temperature: Array) -> None:
+        """Pigment and production in balance with cells that grew undiluted: f = g_ss p / mu.
+
+        Args: producers: OD of P. putida; growth: its rate, 1/min (none: no pigment); temperature: degC; shape (N,).
+        """
+        self.production: Array = steady_production(temperature)
+        self._past = np.tile(self.production, (DELAY_MIN, 1))
+        made = self.production / 60.0 * producers
+        self.pigment: Array = np.divide(made, growth, out=np.zeros_like(made), where=growth > 0.0)
+        self._last = np.full(producers.size, np.nan)
+
+    def new_minute(self, temperature: Array) -> None:
+        """A minute begins at `temperature`, degC, shape (N,): production takes its step."""
+        wanted = self.production + FOLLOW_PER_H / 60.0 * (steady_production(temperature) - self._past[0])
+        self._past = np.concatenate([self._past[1:], self.production[None]])
+        self.production = np.maximum(wanted, LEAST)
+
+    def advance(self, minutes: float, producers: Array, kept: Array, dilution: Array, concentrated: Array) -> None:
+        """Dilute, make and wash out pigment over an interval.
+
+        Args:
+          minutes: its length, min. producers: OD of P. putida, mean of the interval.
+          kept: share that a dose at its start leaves; dilution: 1/min, during it; concentrated: by evaporation, at its
+            end; all of shape (N,).
+        """
+        gone = -np.expm1(-dilution * minutes)
+        duration = np.divide(gone, dilution, out=np.full_like(gone, minutes), where=dilution > 0.0)
+        made = self.production / 60.0 * producers * duration
+        self.pigment = (self.pigment * kept * (1.0 - gone) + made) * concentrated
+
+    def apparent(self, od: Array, minutes: float) -> Array:
+        """What a noise-free sensor would show, counts, shape (N,).
+
+        Args: od: of all cells, shape (N,); minutes: age of the calibration, min.
+        """
+        days, d = minutes / DAY_MIN, self.draws
+        factor = d["fluorescence_factor"] * np.maximum(1.0 + d["fluorescence_drift_per_day"] * days, 0.0)
+        factor = factor * max(1.0 - self.config.ageing_per_day * days, 0.0)
+        return np.asarray(factor * (self.pigment + self.config.od_term * od) + d["fluorescence_offset"])
+
+    def read(self, od: Array, minutes: float) -> Array:
+        """One reading with all that is configured or switched on, counts; arguments as `apparent`, shape (N,)."""
+        c = self.config
+        (z,), _ = self._tape.next()
+        value = np.clip(self.apparent(od, minutes) + c.noise_sd * z, 0.0, c.saturation)
+        value = np.where(self.saturated, c.saturation, np.where(self.dead, 0.0, value))
+        self._last = np.where(self.frozen & ~np.isnan(self._last), self._last, value)
+        return self._last.copy()

@@ -1,0 +1,270 @@
+"""Two species in one vial: shares, lags, pigment and its sensor, against closed forms and figures done by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conf.presets import load
+from conf.schema import build
+from envs.coculture.rates import EQUAL_RATES_C, e_coli_rate, p_putida_rate
+from envs.plant.culture import GrowthConfig
+from envs.plant.fluorescence import FluorescenceConfig, steady_production
+from envs.plant.plant import Plant, PlantConfig
+from envs.plant.species import SecondSpeciesConfig
+from envs.plant.thermal import ThermalConfig
+from envs.plant.vessel import VesselConfig
+
+QUIET = FluorescenceConfig(noise_sd=0.0)
+STEADY = ThermalConfig(medium_c=37.0, heating_c_per_min=10.0)
+
+
+def plant(config: PlantConfig, n: int = 1, seed: int = 0) -> Plant:
+    return Plant(config, n, np.random.default_rng(seed))
+
+
+def pair(**changes) -> PlantConfig:
+    """Rates 0.02 and 0.01 1/min whatever the temperature, half and half at the start, nothing random."""
+    second = SecondSpeciesConfig(start_share=(0.5, 0.5), mu=0.01)
+    base = PlantConfig(growth=GrowthConfig(mu=0.02), second=second, fluorescence=QUIET, integrator="rk4")
+    return replace(base, **changes)
+
+
+def logit(share):
+    return np.log(share / (1.0 - share))
+
+
+def test_the_curves_differ_as_published() -> None:
+    degrees = np.array([29.0, 30, 31, 32, 33, EQUAL_RATES_C, 34, 35, 36, 40])
+    difference = [0.298, 0.298, 0.253, 0.164, 0.031, 0.0, -0.146, -0.367, -0.632, -0.632]
+    np.testing.assert_allclose(p_putida_rate(degrees) - e_coli_rate(degrees), difference, atol=1e-3)
+    assert e_coli_rate(36.0) == pytest.approx(1.11218)
+    assert p_putida_rate(20.0) == p_putida_rate(29.0)
+
+
+@pytest.mark.parametrize("temperature", [29.0, 31.0, EQUAL_RATES_C, 35.0, 36.0])
+def test_the_preset_grows_by_the_published_curves(temperature) -> None:
+    p = plant(build(PlantConfig(), load("plant/coculture")))
+    p.reset(temperature=temperature)
+    rates = [[float(e_coli_rate(temperature)), float(p_putida_rate(temperature))]]
+    np.testing.assert_allclose(60.0 * p.culture.rates(p.age_min), rates, rtol=1e-7)
+
+
+@pytest.mark.parametrize("dosing", ["continuous", "pulse"])
+def test_the_logit_of_the_share_falls_by_the_difference_of_the_rates(dosing) -> None:
+    p = plant(pair(pump=replace(PlantConfig().pump, dosing=dosing)), n=3)
+    p.reset(share=np.array([0.1, 0.5, 0.9]))
+    start = logit(p.culture.share)
+    for _ in range(60):
+        p.advance(1.0, np.array([0.0, 0.3, 1.2]))
+    np.testing.assert_allclose(logit(p.culture.share) - start, 60 * (0.01 - 0.02), rtol=1e-6)
+
+
+def test_dilution_and_evaporation_leave_the_share() -> None:
+    still = pair(growth=GrowthConfig(mu=0.0), vessel=VesselConfig(evaporation_ml_day=50.0))
+    p = plant(replace(still, second=replace(still.second, mu=0.0, start_share=(0.3, 0.3))))
+    for _ in range(30):
+        p.advance(1.0, np.array([1.0]))
+    assert p.culture.share[0] == pytest.approx(0.3, rel=1e-12)
+    assert p.culture.od[0] < 0.2
+
+
+def test_both_eat_the_same_medium_and_share_the_wall() -> None:
+    growth = GrowthConfig(mu=0.02, yield_od=2.0, wall_attach_per_min=1e-3, wall_growth_ratio=0.0)
+    p = plant(pair(growth=growth))
+    for _ in range(120):
+        p.advance(1.0, np.zeros(1))
+        total = p.culture.od + p.culture.wall + 2.0 * p.culture.substrate
+        assert total[0] == pytest.approx(2.0, rel=1e-9)
+    assert p.culture.wall[0] > 0.05
+
+
+def test_two_species_that_are_alike_are_one() -> None:
+    growth = GrowthConfig(
+        mu=0.025, mu_cv=0.0, temperature_law="cardinal", adaptation_min=10.0, yield_od=3.0, drift_sd_per_h=0.05,
+        wall_attach_per_min=2e-4, wall_detach_per_min=1e-3, wall_growth_ratio=0.5, wall_capacity_od=0.2,
+    )  # fmt: skip
+    twin = SecondSpeciesConfig((0.3, 0.3), mu=0.025, temperature_law="cardinal", adaptation_min=10.0)
+    one, two = plant(PlantConfig(growth=growth), 2), plant(PlantConfig(growth=growth, second=twin), 2)
+    for k in range(200):
+        for p in (one, two):
+            p.advance(1.0, np.array([0.3, 1.2]), temperature_target=37.0 if k < 100 else 30.0)
+        now = [p.expected_od(1.0, np.array([[0.0, 0.0], [1.2, 0.5]])) for p in (one, two)]
+        np.testing.assert_allclose(now[1], now[0], rtol=1e-9)
+    for name in ("od", "substrate", "wall"):
+        np.testing.assert_allclose(getattr(two.culture, name), getattr(one.culture, name), rtol=1e-9)
+    np.testing.assert_allclose(two.culture.share, 0.3, rtol=1e-9)
+
+
+def test_a_second_species_moves_no_draw_of_the_first() -> None:
+    """The same reactors and noise: what was drawn for a vial stays when a species is added."""
+    bench = build(PlantConfig(), load("plant/bench"))
+    share = SecondSpeciesConfig((0.2, 0.8), mu=0.01, mu_cv=0.1)
+    one, two = plant(bench, 4), plant(replace(bench, second=share), 4)
+    for name, drawn in one.draws.items():
+        np.testing.assert_array_equal(two.draws[name], drawn)
+    assert np.unique(two.draws["second_share"]).size == 4
+    first = two.culture.share
+    two.reset()
+    np.testing.assert_array_equal(two.culture.share, first)
+
+
+def test_one_species_has_no_share_and_no_light() -> None:
+    p = plant(PlantConfig(), 2)
+    assert np.isnan(p.culture.share).all()
+    assert np.isnan(p.read_fluorescence()).all()
+    assert p.culture.biomass.shape == (2, 1)
+
+
+def test_each_species_follows_the_temperature_with_its_own_lag() -> None:
+    config = build(PlantConfig(), load("plant/coculture"))
+    p = plant(replace(config, thermal=STEADY))
+    p.reset(temperature=29.0)
+    p.thermal.temperature[:] = 36.0  # a step, not a ramp
+    for _ in range(60):
+        p.advance(1.0, np.zeros(1), temperature_target=36.0)
+    e, putida = 60.0 * p.culture.rates(p.age_min)[0]
+    assert e == pytest.approx(1.11218, rel=1e-6)
+    assert putida == pytest.approx(0.47996 + (float(p_putida_rate(29.0)) - 0.47996) * np.exp(-1.0), rel=1e-4)
+
+
+def test_expected_od_is_the_sum_of_both() -> None:
+    p = plant(pair())
+    (grown,) = p.expected_od(1.0, np.zeros((1, 1)))
+    assert grown[0] == pytest.approx(0.25 * (np.exp(0.02) + np.exp(0.01)), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "allowed"),
+    [
+        ("start_share", (0.2, 1.2), r"plant\.second\.start_share = \[0\.2, 1\.2\]: allowed \[low, high\]"),
+        ("temperature_law", "yeast", r"plant\.second\.temperature_law = yeast: allowed none, arrhenius"),
+        ("mu", 0.5, r"plant\.second\.mu = 0\.5 1/min: allowed 0 to 0\.1"),
+    ],
+)
+def test_what_is_out_of_range_is_named(key, value, allowed) -> None:
+    with pytest.raises(ValueError, match=allowed):
+        SecondSpeciesConfig(**{key: value})
+
+
+def test_a_share_outside_its_range_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"start share = 1\.5: allowed 0 to 1"):
+        plant(pair()).reset(share=1.5)
+
+
+# -- pyoverdine and its light ------------------------------------------------------------------------------------------
+
+
+def test_production_is_as_published() -> None:
+    """Worked out by hand: at 33.2, x = 0.7: 44.4957 x^4 + 31.8205 x^3 - 917.586 x^2 - 886.685 x + 6318.71."""
+    degrees = np.array([29.0, 32.5, 33.2, 35.0, 36.0, 40.0])
+    np.testing.assert_allclose(steady_production(degrees), [3495, 6318.7, 5270, 602, 20, 20], rtol=1e-3)
+
+
+def test_pigment_settles_where_production_meets_dilution() -> None:
+    """At a held composition and constant dilution f = g p / D, with D the growth of both."""
+    alike = SecondSpeciesConfig((0.4, 0.4), mu=0.02)
+    p = plant(pair(second=alike, start_temperature=33.0, thermal=replace(STEADY, medium_c=33.0)))
+    p.fluorescence.pigment[:] = 0.0
+    for _ in range(1500):
+        p.advance(1.0, np.array([0.02 * 20.0]))
+    f = float(steady_production(33.0)) * 0.2 / (60.0 * 0.02)
+    assert p.culture.od[0] == pytest.approx(0.5, rel=1e-6)
+    assert p.fluorescence.pigment[0] == pytest.approx(f, rel=1e-6)
+    assert p.read_fluorescence()[0] == pytest.approx(f + 150.0 * 0.5 + 214.0, rel=1e-6)
+
+
+def test_pigment_starts_in_balance_with_undiluted_growth() -> None:
+    """f' = g p and p' = mu p keep f / p = g / mu."""
+    p = plant(pair(start_temperature=33.0, thermal=STEADY))
+    ratio = p.fluorescence.pigment / p.culture.biomass[:, 1]
+    for _ in range(60):
+        p.advance(1.0, np.zeros(1))
+    np.testing.assert_allclose(p.fluorescence.pigment / p.culture.biomass[:, 1], ratio, rtol=1e-4)
+
+
+def test_production_answers_at_once_and_overshoots_after_the_delay() -> None:
+    """g' = k (1 - g(t - d)) from 0: k t until d, then k d + k (t - d) (1 - k (t - d) / 2); k = 1.6 / h, d = 0.5 h."""
+    light = plant(pair()).fluorescence
+    low, high = float(steady_production(35.0)), float(steady_production(32.0))
+    light.reset(np.array([0.2]), np.array([0.01]), np.array([35.0]))
+    done = []
+    for _ in range(120):
+        light.new_minute(np.array([32.0]))
+        done.append((light.production[0] - low) / (high - low))
+    assert done[14] == pytest.approx(1.6 * 0.25, rel=1e-9)
+    assert done[29] == pytest.approx(0.8, rel=1e-9)
+    assert done[44] == pytest.approx(0.8 + 0.4 * (1.0 - 0.2), abs=0.01)
+    assert 1.05 < max(done) < 1.6
+
+
+def test_production_never_falls_below_its_floor() -> None:
+    light = plant(pair()).fluorescence
+    light.reset(np.array([0.2]), np.array([0.01]), np.array([32.0]))
+    for _ in range(120):
+        light.new_minute(np.array([36.0]))
+        assert light.production[0] >= 20.0
+
+
+def test_pulses_and_steady_flow_wash_out_alike() -> None:
+    pulse = replace(pair().pump, dosing="pulse")
+    readings = []
+    for config in (pair(), pair(pump=pulse)):
+        p = plant(replace(config, thermal=STEADY, start_temperature=33.0))
+        for _ in range(300):
+            p.advance(1.0, np.array([0.4]))
+        readings.append(p.read_fluorescence()[0])
+    assert readings[1] == pytest.approx(readings[0], rel=0.02)
+
+
+def test_evaporation_concentrates_the_pigment() -> None:
+    dry = pair(vessel=VesselConfig(evaporation_ml_day=50.0), growth=GrowthConfig(mu=0.0))
+    p = plant(replace(dry, second=replace(dry.second, mu=0.0)))
+    p.fluorescence.pigment[:], p.fluorescence.production[:] = 1000.0, 0.0
+    p.fluorescence.advance(1.0, np.zeros(1), np.ones(1), np.zeros(1), np.array([1.1]))
+    assert p.fluorescence.pigment[0] == pytest.approx(1100.0)
+
+
+def test_a_reactor_s_factor_offset_and_ageing_are_in_its_reading() -> None:
+    lamp = FluorescenceConfig((0.8, 0.8), (300.0, 300.0), noise_sd=0.0, ageing_per_day=0.1)
+    light = plant(pair(fluorescence=lamp)).fluorescence
+    light.pigment[:] = 1000.0
+    assert light.read(np.array([0.5]), 0.0)[0] == pytest.approx(0.8 * 1075.0 + 300.0)
+    assert light.read(np.array([0.5]), 2880.0)[0] == pytest.approx(0.8 * 0.8 * 1075.0 + 300.0)
+
+
+def test_drift_goes_either_way_and_stays_with_the_reactor() -> None:
+    light = plant(pair(fluorescence=replace(QUIET, drift_per_day=0.1)), 40).fluorescence
+    light.pigment[:] = 1000.0
+    day = light.read(np.zeros(40), 1440.0) - 214.0
+    assert day.min() < 950.0 < 1050.0 < day.max() <= 1100.0
+    np.testing.assert_allclose(light.read(np.zeros(40), 2880.0) - 214.0, 2.0 * day - 1000.0)
+
+
+def test_a_reading_spreads_as_configured_and_stays_within_the_converter() -> None:
+    light = plant(pair(fluorescence=FluorescenceConfig(saturation=1000.0)), 500).fluorescence
+    light.pigment[:] = 500.0
+    assert np.std([light.read(np.zeros(500), 0.0) for _ in range(20)]) == pytest.approx(30.0, rel=0.05)
+    light.pigment[:] = 5000.0
+    np.testing.assert_array_equal(light.read(np.zeros(500), 0.0), 1000.0)
+
+
+def test_fault_switches_of_the_light() -> None:
+    light = plant(pair(fluorescence=FluorescenceConfig()), 4).fluorescence
+    before = light.read(np.full(4, 0.5), 0.0)
+    light.dead[1], light.saturated[2], light.frozen[3] = True, True, True
+    after = light.read(np.full(4, 0.5), 0.0)
+    assert after[0] != before[0]
+    np.testing.assert_array_equal(after[1:], [0.0, 65535.0, before[3]])
+
+
+def test_the_published_presets_start_where_they_say() -> None:
+    p = plant(build(PlantConfig(), load("plant/coculture_mixed")), 50)
+    share = p.culture.share
+    assert 0.2 <= share.min() < 0.3 < 0.7 < share.max() <= 0.8
+    assert p.thermal.temperature[0] == EQUAL_RATES_C
+    assert 0.75 <= p.draws["fluorescence_factor"].min() <= p.draws["fluorescence_factor"].max() <= 1.19
+    nominal = load("plant/coculture")
+    both = load("plant/coculture_growth_both")
+    assert both["growth"]["mu"] / nominal["growth"]["mu"] == pytest.approx(0.95)
+    assert both["second"]["mu"] / nominal["second"]["mu"] == pytest.approx(0.90)
