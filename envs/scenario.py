@@ -16,8 +16,8 @@ Array = NDArray[np.float64]
 class Scenario:
     """Phases one after another, counted from the end of the recovery.
 
-    The share r of a second species may be asked for, phase by phase or as r(t) = mean + amplitude sin(2 pi t / period),
-    t since the recovery ended. Where it is, whoever controls the composition decides on the temperature, elsewhere
+    The share of a second species may be asked for, phase by phase or as mean - amplitude sin(2 pi t / period), t since
+    the recovery ended. Where it is, whoever controls the composition decides on the temperature, elsewhere
     `temperatures` holds. Raises: ValueError naming key, value and allowed range.
     """
 
@@ -35,7 +35,7 @@ class Scenario:
         below=1.0,
     )
     ratio_sine: tuple[float, ...] = setting(
-        (), "in place of ratios a sine: mean, amplitude (negative: falls first) and period in min; empty: none"
+        (), "in place of ratios a sine that falls first: mean, amplitude and period in min; empty: none"
     )
     announce_min: float = setting(
         360.0, "how long before it a change of the share is told to its controller; 0: never", "min", within=(0, 1440)

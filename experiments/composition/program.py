@@ -35,7 +35,7 @@ class Program:
         require(inside, "scenario.ratios", self.ratios, "each 0 < share < 1, or null where none is asked for")
         if self.sine is not None:
             mean, amplitude, period = self.sine
-            fits = 0.0 < mean - abs(amplitude) and mean + abs(amplitude) < 1.0 and period > 0.0
+            fits = mean - abs(amplitude) > 0.0 and mean + abs(amplitude) < 1.0 and period > 0.0
             require(fits, "scenario.ratio_sine", self.sine, "mean, amplitude, period with 0 < mean +- amplitude < 1")
 
     @property

@@ -20,7 +20,7 @@ from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
 from experiments.composition import registry as compositions
-from experiments.control.composition import Composition, Keeper
+from experiments.control.composition import Composition, Keeper, program_of
 from experiments.control.config import DeployConfig
 from experiments.control.device import check, linked, load_calibrations
 from experiments.control.loop import ClosedLoop
@@ -117,9 +117,12 @@ def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: l
         if not vials.second.present:
             key = f"{'backend.' if emulated else ''}plant=coculture"
             raise frame.UserError(f"composition={kind}: the vials hold one species that does not fluoresce; give {key}")
+    one = next(s for s in scenarios if s.composed)
+    if kind == "optimum" and any(program_of(s) != program_of(one) for s in scenarios):
+        raise frame.UserError("composition=optimum plans one program: give all reactors the same shares and minutes")
     policy = composition_policy(kind, config.composition_policy, folder, config.resume is not None)
     try:
-        keeper: Keeper = compositions.build(config.composition, policy)
+        keeper: Keeper = compositions.build(config.composition, policy, program_of(one))
     except ValueError as error:
         raise frame.UserError(str(error)) from None
     return keeper

@@ -1,5 +1,6 @@
 """Composition in the loop: from believed samples to thermostat targets, within limits, with lasting warnings."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -12,7 +13,7 @@ from experiments.composition.base import Array, Mask, Wanted
 from experiments.composition.program import Program
 from experiments.controllers.base import put_back, saved
 
-__all__ = ["COLUMNS", "TRUE", "Composed", "Composition", "CompositionLimits", "Keeper", "columns"]
+__all__ = ["COLUMNS", "TRUE", "Composed", "Composition", "CompositionLimits", "Keeper", "columns", "program_of"]
 
 ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what a controller explains, the columns of a recording
 COLUMNS = ("fluorescence", "ratio_setpoint", *ESTIMATE, "temperature_target_degc")
@@ -52,6 +53,15 @@ class CompositionLimits:
         require(rising, "composition_limits.high", f"{self.high:g} degC", f"more than low = {self.low:g} degC")
 
 
+def program_of(schedule: Scenario) -> Program:
+    """What a schedule asks for of the share."""
+    if schedule.ratio_sine:
+        mean, amplitude, period = schedule.ratio_sine
+        return Program((), schedule.minutes, (mean, amplitude, period))
+    ratios = schedule.ratios or (None,) * len(schedule.minutes)
+    return Program(tuple(math.nan if r is None else r for r in ratios), schedule.minutes)
+
+
 class Keeper(Protocol):
     """What is asked of a controller of the composition, structurally; arrays (N,)."""
 
@@ -68,7 +78,7 @@ class Keeper(Protocol):
         ...
 
     def target(self, wanted: Wanted, minute: Array, rows: Mask) -> Array:
-        """Thermostat targets, degC; rows: True where the estimate is new and a share is asked for."""
+        """Thermostat targets, degC; minute: since the program began; rows: where readings are new and a share asked."""
         ...
 
     def explain(self) -> dict[str, Array]:
@@ -114,7 +124,7 @@ class Composition:
     ) -> None:
         self.controller, self.schedules, self.limits = controller, schedules, limits or CompositionLimits()
         self._truth, n = truth, len(schedules)
-        self._programs = [Program(s.ratios, s.minutes, s.ratio_sine) for s in schedules]
+        self._programs = [program_of(s) for s in schedules]
         self._setpoint, self._least = np.full(n, np.nan), np.full(n, np.inf)
         self._nearer_min, self._narrow_min = np.full(n, np.nan), np.full(n, np.nan)
         controller.reset(n)
@@ -133,7 +143,7 @@ class Composition:
         wanted = self.wanted(elapsed)
         asked = np.isfinite(wanted.setpoint)
         self.controller.watch(od, fluorescence, temperature, minute, believed)
-        chosen = self.controller.target(wanted, minute, believed & asked)
+        chosen = self.controller.target(wanted, elapsed, believed & asked)
         limited = np.clip(chosen, self.limits.low, self.limits.high)
         target = np.where(asked & np.isfinite(limited), limited, scheduled)
         told = self.controller.explain()
