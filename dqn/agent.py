@@ -13,7 +13,7 @@ from dqn.network import QNetwork, action_basis, initial_weights
 from dqn.optimiser import Adam
 from dqn.replay import Array, Replay, Transition
 from dqn.streams import UniformStream
-from dqn.targets import advantage_target, huber_loss, loss_gradient, q_target
+from dqn.targets import advantage_target, compressed, expanded, huber_loss, loss_gradient, q_target
 
 __all__ = ["STREAMS", "DQNAgent"]
 
@@ -30,7 +30,8 @@ class DQNAgent:
     mean (Q(s, a) - y)^2 / 2, and every `target_period` updates copy the weights to the target network. The updates of
     one step draw from the same memory, and between two copies the target network stays, so their minibatches and
     targets are made in one go. Keys of the
-    config change three of these: `hindsight_share` the minibatch, `action_gap` the target y, `huber` the loss.
+    config change three of these: `hindsight_share` the minibatch, `action_gap` and `value_root` the target y, `huber`
+    the loss.
 
     Args:
       config: hyper-parameters. observations: O, numbers per observation. actions: A.
@@ -64,7 +65,7 @@ class DQNAgent:
         basis = action_basis(actions, config.output_basis_decay).to(self.device) if config.output_basis_decay else None
         self.online = QNetwork(weights, self.sizes, matrix, offset, basis)
         self.target = self.online.with_weights(weights.clone())
-        self._adam = Adam(weights, self.online.grad, config.learning_rate)
+        self._adam = Adam(weights, self.online.grad)
         self.replay = Replay(self.n_agents, config.replay_size, observations, self.device)
         self._explore = UniformStream(streams["explore"], 2)
         self._draws = UniformStream(streams["replay"], config.batch_size)
@@ -136,7 +137,13 @@ class DQNAgent:
     def _td_target(self, batch: Transition) -> torch.Tensor:
         """y of every transition, shape (S, n, B)."""
         c = self.config
-        target = q_target(batch.r_t, batch.continues, c.gamma, self._q_target(batch.s_t))
+        q_t = self._q_target(batch.s_t)
+        if c.value_root:
+            target = compressed(
+                q_target(batch.r_t, batch.continues, c.gamma, expanded(q_t, c.value_root)), c.value_root
+            )
+        else:
+            target = q_target(batch.r_t, batch.continues, c.gamma, q_t)
         if c.action_gap:
             target = advantage_target(target, c.action_gap, self._q_target(batch.s_tm1), batch.a_tm1)
         return target
@@ -160,7 +167,7 @@ class DQNAgent:
         q, inputs = self.online.forward(features)
         td_error, gradient = loss_gradient(q, action, target, c.huber)
         self.online.backward(inputs, gradient)
-        self._adam.step()
+        self._adam.step(c.learning_rate_at(self.updates))
         self.updates += 1
         if self.updates % c.target_period == 0:
             self.target.flat.copy_(self.online.flat)

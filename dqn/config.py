@@ -18,6 +18,9 @@ class DQNConfig:
     hidden: tuple[int, ...] = setting((64, 64), "of the ReLU layers", "units", at_least=1, some=True)
     gamma: float = setting(0.99, "discount per step", at_least=0.0, below=1.0)
     learning_rate: float = setting(1e-3, "Adam's", above=0.0, at_most=1.0)
+    learning_rate_end: float | None = setting(
+        None, "falls to this in the second half of the updates, geometrically; null: stays", above=0.0, at_most=1.0
+    )
     total_steps: int = setting(10_000, "length of training", "steps", at_least=1)
     epsilon_start: float = setting(1.0, "exploration rate at step 0", within=(0, 1))
     epsilon_end: float = setting(0.05, "and from step epsilon_steps on", within=(0, 1))
@@ -41,6 +44,11 @@ class DQNConfig:
         0.0, "rows of the output basis fall as (1 + degree)^-decay; 0: no basis", at_least=0.0
     )
     huber: float = setting(0.0, "TD errors beyond this are clipped in the gradient; 0: squared error", at_least=0.0)
+    value_root: float = setting(
+        0.0,
+        "c of h(z) = c - sqrt(c^2 - z), the scale in which values z of costs are learned; 0: values themselves",
+        at_least=0.0,
+    )
     reward_scale: float = setting(1.0, "rewards are multiplied by this inside the agent", above=0.0)
     hindsight_share: float = setting(0.0, "share of each minibatch that is given another goal", within=(0, 1))
     hindsight_near: float = setting(0.0, "share of those whose new goal lies close to the state reached", within=(0, 1))
@@ -78,6 +86,13 @@ class DQNConfig:
         if step >= self.epsilon_steps:
             return self.epsilon_end
         return self.epsilon_start + (self.epsilon_end - self.epsilon_start) * step / self.epsilon_steps
+
+    def learning_rate_at(self, update: int) -> float:
+        """Adam's rate at a gradient step."""
+        if self.learning_rate_end is None:
+            return self.learning_rate
+        part = max(0.0, 2.0 * update / max(1, self.total_updates) - 1.0)
+        return float(self.learning_rate * (self.learning_rate_end / self.learning_rate) ** part)
 
     def updates_at(self, step: int) -> int:
         """Gradient steps done when `step` environment steps have been taken."""

@@ -107,9 +107,9 @@ class ProgramRelabel:
     `unannounced` nothing is announced. After the step the change is a period nearer, or has come.
 
     Args:
-      config: its keys `hindsight_*`. span: x lies within plus and minus this. goals: lowest and highest setpoint, as x.
-      spread: maps uniform numbers to setpoints. reward: (x', setpoint) -> reward. period, preview: of a decision and of
-      the announcement, in units of the time column; preview 0: there are no such columns.
+      config: its keys `hindsight_*`. span: x lies within plus and minus this. spread: uniform numbers to setpoints as
+      x. reward: (x', setpoint) -> reward. column: of the setpoint. period, preview: of a decision and of the
+      announcement, in units of the time column; preview 0: there are no such columns.
     """
 
     def __init__(

@@ -16,21 +16,19 @@ class Adam:
 
     Args:
       weights: changed in place, any shape. gradient: read at each step, same shape.
-      learning_rate: lr, the same for every step.
     """
 
-    def __init__(self, weights: torch.Tensor, gradient: torch.Tensor, learning_rate: float) -> None:
-        self._learning_rate = learning_rate
+    def __init__(self, weights: torch.Tensor, gradient: torch.Tensor) -> None:
         self._weights, self._gradient = weights, gradient
         self._mean, self._square = torch.zeros_like(weights), torch.zeros_like(weights)
         self._steps = torch.zeros((), device=weights.device)
 
-    def step(self) -> None:
+    def step(self, learning_rate: float) -> None:
         """One step along the gradient."""
         self._steps += 1
         torch._fused_adam_(
             [self._weights], [self._gradient], [self._mean], [self._square], [], [self._steps],
-            lr=self._learning_rate, beta1=BETA1, beta2=BETA2, eps=EPSILON,
+            lr=learning_rate, beta1=BETA1, beta2=BETA2, eps=EPSILON,
             weight_decay=0.0, amsgrad=False, maximize=False,
         )  # fmt: skip
 

@@ -9,6 +9,7 @@ is read, too: it has `pump_rates` for `actions` and no limits of the observation
 |---|---|---|
 | od, setpoint | OD x and setpoint r | pump rates, mL/s |
 | error, growth_share | e = ln(x/r)/B, s = mu h/B; B is what one period h of full pump takes off ln x | shares of it |
+| logit_share, temperature, rate, logit_setpoint (, logit_next, minutes_to_change) | envs/coculture/task.py | degC |
 """
 
 import hashlib
@@ -21,11 +22,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ABSOLUTE", "FORMAT", "RELATIVE", "Policy", "PolicyError", "fingerprint", "load", "save"]
+__all__ = [
+    "ABSOLUTE", "COCULTURE", "COCULTURE_PREVIEW", "FORMAT", "RELATIVE", "Policy", "PolicyError", "fingerprint", "load",
+    "save",
+]  # fmt: skip
 
 FORMAT = 2
 ABSOLUTE = ("od", "setpoint")
 RELATIVE = ("error", "growth_share")
+COCULTURE = ("logit_share", "temperature", "rate", "logit_setpoint")
+COCULTURE_PREVIEW = (*COCULTURE, "logit_next", "minutes_to_change")
+KNOWN = (ABSOLUTE, RELATIVE, COCULTURE, COCULTURE_PREVIEW)
 READABLE = (1, 2)
 
 
@@ -53,7 +60,7 @@ class Policy:
 
     @property
     def observation(self) -> tuple[str, ...]:
-        """Names of the inputs, `ABSOLUTE` or `RELATIVE`."""
+        """Names of the inputs, one of `KNOWN`."""
         return tuple(self.metadata["observation"])
 
     def q_values(self, observation: NDArray[Any]) -> NDArray[np.float32]:
@@ -124,8 +131,8 @@ def load(path: Path) -> Policy:
         if metadata.get("format") not in READABLE:
             allowed = ", ".join(map(str, READABLE))
             raise PolicyError(f"policy {path}: format {metadata.get('format')}: allowed {allowed}; export it anew")
-        if tuple(metadata.get("observation", ())) not in (ABSOLUTE, RELATIVE):
-            allowed = f"{list(ABSOLUTE)} or {list(RELATIVE)}"
+        if tuple(metadata.get("observation", ())) not in KNOWN:
+            allowed = " or ".join(str(list(names)) for names in KNOWN)
             raise PolicyError(f"policy {path}: observation {metadata.get('observation')}: allowed {allowed}")
         first = metadata["format"] == 1
         layers = sum(name.startswith("w") for name in arrays)
@@ -139,7 +146,7 @@ def load(path: Path) -> Policy:
             high=np.full(2, np.inf, dtype=np.float32) if first else arrays["observation_high"],
             metadata={**metadata, "format": FORMAT},  # which `save` writes
         )
-        q = policy.q_values(np.array([[0.5, 0.5]]))
+        q = policy.q_values(np.full((1, len(metadata["observation"])), 0.5))
     except (KeyError, IndexError, ValueError, AttributeError) as error:
         raise PolicyError(f"policy {path}: incomplete or of mismatched shapes ({error}); {remedy}") from None
     if q.shape != (1, policy.actions.size) or not np.isfinite(q).all():

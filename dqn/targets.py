@@ -2,7 +2,7 @@
 
 import torch
 
-__all__ = ["advantage_target", "huber_loss", "loss_gradient", "q_target"]
+__all__ = ["advantage_target", "compressed", "expanded", "huber_loss", "loss_gradient", "q_target"]
 
 
 def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torch.Tensor) -> torch.Tensor:
@@ -12,6 +12,21 @@ def q_target(r_t: torch.Tensor, continues: torch.Tensor, gamma: float, q_t: torc
     Returns: shape (S, B).
     """
     return torch.addcmul(r_t, continues, q_t.amax(-1), value=gamma)
+
+
+def compressed(value: torch.Tensor, root: float) -> torch.Tensor:
+    """h(z) = c - sqrt(c^2 - z) of values z <= 0, any shape: the scale in which costs are learned (after Pohlen 2018).
+
+    Costs are squared errors, so that values span many orders of magnitude: those of a culture at its setpoint vanish
+    beside those of one far away. Their root is of the size of the error itself. Where nothing is random, the fixed
+    point of h(r + gamma max h^-1(Q)) is h(Q*), with the same greedy policy. Args: root: c > 0, below which h is linear.
+    """
+    return root - torch.sqrt(root * root - value.clamp(max=0.0))
+
+
+def expanded(q: torch.Tensor, root: float) -> torch.Tensor:
+    """h^-1(q) = c^2 - (c - q)^2, any shape; what lies above 0, which no cost does, counts as 0."""
+    return root * root - torch.square(root - q.clamp(max=0.0))
 
 
 def advantage_target(target: torch.Tensor, alpha: float, q_tm1: torch.Tensor, a_tm1: torch.Tensor) -> torch.Tensor:

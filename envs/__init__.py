@@ -1,6 +1,6 @@
 """The simulated world: growth, dilution, sensors, plants and environments; NumPy only, batch axis first.
 
-Importing this package registers `Bioreactor-v0` for `gymnasium.make` and `gymnasium.make_vec`.
+Importing this package registers its environments (`gym_adapter.REGISTERED`) with Gymnasium.
 """
 
 from envs.gym_adapter import register

@@ -6,37 +6,35 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.task import EnvConfig
-from envs.vector_env import (
-    BioreactorVectorEnv,
-    EpisodeSpec,
-    action_space,
-    checked_actions,
-    observation_space,
-)  # fmt: skip
+from envs.vector_env import BioreactorVectorEnv, EpisodeSpec, EpisodeVectorEnv, checked_actions
 
-__all__ = ["BioreactorEnv", "register"]
+__all__ = ["BioreactorEnv", "EpisodeEnv", "register"]
 
-ENV_ID = "Bioreactor-v0"
+PREVIEW = {"control_min": 30.0, "episode_steps": 24, "preview_min": 360.0}
+REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
+    "Bioreactor-v0": ("envs.gym_adapter:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
+    "Coculture-v0": ("envs.coculture.task:CocultureEnv", "envs.coculture.task:CocultureVectorEnv", {}),
+    "CoculturePreview-v0": ("envs.coculture.task:CocultureEnv", "envs.coculture.task:CocultureVectorEnv", PREVIEW),
+}
+"""Name -> single view, vector environment, values of the task that differ from its defaults."""
 
 
-class BioreactorEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
-    """`BioreactorVectorEnv` with N = 1 and no autoreset; observation, action and reward are specified there.
-
-    Version history: v0, the task of the paper.
+class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
+    """A vector environment with N = 1 and no autoreset; observation, action and reward are specified there.
 
     Args: config: the task; overrides: values of it. render_mode: None, there is nothing to draw.
     Raises: ValueError naming what is not allowed.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
+    batch: type[EpisodeVectorEnv[Any]]
 
-    def __init__(self, config: EnvConfig | None = None, *, render_mode: str | None = None, **overrides: Any) -> None:
-        self._batch = BioreactorVectorEnv(1, config, render_mode=render_mode, **overrides)
+    def __init__(self, config: Any = None, *, render_mode: str | None = None, **overrides: Any) -> None:
+        self._batch = self.batch(1, config, render_mode=render_mode, **overrides)
         self.render_mode = None
         self.config = self._batch.config
-        self.observation_space = observation_space()
-        self.action_space = action_space(self.config.n_actions)
+        self.observation_space = self._batch.single_observation_space
+        self.action_space = self._batch.single_action_space
         self._next: NDArray[np.float32] | None = None  # start of the episode the batch has already begun
 
     def reset(
@@ -61,11 +59,14 @@ class BioreactorEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
         return observation[0], float(reward[0]), False, bool(truncated[0]), {}
 
 
+class BioreactorEnv(EpisodeEnv):
+    """`BioreactorVectorEnv` as one environment. Version history: v0, the task of the paper."""
+
+    batch = BioreactorVectorEnv
+
+
 def register() -> None:
     """Make `gymnasium.make("Bioreactor-v0")` and `gymnasium.make_vec(...)` work; called on import of `envs`."""
-    if ENV_ID not in gymnasium.registry:
-        gymnasium.register(
-            id=ENV_ID,
-            entry_point="envs.gym_adapter:BioreactorEnv",
-            vector_entry_point="envs.vector_env:BioreactorVectorEnv",
-        )
+    for name, (single, vector, values) in REGISTERED.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(id=name, entry_point=single, vector_entry_point=vector, kwargs=dict(values))

@@ -15,13 +15,12 @@ from conf.renamed import REMOVED, RENAMED
 from conf.schema import build, entries
 from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
-from envs.relative import RelativeConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame, reference
 from experiments.control.config import deploy_schema
 from experiments.train import main
-from experiments.training.config import TrainConfig, read_env_file, variant
+from experiments.training.config import ENVS, TrainConfig, read_env_file, variant
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.link.transport import TransportConfig
 from hardware.safety.config import SafetyConfig
@@ -51,15 +50,19 @@ def test_both_forms_of_choosing_an_environment(form):
 @pytest.mark.parametrize("option", options("env"))
 def test_every_environment_composes(option):
     env = load_train(f"env={option}").env
-    assert type(env).__name__ == {"sim": "EnvConfig", "relative": "RelativeConfig"}[option]
+    assert type(env).__name__ == {"sim": "EnvConfig", "relative": "RelativeConfig"}.get(option, "CocultureConfig")
 
 
 @pytest.mark.parametrize("option", options("agent"))
 def test_every_agent_composes(option):
     agent = load_train(f"agent={option}").agent
-    assert tuple(agent.hidden) == (64, 64)
-    papers = (0.0, 5e-4, 15_000) if option == "relative" else (0.99, 1e-3, 10_000)
-    assert (agent.gamma, agent.learning_rate, agent.total_steps) == papers
+    own = {
+        "relative": ((64, 64), 0.0, 5e-4, 15_000),
+        "coculture": ((128, 128), 0.9, 1e-3, 15_000),
+        "coculture_preview": ((128, 128), 0.97, 1e-3, 20_000),
+    }
+    papers = ((64, 64), 0.99, 1e-3, 10_000)
+    assert (tuple(agent.hidden), agent.gamma, agent.learning_rate, agent.total_steps) == own.get(option, papers)
 
 
 def test_the_papers_agent_adds_nothing_to_a_plain_dqn():
@@ -124,8 +127,10 @@ def test_a_preset_holds_only_what_differs_from_the_dataclass(name):
     group = name.rpartition("/")[0]
     own = yaml.safe_load((CONF / f"{name}.yaml").read_text()) or {}
     own.pop("defaults", None)
-    if name == "env/relative":
-        assert own == {"kind": RelativeConfig().kind}
+    if name.startswith("env/") and "kind" in own:
+        kind = ENVS[own.pop("kind")]
+        assert name != "env/relative" or not own
+        assert all(getattr(kind(), key) != value for key, value in own.items())
     elif name in STATED:
         assert build(STATED[name], own) == STATED[name]
     else:

@@ -18,14 +18,20 @@ from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
 from envs.coculture.rates import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
+from envs.gym_adapter import EpisodeEnv
 from envs.vector_env import EpisodeVectorEnv
 
-__all__ = ["CocultureConfig", "CocultureVectorEnv", "advance", "logit", "passed", "share"]
+__all__ = [
+    "LOGIT", "NEXT", "RATE", "SETPOINT", "TEMPERATURE", "TIME", "CocultureConfig", "CocultureEnv", "CocultureVectorEnv",
+    "advance", "at_rest", "limits", "logit", "passed", "share",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
 LOGIT, TEMPERATURE, RATE, SETPOINT, NEXT, TIME = range(6)
 """Columns of an observation; the last two where changes are announced."""
+
+LARGEST = 20.0  # of a logit: one species is all but gone
 
 
 @dataclass(frozen=True)
@@ -115,12 +121,20 @@ def at_rest(config: CocultureConfig, x: Array, temperature: Array | float = EQUA
     return np.stack([x, t, config.scale_p * p_putida_rate(t)], axis=-1)
 
 
+def limits(config: CocultureConfig) -> tuple[Array, Array]:
+    """Lowest and highest of every number of an observation, each (O,)."""
+    goal = logit(np.array(config.setpoints))
+    low = np.array([-LARGEST, config.ambient_c, 0.4 * config.scale_p, goal[0], goal[0], 0.0])
+    high = np.array([LARGEST, T_MAX, 1.0 * config.scale_p, goal[1], goal[1], config.preview_min])
+    return low[: config.columns], high[: config.columns]
+
+
 class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
     """The share of P. putida held at a setpoint by choosing the vial's temperature (module's description).
 
     | observation | meaning                                                     | range           | unit |
     |-------------|-------------------------------------------------------------|-----------------|------|
-    | 0           | logit of the share r                                        | any             | -    |
+    | 0           | logit of the share r                                        | -20 to 20       | -    |
     | 1           | temperature of the vial                                     | 24 to 36        | degC |
     | 2           | growth rate m_p of P. putida, which lags the temperature    | 0.4 to 1        | 1/h  |
     | 3           | logit of the setpoint                                       | `setpoints`     | -    |
@@ -159,13 +173,13 @@ class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
     def _advance(self, actions: NDArray[np.intp]) -> Array:
         wanted = self.state[:, SETPOINT].copy()
         self.state[:, :3] = advance(self.config, self.state[:, :3], self._targets[actions], self.config.control_min)
+        np.clip(self.state[:, LOGIT], -LARGEST, LARGEST, out=self.state[:, LOGIT])
         self.state[:, 3:] = passed(self.config, self.state[:, 3:])
-        return -np.square(share(self.state[:, LOGIT]) - share(wanted))
+        reward: Array = -np.square(share(self.state[:, LOGIT]) - share(wanted))
+        return reward
 
 
-def limits(config: CocultureConfig) -> tuple[Array, Array]:
-    """Lowest and highest of every number of an observation, each (O,)."""
-    goal = logit(np.array(config.setpoints))
-    low = np.array([-np.inf, config.ambient_c, 0.4 * config.scale_p, goal[0], goal[0], 0.0])
-    high = np.array([np.inf, T_MAX, 1.0 * config.scale_p, goal[1], goal[1], config.preview_min])
-    return low[: config.columns], high[: config.columns]
+class CocultureEnv(EpisodeEnv):
+    """`CocultureVectorEnv` as one environment. Version history: v0."""
+
+    batch = CocultureVectorEnv

@@ -30,8 +30,8 @@ MEMORY = (
 class CompositionEstimatorConfig:
     """What the filter believes before it has seen anything.
 
-    Seventeen real reactors had factors of 0.75 to 1.19 and offsets of 151 to 339 counts (Lee et al., Cell Reports Methods
-    5:101009, 2025, public model); their mean and spread are the defaults, which a calibration replaces
+    Seventeen real reactors had factors of 0.75 to 1.19 and offsets of 151 to 339 counts (Lee et al., Cell Reports
+    Methods 5:101009, 2025, public model); their mean and spread are the defaults, which a calibration replaces
     (docs/coculture.md, Calibration of the sensor).
     """
 
@@ -59,9 +59,9 @@ class CompositionEstimatorConfig:
 
 
 class CompositionEstimator:
-    """State z = [x, ln S, ln f, b_e, b_p, k, o]: logit of the share of P. putida, OD of both species, pigment, errors of
-    the two growth curves, factor and offset of the light sensor. With e = S/(1 + exp x) and p = S - e, and over h hours
-    in which v of V mL were replaced
+    """State z = [x, ln S, ln f, b_e, b_p, k, o]: logit of the share of P. putida, OD of both species, pigment, errors
+    of the two growth curves, factor and offset of the light sensor. With e = S/(1 + exp x) and p = S - e, and over h
+    hours in which v of V mL were replaced
 
       x <- x + h (1 + b_p) m_p - h (1 + b_e) m_e      b_e, b_p random walks
       ln S <- ln(e exp(h (1 + b_e) m_e) + p exp(h (1 + b_p) m_p)) - v/V
@@ -103,6 +103,11 @@ class CompositionEstimator:
         """Each culture's own sensor, before its first reading: factor (N,), offset in counts (N,), and their sds."""
         self.mean[:, FACTOR], self.mean[:, OFFSET] = factor, offset
         self.cov[:, FACTOR, FACTOR], self.cov[:, OFFSET, OFFSET] = factor_sd**2, offset_sd**2
+
+    @property
+    def begun(self) -> Mask:
+        """Which cultures have been seen, (N,)."""
+        return np.asarray(np.isfinite(self._minute))
 
     def dosed(self, volume_ml: Array) -> None:
         """Fresh medium that went in since this was last called, mL, (N,)."""

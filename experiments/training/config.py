@@ -7,6 +7,7 @@ from omegaconf import DictConfig
 
 from conf.schema import build, check, part, setting
 from dqn.config import DQNConfig
+from envs.coculture.task import CocultureConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 from experiments.cli import files, frame
@@ -14,7 +15,7 @@ from experiments.cli import files, frame
 __all__ = ["ENVS", "TrainConfig", "env_schema", "read_env_file", "variant"]
 
 
-ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig}
+ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, "coculture": CocultureConfig}
 
 
 def env_schema(kind: str) -> Any:

@@ -27,7 +27,7 @@ COARSE = 2e-3  # of log OD: enough for a picture
 class Density:
     """See `Task`; arguments and errors of every method are described there."""
 
-    observation = ABSOLUTE
+    observation: tuple[str, ...] = ABSOLUTE
     unit = "OD"
     arrived = 0.01  # OD
     steady_steps = 30

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 class Relative:
     """See `Task`; arguments and errors of every method are described there."""
 
-    observation = RELATIVE
+    observation: tuple[str, ...] = RELATIVE
     unit = "periods of full pump"
     arrived = 0.1  # periods of full pump
     regret_unit, steady_unit = 0.01, 0.1

@@ -1,6 +1,6 @@
 """What a training run needs to know of a task; `of` finds it from the config of an environment."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,7 +11,10 @@ from dqn.config import DQNConfig
 from dqn.hindsight import Relabel
 from dqn.policy import Policy
 from dqn.trainer import TrainingEnv
+from envs.coculture.task import CocultureConfig
 from envs.relative import RelativeConfig
+from envs.task import EnvConfig
+from experiments.training.coculture import Coculture
 from experiments.training.density import Density
 from experiments.training.evaluation import Evaluated
 from experiments.training.relative import Relative
@@ -66,6 +69,13 @@ class Task(Evaluated, Protocol):
         ...
 
 
+TASKS: dict[type[Any], Callable[[Any], Task]] = {
+    EnvConfig: Density,
+    RelativeConfig: Relative,
+    CocultureConfig: Coculture,
+}
+
+
 def of(config: Any) -> Task:
     """The task of an environment's config."""
-    return Relative(config) if isinstance(config, RelativeConfig) else Density(config)
+    return TASKS[type(config)](config)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dqn.config import DQNConfig
-from dqn.hindsight import GoalRelabel, ShiftRelabel
+from dqn.hindsight import GoalRelabel, ProgramRelabel, ShiftRelabel
 from dqn.replay import Transition
 
 AGENTS, BATCH = 4, 500
@@ -110,3 +110,52 @@ def test_distances_to_the_new_setpoint_cover_every_order_of_magnitude_on_both_si
     count, _ = np.histogram(np.log(np.abs(error)), bins=4, range=(np.log(0.01), np.log(0.3)))
     assert ((count - 500.0) ** 2 / 500.0).sum() < 16.3  # 99.9 % quantile with 3 degrees of freedom
     assert np.mean(error > 0) == pytest.approx(0.5, abs=0.05)
+
+
+def _program(near: float, preview: float) -> tuple[Transition, Transition]:
+    """Transitions of x' = x + (a - 8) / 20 under a setpoint, with or without an announced change; and relabelled."""
+    batches, width = [], 4 if preview else 2
+    for _ in range(2):
+        generator = torch.Generator().manual_seed(3)
+        before = torch.rand(AGENTS, BATCH, width, generator=generator)
+        action = torch.randint(0, 17, (AGENTS, BATCH), generator=generator)
+        after = before.clone()
+        after[..., 0] += (action - 8) / 20.0
+        batches.append(Transition(before, action, torch.zeros(AGENTS, BATCH), after, torch.ones(AGENTS, BATCH)))
+    relabel = ProgramRelabel(
+        DQNConfig(hindsight_near=near, hindsight_width=(0.01, 0.3)), 3.0, lambda u: 4.0 * u - 2.0,
+        lambda x, setpoint: -torch.square(x - setpoint), 1, 30.0, preview,
+    )  # fmt: skip
+    numbers = torch.rand(
+        AGENTS, BATCH, relabel.numbers, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
+    relabel.replace(batches[1], relabel.drawn(numbers))
+    return batches[0], batches[1]
+
+
+@pytest.mark.parametrize("near", [0.0, 0.5])
+@pytest.mark.parametrize("preview", [0.0, 90.0])
+def test_another_program_is_as_true_as_the_one_that_was_seen(near: float, preview: float) -> None:
+    old, new = _program(near, preview)
+    assert torch.equal(old.a_tm1, new.a_tm1)
+    torch.testing.assert_close(new.s_t[..., 0] - new.s_tm1[..., 0], (new.a_tm1 - 8) / 20.0, atol=1e-5, rtol=0.0)
+    x, setpoint = new.s_t[..., 0], new.s_tm1[..., 1]
+    torch.testing.assert_close(new.r_t, -torch.square(x - setpoint))
+    assert float(x.abs().max()) <= 3.0
+    assert float(setpoint.abs().max()) <= 2.0 + 1e-6
+    n = round(near * BATCH)
+    inside = x[:, :n].abs() < 1.7
+    distance = (x - setpoint)[:, :n].abs()[inside]
+    assert bool(((distance > 0.0099) & (distance < 0.3001)).all())
+    if not preview:
+        assert torch.equal(new.s_t[..., 1], setpoint)
+        return
+    following, time = new.s_tm1[..., 2], new.s_tm1[..., 3]
+    assert set(time.unique().tolist()) == {0.0, 30.0, 60.0, 90.0}
+    assert float((time == 0.0).double().mean()) == pytest.approx(0.2, abs=0.04)
+    assert torch.equal(following[time == 0.0], setpoint[time == 0.0])
+    for before, after in ((0.0, 0.0), (30.0, 0.0), (60.0, 30.0), (90.0, 60.0)):
+        here = time == before
+        assert set(new.s_t[..., 3][here].tolist()) == {after}
+        assert torch.equal(new.s_t[..., 2][here], following[here])
+        assert torch.equal(new.s_t[..., 1][here], (setpoint if after else following)[here])

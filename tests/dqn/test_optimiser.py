@@ -14,12 +14,12 @@ def test_steps_are_those_of_torch() -> None:
     """Twenty steps with the published constants, which are torch.optim.Adam's defaults."""
     start = torch.randn(3, 7, generator=torch.Generator().manual_seed(1))
     weights, gradient = start.clone(), torch.zeros(3, 7)
-    ours = Adam(weights, gradient, 1e-3)
+    ours = Adam(weights, gradient)
     parameter = torch.nn.Parameter(start.clone())
     theirs = torch.optim.Adam([parameter], 1e-3)
     for g in _gradients(2):
         gradient.copy_(g)
-        ours.step()
+        ours.step(1e-3)
         parameter.grad = g.clone()
         theirs.step()
         torch.testing.assert_close(weights, parameter.detach(), rtol=1e-5, atol=1e-7)
@@ -27,17 +27,17 @@ def test_steps_are_those_of_torch() -> None:
 
 def test_a_loaded_state_continues() -> None:
     weights, gradient = torch.ones(3, 7), torch.zeros(3, 7)
-    whole = Adam(weights, gradient, 1e-3)
+    whole = Adam(weights, gradient)
     gradients = _gradients(3)
     for g in gradients[:10]:
         gradient.copy_(g)
-        whole.step()
+        whole.step(1e-3)
     copied, other_gradient = weights.clone(), torch.zeros(3, 7)
-    resumed = Adam(copied, other_gradient, 1e-3)
+    resumed = Adam(copied, other_gradient)
     resumed.load_state_dict({key: value.clone() for key, value in whole.state_dict().items()})
     for g in gradients[10:]:
         gradient.copy_(g)
         other_gradient.copy_(g)
-        whole.step()
-        resumed.step()
+        whole.step(1e-3)
+        resumed.step(1e-3)
     assert torch.equal(weights, copied)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dqn.targets import advantage_target, huber_loss, loss_gradient, q_target
+from dqn.targets import advantage_target, compressed, expanded, huber_loss, loss_gradient, q_target
 
 GAMMA = 0.9
 # Chain: in state 0 action 0 stays (reward 0), action 1 moves to state 1 (reward 1); state 1 is left by either action,
@@ -79,3 +79,22 @@ def test_loss_and_gradient_agree_with_autograd(huber: float) -> None:
     expected.sum().backward()
     assert q.grad is not None
     torch.testing.assert_close(gradient, q.grad)
+
+
+def test_the_root_scale_is_its_own_inverse_and_keeps_the_fixed_point() -> None:
+    """Costs from 1e-6 to 10, and Q-iteration on the chain with rewards below 0: h(Q*) is where it ends."""
+    costs = -torch.logspace(-6, 1, 40, dtype=torch.float64)
+    for root in (0.03, 0.3):
+        scaled = compressed(costs, root)
+        torch.testing.assert_close(expanded(scaled, root), costs, rtol=1e-9, atol=1e-12)
+        assert bool((scaled[1:] < scaled[:-1]).all())
+    assert float(compressed(torch.tensor(-4.0), 1e-6)) == pytest.approx(-2.0, abs=1e-5)
+    assert float(expanded(torch.tensor(0.7), 0.3)) == 0.0  # no cost lies above 0
+    _, _, reward, after = _all_transitions()
+    plain, scaled = torch.zeros(2, 2), torch.zeros(2, 2)
+    for _ in range(300):
+        plain = q_target(reward - 3.0, torch.ones(1, 4), GAMMA, plain[after]).view(2, 2)
+        step = q_target(reward - 3.0, torch.ones(1, 4), GAMMA, expanded(scaled[after], 0.3))
+        scaled = compressed(step, 0.3).view(2, 2)
+    torch.testing.assert_close(scaled, compressed(plain, 0.3), rtol=1e-4, atol=1e-4)
+    assert torch.equal(scaled.argmax(1), plain.argmax(1))

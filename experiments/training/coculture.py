@@ -1,0 +1,159 @@
+"""The composition of two species for a training run: state and program in, a temperature out."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from dqn.config import DQNConfig
+from dqn.hindsight import ProgramRelabel, Relabel
+from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
+from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
+from envs.coculture.task import (
+    LOGIT,
+    NEXT,
+    SETPOINT,
+    TEMPERATURE,
+    TIME,
+    CocultureConfig,
+    CocultureVectorEnv,
+    advance,
+    at_rest,
+    limits,
+    logit,
+    passed,
+    share,
+)
+from experiments.reporting import composition_charts
+from experiments.training.evaluation import Rollout, each, rollout
+
+__all__ = ["Coculture"]
+
+Array = NDArray[np.float64]
+SPAN = 3.0  # |logit of the share| that is trained: 0.05 to 0.95
+FINE = Grid(logits=321)
+
+
+class Coculture:
+    """See `Task`; arguments and errors of every method are described there."""
+
+    unit = "of the share"
+    arrived = 0.02
+    regret_unit, steady_unit = 1.0, 0.01
+    """With 17 temperatures a share is held within 0.005, half of what its estimate is good for."""
+
+    def __init__(self, config: CocultureConfig) -> None:
+        self.config = config
+        self.steps = config.episode_steps
+        self.steady_steps = max(1, config.episode_steps // 6)
+        self.observation: tuple[str, ...] = COCULTURE_PREVIEW if config.preview_min else COCULTURE
+        self.actions = config.targets()
+        self.limits = limits(config)
+        for end, span, temperature in zip(self.limits, (-SPAN, SPAN), config.temperatures, strict=True):
+            end[LOGIT], end[TEMPERATURE] = span, temperature  # beyond what is trained a policy sees the end of it
+
+    def copies(self, seeds: Sequence[np.random.SeedSequence]) -> CocultureVectorEnv:
+        """Environments."""
+        env = CocultureVectorEnv(len(seeds), self.config)
+        env.seed_streams(seeds)
+        return env
+
+    def hindsight(self, agent: DQNConfig) -> Relabel:
+        """Another place of the share, other setpoints, another time of the change."""
+        low, high = self.config.setpoints
+        return ProgramRelabel(
+            agent,
+            SPAN,
+            lambda uniform: torch.logit(low + (high - low) * uniform),
+            lambda x, setpoint: -torch.square(torch.sigmoid(x) - torch.sigmoid(setpoint)),
+            SETPOINT,
+            self.config.control_min,
+            self.config.preview_min,
+        )
+
+    def selection_grid(self) -> Array:
+        """Between the reported setpoints: 8 starts x 8 setpoints, or a change between each two of 8, 6 h ahead."""
+        return self._grid(np.linspace(0.15, 0.85, 8), np.linspace(0.1, 0.9, 8))
+
+    def report_grid(self) -> Array:
+        """Starts .05 to .95 x setpoints .1 to .9; with preview a change between each two of these setpoints."""
+        return self._grid(np.linspace(0.1, 0.9, 9), np.linspace(0.05, 0.95, 19))
+
+    def _grid(self, setpoints: Array, starts: Array) -> Array:
+        """Cultures at rest: at the first of two setpoints with the change as far ahead as it is announced, or anywhere.
+
+        The episode begins when the change is announced.
+        """
+        c = self.config
+        if not c.preview_min:
+            start, goal = (logit(a.ravel()) for a in np.meshgrid(starts, setpoints, indexing="ij"))
+            return np.concatenate([at_rest(c, start), goal[:, None]], axis=1)
+        now, following = (logit(a.ravel()) for a in np.meshgrid(setpoints, setpoints, indexing="ij"))
+        now, following = now[now != following], following[now != following]
+        time = np.full(now.shape, c.preview_min)
+        return np.concatenate([at_rest(c, now), np.stack([now, following, time], axis=1)], axis=1)
+
+    def advance(self, observation: Array, action: NDArray[Any]) -> tuple[Array, Array]:
+        """The model and the program one decision on; r - setpoint."""
+        c = self.config
+        state = advance(c, observation[..., :3], self.actions[action], c.control_min)
+        error = share(state[..., LOGIT]) - share(observation[..., SETPOINT])
+        return np.concatenate([state, passed(c, observation[..., 3:])], axis=-1), error
+
+    def asked(self, start: Array) -> Array:
+        """The last setpoint of the episode."""
+        return np.asarray(start[:, NEXT if self.config.preview_min else SETPOINT].round(9))
+
+    def best(self, start: Array) -> Rollout:
+        """By backward induction over the program of each start."""
+        model = transitions(self.config, FINE)
+        programs, which = np.unique(start[:, 3:].round(9), axis=0, return_inverse=True)
+        shape = (self.steps, 1, len(start))
+        run = Rollout(np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.intp))
+        for k in range(0, len(programs), 24):  # so many at a time bound the memory
+            self._solve(
+                model, programs[k : k + 24], np.flatnonzero((which >= k) & (which < k + 24)), which - k, start, run
+            )
+        return run
+
+    def _solve(
+        self, model: Any, programs: Array, rows: NDArray[np.intp], which: Any, start: Array, run: Rollout
+    ) -> None:
+        goal, setpoints = programs, np.empty((self.steps, len(programs)))
+        for k in range(self.steps):
+            setpoints[k], goal = share(goal[:, 0]), passed(self.config, goal)
+        value, state = cost_to_go(model, setpoints), start[rows, :3]
+        for k in range(self.steps):
+            wanted = setpoints[k, which[rows]]
+            run.action[k, 0, rows] = best_action(self.config, model, value[k + 1][:, which[rows]], state, wanted)
+            state = advance(self.config, state, self.actions[run.action[k, 0, rows]], self.config.control_min)
+            run.state[k, 0, rows], run.error[k, 0, rows] = state[:, 0], share(state[:, 0]) - wanted
+
+    def myopic(self, observation: Array) -> NDArray[np.intp]:
+        """The temperature after which the share is nearest to the setpoint in force."""
+        flat = observation.reshape(-1, observation.shape[-1])
+        action = best_action(self.config, None, None, flat[:, :3], share(flat[:, SETPOINT]))
+        return action.reshape(observation.shape[:-1])
+
+    def model(self) -> dict[str, Any]:
+        """Control period and the whole model."""
+        return {"control_min": self.config.control_min, "model": asdict(self.config)}
+
+    def figures(self, policy: Policy) -> dict[str, Figure]:
+        """Share, setpoint and temperature of a few episodes beside the optimum's."""
+        grid = self.selection_grid()
+        picked = grid[np.linspace(0, len(grid) - 1, 6).astype(int)]
+        ours, theirs = rollout(each(policy), self, picked[None]), self.best(picked)
+        hours = np.arange(1.0, self.steps + 1.0) * (self.config.control_min / 60.0)
+        change = picked[:, TIME] / 60.0 if self.config.preview_min else np.zeros(len(picked))
+        last = share(picked[:, NEXT if self.config.preview_min else SETPOINT])
+        wanted = np.where(hours[:, None] <= change, share(picked[:, SETPOINT]), last)
+        temperatures = (self.actions[ours.action[:, 0]], self.actions[theirs.action[:, 0]])
+        figure = composition_charts.episodes(
+            hours, wanted, share(ours.state[:, 0]), share(theirs.state[:, 0]), *temperatures
+        )
+        return {"trajectories": figure}
