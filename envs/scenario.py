@@ -64,7 +64,7 @@ class Scenario:
         words = "mean, amplitude and period in min > 0, with |amplitude| < mean and |amplitude| < 1 - mean"
         require(len(given) == 3 and given[2] > 0.0, "scenario.ratio_sine", given, words)
         mean, amplitude, _ = given
-        require(abs(amplitude) < min(mean, 1.0 - mean), "scenario.ratio_sine", given, words)
+        require(abs(amplitude) < mean and mean + abs(amplitude) < 1.0, "scenario.ratio_sine", given, words)
 
     @property
     def composed(self) -> bool:
