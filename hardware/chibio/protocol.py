@@ -206,8 +206,8 @@ def _slot(data: Any, name: str) -> Slot:
     on, entry = _flag(data, name, "ON"), _get(data, name)
     if not (on and "LED" in entry):
         return Slot(name, on)
-    settings = (_text(data, name, key) for key in ("LED", "BaseBand", "Emit1Band", "Gain"))
-    return Slot(name, on, *settings, _number(data, name, "Base"), _number(data, name, "Emit1"))
+    led, base_band, band, gain = (_text(data, name, key) for key in ("LED", "BaseBand", "Emit1Band", "Gain"))
+    return Slot(name, on, led, base_band, band, gain, _number(data, name, "Base"), _number(data, name, "Emit1"))
 
 
 def parse_state(body: bytes) -> DeviceState:

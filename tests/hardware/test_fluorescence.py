@@ -141,6 +141,23 @@ def test_a_slot_with_other_settings_is_set_anew() -> None:
     assert toggles(bench) == 2
 
 
+def test_settings_that_somebody_changes_are_put_right_in_one_go() -> None:
+    bench = begun()
+    slot(bench)["LED"] = "LEDB"
+    station, before = bench.reactors.stations[0], toggles(bench)
+    station.fluorescence.keep_on(station.connection.read())
+    assert (slot(bench)["ON"], slot(bench)["LED"], toggles(bench)) == (1, "LEDA", before + 2)
+    assert station.fluorescence.trouble == ""
+    assert "was found set to LEDB, CLEAR, nm440, x10 and put right" in bench.of("note")[-1]["note"]
+
+
+def test_a_toggle_selects_its_reactor_itself() -> None:
+    bench = begun(("M0", "M1"))
+    bench.wire.inner.post("/changeDevice/M1")
+    bench.reactors.stations[0].connection.toggle(COMMAND)
+    assert [slot(bench, m)["ON"] for m in ("M0", "M1")] == [0, 1]
+
+
 def test_each_reactor_s_own_slot_is_switched() -> None:
     bench = begun(("M0", "M3"))
     assert [slot(bench, m)["ON"] for m in ("M0", "M1", "M3")] == [1, 0, 1]
