@@ -57,6 +57,8 @@ class Measurement:
     temperature: culture temperature, degC, shape (N,); nan where there is none.
     fresh: True where this sample was not delivered before, shape (N,).
     vitals: state of the device; None for a backend that cannot fail.
+    fluorescence: counts of one band, on the Chi.Bio the base times the first emission of a slot, shape (N,); nan where
+      there is none; None where it is not measured.
     """
 
     time_s: Array
@@ -64,6 +66,7 @@ class Measurement:
     temperature: Array
     fresh: Mask
     vitals: Vitals | None = None
+    fluorescence: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,7 @@ class SimulatedReactors:
             od=self.plant.read_od(),
             temperature=self.plant.thermal.read(),
             fresh=np.ones(self.plant.n, dtype=np.bool_),
+            fluorescence=None if self.plant.fluorescence is None else self.plant.read_fluorescence(),
         )
 
     def actuate(self, command: Command) -> Receipt:

@@ -149,6 +149,7 @@ def encode_reply(number: int, status: int, body: bytes) -> bytes:
     return head + b" %08x\n" % zlib.crc32(head + body) + body + b"\n"
 
 
+SLOT = ("ON", "LED", "BaseBand", "Emit1Band", "Gain", "Base", "Emit1")
 KEPT = {  # None = the whole field
     "UIDevice": None, "presentDevices": None, "DeviceID": None, "Version": ("value",),
     "Experiment": ("ON", "cycles", "startTime"),
@@ -156,8 +157,8 @@ KEPT = {  # None = the whole field
     "Pump1": ("ON", "target"), "Pump2": ("ON", "target"), "Pump3": ("ON", "target"), "Pump4": ("ON", "target"),
     "Stir": ("ON", "target"), "Heat": ("ON", "target"), "Thermostat": ("ON", "target"),
     "ThermometerIR": ("current", "record"), "Volume": ("target",),
-    "Zigzag": ("ON",), "Custom": ("ON",), "Chemostat": ("ON",), "Light": ("ON",), "FP1": ("ON",), "FP2": ("ON",),
-    "FP3": ("ON",), "Terminal": ("text",),
+    "Zigzag": ("ON",), "Custom": ("ON",), "Chemostat": ("ON",), "Light": ("ON",), "FP1": SLOT, "FP2": SLOT,
+    "FP3": SLOT, "Terminal": ("text",),
 }  # fmt: skip
 
 
@@ -170,6 +171,9 @@ def reduce_sysdata(body: bytes) -> bytes:
             if name in data:
                 entry = data[name]
                 small[name] = entry if keys is None else {key: entry[key] for key in keys if key in entry}
+        for name in ("FP1", "FP2", "FP3"):
+            if name in small and small[name].get("ON") == 0:
+                small[name] = {"ON": 0}
         lengths = {}
         for name in ("time", "OD", "ThermometerIR"):
             lengths[name] = len(small[name]["record"])

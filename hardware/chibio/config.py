@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from conf.presets import groups
 from conf.schema import check, part, require, setting
 from hardware.chibio.dosing import DosingConfig
+from hardware.chibio.fluorescence import FluorescenceSlotConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import POSITIONS
 from hardware.link.transport import TransportConfig
@@ -32,6 +33,7 @@ class ChiBioConfig:
     volume_ml: float = setting(20.0, "culture, only told to the device's own regulator", "mL", within=(10, 30))
     dosing: DosingConfig = part(DosingConfig, "how a rate becomes a dose")
     overflow_pump: OverflowPumpConfig = part(OverflowPumpConfig, "a second waste line against overflow")
+    fluorescence: FluorescenceSlotConfig = part(FluorescenceSlotConfig, "a second measurement of the culture")
     stale_s: float = setting(100.0, "age at which a newest sample is no basis for a dose", "s", within=(65, 600))
     lost_s: float = setting(
         180.0, "age at which a dead experiment thread is restarted; more than stale_s", "s", within=(100, 3600)

@@ -53,10 +53,18 @@ class Connection:
       name: position, M0 to M7; reactors: all positions this client owns.
       log: takes every command and its answer.
       overflow_pump: spare pump that may be switched on; "" if there is none.
+      slot_command: the one toggle that may be sent, that of the fluorescence slot; "" if none may be.
     """
 
     def __init__(
-        self, name: str, reactors: Sequence[str], transport: Transport, clock: Clock, log: Log, overflow_pump: str = ""
+        self,
+        name: str,
+        reactors: Sequence[str],
+        transport: Transport,
+        clock: Clock,
+        log: Log,
+        overflow_pump: str = "",
+        slot_command: str = "",
     ) -> None:
         self.name = name
         self.device_id = ""  # pinned at the first read
@@ -65,7 +73,7 @@ class Connection:
         self._unsure = False  # a request was not answered as expected since presence was last seen
         self._seen_s = -math.inf  # clock time at which this reactor was last known to be present
         self.clock, self._transport, self._log = clock, transport, log
-        self._reactors, self._overflow_pump = tuple(reactors), overflow_pump
+        self._reactors, self._overflow_pump, self._slot_command = tuple(reactors), overflow_pump, slot_command
 
     def read(self, tries: int = 3) -> DeviceState:
         """The reactor's state, certainly its own.
@@ -125,8 +133,18 @@ class Connection:
         self._post(path)
         self._seen_s = self.clock.now()
 
+    def toggle(self, path: str) -> DeviceState:
+        """Send a toggle of the selected reactor right after a read of this one; the state after it.
+
+        Another client that selects a reactor in between would have that one toggled: look at the state returned.
+        Raises: as `read` and `post`.
+        """
+        self.read()
+        self._post(path)
+        return self.read()
+
     def _post(self, path: str, quiet: bool = False) -> None:
-        check_command(path, self._reactors, self._overflow_pump)
+        check_command(path, self._reactors, self._overflow_pump, self._slot_command)
         start = self.clock.now()
         answer: int | str = ""
         before, self._unsure = self._unsure, True

@@ -10,7 +10,7 @@ from pathlib import Path
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection, no_log
 from hardware.chibio.dosing import MAX_FEED_DUTY, ReactorCalibration
-from hardware.chibio.overflow_pump import OverflowPumpConfig
+from hardware.chibio.fluorescence import HIDDEN, FluorescenceSlotConfig
 from hardware.chibio.protocol import PERIOD_S, UNSET_BLANK, DeviceState
 from hardware.clock import Clock
 from hardware.errors import ReactorError
@@ -20,6 +20,7 @@ __all__ = ["Check", "preflight"]
 
 MARGIN = 1.1  # over the feed pump's flow: pumps differ from their calibration
 VIAL_ML = 30.0  # up to its rim (docs/biology.md, Volume)
+FULL_SCALE = 65535.0  # counts of the spectrometer
 FREE_MB = 1000.0  # a week of eight reactors writes about 240 MB (docs/faults.md)
 
 
@@ -70,7 +71,9 @@ def preflight(
             checks.append(Check(f"{name} present", False, str(error), remedy))
             continue
         found = f"identity {state.device_id}, software {state.version or 'unnamed'}"
-        checks += [Check(f"{name} present", True, found), *_reactor(name, state, calibration, config.overflow_pump)]
+        checks += [Check(f"{name} present", True, found), *_reactor(name, state, calibration, config)]
+        if config.fluorescence.measure:
+            checks.append(_fluorescence(name, state, config.fluorescence))
     return checks
 
 
@@ -125,9 +128,25 @@ def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration])
     )
 
 
-def _reactor(
-    name: str, state: DeviceState, calibration: ReactorCalibration, overflow_pump: OverflowPumpConfig
-) -> Iterator[Check]:
+def _fluorescence(name: str, state: DeviceState, config: FluorescenceSlotConfig) -> Check:
+    """Whether the slot measures light, if it is on already; a run switches it on."""
+    what = f"{name} fluorescence"
+    slot, found = config.own(state), config.wrong(state)
+    if slot is None:
+        return Check(what, False, f"{config.slot} is {HIDDEN}", "or set backend.fluorescence.measure=false")
+    if found:
+        return Check(what, True, f"{slot.name} is {found}: the run switches it on as configured")
+    if state.cycles == 0 or slot.base == 0.0 == slot.emission:
+        return Check(what, True, f"{slot.name} on, no measurement yet")
+    return Check(
+        what,
+        0.0 < slot.counts < FULL_SCALE,  # not nan
+        f"{slot.name}: {slot.counts:.0f} counts of {slot.band}, base {slot.base:.0f}",
+        f"at 0 check {slot.led} and the spectrometer; at {FULL_SCALE:.0f} lower backend.fluorescence.gain",
+    )
+
+
+def _reactor(name: str, state: DeviceState, calibration: ReactorCalibration, config: ChiBioConfig) -> Iterator[Check]:
     """Checks of one reactor's state."""
     blank = calibration.blank if math.isfinite(calibration.blank) else state.blank
     source = "stored" if math.isfinite(calibration.blank) else "of the device"
@@ -137,12 +156,13 @@ def _reactor(
         f"{blank:.0f} counts ({source})",
         "measure it with clear medium: python -m experiments.blank",
     )
+    modes = config.fluorescence.others_on(state)
     yield Check(
         f"{name} modes",
-        not state.modes and not state.regulating,
-        ", ".join([*state.modes, *(["OD regulation"] if state.regulating else [])]) or "none active",
+        not modes and not state.regulating,
+        ", ".join([*modes, *(["OD regulation"] if state.regulating else [])]) or "none active",
         "switch them off in the web page (OD regulation is switched off by the run itself)",
-        required=bool(state.modes),
+        required=bool(modes),
     )
     yield Check(
         f"{name} temperature",
@@ -173,7 +193,7 @@ def _reactor(
         f"waste moves {stronger:.1f} times the feed in its on-time",
         "exchange or repair the waste pump",
     )
-    on = overflow_pump.others_on(state)
+    on = config.overflow_pump.others_on(state)
     yield Check(
         f"{name} pumps",
         not on,

@@ -13,8 +13,8 @@ from typing import Any
 from hardware.errors import DeviceStateError, ProtocolError
 
 __all__ = [
-    "FEED", "MAX_OVERFLOW_DUTY", "PERIOD_S", "POSITIONS", "PUMPS", "SPARE", "UNSET_BLANK", "WASTE", "DeviceState",
-    "check_command", "parse_state",
+    "BANDS", "FEED", "LEDS", "MAX_OVERFLOW_DUTY", "PERIOD_S", "POSITIONS", "PUMPS", "SLOTS", "SPARE", "UNSET_BLANK",
+    "WASTE", "DeviceState", "Slot", "check_command", "parse_state",
 ]  # fmt: skip
 
 POSITIONS = tuple(f"M{k}" for k in range(8))
@@ -30,6 +30,10 @@ MAX_TEXT = 160
 """Characters of a text of the device that are taken; the longest line of its log that matters has 80."""
 UNSET_BLANK = 65000.0
 """Blank of a device that lost its memory or was never calibrated (docs/device.md, Blank)."""
+SLOTS = ("FP1", "FP2", "FP3")
+"""Each measures fluorescence once per cycle while it is on (docs/device.md, Fluorescence)."""
+LEDS = tuple(f"LED{k}" for k in "ABCDEFGHI")
+BANDS = ("nm410", "nm440", "nm470", "nm510", "nm550", "nm583", "nm620", "nm670", "CLEAR")
 
 _NUMBER = r"[0-9]{1,6}(?:\.[0-9]{1,12})?"
 _LIMITS: Mapping[str, tuple[float, float]] = {
@@ -48,12 +52,34 @@ _MAY_GO_ON = ("Pump1", "Pump2", "OD", "Stir", "Thermostat")
 
 
 @dataclass(frozen=True)
+class Slot:
+    """A fluorescence slot: whether it is on, and then how it measures, and what it measured last.
+
+    base: counts of the base band. emission: counts of `band` over `base`.
+    """
+
+    name: str
+    on: bool
+    led: str = ""
+    base_band: str = ""
+    band: str = ""
+    gain: str = ""
+    base: float = math.nan
+    emission: float = math.nan
+
+    @property
+    def counts(self) -> float:
+        """Counts of `band`, base times emission; nan where the base is not above 0."""
+        return self.base * self.emission if self.base > 0.0 else math.nan
+
+
+@dataclass(frozen=True)
 class DeviceState:
     """What a client needs of one reactor's state. Times in s, temperatures in degC, blank and raw in counts.
 
     sample_s, sample_od, sample_temperature: last entries of the records; nan if there is none yet or the device was
     just replacing its lists. pumps_on, pump_targets: Pump1 to Pump4. regulating, regulation_target: the on-board OD
-    regulation. modes: what else would act on its own.
+    regulation. modes: what else would act on its own. slots: of fluorescence, those that the device shows.
     """
 
     selected: str
@@ -81,6 +107,7 @@ class DeviceState:
     modes: tuple[str, ...]
     volume_ml: float
     terminal: str
+    slots: tuple[Slot, ...] = ()
 
     @property
     def running_pumps(self) -> tuple[str, ...]:
@@ -170,8 +197,17 @@ def _terminal(data: Any) -> str:
 
 
 def _modes(data: Any) -> tuple[str, ...]:
-    names = ("Zigzag", "Custom", "Chemostat", "Light", "FP1", "FP2", "FP3")
+    names = ("Zigzag", "Custom", "Chemostat", "Light", *SLOTS)
     return tuple(n for n in names if n in data and _flag(data, n, "ON"))
+
+
+def _slot(data: Any, name: str) -> Slot:
+    """A slot; settings are empty and values nan where it is off, or left out by an older agent on the board."""
+    on, entry = _flag(data, name, "ON"), _get(data, name)
+    if not (on and "LED" in entry):
+        return Slot(name, on)
+    led, base_band, band, gain = (_text(data, name, key) for key in ("LED", "BaseBand", "Emit1Band", "Gain"))
+    return Slot(name, on, led, base_band, band, gain, _number(data, name, "Base"), _number(data, name, "Emit1"))
 
 
 def parse_state(body: bytes) -> DeviceState:
@@ -217,13 +253,15 @@ def parse_state(body: bytes) -> DeviceState:
         modes=_modes(data),
         volume_ml=_number(data, "Volume", "target"),
         terminal=_terminal(data),
+        slots=tuple(_slot(data, n) for n in SLOTS if n in data),
     )
 
 
-def check_command(path: str, reactors: Sequence[str], overflow_pump: str = "") -> None:
+def check_command(path: str, reactors: Sequence[str], overflow_pump: str = "", slot_command: str = "") -> None:
     """The last gate before the wire: only these POSTs, only for these reactors, only within these limits.
 
-    Args: overflow_pump: which of the spare pumps is one; "" if none is.
+    Args: overflow_pump: which of the spare pumps is one; "" if none is. slot_command: the one that toggles the
+      fluorescence slot of the selected reactor; "" if none may be.
 
     Allowed are changeDevice; SetOutputTarget of feed (at most 0.05), waste (0.5), Stir, Thermostat (42 degC), OD,
     Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; both for the overflow
@@ -232,6 +270,8 @@ def check_command(path: str, reactors: Sequence[str], overflow_pump: str = "") -
 
     Raises: DeviceStateError if the command is not one of them.
     """
+    if slot_command and path == slot_command:
+        return
     verb, *args = path.removeprefix("/").split("/")
     spare = overflow_pump if overflow_pump in SPARE else None
     match verb, args:

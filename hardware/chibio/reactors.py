@@ -56,7 +56,15 @@ class ChiBioReactors:
         self._zero = clock.now()
         self.stations = tuple(
             Station(
-                Connection(m, config.reactors, transport, clock, self._note_down, config.overflow_pump.pump),
+                Connection(
+                    m,
+                    config.reactors,
+                    transport,
+                    clock,
+                    self._note_down,
+                    config.overflow_pump.pump,
+                    config.fluorescence.command,
+                ),
                 calibration,
                 config,
                 self._agenda,
@@ -114,8 +122,8 @@ class ChiBioReactors:
             self._agenda.run_due()
             self._clock.sleep(min(self._agenda.next_due() - self._clock.now(), 1.0))
         for station in self.stations:
-            if station.overflow_pump.trouble:
-                raise DeviceStateError(f"{station.name}: {station.overflow_pump.trouble}; run the preflight")
+            if trouble := station.overflow_pump.trouble or station.fluorescence.trouble:
+                raise DeviceStateError(f"{station.name}: {trouble}; run the preflight")
 
     def measure(self) -> Measurement:
         """The newest samples; waits for one, working through the agenda.
@@ -150,7 +158,8 @@ class ChiBioReactors:
             station.book.news = False
         age = self._clock.now() - column("arrived_s")
         vitals = Vitals(age, column("raw"), tuple(station.book.fault for station in self.stations))
-        return Measurement(column("time_s"), column("od"), column("temperature"), fresh, vitals)
+        light = column("fluorescence") if self.config.fluorescence.measure else None
+        return Measurement(column("time_s"), column("od"), column("temperature"), fresh, vitals, light)
 
     def _work(self) -> None:
         """Run what is due now. A task that fails costs itself only; on a dead link others are due again by then."""

@@ -13,6 +13,7 @@ from hardware.chibio.connection import Connection
 from hardware.chibio.diagnosis import diagnose, fault_of
 from hardware.chibio.dose_sequence import DoseSequence
 from hardware.chibio.dosing import DosePlan, ReactorCalibration
+from hardware.chibio.fluorescence import Fluorescence
 from hardware.chibio.logbook import Logbook
 from hardware.chibio.onboard_regulation import OnboardRegulation
 from hardware.chibio.overflow_pump import OverflowPump
@@ -33,8 +34,8 @@ class Station:
       connection: its verified conversation. calibration: of its pumps and its zero. book: what it reports.
       config, agenda: shared; what must happen later is put on the agenda.
 
-    Attributes: sampling, doses, regulation, overflow_pump: its parts; busy while the reactor is being started or
-      recovered.
+    Attributes: sampling, doses, regulation, overflow_pump, fluorescence: its parts; busy while the reactor is being
+      started or recovered.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class Station:
         self.doses = DoseSequence(connection, calibration, config, agenda, book)
         self.regulation = OnboardRegulation(connection, config.overflow_pump, book)
         self.overflow_pump = OverflowPump(connection, config.overflow_pump, book)
+        self.fluorescence = Fluorescence(connection, config.fluorescence, book)
         self.busy = False
         self._calibration, self._config, self._agenda, self._clock = calibration, config, agenda, connection.clock
         self._target_c = config.temperature
@@ -100,7 +102,7 @@ class Station:
             if not state.running and state.cycles > 0 and not waited and not state.ended:
                 yield OLD_CYCLE_S
             self._prepare()
-            state = self.connection.read()
+            state = self.fluorescence.keep_on(self.connection.read())
             self.sampling.pass_over(state)
             if not state.running:
                 self._start()
@@ -111,7 +113,7 @@ class Station:
             self.doses.escalated = False
             if self.regulation.active:
                 self.regulation.hand_over_again()
-            self._start_time = self.overflow_pump.keep_on(self.connection.read()).start_time
+            self._start_time = self._keep_on(self.connection.read()).start_time
             self.sampling.wait_from_now()
             self.book.log(
                 "device", device_id=self.connection.device_id, blank=self._blank, temperature=self._target_c,
@@ -180,11 +182,15 @@ class Station:
         """Look at the reactor; True if it has a new sample. Trouble becomes the logbook's fault."""
         self.sampling.retry_later()
         try:
-            state = self.overflow_pump.keep_on(self.connection.read())
+            state = self._keep_on(self.connection.read())
         except (LinkError, ProtocolError, DeviceStateError) as error:
             self.book.report(fault_of(error, present=self.connection.state is not None))
             return False
         return False if self.busy else self._judge(state)
+
+    def _keep_on(self, state: DeviceState) -> DeviceState:
+        """Overflow pump and fluorescence slot as this run has them; the reactor's state then."""
+        return self.fluorescence.keep_on(self.overflow_pump.keep_on(state))
 
     def _judge(self, state: DeviceState) -> bool:
         """What a verified state means; True if it brings a new sample."""
@@ -218,9 +224,11 @@ class Station:
         sampling = self.sampling
         if note := sampling.take(state, now, elapsed):
             self.book.tell(note)
+        sampling.fluorescence = self.fluorescence.reading(state)
+        light = {"fluorescence": sampling.fluorescence} if self._config.fluorescence.measure else {}
         self.book.log(
             "sample", sample=sampling.key, od=sampling.od, temperature=sampling.temperature, raw=sampling.raw,
-            blank=state.blank, late_s=sampling.late_s, read_s=self.connection.took_s,
+            blank=state.blank, late_s=sampling.late_s, read_s=self.connection.took_s, **light,
         )  # fmt: skip
         if sampling.late_s > 30.0 or self.doses.running:
             return  # the stirrer may be off for the next measurement already

@@ -1,6 +1,9 @@
 """Faults of the emulated device that can be switched while it runs, by name: in process or over HTTP."""
 
+from itertools import product
+
 from hardware.emulator.device import ChiBioDevice
+from hardware.emulator.sysdata import SLOTS
 
 __all__ = ["FAULTS", "inject"]
 
@@ -39,6 +42,7 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "terminal_as_list": ("board", "0 or 1", "fork: Terminal.text is a list of lines"),
     "terminal_named": ("board", "0 or 1", "newer app: lines of the log name reactor and identity"),
     "extra_fields": ("board", "0 or 1", "fork: more fields in getSysdata"),
+    "fp_off": ("act", "any", "somebody's web page switches the fluorescence slots off"),
     "unplugged": ("vial", "0 or 1", "cable out: the next access to the reactor ends the software"),
     "od_frozen": ("vial", "0 or 1", "the spectrometer repeats its last count"),
     "od_offset": ("vial", "OD", "added to every reading"),
@@ -56,6 +60,9 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "back_leak_ml": ("plant", "mL >= 0", "siphons back after each feed pulse"),
     "media_left_ml": ("plant", "mL >= 0", "fresh medium left in the bottle; 0 = empty"),
     "mu_factor": ("plant", "factor >= 0", "growth rate relative to healthy"),
+    "fp_frozen": ("plant", "0 or 1", "fluorescence repeats its last count; of no effect on cultures of one species"),
+    "fp_dead": ("plant", "0 or 1", "fluorescence reads 0; likewise"),
+    "fp_saturated": ("plant", "0 or 1", "fluorescence reads full scale; likewise"),
 }
 PLANT = {  # fault: part of the plant, its switch
     "pump_gain_factor": ("feed", "gain_factor"),
@@ -64,6 +71,9 @@ PLANT = {  # fault: part of the plant, its switch
     "waste_gain_factor": ("vessel", "waste_gain_factor"),
     "overflow_gain_factor": ("vessel", "overflow_gain_factor"),
     "mu_factor": ("culture", "mu_factor"),
+    "fp_frozen": ("fluorescence", "frozen"),
+    "fp_dead": ("fluorescence", "dead"),
+    "fp_saturated": ("fluorescence", "saturated"),
 }
 SIGNED = {"clock_step", "od_offset", "od_jump", "lost_request", "lost_reply", "reset_before", "reset_after"}
 SIGNED |= {"malformed", "truncated", "lying"}  # counts may be -1
@@ -95,7 +105,8 @@ def inject(device: ChiBioDevice, name: str, reactor: str = "all", value: float =
         for vial in (device.vials[m] for m in names):
             vial.sync(now)
             part, switch = PLANT[name]
-            getattr(getattr(vial.plant, part), switch)[:] = value
+            if owner := getattr(vial.plant, part):  # None: nothing fluoresces
+                getattr(owner, switch)[:] = value
 
 
 def _act(device: ChiBioDevice, name: str, names: tuple[str, ...], value: float) -> None:
@@ -106,6 +117,9 @@ def _act(device: ChiBioDevice, name: str, names: tuple[str, ...], value: float) 
     elif name == "marked_absent":
         for m in names:
             device.apps[m].data["present"] = 0
+    elif name == "fp_off":
+        for m, slot in product(names, SLOTS):
+            device.apps[m].data[slot]["ON"] = 0
     elif name == "clock_step":
         device.computer.wall_offset_s += value
     else:

@@ -5,11 +5,15 @@ from collections.abc import Generator
 
 from hardware.emulator.computer import AppError, Steps
 from hardware.emulator.outputs import Outputs, Position, store_target
-from hardware.emulator.sysdata import SLOTS
+from hardware.emulator.sysdata import SLOTS, SysData
 
 __all__ = ["Optics"]
 
 EXPOSURE_S = 0.97  # one spectrometer reading
+FLUORESCENCE_S = 1.0  # LED on, one reading, LED off
+EXCITES, SHINES = "LEDA", "nm440"  # of pyoverdine: 395 nm in, 440 nm out (docs/plant.md, Two species)
+DARK_BASE = 120.0  # counts of the base band where no culture fluoresces
+BASE = 20000.0  # and where one does
 
 
 class Optics:
@@ -42,12 +46,26 @@ class Optics:
         od["current"] = r * zero["LASERb"] + r * r * zero["LASERa"]
 
     def measure_fluorescence(self) -> Steps:
-        """`MeasureFP`: about a second per enabled slot; the emulated cultures do not fluoresce."""
-        for slot in SLOTS:
-            if self._position.data[slot]["ON"] == 1:
+        """`MeasureFP`: about a second per enabled slot; emissions are over the base."""
+        for slot in (self._position.data[name] for name in SLOTS):
+            if slot["ON"] == 1:
                 self._position.hardware()
-                yield 1.0
-                self._position.data[slot].update({"Base": 120.0, "Emit1": 0.0, "Emit2": 0.0})
+                yield FLUORESCENCE_S
+                base, light = self._light()
+                first, second = (light if self._shines(slot, band) else 0.0 for band in ("Emit1Band", "Emit2Band"))
+                slot.update({"Base": base, "Emit1": first / base, "Emit2": second / base})
+
+    def _light(self) -> tuple[float, float]:
+        """Counts of the base band and of pyoverdine's; a spectrometer that fails twice gives 1 and 0."""
+        vial = self._position.hardware()
+        if vial.faults.spectrometer_dead:
+            return 1.0, 0.0
+        light = vial.fluorescence(self._position.computer.now())
+        return (DARK_BASE, 0.0) if math.isnan(light) else (BASE, light)
+
+    @staticmethod
+    def _shines(slot: SysData, band: str) -> bool:
+        return (slot["LED"], slot[band]) == (EXCITES, SHINES)
 
     def calibrate(self, item: str, raw: float, od: float) -> None:
         """`CalibrateOD`: the zero with which `raw` reads as `od` (docs/device.md, OD measurement)."""

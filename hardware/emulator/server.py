@@ -252,7 +252,7 @@ def parser() -> argparse.ArgumentParser:
     add("--speed", type=float, default=1.0, help="device seconds per real second (default %(default)s)")
     add("--seed", type=int, default=0, help="of all noise (default %(default)s)")
     add("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
-    add("--temperature", type=float, default=37.0, help="initial, degC (default %(default)s)")
+    add("--temperature", type=float, help="initial, degC (default: the preset's, 37 as a rule)")
     plants = groups()["plant"]
     add("--plant", choices=plants, default="healthy", help="preset of cultures and pumps (default %(default)s)")
     add("--overflow-pump", choices=SPARE, default="", help="pump that keeps a vial from overflowing (default: none)")
@@ -286,7 +286,7 @@ def build(arguments: argparse.Namespace) -> ChiBioDevice:
         np.random.default_rng(arguments.seed),
         DeviceOptions(unit=arguments.unit, vial=vial, plant=plant),
         od=ods[0] if len(ods) == 1 else ods,
-        temperature=arguments.temperature,
+        temperature=plant.start_temperature if arguments.temperature is None else arguments.temperature,
         blanked=not arguments.unblanked,
     )
 

@@ -300,6 +300,11 @@ class Vial:
         moving = self.stir > 0.0 or at < self._settled_at
         return self.spectrometer.counts(at, exposure_s, float(self.plant.apparent_od[0]), moving)
 
+    def fluorescence(self, at: float) -> float:
+        """One reading of the fluorescent band, whole counts; nan where the plant has no second species."""
+        self._nearly_sync(at)
+        return float(np.round(self.plant.read_fluorescence()[0]))
+
     def truth(self, at: float) -> dict[str, Any]:
         """What no client can know of the reactor at device time `at`."""
         self.sync(at)
@@ -310,5 +315,6 @@ class Vial:
             "peak_ml": self.peak_ml, "overflowed": bool(vessel.overflowed[0]),
             "feed_ml": float(plant.feed.delivered_ml[0]), "media_left_ml": float(plant.feed.media_left_ml[0]),
             "on_s": dict(self.on_s), "motors": {pump: self.motor(pump) for pump in self.on_s},
+            "share": None if plant.fluorescence is None else float(plant.culture.share[0]),
             "heat": self.heat, "stir": self.stir, "powered": self.powered, "blank": self.spectrometer.blank,
         }  # fmt: skip

@@ -49,8 +49,23 @@ REMEDIES = {
     "hot": "check heater and thermometer; heating stays off in this run",
     "thermometer": "check that the vial is seated; heating stays off in this run",
     "device": "see the text",
+    "fluorescence": "check LED, spectrometer and the slot's gain",
+    "fluorescence_lost": "composition is not seen: check LED and spectrometer, then look at the device's FP slot",
+    "temperature_limit": "nothing if the law asked for too much; else set safety.composition_low and composition_high",
 }
-MAY_BE_REPORTED = ("limit", "undosed", "no_dilution", "cannot_hold", "thermometer", "hot", "jump", "stale")
+MAY_BE_REPORTED = (
+    "limit",
+    "undosed",
+    "no_dilution",
+    "cannot_hold",
+    "thermometer",
+    "hot",
+    "jump",
+    "stale",
+    "fluorescence",
+    "fluorescence_lost",
+    "temperature_limit",
+)
 SENSOR_REASONS = ("impossible", "spectrometer", "frozen", "jump", "no_dilution", "falls", "stale", "lost", "silent")
 CHOICES = tuple(WORDS)
 
@@ -87,6 +102,9 @@ class Responses:
     silent: str = setting("stop", "nothing for `silent` minutes", choices=CHOICES)
     hot: str = setting("hold", "too warm; the heater is switched off as well", choices=CHOICES)
     thermometer: str = setting("report", "reads nonsense; the heater is switched off", choices=CHOICES)
+    fluorescence: str = setting("report", "none, none at all, full scale or frozen", choices=CHOICES)
+    fluorescence_lost: str = setting("report", "and for more than light_lost minutes", choices=CHOICES)
+    temperature_limit: str = setting("report", "a composition's temperature was out of range: cut", choices=CHOICES)
     link: str = setting("hold", "no answer", choices=CHOICES)
     selection: str = setting("hold", "the device addresses another reactor", choices=CHOICES)
     identity: str = setting("stop", "another device than the run began with", choices=CHOICES)
@@ -163,6 +181,15 @@ class SafetyConfig:
     cooling: float = setting(
         90.0, "slowest time constant of cooling to a lower target", "min", above=0.0, below=math.inf
     )
+    light_min: float = setting(1.0, "fluorescence below is a dead LED or spectrometer", "counts", within=(0, 65534))
+    frozen_light: int = setting(5, "equal readings of fluorescence in a row that no noisy sensor gives", within=(2, 60))
+    light_lost: float = setting(
+        15.0, "without a believed fluorescence, then that is said until it comes back", "min", above=0.0, below=math.inf
+    )
+    composition_low: float = setting(
+        29.0, "lowest target that a composition controller may set; composition_high or less", "degC", within=(15, 42)
+    )
+    composition_high: float = setting(36.0, "and highest", "degC", within=(15, 42))
     controller_patience: int = setting(5, "unusable proposals in a row: the controller is lost", within=(1, 60))
     responses: Responses = part(Responses, "what is done about each reason")
 
@@ -173,6 +200,7 @@ class SafetyConfig:
             ("od_max", self.max_setpoint, 10.0),
             ("stale_s", self.period_s * 1.1, 3600.0),
             ("lost_s", self.stale_s, 7200.0),
+            ("composition_high", self.composition_low, 42.0),
         ):
             given = getattr(self, key)
             require(low <= given, f"safety.{key}", given, f"{low:g} to {high:g}")

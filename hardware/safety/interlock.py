@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from hardware.reactor import Array, Mask, Measurement, Receipt
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import DONE, REMEDIES, WORDS, Response, SafetyConfig
+from hardware.safety.fluorescence import Light
 from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
 __all__ = ["Interlock", "Verdict", "kinds_of"]
 
-ADDED = ("_helpless_od", "_eased")  # to the saved state of earlier versions
+ADDED = ("_helpless_od", "_eased", "_light", "_light_repeats", "_light_s")  # to the saved state of earlier versions
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Verdict:
 
 
 class Interlock:
-    """Stands between controllers and pumps of N reactors: asks its four parts, then concludes.
+    """Stands between controllers and pumps of N reactors: asks its five parts, then concludes.
 
     Attributes: budget, the ledger of feed and level.
     """
@@ -58,7 +59,9 @@ class Interlock:
         self._readings = Readings(n, self.config)
         self._change = UnexplainedChange(n, self.config)
         self._heat = Heat(n, self.config)
-        self._parts = (self.budget, self._readings, self._change, self._heat)
+        self._light = Light(n, self.config)
+        self._parts = (self.budget, self._readings, self._change, self._heat, self._light)
+        self._asked_c = np.full(n, math.nan)  # temperatures out of range, until `check` has told of them
         self._hold_until_s = np.full(n, -math.inf)
         self._hold_kind = np.full(n, -1.0)  # index into REMEDIES
         self._latched = np.zeros(n)  # a `Response` that no later one may fall below
@@ -85,7 +88,9 @@ class Interlock:
         of_setpoint = Finding("setpoint", ~sound, lambda i: f"setpoint {setpoint[i]:g}")
         allowed, of_rates = self.budget.check(rate, fresh, now)
         found = self._reported(measurement)
-        self._collect(found, [*of_readings, *of_changes, *of_heat, of_setpoint, *of_rates], now)
+        of_light = self._light.check(measurement, now)
+        findings = [*of_readings, *of_changes, *of_heat, of_setpoint, *of_rates, *of_light, self._cut()]
+        self._collect(found, findings, now)
         self._add_holds(found, fresh, now)
         return self._conclude(found, allowed, np.where(sound, np.clip(setpoint, 0.05, None), 0.5))
 
@@ -98,6 +103,29 @@ class Interlock:
         if self._response("jump") is Response.PASS:
             return believed
         return believed & self._change.takes(measurement.od, measurement.time_s, believed)
+
+    def fluorescence(self, measurement: Measurement) -> Array | None:
+        """Fresh counts that may be believed, nan for all others, shape (N,); None where none are measured.
+
+        Asked before `check`, as `believes`; changes nothing.
+        """
+        return self._light.believed(measurement)
+
+    def temperature(self, target: Array) -> Array:
+        """A composition controller's target as it may be commanded, degC, shape (N,): cut to the limits, nan stays.
+
+        The next `check` tells of what was cut.
+        """
+        c = self.config
+        allowed = np.clip(np.asarray(target, dtype=np.float64), c.composition_low, c.composition_high)
+        self._asked_c = np.where(allowed == target, math.nan, target)  # nan is none
+        return np.asarray(allowed)
+
+    def _cut(self) -> Finding:
+        """What `temperature` cut since the last call."""
+        asked, self._asked_c = self._asked_c, np.full(self.n, math.nan)
+        limits = f"{self.config.composition_low:g} to {self.config.composition_high:g}"
+        return Finding("temperature_limit", ~np.isnan(asked), lambda i: f"{asked[i]:.1f} degC asked, allowed {limits}")
 
     def _response(self, kind: str) -> Response:
         return WORDS[getattr(self.config.responses, kind)]

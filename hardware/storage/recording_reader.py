@@ -26,6 +26,8 @@ PUMPS = (1, 2, 3, 4)
 WASTE_PUMP = 2  # of the Chi.Bio; it follows the feed pump and does not dilute
 TEMPERATURE = ("media_temp", "temperature_degc", "temperature_c", "temperature")
 
+LIGHT = (("fluorescence",), ("fp1_base", "fp1_emit1"))  # counts; the Chi.Bio writes the emission over the base
+
 CHIBIO_POSITIONS = (0, 1, 8)  # of exp_time, od_measured, media_temp
 CHIBIO_FIRST_PUMP = 10  # position of pump_1_rate; the other three follow
 CHIBIO_COMMON_COLUMNS = 16  # the first 16 columns are the same in every release; later ones were inserted after them
@@ -53,6 +55,7 @@ class Recording:
     notes: what was excluded, assumed or repaired, one sentence each.
     source: which layout was recognised.
     runs: first and last row number of every run in the file.
+    fluorescence: counts, nan where there are none, shape (n,).
     """
 
     time_min: Array
@@ -63,13 +66,15 @@ class Recording:
     notes: tuple[str, ...]
     source: str
     runs: tuple[tuple[int, int], ...]
+    fluorescence: Array
 
 
 @dataclass(frozen=True)
 class _Layout:
     """Where time, OD, temperature and pump rates stand, and the factors of time and pump rates to house units.
 
-    pumps: of the pumps that feed. idle: pump number -> column of those that are not counted.
+    pumps: of the pumps that feed. idle: pump number -> column of those that are not counted. light: of the factors
+    that make fluorescence.
     """
 
     source: str
@@ -82,6 +87,7 @@ class _Layout:
     header: tuple[str, ...] | None
     idle: dict[int, int] = field(default_factory=dict)
     reactor: int | None = None
+    light: tuple[int, ...] = ()
 
     @property
     def last(self) -> int:
@@ -144,6 +150,7 @@ def read_recording(
         notes=tuple(notes),
         source=layout.source,
         runs=tuple((int(number[r.rows[0]]), int(number[r.rows[-1]])) for r in runs),
+        fluorescence=values[keep, -1],
     )
 
 
@@ -233,6 +240,7 @@ def _named_layout(path: Path, first: Sequence[str], pump_ml_s: float, pumps: Seq
         header=tuple(first),
         idle=idle,
         reactor=at("reactor") if "reactor" in names else None,
+        light=next((tuple(map(at, columns)) for columns in LIGHT if set(columns) <= set(names)), ()),
     )
 
 
@@ -258,7 +266,8 @@ def _numbers(
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
     """Values in house units, data row numbers (n,), and True where a new run is announced by a header.
 
-    Values have shape (n, 4 + idle pumps): time, OD, pump rate, temperature, and the rate of each pump not counted.
+    Values have shape (n, 5 + idle pumps): time, OD, pump rate, temperature, the rate of each pump not counted, and
+    fluorescence.
     """
     header = layout.header
     width = int(np.median([len(cells) for _, cells in table if tuple(cells) != header] or [0]))
@@ -284,7 +293,7 @@ def _numbers(
         rate = layout.ml_s * sum(_cell(cells, i) for i in layout.pumps)
         picked = [layout.minutes * _cell(cells, layout.time), _cell(cells, layout.od), rate]
         idle = [layout.ml_s * _cell(cells, i) for i in layout.idle.values()]
-        values.append([*picked, _cell(cells, layout.temperature), *idle])
+        values.append([*picked, _cell(cells, layout.temperature), *idle, _light(cells, layout.light)])
         number.append(row)
         starts.append(announced)
         announced = False
@@ -294,6 +303,12 @@ def _numbers(
     if not values:
         raise RecordingError(f"{path}: holds no complete data row; expected time, OD and pump rate in every row")
     return np.array(values), np.array(number, dtype=np.int64), np.array(starts)
+
+
+def _light(cells: Sequence[str], columns: Sequence[int]) -> float:
+    """Fluorescence, counts; the Chi.Bio writes a base of 0 while its slot is off."""
+    counts = math.prod(_cell(cells, i) for i in columns) if columns else math.nan
+    return math.nan if len(columns) > 1 and _cell(cells, columns[0]) == 0.0 else counts
 
 
 def _cell(cells: Sequence[str], column: int | None) -> float:

@@ -268,3 +268,23 @@ def test_the_published_presets_start_where_they_say() -> None:
     both = load("plant/coculture_growth_both")
     assert both["growth"]["mu"] / nominal["growth"]["mu"] == pytest.approx(0.95)
     assert both["second"]["mu"] / nominal["second"]["mu"] == pytest.approx(0.90)
+
+
+def test_a_day_of_temperatures_goes_as_in_the_public_model() -> None:
+    """Run of Janmorlock/CompEst3000 (1 s steps, held OD 0.5) from half and half in balance at 33.2 degC."""
+    program = [(2, 33.2), (4, 29.0), (4, 36.0), (2, 33.2)]  # hours, degC
+    shares = {2: 0.4997, 4: 0.6471, 6: 0.7694, 8: 0.5734, 10: 0.2844, 12: 0.2169}
+    pigments = {2: 2941.6, 4: 2718.5, 6: 3127.3, 8: 852.6, 10: 161.9, 12: 1237.4}  # over OD
+    config = build(PlantConfig(), load("plant/coculture"))
+    hour = 0
+    p = plant(config)
+    for hours, degrees in program:
+        p.thermal.config = ThermalConfig(ambient_c=degrees, medium_c=degrees)
+        p.thermal.temperature[:] = degrees  # steps
+        for _ in range(hours):
+            for _ in range(60):
+                p.advance(1.0, np.maximum(20.0 * np.log(p.culture.od / 0.5), 0.0), temperature_target=degrees)
+            hour += 1
+            if hour in shares:
+                assert p.culture.share[0] == pytest.approx(shares[hour], abs=0.002)
+                assert p.fluorescence.pigment[0] / p.culture.od[0] == pytest.approx(pigments[hour], rel=0.015)

@@ -394,6 +394,7 @@ def test_the_saved_state_has_the_fields_that_earlier_runs_wrote() -> None:
         "_excess", "_deficit", "_futile", "_over", "_helpless_od", "_eased",
         "_target_c", "_relief_c", "_thermo_s", "_hot", "_too_hot", "_nonsense", "_heat_off",
         "_hold_until_s", "_hold_kind", "_latched",
+        "_light", "_light_repeats", "_light_s",
     }  # fmt: skip
     assert all(len(values) == 2 for values in state.values())
 

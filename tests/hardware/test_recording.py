@@ -341,3 +341,21 @@ def test_paths_that_cannot_be_read(tmp_path: Path) -> None:
         read_recording(tmp_path)
     with pytest.raises(RecordingError, match="pump_ml_s = 0"):
         read_recording(tmp_path / "absent.csv", pump_ml_s=0.0)
+
+
+def test_fluorescence_is_read_where_it_was_measured(read: Callable[..., object]) -> None:
+    counts = 1000.0 + 5.0 * np.arange(len(T))
+    own = ["time_min,od,pump_rate_ml_s,interlock,fluorescence"]
+    own += [
+        f"{t!r},{od!r},{u!r},,{c!r}" for t, od, u, c in zip(*map(np.ndarray.tolist, (T, OD, U, counts)), strict=True)
+    ]
+    own[4] = own[4].rsplit(",", 1)[0] + ","  # a row without
+    found = read("\n".join(own) + "\n").fluorescence  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(found, changed(counts, 3, np.nan))
+    assert np.isnan(read(tidy()).fluorescence).all()  # type: ignore[attr-defined]
+
+
+def test_the_device_s_own_file_gives_base_times_emission(read: Callable[..., object]) -> None:
+    base = changed(np.full(len(T), 20000.0), 3, 0.0)  # switched off in the fourth cycle
+    found = read(chibio(FP1_base=base, FP1_emit1=changed(np.full(len(T), 0.1), 3, 0.0))).fluorescence  # type: ignore[attr-defined]
+    np.testing.assert_allclose(found, changed(np.full(len(T), 2000.0), 3, np.nan))

@@ -1,0 +1,110 @@
+"""Fluorescence of a culture: one slot of the device measures it with every cycle, if this run has it switched on.
+
+A slot is switched by one route, which acts on the selected reactor and toggles (docs/device.md, Fluorescence). So it is
+read first, toggled only if it has to be, and read back. It costs about a second of each cycle and moves nothing.
+"""
+
+import math
+from dataclasses import dataclass
+
+from conf.schema import check, setting
+from hardware.chibio.connection import Connection
+from hardware.chibio.logbook import Logbook
+from hardware.chibio.protocol import BANDS, LEDS, SLOTS, DeviceState, Slot
+
+__all__ = ["Fluorescence", "FluorescenceSlotConfig"]
+
+HIDDEN = "not shown with its settings: update the device's software or the agent on its board"
+
+
+@dataclass(frozen=True)
+class FluorescenceSlotConfig:
+    """Which slot measures what; as a rule none.
+
+    The defaults are for pyoverdine, 395 nm in and 440 nm out, as in Lee, Morlock, Allan, Steel, Cell Reports Methods
+    5:101009 (2025) and their device software Janmorlock/ChiBio.
+    Raises: ValueError naming key, value and allowed range.
+    """
+
+    measure: bool = setting(False, "measure fluorescence with every sample")
+    slot: str = setting("FP1", "of the device; the others must be off", choices=SLOTS)
+    led: str = setting("LEDA", "that excites: LEDA 395 nm, LEDB 457, LEDC 500, LEDD 523, LEDE 595", choices=LEDS)
+    base_band: str = setting("CLEAR", "that the device divides by", choices=BANDS)
+    band: str = setting("nm440", "that is read; not the base band", choices=BANDS)
+    gain: str = setting("x10", "of the spectrometer, its code", choices=tuple(f"x{k}" for k in range(11)))
+
+    def __post_init__(self) -> None:
+        check(self, "backend.fluorescence")
+        if self.band == self.base_band:
+            raise ValueError(f"backend.fluorescence.band = {self.band}: allowed another than base_band")
+
+    @property
+    def command(self) -> str:
+        """The one POST that toggles the slot; "" if nothing is to be measured."""
+        settings = (self.slot, self.led, self.base_band, self.band, "OFF", self.gain)
+        return f"/SetFPMeasurement/{'/'.join(settings)}" if self.measure else ""
+
+    def own(self, state: DeviceState) -> Slot | None:
+        """The configured slot; None if the device does not show it, or it is on without its settings."""
+        return next((s for s in state.slots if s.name == self.slot and (s.led or not s.on)), None)
+
+    def wrong(self, state: DeviceState) -> str:
+        """What a read shows of the slot that is not as it must be; "" if all is well or nothing is measured."""
+        if not self.measure:
+            return ""
+        slot = self.own(state)
+        if slot is None:
+            return HIDDEN
+        if not slot.on:
+            return "off"
+        found = (slot.led, slot.base_band, slot.band, slot.gain)
+        return "" if found == (self.led, self.base_band, self.band, self.gain) else f"set to {', '.join(found)}"
+
+    def others_on(self, state: DeviceState) -> tuple[str, ...]:
+        """The modes that are on beside the slot that this run uses."""
+        return tuple(m for m in state.modes if not (self.measure and m == self.slot))
+
+
+class Fluorescence:
+    """The fluorescence slot of one reactor: looked at with every read, put right, read back.
+
+    Attributes: trouble, why it could not be verified on, "" if it was.
+    """
+
+    def __init__(self, connection: Connection, config: FluorescenceSlotConfig, book: Logbook) -> None:
+        self.trouble = ""
+        self._connection, self._config, self._book = connection, config, book
+        self._was_on = False
+        self._switched_in = -1  # the cycle in which it was last toggled, which may have been after its measurement
+
+    def keep_on(self, state: DeviceState) -> DeviceState:
+        """Have the slot on with its settings; the reactor's state then. What cannot be had becomes `trouble`.
+
+        Args: state: just read. Raises: as `Connection.toggle` and `Connection.read`.
+        """
+        found = still = self._config.wrong(state)
+        if found not in ("", HIDDEN):
+            self._switched_in = state.cycles
+            state, still = self._toggle()
+            if found != "off" and still == "off":  # it takes its settings when it goes on
+                state, still = self._toggle()
+        slot = self._config.slot
+        self.trouble = f"the fluorescence slot {slot} is {still} after it was switched on" if still else ""
+        if found and not still and self._was_on:
+            self._book.tell(f"the fluorescence slot {slot} was found {found} and put right")
+        self._was_on = self._was_on or not still
+        return state
+
+    def _toggle(self) -> tuple[DeviceState, str]:
+        state = self._connection.toggle(self._config.command)
+        return state, self._config.wrong(state)
+
+    def reading(self, state: DeviceState) -> float:
+        """Counts of the band in the newest sample, base times emission; nan where there are none.
+
+        Args: state: that brought the sample.
+        """
+        slot, old = self._config.own(state), state.cycles == self._switched_in
+        if old or slot is None or not self._config.measure or self._config.wrong(state):
+            return math.nan
+        return slot.counts

@@ -1,0 +1,73 @@
+"""What each reading of fluorescence says by itself: whether a working sensor can have given it."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from hardware.reactor import Array, Mask, Measurement
+from hardware.safety.config import SafetyConfig
+from hardware.safety.readings import Finding
+
+__all__ = ["Light"]
+
+
+class Light:
+    """Plausibility of the newest fluorescence of N reactors, where it is measured; it is no basis of a dose.
+
+    Args: n: number of reactors; config: limits.
+    """
+
+    def __init__(self, n: int, config: SafetyConfig) -> None:
+        self._config = config
+        self._light = np.full(n, math.nan)  # the newest reading, believed or not
+        self._light_repeats = np.zeros(n)  # samples in a row that were equal to the one before
+        self._light_s = np.full(n, math.nan)  # when a reading was last believed, or first asked for
+
+    def check(self, m: Measurement, now: float) -> list[Finding]:
+        """What is wrong with the fresh readings of `m`; `now`: run time, s."""
+        if m.fluorescence is None:
+            return []
+        counts, fresh = m.fluorescence, np.asarray(m.fresh, dtype=np.bool_)
+        believed, repeats = self._judge(counts, fresh)
+        self._light, self._light_repeats = np.where(fresh, counts, self._light), repeats
+        self._light_s = np.where(believed | (fresh & np.isnan(self._light_s)), now, self._light_s)
+        minutes = (now - self._light_s) / 60.0
+        lost = fresh & (minutes > self._config.light_lost)
+        return [
+            Finding("fluorescence", fresh & ~believed & ~lost, lambda i: _words(counts[i], repeats[i])),
+            Finding(
+                "fluorescence_lost",
+                lost,
+                lambda i: f"no reading to believe for {minutes[i]:.0f} min, {_words(counts[i], repeats[i])}",
+            ),
+        ]
+
+    def believed(self, m: Measurement) -> Array | None:
+        """Fresh counts that may be believed, nan for all others, shape (N,); None where none are measured."""
+        if m.fluorescence is None:
+            return None
+        believed, _ = self._judge(m.fluorescence, np.asarray(m.fresh, dtype=np.bool_))
+        return np.where(believed, m.fluorescence, np.nan)
+
+    def _judge(self, counts: Array, fresh: Mask) -> tuple[Mask, Array]:
+        """Fresh rows that may be believed; equal samples in a row, of all."""
+        c = self._config
+        repeats = np.where(fresh, np.where(counts == self._light, self._light_repeats + 1, 0), self._light_repeats)
+        inside = (counts >= c.light_min) & (counts <= c.raw_max)  # not nan
+        return np.asarray(fresh & inside & (repeats < c.frozen_light - 1), dtype=np.bool_), repeats
+
+    def state(self) -> dict[str, Array]:
+        """What it remembers."""
+        return {"_light": self._light, "_light_repeats": self._light_repeats, "_light_s": self._light_s}
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        """Continue as saved."""
+        self._light, self._light_repeats, self._light_s = (state[key] for key in self.state())
+
+
+def _words(counts: float, repeats: float) -> str:
+    """A reading in words."""
+    if math.isnan(counts):
+        return "no counts"
+    return f"{counts:.0f} counts" + (f", the same in {repeats + 1:.0f} samples" if repeats else "")

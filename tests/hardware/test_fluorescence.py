@@ -1,0 +1,315 @@
+"""Fluorescence on its way from an emulated culture to a measurement: slot, sample, preflight, faults."""
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.plant.plant import Plant
+from hardware.board.board_agent import reduce_sysdata
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.dosing import ReactorCalibration
+from hardware.chibio.fluorescence import FluorescenceSlotConfig
+from hardware.chibio.preflight import Check, preflight
+from hardware.chibio.protocol import check_command, parse_state
+from hardware.emulator.device import DeviceOptions, plant_preset
+from hardware.errors import DeviceStateError
+from hardware.simulated import SimulatedConfig, SimulatedReactors
+from tests.hardware.driver_lab import DriverLab
+from tests.hardware.emulator_lab import Lab
+
+ON = FluorescenceSlotConfig(measure=True)
+COMMAND = "/SetFPMeasurement/FP1/LEDA/CLEAR/nm440/OFF/x10"
+PLANT = plant_preset("coculture")
+EXACT = replace(PLANT, fluorescence=replace(PLANT.fluorescence, noise_sd=0.0))
+
+
+def lab(names: tuple[str, ...] = ("M0",), plant=PLANT, **config: Any) -> DriverLab:
+    settings = {"fluorescence": ON, "temperature": 33.0} | config
+    found = DriverLab(names, options=DeviceOptions(plant=plant), **settings)
+    found.law.rate = 0.005
+    return found
+
+
+def begun(*args: Any, **config: Any) -> DriverLab:
+    found = lab(*args, **config)
+    found.reactors.begin()
+    return found
+
+
+def sample(bench: DriverLab) -> np.ndarray:
+    """Fluorescence of the next new sample."""
+    while True:
+        m = bench.reactors.measure()
+        if m.fresh.any():
+            assert m.fluorescence is not None
+            return m.fluorescence
+
+
+def slot(bench: DriverLab, name: str = "M0", which: str = "FP1") -> dict[str, Any]:
+    data: dict[str, Any] = bench.device.apps[name].data[which]
+    return data
+
+
+def toggles(bench: DriverLab) -> int:
+    return sum(path.startswith("/SetFPMeasurement") for _, path in bench.wire.posts)
+
+
+# -- the simulated reactor and the emulated device ---------------------------------------------------------------------
+
+
+def test_simulated_reactors_measure_it_where_the_plant_fluoresces() -> None:
+    two = SimulatedReactors(Plant(EXACT, 1, np.random.default_rng(0)), SimulatedConfig())
+    f = two.plant.fluorescence
+    assert f is not None
+    np.testing.assert_allclose(two.measure().fluorescence, f.pigment + 150.0 * 0.5 + 214.0)
+    one = SimulatedReactors(Plant(plant_preset("healthy"), 1, np.random.default_rng(0)), SimulatedConfig())
+    assert one.measure().fluorescence is None
+
+
+def test_the_device_shows_emissions_over_the_base() -> None:
+    emulated = Lab(("M0",), options=DeviceOptions(plant=EXACT), od=0.5, temperature=33.0)
+    assert emulated.post("/changeDevice/M0") == emulated.post(COMMAND) == emulated.post("/MeasureFP/M0") == 204
+    fp, plant = emulated.state()["FP1"], emulated.device.vials["M0"].plant
+    assert plant.fluorescence is not None
+    expected = float(plant.fluorescence.apparent(plant.culture.od, plant.minutes)[0])
+    assert fp["Base"] > 0.0
+    assert fp["Base"] * fp["Emit1"] == pytest.approx(expected, abs=1.0)
+    assert fp["Emit2"] == 0.0
+    assert fp["Emit1"] < 1.0
+
+
+@pytest.mark.parametrize("command", [COMMAND.replace("LEDA", "LEDD"), COMMAND.replace("nm440", "nm510")])
+def test_other_light_shows_no_pigment(command) -> None:
+    emulated = Lab(("M0",), options=DeviceOptions(plant=EXACT), od=0.5)
+    assert emulated.post(command) == emulated.post("/MeasureFP/M0") == 204
+    assert emulated.state()["FP1"]["Emit1"] == 0.0
+
+
+def test_the_cycle_measures_and_records_it() -> None:
+    emulated = Lab(("M0",), options=DeviceOptions(plant=EXACT), od=0.5)
+    emulated.post("/changeDevice/M0")
+    emulated.post(COMMAND)
+    emulated.post("/Experiment/1/M0")
+    emulated.wait(80.0)
+    fp = emulated.state()["FP1"]
+    assert fp["BaseRecord"][-1] * fp["Emit1Record"][-1] > 300.0
+
+
+# -- the driver --------------------------------------------------------------------------------------------------------
+
+
+def test_a_sample_brings_the_counts_of_its_own_cycle() -> None:
+    bench = begun(plant=EXACT)
+    assert slot(bench)["ON"] == 1
+    for _ in range(3):
+        counts = sample(bench)[0]
+        plant = bench.device.vials["M0"].plant
+        assert plant.fluorescence is not None
+        assert counts == pytest.approx(plant.fluorescence.apparent(plant.culture.od, plant.minutes)[0], rel=0.02)
+        assert bench.of("sample")[-1]["fluorescence"] == counts
+    assert toggles(bench) == 1
+
+
+def test_without_it_nothing_is_switched_and_nothing_measured() -> None:
+    bench = begun(fluorescence=FluorescenceSlotConfig())
+    while not (m := bench.reactors.measure()).fresh.any():
+        pass
+    assert m.fluorescence is None
+    assert toggles(bench) == 0
+    assert "fluorescence" not in bench.of("sample")[-1]
+
+
+def test_a_slot_that_is_on_already_is_not_toggled() -> None:
+    bench = lab()
+    bench.wire.inner.post("/changeDevice/M0")
+    bench.wire.inner.post(COMMAND)
+    bench.reactors.begin()
+    assert (slot(bench)["ON"], toggles(bench)) == (1, 0)
+
+
+def test_a_slot_with_other_settings_is_set_anew() -> None:
+    bench = lab()
+    bench.wire.inner.post("/changeDevice/M0")
+    bench.wire.inner.post(COMMAND.replace("x10", "x4").replace("LEDA", "LEDB"))
+    bench.reactors.begin()
+    fp = slot(bench)
+    assert (fp["ON"], fp["LED"], fp["Gain"], fp["Emit1Band"], fp["Emit2Band"]) == (1, "LEDA", "x10", "nm440", "OFF")
+    assert toggles(bench) == 2
+
+
+def test_settings_that_somebody_changes_are_put_right_in_one_go() -> None:
+    bench = begun()
+    slot(bench)["LED"] = "LEDB"
+    station, before = bench.reactors.stations[0], toggles(bench)
+    station.fluorescence.keep_on(station.connection.read())
+    assert (slot(bench)["ON"], slot(bench)["LED"], toggles(bench)) == (1, "LEDA", before + 2)
+    assert station.fluorescence.trouble == ""
+    assert "was found set to LEDB, CLEAR, nm440, x10 and put right" in bench.of("note")[-1]["note"]
+
+
+def test_a_toggle_selects_its_reactor_itself() -> None:
+    bench = begun(("M0", "M1"))
+    bench.wire.inner.post("/changeDevice/M1")
+    bench.reactors.stations[0].connection.toggle(COMMAND)
+    assert [slot(bench, m)["ON"] for m in ("M0", "M1")] == [0, 1]
+
+
+def test_each_reactor_s_own_slot_is_switched() -> None:
+    bench = begun(("M0", "M3"))
+    assert [slot(bench, m)["ON"] for m in ("M0", "M1", "M3")] == [1, 0, 1]
+    bench.run(3.0)
+    newest = {row["reactor"]: row["fluorescence"] for row in bench.of("sample")}
+    assert all(counts > 300.0 for counts in newest.values())
+    assert len(newest) == 2
+
+
+def test_a_slot_that_somebody_switches_off_is_put_right_and_its_old_value_not_shown() -> None:
+    bench = begun()
+    sample(bench)
+    bench.fault("fp_off")
+    assert math.isnan(sample(bench)[0])
+    assert slot(bench)["ON"] == 1
+    assert sample(bench)[0] > 300.0
+    assert any("FP1 was found off and put right" in row["note"] for row in bench.of("note"))
+
+
+def test_a_worker_that_lost_its_memory_gets_it_back() -> None:
+    bench = begun()
+    bench.run(3.0)
+    bench.fault("worker_wipe")
+    bench.run(10.0)
+    assert slot(bench)["ON"] == 1
+    assert bench.of("sample")[-1]["fluorescence"] > 300.0
+
+
+def test_a_resumed_run_finds_it_on() -> None:
+    bench = begun()
+    sample(bench)
+    bench.client()
+    bench.reactors.begin()
+    assert toggles(bench) == 1
+    assert sample(bench)[0] > 300.0
+
+
+def test_somebody_who_selects_reactors_leaves_it_on_in_the_end() -> None:
+    bench = begun(("M0", "M1"))
+    bench.fault("fp_off")
+    bench.fault("foreign_selects", 0.2)
+    bench.run(6.0)
+    bench.fault("foreign_selects", 0.0)
+    bench.run(3.0)
+    assert [slot(bench, m)["ON"] for m in ("M0", "M1")] == [1, 1]
+
+
+def test_a_run_does_not_begin_where_it_cannot_be_had() -> None:
+    bench = lab()
+
+    def refuse(path: str) -> Any:
+        bench.wire.posts.append((bench.clock.now(), path))
+        return bench.wire.inner.post("/changeDevice/M0" if path == COMMAND else path)
+
+    bench.wire.post = refuse
+    with pytest.raises(DeviceStateError, match="fluorescence slot FP1 is off after it was switched on; run the pref"):
+        bench.reactors.begin()
+
+
+@pytest.mark.parametrize(("fault", "counts"), [("fp_dead", 0.0), ("fp_saturated", 65535.0), ("spectrometer_dead", 0.0)])
+def test_a_sensor_that_fails_shows_what_it_reads(fault, counts) -> None:
+    bench = begun()
+    sample(bench)
+    bench.fault(fault)
+    sample(bench)
+    assert sample(bench)[0] == pytest.approx(counts)
+
+
+def test_a_frozen_sensor_repeats_exactly() -> None:
+    bench = begun()
+    first = [sample(bench)[0] for _ in range(2)]
+    bench.fault("fp_frozen")
+    later = [sample(bench)[0] for _ in range(3)]
+    assert first[0] != first[1]
+    assert later[0] == later[1] == later[2]
+
+
+# -- what may be sent, what is read ------------------------------------------------------------------------------------
+
+
+def test_only_the_configured_toggle_may_be_sent() -> None:
+    check_command(COMMAND, ("M0",), slot_command=COMMAND)
+    for other in (COMMAND.replace("FP1", "FP2"), COMMAND.replace("x10", "x9")):
+        with pytest.raises(DeviceStateError, match="refused to send POST /SetFPMeasurement"):
+            check_command(other, ("M0",), slot_command=COMMAND)
+    with pytest.raises(DeviceStateError, match="refused"):
+        check_command(COMMAND, ("M0",))
+    with pytest.raises(DeviceStateError, match="refused"):
+        check_command("", ("M0",))
+
+
+def test_the_board_agent_passes_what_the_driver_reads() -> None:
+    emulated = Lab(("M0",), options=DeviceOptions(plant=EXACT), od=0.5)
+    emulated.post("/changeDevice/M0")
+    emulated.post(COMMAND)
+    emulated.post("/MeasureFP/M0")
+    body = emulated.device.handle("GET", "/getSysdata/")[1]
+    whole, reduced = parse_state(body), parse_state(reduce_sysdata(body))
+    assert reduced.slots == whole.slots
+    assert whole.slots[0].counts > 300.0
+    old = json.loads(body)
+    old["FP1"] = {"ON": 1}
+    assert ON.own(parse_state(json.dumps(old).encode())) is None
+    assert "update" in ON.wrong(parse_state(json.dumps(old).encode()))
+
+
+def test_a_band_is_not_its_own_base() -> None:
+    with pytest.raises(ValueError, match=r"backend\.fluorescence\.band = CLEAR: allowed another than base_band"):
+        FluorescenceSlotConfig(band="CLEAR")
+
+
+# -- preflight ---------------------------------------------------------------------------------------------------------
+
+
+def checked(bench: DriverLab, name: str = "M0 fluorescence", config: ChiBioConfig | None = None) -> Check:
+    checks = preflight(bench.wire, bench.clock, config or bench.config, [ReactorCalibration()])
+    return next(c for c in checks if c.name == name)
+
+
+def test_preflight_says_that_the_run_switches_it_on() -> None:
+    bench = lab()
+    assert checked(bench).ok
+    assert "FP1 is off: the run switches it on" in checked(bench).detail
+    assert toggles(bench) == 0
+
+
+def test_preflight_reads_a_slot_that_is_on() -> None:
+    bench = begun()
+    sample(bench)
+    found = checked(bench)
+    assert found.ok
+    assert "counts of nm440" in found.detail
+    assert checked(bench, "M0 modes").ok
+
+
+@pytest.mark.parametrize(("fault", "counts"), [("fp_dead", "0 counts"), ("fp_saturated", "65535 counts")])
+def test_preflight_refuses_a_sensor_that_reads_nothing_or_everything(fault, counts) -> None:
+    bench = begun()
+    bench.fault(fault)
+    sample(bench)
+    found = checked(bench)
+    assert not found.ok
+    assert found.required
+    assert counts in found.detail
+    assert "gain" in found.remedy
+
+
+def test_preflight_still_refuses_every_other_slot() -> None:
+    bench = begun()
+    slot(bench, which="FP2")["ON"] = 1
+    modes = checked(bench, "M0 modes")
+    assert not modes.ok
+    assert modes.detail == "FP2"
+    without = replace(bench.config, fluorescence=FluorescenceSlotConfig())
+    assert checked(bench, "M0 modes", without).detail == "FP1, FP2"
