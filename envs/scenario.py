@@ -1,4 +1,4 @@
-"""What a culture is asked to do over time: a sequence of phases with a setpoint and a temperature each."""
+"""What a culture is asked to do over time: phases with a setpoint and a temperature each, and maybe a composition."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,9 @@ Array = NDArray[np.float64]
 class Scenario:
     """Phases one after another, counted from the end of the recovery.
 
-    Raises: ValueError naming key, value and allowed range.
+    The share of a second species may be asked for, phase by phase or as mean - amplitude sin(2 pi t / period), t since
+    the recovery ended. Where it is, whoever controls the composition decides on the temperature, elsewhere
+    `temperatures` holds. Raises: ValueError naming key, value and allowed range.
     """
 
     setpoints: tuple[float, ...] = setting((0.5,), "one of each phase", "OD", above=0.0, at_most=1.5)
@@ -26,8 +28,21 @@ class Scenario:
         0.0, "before the first phase the culture grows undiluted to here; 0: no recovery", "OD", within=(0, 1.5)
     )
     recovery_limit_min: float = setting(600.0, "how long that may take", "min", above=0.0)
+    ratios: tuple[float | None, ...] = setting(
+        (),
+        "share of the second species in each phase, null where none is asked for; empty: in no phase",
+        above=0.0,
+        below=1.0,
+    )
+    ratio_sine: tuple[float, ...] = setting(
+        (), "in place of ratios a sine that falls first: mean, amplitude and period in min; empty: none"
+    )
+    announce_min: float = setting(
+        360.0, "how long before it a change of the share is told to its controller; 0: never", "min", within=(0, 1440)
+    )
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "ratios", tuple(None if r is None or r != r else r for r in self.ratios))
         lists = (self.setpoints, self.minutes, self.temperatures)
         lengths = {len(phases) for phases in lists}
         require(
@@ -37,6 +52,24 @@ class Scenario:
             "three lists of the same length, one entry per phase",
         )
         check(self, "scenario")
+        self._check_composition()
+
+    def _check_composition(self) -> None:
+        whole = len(self.ratios) in (0, len(self.setpoints))
+        require(whole, "scenario.ratios", self.ratios, f"none or one for each of the {len(self.setpoints)} phases")
+        if not self.ratio_sine:
+            return
+        require(not self.ratios, "scenario.ratios", self.ratios, "[] beside ratio_sine")
+        given = tuple(self.ratio_sine)
+        words = "mean, amplitude and period in min > 0, with |amplitude| < mean and |amplitude| < 1 - mean"
+        require(len(given) == 3 and given[2] > 0.0, "scenario.ratio_sine", given, words)
+        mean, amplitude, _ = given
+        require(abs(amplitude) < mean and mean + abs(amplitude) < 1.0, "scenario.ratio_sine", given, words)
+
+    @property
+    def composed(self) -> bool:
+        """Whether a share is asked for at any time."""
+        return bool(self.ratio_sine) or any(r is not None for r in self.ratios)
 
     @property
     def total_min(self) -> float:

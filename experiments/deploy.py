@@ -16,7 +16,10 @@ def deploy(config: DeployConfig, folder: Path) -> None:
 
 
 def _schema(cfg: DictConfig) -> DeployConfig:
-    return deploy_schema(str(cfg.backend.kind), str(cfg.controller.kind))
+    composition = cfg.get("composition")
+    return deploy_schema(
+        str(cfg.backend.kind), str(cfg.controller.kind), None if composition is None else str(composition.kind)
+    )
 
 
 main = frame.Command("deploy", DeployConfig(), deploy, _schema, resumes="state.json")

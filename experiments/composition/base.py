@@ -1,7 +1,7 @@
 """What a law of the composition is told and what it answers: N cultures in, N thermostat targets out."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,4 +62,12 @@ class Law(Protocol):
         A law with a longer period of its own keeps its target until that is over. Args: minute: since the program
         began, (N,). rows: True where the estimate is new and a setpoint is in force; only these rows' state advances.
         """
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `reset` forgets, as plain numbers and lists."""
+        ...
+
+    def restore(self, state: object) -> None:
+        """Continue as saved. Raises: ValueError naming what is missing or does not fit."""
         ...

@@ -111,6 +111,9 @@ def write(page: Page, run: Path, label: str = "") -> None:
     model, summary = believed(run), json.loads((run / "summary.json").read_text(encoding="utf-8"))
     reactors = summary.get("reactors") if isinstance(summary, Mapping) else None
     page.section(f"{label}: predicted and measured" if label else "Predicted and measured")
+    if _config(run).get("composition"):
+        page.text("Not compared: the growth of two species follows their share, and the model is of one species.")
+        return
     page.text(
         f"The model: growth {number(model.mu, 4)} 1/min, tau {number(model.tau, 4)} ({model.source}). Growth and pump "
         "gain are estimated from segments of about two hours, each alone. Net growth is what a sample grew or shrank "

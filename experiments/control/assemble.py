@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,17 +19,20 @@ from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
+from experiments.composition import registry as compositions
+from experiments.control.composition import Composition, Keeper, program_of
 from experiments.control.config import DeployConfig
 from experiments.control.device import check, linked, load_calibrations
 from experiments.control.loop import ClosedLoop
 from experiments.control.plant_file import read_plant_file
-from experiments.control.policies import admit, policy_check, run_policy
+from experiments.control.policies import admit, composition_policy, policy_check, run_policy
 from experiments.control.record import Record
 from experiments.control.recovery import continue_loop
 from experiments.controllers import registry
 from experiments.training.config import read_env_file
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
+from hardware.emulator.device import plant_preset
 from hardware.errors import RecordingError
 from hardware.reactor import Reactor
 from hardware.safety.interlock import Interlock
@@ -45,7 +49,7 @@ class Setup:
       `env_file` it grows and is fed as calibrated.
     model: growth model that model-based controllers are given: the calibrated one, else the nominal one.
     policy: of controller=dqn, None for a preflight. bounds: of its certificate. resumed: an earlier life of the run is
-      continued.
+      continued. keeper: of the composition, None where none is controlled.
     """
 
     config: DeployConfig
@@ -55,6 +59,7 @@ class Setup:
     policy: Policy | None
     bounds: EstimateBounds | None
     resumed: bool
+    keeper: Keeper | None = None
 
 
 def unpack(config: DeployConfig, folder: Path) -> Setup:
@@ -78,6 +83,10 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         gain = plant.vessel.volume_ml / (60.0 * model.tau)  # tau = V / (60 g)
         growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
         plant = replace(plant, growth=growth, pump=pump)
+    keeper = _keeper(config, plant, folder, scenarios)
+    if keeper is not None and backend.kind != "sim":  # the device has to measure what the estimate needs
+        backend = replace(backend, fluorescence=replace(backend.fluorescence, measure=True))
+        config = replace(config, backend=backend)
     fastest = min(model.max_pump_rate, config.safety.max_rate)
     model = replace(model, control_min=backend.control_min, max_pump_rate=fastest)
     policy = bounds = None
@@ -85,7 +94,38 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         policy = run_policy(config.policy, folder, resumed, backend.control_min, config.safety.max_rate)
         admit(policy, folder / "policy.npz", config, scenarios)
         bounds = certificate.bounds(policy, folder / "policy.npz")
-    return Setup(config, scenarios, plant, model, policy, bounds, resumed)
+    return Setup(config, scenarios, plant, model, policy, bounds, resumed, keeper)
+
+
+def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Keeper | None:
+    """What controls the composition, None if nothing does. Raises: UserError where scenario, backend and it differ."""
+    asked = [name for name, s in zip(config.backend.reactors, scenarios, strict=True) if s.composed]
+    if config.composition is None:
+        if asked:
+            remedy = "add composition=dqn_preview or another of composition, or choose a scenario without ratios"
+            raise frame.UserError(
+                f"the scenario of {', '.join(asked)} asks for a share that nothing controls; {remedy}"
+            )
+        return None
+    kind = config.composition.kind
+    if not asked:
+        remedy = "give scenario=ratio_steps or scenario.ratios, or drop it"
+        raise frame.UserError(f"composition={kind}: no scenario asks for a share; {remedy}")
+    emulated = config.backend.kind == "emulator"
+    if config.backend.kind == "sim" or emulated:
+        vials = plant_preset(config.backend.plant) if emulated else plant
+        if not vials.second.present:
+            key = f"{'backend.' if emulated else ''}plant=coculture"
+            raise frame.UserError(f"composition={kind}: the vials hold one species that does not fluoresce; give {key}")
+    one = next(s for s in scenarios if s.composed)
+    if kind == "optimum" and any(program_of(s) != program_of(one) for s in scenarios):
+        raise frame.UserError("composition=optimum plans one program: give all reactors the same shares and minutes")
+    policy = composition_policy(kind, config.composition_policy, folder, config.resume is not None)
+    try:
+        keeper: Keeper = compositions.build(config.composition, policy, program_of(one))
+    except ValueError as error:
+        raise frame.UserError(str(error)) from None
+    return keeper
 
 
 def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
@@ -101,8 +141,12 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
         controller = registry.build(setup.config.controller, setup.model, setup.policy, plant, flow, setup.bounds)
     except ValueError as error:
         raise frame.UserError(str(error)) from None
-    interlock = Interlock(len(reactors.names), setup.config.safety)
-    loop = ClosedLoop(reactors, controller, interlock, setup.scenarios, record.decided, setup.config.ends())
+    interlock, composition = Interlock(len(reactors.names), setup.config.safety), None
+    if setup.keeper is not None:
+        truth = None if plant is None else partial(getattr, plant.culture, "share")
+        composition = Composition(setup.keeper, setup.scenarios, setup.config.composition_limits, truth)
+    ends = setup.config.ends()
+    loop = ClosedLoop(reactors, controller, interlock, setup.scenarios, record.decided, ends, composition)
     if setup.resumed:
         continue_loop(loop, record.journal, record.state_path)
     return loop

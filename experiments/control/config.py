@@ -6,6 +6,9 @@ from typing import Any
 from conf.schema import check, part, require, setting
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
+from experiments.composition import registry as compositions
+from experiments.control.composition import CompositionLimits, columns
+from experiments.control.recovery import COLUMNS
 from experiments.controllers import registry
 from experiments.controllers.learned import LearnedConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
@@ -54,6 +57,16 @@ class DeployConfig:
     force_policy: bool = setting(
         False, "run a policy on a device although it is not certified, poor, or was trained for other setpoints"
     )
+    composition: Any = setting(
+        None,
+        "what decides the temperature where the scenario asks for a share: a preset of `composition`; null: nothing",
+    )
+    composition_policy: str = setting(
+        "shipped", "of composition=dqn and dqn_preview: `shipped`, a policy.npz, or a run folder"
+    )
+    composition_limits: CompositionLimits = part(
+        CompositionLimits, "limits of its temperatures, and when a share is out of control"
+    )
     env_file: str | None = setting(None, "a calibrated.yaml whose model the simulated plant takes")
     plant_file: str | None = setting(None, "a twin.yaml of calibrate, in place of `plant`; backend=sim")
     fsync: bool = setting(True, "every row on the disk before the next command")
@@ -100,9 +113,15 @@ class DeployConfig:
         """What a reactor is for, in words of the user."""
         return str(self.each.get(reactor, {}).get("role", "replicate"))
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Of the recordings."""
+        return COLUMNS if self.composition is None else (*COLUMNS, *columns(true=self.backend.kind == "sim"))
 
-def deploy_schema(kind: str, controller: str = "dqn") -> DeployConfig:
-    """The schema for the backend and controller of these kinds. Raises: ValueError naming the kinds there are."""
+
+def deploy_schema(kind: str, controller: str = "dqn", composition: str | None = None) -> DeployConfig:
+    """The schema for the backend and controllers of these kinds. Raises: ValueError naming the kinds there are."""
     if kind not in BACKENDS:
         raise ValueError(f"backend.kind = {kind}: allowed {', '.join(BACKENDS)}")
-    return DeployConfig(backend=BACKENDS[kind](), controller=registry.config(controller))
+    law = None if composition is None else compositions.config(composition)
+    return DeployConfig(backend=BACKENDS[kind](), controller=registry.config(controller), composition=law)

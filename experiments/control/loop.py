@@ -4,15 +4,16 @@ It is a generator of what happened. Clocks and wires belong to the reactors, fil
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.scenario import Scenario
+from experiments.control.composition import Composition
 from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Remembers, Watches
-from hardware.reactor import Command, Reactor, Receipt
+from hardware.reactor import Command, Measurement, Reactor, Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock, Verdict
 
@@ -29,6 +30,7 @@ class Step:
     volume_ml: asked of the pump, and what the device repeated since the row before; known only after the dose was
     begun. reasons: of the interlock, for all reactors.
     response: of the interlock. notes: of the reactors. explanation: of the controller. done: schedule over.
+    composition: further columns of the recording, where a composition is controlled.
     """
 
     now_s: float
@@ -47,6 +49,7 @@ class Step:
     notes: Sequence[str]
     explanation: dict[str, Array]
     done: Mask
+    composition: dict[str, Array] = field(default_factory=dict)
 
 
 class ClosedLoop:
@@ -61,6 +64,7 @@ class ClosedLoop:
       at_end: of each reactor, or one for all, once its schedule is over and others are not: "hold" goes on at the last
         setpoint, "stop" gives no dose any more, "regulate" hands over to the device's own regulation for good.
       before_dose: called with the step as decided, before anything is dosed (volume_ml still nan): the journal.
+      composition: decides on the temperature where a share is asked for; None: the schedules do everywhere.
     Raises: ValueError for another number of schedules than of reactors.
     """
 
@@ -72,9 +76,11 @@ class ClosedLoop:
         schedules: Sequence[Scenario] | Scenario,
         before_dose: Callable[[Step], None] | None = None,
         at_end: Sequence[str] | str = "stop",
+        composition: Composition | None = None,
     ) -> None:
         n = len(reactors.names)
         self.reactors, self.controller, self.interlock = reactors, controller, interlock
+        self.composition = composition
         self.schedules = [schedules] * n if isinstance(schedules, Scenario) else list(schedules)
         if len(self.schedules) != n:
             raise ValueError(f"{len(self.schedules)} schedules: allowed one for each of the {n} reactors")
@@ -123,6 +129,11 @@ class ClosedLoop:
         phase, setpoint, temperature = self._asked(elapsed)
         self.done = self.done | (rows & (elapsed >= self._total - 1e-6))
 
+        composed = None
+        if self.composition is not None:
+            sample = (m.od, self._fluorescence(m), m.temperature)
+            composed = self.composition.step(sample, minute, elapsed, believed, temperature)
+            temperature = composed.target
         steered = believed & (phase >= 0)
         if isinstance(self.controller, Watches):
             self.controller.watch(m.od, m.temperature, minute, believed)
@@ -133,10 +144,15 @@ class ClosedLoop:
         left = self.done & (self._at_end == "regulate") & sound
         self.interlock.latch(Response.REGULATE, left)
         explanation = self.controller.explain() if isinstance(self.controller, Explains) else {}
+        reasons: Sequence[str | None] = verdict.reasons
+        if composed is not None:
+            explanation = explanation | composed.why
+            reasons = [" | ".join(filter(None, both)) or None for both in zip(reasons, composed.warnings, strict=True)]
 
         decision = Step(
             now, rows, minute, elapsed, phase, m.od, m.temperature, setpoint, proposed, verdict.rate,
-            np.full(len(self.done), np.nan), verdict.reasons, verdict.response, (), explanation, self.done.copy(),
+            np.full(len(self.done), np.nan), reasons, verdict.response, (), explanation, self.done.copy(),
+            {} if composed is None else composed.columns,
         )  # fmt: skip
         if self._before_dose is not None:
             self._before_dose(decision)
@@ -151,6 +167,10 @@ class ClosedLoop:
         self.repeated_ml = np.where(rows, 0.0, self.repeated_ml)
         return replace(decision, volume_ml=volume, notes=(*failures, *receipt.notes))
 
+    def _fluorescence(self, m: Measurement) -> Array:
+        """Readings of the fluorescence, counts, (N,); nan where there is none."""
+        return np.full(len(self.done), np.nan) if m.fluorescence is None else m.fluorescence
+
     def _book_repeats(self) -> None:
         """What the devices dosed by themselves counts when it happened, before the sample after it is judged."""
         for at_s, receipt in self.reactors.repeated():
@@ -162,6 +182,8 @@ class ClosedLoop:
         self.interlock.confirm(receipt, at_s)
         if isinstance(self.controller, Accounts):
             self.controller.dosed(receipt.volume_ml + (0.0 if receipt.kept_ml is None else receipt.kept_ml))
+        if self.composition is not None:
+            self.composition.dosed(receipt.volume_ml)
 
     def _respond(self, verdict: Verdict, left: Mask) -> list[str]:
         """Carry out what the interlock demands beyond not dosing; returns what failed, to be tried again.
@@ -188,9 +210,10 @@ class ClosedLoop:
         return np.array([any(line.startswith(f"{name}:") for line in failures) for name in self.reactors.names])
 
     def state(self) -> dict[str, Any]:
-        """Where each reactor's schedule, the interlock and the controller stand; plain numbers and lists."""
+        """Where each reactor's schedule, the interlock and the controllers stand; plain numbers and lists."""
         known = {"began": self.began, "done": self.done, "stopped": self.stopped}
         state = {**{key: values.tolist() for key, values in known.items()}, "interlock": self.interlock.state()}
+        state |= {} if self.composition is None else {"composition": self.composition.state()}
         return state | ({"controller": self.controller.state()} if isinstance(self.controller, Remembers) else {})
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -211,6 +234,8 @@ class ClosedLoop:
         self.done = np.array(state["done"], dtype=np.bool_)
         self.stopped = np.array(state["stopped"], dtype=np.bool_)
         self.interlock.restore(state.get("interlock", "missing"))
+        if self.composition is not None:
+            self.composition.restore(state.get("composition", "missing"))
         if isinstance(self.controller, Remembers) and "controller" in state:
             if not isinstance(state["controller"], dict):
                 raise ValueError(f"controller: {str(state['controller'])[:40]}, expected keys and values")

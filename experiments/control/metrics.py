@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SETTLING_BAND", "STEADY_MIN", "WindowMetrics", "window_metrics"]
+__all__ = ["LATE_MIN", "SETTLING_BAND", "STEADY_MIN", "WindowMetrics", "share_errors", "window_metrics"]
 
 Array = NDArray[np.float64]
 
 SETTLING_BAND = 0.05  # relative: settled from the first moment after which |e| <= 5 % of the setpoint for good
+LATE_MIN = 120.0  # min at the end of a window over which the late error of a share is averaged
 STEADY_MIN = 10.0  # min at the end of a window over which the steady error is averaged
 
 
@@ -90,3 +91,18 @@ def window_metrics(minute: Array, od: Array, setpoint: float, start: float, end:
         steady_abs_error=known(steady, enough & tail.any(axis=1)),
         abs_error=known(np.trapezoid(np.abs(e), t, axis=1) / length),
     )
+
+
+def share_errors(minute: Array, share: Array, setpoint: Array, start: float, end: float) -> tuple[Array, Array]:
+    """Mean |r - setpoint| over the samples with start <= minute < end, and over the last two hours of them, each (N,).
+
+    nan where there is none. Args: minute, share, setpoint: (N, K), nan where there is none.
+    """
+    error = np.abs(share - setpoint)
+    inside = np.isfinite(error) & (minute >= start - 1e-6) & (minute < end - 1e-6)
+    late = inside & (minute >= end - LATE_MIN - 1e-6)
+    whole, last = (
+        np.where(mask, error, 0.0).sum(axis=1) / np.where(mask.any(axis=1), mask.sum(axis=1), np.nan)
+        for mask in (inside, late)
+    )
+    return whole, last

@@ -17,12 +17,20 @@ from experiments.control.config import DeployConfig
 from hardware.chibio.preflight import Check
 from hardware.storage import atomic
 
-__all__ = ["Training", "admit", "find_policy", "load_policy", "policy_check", "run_policy"]
+__all__ = [
+    "SHIPPED_COMPOSITION", "Training", "admit", "composition_policy", "find_policy", "load_policy", "policy_check",
+    "run_policy",
+]  # fmt: skip
 
 log = logging.getLogger(__name__)
 
 REHEARSED = ("sim", "emulator")  # backends without a culture; on any other a doubtful policy is refused
 SHIPPED = Path(str(resources.files("dqn"))) / "shipped" / "policy.npz"
+SHIPPED_COMPOSITION = {
+    "dqn": SHIPPED.with_name("coculture.npz"),
+    "dqn_preview": SHIPPED.with_name("coculture_preview.npz"),
+}
+"""The policy of each learned composition controller that comes with the program."""
 TRAINED = ("train/**/policy.npz", "demo/*/2_train/policy.npz")  # below runs/; other commands keep copies of policies
 FORCE = "force_policy=true runs it all the same"
 
@@ -179,10 +187,47 @@ def run_policy(name: str, folder: Path, resumed: bool, control_min: float, max_r
         return load_policy(str(kept), control_min, max_rate)
     source = find_policy(name)
     policy = load_policy(str(source), control_min, max_rate)
+    _keep(policy, kept)
     try:
-        policies.save(kept, policy)
         if certificate.beside(source).is_file():
             atomic.write(certificate.beside(kept), certificate.beside(source).read_text(encoding="utf-8"), fsync=False)
     except OSError as error:
-        raise frame.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free the disk") from None
+        raise _not_kept(kept, error) from None
+    return policy
+
+
+def _keep(policy: Policy, kept: Path) -> None:
+    try:
+        policies.save(kept, policy)
+    except OSError as error:
+        raise _not_kept(kept, error) from None
+
+
+def _not_kept(kept: Path, error: OSError) -> frame.UserError:
+    return frame.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free the disk")
+
+
+def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Policy | None:
+    """The policy of a composition controller, None for one that follows no policy; the run folder keeps a copy.
+
+    Args: kind: of the controller. name: `shipped`, a policy.npz or a run folder.
+    Raises: UserError naming the file and what is wrong with it.
+    """
+    if kind not in SHIPPED_COMPOSITION:
+        return None
+    kept = folder / "composition_policy.npz"
+    path = SHIPPED_COMPOSITION[kind] if name == "shipped" else find_policy(name)
+    again = resumed and kept.is_file()
+    if not again and name == "shipped" and not path.is_file():
+        remedy = "give composition_policy=RUN/policy.npz of a training with env=coculture or env=coculture_preview"
+        raise frame.UserError(f"composition={kind}: no policy for it comes with this version; {remedy}")
+    try:
+        policy = policies.load(kept if again else path)
+    except policies.PolicyError as error:
+        raise frame.UserError(str(error)) from None
+    except Exception as error:  # whatever a damaged file makes NumPy say
+        why = (str(error).splitlines() or [type(error).__name__])[0]
+        raise frame.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
+    if not again:
+        _keep(policy, kept)
     return policy

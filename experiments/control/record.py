@@ -29,13 +29,13 @@ class Record:
 
     Args:
       folder: run folder; what an earlier life of the run left there is continued. names: of the reactors.
-      fsync: each row on the disk before the call returns.
-    Attributes: journal (the driver writes into it, too); state_path; rows, of each reactor; repairs, what was mended on
-      opening, one line each.
+      fsync: each row on the disk before the call returns. columns: of the recordings.
+    Attributes: journal (the driver writes into it, too); state_path; columns; rows, of each reactor; repairs, what was
+      mended on opening, one line each.
     Raises: RecordingError.
     """
 
-    def __init__(self, folder: Path, names: Sequence[str], fsync: bool) -> None:
+    def __init__(self, folder: Path, names: Sequence[str], fsync: bool, columns: Sequence[str] = COLUMNS) -> None:
         self.folder, self.names = folder, tuple(names)
         self.state_path = folder / "state.json"
         self._fsync = fsync
@@ -43,10 +43,10 @@ class Record:
         self.journal = Journal(folder / "journal.jsonl", fsync=fsync)
         self.repairs = [f"journal: cut a torn last line of {self.journal.cut} bytes"] if self.journal.cut else []
         paths = [folder / "recordings" / f"{name}.csv" for name in names]
-        self._recorders = [Recorder(path, COLUMNS, fsync, REBUILD) for path in paths]
+        self._recorders = [Recorder(path, columns, fsync, REBUILD) for path in paths]
         self.repairs += [r.repaired for r in self._recorders if r.repaired]
-        self._paths = paths
-        self.rows = [read_rows(path) for path in paths]
+        self._paths, self.columns = paths, tuple(columns)
+        self.rows = [read_rows(path, columns) for path in paths]
         self.repairs += self._completed(self.journal.rows)
         self._points = max(map(len, self.rows), default=0)  # of the curves: the newest minute
         self.events = Events(folder, self._points)
@@ -57,12 +57,12 @@ class Record:
         What was written is read from the disk, because a signal may have come between a row and the memory of it.
         Raises: RecordingError.
         """
-        self.rows, journal = [read_rows(path) for path in self._paths], self.journal.reread()
+        self.rows, journal = [read_rows(path, self.columns) for path in self._paths], self.journal.reread()
         self._completed(journal)
         for n, name in enumerate(self.names):
             if row := cut_short(journal, name, self.rows[n]):
                 self._recorders[n].amend(row)
-                self.rows[n] = read_rows(self._paths[n])
+                self.rows[n] = read_rows(self._paths[n], self.columns)
 
     def _completed(self, journal: Sequence[Mapping[str, Any]]) -> list[str]:
         """What was completed from the rows of the journal, one line each."""
@@ -91,7 +91,8 @@ class Record:
             self._write(n, row_of(step, n))
             minute = self._points = max(self._points, round(float(step.minute[n])))
             curves = {"od": step.od, "setpoint": step.setpoint, "pump_rate_ml_s": step.rate}
-            for tag, value in {**curves, "temperature_degc": step.temperature, **step.explanation}.items():
+            curves |= {"temperature_degc": step.temperature, **step.composition, **step.explanation}
+            for tag, value in curves.items():
                 if value.ndim == 1 and np.isfinite(value[n]):
                     self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
         try:

@@ -40,11 +40,11 @@ COLUMNS = (
     "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
     "temperature_degc", "interlock",
 )  # fmt: skip
-NUMBERS = COLUMNS[:-1]
 
 
 def row_of(step: Step, n: int) -> Row:
     """The CSV row of reactor n in a step."""
+    further = {key: float(value[n]) for key, value in step.composition.items()}
     return {
         "time_min": round(float(step.minute[n]), 4),
         "elapsed_min": round(float(step.elapsed[n]), 4),
@@ -56,6 +56,7 @@ def row_of(step: Step, n: int) -> Row:
         "volume_ml": float(step.volume_ml[n]),
         "temperature_degc": round(float(step.temperature[n]), 3),
         "interlock": step.reasons[n] or "",
+        **further,
     }
 
 
@@ -71,11 +72,13 @@ class Told:
 class Rows:
     """All rows of one reactor's recording: the numbers by column, and what the interlock said.
 
-    Attributes: alarms, in how many rows it spoke; told, by kind of reason.
+    Args: columns: of the recording, `COLUMNS` and maybe more behind them.
+    Attributes: names, of the columns; columns, the numbers; alarms, in how many rows it spoke; told, by kind of reason.
     """
 
-    def __init__(self) -> None:
-        self.columns = {key: array("d") for key in NUMBERS}
+    def __init__(self, columns: Sequence[str] = COLUMNS) -> None:
+        self.names = tuple(columns)
+        self.columns = {key: array("d") for key in self.names if key != "interlock"}
         self.alarms = 0
         self.told: dict[str, Told] = {}
 
@@ -97,14 +100,14 @@ class Rows:
         return {key: column[-1] for key, column in self.columns.items()} if len(self) else {}
 
 
-def read_rows(path: Path) -> Rows:
-    """The rows of a recording. Raises: RecordingError for a row that was damaged."""
-    found = Rows()
+def read_rows(path: Path, columns: Sequence[str] = COLUMNS) -> Rows:
+    """The rows of a recording with these columns. Raises: RecordingError for a row that was damaged."""
+    found = Rows(columns)
     with open(path, newline="", encoding="utf-8") as f:
         rows = csv.DictReader(f)
         try:
             for raw in rows:
-                if raw.keys() != set(COLUMNS) or None in raw.values() or not math.isfinite(float(raw["time_min"])):
+                if raw.keys() != set(columns) or None in raw.values() or not math.isfinite(float(raw["time_min"])):
                     raise ValueError("a row without a time, or not with a cell for every column")
                 found.append({key: value if key == "interlock" else value or "nan" for key, value in raw.items()})
         except (ValueError, csv.Error) as error:
@@ -154,7 +157,7 @@ def cut_short(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Ro
     given = volumes(journal, name)[decisions[-1]["n"]]
     if given >= rows.last()["volume_ml"] - 1e-6:
         return None
-    return {c: decisions[-1]["row"][c] for c in COLUMNS} | {"volume_ml": given}
+    return {c: decisions[-1]["row"][c] for c in rows.names} | {"volume_ml": given}
 
 
 def _unwritten(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Iterator[Row]:
@@ -163,27 +166,29 @@ def _unwritten(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> I
     volume = volumes(journal, name)
     for earlier, this, following in zip([{}, *mine], mine, [*mine[1:], {}], strict=False):
         if this["kind"] == "decision":
-            row: Row = {c: math.nan if this["row"][c] is None else this["row"][c] for c in COLUMNS}
+            row: Row = {c: math.nan if this["row"][c] is None else this["row"][c] for c in rows.names}
             row["volume_ml"] = volume[this["n"]]
         elif not following and earlier.get("kind") != "sample":
-            row = _undecided(this, rows.last())
+            row = _undecided(this, rows)
         else:
             continue
         if float(row["time_min"] or 0.0) > last + 1e-3:
             yield row
 
 
-def _undecided(sample: Mapping[str, Any], before: Mapping[str, float]) -> Row:
+def _undecided(sample: Mapping[str, Any], rows: Rows) -> Row:
     """The row of a sample after which the program was killed before it decided: no dose.
 
-    Args: before: the row before it; empty if there is none.
+    Args: rows: those before it.
     """
-    time = round(float(sample["time_s"]) / 60.0, 4)
-    row: Row = dict.fromkeys(NUMBERS, math.nan)
+    time, before = round(float(sample["time_s"]) / 60.0, 4), rows.last()
+    row: Row = dict.fromkeys(rows.columns, math.nan)
     if before:
         elapsed = round(before["elapsed_min"] + time - before["time_min"], 4)
         row |= {"phase": int(before["phase"]), "setpoint": before["setpoint"], "elapsed_min": elapsed}
     reading = {"od": sample["od"], "temperature_degc": sample["temperature"]}
+    if "fluorescence" in rows.columns:
+        reading["fluorescence"] = sample.get("fluorescence")
     row |= {"time_min": time, **{k: math.nan if v is None else float(v) for k, v in reading.items()}}
     nothing = {"pump_rate_ml_s": 0.0, "proposed_ml_s": 0.0, "volume_ml": 0.0}
     return {**row, **nothing, "interlock": "the program ended before it decided"}

@@ -15,7 +15,15 @@ from experiments.control.config import DeployConfig
 from experiments.control.device import one_interrupt
 from experiments.control.loop import ClosedLoop
 from experiments.control.record import Record
-from experiments.control.summary import ChangeLog, figure_of, metrics_table, reasons_line, summarise
+from experiments.control.summary import (
+    ChangeLog,
+    composition_figure_of,
+    figure_of,
+    metrics_table,
+    reasons_line,
+    shares_table,
+    summarise,
+)
 from experiments.reporting import charts
 from hardware.errors import ReactorError, RecordingError
 
@@ -61,11 +69,18 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
         with suppress(RecordingError):  # a signal or an error in a dose ends the loop before its row is written
             record.complete()
     try:
-        figure = figure_of(record, setup.scenarios, f"{config.backend.kind}: {outcome}")
-        path = charts.save(figure, folder / "figures", "closed_loop")
-        record.events.picture("figures/closed_loop", path, record.series("time_min").shape[1])
+        title = f"{config.backend.kind}: {outcome}"
+        figures = {"closed_loop": figure_of(record, setup.scenarios, title)}
+        if setup.keeper is not None:
+            figures["composition"] = composition_figure_of(record, title)
+        for name, figure in figures.items():
+            path = charts.save(figure, folder / "figures", name)
+            record.events.picture(f"figures/{name}", path, record.series("time_min").shape[1])
         roles = [config.role(name) for name in record.names]
-        summary = {**summarise(record, setup.scenarios, roles, outcome), "figure": str(path)}
+        summary = {
+            **summarise(record, setup.scenarios, roles, outcome),
+            "figure": str(folder / "figures" / "closed_loop.png"),
+        }
         files.write_json(folder / "summary.json", summary)
     except OSError as error:
         why = f"figure and summary not written ({error.strerror or error})"
@@ -76,7 +91,9 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
             log.warning("%s: the interlock told: %s", name, line)
     what = "ISE, ITAE with T = 1 min; /T with T = window; settled: min until |e| stays within 5 %"
     log.info("%s\n%s", what, metrics_table(summary["windows"]))
-    log.info("recordings %s; figure %s; tensorboard --logdir %s", folder / "recordings", path, folder)
+    if shares := shares_table(summary["windows"]):
+        log.info("share of the second species, estimated unless it says true\n%s", shares)
+    log.info("recordings %s; figure %s; tensorboard --logdir %s", folder / "recordings", summary["figure"], folder)
     return outcome
 
 
@@ -87,7 +104,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         if config.preflight_only:
             assemble.run_preflight(setup, folder)
             return
-        with one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync)) as record:
+        with one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync, config.columns)) as record:
             for repair in record.repairs:
                 log.warning("%s", repair)
             with assemble.opened(setup, record) as loop:

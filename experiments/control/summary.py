@@ -10,14 +10,24 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs.scenario import Scenario
+from experiments.control.composition import TRUE
 from experiments.control.loop import ClosedLoop, Step
-from experiments.control.metrics import window_metrics
+from experiments.control.metrics import share_errors, window_metrics
 from experiments.control.record import Record
 from experiments.control.recovery import Rows
 from experiments.reporting import charts
+from experiments.reporting.composition_chart import composition_figure
 from hardware.safety.interlock import kinds_of
 
-__all__ = ["ChangeLog", "figure_of", "metrics_table", "reasons_line", "summarise"]
+__all__ = [
+    "ChangeLog",
+    "composition_figure_of",
+    "figure_of",
+    "metrics_table",
+    "reasons_line",
+    "shares_table",
+    "summarise",
+]
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +56,9 @@ class ChangeLog:
         for n, name in enumerate(self._names):
             if step.rows[n] and int(step.phase[n]) != self._phase[n]:
                 self._phase[n] = int(step.phase[n])
+                share = step.composition.get("ratio_setpoint", np.full(len(self._names), np.nan))[n]
                 what = "recovery" if self._phase[n] < 0 else f"setpoint {step.setpoint[n]:g}"
+                what += f", share {share:g}" if np.isfinite(share) else ""
                 log.info("%s: %s from minute %.0f, OD %.3f", name, what, step.minute[n], step.od[n])
             if step.rows[n]:
                 self._who_decides(step, n)
@@ -123,8 +135,41 @@ def _windows(record: Record, scenarios: Sequence[Scenario]) -> list[dict[str, An
             m = window_metrics(elapsed[n : n + 1], od[n : n + 1], setpoint, start, end)
             window = {"reactor": name, "phase": phase, "setpoint": setpoint, "start_min": start, "end_min": end}
             window["temperature"] = scenario.temperatures[phase]
-            rows.append({**window, **{key: float(getattr(m, key)[0]) for key in FORMATS}})
+            window |= {key: float(getattr(m, key)[0]) for key in FORMATS}
+            if "ratio" in record.columns:
+                window |= _shares(record, n, start, end) | {"od_abs_error_mean": float(m.abs_error[0])}
+            rows.append(window)
     return rows
+
+
+def _shares(record: Record, n: int, start: float, end: float) -> dict[str, Any]:
+    """How well reactor n's share followed what was asked for, by the estimate and, where it is known, in truth.
+
+    The setpoint is None where none or more than one was asked for.
+    """
+    columns = {key: record.series(key)[n : n + 1] for key in ("elapsed_min", "ratio", "ratio_setpoint")}
+    minute, asked = columns["elapsed_min"], columns["ratio_setpoint"]
+    found = np.unique(asked[(minute >= start - 1e-6) & (minute < end - 1e-6) & np.isfinite(asked)])
+    told: dict[str, Any] = {"ratio_setpoint": float(found[0]) if found.size == 1 else None}
+    for key in ("ratio", TRUE):
+        if key in record.columns:
+            whole, late = share_errors(minute, record.series(key)[n : n + 1], asked, start, end)
+            told |= {f"{key}_abs_error_mean": float(whole[0]), f"{key}_abs_error_last2h": float(late[0])}
+    return told
+
+
+def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:
+    """A head and one line per window in which a share was asked for; "" if there is none."""
+    keys = {"asked": "ratio_setpoint", "mean |e|": "ratio_abs_error_mean", "last 2 h": "ratio_abs_error_last2h"}
+    keys |= {"true |e|": "true_ratio_abs_error_mean", "OD |e|": "od_abs_error_mean"}
+    kept = [w for w in windows if np.isfinite(w.get("ratio_abs_error_mean", np.nan))]
+    known = {head: key for head, key in keys.items() if kept and key in kept[0]}
+    lines = [f"{'reactor':8} {'hours':>11} " + " ".join(f"{head:>8}" for head in known)]
+    for w in kept:
+        hours = f"{w['start_min'] / 60:.1f}-{w['end_min'] / 60:.1f}"
+        cells = [f"{'varies':>8}" if w[key] is None else f"{w[key]:8.3f}" for key in known.values()]
+        lines.append(f"{w['reactor']:8} {hours:>11} " + " ".join(cells))
+    return "\n".join(lines) if kept else ""
 
 
 def figure_of(record: Record, scenarios: Sequence[Scenario], title: str) -> Figure:
@@ -134,3 +179,10 @@ def figure_of(record: Record, scenarios: Sequence[Scenario], title: str) -> Figu
     temperature = record.series("temperature_degc").T if switched else None
     series = (record.series("time_min").T, record.series("od").T, setpoint.T, record.series("pump_rate_ml_s").T)
     return charts.closed_loop(*series, record.names, temperature, title)
+
+
+def composition_figure_of(record: Record, title: str) -> Figure:
+    """Share, temperature, OD and fluorescence of all reactors, of a run that controlled a composition."""
+    return composition_figure(
+        {key: record.series(key) for key in record.columns if key != "interlock"}, record.names, title
+    )

@@ -1,0 +1,219 @@
+"""Composition in the loop: from believed samples to thermostat targets, within limits, with lasting warnings."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from conf.schema import check, require, setting
+from envs.scenario import Scenario
+from experiments.composition.base import Array, Mask, Wanted
+from experiments.composition.program import Program
+from experiments.controllers.base import put_back, saved
+
+__all__ = ["COLUMNS", "TRUE", "Composed", "Composition", "CompositionLimits", "Keeper", "columns", "program_of"]
+
+ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what a controller explains, the columns of a recording
+COLUMNS = ("fluorescence", "ratio_setpoint", *ESTIMATE, "temperature_target_degc")
+TRUE = "true_ratio"
+EDGE_C = 0.05  # a target so near a limit is at it
+NEARER = 0.02  # a distance less by this is progress, a setpoint that moves by more within a sample is another one
+STUCK = "check that the vial follows the thermostat and that both species grow; the program may ask for too much"
+UNCERTAIN = "check the fluorescence and calibrate its sensor (docs/coculture.md, Calibration of the sensor)"
+
+
+def columns(true: bool) -> tuple[str, ...]:
+    """The columns that a composition adds at the end of a recording. Args: true: of a simulation, which knows it."""
+    return (*COLUMNS, TRUE) if true else COLUMNS
+
+
+@dataclass(frozen=True)
+class CompositionLimits:
+    """Limits of the thermostat targets, and when a share is out of control.
+
+    There is no limit of their rate: the device's thermostat takes any step, a vial warms by 2 degC/min and cools by
+    itself (docs/biology.md), and the interlock allows for a vial that still cools. Raises: ValueError naming key, value
+    and allowed range.
+    """
+
+    low: float = setting(29.0, "coldest target", "degC", within=(20, 42))
+    high: float = setting(36.0, "warmest target; more than low", "degC", within=(20, 42))
+    far: float = setting(0.1, "a share farther than this from its setpoint is far", within=(0.01, 1))
+    stuck_h: float = setting(
+        3.0, "a share is stuck that is far and came no nearer for so long with the target at a limit", "h", above=0.0
+    )
+    wide: float = setting(0.4, "an estimate whose 95 % band is wider than this is uncertain", within=(0.01, 1))
+    wide_h: float = setting(2.0, "if it is so for this long", "h", at_least=0.0)
+
+    def __post_init__(self) -> None:
+        check(self, "composition_limits")
+        rising = self.low < self.high
+        require(rising, "composition_limits.high", f"{self.high:g} degC", f"more than low = {self.low:g} degC")
+
+
+def program_of(schedule: Scenario) -> Program:
+    """What a schedule asks for of the share."""
+    if schedule.ratio_sine:
+        mean, amplitude, period = schedule.ratio_sine
+        return Program((), schedule.minutes, (mean, amplitude, period))
+    ratios = schedule.ratios or (None,) * len(schedule.minutes)
+    return Program(tuple(math.nan if r is None else r for r in ratios), schedule.minutes)
+
+
+class Keeper(Protocol):
+    """What is asked of a controller of the composition, structurally; arrays (N,)."""
+
+    def reset(self, n: int) -> None:
+        """Forget everything; n cultures from here on."""
+        ...
+
+    def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
+        """A sample: OD, counts, degC, min since the run began; rows: True where it is new and believed."""
+        ...
+
+    def dosed(self, volume_ml: Array) -> None:
+        """Fresh medium that went in since this was last called, mL."""
+        ...
+
+    def target(self, wanted: Wanted, minute: Array, rows: Mask) -> Array:
+        """Thermostat targets, degC; minute: since the program began; rows: where readings are new and a share asked."""
+        ...
+
+    def explain(self) -> dict[str, Array]:
+        """The estimate behind the last target: ratio, ratio_low, ratio_high and more."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `reset` forgets, as plain numbers and lists; None stands for nan."""
+        ...
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue as saved. Raises: ValueError naming what is missing or does not fit."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Composed:
+    """What came of a sample: thermostat targets, degC, (N,); columns of the recording; further reasons; warnings."""
+
+    target: Array
+    columns: dict[str, Array]
+    why: dict[str, Array]
+    warnings: list[str | None]
+
+
+class Composition:
+    """A controller of the composition on N reactors, each with its own program of shares.
+
+    A share is out of control, which is said in every sample until it is over, where it is stuck or its estimate is
+    uncertain as `CompositionLimits` have it. A share that is asked for anew begins anew.
+
+    Args: controller; schedules: one per reactor; limits. truth: the shares of a simulation, for its recording.
+    """
+
+    _memory = ("_setpoint", "_least", "_nearer_min", "_narrow_min")
+
+    def __init__(
+        self,
+        controller: Keeper,
+        schedules: Sequence[Scenario],
+        limits: CompositionLimits | None = None,
+        truth: Callable[[], Array] | None = None,
+    ) -> None:
+        self.controller, self.schedules, self.limits = controller, schedules, limits or CompositionLimits()
+        self._truth, n = truth, len(schedules)
+        self._programs = [program_of(s) for s in schedules]
+        self._setpoint, self._least = np.full(n, np.nan), np.full(n, np.inf)
+        self._nearer_min, self._narrow_min = np.full(n, np.nan), np.full(n, np.nan)
+        controller.reset(n)
+
+    def step(
+        self, sample: tuple[Array, Array, Array], minute: Array, elapsed: Array, believed: Mask, scheduled: Array
+    ) -> Composed:
+        """Watch a sample and decide.
+
+        Args:
+          sample: OD, fluorescence in counts and temperature in degC, (N,) each.
+          minute: of the sample, min since the run began, (N,). elapsed: min since the schedule began, nan before, (N,).
+          believed: rows whose sample is new and believed, (N,). scheduled: the schedule's targets, degC, (N,).
+        """
+        od, fluorescence, temperature = sample
+        wanted = self.wanted(elapsed)
+        asked = np.isfinite(wanted.setpoint)
+        self.controller.watch(od, fluorescence, temperature, minute, believed)
+        chosen = self.controller.target(wanted, elapsed, believed & asked)
+        limited = np.clip(chosen, self.limits.low, self.limits.high)
+        target = np.where(asked & np.isfinite(limited), limited, scheduled)
+        told = self.controller.explain()
+        known = {"fluorescence": fluorescence, "ratio_setpoint": wanted.setpoint, "temperature_target_degc": target}
+        known |= {key: told[key] for key in ESTIMATE}
+        found = {key: known[key] for key in COLUMNS} | ({TRUE: self._truth()} if self._truth else {})
+        why = {key: value for key, value in told.items() if key not in ESTIMATE}
+        return Composed(target, found, why, self._warnings(found, minute, believed))
+
+    def wanted(self, elapsed: Array) -> Wanted:
+        """What each reactor's program asks for, `elapsed` min after it began; nothing where that is nan."""
+        each = [
+            program.wanted(elapsed[i : i + 1], schedule.announce_min)
+            for i, (program, schedule) in enumerate(zip(self._programs, self.schedules, strict=True))
+        ]
+        begun = np.isfinite(elapsed)
+        setpoint, following, minutes = (
+            np.concatenate([getattr(w, key) for w in each]) for key in ("setpoint", "following", "minutes")
+        )
+        return Wanted(np.where(begun, setpoint, np.nan), np.where(begun, following, np.nan), minutes)
+
+    def _warnings(self, found: dict[str, Array], minute: Array, believed: Mask) -> list[str | None]:
+        """What is out of control in each believed row, None elsewhere."""
+        stuck = self._stuck(found, minute, believed)
+        uncertain = self._uncertain(found, minute, believed)
+        hours, c = (minute - self._nearer_min) / 60.0, found
+        lines: list[str | None] = []
+        for i in range(minute.size):
+            said = []
+            if stuck[i]:
+                at = f"share {c['ratio'][i]:.2f}, asked for {c['ratio_setpoint'][i]:.2f}"
+                heat = f"the thermostat at {c['temperature_target_degc'][i]:.1f} degC"
+                said.append(f"share_stuck: {at}, no nearer for {hours[i]:.1f} h with {heat}; reported; {STUCK}")
+            if uncertain[i]:
+                between = f"share between {c['ratio_low'][i]:.2f} and {c['ratio_high'][i]:.2f}"
+                said.append(f"share_uncertain: {between}; reported; {UNCERTAIN}")
+            lines.append(" | ".join(said) or None)
+        return lines
+
+    def _stuck(self, found: dict[str, Array], minute: Array, believed: Mask) -> Mask:
+        setpoint, target = found["ratio_setpoint"], found["temperature_target_degc"]
+        rows = believed & np.isfinite(setpoint)
+        distance = np.abs(found["ratio"] - setpoint)
+        inside = (target > self.limits.low + EDGE_C) & (target < self.limits.high - EDGE_C)
+        same = np.abs(setpoint - self._setpoint) <= NEARER
+        well = rows & (inside | ~(distance > self.limits.far) | ~same)
+        nearer = well | (rows & (distance < self._least - NEARER))
+        self._least = np.where(nearer, distance, self._least)
+        self._nearer_min = np.where(nearer, minute, self._nearer_min)
+        self._setpoint = np.where(believed, setpoint, self._setpoint)
+        return np.asarray(rows & ~well & (minute - self._nearer_min >= 60.0 * self.limits.stuck_h))
+
+    def _uncertain(self, found: dict[str, Array], minute: Array, believed: Mask) -> Mask:
+        narrow = believed & (found["ratio_high"] - found["ratio_low"] <= self.limits.wide)
+        first = believed & np.isnan(self._narrow_min)
+        self._narrow_min = np.where(narrow | first, minute, self._narrow_min)
+        return np.asarray(believed & ~narrow & (minute - self._narrow_min >= 60.0 * self.limits.wide_h))
+
+    def dosed(self, volume_ml: Array) -> None:
+        """What went in, mL, (N,)."""
+        self.controller.dosed(volume_ml)
+
+    def state(self) -> dict[str, Any]:
+        """The controller's memory and that of the warnings, as plain values."""
+        return {"controller": self.controller.state(), **saved(self, self._memory)}
+
+    def restore(self, state: Any) -> None:
+        """Continue as saved. Raises: ValueError naming what is missing or does not fit."""
+        if not (isinstance(state, dict) and isinstance(state.get("controller"), dict)):
+            raise ValueError(f"composition: {str(state)[:40]}, expected keys and values")
+        put_back(self, self._memory, state)
+        self._least = np.where(np.isnan(self._least), np.inf, self._least)
+        self.controller.restore(state["controller"])

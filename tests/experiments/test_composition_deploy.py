@@ -1,0 +1,171 @@
+"""Density and composition deployed as a user does: what is recorded, summed up, drawn, and refused."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import report
+from experiments.cli import frame
+from experiments.control import policies, run
+from experiments.control.composition import COLUMNS
+from experiments.control.metrics import share_errors
+from experiments.control.recovery import COLUMNS as USUAL
+from experiments.deploy import main
+from hardware.storage.recording_reader import read_recording
+
+pytestmark = pytest.mark.xdist_group("composition")  # its tests share a run, made once
+WORDS = ("plant=coculture", "scenario=ratio_steps", "composition=proportional", "fsync=false")
+PHASES = ("scenario.minutes=[20,150,180,30]", "backend.reactors=[M0,M1]", "+each.M1.ratios=[0.6,null,0.4,null]")
+
+
+def deploy(folder: Path, *words: str) -> Path:
+    folder.mkdir()
+    config = main.config(words)
+    frame.save_config(config, folder)
+    run.deploy(config, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def deployed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return deploy(tmp_path_factory.mktemp("composition") / "run", *WORDS, *PHASES)
+
+
+def rows(folder: Path, name: str = "M0") -> list[dict[str, str]]:
+    with open(folder / "recordings" / f"{name}.csv", newline="") as f:
+        return list(csv.DictReader(f))
+
+
+def column(folder: Path, key: str, name: str = "M0") -> np.ndarray:
+    return np.array([float(row[key] or "nan") for row in rows(folder, name)])
+
+
+def test_the_recording_has_its_columns_behind_the_usual_ones(deployed: Path) -> None:
+    assert tuple(rows(deployed)[0]) == (*USUAL, *COLUMNS, "true_ratio")
+    for name, asked in (("M0", (None, 0.3, 0.7, 0.3)), ("M1", (0.6, None, 0.4, None))):
+        phase, setpoint = column(deployed, "phase", name), column(deployed, "ratio_setpoint", name)
+        for k, share in enumerate(asked):
+            found = set(setpoint[phase == k][:-1])
+            assert found == {share} if share else np.isnan(list(found)).all()
+        target = column(deployed, "temperature_target_degc", name)
+        assert set(target[np.isnan(setpoint)]) == {33.2}
+        assert target.min() >= 29.0
+        assert target.max() <= 36.0
+        np.testing.assert_allclose(column(deployed, "fluorescence", name).mean(), 1600.0, atol=500.0)
+        low, ratio, high = (column(deployed, key, name) for key in ("ratio_low", "ratio", "ratio_high"))
+        assert (low < ratio).all()
+        assert (ratio < high).all()
+    assert read_recording(deployed / "recordings" / "M0.csv").od.size == len(rows(deployed))
+
+
+def test_the_summary_has_the_errors_of_every_window(deployed: Path) -> None:
+    windows = json.loads((deployed / "summary.json").read_text())["windows"]
+    assert [w["ratio_setpoint"] for w in windows] == [None, 0.3, 0.7, 0.3, 0.6, None, 0.4, None]
+    minute, ratio, true = (column(deployed, key) for key in ("elapsed_min", "ratio", "true_ratio"))
+    od = column(deployed, "od")
+    inside = (minute >= 170.0) & (minute < 350.0)
+    late = inside & (minute >= 230.0)
+    assert inside.sum() == 180
+    third = windows[2]
+    assert third["ratio_abs_error_mean"] == pytest.approx(np.abs(ratio[inside] - 0.7).mean())
+    assert third["ratio_abs_error_last2h"] == pytest.approx(np.abs(ratio[late] - 0.7).mean())
+    assert third["true_ratio_abs_error_mean"] == pytest.approx(np.abs(true[inside] - 0.7).mean())
+    assert third["od_abs_error_mean"] == pytest.approx(np.abs(od[inside] - 0.5).mean(), rel=0.02)
+    assert third["ise"] > 0.0
+    assert windows[0]["ratio_abs_error_mean"] is windows[5]["ratio_abs_error_last2h"] is None
+
+
+def test_the_share_goes_where_it_is_asked_to(deployed: Path) -> None:
+    true, minute = column(deployed, "true_ratio"), column(deployed, "elapsed_min")
+    assert true[0] == 0.5
+    assert true[minute == 170.0] == pytest.approx(0.3, abs=0.03)
+    assert true[minute == 350.0] > 0.45
+    assert np.abs(column(deployed, "ratio") - true)[60:].max() < 0.1
+    assert np.abs(column(deployed, "od") - 0.5).max() < 0.05
+
+
+def test_figure_curves_and_page_show_it(deployed: Path, tmp_path: Path) -> None:
+    picture = (deployed / "figures" / "composition.svg").read_text()
+    for word in ("share of the second species", "truth", "thermostat", "fluorescence, counts", "M1, estimate"):
+        assert word in picture
+    (events,) = deployed.glob("events*")
+    for tag in ("ratio", "ratio_setpoint", "fluorescence", "temperature_target_degc", "true_ratio", "bias_e"):
+        assert f"M0/{tag}".encode() in events.read_bytes()
+    page = report.write(deployed).read_text()
+    assert "ratio_abs_error_last2h" in page
+    assert ">composition<" in page
+    assert "of one species" in page
+
+
+def test_without_a_composition_nothing_of_it_is_left(tmp_path: Path) -> None:
+    folder = deploy(tmp_path / "run", "plant=coculture", "scenario=regulation", "fsync=false")
+    assert tuple(rows(folder)[0]) == USUAL
+    summary, state = ((folder / f"{name}.json").read_text() for name in ("summary", "state"))
+    assert "ratio" not in summary
+    assert "composition" not in state
+    assert not (folder / "figures" / "composition.svg").exists()
+
+
+def test_the_error_of_a_share_by_hand() -> None:
+    minute = np.array([[0.0, 60.0, 121.0, 180.0, 240.0], [0.0, np.nan, 10.0, 20.0, 240.0]])
+    share = np.array([[0.5, 0.4, 0.3, np.nan, 0.9], [np.nan] * 4 + [0.2]])
+    setpoint = np.full((2, 5), 0.2)
+    whole, late = share_errors(minute, share, setpoint, 0.0, 240.0)
+    assert whole[0] == pytest.approx(0.2)  # of 0.3, 0.2 and 0.1: the one at the end is of the next window
+    assert late[0] == pytest.approx(0.1)
+    assert np.isnan(whole[1])
+    assert np.isnan(late[1])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ("plant=coculture", "scenario=ratio_steps"),
+            "the scenario of M0 asks for a share that nothing controls; add comp",
+        ),
+        (
+            ("plant=coculture", "composition=pi"),
+            "composition=pi: no scenario asks for a share; give scenario=ratio_steps",
+        ),
+        (
+            ("scenario=ratio_steps", "composition=pi"),
+            "composition=pi: the vials hold one species .* give plant=coculture",
+        ),
+        (
+            ("scenario=ratio_steps", "composition=pi", "backend=emulator"),
+            "composition=pi: the vials hold one species .* give backend.plant=coculture",
+        ),
+        (
+            (*WORDS[:2], "composition=dqn", "composition_policy=nowhere"),
+            "policy nowhere: no such file; give the policy.npz",
+        ),
+        (
+            (*WORDS[:2], "composition=dqn", f"composition_policy={policies.SHIPPED}"),
+            r"policy = \['error', 'growth_share'\]: allowed one with observation \['logit_share'",
+        ),
+        (
+            (*WORDS[:2], "composition=optimum", "backend.reactors=[M0,M1]", "+each.M1.ratios=[0.6,0.5,0.4,0.3]"),
+            "composition=optimum plans one program: give all reactors the same shares and minutes",
+        ),
+        (
+            ("scenario=ratio_steps", "composition=pi", "+each.M0.ratios=[0.5]", "plant=coculture"),
+            "each.M0: scenario.ratios",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_the_remedy(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    with pytest.raises(frame.UserError, match=said) as caught:
+        deploy(tmp_path / "run", *words)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_learned_controller_without_a_policy_that_ships_says_what_to_give(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(policies.SHIPPED_COMPOSITION, "dqn", tmp_path / "none.npz")
+    with pytest.raises(frame.UserError, match="composition=dqn: no policy for it comes with this version; give compos"):
+        deploy(tmp_path / "run", *WORDS[:2], "composition=dqn")

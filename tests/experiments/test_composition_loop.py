@@ -1,0 +1,255 @@
+"""The composition in the loop: what is shown to its controller, what comes of its targets, what is warned of."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.plant.plant import Plant
+from envs.scenario import Scenario
+from envs.task import EnvConfig
+from experiments.composition import registry as compositions
+from experiments.composition.base import Array, Mask, Wanted
+from experiments.control.composition import COLUMNS, Composition, CompositionLimits, program_of
+from experiments.control.loop import ClosedLoop, Step
+from experiments.controllers import registry
+from hardware.emulator.device import plant_preset
+from hardware.safety.interlock import Interlock, kinds_of
+from hardware.simulated import SimulatedConfig, SimulatedReactors
+from tests.experiments.composition_keeper import Reckoning
+
+HOLD = Scenario((0.5,), (10_000.0,), (33.2,), ratios=(0.7,))
+PLANT = plant_preset("coculture")
+
+
+class Scripted(Reckoning):
+    """Says what the test tells it to: share, width of the band, target."""
+
+    def __init__(self, ratio: float = 0.5, width: float = 0.1, target: float = 29.0) -> None:
+        super().__init__()
+        self.ratio, self.width, self.answer, self.seen = ratio, width, target, []
+
+    def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
+        self.seen.append((od, fluorescence, temperature, minute, rows))
+
+    def target(self, wanted: Wanted, minute: Array, rows: Mask) -> Array:
+        self.asked = wanted, minute, rows
+        return np.full(minute.shape, self.answer)
+
+    def explain(self) -> dict[str, Array]:
+        n = self.told_ml.size
+        low, high = self.ratio - self.width / 2.0, self.ratio + self.width / 2.0
+        return {
+            key: np.full(n, value) for key, value in (("ratio", self.ratio), ("ratio_low", low), ("ratio_high", high))
+        }
+
+
+def step(composition: Composition, minute: float, believed: bool = True, elapsed: float | None = None) -> Any:
+    n = len(composition.schedules)
+    sample = (np.full(n, 0.5), np.full(n, 900.0), np.full(n, 33.0))
+    at = np.full(n, minute)
+    since = at if elapsed is None else np.full(n, elapsed)
+    return composition.step(sample, at, since, np.full(n, believed), np.full(n, 33.2))
+
+
+def warned(composition: Composition, minute: float, believed: bool = True) -> list[str]:
+    (line,) = step(composition, minute, believed).warnings
+    return kinds_of(line or "")
+
+
+@pytest.mark.parametrize(("answer", "target"), [(31.5, 31.5), (12.0, 29.0), (80.0, 36.0), (np.nan, 33.2)])
+def test_a_target_goes_through_the_limits_and_one_that_is_no_number_leaves_the_schedules(
+    answer: float, target: float
+) -> None:
+    composed = step(Composition(Scripted(target=answer), [HOLD]), 5.0)
+    assert composed.target == composed.columns["temperature_target_degc"] == target
+    assert tuple(composed.columns) == COLUMNS
+
+
+def test_the_limits_are_the_configured_ones() -> None:
+    limits = CompositionLimits(low=30.0, high=35.0)
+    assert step(Composition(Scripted(target=10.0), [HOLD], limits), 5.0).target == 30.0
+    assert step(Composition(Scripted(target=90.0), [HOLD], limits), 5.0).target == 35.0
+
+
+@pytest.mark.parametrize("schedule", [replace(HOLD, ratios=()), replace(HOLD, ratios=(None,))])
+def test_where_no_share_is_asked_for_the_schedule_decides_and_the_controller_goes_on_watching(
+    schedule: Scenario,
+) -> None:
+    keeper = Scripted(target=30.0)
+    composed = step(Composition(keeper, [schedule]), 5.0)
+    assert composed.target == 33.2
+    assert np.isnan(composed.columns["ratio_setpoint"]).all()
+    od, fluorescence, temperature, minute, rows = keeper.seen[0]
+    assert (od, fluorescence, temperature, minute, rows) == (0.5, 900.0, 33.0, 5.0, True)
+    assert not keeper.asked[2].any()
+
+
+def test_nothing_is_asked_for_before_the_schedule_begins() -> None:
+    keeper = Scripted(target=30.0)
+    composed = step(Composition(keeper, [HOLD]), 5.0, elapsed=np.nan)
+    assert composed.target == 33.2
+    assert np.isnan(keeper.asked[0].setpoint)
+    assert len(keeper.seen) == 1
+
+
+def test_each_reactor_has_its_own_program_and_is_told_its_changes_as_far_ahead_as_its_scenario_says() -> None:
+    phases = {"setpoints": (0.5, 0.5), "minutes": (100.0, 100.0), "temperatures": (33.2, 33.2)}
+    steps = [Scenario(**phases, ratios=(0.3, 0.7), announce_min=ahead) for ahead in (60.0, 20.0)]
+    keeper = Scripted()
+    step(Composition(keeper, [*steps, replace(HOLD, ratios=(0.4,))]), 500.0, elapsed=50.0)
+    wanted, minute, _ = keeper.asked
+    assert wanted.setpoint.tolist() == [0.3, 0.3, 0.4]
+    assert wanted.following.tolist() == [0.7, 0.3, 0.4]
+    assert wanted.minutes.tolist() == [50.0, 0.0, 0.0]
+    assert minute.tolist() == [50.0] * 3  # since the program began
+
+
+def test_a_sine_falls_first() -> None:
+    sine = program_of(Scenario((0.5,), (1200.0,), (33.2,), ratio_sine=(0.5, 0.4, 1200.0)))
+    found = sine.setpoint(np.array([0.0, 300.0, 600.0, 900.0]))
+    np.testing.assert_allclose(found, [0.5, 0.1, 0.5, 0.9], atol=1e-12)
+
+
+def test_a_share_that_comes_no_nearer_at_full_authority_is_stuck_until_it_moves() -> None:
+    keeper = Scripted(ratio=0.5, target=29.0)
+    composition = Composition(keeper, [HOLD])
+    told = {minute: warned(composition, minute) for minute in np.arange(0.0, 260.0, 10.0)}
+    assert [minute for minute, kinds in told.items() if kinds] == list(np.arange(180.0, 260.0, 10.0))
+    assert told[250.0] == ["share_stuck"]
+    assert warned(composition, 255.0, believed=False) == []
+    (line,) = step(composition, 260.0).warnings
+    assert line.startswith(
+        "share_stuck: share 0.50, asked for 0.70, no nearer for 4.3 h with the thermostat at 29.0 degC"
+    )
+    keeper.ratio = 0.515  # less than what counts
+    assert warned(composition, 270.0) == ["share_stuck"]
+    keeper.ratio = 0.53
+    assert warned(composition, 280.0) == []
+    assert warned(composition, 450.0) == []
+    assert warned(composition, 460.0) == ["share_stuck"]
+    keeper.answer = 30.0  # not at a limit any more
+    assert warned(composition, 470.0) == []
+
+
+@pytest.mark.parametrize(("ratio", "target"), [(0.61, 29.0), (0.5, 29.2), (0.5, 35.9)])
+def test_a_share_that_is_near_or_a_target_inside_the_limits_is_not_stuck(ratio: float, target: float) -> None:
+    composition = Composition(Scripted(ratio=ratio, target=target), [HOLD])
+    assert not any(warned(composition, minute) for minute in np.arange(0.0, 600.0, 10.0))
+
+
+def test_another_setpoint_begins_anew_also_for_a_share_that_is_stuck() -> None:
+    schedule = Scenario((0.5, 0.5), (200.0, 400.0), (33.2, 33.2), ratios=(0.7, 0.9))
+    composition = Composition(Scripted(ratio=0.5), [schedule])
+    told = [minute for minute in np.arange(0.0, 600.0, 10.0) if warned(composition, minute)]
+    assert told == [180.0, 190.0, *np.arange(380.0, 600.0, 10.0)]
+
+
+def test_an_estimate_that_stays_wide_is_uncertain() -> None:
+    keeper = Scripted(ratio=0.7, width=0.5)
+    composition = Composition(keeper, [HOLD])
+    told = [minute for minute in np.arange(0.0, 200.0, 10.0) if warned(composition, minute) == ["share_uncertain"]]
+    assert told == list(np.arange(120.0, 200.0, 10.0))
+    (line,) = step(composition, 200.0).warnings
+    assert line.startswith("share_uncertain: share between 0.45 and 0.95; reported; check the fluorescence")
+    keeper.width = 0.4
+    assert warned(composition, 210.0) == []
+    keeper.width = np.nan  # no estimate at all
+    assert warned(composition, 320.0) == []
+    assert warned(composition, 330.0) == ["share_uncertain"]
+
+
+def vials(n: int) -> SimulatedReactors:
+    names = tuple(f"M{k}" for k in range(n))
+    return SimulatedReactors(Plant(PLANT, n, np.random.default_rng(3)), SimulatedConfig(reactors=names))
+
+
+def loop(
+    reactors: SimulatedReactors, keeper: Any, scenario: Scenario, limits: CompositionLimits | None = None
+) -> ClosedLoop:
+    n = len(reactors.names)
+    composition = Composition(keeper, [scenario] * n, limits)
+    law = registry.build(registry.config("inverse"), EnvConfig())
+    return ClosedLoop(reactors, law, Interlock(n), scenario, composition=composition)
+
+
+def test_the_vials_follow_the_target_and_the_controller_is_told_what_went_in() -> None:
+    keeper, reactors = Reckoning(), vials(2)
+    steps = list(loop(reactors, keeper, replace(HOLD, minutes=(300.0,))).run())
+    assert keeper.looks.tolist() == [len(steps)] * 2
+    np.testing.assert_allclose(keeper.told_ml, np.sum([s.volume_ml for s in steps], axis=0))
+    assert keeper.told_ml.min() > 30.0
+    np.testing.assert_allclose(steps[-1].composition["ratio"], reactors.plant.culture.share, atol=0.01)
+    np.testing.assert_allclose(reactors.plant.culture.share, 0.7, atol=0.02)
+    assert {float(s.composition["temperature_target_degc"][0]) for s in steps[1:100]} == {29.0}
+    assert abs(steps[60].temperature - 29.0).max() < 0.1
+
+
+def test_a_warning_stands_beside_what_the_interlock_says() -> None:
+    keeper = Scripted(ratio=0.1, width=0.9)
+    limits = CompositionLimits(stuck_h=0.1, wide_h=0.1)
+    reactors = vials(1)
+    run = loop(reactors, keeper, HOLD, limits)
+    for _ in range(10):
+        last = run.step()
+    assert kinds_of(last.reasons[0] or "") == ["share_stuck", "share_uncertain"]
+    reactors.plant.sensor.frozen[:] = True
+    for _ in range(5):
+        last = run.step()
+    assert kinds_of(last.reasons[0] or "")[0] == "frozen"  # nothing is believed, nothing is said of the share
+    assert len(kinds_of(last.reasons[0] or "")) == 1
+
+
+KINDS = ("proportional", "pi", "midpoint")
+SCHEDULE = Scenario((0.5, 0.5), (40.0, 80.0), (33.2, 33.2), ratios=(0.4, 0.6), announce_min=30.0)
+LENGTH, CUT = 110, 55
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_resumed_run_decides_what_one_without_a_pause_decides(kind: str) -> None:
+    def fresh(reactors: SimulatedReactors) -> ClosedLoop:
+        limits = CompositionLimits(wide=0.01, wide_h=0.5)
+        return loop(reactors, compositions.build(compositions.config(kind)), SCHEDULE, limits)
+
+    def told(steps: list[Step]) -> list[Any]:
+        return [
+            [s.composition["temperature_target_degc"].tolist(), s.composition["ratio"].tolist(), s.reasons]
+            for s in steps
+        ]
+
+    reactors = vials(2)
+    whole = fresh(reactors)
+    expected = told([whole.step() for _ in range(LENGTH)])
+    reactors = vials(2)
+    first = fresh(reactors)
+    steps = [first.step() for _ in range(CUT)]
+    state = json.loads(json.dumps(first.state()))
+    second = fresh(reactors)
+    second.restore(state)
+    assert told(steps + [second.step() for _ in range(LENGTH - CUT)]) == expected
+    assert [bool(reasons[0]) for _, _, reasons in expected] == [False] * 30 + [True] * (LENGTH - 30)
+    cold = fresh(vials(2))
+    for key in ("setpoint", "least", "nearer_min", "narrow_min", "controller"):
+        wrong = json.loads(json.dumps(state))
+        del wrong["composition"][key]
+        with pytest.raises(ValueError, match=rf"^(controller\.{key}|composition)"):
+            cold.restore(wrong)
+
+
+def test_a_state_without_the_compositions_is_refused() -> None:
+    run = loop(vials(1), Reckoning(), HOLD)
+    state = run.state()
+    del state["composition"]
+    with pytest.raises(ValueError, match="^composition: missing, expected keys and values"):
+        run.restore(state)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"low": 19.0}, {"high": 43.0}, {"low": 36.0}, {"far": 0.0}, {"stuck_h": 0.0}, {"wide": 2.0}, {"wide_h": -1.0}],
+)
+def test_limits_out_of_range_are_named(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=r"composition_limits\.(high|" + next(iter(wrong)) + ").*allowed"):
+        CompositionLimits(**wrong)
