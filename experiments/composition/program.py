@@ -11,8 +11,10 @@ from experiments.composition.base import Array, Wanted
 
 __all__ = ["SINE_LEAD_MIN", "Program"]
 
-SINE_LEAD_MIN = 120.0
-"""Of a share that changes all the time, the one so far ahead is the next (docs/coculture.md, Laws)."""
+SINE_LEAD_MIN, SINE_STEP = 300.0, 0.4
+"""A share that changes all the time is announced as a step to the one so far ahead, after that part of this time
+(docs/coculture.md, Laws).
+"""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ class Program:
         """What a law is told at each minute since the program began, (N,).
 
         Args: preview_min: how long before it a change is announced; 0: never. Only a change from one share to another
-          is one. Of a sine the share `SINE_LEAD_MIN` ahead, or `preview_min` where that is shorter, is announced.
+          is one. A sine is announced as a step: in 120 min to its share in 300, or both shorter by `preview_min` < 300.
         """
         now = self.setpoint(minute)
         at = np.nan_to_num(np.asarray(minute, dtype=np.float64), nan=-1.0)
@@ -80,7 +82,7 @@ class Program:
             lead = min(SINE_LEAD_MIN, preview_min)
             ahead = self.setpoint(at + lead)
             known = np.isfinite(ahead) & np.isfinite(now) & (lead > 0.0) & (at + lead <= self.total_min)
-            return Wanted(now, np.where(known, ahead, now), np.where(known, lead, 0.0))
+            return Wanted(now, np.where(known, ahead, now), np.where(known, SINE_STEP * lead, 0.0))
         change, following = self._changes()
         left = change[self._phase(np.maximum(at, 0.0))] - at
         known = (left <= preview_min + 1e-9) & np.isfinite(now) & (preview_min > 0.0)
