@@ -21,7 +21,7 @@ ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what a controller explains
 COLUMNS = ("fluorescence", "ratio_setpoint", *ESTIMATE, "temperature_target_degc")
 TRUE = "true_ratio"
 EDGE_C = 0.05  # a target so near a limit is at it
-NEARER = 0.02  # a distance less by this is progress, a setpoint that moves by more within a sample is another one
+NEARER = 0.02  # a share that has moved so far towards its goal comes nearer; a goal that jumps by more is another one
 STUCK = "check that the vial follows the thermostat and that both species grow; the program may ask for too much"
 UNCERTAIN = "check the fluorescence and calibrate its sensor (docs/coculture.md, Calibration of the sensor)"
 
@@ -37,7 +37,10 @@ class ShareWarnings:
 
     far: float = setting(0.1, "a share farther than this from its setpoint is far", within=(0.01, 1))
     stuck_h: float = setting(
-        3.0, "a share is stuck that is far and came no nearer for so long with the target at a limit", "h", above=0.0
+        3.0,
+        "a share is stuck that is far and came no nearer for so long with the thermostat's target at a limit",
+        "h",
+        above=0.0,
     )
     wide: float = setting(0.4, "an estimate whose 95 % band is wider than this is uncertain", within=(0.01, 1))
     wide_h: float = setting(2.0, "if it is so for this long", "h", at_least=0.0)
@@ -103,13 +106,13 @@ class Composition:
     Targets are cut by the interlock. There is no limit of their rate: the device's thermostat takes any step, and the
     interlock allows for a vial that still cools (docs/biology.md, Temperature).
     A share is out of control, which is said in every sample until it is over, where it is stuck or its estimate is
-    uncertain as `ShareWarnings` has it. A share that is asked for anew begins anew.
+    uncertain as `ShareWarnings` has it. Another share that is asked for or announced begins anew.
 
     Args: controller; schedules: one per reactor; warnings: when to warn. truth: the shares of a simulation, for its
       recording.
     """
 
-    _memory = ("_setpoint", "_least", "_nearer_min", "_narrow_min")
+    _memory = ("_goal", "_best", "_nearer_min", "_narrow_min")
 
     def __init__(
         self,
@@ -121,7 +124,7 @@ class Composition:
         self.controller, self.schedules, self.warnings = controller, schedules, warnings or ShareWarnings()
         self._truth, n = truth, len(schedules)
         self._programs = [program_of(s) for s in schedules]
-        self._setpoint, self._least = np.full(n, np.nan), np.full(n, np.inf)
+        self._goal, self._best = np.full(n, np.nan), np.full(n, np.nan)  # the nearest share to it so far
         self._nearer_min, self._narrow_min = np.full(n, np.nan), np.full(n, np.nan)
         controller.reset(n)
 
@@ -149,7 +152,8 @@ class Composition:
         why = {key: value for key, value in told.items() if key not in ESTIMATE}
         safety = interlock.config
         inside = (target > safety.composition_low + EDGE_C) & (target < safety.composition_high - EDGE_C)
-        return Composed(target, found, why, self._warned(found, inside, minute, believed))
+        goal = np.where(wanted.minutes > 0.0, wanted.following, wanted.setpoint)
+        return Composed(target, found, why, self._warned(found, goal, inside, minute, believed))
 
     def wanted(self, elapsed: Array) -> Wanted:
         """What each reactor's program asks for, `elapsed` min after it began; nothing where that is nan."""
@@ -163,16 +167,21 @@ class Composition:
         )
         return Wanted(np.where(begun, setpoint, np.nan), np.where(begun, following, np.nan), minutes)
 
-    def _warned(self, found: dict[str, Array], inside: Mask, minute: Array, believed: Mask) -> list[str | None]:
-        """What is out of control in each believed row, None elsewhere. Args: inside: targets that are at no limit."""
-        stuck = self._stuck(found, inside, minute, believed)
+    def _warned(
+        self, found: dict[str, Array], goal: Array, inside: Mask, minute: Array, believed: Mask
+    ) -> list[str | None]:
+        """What is out of control in each believed row, None elsewhere.
+
+        Args: goal: the share that is announced, else the one asked for, (N,). inside: targets that are at no limit.
+        """
+        stuck = self._stuck(found["ratio"], goal, inside, minute, believed)
         uncertain = self._uncertain(found, minute, believed)
         hours, c = (minute - self._nearer_min) / 60.0, found
         lines: list[str | None] = []
         for i in range(minute.size):
             said = []
             if stuck[i]:
-                at = f"share {c['ratio'][i]:.2f}, asked for {c['ratio_setpoint'][i]:.2f}"
+                at = f"share {c['ratio'][i]:.2f}, wanted {goal[i]:.2f}"
                 heat = f"the thermostat at {c['temperature_target_degc'][i]:.1f} degC"
                 said.append(f"share_stuck: {at}, no nearer for {hours[i]:.1f} h with {heat}; reported; {STUCK}")
             if uncertain[i]:
@@ -181,16 +190,14 @@ class Composition:
             lines.append(" | ".join(said) or None)
         return lines
 
-    def _stuck(self, found: dict[str, Array], inside: Mask, minute: Array, believed: Mask) -> Mask:
-        setpoint = found["ratio_setpoint"]
-        rows = believed & np.isfinite(setpoint)
-        distance = np.abs(found["ratio"] - setpoint)
-        same = np.abs(setpoint - self._setpoint) <= NEARER
-        well = rows & (inside | ~(distance > self.warnings.far) | ~same)
-        nearer = well | (rows & (distance < self._least - NEARER))
-        self._least = np.where(nearer, distance, self._least)
+    def _stuck(self, share: Array, goal: Array, inside: Mask, minute: Array, believed: Mask) -> Mask:
+        rows, away = believed & np.isfinite(goal), goal - share
+        same = np.abs(goal - self._goal) <= NEARER
+        well = rows & (inside | ~(np.abs(away) > self.warnings.far) | ~same)
+        nearer = well | (rows & (np.sign(away) * (share - self._best) > NEARER))
+        self._best = np.where(nearer, share, self._best)
         self._nearer_min = np.where(nearer, minute, self._nearer_min)
-        self._setpoint = np.where(believed, setpoint, self._setpoint)
+        self._goal = np.where(believed, goal, self._goal)
         return np.asarray(rows & ~well & (minute - self._nearer_min >= 60.0 * self.warnings.stuck_h))
 
     def _uncertain(self, found: dict[str, Array], minute: Array, believed: Mask) -> Mask:
@@ -212,5 +219,4 @@ class Composition:
         if not (isinstance(state, dict) and isinstance(state.get("controller"), dict)):
             raise ValueError(f"composition: {str(state)[:40]}, expected keys and values")
         put_back(self, self._memory, state)
-        self._least = np.where(np.isnan(self._least), np.inf, self._least)
         self.controller.restore(state["controller"])

@@ -129,9 +129,7 @@ def test_a_share_that_comes_no_nearer_at_full_authority_is_stuck_until_it_moves(
     assert told[250.0] == ["share_stuck"]
     assert warned(composition, 255.0, believed=False) == []
     (line,) = step(composition, 260.0).warnings
-    assert line.startswith(
-        "share_stuck: share 0.50, asked for 0.70, no nearer for 4.3 h with the thermostat at 29.0 degC"
-    )
+    assert line.startswith("share_stuck: share 0.50, wanted 0.70, no nearer for 4.3 h with the thermostat at 29.0 degC")
     keeper.ratio = 0.515  # less than what counts
     assert warned(composition, 270.0) == ["share_stuck"]
     keeper.ratio = 0.53
@@ -149,10 +147,32 @@ def test_a_share_that_is_near_or_a_target_inside_the_limits_is_not_stuck(ratio: 
 
 
 def test_another_setpoint_begins_anew_also_for_a_share_that_is_stuck() -> None:
-    schedule = Scenario((0.5, 0.5), (200.0, 400.0), (33.2, 33.2), ratios=(0.7, 0.9))
+    schedule = Scenario((0.5, 0.5), (200.0, 400.0), (33.2, 33.2), ratios=(0.7, 0.9), announce_min=0.0)
     composition = Composition(Scripted(ratio=0.5), [schedule])
     told = [minute for minute in np.arange(0.0, 600.0, 10.0) if warned(composition, minute)]
     assert told == [180.0, 190.0, *np.arange(380.0, 600.0, 10.0)]
+
+
+def test_a_share_on_its_way_to_one_that_is_announced_is_not_stuck() -> None:
+    schedule = Scenario((0.5, 0.5), (400.0, 400.0), (33.2, 33.2), ratios=(0.3, 0.7), announce_min=360.0)
+    keeper = Scripted(ratio=0.3)
+    composition = Composition(keeper, [schedule])
+    for minute in np.arange(0.0, 700.0, 10.0):
+        keeper.ratio = 0.3 if minute < 100.0 else min(0.3 + 0.001 * (minute - 100.0), 0.7)
+        assert not warned(composition, minute)
+    keeper.ratio = 0.45  # lost again, for whatever reason
+    assert next(minute for minute in np.arange(700.0, 1000.0, 10.0) if warned(composition, minute)) == 870.0
+
+
+@pytest.mark.parametrize(("per_h", "stuck"), [(0.01, False), (0.0, True)])
+def test_a_share_that_lags_behind_a_sine_is_stuck_only_if_it_stands_still(per_h: float, stuck: bool) -> None:
+    keeper = Scripted(ratio=0.2)
+    composition = Composition(keeper, [Scenario((0.5,), (2400.0,), (33.2,), ratio_sine=(0.5, 0.4, 1200.0))])
+    told = []
+    for minute in np.arange(600.0, 900.0, 10.0):  # from 0.5 up to 0.9, ever further away
+        keeper.ratio += per_h * 10.0 / 60.0
+        told.append(bool(warned(composition, minute)))
+    assert any(told) == stuck
 
 
 def test_an_estimate_that_stays_wide_is_uncertain() -> None:
@@ -239,7 +259,7 @@ def test_a_resumed_run_decides_what_one_without_a_pause_decides(kind: str) -> No
     assert told(steps + [second.step() for _ in range(LENGTH - CUT)]) == expected
     assert [bool(reasons[0]) for _, _, reasons in expected] == [False] * 30 + [True] * (LENGTH - 30)
     cold = fresh(vials(2))
-    for key in ("setpoint", "least", "nearer_min", "narrow_min", "controller"):
+    for key in ("goal", "best", "nearer_min", "narrow_min", "controller"):
         wrong = json.loads(json.dumps(state))
         del wrong["composition"][key]
         with pytest.raises(ValueError, match=rf"^(controller\.{key}|composition)"):
