@@ -104,7 +104,7 @@ class Composition:
     """A controller of the composition on N reactors, each with its own program of shares.
 
     Targets are cut by the interlock. There is no limit of their rate: the device's thermostat takes any step, and the
-    interlock allows for a vial that still cools (docs/biology.md, Temperature).
+    interlock allows for a vial that still cools (docs/biology.md, Vial temperature).
     A share is out of control, which is said in every sample until it is over, where it is stuck or its estimate is
     uncertain as `ShareWarnings` has it. Another share that is asked for or announced begins anew.
 
