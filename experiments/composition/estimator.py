@@ -223,18 +223,28 @@ class CompositionEstimator:
         far = np.square(reading - expected) > self.config.gate_sigma**2 * spread
         self._far[idx, which] = np.where(far, self._far[idx, which] + 1, 0)
         stays = self._far[idx, which] >= self.config.gate_max
-        self._anew(idx[stays], which)
+        (self._density_anew, self._pigment_anew)[which](idx[stays], reading[stays])
         self._far[idx[stays], which] = 0
-        good = ~far | stays
-        self._update(idx[good], which, reading[good], noise)
+        self._update(idx[~far], which, reading[~far], noise)
 
-    def _anew(self, idx: NDArray[np.intp], which: int) -> None:
-        """Nothing is known any more of the density (0) or of the pigment (1); the share stays as it is."""
-        if which == 0:
-            self.cov[idx, DILUTED, DILUTED] += 1.0
-            return
+    def _density_anew(self, idx: NDArray[np.intp], od: Array) -> None:
+        """A density that jumped and stays is believed; maybe the pigment went with it, as by a dose nobody told."""
+        found = np.log(np.maximum(od, LOWEST_OD))
+        jump = found - self.mean[idx, LOG_OD]
+        self.mean[idx, LOG_OD], self.mean[idx, LOG_F] = found, self.mean[idx, LOG_F] + jump
+        self.cov[idx, LOG_OD, :], self.cov[idx, :, LOG_OD] = 0.0, 0.0
+        self.cov[idx, LOG_OD, LOG_OD] = np.square(self.config.od_sd / np.exp(found))
+        self.cov[idx, LOG_F, LOG_F] += np.square(jump)
+
+    def _pigment_anew(self, idx: NDArray[np.intp], light: Array) -> None:
+        """Light that jumped and stays is believed to be the pigment's."""
+        z = self.mean[idx]
+        k, scattered = z[:, FACTOR], self.config.od_term * np.exp(z[:, LOG_OD])
+        f = np.maximum((light - z[:, OFFSET]) / k - scattered, LOWEST_LIGHT)
+        sensor = np.square(f + scattered) * self.cov[idx, FACTOR, FACTOR] + self.cov[idx, OFFSET, OFFSET]
+        self.mean[idx, LOG_F] = np.log(f)
         self.cov[idx, LOG_F, :], self.cov[idx, :, LOG_F] = 0.0, 0.0
-        self.cov[idx, LOG_F, LOG_F] = 1.0
+        self.cov[idx, LOG_F, LOG_F] = (sensor + self.config.fluorescence_sd**2) / np.square(k * f)
 
     def _update(self, idx: NDArray[np.intp], which: int, reading: Array, noise: float) -> None:
         """Iterated update in Joseph's form, which holds for any gain; that of what is considered is zero."""
