@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from conf.schema import check, part, require, setting
 from envs.dual_chamber import optimum
 from envs.dual_chamber.estimator import Estimator, EstimatorConfig
-from envs.dual_chamber.laws import GAIN_OD, GAIN_RATIO, PI, FeedForward, Law, Planned, hold_reservoir
-from envs.dual_chamber.rig import Rig, RigCase, RigConfig, carried
-from envs.dual_chamber.task import mixture, settled, start
+from envs.dual_chamber.laws import GAIN_OD, GAIN_RATIO, PI, FeedForward, Law, Planned, hold_reservoir, spare_reservoir
+from envs.dual_chamber.rig import RESERVOIR, Rig, RigCase, RigConfig, carried
+from envs.dual_chamber.task import mixture, settled, start, steady_dose
 from envs.plant.noise import streams, uniform
 from experiments.cli import files, frame
 
@@ -46,6 +46,9 @@ class DualChamberConfig:
                                                within=(0.05, 0.95), interval=True)  # fmt: skip
     laws: tuple[str, ...] = setting(LAWS, "which laws", choices=LAWS, some=True)
     observed: tuple[str, ...] = setting(OBSERVED, "what they are shown", choices=OBSERVED, some=True)
+    supply_margin: float = setting(
+        1.5, "level of the reservoir that fast steps leave, in multiples of the critical one; 0: none", within=(0, 5)
+    )
     rig: RigConfig = part(RigConfig, "what laws and filter believe")
     estimator: EstimatorConfig = part(EstimatorConfig, "the filter")
     plants: dict[str, RigCase] = setting({"nominal": RigCase()}, "plants by name")
@@ -84,6 +87,9 @@ def closed_loop(config: DualChamberConfig, case: RigCase, law: Law, observed: st
     for minute, ratio in enumerate(config.program.tolist()):
         state = rig.state if observed == "true" else filtered.state
         asked = law.act(state, ratio, minute)
+        if config.supply_margin:
+            steady = steady_dose(config.rig, config.od, ratio, state[:, RESERVOIR])[1]
+            asked[:, 1] = spare_reservoir(config.rig, state, asked[:, 1], steady, config.supply_margin)
         asked[:, 2] = hold_reservoir(config.rig, state)
         if case.carry_over:
             asked, rest = carried(asked, rest, case.smallest_ml, config.rig.largest_ml)
@@ -96,7 +102,7 @@ def closed_loop(config: DualChamberConfig, case: RigCase, law: Law, observed: st
 
 def _planned(config: DualChamberConfig, case: RigCase) -> dict[str, Callable[[], Law]]:
     """Laws by dynamic programming; the grid's model is made once for all."""
-    grid = optimum.model(config.rig, case.smallest_ml)
+    grid = optimum.model(config.rig, case.smallest_ml, config.od, config.ratios)
     law: dict[str, Callable[[], Law]] = {"myopic": lambda: Planned(config.rig, config.od, grid)}
     if "optimum" in config.laws:
         lasting = np.tile(np.unique(config.ratios), (config.window_min, 1))

@@ -9,7 +9,7 @@ from envs.dual_chamber.optimum import Model, best_dose
 from envs.dual_chamber.rig import LEVEL, RESERVOIR, RigConfig
 from envs.dual_chamber.task import mixture, steady_dose
 
-__all__ = ["PI", "FeedForward", "Law", "Planned", "hold_reservoir"]
+__all__ = ["PI", "FeedForward", "Law", "Planned", "hold_reservoir", "spare_reservoir"]
 
 Array = NDArray[np.float64]
 
@@ -35,6 +35,17 @@ def hold_reservoir(config: RigConfig, state: Array) -> Array:
     """
     needed = state[:, RESERVOIR] / config.reservoir_od * np.exp(config.mu_slow) - 1.0
     return np.asarray(np.maximum(needed, 0.0) * state[:, LEVEL])
+
+
+def spare_reservoir(config: RigConfig, state: Array, dose: Array, steady: Array, margin: float) -> Array:
+    """The dose from the reservoir that leaves it able to grow what the steady state takes, mL, (N,).
+
+    A reservoir held at its density makes VR (e^mu2 - 1) a minute. Once its level is below the steady dose over
+    e^mu2 - 1 it loses more than it makes, until it is empty; above `margin` times that level doses are free, below it
+    they are at most the steady one. Args: dose: asked of the reservoir; steady: that of the setpoint, mL, (N,).
+    """
+    critical = steady / np.expm1(config.mu_slow)
+    return np.asarray(np.minimum(dose, np.maximum(state[:, LEVEL] - margin * critical, steady)))
 
 
 def _doses(fresh: Array, slow: Array) -> Array:

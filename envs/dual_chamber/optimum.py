@@ -11,9 +11,12 @@ exact model, from whatever is believed of the reservoir.
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 from scipy.sparse import csr_array
 
 from envs.dual_chamber.rig import TINY, RigConfig, advance
@@ -26,20 +29,34 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Grid:
-    """Points of ln X and logit rho, and levels of each dose, zero and the largest included."""
+    """Points of ln X and logit rho, fine where they are asked for, and levels of each dose with zero and the largest.
 
-    ods: int = 61
-    logits: int = 71
-    levels: int = 25
-    od_range: tuple[float, float] = (0.15, 1.5)
-    logit_span: float = 3.5
+    finest: distance of points at a setpoint. widening: by how much it grows with the distance from it.
+    """
 
-    def axes(self) -> tuple[Array, Array]:
-        """Points of ln X and of logit rho."""
-        span = self.logit_span
-        return np.linspace(math.log(self.od_range[0]), math.log(self.od_range[1]), self.ods), np.linspace(
-            -span, span, self.logits
+    finest: float = 0.008
+    widening: float = 0.4
+    levels: int = 13
+    od_span: float = 1.1  # of ln X to either side
+    logit_span: float = 3.5  # largest |logit|
+
+    def axes(self, od: float, ratios: tuple[float, ...]) -> tuple[Array, Array]:
+        """Points of ln X and of logit rho for these setpoints."""
+        logits = [math.log(r / (1.0 - r)) for r in ratios]
+        x = math.log(od)
+        return self._axis([x], x - self.od_span, x + self.od_span), self._axis(
+            logits, -self.logit_span, self.logit_span
         )
+
+    def _axis(self, goals: list[float], low: float, high: float) -> Array:
+        """Rising points from low to high through every goal; their density is 1 / (finest + widening distance)."""
+        stops, points = sorted({low, *goals, high}), [low]
+        for left, right in pairwise(stops):
+            mesh = np.linspace(left, right, 2001)
+            spacing = self.finest + self.widening * np.abs(mesh[:, None] - np.array(goals)).min(axis=1)
+            passed = cumulative_trapezoid(1.0 / spacing, mesh, initial=0)
+            points += [*np.interp(np.linspace(0.0, passed[-1], math.ceil(passed[-1]) + 1)[1:], passed, mesh)]
+        return np.array(points)
 
 
 def doses(config: RigConfig, smallest: float, levels: int) -> Array:
@@ -76,22 +93,21 @@ def _corners(axes: tuple[Array, Array], state: Array) -> tuple[NDArray[np.int32]
     (i, a), (j, b) = (
         _cell(at, axis) for at, axis in zip((np.log(total), np.log(share / (1.0 - share))), axes, strict=True)
     )
-    first = i * axes[1].size + j
-    index = np.stack([first, first + 1, first + axes[1].size, first + axes[1].size + 1], axis=-1)
+    index = (i * axes[1].size + j)[..., None] + np.array([0, 1, axes[1].size, axes[1].size + 1])
     weight = np.stack([(1.0 - a) * (1.0 - b), (1.0 - a) * b, a * (1.0 - b), a * b], axis=-1)
     return index.astype(np.int32), weight
 
 
 def _cell(at: Array, axis: Array) -> tuple[NDArray[np.intp], Array]:
     """Index of the grid point below and the share of the one above."""
-    position = np.clip((at - axis[0]) / (axis[1] - axis[0]), 0.0, axis.size - 1.0)
-    left = np.minimum(position.astype(np.intp), axis.size - 2)
-    return left, position - left
+    left = np.clip(np.searchsorted(axis, at, side="right") - 1, 0, axis.size - 2)
+    return left, np.clip((at - axis[left]) / (axis[left + 1] - axis[left]), 0.0, 1.0)
 
 
-def model(config: RigConfig, smallest: float, grid: Grid = Grid()) -> Model:
-    """The rig on a grid. Args: smallest: useful dose, mL."""
-    axes, pairs = grid.axes(), doses(config, smallest, grid.levels)
+@lru_cache(maxsize=4)
+def model(config: RigConfig, smallest: float, od: float, ratios: tuple[float, ...], grid: Grid = Grid()) -> Model:
+    """The rig on a grid, kept for the last few. Args: smallest: useful dose, mL. od, ratios: setpoints."""
+    axes, pairs = grid.axes(od, ratios), doses(config, smallest, grid.levels)
     x, r = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     after = advance(config, start(config, np.exp(x), 1.0 / (1.0 + np.exp(-r))), pairs[:, None])
     index, weight = _corners(axes, after)
