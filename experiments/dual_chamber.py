@@ -90,7 +90,7 @@ def closed_loop(config: DualChamberConfig, case: RigCase, law: Law, observed: st
         if config.supply_margin:
             steady = steady_dose(config.rig, config.od, ratio, state[:, RESERVOIR])[1]
             asked[:, 1] = spare_reservoir(config.rig, state, asked[:, 1], steady, config.supply_margin)
-        asked[:, 2] = hold_reservoir(config.rig, state)
+        asked[:, 2] = hold_reservoir(config.rig, state, asked[:, 1])
         if case.carry_over:
             asked, rest = carried(asked, rest, case.smallest_ml, config.rig.largest_ml)
         dose = np.clip(asked, 0.0, config.rig.largest_ml)

@@ -23,10 +23,10 @@ Array = NDArray[np.float64]
 class EstimatorConfig:
     """What the filter trusts. Raises: ValueError naming key, value and allowed range."""
 
-    growth_sd: float = setting(0.001, "what a minute adds to each logarithm", within=(0, 0.1))
+    growth_sd: float = setting(0.005, "what a minute adds to each logarithm", within=(0, 0.1))
     dose_sd: float = setting(0.03, "relative error of a dose", within=(0, 1))
     od_sd: float = setting(0.005, "of a reading of OD", "OD", above=0.0, at_most=0.2)
-    fluorescence_sd: float = setting(0.02, "of a reading of fluorescence, in OD of the fast strain", "OD", above=0.0,
+    fluorescence_sd: float = setting(0.01, "of a reading of fluorescence, in OD of the fast strain", "OD", above=0.0,
                                      at_most=0.2)  # fmt: skip
     start_sd: float = setting(0.3, "of each logarithm at the start", above=0.0, at_most=3.0)
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.dual_chamber.optimum import Model, best_dose
-from envs.dual_chamber.rig import LEVEL, RESERVOIR, RigConfig
+from envs.dual_chamber.rig import LEVEL, RESERVOIR, RigConfig, taken
 from envs.dual_chamber.task import mixture, steady_dose
 
 __all__ = ["PI", "FeedForward", "Law", "Planned", "hold_reservoir", "spare_reservoir"]
@@ -28,13 +28,15 @@ class Law(Protocol):
         ...
 
 
-def hold_reservoir(config: RigConfig, state: Array) -> Array:
+def hold_reservoir(config: RigConfig, state: Array, dose: Array) -> Array:
     """Supply of fresh medium that brings xR back to its density within the minute, mL, (N,).
 
-    It holds the density, not the level: more than VR (e^mu2 - 1) a minute cannot be taken for long.
+    It holds the density, not the level: more than VR (e^mu2 - 1) a minute cannot be taken for long. Args: dose: asked of the
+    reservoir in the same minute, mL, (N,).
     """
+    left = state[:, LEVEL] - taken(config, state[:, LEVEL], np.clip(dose, 0.0, config.largest_ml))
     needed = state[:, RESERVOIR] / config.reservoir_od * np.exp(config.mu_slow) - 1.0
-    return np.asarray(np.maximum(needed, 0.0) * state[:, LEVEL])
+    return np.asarray(np.maximum(needed, 0.0) * left)
 
 
 def spare_reservoir(config: RigConfig, state: Array, dose: Array, steady: Array, margin: float) -> Array:
