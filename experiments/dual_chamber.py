@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 LAWS = ("feed_forward", "proportional", "pi", "myopic", "optimum", "preview")
-OBSERVED = ("true", "fluorescence", "od")
+OBSERVED = ("state", "fluorescence", "od")
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def closed_loop(config: DualChamberConfig, case: RigCase, law: Law, observed: st
     filtered = Estimator(config.estimator, config.rig, believed, observed == "fluorescence")
     rest, kept = np.zeros((len(rngs), 3)), []
     for minute, ratio in enumerate(config.program.tolist()):
-        state = rig.state if observed == "true" else filtered.state
+        state = rig.state if observed == "state" else filtered.state
         asked = law.act(state, ratio, minute)
         if config.supply_margin:
             steady = steady_dose(config.rig, config.od, ratio, state[:, RESERVOIR])[1]
@@ -95,7 +95,7 @@ def closed_loop(config: DualChamberConfig, case: RigCase, law: Law, observed: st
             asked, rest = carried(asked, rest, case.smallest_ml, config.rig.largest_ml)
         dose = np.clip(asked, 0.0, config.rig.largest_ml)
         filtered.update(dose, rig.step(dose))
-        state = rig.state if observed == "true" else filtered.state
+        state = rig.state if observed == "state" else filtered.state
         kept.append((*mixture(rig.state), *mixture(state), dose))
     return Trial(*(np.stack(of) for of in zip(*kept, strict=True)))
 

@@ -31,8 +31,8 @@ class Law(Protocol):
 def hold_reservoir(config: RigConfig, state: Array, dose: Array) -> Array:
     """Supply of fresh medium that brings xR back to its density within the minute, mL, (N,).
 
-    It holds the density, not the level: more than VR (e^mu2 - 1) a minute cannot be taken for long. Args: dose: asked of the
-    reservoir in the same minute, mL, (N,).
+    It holds the density, not the level: more than VR (e^mu2 - 1) a minute cannot be taken for long.
+    Args: dose: asked of the reservoir in the same minute, mL, (N,).
     """
     left = state[:, LEVEL] - taken(config, state[:, LEVEL], np.clip(dose, 0.0, config.largest_ml))
     needed = state[:, RESERVOIR] / config.reservoir_od * np.exp(config.mu_slow) - 1.0
