@@ -73,7 +73,7 @@ def _variants(command: Command[Any]) -> Iterator[Any]:
     """The command's config with every kind of backend and controller that it may hold."""
     yield command.config()
     if command.choose:
-        for group in ("backend", "controller"):
+        for group in ("backend", "controller", "composition"):
             if group in chosen(command.name):
                 for option in groups()[group]:
                     yield command.config([f"{group}={option}"])

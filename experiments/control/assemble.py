@@ -144,7 +144,7 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     interlock, composition = Interlock(len(reactors.names), setup.config.safety), None
     if setup.keeper is not None:
         truth = None if plant is None else partial(getattr, plant.culture, "share")
-        composition = Composition(setup.keeper, setup.scenarios, setup.config.composition_limits, truth)
+        composition = Composition(setup.keeper, setup.scenarios, setup.config.share_warnings, truth)
     ends = setup.config.ends()
     loop = ClosedLoop(reactors, controller, interlock, setup.scenarios, record.decided, ends, composition)
     if setup.resumed:

@@ -7,19 +7,21 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from conf.schema import check, require, setting
+from conf.schema import check, setting
 from envs.scenario import Scenario
 from experiments.composition.base import Array, Mask, Wanted
 from experiments.composition.program import Program
 from experiments.controllers.base import put_back, saved
+from hardware.reactor import Measurement
+from hardware.safety.interlock import Interlock
 
-__all__ = ["COLUMNS", "TRUE", "Composed", "Composition", "CompositionLimits", "Keeper", "columns", "program_of"]
+__all__ = ["COLUMNS", "TRUE", "Composed", "Composition", "Keeper", "ShareWarnings", "columns", "program_of"]
 
 ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what a controller explains, the columns of a recording
 COLUMNS = ("fluorescence", "ratio_setpoint", *ESTIMATE, "temperature_target_degc")
 TRUE = "true_ratio"
 EDGE_C = 0.05  # a target so near a limit is at it
-NEARER = 0.02  # a distance less by this is progress, a setpoint that moves by more within a sample is another one
+NEARER = 0.02  # a share that has moved so far towards its goal comes nearer; a goal that jumps by more is another one
 STUCK = "check that the vial follows the thermostat and that both species grow; the program may ask for too much"
 UNCERTAIN = "check the fluorescence and calibrate its sensor (docs/coculture.md, Calibration of the sensor)"
 
@@ -30,27 +32,21 @@ def columns(true: bool) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class CompositionLimits:
-    """Limits of the thermostat targets, and when a share is out of control.
+class ShareWarnings:
+    """When a share is said to be out of control. Raises: ValueError naming key, value and allowed range."""
 
-    There is no limit of their rate: the device's thermostat takes any step, a vial warms by 2 degC/min and cools by
-    itself (docs/biology.md), and the interlock allows for a vial that still cools. Raises: ValueError naming key, value
-    and allowed range.
-    """
-
-    low: float = setting(29.0, "coldest target", "degC", within=(20, 42))
-    high: float = setting(36.0, "warmest target; more than low", "degC", within=(20, 42))
     far: float = setting(0.1, "a share farther than this from its setpoint is far", within=(0.01, 1))
     stuck_h: float = setting(
-        3.0, "a share is stuck that is far and came no nearer for so long with the target at a limit", "h", above=0.0
+        3.0,
+        "a share is stuck that is far and came no nearer for so long with the thermostat's target at a limit",
+        "h",
+        above=0.0,
     )
     wide: float = setting(0.4, "an estimate whose 95 % band is wider than this is uncertain", within=(0.01, 1))
     wide_h: float = setting(2.0, "if it is so for this long", "h", at_least=0.0)
 
     def __post_init__(self) -> None:
-        check(self, "composition_limits")
-        rising = self.low < self.high
-        require(rising, "composition_limits.high", f"{self.high:g} degC", f"more than low = {self.low:g} degC")
+        check(self, "share_warnings")
 
 
 def program_of(schedule: Scenario) -> Program:
@@ -107,51 +103,57 @@ class Composed:
 class Composition:
     """A controller of the composition on N reactors, each with its own program of shares.
 
+    Targets are cut by the interlock. There is no limit of their rate: the device's thermostat takes any step, and the
+    interlock allows for a vial that still cools (docs/biology.md, Vial temperature).
     A share is out of control, which is said in every sample until it is over, where it is stuck or its estimate is
-    uncertain as `CompositionLimits` have it. A share that is asked for anew begins anew.
+    uncertain as `ShareWarnings` has it. Another share that is asked for or announced begins anew.
 
-    Args: controller; schedules: one per reactor; limits. truth: the shares of a simulation, for its recording.
+    Args: controller; schedules: one per reactor; warnings: when to warn. truth: the shares of a simulation, for its
+      recording.
     """
 
-    _memory = ("_setpoint", "_least", "_nearer_min", "_narrow_min")
+    _memory = ("_goal", "_best", "_nearer_min", "_narrow_min")
 
     def __init__(
         self,
         controller: Keeper,
         schedules: Sequence[Scenario],
-        limits: CompositionLimits | None = None,
+        warnings: ShareWarnings | None = None,
         truth: Callable[[], Array] | None = None,
     ) -> None:
-        self.controller, self.schedules, self.limits = controller, schedules, limits or CompositionLimits()
+        self.controller, self.schedules, self.warnings = controller, schedules, warnings or ShareWarnings()
         self._truth, n = truth, len(schedules)
         self._programs = [program_of(s) for s in schedules]
-        self._setpoint, self._least = np.full(n, np.nan), np.full(n, np.inf)
+        self._goal, self._best = np.full(n, np.nan), np.full(n, np.nan)  # the nearest share to it so far
         self._nearer_min, self._narrow_min = np.full(n, np.nan), np.full(n, np.nan)
         controller.reset(n)
 
-    def step(
-        self, sample: tuple[Array, Array, Array], minute: Array, elapsed: Array, believed: Mask, scheduled: Array
-    ) -> Composed:
+    def step(self, m: Measurement, interlock: Interlock, elapsed: Array, believed: Mask, scheduled: Array) -> Composed:
         """Watch a sample and decide.
 
         Args:
-          sample: OD, fluorescence in counts and temperature in degC, (N,) each.
-          minute: of the sample, min since the run began, (N,). elapsed: min since the schedule began, nan before, (N,).
-          believed: rows whose sample is new and believed, (N,). scheduled: the schedule's targets, degC, (N,).
+          m: the sample. interlock: says which fluorescence is believed, and cuts targets. elapsed: min since the
+            schedule began, nan before, (N,). believed: rows whose OD is new and believed, (N,).
+          scheduled: the schedule's targets, degC, (N,).
         """
-        od, fluorescence, temperature = sample
+        minute, none = m.time_s / 60.0, np.full(m.od.shape, np.nan)
         wanted = self.wanted(elapsed)
         asked = np.isfinite(wanted.setpoint)
-        self.controller.watch(od, fluorescence, temperature, minute, believed)
+        light = interlock.fluorescence(m)
+        self.controller.watch(m.od, none if light is None else light, m.temperature, minute, believed)
         chosen = self.controller.target(wanted, elapsed, believed & asked)
-        limited = np.clip(chosen, self.limits.low, self.limits.high)
-        target = np.where(asked & np.isfinite(limited), limited, scheduled)
+        allowed = interlock.temperature(np.where(asked, chosen, np.nan))
+        target = np.where(np.isfinite(allowed), allowed, scheduled)
         told = self.controller.explain()
-        known = {"fluorescence": fluorescence, "ratio_setpoint": wanted.setpoint, "temperature_target_degc": target}
+        known = {"ratio_setpoint": wanted.setpoint, "temperature_target_degc": target}
+        known |= {"fluorescence": none if m.fluorescence is None else m.fluorescence}
         known |= {key: told[key] for key in ESTIMATE}
         found = {key: known[key] for key in COLUMNS} | ({TRUE: self._truth()} if self._truth else {})
         why = {key: value for key, value in told.items() if key not in ESTIMATE}
-        return Composed(target, found, why, self._warnings(found, minute, believed))
+        safety = interlock.config
+        inside = (target > safety.composition_low + EDGE_C) & (target < safety.composition_high - EDGE_C)
+        goal = np.where(wanted.minutes > 0.0, wanted.following, wanted.setpoint)
+        return Composed(target, found, why, self._warned(found, goal, inside, minute, believed))
 
     def wanted(self, elapsed: Array) -> Wanted:
         """What each reactor's program asks for, `elapsed` min after it began; nothing where that is nan."""
@@ -165,16 +167,21 @@ class Composition:
         )
         return Wanted(np.where(begun, setpoint, np.nan), np.where(begun, following, np.nan), minutes)
 
-    def _warnings(self, found: dict[str, Array], minute: Array, believed: Mask) -> list[str | None]:
-        """What is out of control in each believed row, None elsewhere."""
-        stuck = self._stuck(found, minute, believed)
+    def _warned(
+        self, found: dict[str, Array], goal: Array, inside: Mask, minute: Array, believed: Mask
+    ) -> list[str | None]:
+        """What is out of control in each believed row, None elsewhere.
+
+        Args: goal: the share that is announced, else the one asked for, (N,). inside: targets that are at no limit.
+        """
+        stuck = self._stuck(found["ratio"], goal, inside, minute, believed)
         uncertain = self._uncertain(found, minute, believed)
         hours, c = (minute - self._nearer_min) / 60.0, found
         lines: list[str | None] = []
         for i in range(minute.size):
             said = []
             if stuck[i]:
-                at = f"share {c['ratio'][i]:.2f}, asked for {c['ratio_setpoint'][i]:.2f}"
+                at = f"share {c['ratio'][i]:.2f}, wanted {goal[i]:.2f}"
                 heat = f"the thermostat at {c['temperature_target_degc'][i]:.1f} degC"
                 said.append(f"share_stuck: {at}, no nearer for {hours[i]:.1f} h with {heat}; reported; {STUCK}")
             if uncertain[i]:
@@ -183,24 +190,21 @@ class Composition:
             lines.append(" | ".join(said) or None)
         return lines
 
-    def _stuck(self, found: dict[str, Array], minute: Array, believed: Mask) -> Mask:
-        setpoint, target = found["ratio_setpoint"], found["temperature_target_degc"]
-        rows = believed & np.isfinite(setpoint)
-        distance = np.abs(found["ratio"] - setpoint)
-        inside = (target > self.limits.low + EDGE_C) & (target < self.limits.high - EDGE_C)
-        same = np.abs(setpoint - self._setpoint) <= NEARER
-        well = rows & (inside | ~(distance > self.limits.far) | ~same)
-        nearer = well | (rows & (distance < self._least - NEARER))
-        self._least = np.where(nearer, distance, self._least)
+    def _stuck(self, share: Array, goal: Array, inside: Mask, minute: Array, believed: Mask) -> Mask:
+        rows, away = believed & np.isfinite(goal), goal - share
+        same = np.abs(goal - self._goal) <= NEARER
+        well = rows & (inside | ~(np.abs(away) > self.warnings.far) | ~same)
+        nearer = well | (rows & (np.sign(away) * (share - self._best) > NEARER))
+        self._best = np.where(nearer, share, self._best)
         self._nearer_min = np.where(nearer, minute, self._nearer_min)
-        self._setpoint = np.where(believed, setpoint, self._setpoint)
-        return np.asarray(rows & ~well & (minute - self._nearer_min >= 60.0 * self.limits.stuck_h))
+        self._goal = np.where(believed, goal, self._goal)
+        return np.asarray(rows & ~well & (minute - self._nearer_min >= 60.0 * self.warnings.stuck_h))
 
     def _uncertain(self, found: dict[str, Array], minute: Array, believed: Mask) -> Mask:
-        narrow = believed & (found["ratio_high"] - found["ratio_low"] <= self.limits.wide)
+        narrow = believed & (found["ratio_high"] - found["ratio_low"] <= self.warnings.wide)
         first = believed & np.isnan(self._narrow_min)
         self._narrow_min = np.where(narrow | first, minute, self._narrow_min)
-        return np.asarray(believed & ~narrow & (minute - self._narrow_min >= 60.0 * self.limits.wide_h))
+        return np.asarray(believed & ~narrow & (minute - self._narrow_min >= 60.0 * self.warnings.wide_h))
 
     def dosed(self, volume_ml: Array) -> None:
         """What went in, mL, (N,)."""
@@ -215,5 +219,4 @@ class Composition:
         if not (isinstance(state, dict) and isinstance(state.get("controller"), dict)):
             raise ValueError(f"composition: {str(state)[:40]}, expected keys and values")
         put_back(self, self._memory, state)
-        self._least = np.where(np.isnan(self._least), np.inf, self._least)
         self.controller.restore(state["controller"])

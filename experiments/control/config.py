@@ -7,7 +7,7 @@ from conf.schema import check, part, require, setting
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.composition import registry as compositions
-from experiments.control.composition import CompositionLimits, columns
+from experiments.control.composition import ShareWarnings, columns
 from experiments.control.recovery import COLUMNS
 from experiments.controllers import registry
 from experiments.controllers.learned import LearnedConfig
@@ -64,9 +64,7 @@ class DeployConfig:
     composition_policy: str = setting(
         "shipped", "of composition=dqn and dqn_preview: `shipped`, a policy.npz, or a run folder"
     )
-    composition_limits: CompositionLimits = part(
-        CompositionLimits, "limits of its temperatures, and when a share is out of control"
-    )
+    share_warnings: ShareWarnings = part(ShareWarnings, "when a share is said to be out of control")
     env_file: str | None = setting(None, "a calibrated.yaml whose model the simulated plant takes")
     plant_file: str | None = setting(None, "a twin.yaml of calibrate, in place of `plant`; backend=sim")
     fsync: bool = setting(True, "every row on the disk before the next command")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from envs.scenario import Scenario
 from experiments.control.composition import Composition
 from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Remembers, Watches
-from hardware.reactor import Command, Measurement, Reactor, Receipt
+from hardware.reactor import Command, Reactor, Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock, Verdict
 
@@ -131,8 +131,7 @@ class ClosedLoop:
 
         composed = None
         if self.composition is not None:
-            sample = (m.od, self._fluorescence(m), m.temperature)
-            composed = self.composition.step(sample, minute, elapsed, believed, temperature)
+            composed = self.composition.step(m, self.interlock, elapsed, believed, temperature)
             temperature = composed.target
         steered = believed & (phase >= 0)
         if isinstance(self.controller, Watches):
@@ -166,10 +165,6 @@ class ClosedLoop:
         volume = receipt.volume_ml + np.where(rows, self.repeated_ml, 0.0)
         self.repeated_ml = np.where(rows, 0.0, self.repeated_ml)
         return replace(decision, volume_ml=volume, notes=(*failures, *receipt.notes))
-
-    def _fluorescence(self, m: Measurement) -> Array:
-        """Readings of the fluorescence, counts, (N,); nan where there is none."""
-        return np.full(len(self.done), np.nan) if m.fluorescence is None else m.fluorescence
 
     def _book_repeats(self) -> None:
         """What the devices dosed by themselves counts when it happened, before the sample after it is judged."""

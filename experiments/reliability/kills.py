@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from conf.presets import groups
 from conf.schema import check, require, setting
 from experiments.controllers.registry import ON_DEVICE
 from experiments.reliability.audit import Served, audit_doses, rows_per_sample
@@ -57,6 +58,7 @@ class KillConfig:
     )
     reactors: tuple[str, ...] = setting(("M0", "M1", "M2"), "of the runs")
     controller_kind: str = setting("dqn", "what decides the pump rate; dqn is the policy that ships", choices=ON_DEVICE)
+    plant: str = setting("healthy", "preset of the emulated cultures and pumps", choices=tuple(groups()["plant"]))
     overrides: tuple[str, ...] = setting((), "further words of the deploy command, e.g. safety.cooldown=10")
     seed: int = setting(0, "of kill moments and emulators", at_least=0)
 
@@ -134,6 +136,7 @@ def killed_run(
     """
     findings = Findings(kills=kills)
     arguments = {"reactors": ",".join(config.reactors), "speed": config.speed, "seed": seed, "od": SETPOINT}
+    arguments["plant"] = config.plant
     with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
         rng = np.random.default_rng([config.seed, seed])
         clients = _Clients(config, device, folder, rng, findings, stop or threading.Event())

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.coculture.rates import EQUAL_RATES_C, LAG_P_MIN, e_coli_rate, p_putida_rate
+from envs.coculture.rates import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
 from envs.coculture.task import logit, share
 from experiments.composition.base import Array, Mask, Wanted
 from experiments.controllers.base import put_back, saved
@@ -39,7 +39,7 @@ class Reckoning:
 
     def target(self, wanted: Wanted, minute: Array, rows: Mask) -> Array:
         with np.errstate(invalid="ignore"):
-            return np.asarray(EQUAL_RATES_C - 20.0 * (logit(wanted.setpoint) - self._x))
+            return np.clip(EQUAL_RATES_C - 20.0 * (logit(wanted.setpoint) - self._x), T_MIN, T_MAX)
 
     def explain(self) -> dict[str, Array]:
         r = share(self._x)

@@ -12,10 +12,12 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.composition import registry as compositions
 from experiments.composition.base import Array, Mask, Wanted
-from experiments.control.composition import COLUMNS, Composition, CompositionLimits, program_of
+from experiments.control.composition import COLUMNS, Composition, ShareWarnings, program_of
 from experiments.control.loop import ClosedLoop, Step
 from experiments.controllers import registry
 from hardware.emulator.device import plant_preset
+from hardware.reactor import Measurement
+from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock, kinds_of
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from tests.experiments.composition_keeper import Reckoning
@@ -46,12 +48,16 @@ class Scripted(Reckoning):
         }
 
 
-def step(composition: Composition, minute: float, believed: bool = True, elapsed: float | None = None) -> Any:
+def step(
+    composition: Composition, minute: float, believed: bool = True, elapsed: float | None = None, **safety: Any
+) -> Any:
     n = len(composition.schedules)
-    sample = (np.full(n, 0.5), np.full(n, 900.0), np.full(n, 33.0))
     at = np.full(n, minute)
+    light = np.full(n, 900.0 + minute)
+    m = Measurement(60.0 * at, np.full(n, 0.5), np.full(n, 33.0), np.ones(n, dtype=np.bool_), fluorescence=light)
     since = at if elapsed is None else np.full(n, elapsed)
-    return composition.step(sample, at, since, np.full(n, believed), np.full(n, 33.2))
+    interlock = Interlock(n, SafetyConfig(**safety))
+    return composition.step(m, interlock, since, np.full(n, believed), np.full(n, 33.2))
 
 
 def warned(composition: Composition, minute: float, believed: bool = True) -> list[str]:
@@ -68,10 +74,12 @@ def test_a_target_goes_through_the_limits_and_one_that_is_no_number_leaves_the_s
     assert tuple(composed.columns) == COLUMNS
 
 
-def test_the_limits_are_the_configured_ones() -> None:
-    limits = CompositionLimits(low=30.0, high=35.0)
-    assert step(Composition(Scripted(target=10.0), [HOLD], limits), 5.0).target == 30.0
-    assert step(Composition(Scripted(target=90.0), [HOLD], limits), 5.0).target == 35.0
+def test_the_limits_are_the_interlocks_and_a_target_at_one_of_them_may_be_stuck() -> None:
+    limits = {"composition_low": 30.0, "composition_high": 35.0}
+    assert step(Composition(Scripted(target=10.0), [HOLD]), 5.0, **limits).target == 30.0
+    composition = Composition(Scripted(target=90.0), [HOLD])
+    assert step(composition, 5.0, **limits).target == 35.0
+    assert step(composition, 200.0, **limits).warnings[0].startswith("share_stuck")
 
 
 @pytest.mark.parametrize("schedule", [replace(HOLD, ratios=()), replace(HOLD, ratios=(None,))])
@@ -83,7 +91,7 @@ def test_where_no_share_is_asked_for_the_schedule_decides_and_the_controller_goe
     assert composed.target == 33.2
     assert np.isnan(composed.columns["ratio_setpoint"]).all()
     od, fluorescence, temperature, minute, rows = keeper.seen[0]
-    assert (od, fluorescence, temperature, minute, rows) == (0.5, 900.0, 33.0, 5.0, True)
+    assert (od, fluorescence, temperature, minute, rows) == (0.5, 905.0, 33.0, 5.0, True)
     assert not keeper.asked[2].any()
 
 
@@ -121,9 +129,7 @@ def test_a_share_that_comes_no_nearer_at_full_authority_is_stuck_until_it_moves(
     assert told[250.0] == ["share_stuck"]
     assert warned(composition, 255.0, believed=False) == []
     (line,) = step(composition, 260.0).warnings
-    assert line.startswith(
-        "share_stuck: share 0.50, asked for 0.70, no nearer for 4.3 h with the thermostat at 29.0 degC"
-    )
+    assert line.startswith("share_stuck: share 0.50, wanted 0.70, no nearer for 4.3 h with the thermostat at 29.0 degC")
     keeper.ratio = 0.515  # less than what counts
     assert warned(composition, 270.0) == ["share_stuck"]
     keeper.ratio = 0.53
@@ -141,10 +147,32 @@ def test_a_share_that_is_near_or_a_target_inside_the_limits_is_not_stuck(ratio: 
 
 
 def test_another_setpoint_begins_anew_also_for_a_share_that_is_stuck() -> None:
-    schedule = Scenario((0.5, 0.5), (200.0, 400.0), (33.2, 33.2), ratios=(0.7, 0.9))
+    schedule = Scenario((0.5, 0.5), (200.0, 400.0), (33.2, 33.2), ratios=(0.7, 0.9), announce_min=0.0)
     composition = Composition(Scripted(ratio=0.5), [schedule])
     told = [minute for minute in np.arange(0.0, 600.0, 10.0) if warned(composition, minute)]
     assert told == [180.0, 190.0, *np.arange(380.0, 600.0, 10.0)]
+
+
+def test_a_share_on_its_way_to_one_that_is_announced_is_not_stuck() -> None:
+    schedule = Scenario((0.5, 0.5), (400.0, 400.0), (33.2, 33.2), ratios=(0.3, 0.7), announce_min=360.0)
+    keeper = Scripted(ratio=0.3)
+    composition = Composition(keeper, [schedule])
+    for minute in np.arange(0.0, 700.0, 10.0):
+        keeper.ratio = 0.3 if minute < 100.0 else min(0.3 + 0.001 * (minute - 100.0), 0.7)
+        assert not warned(composition, minute)
+    keeper.ratio = 0.45  # lost again, for whatever reason
+    assert next(minute for minute in np.arange(700.0, 1000.0, 10.0) if warned(composition, minute)) == 870.0
+
+
+@pytest.mark.parametrize(("per_h", "stuck"), [(0.01, False), (0.0, True)])
+def test_a_share_that_lags_behind_a_sine_is_stuck_only_if_it_stands_still(per_h: float, stuck: bool) -> None:
+    keeper = Scripted(ratio=0.2)
+    composition = Composition(keeper, [Scenario((0.5,), (2400.0,), (33.2,), ratio_sine=(0.5, 0.4, 1200.0))])
+    told = []
+    for minute in np.arange(600.0, 900.0, 10.0):  # from 0.5 up to 0.9, ever further away
+        keeper.ratio += per_h * 10.0 / 60.0
+        told.append(bool(warned(composition, minute)))
+    assert any(told) == stuck
 
 
 def test_an_estimate_that_stays_wide_is_uncertain() -> None:
@@ -167,7 +195,7 @@ def vials(n: int) -> SimulatedReactors:
 
 
 def loop(
-    reactors: SimulatedReactors, keeper: Any, scenario: Scenario, limits: CompositionLimits | None = None
+    reactors: SimulatedReactors, keeper: Any, scenario: Scenario, limits: ShareWarnings | None = None
 ) -> ClosedLoop:
     n = len(reactors.names)
     composition = Composition(keeper, [scenario] * n, limits)
@@ -189,7 +217,7 @@ def test_the_vials_follow_the_target_and_the_controller_is_told_what_went_in() -
 
 def test_a_warning_stands_beside_what_the_interlock_says() -> None:
     keeper = Scripted(ratio=0.1, width=0.9)
-    limits = CompositionLimits(stuck_h=0.1, wide_h=0.1)
+    limits = ShareWarnings(stuck_h=0.1, wide_h=0.1)
     reactors = vials(1)
     run = loop(reactors, keeper, HOLD, limits)
     for _ in range(10):
@@ -210,7 +238,7 @@ LENGTH, CUT = 110, 55
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_resumed_run_decides_what_one_without_a_pause_decides(kind: str) -> None:
     def fresh(reactors: SimulatedReactors) -> ClosedLoop:
-        limits = CompositionLimits(wide=0.01, wide_h=0.5)
+        limits = ShareWarnings(wide=0.01, wide_h=0.5)
         return loop(reactors, compositions.build(compositions.config(kind)), SCHEDULE, limits)
 
     def told(steps: list[Step]) -> list[Any]:
@@ -231,7 +259,7 @@ def test_a_resumed_run_decides_what_one_without_a_pause_decides(kind: str) -> No
     assert told(steps + [second.step() for _ in range(LENGTH - CUT)]) == expected
     assert [bool(reasons[0]) for _, _, reasons in expected] == [False] * 30 + [True] * (LENGTH - 30)
     cold = fresh(vials(2))
-    for key in ("setpoint", "least", "nearer_min", "narrow_min", "controller"):
+    for key in ("goal", "best", "nearer_min", "narrow_min", "controller"):
         wrong = json.loads(json.dumps(state))
         del wrong["composition"][key]
         with pytest.raises(ValueError, match=rf"^(controller\.{key}|composition)"):
@@ -248,8 +276,32 @@ def test_a_state_without_the_compositions_is_refused() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"low": 19.0}, {"high": 43.0}, {"low": 36.0}, {"far": 0.0}, {"stuck_h": 0.0}, {"wide": 2.0}, {"wide_h": -1.0}],
+    [{"far": 0.0}, {"stuck_h": 0.0}, {"wide": 2.0}, {"wide_h": -1.0}],
 )
-def test_limits_out_of_range_are_named(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=r"composition_limits\.(high|" + next(iter(wrong)) + ").*allowed"):
-        CompositionLimits(**wrong)
+def test_warnings_out_of_range_are_named(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=rf"^share_warnings\.{next(iter(wrong))} = .*allowed"):
+        ShareWarnings(**wrong)
+
+
+def test_a_fluorescence_that_no_sensor_gives_is_recorded_and_not_shown() -> None:
+    keeper, reactors = Recorded(), vials(1)
+    run = loop(reactors, keeper, HOLD)
+    run.step()
+    assert reactors.plant.fluorescence is not None
+    reactors.plant.fluorescence.dead[:] = True
+    last = run.step()
+    assert last.composition["fluorescence"] == [0.0]
+    assert kinds_of(last.reasons[0] or "") == ["fluorescence"]
+    assert [bool(np.isfinite(light[0])) for light in keeper.light] == [True, False]
+
+
+class Recorded(Reckoning):
+    """Keeps what light it was shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.light: list[Array] = []
+
+    def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
+        self.light.append(fluorescence)
+        super().watch(od, fluorescence, temperature, minute, rows)

@@ -10,6 +10,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -211,15 +212,22 @@ class Cable:
 
 @pytest.fixture
 def cable(tmp_path: Path) -> Iterator[tuple[Cable, EmulatorProcess]]:
-    with EmulatorProcess(["--reactors", "M0,M1", "--speed", "60", "--od", "0.5"]) as emulator:
-        line = Cable(tmp_path)
-        log = (tmp_path / "log").open("w")
+    with wired(tmp_path) as both:
+        yield both
+
+
+@contextmanager
+def wired(folder: Path, *words: str) -> Iterator[tuple[Cable, EmulatorProcess]]:
+    """A cable with an agent and an emulator of two reactors at its end. Args: words: further ones of the emulator."""
+    with EmulatorProcess(["--reactors", "M0,M1", "--speed", "60", "--od", "0.5", *words]) as emulator:
+        line = Cable(folder)
+        log = (folder / "log").open("w")
         agent = subprocess.Popen(
             [sys.executable, str(AGENT), "--tty", str(line.board), "--url", emulator.url, "--deadman", "30"], stderr=log
         )
         try:
             deadline = time.monotonic() + 5.0
-            while "open" not in (tmp_path / "log").read_text() and time.monotonic() < deadline:
+            while "open" not in (folder / "log").read_text() and time.monotonic() < deadline:
                 time.sleep(0.02)
             yield line, emulator
         finally:
