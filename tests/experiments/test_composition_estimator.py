@@ -193,7 +193,7 @@ def test_a_jump_that_stays_is_followed_but_the_share_learns_nothing_from_it(kept
     estimator = CompositionEstimator(CompositionEstimatorConfig())
     follow(estimator, jumped[:107])
     follow(before, seen[:107])
-    assert estimator.estimate().logit[0] == pytest.approx(before.estimate().logit[0], abs=0.02)
+    assert estimator.estimate().logit[0] == pytest.approx(before.estimate().logit[0], abs=0.03)
     told = estimator.explain()
     assert told["composition_od"][0] == pytest.approx(jumped[106, 0], rel=0.02)
     light = told["pigment"][0] + 150.0 * told["composition_od"][0]
