@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 Row = Mapping[str, Any]
 
 STEP = 5  # minutes between the points of a curve
+SHOWN = ("pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")  # where there are more than so many laws
 
 DEFINITIONS = {
     "error": "mean over the scenario of |r - setpoint|, r the true share of P. putida, wherever a share is asked for.",
@@ -55,14 +56,16 @@ def whole(rows: Sequence[Row], name: str, title: str, text: Callable[[Row], str]
 
 
 def shares(trials: Sequence[CompositionTrial]) -> Figure:
-    """A column per law: true shares of all replicates with the setpoint, and the vials' temperature."""
+    """A column per law: true share with the setpoint, and the vials' temperature; median and the middle 90 %."""
     columns = len(trials)
     figure, axes = new_figure(2.7 * columns, 4.6, 2, columns, sharex=True, sharey="row", height_ratios=[2, 1])
     for k, trial in enumerate(trials):
         top, bottom, hours = axes[k], axes[columns + k], trial.minute[::STEP] / 60.0
-        top.plot(hours, trial.share[:, ::STEP].T, color=COLOURS[0], linewidth=0.5, alpha=0.35)
-        top.plot(hours, trial.setpoint[::STEP], color="black", linewidth=1.2, linestyle="--")
-        bottom.plot(hours, trial.temperature[:, ::STEP].T, color=COLOURS[1], linewidth=0.4, alpha=0.35)
+        for ax, values, colour in ((top, trial.share, COLOURS[0]), (bottom, trial.temperature, COLOURS[1])):
+            low, middle, high = np.quantile(values[:, ::STEP], (0.05, 0.5, 0.95), axis=0)
+            ax.fill_between(hours, low, high, color=colour, alpha=0.28, linewidth=0)
+            ax.plot(hours, middle, color=colour, linewidth=1.2)
+        top.plot(hours, trial.setpoint[::STEP], color="black", linewidth=1.0, linestyle="--")
         top.set_title(f"{trial.cell.law}{', told ahead' if trial.foresight else ''}")
         bottom.set_xlabel("hours")
     axes[0].set(ylabel="share of P. putida", ylim=(0.0, 1.0))
@@ -95,7 +98,9 @@ def draw(trials: Sequence[CompositionTrial], rows: Sequence[Row], folder: Path) 
     for scenario in dict.fromkeys(t.cell.scenario for t in trials):
         here = [t for t in trials if t.cell.scenario == scenario]
         first = [t for t in here if t.cell.plant == here[0].cell.plant]
-        told = "Line: one reactor; dashed: setpoint."
+        if len(first) > len(SHOWN):
+            first = [t for t in first if t.cell.law in SHOWN]
+        told = "Line: median over the reactors; band: the middle 90 %; dashed: setpoint."
         for name, figure, title, caption in (
             ("laws", _overview([r for r in rows if r["scenario"] == scenario]), "every law and plant",
              "Mean and 95 % interval over the reactors."),

@@ -228,13 +228,11 @@ class CompositionEstimator:
         self._update(idx[~far], which, reading[~far], noise)
 
     def _density_anew(self, idx: NDArray[np.intp], od: Array) -> None:
-        """A density that jumped and stays is believed; maybe the pigment went with it, as by a dose nobody told."""
+        """A density that jumped and stays is believed; the light has said by now what became of the pigment."""
         found = np.log(np.maximum(od, LOWEST_OD))
-        jump = found - self.mean[idx, LOG_OD]
-        self.mean[idx, LOG_OD], self.mean[idx, LOG_F] = found, self.mean[idx, LOG_F] + jump
+        self.mean[idx, LOG_OD] = found
         self.cov[idx, LOG_OD, :], self.cov[idx, :, LOG_OD] = 0.0, 0.0
         self.cov[idx, LOG_OD, LOG_OD] = np.square(self.config.od_sd / np.exp(found))
-        self.cov[idx, LOG_F, LOG_F] += np.square(jump)
 
     def _pigment_anew(self, idx: NDArray[np.intp], light: Array) -> None:
         """Light that jumped and stays is believed to be the pigment's."""

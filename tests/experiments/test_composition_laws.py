@@ -120,7 +120,7 @@ def test_rows_without_a_new_estimate_keep_their_target():
     assert after[1] == before[1]
 
 
-@pytest.mark.parametrize(("now", "following"), [(0.3, 0.7), (0.7, 0.3), (0.4, 0.5)])
+@pytest.mark.parametrize(("now", "following"), [(0.3, 0.7), (0.7, 0.3), (0.2, 0.5), (0.8, 0.6)])
 def test_the_midpoint_law_is_half_way_at_the_change(now, following):
     program = Program((now, following), (480.0, 480.0))
     shares = on_the_model("midpoint", program, start=now)
