@@ -168,7 +168,7 @@ def draw(config: DualChamberConfig, trials: dict[tuple[str, str], Trial], plant:
         axes[2 * columns + at].set_xlabel("minutes")
     axes[0].set(ylabel="share of the slow strain", ylim=(0.0, 1.0))
     axes[columns].set(ylabel="density X, OD", ylim=(0.4 * config.od, 1.6 * config.od))
-    axes[2 * columns].set_ylabel("asked of the reservoir so far, mL")
+    axes[2 * columns].set_ylabel("reservoir, mL so far")
     axes[0].legend()
     charts.save(figure, folder / "figures", plant)
 

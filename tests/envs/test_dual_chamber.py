@@ -69,7 +69,7 @@ def test_volume_and_biomass_are_accounted_for() -> None:
     rig = rigs(EXACT, 3, start(config, 0.5, 0.4), config)
     rng, waste = np.random.default_rng(1), np.zeros((3, 3))
     for _ in range(60):
-        before, dose = rig.state, rng.uniform(0.0, 1.2, (3, 3)) * [1.0, 1.0, 0.4]
+        before, dose = rig.state, rng.uniform(0.0, 1.2, (3, 3)) * [1.0, 0.5, 1.0]
         given = np.minimum(dose[:, 1], before[:, 3] - 1.0)
         rig.step(dose)
         waste[:, :2] += rig.state[:, :2] * (dose[:, :1] + given[:, None])
@@ -121,6 +121,7 @@ def test_small_doses_are_put_together_until_they_flow() -> None:
         given.append(dose)
     np.testing.assert_allclose(np.array(given)[:, 0], [0, 0, 0.24, 0, 0, 0.24], atol=1e-12)
     np.testing.assert_allclose(np.array(given)[:, 1], 0.4)  # what a pump cannot give is not owed
+    assert rest[1] == 0.0
     np.testing.assert_array_equal(carried(np.array([-1.0, 0.1]), np.array([0.1, 0.1]), 0.2, 1.0)[0], [0.0, 0.2])
 
 
@@ -161,6 +162,15 @@ def test_the_cost_and_when_a_window_has_settled() -> None:
     od = np.array([[0.6, 0.5, 0.5], [0.5, 0.6, 0.5], [0.5, 0.5, 0.5], [0.52, 0.5, 0.6]])
     np.testing.assert_array_equal(settled(od, np.full((4, 3), 0.46), 0.5, 0.5), [2.0, 3.0, np.nan])
     np.testing.assert_array_equal(settled(od[:, :1], np.full((4, 1), 0.44), 0.5, 0.5), [np.nan])
+
+
+def test_a_dense_reservoir_raises_the_share_and_leaves_the_density_alone() -> None:
+    config = RigConfig(reservoir_od=1.0)
+    state = start(config, 0.5, np.array([0.5]))
+    dose = FeedForward(config, 0.5, 0.3, 0.3).act(state, 0.7, 0)
+    total, share = mixture(advance(config, state, dose))
+    assert share[0] > 0.53
+    assert total[0] == pytest.approx(0.5, rel=0.01)
 
 
 def test_short_programs_agree_with_all_sequences_of_doses() -> None:
