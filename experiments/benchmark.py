@@ -15,6 +15,7 @@ from experiments.certification import certificate
 from experiments.cli import files, frame
 from experiments.comparison.config import TWIN, BenchmarkConfig
 from experiments.comparison.trials import Followed, Loops, Trial, cells
+from experiments.composition import registry as laws
 from experiments.control.plant_file import read_plant_file
 from experiments.control.policies import find_policy, load_policy
 from experiments.controllers import registry
@@ -103,12 +104,32 @@ def with_seeds(config: BenchmarkConfig) -> BenchmarkConfig:
     return config
 
 
+def composition(config: BenchmarkConfig, folder: Path) -> None:
+    """Run every closed loop of the composition, compare, draw, report."""
+    from experiments.comparison import composition_page as pages
+    from experiments.comparison import composition_statistics as statistics
+    from experiments.comparison import composition_trials as trials
+    from experiments.reporting import page
+
+    wanted = trials.composition_cells(config)
+    policies = trials.policies_of(config, sorted({cell.law for cell in wanted}), folder)
+    done = trials.run_cells(config, wanted, policies)
+    summary = statistics.summarise(done, config.replicates, config.seed)
+    shown = pages.draw(done, summary["rows"], folder)
+    files.write_json(folder / "summary.json", summary | {"figures": shown})
+    report = page.save(pages.of_composition(folder), folder)
+    log.info("%d closed loops of %d replicates; report %s", len(done), config.replicates, report)
+
+
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     """Calibrate, train, run every closed loop, compare, draw, report."""
     from experiments.comparison import page as pages
     from experiments.comparison import studies
     from experiments.reporting import charts, page
 
+    if any(study.compositions for study in config.studies.values()):
+        composition(config, folder)
+        return
     config = with_seeds(with_twin(config))
     wanted = cells(config)
     if not (wanted or config.training or config.calibration):
@@ -146,8 +167,11 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
 
 
 def _schema(cfg: DictConfig) -> BenchmarkConfig:
-    """A controller's config is that of its kind."""
-    return BenchmarkConfig(controllers={str(name): registry.config(str(c.kind)) for name, c in cfg.controllers.items()})
+    """A controller's config is that of its kind, and so is a composition's."""
+    return BenchmarkConfig(
+        controllers={str(name): registry.config(str(c.kind)) for name, c in cfg.controllers.items()},
+        compositions={str(name): laws.config(str(c.kind)) for name, c in cfg.compositions.items()},
+    )
 
 
 main = frame.Command("benchmark", BenchmarkConfig(), benchmark, _schema)

@@ -58,7 +58,7 @@ def test_every_agent_composes(option):
     agent = load_train(f"agent={option}").agent
     own = {
         "relative": ((64, 64), 0.0, 5e-4, 15_000),
-        "coculture": ((128, 128), 0.9, 1e-3, 15_000),
+        "coculture": ((128, 128), 0.9, 1e-3, 8_000),
         "coculture_preview": ((128, 128), 0.97, 1e-3, 20_000),
     }
     papers = ((64, 64), 0.99, 1e-3, 10_000)

@@ -8,6 +8,7 @@ from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
+from experiments.composition.registry import LEARNED
 
 __all__ = ["TWIN", "BenchmarkConfig", "StudyConfig"]
 
@@ -21,6 +22,11 @@ class StudyConfig:
     scenarios: tuple[str, ...] = setting(("setpoint_steps",), "names of scenarios")
     plants: tuple[str, ...] = setting(("nominal_noise",), "names of plants")
     controllers: tuple[str, ...] = setting(("dqn", "pi", "mpc"), "names of controllers")
+    compositions: tuple[str, ...] = setting(
+        (), "names of laws of the composition; then `controllers` hold the density beside each of them"
+    )
+    announced: bool = setting(True, "of a composition: its changes are told ahead, as the scenario has it")
+    calibrated: bool = setting(False, "of a composition: each reactor's light sensor was calibrated")
 
 
 @dataclass(frozen=True)
@@ -55,18 +61,41 @@ class BenchmarkConfig:
     )
     scenarios: dict[str, Scenario] = setting({}, "scenarios by name")
     controllers: dict[str, Any] = setting({}, "controllers by name")
+    compositions: dict[str, Any] = setting({}, "laws of the composition by name")
+    composition_policies: dict[str, str] = setting(
+        {}, "policies of learned laws of the composition by name: `shipped`, a policy.npz or a run folder"
+    )
     studies: dict[str, StudyConfig] = setting({}, "what is compared, by name; the recipes of experiment/ fill it")
 
     def __post_init__(self) -> None:
         check(self)
         for name, study in self.studies.items():
-            for key in ("scenarios", "plants", "controllers"):
+            for key in ("scenarios", "plants", "controllers", "compositions"):
                 known = [*getattr(self, key)]
                 if key == "plants":
                     known += [TWIN if self.plant_file else f"{TWIN} (with plant_file=FILE)"]
                 for given in getattr(study, key):
                     if given not in known:
                         raise ValueError(f"studies.{name}.{key}: {given} is none of {', '.join(known)}")
+        for name in self.composition_policies:
+            learned = [key for key, c in self.compositions.items() if c.kind in LEARNED]
+            require(name in learned, "composition_policies", name, ", ".join(learned) or "none: no learned law")
+        composed = [name for name, study in self.studies.items() if study.compositions]
+        same = len(composed) in (0, len(self.studies))
+        require(same, "studies", ", ".join(self.studies), "all with compositions, or none: their numbers differ")
+        self._check_composed(composed)
         met = any(TWIN in study.plants for study in self.studies.values())
         wanted = f"null, or a study on it, as studies.NAME.plants=[nominal,{TWIN}]"
         require(met or self.plant_file is None, "plant_file", self.plant_file, wanted)
+
+    def _check_composed(self, names: list[str]) -> None:
+        """A composition needs a share to be asked for, and two species."""
+        for name in names:
+            for scenario in self.studies[name].scenarios:
+                asks = [key for key, s in self.scenarios.items() if s.composed]
+                require(
+                    scenario in asks, f"studies.{name}.scenarios", scenario, f"those with ratios: {', '.join(asks)}"
+                )
+            for plant in self.studies[name].plants:
+                two = [key for key, p in self.plants.items() if p.second.present]
+                require(plant in two, f"studies.{name}.plants", plant, f"those with two species: {', '.join(two)}")

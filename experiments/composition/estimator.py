@@ -49,6 +49,7 @@ class CompositionEstimatorConfig:
     od_term: float = setting(150.0, "light that cells of any kind scatter into the band", "counts/OD", within=(0, 5000))
     factor: float = setting(0.99, "k of the reading k (f + od_term OD) + offset", within=(0.05, 20))
     factor_sd: float = setting(0.13, "its sd", within=(0, 5))
+    factor_walk: float = setting(0.005, "its relative random walk: lamp, optics, biofilm", "1/sqrt(day)", within=(0, 1))
     offset: float = setting(214.0, "of the reading", "counts", within=(0, 20_000))
     offset_sd: float = setting(45.0, "its sd", "counts", within=(0, 5000))
     gate_sigma: float = setting(5.0, "a reading further off than this is an outlier ...", "sigma", within=(2, 20))
@@ -63,7 +64,7 @@ class CompositionEstimator:
     of the two growth curves, factor and offset of the light sensor. With e = S/(1 + exp x) and p = S - e, and over h
     hours in which v of V mL were replaced
 
-      x <- x + h (1 + b_p) m_p - h (1 + b_e) m_e      b_e, b_p random walks
+      x <- x + h (1 + b_p) m_p - h (1 + b_e) m_e      b_e, b_p, k random walks
       ln S <- ln(e exp(h (1 + b_e) m_e) + p exp(h (1 + b_p) m_p)) - v/V
       ln f <- ln(f + h g p) - v/V
       OD = S + noise                                  FL = k (f + 150 S) + o + noise
@@ -99,8 +100,8 @@ class CompositionEstimator:
         self._past = np.zeros((n, DELAY_MIN))
         self._far = np.zeros((n, 2), dtype=np.int64)
 
-    def calibrate(self, factor: Array, factor_sd: float, offset: Array, offset_sd: float) -> None:
-        """Each culture's own sensor, before its first reading: factor (N,), offset in counts (N,), and their sds."""
+    def calibrate(self, factor: Array, factor_sd: Array, offset: Array, offset_sd: float) -> None:
+        """Each culture's own sensor, before its first reading: factor, its sd and offset, (N,) each; in counts."""
         self.mean[:, FACTOR], self.mean[:, OFFSET] = factor, offset
         self.cov[:, FACTOR, FACTOR], self.cov[:, OFFSET, OFFSET] = factor_sd**2, offset_sd**2
 
@@ -186,6 +187,7 @@ class CompositionEstimator:
         step[:, LOG_F, LOG_F], step[:, LOG_F, BIAS_P] = 1.0 - new, 0.5 * new * grown[:, 1]
         cov = step @ self.cov[idx] @ step.swapaxes(1, 2)
         cov[:, DILUTED, DILUTED] += ((c.dose_cv * dose) ** 2)[:, None, None]
+        cov[:, FACTOR, FACTOR] += (c.factor * c.factor_walk) ** 2 * minutes / 1440.0
         for k, sd in enumerate((2.0**0.5 * c.growth_sd, c.growth_sd, c.pigment_sd, c.bias_walk, c.bias_walk)):
             cov[:, k, k] += sd**2 * minutes
         self.cov[idx] = cov
@@ -221,18 +223,26 @@ class CompositionEstimator:
         far = np.square(reading - expected) > self.config.gate_sigma**2 * spread
         self._far[idx, which] = np.where(far, self._far[idx, which] + 1, 0)
         stays = self._far[idx, which] >= self.config.gate_max
-        self._anew(idx[stays], which)
+        (self._density_anew, self._pigment_anew)[which](idx[stays], reading[stays])
         self._far[idx[stays], which] = 0
-        good = ~far | stays
-        self._update(idx[good], which, reading[good], noise)
+        self._update(idx[~far], which, reading[~far], noise)
 
-    def _anew(self, idx: NDArray[np.intp], which: int) -> None:
-        """Nothing is known any more of the density (0) or of the pigment (1); the share stays as it is."""
-        if which == 0:
-            self.cov[idx, DILUTED, DILUTED] += 1.0
-            return
+    def _density_anew(self, idx: NDArray[np.intp], od: Array) -> None:
+        """A density that jumped and stays is believed; the light has said by now what became of the pigment."""
+        found = np.log(np.maximum(od, LOWEST_OD))
+        self.mean[idx, LOG_OD] = found
+        self.cov[idx, LOG_OD, :], self.cov[idx, :, LOG_OD] = 0.0, 0.0
+        self.cov[idx, LOG_OD, LOG_OD] = np.square(self.config.od_sd / np.exp(found))
+
+    def _pigment_anew(self, idx: NDArray[np.intp], light: Array) -> None:
+        """Light that jumped and stays is believed to be the pigment's."""
+        z = self.mean[idx]
+        k, scattered = z[:, FACTOR], self.config.od_term * np.exp(z[:, LOG_OD])
+        f = np.maximum((light - z[:, OFFSET]) / k - scattered, LOWEST_LIGHT)
+        sensor = np.square(f + scattered) * self.cov[idx, FACTOR, FACTOR] + self.cov[idx, OFFSET, OFFSET]
+        self.mean[idx, LOG_F] = np.log(f)
         self.cov[idx, LOG_F, :], self.cov[idx, :, LOG_F] = 0.0, 0.0
-        self.cov[idx, LOG_F, LOG_F] = 1.0
+        self.cov[idx, LOG_F, LOG_F] = (sensor + self.config.fluorescence_sd**2) / np.square(k * f)
 
     def _update(self, idx: NDArray[np.intp], which: int, reading: Array, noise: float) -> None:
         """Iterated update in Joseph's form, which holds for any gain; that of what is considered is zero."""

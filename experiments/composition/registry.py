@@ -25,7 +25,7 @@ from experiments.composition.learned import LearnedLaw, LearnedLawConfig, Previe
 from experiments.composition.planned import Optimum, OptimumConfig, Receding, RecedingConfig
 from experiments.composition.program import Program
 
-__all__ = ["LEARNED", "build", "config"]
+__all__ = ["FORESIGHT", "LEARNED", "build", "config"]
 
 KINDS: dict[str, tuple[type[Any], Callable[..., Law], tuple[str, ...]]] = {
     "dqn": (LearnedLawConfig, LearnedLaw, ("config", "policy")),
@@ -40,6 +40,8 @@ KINDS: dict[str, tuple[type[Any], Callable[..., Law], tuple[str, ...]]] = {
     "optimum": (OptimumConfig, Optimum, ("config", "program")),
 }
 LEARNED = ("dqn", "dqn_preview")
+FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")
+"""Kinds that act on what is announced."""
 MISSING = {
     "policy": "needs a policy; give policy=RUN/policy.npz of a training with env=coculture or env=coculture_preview",
     "program": "plans the whole program; give a scenario with ratios",

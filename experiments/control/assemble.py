@@ -3,6 +3,7 @@
 A rehearsal is assembled here too, with a clock and a transport of its own.
 """
 
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from conf.presets import load
+from conf.schema import build
 from dqn.policy import Policy
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
@@ -38,7 +41,11 @@ from hardware.reactor import Reactor
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedReactors
 
-__all__ = ["Setup", "close_loop", "opened", "run_preflight", "unpack"]
+__all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack"]
+
+log = logging.getLogger(__name__)
+
+COMPOSITION, VIALS, USUAL_VIALS = "dqn_preview", "coculture", "nominal_noise"  # presets
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +67,34 @@ class Setup:
     bounds: EstimateBounds | None
     resumed: bool
     keeper: Keeper | None = None
+
+
+def completed(config: DeployConfig) -> DeployConfig:
+    """Of a scenario that asks for a share, what was left as it is for one species: who controls it, and the vials.
+
+    Raises: UserError for a schedule that is not allowed.
+    """
+    try:
+        composed = any(s.composed for s in config.schedules())
+    except ValueError as error:
+        raise frame.UserError(str(error)) from None
+    if not composed:
+        return config
+    backend, chosen = config.backend, []
+    if config.composition is None:
+        law = build(compositions.config(COMPOSITION), load(f"composition/{COMPOSITION}"), "composition")
+        config = replace(config, composition=law)
+        chosen.append(f"composition={COMPOSITION}")
+    if backend.kind == "emulator" and backend.plant == type(backend)().plant:
+        config = replace(config, backend=replace(backend, plant=VIALS))
+        chosen.append(f"backend.plant={VIALS}")
+    usual = build(PlantConfig(), load(f"plant/{USUAL_VIALS}"), "plant")
+    if backend.kind == "sim" and config.plant == usual and not (config.plant_file or config.env_file):
+        config = replace(config, plant=build(PlantConfig(), load(f"plant/{VIALS}"), "plant"))
+        chosen.append(f"plant={VIALS}")
+    if chosen:
+        log.info("the scenario asks for a share: %s", " ".join(chosen))
+    return config
 
 
 def unpack(config: DeployConfig, folder: Path) -> Setup:
@@ -101,11 +136,6 @@ def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: l
     """What controls the composition, None if nothing does. Raises: UserError where scenario, backend and it differ."""
     asked = [name for name, s in zip(config.backend.reactors, scenarios, strict=True) if s.composed]
     if config.composition is None:
-        if asked:
-            remedy = "add composition=dqn_preview or another of composition, or choose a scenario without ratios"
-            raise frame.UserError(
-                f"the scenario of {', '.join(asked)} asks for a share that nothing controls; {remedy}"
-            )
         return None
     kind = config.composition.kind
     if not asked:

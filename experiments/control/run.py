@@ -99,6 +99,9 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
 
 def deploy(config: DeployConfig, folder: Path) -> None:
     """One closed loop over the scenario."""
+    if (whole := assemble.completed(config)) != config:
+        config = whole
+        frame.save_config(config, folder)
     setup = assemble.unpack(config, folder)
     try:
         if config.preflight_only:

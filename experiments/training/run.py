@@ -16,6 +16,7 @@ from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
 from experiments.controllers.estimator import EstimatorConfig
 from experiments.reporting import charts
+from experiments.training import tasks
 from experiments.training.config import TrainConfig, read_env_file
 from experiments.training.evaluation import Score
 from experiments.training.session import Session
@@ -34,6 +35,7 @@ def train(config: TrainConfig, folder: Path) -> float:
         raise frame.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
     if isinstance(config.env, EnvConfig):
         _warn_of_growth(config.env)
+    _check_inputs(config)
     torch.set_num_threads(1)  # of one operation: matrices of this size do not gain from more
     try:
         session = Session(config, folder, resume=config.resume is not None)
@@ -45,6 +47,18 @@ def train(config: TrainConfig, folder: Path) -> float:
     finally:
         session.writer.close()
     return float(np.median(session.best.regret))
+
+
+def _check_inputs(config: TrainConfig) -> None:
+    """Refuse an agent whose input map is made for observations of another width. Raises: UserError."""
+    agent, names = config.agent, tasks.of(config.env).observation
+    width = np.size(agent.input_matrix) // len(agent.input_offset) if agent.input_offset else len(names)
+    if width != len(names):
+        raise frame.UserError(
+            f"agent.input_matrix has rows of {width} numbers, this task observes {len(names)} ({', '.join(names)}): "
+            "choose the agent of the task, e.g. agent=coculture for env=coculture, agent=coculture_preview for "
+            "env=coculture_preview, agent=relative for env=relative, or agent=paper"
+        )
 
 
 def _warn_of_growth(env: EnvConfig) -> None:
@@ -74,11 +88,13 @@ def _finish(session: Session) -> None:
         "regret_pct": kept.regret_pct,
         "steady_abs_error": kept.steady_abs_error,
         "steady_abs_error_by_setpoint": kept.steady_by_setpoint,
+        "mean_abs_error": kept.mean_abs_error,
         "regret_pct_last": last.regret_pct,
         "steady_abs_error_last": last.steady_abs_error,
         "kept_step": best.step,
         "optimum_cost": report.optimum_cost,
         "optimum_steady_abs_error": report.optimum_steady,
+        "optimum_mean_abs_error": report.optimum_abs_error,
         "myopic_regret_pct": float(myopic.regret_pct[0]),
         "myopic_steady_abs_error": float(myopic.steady_abs_error[0]),
         "policy": str(path),
@@ -136,7 +152,9 @@ def _figures(session: Session, policy_path: Path) -> None:
     """Learning curves, policy map and example trajectories, as files and in TensorBoard."""
     best = session.best
     history = np.array([[step, *regret] for step, regret, _ in best.history])
-    curves = (np.array(session.returns), history[:, 0], history[:, 1:], best.step.astype(float))
+    returns = np.array(session.returns)
+    ended = ~np.isnan(returns).all(axis=1)  # no episode ends in what is left over of the last interval
+    curves = (returns[ended], history[:, 0], history[:, 1:], best.step.astype(float))
     drawn = {"learning": charts.learning(*curves), **session.task.figures(policy.load(policy_path))}
     for name, figure in drawn.items():
         path = charts.save(figure, session.folder / "figures", name)

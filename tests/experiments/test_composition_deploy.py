@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from experiments import report
 from experiments.cli import frame
@@ -132,23 +133,30 @@ def test_the_error_of_a_share_by_hand() -> None:
     assert np.isnan(late[1])
 
 
+def test_a_scenario_alone_is_completed(tmp_path: Path) -> None:
+    """`scenario=ratio_steps` and nothing else: the shipped policy with preview, two species in the vial."""
+    words = ["scenario=ratio_steps", "scenario.minutes=[10,20,20,20]", "fsync=false"]
+    folder = deploy(tmp_path / "run", *words)
+    summary = json.loads((folder / "summary.json").read_text())
+    assert {row["ratio_setpoint"] for row in summary["windows"]} == {None, 0.3, 0.7}
+    stored = yaml.safe_load((folder / "config.yaml").read_text())
+    assert stored["composition"]["kind"] == "dqn_preview"
+    assert stored["plant"]["second"]["start_share"] == [0.5, 0.5]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (
-            ("plant=coculture", "scenario=ratio_steps"),
-            "the scenario of M0 asks for a share that nothing controls; add comp",
-        ),
         (
             ("plant=coculture", "composition=pi"),
             "composition=pi: no scenario asks for a share; give scenario=ratio_steps",
         ),
         (
-            ("scenario=ratio_steps", "composition=pi"),
+            ("scenario=ratio_steps", "composition=pi", "plant=bench"),
             "composition=pi: the vials hold one species .* give plant=coculture",
         ),
         (
-            ("scenario=ratio_steps", "composition=pi", "backend=emulator"),
+            ("scenario=ratio_steps", "composition=pi", "backend=emulator", "backend.plant=bench"),
             "composition=pi: the vials hold one species .* give backend.plant=coculture",
         ),
         (

@@ -24,6 +24,7 @@ from dqn.config import DQNConfig
 from envs.optimum import solve_episode
 from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
+from experiments.train import main as entry_point
 from experiments.training import build
 from experiments.training import run as train_run
 from experiments.training.config import TrainConfig
@@ -133,7 +134,7 @@ def test_a_policy_with_an_offset_at_one_setpoint_gives_way_to_one_without():
     offset[0, 3] = 0.012
     best = Best.empty(torch.zeros(1, 2))
     for step, steady in ((100, offset), (200, even), (300, offset)):
-        score = Score(np.ones(1), np.full(1, 0.1), steady)
+        score = Score(np.ones(1), np.full(1, 0.1), steady, np.zeros(1))
         best.update(step, score, merit(score, Density(EnvConfig())), torch.full((1, 2), float(step)))
     assert (best.step.tolist(), best.steady.tolist(), best.weights.tolist()) == ([200], [0.0025], [[200.0, 200.0]])
 
@@ -297,7 +298,7 @@ def test_a_culture_that_outgrows_the_pump_is_said_before_it_is_trained_on(mu, ta
     [
         (["env.mu=abc"], "env.mu = abc: allowed a number"),
         (["resume=nowhere"], "resume=nowhere: no run folder"),
-        (["+env=simm"], "env=simm: no such option; allowed: relative, sim"),
+        (["+env=simm"], "env=simm: no such option; allowed: coculture, coculture_preview, relative, sim"),
     ],
 )
 def test_bad_input_ends_in_one_line(arguments, message, tmp_path):
@@ -347,3 +348,23 @@ def test_help_and_config_printing(flags):
     assert done.returncode == 0
     assert "mu: 0.03" in done.stdout or "env.mu = 0.03" in done.stdout
     assert "Traceback" not in done.stderr
+
+
+def test_an_agent_of_another_task_is_refused_before_it_trains(tmp_path):
+    config = entry_point.config(["env=coculture_preview", "agent=tuned"])
+    with pytest.raises(UserError, match=r"rows of 2 numbers, this task observes 6.*agent=coculture_preview"):
+        train_run.train(config, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["coculture", "coculture_preview"])
+def test_a_composition_is_trained_scored_and_exported(tmp_path, name):
+    """A few hundred steps: what is written, and that the file says what the summary says."""
+    words = ["agent.total_steps=240", "agent.learn_start=100", "agent.updates_per_step=1", "eval_every=120"]
+    train_run.train(entry_point.config([f"env={name}", f"agent={name}", *words]), tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    learned = policy.load(tmp_path / "policy.npz")
+    assert learned.observation == (policy.COCULTURE if name == "coculture" else policy.COCULTURE_PREVIEW)
+    assert learned.actions.tolist() == np.linspace(29.0, 36.0, 17).tolist()
+    assert learned.metadata["regret_pct"] == pytest.approx(summary["regret_pct"][0])
+    assert (summary["myopic_regret_pct"] > 300.0) == (name == "coculture_preview")
+    assert (tmp_path / "figures" / "trajectories.png").exists()

@@ -1,0 +1,74 @@
+"""Factor and offset of a light sensor from two known cultures (docs/coculture.md, Calibration of the sensor)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from conf.schema import require
+from envs.coculture.rates import T_MAX, T_MIN, p_putida_rate
+from envs.plant.fluorescence import steady_production
+from experiments.composition.base import Array
+from experiments.composition.estimator import CompositionEstimatorConfig
+
+__all__ = ["SensorCalibration", "calibrate_sensor"]
+
+OD_TERM = CompositionEstimatorConfig().od_term
+
+
+@dataclass(frozen=True)
+class SensorCalibration:
+    """k and o of a reading FL = k (f + 150 OD) + o with their sds: the keys of `composition.estimator`; o in counts."""
+
+    factor: float
+    factor_sd: float
+    offset: float
+    offset_sd: float
+
+
+def calibrate_sensor(
+    blank: Array,
+    light: Array,
+    od: Array,
+    temperature: float,
+    share: float = 1.0,
+    growth: float | None = None,
+    share_sd: float = 0.0,
+    growth_cv: float = 0.05,
+) -> SensorCalibration:
+    """Calibrate on medium alone, and on a culture held at one temperature and density until its pigment is in balance.
+
+      o = mean(blank),   k = mean((FL - o) / OD) / L,   L = share g(T) / D + 150
+
+    where D is the dilution rate that holds the density, which is the growth rate, and g the production of pigment.
+    The sds follow from the scatter of the readings and from `share_sd` and `growth_cv` to first order.
+
+    Args:
+      blank: readings of sterile medium, counts, (B,), two or more.
+      light, od: readings of the culture, counts and OD, (K,) each, two or more.
+      temperature: that of the culture, degC, since three hours or more.
+      share: of P. putida, 1 for a pure culture, with its sd. growth: 1/h, as dosed; None: the curve's at that
+        temperature; growth_cv: its relative sd.
+    Raises: ValueError naming what is wrong, its value and what is allowed.
+    """
+    dark, bright, dense = (np.asarray(a, dtype=np.float64) for a in (blank, light, od))
+    for name, given in (("blank", dark), ("light", bright), ("od", dense)):
+        require(given.ndim == 1 and given.size > 1, f"{name} readings", given.size, "two or more")
+        require(
+            bool(np.isfinite(given).all()), f"{name} readings", "nan or inf", "finite numbers; leave broken ones out"
+        )
+    require(bright.size == dense.size, "light readings", bright.size, f"as many as of OD, {dense.size}")
+    require(bool((dense > 0.0).all()), "smallest od", float(dense.min()), "greater than 0")
+    require(T_MIN <= temperature <= T_MAX, "temperature", temperature, f"{T_MIN:g} to {T_MAX:g} degC")
+    require(0.0 < share <= 1.0, "share", share, "0 < share <= 1; without P. putida nothing fluoresces")
+    rate = float(p_putida_rate(temperature)) if growth is None else growth
+    require(rate > 0.0, "growth", rate, "greater than 0 1/h")
+    pigment = share * float(steady_production(temperature)) / rate  # per OD
+    glow = pigment + OD_TERM
+    offset, offset_sd = float(dark.mean()), float(dark.std(ddof=1)) / dark.size**0.5
+    each = (bright - offset) / dense
+    factor = float(each.mean()) / glow
+    require(factor > 0.0, "mean light over the blank", float(bright.mean() - offset), "greater than 0 counts")
+    scatter = float(each.std(ddof=1)) / each.size**0.5
+    by_offset = offset_sd * float((1.0 / dense).mean())
+    by_pigment = factor * pigment * float(np.hypot(share_sd / share, growth_cv))
+    return SensorCalibration(factor, float(np.linalg.norm([scatter, by_offset, by_pigment])) / glow, offset, offset_sd)

@@ -1,0 +1,159 @@
+"""Comparison of the composition: numbers by hand, paired noise, the command, and wrong words."""
+
+import json
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from experiments.benchmark import _schema, benchmark
+from experiments.cli import frame
+from experiments.comparison import composition_statistics as statistics
+from experiments.comparison.composition_trials import (
+    CompositionCell,
+    CompositionTrial,
+    composition_cells,
+    policies_of,
+    run_cell,
+)
+from experiments.comparison.config import BenchmarkConfig
+
+SHORT = (
+    "replicates=3", "workers=1", "studies.composition.scenarios=[ratio_steps]",
+    "scenarios.ratio_steps.minutes=[30,60,60,60]",
+)  # fmt: skip
+
+
+def load(*overrides: str) -> BenchmarkConfig:
+    cfg = frame.compose("benchmark", overrides)
+    return frame.load(cfg, _schema(cfg))
+
+
+@cache
+def config() -> BenchmarkConfig:
+    return load(*SHORT)
+
+
+def cell(law, plant="coculture", announced=True, calibrated=True):
+    return CompositionCell(law, "inverse", plant, "ratio_steps", announced, calibrated)
+
+
+@cache
+def trial(law, plant="coculture", announced=True, calibrated=True):
+    return run_cell(config(), cell(law, plant, announced, calibrated), None)
+
+
+def made_up(share, law="proportional", setpoint=(math.nan, 0.5, 0.5, 0.4)):
+    """One sample a minute, one phase a minute but the second, which has two."""
+    share = np.array(share)
+    return CompositionTrial(
+        cell(law), False, np.array([0.0, 1.0, 3.0, 4.0]), np.arange(4.0), np.array(setpoint), share, share + 0.1,
+        share - 0.05, share + 0.05, share, np.full(share.shape, 0.5),
+    )  # fmt: skip
+
+
+def test_errors_by_hand():
+    t = made_up([[0.9, 0.6, 0.5, 0.5], [0.9, 0.5, 0.5, 0.4]])
+    np.testing.assert_allclose(statistics.abs_error(t), [0.2 / 3.0, 0.0], atol=1e-12)
+    row = statistics.row(t)
+    assert row["ratio_abs_error_mean"] == pytest.approx(0.1 / 3.0)
+    assert row["n"] == 2
+    assert row["estimate_rms"] == pytest.approx(0.1)
+    assert row["band_covers"] == 1.0
+    assert (row["od_min"], row["od_mean"], row["od_max"]) == (0.5, 0.5, 0.5)
+    assert math.isnan(row["ratio_abs_error_last_day"])
+
+
+def test_the_last_two_hours_are_those_of_every_window():
+    minute = np.arange(601.0)
+    setpoint = np.where(minute < 300, 0.3, 0.7)
+    share = np.where((minute >= 180) & (minute < 300), setpoint + 0.01, setpoint + 0.2)
+    share = np.where((minute >= 480) & (minute < 600), setpoint + 0.03, share)[None]
+    edges = np.array([0.0, 300.0, 600.0])
+    t = replace(made_up([[0.0]]), edges=edges, minute=minute, setpoint=setpoint, share=share)
+    assert statistics.last_hours(t)[0] == pytest.approx(0.02)
+    wave = replace(t, setpoint=0.5 + 0.1 * np.sin(minute))
+    assert math.isnan(statistics.last_hours(wave)[0])
+
+
+def test_a_law_is_paired_with_the_vendors_reactor_by_reactor():
+    vendor = made_up([[0.9, 0.6, 0.6, 0.5], [0.9, 0.5, 0.5, 0.4]], law="pi")
+    other = made_up([[0.9, 0.5, 0.5, 0.4], [0.9, 0.5, 0.5, 0.7]])
+    (pair,) = statistics.pairs([vendor, other])
+    assert pair["lower_in"] == 1
+    assert pair["difference"] == pytest.approx((-0.1 + 0.1) / 2.0, abs=1e-12)
+    assert statistics.pairs([other]) == []
+
+
+def test_every_law_meets_the_same_reactors_and_nothing_happens_before_a_share_is_asked_for():
+    one, other = trial("pi"), trial("proportional")
+    hour = slice(0, 30)
+    for key in ("share", "estimate", "od", "temperature"):
+        np.testing.assert_array_equal(getattr(one, key)[:, hour], getattr(other, key)[:, hour])
+    assert np.abs(one.share[:, -1] - other.share[:, -1]).max() > 1e-6
+    np.testing.assert_array_equal(one.setpoint[30:90], 0.3)
+    assert one.temperature[:, 5] == pytest.approx(33.2, abs=0.05)
+
+
+def test_who_is_told_and_who_is_calibrated_makes_a_difference():
+    assert trial("receding").foresight
+    assert not trial("receding", announced=False).foresight
+    assert not trial("pi").foresight
+    assert np.abs(trial("receding").share - trial("receding", announced=False).share).max() > 1e-3
+    sure, unsure = (trial("pi", "coculture_mixed", calibrated=c) for c in (True, False))
+    assert (sure.high - sure.low)[:, -1].mean() < (unsure.high - unsure.low)[:, -1].mean()
+
+
+def test_the_recipe_asks_for_every_law_on_every_plant():
+    recipe = load("+experiment=coculture")
+    found = composition_cells(recipe)
+    assert len(found) == len(set(found)) == 80 + 4 + 40 + 3
+    assert {c.law for c in found} == set(recipe.compositions)
+
+
+def test_the_command_leaves_numbers_figures_and_a_page(tmp_path):
+    c = load(
+        *SHORT, "studies.composition.plants=[coculture]", "studies.composition.controllers=[inverse]",
+        "studies.composition.compositions=[pi,proportional,dqn_preview]",
+    )  # fmt: skip
+    benchmark(c, tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    keys = {"controller", "preview", "plant", "scenario", "ratio_abs_error_mean", "ci95", "n", "od_min", "od_max"}
+    assert [r["controller"] for r in summary["rows"]] == ["pi", "proportional", "dqn_preview"]
+    assert [r["preview"] for r in summary["rows"]] == [False, False, True]
+    assert all(keys <= set(r) for r in summary["rows"])
+    assert [p["controller"] for p in summary["paired"]] == ["proportional", "dqn_preview"]
+    page = (tmp_path / "report.html").read_text()
+    assert "Mean |r - setpoint|" in page or "Mean |r − setpoint|" in page
+    assert (tmp_path / "tables" / "ratio_steps_ratio_abs_error_mean.csv").is_file()
+    for figure in summary["figures"]:
+        assert (tmp_path / figure["file"]).is_file()
+
+
+def test_a_learned_law_follows_the_policy_that_ships(tmp_path):
+    found = policies_of(config(), ["dqn", "pi"], tmp_path)
+    assert found["pi"] is None
+    assert found["dqn"] is not None
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["studies.composition.compositions=[pid]"], "studies.composition.compositions: pid is none of"),
+        (
+            ["studies.c.compositions=[pi]", "studies.c.plants=[nominal]", "studies.c.scenarios=[ratio_steps]"],
+            "studies.c.plants = nominal: allowed those with two species",
+        ),
+        (
+            ["studies.c.compositions=[pi]", "studies.c.plants=[coculture]", "studies.c.scenarios=[day]"],
+            "studies.c.scenarios = day: allowed those with ratios",
+        ),
+        (["+experiment=comparison", "studies.c.compositions=[pi]"], "all with compositions, or none"),
+        (["composition_policies.pi=x.npz"], "composition_policies = pi: allowed dqn, dqn_preview"),
+    ],
+)
+def test_wrong_words_end_in_one_line(overrides, says):
+    with pytest.raises(frame.UserError, match=says):
+        load(*overrides)

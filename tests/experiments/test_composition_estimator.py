@@ -1,0 +1,231 @@
+"""The composition's estimator against a dense reference, the plant's truth, and what may not move it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conf import presets
+from conf.schema import build
+from envs.coculture.rates import e_coli_rate, p_putida_rate
+from envs.plant.fluorescence import steady_production
+from envs.plant.plant import Plant, PlantConfig
+from envs.task import EnvConfig
+from experiments.comparison.composition_trials import calibrate, run_composition
+from experiments.composition import registry
+from experiments.composition.estimator import FACTOR, LOGIT, OFFSET, CompositionEstimator, CompositionEstimatorConfig
+from experiments.composition.program import Program
+from experiments.controllers import registry as densities
+
+NAN = float("nan")
+QUIET = CompositionEstimatorConfig(
+    growth_sd=0.0, pigment_sd=0.0, bias_walk=0.0, dose_cv=0.0, factor_sd=0.0, offset_sd=0.0, factor_walk=0.0
+)
+SMALL = replace(QUIET, share_sd=0.02, bias_sd=0.01, pigment_first_sd=0.02)
+WARM = 35.0  # degC, where the two grow by very different rates
+DOSE_ML = 0.3
+
+
+def readings(theta, minutes):
+    """OD and light by minute, in the species' own densities. theta: logit, ln OD, ln pigment over balance, biases."""
+    logit, log_od, more, bias_e, bias_p = theta
+    share = 1.0 / (1.0 + np.exp(-logit))
+    e, p = np.exp(log_od) * (1.0 - share), np.exp(log_od) * share
+    grow_e, grow_p = (
+        (1.0 + bias_e) * float(e_coli_rate(WARM)) / 60.0,
+        (1.0 + bias_p) * float(p_putida_rate(WARM)) / 60.0,
+    )
+    per_minute = float(steady_production(WARM)) / 60.0
+    f = np.exp(more) * float(steady_production(WARM)) * 0.5 * 0.5 / float(p_putida_rate(WARM))
+    seen = [(e + p, QUIET.factor * (f + 150.0 * (e + p)) + QUIET.offset)]
+    for _ in range(minutes):
+        kept = np.exp(-DOSE_ML / 20.0)
+        f = (f + per_minute * p * np.exp(0.5 * grow_p)) * kept
+        e, p = e * np.exp(grow_e) * kept, p * np.exp(grow_p) * kept
+        seen.append((e + p, QUIET.factor * (f + 150.0 * (e + p)) + QUIET.offset))
+    return np.array(seen)
+
+
+def follow(estimator, seen, warm=WARM):
+    for k, (od, light) in enumerate(seen):
+        estimator.watch(*(np.array([v]) for v in (od, light, warm, float(k))), rows=np.array([True]))
+        estimator.dosed(np.array([DOSE_ML]))
+
+
+def test_it_is_the_dense_solution_where_everything_is_nearly_linear():
+    """Unknown are five numbers of the beginning; all readings at once, by normal equations with numerical slopes."""
+    minutes, prior = 240, np.array([0.0, np.log(0.5), 0.0, 0.0, 0.0])
+    truth = prior + np.array([0.02, 0.0, -0.015, 0.008, -0.006])
+    seen = readings(truth, minutes)
+    slope = np.stack(
+        [(readings(prior + h, minutes) - readings(prior - h, minutes)) / 2e-5 for h in 1e-5 * np.eye(5)], axis=-1
+    )
+    noise = np.array([SMALL.od_sd, SMALL.fluorescence_sd])
+    # The first guess of the pigment goes with that of the share and of the OD: ln f = ln p + ln(g / mu) + 'more'.
+    joint = np.eye(5)
+    joint[2, 0], joint[2, 1] = 0.5, 1.0
+    spread = np.diag(
+        np.square([SMALL.share_sd, SMALL.od_sd / 0.5, SMALL.pigment_first_sd, SMALL.bias_sd, SMALL.bias_sd])
+    )
+    first = joint @ spread @ joint.T
+    weighted = slope / noise[:, None]
+    weighted[0, 0] = 0.0  # the first OD is the prior's
+    flat = weighted.reshape(-1, 5)
+    cov = np.linalg.inv(np.linalg.inv(first) + flat.T @ flat)
+    surprise = ((seen - readings(prior, minutes)) / noise).reshape(-1)
+    mean = prior + cov @ (flat.T @ surprise)
+
+    estimator = CompositionEstimator(SMALL)
+    follow(estimator, seen)
+    hours = minutes / 60.0
+    last = np.array([1.0, 0.0, 0.0, -hours * float(e_coli_rate(WARM)), hours * float(p_putida_rate(WARM))])
+    drift = hours * (float(p_putida_rate(WARM)) - float(e_coli_rate(WARM)))
+    sd = np.sqrt(last @ cov @ last)
+    assert estimator.mean[0, LOGIT] == pytest.approx(last @ mean + drift, abs=0.05 * sd)
+    assert np.sqrt(estimator.cov[0, LOGIT, LOGIT]) == pytest.approx(sd, rel=0.02)
+    np.testing.assert_allclose(estimator.mean[0, 3:5], mean[3:], atol=0.05 * np.sqrt(cov[3, 3]))
+    np.testing.assert_allclose(estimator.cov[0, 3:5, 3:5], cov[3:, 3:], rtol=0.08)
+
+
+def closed_loop(plant_name, calibrated, n=32):
+    plant = Plant(build(PlantConfig(), presets.load(f"plant/{plant_name}")), n, np.random.default_rng(0))
+    law = registry.build(registry.config("proportional"))
+    law.reset(n)
+    if calibrated:
+        calibrate(law, plant, seed=0)
+    density = densities.build(densities.config("inverse"), EnvConfig())
+    program = Program((NAN, 0.3, 0.7, 0.3), (60.0, 360.0, 600.0, 600.0))
+    found = run_composition(plant, law, density, program, np.full(4, 0.5), np.full(4, 33.2), 0.0)
+    return found, law
+
+
+@pytest.mark.parametrize(
+    ("plant", "calibrated", "most", "rms"),
+    [
+        ("coculture", True, 0.99, 0.013),
+        ("coculture_uncalibrated", False, 1.0, 0.04),
+        ("coculture_mixed", False, 1.0, 0.05),
+    ],
+)
+def test_its_band_covers_the_truth_as_often_as_it_says(plant, calibrated, most, rms):
+    """Where the sensor is not calibrated its constants are drawn from a range that ends within two sds: more often."""
+    found, _ = closed_loop(plant, calibrated)
+    after = slice(60, None)  # the first guess is the plant's own start here, which is no merit
+    inside = (found["low"] <= found["share"]) & (found["share"] <= found["high"])
+    assert 0.9 <= inside[:, after].mean() <= most
+    assert np.sqrt(np.square(found["estimate"] - found["share"]).mean()) < rms
+
+
+def test_errors_of_both_growth_curves_are_found():
+    _, law = closed_loop("coculture_growth_both", calibrated=True, n=8)
+    told = law.explain()
+    np.testing.assert_allclose(told["bias_e"].mean(), -0.05, atol=0.01)
+    np.testing.assert_allclose(told["bias_p"].mean(), -0.10, atol=0.015)
+
+
+def test_what_is_considered_never_moves_and_always_counts():
+    seen = readings([0.4, np.log(0.5), 0.0, 0.0, 0.0], 300)
+    sure, unsure = CompositionEstimator(QUIET), CompositionEstimator(replace(QUIET, factor_sd=0.13, offset_sd=45.0))
+    for estimator in (sure, unsure):
+        follow(estimator, seen)
+        assert estimator.mean[0, FACTOR] == QUIET.factor
+        assert estimator.mean[0, OFFSET] == QUIET.offset
+    assert unsure.cov[0, FACTOR, FACTOR] == pytest.approx(0.13**2, rel=1e-9)
+    assert unsure.cov[0, OFFSET, OFFSET] == pytest.approx(45.0**2, rel=1e-9)
+    assert unsure.estimate().sd[0] > 1.5 * sure.estimate().sd[0]
+
+
+def test_a_state_that_was_saved_goes_on_to_the_bit():
+    rng, seen = np.random.default_rng(3), readings([0.4, np.log(0.5), 0.0, 0.0, 0.0], 90)
+    seen = seen + rng.normal(size=seen.shape) * [0.005, 30.0]
+    whole, first, second = (CompositionEstimator(CompositionEstimatorConfig()) for _ in range(3))
+    follow(whole, seen)
+    follow(first, seen[:40])
+    second.restore(json.loads(json.dumps(first.state())))
+    for k in range(40, len(seen)):
+        second.watch(*(np.array([v]) for v in (*seen[k], WARM, float(k))), rows=np.array([True]))
+        second.dosed(np.array([DOSE_ML]))
+    np.testing.assert_array_equal(second.mean, whole.mean)
+    np.testing.assert_array_equal(second.cov, whole.cov)
+    assert second.state() == whole.state()
+
+
+def test_a_gap_is_as_many_minutes_without_readings():
+    seen = readings([0.4, np.log(0.5), 0.0, 0.0, 0.0], 60)
+    gap, nothing = (
+        CompositionEstimator(CompositionEstimatorConfig()),
+        CompositionEstimator(CompositionEstimatorConfig()),
+    )
+    yes = np.array([True])
+    for estimator in (gap, nothing):
+        follow(estimator, seen[:30])
+        estimator.dosed(-np.array([DOSE_ML]))  # the last dose was not given after all
+    for k in range(30, 60):
+        nothing.watch(*(np.array([v]) for v in (NAN, NAN, WARM, float(k))), rows=yes)
+    for estimator in (gap, nothing):
+        estimator.watch(*(np.array([v]) for v in (0.5, NAN, WARM, 60.0)), rows=yes)
+    np.testing.assert_allclose(gap.mean, nothing.mean, rtol=1e-9)
+    np.testing.assert_allclose(gap.cov, nothing.cov, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_one_wild_reading_is_as_good_as_none(which):
+    seen = readings([0.4, np.log(0.5), 0.0, 0.0, 0.0], 200)
+    wild, none = (CompositionEstimator(CompositionEstimatorConfig()) for _ in range(2))
+    bad, gone = seen.copy(), seen.copy()
+    bad[100, which], gone[100, which] = 4.0 * seen[100, which], NAN
+    follow(wild, bad)
+    follow(none, gone)
+    np.testing.assert_array_equal(wild.mean, none.mean)
+
+
+@pytest.mark.parametrize("kept", [0.5, 0.85, None])
+def test_a_jump_that_stays_is_followed_but_the_share_learns_nothing_from_it(kept):
+    """A part was replaced and nobody said so, or the light is another one."""
+    seen = readings([0.4, np.log(0.5), 0.0, 0.0, 0.0], 120)
+    jumped, before = seen.copy(), CompositionEstimator(CompositionEstimatorConfig())
+    if kept is not None:
+        jumped[100:, 0] *= kept
+        jumped[100:, 1] = QUIET.offset + kept * (seen[100:, 1] - QUIET.offset)
+    else:
+        jumped[100:, 1] *= 2.5
+    estimator = CompositionEstimator(CompositionEstimatorConfig())
+    follow(estimator, jumped[:107])
+    follow(before, seen[:107])
+    assert estimator.estimate().logit[0] == pytest.approx(before.estimate().logit[0], abs=0.03)
+    told = estimator.explain()
+    assert told["composition_od"][0] == pytest.approx(jumped[106, 0], rel=0.02)
+    light = told["pigment"][0] + 150.0 * told["composition_od"][0]
+    assert QUIET.factor * light + QUIET.offset == pytest.approx(jumped[106, 1], rel=0.1)
+
+
+def test_rows_are_independent_and_those_not_new_stand_still():
+    rng = np.random.default_rng(0)
+    three, one = CompositionEstimator(CompositionEstimatorConfig()), CompositionEstimator(CompositionEstimatorConfig())
+    three.reset(3)
+    for k in range(50):
+        od, light = 0.5 + 0.01 * rng.normal(size=3), 1000.0 + 100.0 * rng.normal(size=3)
+        minute, warm = np.full(3, float(k)), np.array([30.0, 33.0, 36.0])
+        three.watch(od, light, warm, minute, np.array([True, True, k < 20]))
+        one.watch(od[1:2], light[1:2], warm[1:2], minute[1:2], np.array([True]))
+        if k == 19:
+            third = three.mean[2].copy()
+        three.dosed(np.full(3, 0.2))
+        one.dosed(np.full(1, 0.2))
+    np.testing.assert_allclose(three.mean[1], one.mean[0], rtol=1e-12)
+    np.testing.assert_array_equal(three.mean[2], third)
+
+
+def test_nothing_is_believed_before_the_first_density():
+    estimator = CompositionEstimator(CompositionEstimatorConfig(share=0.3, share_sd=0.5))
+    estimator.watch(*(np.array([v]) for v in (NAN, 900.0, 33.0, 0.0)), rows=np.array([True]))
+    assert not estimator.begun.any()
+    estimator.watch(*(np.array([v]) for v in (0.4, NAN, 33.0, 1.0)), rows=np.array([True]))
+    assert estimator.begun.all()
+    told = estimator.explain()
+    assert told["ratio"][0] == pytest.approx(0.3)
+    assert told["composition_od"][0] == pytest.approx(0.4)
+    spread = 1.96 * 0.5
+    assert told["ratio_high"][0] == pytest.approx(1.0 / (1.0 + np.exp(-np.log(0.3 / 0.7) - spread)))
+    assert estimator.estimate().rate[0] == pytest.approx(float(p_putida_rate(33.0)))

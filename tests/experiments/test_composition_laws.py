@@ -1,0 +1,224 @@
+"""Laws of the composition by hand, against the model, and at the door."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
+from envs.coculture.rates import e_coli_rate, p_putida_rate
+from envs.coculture.task import CocultureConfig, advance, at_rest, logit, share
+from experiments.composition import registry
+from experiments.composition.base import Estimate, Wanted
+from experiments.composition.program import Program
+
+NAN = float("nan")
+STEPS = Program((NAN, 0.3, 0.7, 0.3), (60.0, 360.0, 600.0, 600.0))
+BLIND = ("pi", "proportional", "inverse_dynamics", "bang_bang", "myopic", "receding")
+
+
+def law(kind, program=STEPS, policy=None, **values):
+    made = type(registry.config(kind))(**values)
+    return registry.build(made, policy, program).law
+
+
+def seen(x, temperature=33.2, rate=None):
+    x = np.atleast_1d(np.asarray(x, dtype=float))
+    warm = np.broadcast_to(float(temperature), x.shape)
+    return Estimate(x, np.full(x.shape, 0.1), warm, p_putida_rate(warm) if rate is None else np.full(x.shape, rate))
+
+
+def asked(s, following=None, minutes=0.0, n=1):
+    now = np.full(n, float(s))
+    return Wanted(now, now if following is None else np.full(n, float(following)), np.full(n, float(minutes)))
+
+
+def at(minute, n=1):
+    return np.full(n, float(minute)), np.ones(n, dtype=bool)
+
+
+def on_the_model(kind, program, announce_min=360.0, start=0.5, policy=None, **values):
+    """Shares minute by minute where the estimate is the truth."""
+    controller, config = law(kind, program, policy, **values), CocultureConfig()
+    controller.reset(1)
+    state, shares = at_rest(config, logit(np.array([start]))), [start]
+    for minute in range(int(program.total_min)):
+        wanted = program.wanted(np.array([float(minute)]), announce_min)
+        known = Estimate(state[:, 0], np.zeros(1), state[:, 1], state[:, 2])
+        target = controller.act(known, wanted, np.array([float(minute)]), np.isfinite(wanted.setpoint))
+        state = advance(config, state, np.where(np.isfinite(wanted.setpoint), target, 33.2), 1.0)
+        shares.append(float(share(state[0, 0])))
+    return np.array(shares)
+
+
+def error(shares, program):
+    wanted = program.setpoint(np.arange(len(shares), dtype=float))
+    return float(np.nanmean(np.abs(shares - wanted)))
+
+
+def test_the_vendors_pi_is_its_formula():
+    pi, integral = law("pi"), 0.0
+    for minute, r in enumerate((0.45, 0.47, 0.52)):
+        integral += 0.01 * (0.5 - r)
+        target = pi.act(seen(logit(r)), asked(0.5), *at(minute))
+        assert target[0] == pytest.approx(33.2 - 15.0 * (0.5 - r) - integral, abs=1e-9)
+
+
+def test_the_vendors_integrator_rests_at_the_limit_it_pushes_against():
+    pi = law("pi")
+    for minute in range(50):
+        assert pi.act(seen(logit(0.1)), asked(0.9), *at(minute))[0] == 29.0
+    assert pi.act(seen(logit(0.9)), asked(0.9), *at(50))[0] == pytest.approx(33.2)
+
+
+def test_proportional_bang_bang_and_inverse_dynamics_by_hand():
+    x, goal = np.log(0.4 / 0.6), np.log(0.45 / 0.55)
+    assert law("proportional").act(seen(x), asked(0.45), *at(0))[0] == pytest.approx(
+        max(33.2 - 20.0 * (goal - x), 29.0)
+    )
+    assert law("bang_bang").act(seen(x), asked(0.45), *at(0))[0] == 29.0
+    assert law("bang_bang").act(seen(x), asked(0.35), *at(0))[0] == 36.0
+    cold = law("inverse_dynamics").act(seen(x, rate=0.8), asked(0.41), *at(0))[0]
+    wanted = (np.log(0.41 / 0.59) - x) / 0.5  # per hour, with half an hour to reach it
+    assert 0.8 - float(e_coli_rate(cold)) == pytest.approx(wanted)
+
+
+def test_targets_stay_within_the_range_of_the_fits():
+    for kind in BLIND:
+        for r in (0.01, 0.99):
+            assert 29.0 <= law(kind).act(seen(logit(r)), asked(0.5), *at(0))[0] <= 36.0
+
+
+def test_myopic_is_the_best_of_seventeen_and_a_horizon_of_one_decision_is_myopic():
+    config = CocultureConfig(control_min=30.0)
+    x = np.linspace(-1.0, 1.0, 9)
+    state = np.stack([x, np.full(9, 33.2), p_putida_rate(np.full(9, 33.2))], axis=1)
+    reached = [share(advance(config, state, t, 30.0)[:, 0]) for t in np.linspace(29.0, 36.0, 17)]
+    best = np.linspace(29.0, 36.0, 17)[np.abs(np.array(reached) - 0.5).argmin(axis=0)]
+    for kind, values in (("myopic", {}), ("receding", {"horizon_min": 30.0})):
+        found = law(kind, control_min=30.0, **values)
+        found.reset(9)
+        np.testing.assert_array_equal(found.act(seen(x), asked(0.5, n=9), *at(0, 9)), best)
+
+
+def test_a_law_keeps_its_target_until_its_period_is_over_and_decides_at_its_multiples():
+    found = law("myopic")
+    first = found.act(seen(-1.0), asked(0.5), *at(3))[0]
+    for minute in (4, 9):
+        assert found.act(seen(1.0), asked(0.5), *at(minute))[0] == first
+    assert found.act(seen(1.0), asked(0.5), *at(10))[0] != first
+
+
+def test_rows_without_a_new_estimate_keep_their_target():
+    found = law("pi")
+    found.reset(2)
+    both, first = np.array([True, True]), np.array([True, False])
+    before = found.act(seen([-0.1, -0.1]), asked(0.5, n=2), np.zeros(2), both)
+    after = found.act(seen([0.1, 0.1]), asked(0.5, n=2), np.ones(2), first)
+    assert after[0] != before[0]
+    assert after[1] == before[1]
+
+
+@pytest.mark.parametrize(("now", "following"), [(0.3, 0.7), (0.7, 0.3), (0.2, 0.5), (0.8, 0.6)])
+def test_the_midpoint_law_is_half_way_at_the_change(now, following):
+    program = Program((now, following), (480.0, 480.0))
+    shares = on_the_model("midpoint", program, start=now)
+    half = 0.5 * (logit(now) + logit(following))
+    one_decision = 10.0 / 60.0 * 0.64  # logit, the fastest there is
+    assert abs(logit(shares[480]) - half) <= one_decision
+    assert np.abs(shares[:120] - now).max() < 0.01  # it does not begin before it must
+    assert abs(shares[-1] - following) < 0.01
+
+
+def test_the_midpoint_law_is_proportional_where_nothing_is_announced():
+    shares = on_the_model("midpoint", STEPS, announce_min=0.0)
+    other = on_the_model("proportional", STEPS, control_min=10.0)
+    np.testing.assert_allclose(shares, other)
+
+
+def test_nothing_beats_the_optimum_over_the_program_and_foresight_pays():
+    """With the tolerance of its grid."""
+    best = error(on_the_model("optimum", STEPS), STEPS)
+    found = {kind: error(on_the_model(kind, STEPS), STEPS) for kind in (*BLIND, "midpoint")}
+    assert best <= 1.03 * min(found.values())
+    assert found["receding"] <= 1.1 * best
+    assert found["midpoint"] <= 1.2 * best
+    blind = error(on_the_model("receding", STEPS, announce_min=0.0), STEPS)
+    assert blind > 1.5 * best
+
+
+def test_a_sine_is_followed_better_when_it_is_told_ahead():
+    sine = Program((), (2400.0,), (0.5, 0.4, 1200.0))
+    for kind in ("midpoint", "receding"):
+        told, blind = (error(on_the_model(kind, sine, announce_min=m), sine) for m in (360.0, 0.0))
+        assert told < 0.75 * blind
+
+
+def test_every_law_goes_on_to_the_bit_from_what_it_saved():
+    for kind in ("pi", "midpoint", "myopic", "optimum"):
+        whole, second = law(kind), law(kind)
+        moves = [(m, 0.2 * np.sin(m / 7.0)) for m in range(60, 160)]
+        for m, x in moves[:50]:
+            whole.act(seen(x), STEPS.wanted(np.array([float(m)]), 360.0), *at(m))
+        second.restore(json.loads(json.dumps(whole.state())))
+        for m, x in moves[50:]:
+            told = STEPS.wanted(np.array([float(m)]), 360.0)
+            assert whole.act(seen(x), told, *at(m))[0] == second.act(seen(x), told, *at(m))[0], kind
+
+
+def linear_policy(names, column, control_min=10.0):
+    """Prefers the second of two temperatures, 30 and 35 degC, where one number of the observation is above 0."""
+    weight = np.zeros((len(names), 2), dtype=np.float32)
+    weight[names.index(column), 1] = 1.0
+    preview = 360.0 if len(names) == 6 else 0.0
+    model = asdict(CocultureConfig(control_min=control_min, preview_min=preview))
+    return Policy(
+        weights=(weight,),
+        biases=(np.zeros(2, dtype=np.float32),),
+        input_matrix=np.eye(len(names), dtype=np.float32),
+        input_offset=np.zeros(len(names), dtype=np.float32),
+        actions=np.array([30.0, 35.0]),
+        low=np.full(len(names), -1e6, dtype=np.float32),
+        high=np.full(len(names), 1e6, dtype=np.float32),
+        metadata={"observation": list(names), "control_min": control_min, "model": model},
+    )
+
+
+@pytest.mark.parametrize(
+    ("column", "x", "wanted", "expected"),
+    [
+        ("logit_share", 0.1, asked(0.4), 35.0),
+        ("logit_share", -0.1, asked(0.6), 30.0),
+        ("logit_setpoint", -0.1, asked(0.6), 35.0),
+        ("logit_next", 0.1, asked(0.4, 0.6, 100.0), 35.0),
+        ("logit_next", 0.1, asked(0.4, 0.6, 700.0), 30.0),  # further ahead than it was trained for
+        ("minutes_to_change", 0.1, asked(0.4, 0.6, 700.0), 30.0),
+        ("minutes_to_change", 0.1, asked(0.4, 0.6, 300.0), 35.0),
+    ],
+)
+def test_a_policy_sees_what_it_was_trained_on(column, x, wanted, expected):
+    found = law("dqn_preview", policy=linear_policy(COCULTURE_PREVIEW, column))
+    assert found.act(seen(x), wanted, *at(0))[0] == expected
+    if column in COCULTURE:
+        assert law("dqn", policy=linear_policy(COCULTURE, column)).act(seen(x), wanted, *at(0))[0] == expected
+
+
+def test_a_policy_decides_as_often_as_in_training():
+    found = law("dqn", policy=linear_policy(COCULTURE, "logit_share", control_min=30.0))
+    assert found.act(seen(1.0), asked(0.5), *at(0))[0] == 35.0
+    assert found.act(seen(-1.0), asked(0.5), *at(29))[0] == 35.0
+    assert found.act(seen(-1.0), asked(0.5), *at(30))[0] == 30.0
+
+
+def test_what_cannot_be_built_is_said_in_one_line():
+    with pytest.raises(ValueError, match=r"^composition.kind = pid: allowed dqn, dqn_preview, pi"):
+        registry.config("pid")
+    with pytest.raises(ValueError, match=r"^composition = dqn: needs a policy"):
+        registry.build(registry.config("dqn"))
+    with pytest.raises(ValueError, match=r"^composition = optimum: plans the whole program"):
+        registry.build(registry.config("optimum"))
+    with pytest.raises(ValueError, match=r"^policy = .*logit_next.*env=coculture trains"):
+        law("dqn", policy=linear_policy(COCULTURE_PREVIEW, "rate"))
+    with pytest.raises(ValueError, match=r"^composition.gain = 0.0 degC"):
+        law("proportional", gain=0.0)

@@ -1,0 +1,62 @@
+"""What is asked for and what is known of it ahead, by hand."""
+
+import numpy as np
+import pytest
+
+from experiments.composition.program import Program
+
+NAN = float("nan")
+STEPS = Program((NAN, 0.3, 0.7, 0.7, 0.3, NAN, 0.5), (60.0, 360.0, 300.0, 300.0, 60.0, 60.0, 60.0))
+
+
+def told(program, minute, preview_min):
+    found = program.wanted(np.array([float(minute)]), preview_min)
+    return tuple(float(v[0]) for v in (found.setpoint, found.following, found.minutes))
+
+
+@pytest.mark.parametrize(
+    ("minute", "preview", "expected"),
+    [
+        (60, 0.0, (0.3, 0.3, 0.0)),
+        (60, 360.0, (0.3, 0.7, 360.0)),
+        (60, 350.0, (0.3, 0.3, 0.0)),
+        (419, 360.0, (0.3, 0.7, 1.0)),
+        (420, 360.0, (0.7, 0.7, 0.0)),  # .7 goes on for 600 min
+        (700, 360.0, (0.7, 0.3, 320.0)),
+        (1050, 360.0, (0.3, 0.3, 0.0)),  # nothing is asked for after it
+        (1150, 360.0, (0.5, 0.5, 0.0)),
+        (5000, 360.0, (0.5, 0.5, 0.0)),  # the last one after the end
+    ],
+)
+def test_a_change_is_announced_as_early_as_it_says(minute, preview, expected):
+    assert told(STEPS, minute, preview) == expected
+
+
+@pytest.mark.parametrize("minute", [-1.0, NAN, 0.0, 59.0, 1080.0])
+def test_where_nothing_is_asked_for_nothing_is(minute):
+    assert np.isnan(STEPS.setpoint(np.array([minute]))[0])
+    assert np.isnan(told(STEPS, minute, 360.0)[0])
+    assert told(STEPS, minute, 360.0)[2] == 0.0
+
+
+def test_a_sine_falls_first_and_is_announced_as_a_step():
+    sine = Program((), (2400.0,), (0.5, 0.4, 1200.0))
+    assert told(sine, 0, 0.0) == pytest.approx((0.5, 0.5, 0.0))
+    assert told(sine, 300, 0.0)[0] == pytest.approx(0.1)
+    assert told(sine, 900, 360.0) == pytest.approx((0.9, 0.5, 120.0))
+    assert told(sine, 900, 100.0) == pytest.approx((0.9, 0.5 + 0.4 * np.cos(np.pi / 6.0), 40.0))
+    assert told(sine, 2200, 360.0)[2] == 0.0  # what comes after the end is nobody's business
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        (((0.3, 0.7), (60.0,)), "scenario.ratios"),
+        (((1.2,), (60.0,)), "each 0 < share < 1"),
+        (((), (60.0,), (0.5, 0.5, 600.0)), "0 < mean"),
+        (((), (60.0,)), "scenario.ratios"),
+    ],
+)
+def test_a_program_that_cannot_be_is_refused(values, says):
+    with pytest.raises(ValueError, match=says):
+        Program(*values)
