@@ -161,11 +161,8 @@ class Composition:
             program.wanted(elapsed[i : i + 1], schedule.announce_min)
             for i, (program, schedule) in enumerate(zip(self._programs, self.schedules, strict=True))
         ]
-        begun = np.isfinite(elapsed)
-        setpoint, following, minutes = (
-            np.concatenate([getattr(w, key) for w in each]) for key in ("setpoint", "following", "minutes")
-        )
-        return Wanted(np.where(begun, setpoint, np.nan), np.where(begun, following, np.nan), minutes)
+        keys = ("setpoint", "following", "minutes")
+        return Wanted(*(np.concatenate([getattr(wanted, key) for wanted in each]) for key in keys))
 
     def _warned(
         self, found: dict[str, Array], goal: Array, inside: Mask, minute: Array, believed: Mask

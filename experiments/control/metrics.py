@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LATE_MIN", "SETTLING_BAND", "STEADY_MIN", "WindowMetrics", "share_errors", "window_metrics"]
+__all__ = ["LATE_MIN", "SETTLING_BAND", "STEADY_MIN", "WindowMetrics", "mean_errors", "window_metrics"]
 
 Array = NDArray[np.float64]
 
 SETTLING_BAND = 0.05  # relative: settled from the first moment after which |e| <= 5 % of the setpoint for good
-LATE_MIN = 120.0  # min at the end of a window over which the late error of a share is averaged
+LATE_MIN = 120.0  # min at the end of a window over which a late error is averaged
 STEADY_MIN = 10.0  # min at the end of a window over which the steady error is averaged
 
 
@@ -93,12 +93,12 @@ def window_metrics(minute: Array, od: Array, setpoint: float, start: float, end:
     )
 
 
-def share_errors(minute: Array, share: Array, setpoint: Array, start: float, end: float) -> tuple[Array, Array]:
-    """Mean |r - setpoint| over the samples with start <= minute < end, and over the last two hours of them, each (N,).
+def mean_errors(minute: Array, value: Array, setpoint: Array, start: float, end: float) -> tuple[Array, Array]:
+    """Mean |value - setpoint| over the samples with start <= minute < end, and over the last two hours of them.
 
-    nan where there is none. Args: minute, share, setpoint: (N, K), nan where there is none.
+    Each (N,), nan where there is none. Args: minute, value, setpoint: (N, K), nan where there is none.
     """
-    error = np.abs(share - setpoint)
+    error = np.abs(value - setpoint)
     inside = np.isfinite(error) & (minute >= start - 1e-6) & (minute < end - 1e-6)
     late = inside & (minute >= end - LATE_MIN - 1e-6)
     whole, last = (

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from envs.scenario import Scenario
 from experiments.control.composition import TRUE
 from experiments.control.loop import ClosedLoop, Step
-from experiments.control.metrics import share_errors, window_metrics
+from experiments.control.metrics import mean_errors, window_metrics
 from experiments.control.record import Record
 from experiments.control.recovery import Rows
 from experiments.reporting import charts
@@ -94,6 +94,10 @@ def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def _cell(value: float) -> str:
+    return f"{value:8.3f}" if np.isfinite(value) else f"{'–':>8}"
+
+
 def reasons_line(rows: Rows) -> str:
     """What the interlock said in a run, most frequent first; "" if it had nothing to say."""
     often = sorted(rows.told.items(), key=lambda item: -item[1].rows)
@@ -137,13 +141,13 @@ def _windows(record: Record, scenarios: Sequence[Scenario]) -> list[dict[str, An
             window["temperature"] = scenario.temperatures[phase]
             window |= {key: float(getattr(m, key)[0]) for key in FORMATS}
             if "ratio" in record.columns:
-                window |= _shares(record, n, start, end) | {"od_abs_error_mean": float(m.abs_error[0])}
+                window |= _shares(record, n, start, end)
             rows.append(window)
     return rows
 
 
 def _shares(record: Record, n: int, start: float, end: float) -> dict[str, Any]:
-    """How well reactor n's share followed what was asked for, by the estimate and, where it is known, in truth.
+    """How well reactor n's share, by the estimate and, where it is known, in truth, and its OD followed.
 
     The setpoint is None where none or more than one was asked for.
     """
@@ -153,9 +157,10 @@ def _shares(record: Record, n: int, start: float, end: float) -> dict[str, Any]:
     told: dict[str, Any] = {"ratio_setpoint": float(found[0]) if found.size == 1 else None}
     for key in ("ratio", TRUE):
         if key in record.columns:
-            whole, late = share_errors(minute, record.series(key)[n : n + 1], asked, start, end)
+            whole, late = mean_errors(minute, record.series(key)[n : n + 1], asked, start, end)
             told |= {f"{key}_abs_error_mean": float(whole[0]), f"{key}_abs_error_last2h": float(late[0])}
-    return told
+    density, _ = mean_errors(minute, record.series("od")[n : n + 1], record.series("setpoint")[n : n + 1], start, end)
+    return told | {"od_abs_error_mean": float(density[0])}
 
 
 def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:
@@ -167,7 +172,7 @@ def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:
     lines = [f"{'reactor':8} {'hours':>11} " + " ".join(f"{head:>8}" for head in known)]
     for w in kept:
         hours = f"{w['start_min'] / 60:.1f}-{w['end_min'] / 60:.1f}"
-        cells = [f"{'varies':>8}" if w[key] is None else f"{w[key]:8.3f}" for key in known.values()]
+        cells = [f"{'varies':>8}" if w[key] is None else _cell(w[key]) for key in known.values()]
         lines.append(f"{w['reactor']:8} {hours:>11} " + " ".join(cells))
     return "\n".join(lines) if kept else ""
 

@@ -140,6 +140,17 @@ def test_a_share_that_comes_no_nearer_at_full_authority_is_stuck_until_it_moves(
     assert warned(composition, 470.0) == []
 
 
+def test_a_share_that_is_too_large_comes_nearer_by_falling() -> None:
+    keeper = Scripted(ratio=0.9, target=36.0)
+    composition = Composition(keeper, [HOLD])
+    assert not warned(composition, 0.0)
+    keeper.ratio = 0.93
+    assert not warned(composition, 100.0)
+    assert warned(composition, 180.0) == ["share_stuck"]
+    keeper.ratio = 0.87
+    assert warned(composition, 190.0) == []
+
+
 @pytest.mark.parametrize(("ratio", "target"), [(0.61, 29.0), (0.5, 29.2), (0.5, 35.9)])
 def test_a_share_that_is_near_or_a_target_inside_the_limits_is_not_stuck(ratio: float, target: float) -> None:
     composition = Composition(Scripted(ratio=ratio, target=target), [HOLD])
