@@ -78,8 +78,8 @@ class CompositionEstimator:
     An extended Kalman filter, iterated about the newest estimate (Bell, Cathey 1993), in Joseph's form. k and o are
     considered and not estimated (Schmidt 1966): how unsure they are counts in every gain, but no reading changes them,
     because in a week at one temperature nothing tells a sensor that drifts from a culture that does.
-    A reading further off than `gate_sigma` is left out. Where it stays, the density, or the pigment, is set anew, and
-    the share learns nothing from it. Doses must be told.
+    A reading further off than `gate_sigma` is left out, and with an OD the light beside it. Where it stays, the density
+    with the pigment, or the pigment alone, is set anew, and the share learns nothing from it. Doses must be told.
 
     State: mean (N, 8), cov (N, 8, 8). Args: config: first guesses and noise.
     """
@@ -132,7 +132,7 @@ class CompositionEstimator:
             self._elapse(going, minute[going] - self._minute[going], temperature[going])
             self._take(going, 0, od[going])
         seen = np.concatenate([first, going])
-        self._take(seen, 1, fluorescence[seen])
+        self._take(seen, 1, np.where(self._far[seen, 0] > 0, np.nan, fluorescence[seen]))
         self._minute[seen] = minute[seen]
         self._given_ml[seen] = 0.0
 
@@ -232,9 +232,11 @@ class CompositionEstimator:
         self._update(idx[~far], which, reading[~far], noise)
 
     def _density_anew(self, idx: NDArray[np.intp], od: Array) -> None:
-        """A density that jumped and stays is believed; the light has said by now what became of the pigment."""
+        """A density that jumped and stays is believed; maybe the pigment went with it, as by a dose nobody told."""
         found = np.log(np.maximum(od, LOWEST_OD))
-        self.mean[idx, LOG_OD] = found
+        jump = found - self.mean[idx, LOG_OD]
+        self.mean[idx, LOG_OD], self.mean[idx, LOG_F] = found, self.mean[idx, LOG_F] + jump
+        self.cov[idx, LOG_F, LOG_F] += np.square(jump)
         self.cov[idx, LOG_OD, :], self.cov[idx, :, LOG_OD] = 0.0, 0.0
         self.cov[idx, LOG_OD, LOG_OD] = np.square(self.config.od_sd / np.exp(found))
 

