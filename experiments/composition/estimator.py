@@ -14,7 +14,8 @@ from experiments.controllers.base import put_back, saved
 
 __all__ = ["CompositionEstimator", "CompositionEstimatorConfig"]
 
-LOGIT, LOG_OD, LOG_F, BIAS_E, BIAS_P, FACTOR, OFFSET = range(7)
+LOGIT, LOG_OD, LOG_F, BIAS_E, BIAS_P, GAIN, FACTOR, OFFSET = range(8)
+STATES = 8
 CONSIDERED = (FACTOR, OFFSET)
 DILUTED = slice(LOG_OD, BIAS_E)
 LOWEST_OD = 0.005  # below it a first reading says nothing
@@ -42,6 +43,7 @@ class CompositionEstimatorConfig:
     growth_sd: float = setting(3e-4, "spread of either species' growth within a minute", "1/sqrt(min)", within=(0, 0.1))
     pigment_sd: float = setting(1e-3, "spread of ln pigment within a minute", "1/sqrt(min)", within=(0, 0.1))
     pigment_first_sd: float = setting(0.5, "sd of the first guess of ln (pigment over its balance)", within=(0.01, 5))
+    gain_sd: float = setting(0.1, "sd of the pump's true flow over the calibrated one", within=(0, 1))
     dose_cv: float = setting(0.15, "spread of a dose", within=(0, 1))
     volume_ml: float = setting(20.0, "of the culture", "mL", within=(5, 100))
     od_sd: float = setting(0.005, "of an OD reading", "OD", within=(1e-4, 0.1))
@@ -60,26 +62,26 @@ class CompositionEstimatorConfig:
 
 
 class CompositionEstimator:
-    """State z = [x, ln S, ln f, b_e, b_p, k, o]: logit of the share of P. putida, OD of both species, pigment, errors
-    of the two growth curves, factor and offset of the light sensor. With e = S/(1 + exp x) and p = S - e, and over h
-    hours in which v of V mL were replaced
+    """State z = [x, ln S, ln f, b_e, b_p, g, k, o]: logit of the share of P. putida, OD of both species, pigment,
+    errors of the two growth curves, true over calibrated flow of the pump, factor and offset of the light sensor. With
+    e = S/(1 + exp x) and p = S - e, and over h hours in which v of V mL were replaced
 
       x <- x + h (1 + b_p) m_p - h (1 + b_e) m_e      b_e, b_p, k random walks
-      ln S <- ln(e exp(h (1 + b_e) m_e) + p exp(h (1 + b_p) m_p)) - v/V
-      ln f <- ln(f + h g p) - v/V
+      ln S <- ln(e exp(h (1 + b_e) m_e) + p exp(h (1 + b_p) m_p)) - g v/V
+      ln f <- ln(f + h q p) - g v/V
       OD = S + noise                                  FL = k (f + 150 S) + o + noise
 
-    with m_e, m_p the curves' rates, 1/h, lagging the measured temperature by 2 and 60 min, and g the production of
+    with m_e, m_p the curves' rates, 1/h, lagging the measured temperature by 2 and 60 min, and q the production of
     pigment, whose delayed answer to temperature is known (docs/plant.md, Two species). In these coordinates the OD says
     nothing of the share at once, however unsure that is; in ln e and ln p a linearised filter soon believes too much.
 
     An extended Kalman filter, iterated about the newest estimate (Bell, Cathey 1993), in Joseph's form. k and o are
     considered and not estimated (Schmidt 1966): how unsure they are counts in every gain, but no reading changes them,
     because in a week at one temperature nothing tells a sensor that drifts from a culture that does.
-    A reading further off than `gate_sigma` is left out. Where it stays, the density, or the pigment, is set anew, and
-    the share learns nothing from it. Doses must be told.
+    A reading further off than `gate_sigma` is left out, and with an OD the light beside it. Where it stays, the density
+    with the pigment, or the pigment alone, is set anew, and the share learns nothing from it. Doses must be told.
 
-    State: mean (N, 7), cov (N, 7, 7). Args: config: first guesses and noise.
+    State: mean (N, 8), cov (N, 8, 8). Args: config: first guesses and noise.
     """
 
     def __init__(self, config: CompositionEstimatorConfig) -> None:
@@ -89,10 +91,11 @@ class CompositionEstimator:
     def reset(self, n: int) -> None:
         """Forget everything; N cultures that have not been seen yet."""
         c = self.config
-        self.mean = np.zeros((n, 7))
+        self.mean = np.zeros((n, STATES))
+        self.mean[:, GAIN] = 1.0
         self.mean[:, FACTOR], self.mean[:, OFFSET] = c.factor, c.offset
         self.cov = np.tile(
-            np.diag([0.0, 0.0, 0.0, c.bias_sd**2, c.bias_sd**2, c.factor_sd**2, c.offset_sd**2]), (n, 1, 1)
+            np.diag(np.square([0.0, 0.0, 0.0, c.bias_sd, c.bias_sd, c.gain_sd, c.factor_sd, c.offset_sd])), (n, 1, 1)
         )
         self._minute, self._given_ml = np.full(n, np.nan), np.zeros(n)
         self._temperature = np.full(n, EQUAL_RATES_C)
@@ -129,7 +132,7 @@ class CompositionEstimator:
             self._elapse(going, minute[going] - self._minute[going], temperature[going])
             self._take(going, 0, od[going])
         seen = np.concatenate([first, going])
-        self._take(seen, 1, fluorescence[seen])
+        self._take(seen, 1, np.where(self._far[seen, 0] > 0, np.nan, fluorescence[seen]))
         self._minute[seen] = minute[seen]
         self._given_ml[seen] = 0.0
 
@@ -168,7 +171,7 @@ class CompositionEstimator:
         steady = np.stack([e_coli_rate(mean), p_putida_rate(mean)], axis=1)
         self._lagged[idx] = before + (steady - before) * -np.expm1(-minutes[:, None] / lag)
         grown = 0.5 * hours[:, None] * (before + self._lagged[idx])  # of each curve itself, (N, 2)
-        growth = grown * (1.0 + z[:, BIAS_E:FACTOR])
+        growth = grown * (1.0 + z[:, BIAS_E:GAIN])
         share = 1.0 / (1.0 + np.exp(-z[:, LOGIT]))
         parts = np.stack([1.0 - share, share], axis=1) * np.exp(growth)
         total = parts.sum(axis=1)
@@ -176,15 +179,16 @@ class CompositionEstimator:
         made = hours * self._production[idx] * share * np.exp(z[:, LOG_OD] + 0.5 * growth[:, 1] - z[:, LOG_F])
         new = made / (1.0 + made)  # share of the pigment that is of this step
         z[:, LOGIT] += growth[:, 1] - growth[:, 0]
-        z[:, LOG_OD] += np.log(total) - dose
-        z[:, LOG_F] += np.log1p(made) - dose
+        z[:, LOG_OD] += np.log(total) - z[:, GAIN] * dose
+        z[:, LOG_F] += np.log1p(made) - z[:, GAIN] * dose
         self.mean[idx] = z
-        step = np.tile(np.eye(7), (idx.size, 1, 1))
+        step = np.tile(np.eye(STATES), (idx.size, 1, 1))
         step[:, LOGIT, BIAS_E], step[:, LOGIT, BIAS_P] = -grown[:, 0], grown[:, 1]
         step[:, LOG_OD, LOGIT] = later[:, 1] - share
-        step[:, LOG_OD, BIAS_E:FACTOR] = later * grown
+        step[:, LOG_OD, BIAS_E:GAIN] = later * grown
         step[:, LOG_F, LOGIT], step[:, LOG_F, LOG_OD] = new * (1.0 - share), new
         step[:, LOG_F, LOG_F], step[:, LOG_F, BIAS_P] = 1.0 - new, 0.5 * new * grown[:, 1]
+        step[:, LOG_OD, GAIN] = step[:, LOG_F, GAIN] = -dose
         cov = step @ self.cov[idx] @ step.swapaxes(1, 2)
         cov[:, DILUTED, DILUTED] += ((c.dose_cv * dose) ** 2)[:, None, None]
         cov[:, FACTOR, FACTOR] += (c.factor * c.factor_walk) ** 2 * minutes / 1440.0
@@ -201,7 +205,7 @@ class CompositionEstimator:
         self._production[idx] = np.maximum(wanted, LEAST)
 
     def _seen(self, z: Array, which: int) -> tuple[Array, Array]:
-        """Expected reading of states (N, 7) and its slope, (N,) and (N, 7). Args: which: 0 OD, 1 fluorescence."""
+        """Expected reading of states (N, 8) and its slope, (N,) and (N, 8). Args: which: 0 OD, 1 fluorescence."""
         od, f, k = np.exp(z[:, LOG_OD]), np.exp(z[:, LOG_F]), z[:, FACTOR]
         slope = np.zeros_like(z)
         if which == 0:
@@ -228,9 +232,11 @@ class CompositionEstimator:
         self._update(idx[~far], which, reading[~far], noise)
 
     def _density_anew(self, idx: NDArray[np.intp], od: Array) -> None:
-        """A density that jumped and stays is believed; the light has said by now what became of the pigment."""
+        """A density that jumped and stays is believed; maybe the pigment went with it, as by a dose nobody told."""
         found = np.log(np.maximum(od, LOWEST_OD))
-        self.mean[idx, LOG_OD] = found
+        jump = found - self.mean[idx, LOG_OD]
+        self.mean[idx, LOG_OD], self.mean[idx, LOG_F] = found, self.mean[idx, LOG_F] + jump
+        self.cov[idx, LOG_F, LOG_F] += np.square(jump)
         self.cov[idx, LOG_OD, :], self.cov[idx, :, LOG_OD] = 0.0, 0.0
         self.cov[idx, LOG_OD, LOG_OD] = np.square(self.config.od_sd / np.exp(found))
 
@@ -255,7 +261,7 @@ class CompositionEstimator:
             gain[:, CONSIDERED] = 0.0
             surprise = reading - expected - np.einsum("ni,ni->n", slope, prior - z)
             z = prior + gain * surprise[:, None]
-        kept = np.eye(7) - gain[:, :, None] * slope[:, None, :]
+        kept = np.eye(STATES) - gain[:, :, None] * slope[:, None, :]
         self.mean[idx] = z
         self.cov[idx] = kept @ cov @ kept.swapaxes(1, 2) + noise * gain[:, :, None] * gain[:, None, :]
 
@@ -275,6 +281,7 @@ class CompositionEstimator:
             "ratio_high": high,
             "bias_e": self.mean[:, BIAS_E].copy(),
             "bias_p": self.mean[:, BIAS_P].copy(),
+            "dose_gain": self.mean[:, GAIN].copy(),
             "composition_od": np.exp(self.mean[:, LOG_OD]),
             "pigment": np.exp(self.mean[:, LOG_F]),
         }

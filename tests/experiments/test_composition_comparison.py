@@ -79,11 +79,11 @@ def test_the_last_two_hours_are_those_of_every_window():
 
 
 def test_a_law_is_paired_with_the_vendors_reactor_by_reactor():
-    vendor = made_up([[0.9, 0.6, 0.6, 0.5], [0.9, 0.5, 0.5, 0.4]], law="pi")
-    other = made_up([[0.9, 0.5, 0.5, 0.4], [0.9, 0.5, 0.5, 0.7]])
+    vendor = made_up([[0.9, 0.6, 0.6, 0.5], [0.9, 0.5, 0.5, 0.4], [0.9, 0.5, 0.5, 0.7]], law="pi")
+    other = made_up([[0.9, 0.5, 0.5, 0.4], [0.9, 0.5, 0.5, 0.7], [0.9, 0.5, 0.5, 0.4]])
     (pair,) = statistics.pairs([vendor, other])
-    assert pair["lower_in"] == 1
-    assert pair["difference"] == pytest.approx((-0.1 + 0.1) / 2.0, abs=1e-12)
+    assert pair["lower_in"] == 2
+    assert pair["difference"] == pytest.approx((-0.1 + 0.1 - 0.1) / 3.0)
     assert statistics.pairs([other]) == []
 
 

@@ -20,7 +20,14 @@ from experiments.controllers import registry as densities
 
 NAN = float("nan")
 QUIET = CompositionEstimatorConfig(
-    growth_sd=0.0, pigment_sd=0.0, bias_walk=0.0, dose_cv=0.0, factor_sd=0.0, offset_sd=0.0, factor_walk=0.0
+    growth_sd=0.0,
+    pigment_sd=0.0,
+    bias_walk=0.0,
+    dose_cv=0.0,
+    gain_sd=0.0,
+    factor_sd=0.0,
+    offset_sd=0.0,
+    factor_walk=0.0,
 )
 SMALL = replace(QUIET, share_sd=0.02, bias_sd=0.01, pigment_first_sd=0.02)
 WARM = 35.0  # degC, where the two grow by very different rates
@@ -88,8 +95,10 @@ def test_it_is_the_dense_solution_where_everything_is_nearly_linear():
     np.testing.assert_allclose(estimator.cov[0, 3:5, 3:5], cov[3:, 3:], rtol=0.08)
 
 
-def closed_loop(plant_name, calibrated, n=32):
-    plant = Plant(build(PlantConfig(), presets.load(f"plant/{plant_name}")), n, np.random.default_rng(0))
+def closed_loop(plant_name, calibrated, n=32, flow=1.0):
+    config = build(PlantConfig(), presets.load(f"plant/{plant_name}"))
+    config = replace(config, pump=replace(config.pump, gain_ml_s=flow))
+    plant = Plant(config, n, np.random.default_rng(0))
     law = registry.build(registry.config("proportional"))
     law.reset(n)
     if calibrated:
@@ -103,7 +112,7 @@ def closed_loop(plant_name, calibrated, n=32):
 @pytest.mark.parametrize(
     ("plant", "calibrated", "most", "rms"),
     [
-        ("coculture", True, 0.99, 0.013),
+        ("coculture", True, 0.99, 0.015),
         ("coculture_uncalibrated", False, 1.0, 0.04),
         ("coculture_mixed", False, 1.0, 0.05),
     ],
@@ -120,8 +129,16 @@ def test_its_band_covers_the_truth_as_often_as_it_says(plant, calibrated, most, 
 def test_errors_of_both_growth_curves_are_found():
     _, law = closed_loop("coculture_growth_both", calibrated=True, n=8)
     told = law.explain()
-    np.testing.assert_allclose(told["bias_e"].mean(), -0.05, atol=0.01)
-    np.testing.assert_allclose(told["bias_p"].mean(), -0.10, atol=0.015)
+    np.testing.assert_allclose(told["bias_e"].mean(), -0.05, atol=0.02)
+    np.testing.assert_allclose(told["bias_p"].mean(), -0.10, atol=0.02)
+
+
+def test_a_pump_that_gives_a_tenth_less_is_found_and_does_not_mislead():
+    found, law = closed_loop("coculture", calibrated=True, flow=0.9)
+    np.testing.assert_allclose(law.explain()["dose_gain"].mean(), 0.9, atol=0.02)
+    inside = (found["low"] <= found["share"]) & (found["share"] <= found["high"])
+    assert inside[:, 60:].mean() >= 0.9
+    assert np.sqrt(np.square(found["estimate"] - found["share"]).mean()) < 0.016
 
 
 def test_what_is_considered_never_moves_and_always_counts():
@@ -174,7 +191,7 @@ def test_one_wild_reading_is_as_good_as_none(which):
     seen = readings([0.4, np.log(0.5), 0.0, 0.0, 0.0], 200)
     wild, none = (CompositionEstimator(CompositionEstimatorConfig()) for _ in range(2))
     bad, gone = seen.copy(), seen.copy()
-    bad[100, which], gone[100, which] = 4.0 * seen[100, which], NAN
+    bad[100, which], gone[100, which:] = 4.0 * seen[100, which], NAN  # with a density the light beside it is left out
     follow(wild, bad)
     follow(none, gone)
     np.testing.assert_array_equal(wild.mean, none.mean)
@@ -197,7 +214,7 @@ def test_a_jump_that_stays_is_followed_but_the_share_learns_nothing_from_it(kept
     told = estimator.explain()
     assert told["composition_od"][0] == pytest.approx(jumped[106, 0], rel=0.02)
     light = told["pigment"][0] + 150.0 * told["composition_od"][0]
-    assert QUIET.factor * light + QUIET.offset == pytest.approx(jumped[106, 1], rel=0.1)
+    assert QUIET.factor * light + QUIET.offset == pytest.approx(jumped[106, 1], abs=90.0)  # two of its sds
 
 
 def test_rows_are_independent_and_those_not_new_stand_still():
