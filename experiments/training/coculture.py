@@ -43,11 +43,12 @@ class Coculture:
 
     unit = "of the share"
     arrived = 0.02
-    regret_unit, steady_unit = 1.0, 0.01
-    """With 17 temperatures a share is held within 0.005, half of what its estimate is good for."""
+    steady_unit = 0.02
+    """Twice what an estimate is good for: the regret decides, unless a share rests clearly beside its setpoint."""
 
     def __init__(self, config: CocultureConfig) -> None:
         self.config = config
+        self.regret_unit = 5.0 if config.preview_min else 0.5  # where planning pays there is more to lose
         self.steps = config.episode_steps
         self.steady_steps = max(1, config.episode_steps // 6)
         self.observation: tuple[str, ...] = COCULTURE_PREVIEW if config.preview_min else COCULTURE
@@ -76,8 +77,8 @@ class Coculture:
         )
 
     def selection_grid(self) -> Array:
-        """Between the reported setpoints: 8 starts x 8 setpoints, or a change between each two of 8, 6 h ahead."""
-        return self._grid(np.linspace(0.15, 0.85, 8), np.linspace(0.1, 0.9, 8))
+        """Between the reported points: 8 starts .06 to .94 x 8 setpoints, or a change between each two of 8 setpoints."""
+        return self._grid(np.linspace(0.15, 0.85, 8), np.linspace(0.06, 0.94, 8))
 
     def report_grid(self) -> Array:
         """Starts .05 to .95 x setpoints .1 to .9; with preview a change between each two of these setpoints."""

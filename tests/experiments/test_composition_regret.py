@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import CocultureConfig, advance, passed, share
 from experiments.composition import registry
 from experiments.composition.base import Array, Estimate, Law, Wanted
@@ -59,3 +60,27 @@ def test_without_preview_simple_laws_are_close(regret, name: str, expected: floa
 @pytest.mark.parametrize(("name", "expected"), [("midpoint", 13.0), ("proportional", 375.5)])
 def test_with_preview_the_time_to_begin_decides(regret, name: str, expected: float) -> None:
     assert regret(name, PREVIEW) == pytest.approx(expected, rel=0.05)
+
+
+def receding(decisions: int, config: CocultureConfig, start: Array) -> float:
+    """Cost of the plan that ends after so many decisions, made anew before each of them."""
+    model, state = transitions(config, Grid()), start[:, :3]
+    program, goal = np.empty((config.episode_steps + decisions, len(start))), start[:, 3:]
+    for k in range(len(program)):
+        program[k], goal = share(goal[:, 0]), passed(config, goal)
+    total = np.zeros(len(start))
+    for k in range(config.episode_steps):
+        value = cost_to_go(model, program[k : k + decisions])[1]
+        action = best_action(config, model, value, state, program[k])
+        state = advance(config, state, config.targets()[action], config.control_min)
+        total += np.square(share(state[:, 0]) - program[k])
+    return float(total.mean())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("hours", "expected"), [(1, 0.0), (2, 0.0), (3, 0.0), (4, 0.0), (5, 0.0), (6, 0.0)])
+def test_how_far_a_plan_must_reach(hours: int, expected: float) -> None:
+    task = Coculture(PREVIEW)
+    evaluation = Evaluation(task, task.report_grid())
+    regret = 100.0 * (receding(2 * hours, PREVIEW, evaluation.start) / evaluation.optimum_cost - 1.0)
+    assert regret == pytest.approx(expected, rel=0.05)
