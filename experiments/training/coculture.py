@@ -77,7 +77,7 @@ class Coculture:
         )
 
     def selection_grid(self) -> Array:
-        """Between the reported points: 8 starts .06 to .94 x 8 setpoints, or a change between each two of 8 setpoints."""
+        """Between the reported points: 8 starts .06 to .94 x 8 setpoints, or changes between each two of these."""
         return self._grid(np.linspace(0.15, 0.85, 8), np.linspace(0.06, 0.94, 8))
 
     def report_grid(self) -> Array:
