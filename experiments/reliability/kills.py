@@ -291,7 +291,7 @@ class _Comparison:
             f.booked_ml += float(row["feed_ml"])
             at = row["on_s"] + self._zero
             given = ((starts > at - 3.0) & (starts < at + 45.0)).any()
-            killed = any(row["wall"] - 0.1 <= t <= row["wall"] + 1.0 for t in self._killed)
+            killed = any(row["wall"] - 0.1 <= t <= row["wall"] + 2.0 * self.config.answer_s for t in self._killed)
             f.doses_not_given += int(not given)
             if not given and not killed and "no dose" not in str(following.get("note")):
                 f.doses_lost += 1

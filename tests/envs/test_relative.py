@@ -80,7 +80,7 @@ def test_nothing_beats_the_optimum_and_the_one_line_law_is_it() -> None:
             lambda o, by=change: nearest_level(o[..., 0] + by * rng.standard_normal(o.shape[:-1]), o[..., 1])
         )
         assert off.regret_pct[0] > law.regret_pct[0]
-    assert evaluation(lambda e, s: nearest_level(e + 0.03, s)).regret_pct[0] > 0.1
+    assert evaluation(lambda o: nearest_level(o[..., 0] + 0.03, o[..., 1])).regret_pct[0] > 0.1
 
 
 def test_a_finer_grid_finds_the_same_optimum() -> None:

@@ -347,7 +347,7 @@ class AgentLab:
     def send(self, data: bytes) -> None:
         os.write(self.master, data)
 
-    def receive(self, timeout: float = 5.0) -> tuple[int, int, bytes]:
+    def receive(self, timeout: float = 20.0) -> tuple[int, int, bytes]:
         """(ID, status, body) of the next reply frame."""
         data, deadline = b"", time.monotonic() + timeout
         while True:
@@ -528,7 +528,7 @@ def test_silence_switches_all_pumps_of_all_present_reactors_off(short: AgentLab)
     assert hello["trips"] == 1
     assert hello["silent_s"] > 1.0
     assert hello["last_trip"].startswith("20")
-    assert "pumps verified off" in short.log.read_text()
+    short.until(lambda: "pumps verified off" in short.log.read_text())  # said once that is verified
     assert short.emulator.truth()["alive"] is True  # the absent reactors were not touched
 
 
