@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from envs.coculture.rates import T_MAX, p_putida_rate
 from envs.coculture.task import CocultureConfig, advance, share
 
-__all__ = ["Grid", "best_action", "cost_to_go", "transitions"]
+__all__ = ["Grid", "Transitions", "best_action", "cost_to_go", "transitions"]
 
 Array = NDArray[np.float64]
 

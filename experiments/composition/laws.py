@@ -1,5 +1,6 @@
 """Laws that ask nothing of a model, or one look ahead: from estimated and wanted share to a thermostat target."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +37,7 @@ class LawConfig:
         check(self, "composition")
 
 
-class Periodic:
+class Periodic(ABC):
     """A law that decides at whole multiples of its period since the program began, and keeps its target in between.
 
     Args: control_min: the period, min.
@@ -62,9 +63,9 @@ class Periodic:
             self._next[idx] = (np.floor(minute[idx] / self.control_min + 1e-6) + 1.0) * self.control_min
         return self._target.copy()
 
+    @abstractmethod
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         """Targets of the rows `idx`, whose estimates and wishes are given, degC; clipped by the caller."""
-        raise NotImplementedError
 
     def state(self) -> dict[str, Any]:
         """See `Remembers.state`."""
