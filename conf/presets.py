@@ -2,25 +2,84 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import resources
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
-__all__ = ["chosen", "commands", "groups", "load", "options", "owner"]
+__all__ = [
+    "Added", "add", "added", "chosen", "commands", "groups", "load", "opening", "options", "owner",
+    "sentence",
+]  # fmt: skip
 
 ROOT = Path(str(resources.files("conf")))
 
 
+@dataclass(frozen=True)
+class Added:
+    """A preset that is not a file of conf/: what it changes, and what it is, in a sentence."""
+
+    values: dict[str, Any]
+    what: str
+
+
+_added: dict[str, Added] = {}
+
+
+def add(name: str, values: Mapping[str, Any], what: str) -> None:
+    """Make a preset known for this process, in place of one of the same name that was added before.
+
+    Args: name: group and option, "controller/mine"; values, what: as of `Added`.
+    Raises: ValueError for a group that no command takes, or a preset that conf/ has already.
+    """
+    group, _, option = name.rpartition("/")
+    known = _files()
+    if group not in known:
+        raise ValueError(f"{group} = {option}: no such group; allowed {', '.join(known)}")
+    if option in known[group]:
+        raise ValueError(f"{group} = {option}: there is a preset of this name already; choose another")
+    _added[name] = Added(dict(values), what)
+
+
+def added() -> dict[str, Added]:
+    """Every preset that was added, by group and option."""
+    return dict(_added)
+
+
 def groups() -> dict[str, list[str]]:
     """Config groups and their presets: {"env": ["sim"], ...}."""
+    found = _files()
+    for name in _added:
+        group, _, option = name.rpartition("/")
+        found[group].append(option)
+    return found
+
+
+def _files() -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for path in sorted(ROOT.rglob("*.yaml")):
         group = path.parent.relative_to(ROOT).as_posix()
         if group != ".":
             found.setdefault(group, []).append(path.stem)
     return found
+
+
+def opening(name: str) -> list[str]:
+    """The comment at the top of a file of conf/, line by line."""
+    lines = (ROOT / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
+    first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    return [line[1:].removeprefix(" ") for line in lines[:first] if not line.startswith("# @")]
+
+
+def sentence(name: str) -> str:
+    """What a command or preset is, in a sentence: the first of the comment at the top of its file, without its name."""
+    if name in _added:
+        return _added[name].what
+    first = " ".join(takewhile(str.strip, opening(name))).removeprefix(f"{name.rpartition('/')[2]}: ")
+    return re.split(r"(?<=\.)\s(?=[A-Z`])", first)[0]
 
 
 def commands() -> list[str]:
@@ -41,6 +100,8 @@ def owner(name: str) -> str | None:
 
     Args: name: group and option, "experiment/paper".
     """
+    if name in _added:
+        return None
     found = re.search(r"^# @command (\w+)$", (ROOT / f"{name}.yaml").read_text(encoding="utf-8"), re.MULTILINE)
     return found[1] if found else None
 
@@ -60,7 +121,8 @@ def load(name: str) -> dict[str, Any]:
     known = groups().get(group, [])
     if option not in known:
         raise ValueError(f"{group} = {option}: allowed {', '.join(known)}")
-    own = yaml.safe_load((ROOT / f"{name}.yaml").read_text(encoding="utf-8")) or {}
+    text = None if name in _added else (ROOT / f"{name}.yaml").read_text(encoding="utf-8")
+    own = dict(_added[name].values) if text is None else yaml.safe_load(text) or {}
     found: dict[str, Any] = {}
     for entry in own.pop("defaults", []):
         if isinstance(entry, Mapping):  # a group inside this one

@@ -15,7 +15,7 @@ from conf.schema import check, part, require, setting
 from envs.scenario import Scenario
 from experiments.cli import files, frame
 from experiments.cli.stop import Workers
-from experiments.controllers.registry import ON_DEVICE
+from experiments.controllers.registry import on_device
 from experiments.reliability.case import MOMENTS, FaultCase
 from experiments.reliability.faults import FAULTY, by_name
 from experiments.reliability.outcome import Outcome, declared, table, totals, write_cases
@@ -41,7 +41,7 @@ class FaultMatrixConfig:
         lambda: Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8), "of every run"
     )
     safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
-    controller_kind: str = setting("dqn", "what decides the pump rate; dqn is the policy that ships", choices=ON_DEVICE)
+    controller_kind: str = setting("dqn", "a controller that can run a device; dqn is the policy that ships")
     overflow_pump: OverflowPumpConfig = part(lambda: OverflowPumpConfig("Pump3", 0.95, 1.2), "of the rig")
     faults: tuple[str, ...] = setting((), "names, as in docs/faults.md; empty: all")
     moments: tuple[str, ...] = setting(
@@ -53,6 +53,7 @@ class FaultMatrixConfig:
 
     def __post_init__(self) -> None:
         check(self)
+        on_device(self.controller_kind)
         by_name(self.faults)
         sick = f"{FAULTY} first, it is the one that falls sick"
         require(self.reactors[0] == FAULTY, "reactors", self.reactors, sick)

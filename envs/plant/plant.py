@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from conf.schema import check, part, setting
 from envs.integrators import INTEGRATORS
 from envs.plant.culture import Culture, GrowthConfig
+from envs.plant.disturbance import named
 from envs.plant.fluorescence import Fluorescence, FluorescenceConfig
 from envs.plant.noise import Streams, Tape, streams, uniform
 from envs.plant.pump import FeedPump, PumpConfig
@@ -51,11 +52,14 @@ class PlantConfig:
         "min",
         at_least=0.0,
     )
+    disturbances: tuple[str, ...] = setting((), "functions of one's own that act on the vials every minute, by name")
     integrator: str = setting("euler", "scheme of the mass balances", choices=tuple(INTEGRATORS))
     substep_min: float = setting(0.1, "longest integration step (paper)", "min", within=(1e-3, 1))
 
     def __post_init__(self) -> None:
         check(self, "plant")
+        for name in self.disturbances:
+            named(name)
 
 
 class Plant:
@@ -99,6 +103,7 @@ class Plant:
         if self.fluorescence is not None:
             self.draws |= self.fluorescence.draws
         self.draws["start_min"] = uniform(start, config.start_min, config.start_min + config.start_spread_min)
+        self._disturbances = [named(name) for name in config.disturbances]
         self._tape = Tape(process, normals=3, uniforms=2)
         self.reset()
 
@@ -203,6 +208,8 @@ class Plant:
             self.thermal.new_minute(z_ripple)
             if self.fluorescence is not None:
                 self.fluorescence.new_minute(self.thermal.temperature)
+            for disturb in self._disturbances:
+                disturb(self)
             self._minute += 1
 
     def expected_od(self, minutes: float, feed_s: Array) -> Array:

@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from conf import presets
 from conf.schema import build, old_name
-from experiments.cli import files, help_page, stop
+from experiments.cli import extensions, files, help_page, stop
 
 __all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config"]
 
@@ -71,10 +71,20 @@ def _choose(command: str, group: str, option: str) -> None:
 def normalise(argv: Sequence[str], command: str) -> list[str]:
     """Arguments in the one form that Hydra takes for each of them, whatever the YAML files hold.
 
-    A group is chosen by `group=option` or `+group=option`. Every other key is forced in, because a default stands in
-    the dataclass and not in YAML, and an unknown key is named by the schema. `resume=RUN` makes RUN the run folder.
-    Raises: UserError for a group or option that the command does not take, naming those that it does.
+    A group is chosen by `group=option` or `+group=option`, where the option may be a YAML file of one's own. Every
+    other key is forced in, because a default stands in the dataclass and not in YAML, and an unknown key is named by
+    the schema. `resume=RUN` makes RUN the run folder; `extend=FILE.py` has been obeyed when this returns.
+    Raises: UserError for a group or option that the command does not take, naming those that it does, and for a file
+      that cannot be used.
     """
+    resumed = _resumed(argv)
+    try:
+        if resumed:
+            extensions.kept(Path(resumed))
+        argv = [_with_preset_files(arg) for arg in extensions.taken(argv)]
+    except ValueError as error:
+        raise UserError(_one_line(error)) from None
+    extensions.offer()
     known = presets.groups()
     out: list[str] = []
     for arg in argv:
@@ -86,12 +96,19 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
         elif re.split("[@=]", arg.lstrip("+"))[0] not in known and not arg.startswith("hydra."):
             arg = re.sub(r"^\+*(?=\w+[^=]*=)", "++", arg)
         out.append(arg)
-    resumed = _resumed(argv)
     if resumed:
         if not (Path(resumed) / "config.yaml").is_file():
             raise UserError(f"resume={resumed}: no run folder (it holds no config.yaml); give the folder of a run")
         out += [f"hydra.run.dir={resumed}", "hydra.output_subdir=null"]
     return out
+
+
+def _with_preset_files(arg: str) -> str:
+    """`group=FILE.yaml` as `group=FILE`, a preset from here on."""
+    match = re.match(r"^(\+?([\w/]+)=)(.*\.yaml)$", arg)
+    if match is None or match[2] not in presets.groups():
+        return arg
+    return match[1] + ",".join(extensions.preset_file(match[2], option) for option in match[3].split(","))
 
 
 def _resumed(argv: Sequence[str]) -> str | None:
@@ -246,7 +263,7 @@ class Command(Generic[T]):
         if not flags:  # a sweep or another flag is Hydra's to read; a plain run is checked before it has a folder
             self.config(given)
             resumed = _resumed(given)
-            others = [a for a in given if not a.startswith(("resume=", "hydra."))]
+            others = [a for a in given if not a.startswith(("resume=", "hydra.", "extend="))]
             if resumed and others:
                 raise UserError(f"{others[0]}: a resumed run takes every value from {resumed}/config.yaml; drop it")
         GlobalHydra.instance().clear()
@@ -257,11 +274,13 @@ class Command(Generic[T]):
         """One run in its folder."""
         folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
         try:
+            extensions.load_all()  # in a worker of a sweep they are not loaded yet
             if cfg.get("resume"):
                 config = _stored(folder / "config.yaml", str(cfg.resume), self.fitting)
             else:
                 config = load(cfg, self.fitting(cfg))
                 save_config(config, folder)
+                extensions.keep(folder)
             return self.body(config, folder)
         except KeyboardInterrupt:
             print(f"stopped; {self._left(folder)}", file=sys.stderr)

@@ -3,17 +3,15 @@
 Usage is the comment that opens conf/NAME.yaml; all else comes from the fields of the command's config.
 """
 
-import re
 import textwrap
 from collections.abc import Iterator
 from dataclasses import is_dataclass
-from itertools import takewhile
 from typing import Any
 
-from conf.presets import ROOT, chosen, options
+from conf.presets import chosen, opening, options, sentence
 from conf.schema import entries
 
-__all__ = ["sentence", "shown", "text"]
+__all__ = ["shown", "text"]
 
 WIDTH = 118
 LEFT = 44  # columns of `key = value`
@@ -30,19 +28,6 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     return "''" if value == "" else str(value)
-
-
-def _opening(name: str) -> list[str]:
-    """The comment at the top of a file of conf/, line by line."""
-    lines = (ROOT / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
-    first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
-    return [line[1:].removeprefix(" ") for line in lines[:first] if not line.startswith("# @")]
-
-
-def sentence(name: str) -> str:
-    """The first sentence of the comment at the top of a file of conf/, without the file's own name before it."""
-    first = " ".join(takewhile(str.strip, _opening(name))).removeprefix(f"{name.rpartition('/')[2]}: ")
-    return re.split(r"(?<=\.)\s(?=[A-Z`])", first)[0]
 
 
 def _line(left: str, right: str, at: int) -> list[str]:
@@ -94,4 +79,4 @@ def text(name: str, config: Any) -> str:
             choices += _line(f"    {option}", sentence(f"{group}/{option}"), 26)
         choices.append("")
     head = ["Choices (group=option)", ""] if choices else []
-    return "\n".join([*_opening(name), "", *head, *choices, "Values (key=value)", "", *_values(config, "")])
+    return "\n".join([*opening(name), "", *head, *choices, "Values (key=value)", "", *_values(config, "")])

@@ -11,10 +11,10 @@ from typing import Any, cast, get_args, get_type_hints
 
 import yaml  # type: ignore[import-untyped]
 
-from conf.presets import ROOT, chosen, commands, groups, owner
+from conf.presets import ROOT, chosen, commands, groups, owner, sentence
 from conf.schema import Entry, entries
 from experiments.cli.frame import Command
-from experiments.cli.help_page import sentence, shown
+from experiments.cli.help_page import shown
 from experiments.reporting.page import flat
 from experiments.reporting.tables import markdown
 

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import ParamSpec, TypeVar
 
+from experiments.cli import extensions
+
 __all__ = ["SIGNALS", "STATUS", "Workers", "handled", "interrupts", "pausing"]
 
 P = ParamSpec("P")
@@ -63,8 +65,9 @@ def pausing(until: str) -> Iterator[Callable[[], bool]]:
         yield asked.is_set
 
 
-def _end_with_parent() -> None:
-    """In a worker: it ends when its parent does, also when that was killed."""
+def _begin_worker() -> None:
+    """In a worker: what the command loaded; and it ends when its parent does, also when that was killed."""
+    extensions.load_all()
     parent = multiprocessing.parent_process()
 
     def watch() -> None:
@@ -84,7 +87,7 @@ class Workers(ProcessPoolExecutor):
 
     def __init__(self, count: int) -> None:
         context = multiprocessing.get_context("spawn")
-        super().__init__(count or os.cpu_count() or 1, mp_context=context, initializer=_end_with_parent)
+        super().__init__(count or os.cpu_count() or 1, mp_context=context, initializer=_begin_worker)
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """As of an executor. A process started here inherits which signals are held back."""

@@ -4,28 +4,27 @@ A rehearsal is assembled here too, with a clock and a transport of its own.
 """
 
 import logging
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from conf.presets import load
 from conf.schema import build
 from dqn.policy import Policy
-from envs.plant.plant import Plant, PlantConfig
+from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
 from experiments.composition import registry as compositions
+from experiments.control import families
 from experiments.control.composition import Composition, Keeper, program_of
 from experiments.control.config import DeployConfig
 from experiments.control.device import check, linked, load_calibrations
+from experiments.control.families import Opening
 from experiments.control.loop import ClosedLoop
 from experiments.control.plant_file import read_plant_file
 from experiments.control.policies import admit, composition_policy, policy_check, run_policy
@@ -33,10 +32,7 @@ from experiments.control.record import Record
 from experiments.control.recovery import continue_loop
 from experiments.controllers import registry
 from experiments.training.config import read_env_file
-from hardware.chibio.reactors import ChiBioReactors
-from hardware.chibio.resume import replay
 from hardware.emulator.device import plant_preset
-from hardware.errors import RecordingError
 from hardware.reactor import Reactor
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedReactors
@@ -119,7 +115,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
         plant = replace(plant, growth=growth, pump=pump)
     keeper = _keeper(config, plant, folder, scenarios)
-    if keeper is not None and backend.kind != "sim":  # the device has to measure what the estimate needs
+    if keeper is not None and hasattr(backend, "fluorescence"):  # the device has to measure what the estimate needs
         backend = replace(backend, fluorescence=replace(backend.fluorescence, measure=True))
         config = replace(config, backend=backend)
     fastest = min(model.max_pump_rate, config.safety.max_rate)
@@ -185,20 +181,8 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
 @contextmanager
 def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
     """The loop around the configured reactors, which are released afterwards. Raises: ReactorError, UserError."""
-    backend, earlier = setup.config.backend, record.journal.rows
-    if backend.kind == "sim":
-        vials = Plant(setup.plant, len(backend.reactors), np.random.default_rng(backend.seed))
-        yield close_loop(setup, SimulatedReactors(vials, backend), record)
-        return
-    with linked(backend) as (transport, clock):
-        calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
-        if setup.resumed and not earlier:
-            raise RecordingError(f"journal {record.journal.path}: missing or empty; put it back, or start a new run")
-        if not earlier:
-            check(backend, transport, clock, calibrations, record.folder)
-        reactors = ChiBioReactors(transport, clock, backend, calibrations, record.journal.append)
-        elapsed_s = (time.time() - float(earlier[0]["wall"])) * backend.speed if earlier else 0.0
-        reactors.begin(replay(earlier), elapsed_s)
+    opening = Opening(setup.config.backend, setup.plant, record.journal, record.folder, setup.resumed)
+    with families.opened(opening) as reactors:
         try:
             yield close_loop(setup, reactors, record)
         except BaseException:  # before the loop, which ends with the same by itself: an overflow pump runs already

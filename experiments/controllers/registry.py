@@ -1,8 +1,9 @@
 """Every kind of controller: its config, its class, and what the class is built from."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+from conf import presets
 from conf.schema import old_name
 from dqn.policy import Policy
 from envs.plant.plant import Plant
@@ -16,7 +17,7 @@ from experiments.controllers.mpc import Mpc, MpcConfig
 from experiments.controllers.oracle import Oracle, OracleConfig
 from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 
-__all__ = ["ON_DEVICE", "build", "config"]
+__all__ = ["add", "build", "config", "on_device"]
 
 KINDS: dict[str, tuple[type[Any], Callable[..., Controller], tuple[str, ...]]] = {
     "dqn": (LearnedConfig, learned, ("config", "policy", "model", "bounds")),
@@ -28,12 +29,38 @@ KINDS: dict[str, tuple[type[Any], Callable[..., Controller], tuple[str, ...]]] =
     "hold": (HoldConfig, Hold, ("config", "model")),
     "oracle": (OracleConfig, Oracle, ("config", "plant", "model", "flow_ml_s")),
 }
+PARTS = ("model", "policy", "plant", "bounds", "flow_ml_s")
 MISSING = {
     "policy": "needs a policy; give policy=RUN/policy.npz",
     "plant": "knows a simulated plant; allowed with backend=sim only",
 }
-ON_DEVICE = tuple(kind for kind, (_, _, parts) in KINDS.items() if "plant" not in parts)
-"""Kinds that can run a device: they need no simulated plant. dqn, the program's own, is first."""
+
+
+def add(kind: str, config: type[Any], make: Callable[..., Controller], what: str, parts: Sequence[str] = ()) -> None:
+    """Make a controller known as `controller=KIND` to every command.
+
+    Args:
+      kind: its name, the default of the field `kind` of `config`.
+      config: dataclass of its values, whose fields are made by `conf.schema.setting`.
+      make: called with the config and then the `parts`, returns the controller.
+      what: the sentence that the help shows.
+      parts: what else it is built from, arguments of `build`.
+    Raises: ValueError for a kind that exists, or a part that nobody has.
+    """
+    if wrong := set(parts) - {"model", "policy", "plant", "bounds", "flow_ml_s"}:
+        raise ValueError(
+            f"controller {kind}: no part {sorted(wrong)[0]}; allowed model, policy, plant, bounds, flow_ml_s"
+        )
+    presets.add(f"controller/{kind}", {"kind": kind}, what)
+    KINDS[kind] = (config, make, ("config", *parts))
+
+
+def on_device(kind: str) -> str:
+    """The kind itself, if it needs no simulated plant. Raises: ValueError naming the kinds that can run a device."""
+    known = [name for name, (_, _, parts) in KINDS.items() if "plant" not in parts]
+    if kind not in known:
+        raise ValueError(f"controller_kind = {kind}: allowed {', '.join(known)}")
+    return kind
 
 
 def config(kind: str) -> Any:

@@ -16,7 +16,7 @@ from conf.schema import check, part, setting
 from envs.scenario import Scenario
 from experiments.control.loop import Step
 from experiments.controllers.base import Mask
-from experiments.controllers.registry import ON_DEVICE
+from experiments.controllers.registry import on_device
 from experiments.reliability.audit import Served, audit_doses, audit_rows
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from experiments.reliability.tracking import BAND_OD, Tracking
@@ -42,7 +42,7 @@ class SoakConfig:
     days: float = setting(7.0, "length", within=(0.01, 100))
     setpoints: tuple[float, ...] = setting((0.5, 0.4, 0.6), "in turn", "OD", some=True)
     phase_min: float = setting(240.0, "each", "min", within=(10, 1e5))
-    controller_kind: str = setting("dqn", "what decides the pump rate; dqn is the policy that ships", choices=ON_DEVICE)
+    controller_kind: str = setting("dqn", "a controller that can run a device; dqn is the policy that ships")
     safety: SafetyConfig = part(
         lambda: SafetyConfig(bottle_ml=1e6, ml_per_run=1e6), "limits of the interlock; somebody fills the bottles"
     )
@@ -50,6 +50,7 @@ class SoakConfig:
 
     def __post_init__(self) -> None:
         check(self)
+        on_device(self.controller_kind)
 
     def schedule(self) -> Scenario:
         """The setpoints in turn until the days are over."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from conf.presets import groups
 from conf.schema import check, require, setting
-from experiments.controllers.registry import ON_DEVICE
+from experiments.controllers.registry import on_device
 from experiments.reliability.audit import Served, audit_doses, rows_per_sample
 from experiments.reliability.tracking import reachable
 from hardware.emulator.process import EmulatorProcess
@@ -57,13 +57,14 @@ class KillConfig:
         0.5, "real time a client needs to ask for a sample and to date its answer, at most", "s", within=(0.1, 10)
     )
     reactors: tuple[str, ...] = setting(("M0", "M1", "M2"), "of the runs")
-    controller_kind: str = setting("dqn", "what decides the pump rate; dqn is the policy that ships", choices=ON_DEVICE)
+    controller_kind: str = setting("dqn", "a controller that can run a device; dqn is the policy that ships")
     plant: str = setting("healthy", "preset of the emulated cultures and pumps", choices=tuple(groups()["plant"]))
     overrides: tuple[str, ...] = setting((), "further words of the deploy command, e.g. safety.cooldown=10")
     seed: int = setting(0, "of kill moments and emulators", at_least=0)
 
     def __post_init__(self) -> None:
         check(self)
+        on_device(self.controller_kind)
         require(self.runs <= self.kills, "runs", self.runs, "1 to kills")
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from conf import presets
 from dqn.config import DQNConfig
 from dqn.hindsight import Relabel
 from dqn.policy import Policy
@@ -15,11 +16,12 @@ from envs.coculture.task import CocultureConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 from experiments.training.coculture import Coculture
+from experiments.training.config import ENVS
 from experiments.training.density import Density
 from experiments.training.evaluation import Evaluated
 from experiments.training.relative import Relative
 
-__all__ = ["Task", "of"]
+__all__ = ["Task", "add", "of"]
 
 Array = NDArray[np.float64]
 
@@ -74,6 +76,19 @@ TASKS: dict[type[Any], Callable[[Any], Task]] = {
     RelativeConfig: Relative,
     CocultureConfig: Coculture,
 }
+
+
+def add(kind: str, config: type[Any], task: Callable[[Any], Task], what: str) -> None:
+    """Make a task known as `train env=KIND`.
+
+    Args:
+      kind: its name, the default of the field `kind` of `config`.
+      config: dataclass of its values, whose fields are made by `conf.schema.setting`.
+      task: called with the config. what: the sentence that the help shows.
+    Raises: ValueError for a kind that exists.
+    """
+    presets.add(f"env/{kind}", {"kind": kind}, what)
+    ENVS[kind], TASKS[config] = config, task
 
 
 def of(config: Any) -> Task:

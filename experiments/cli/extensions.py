@@ -1,0 +1,124 @@
+"""What a user adds without touching the program: Python files by `extend=FILE.py`, presets by `group=FILE.yaml`.
+
+A Python file registers what it brings (docs/extending.md) when it is loaded. The variable `TURBIDOSTAT_EXTEND` tells
+every process that a command starts, and every job that a cluster starts for it, which files those are. The run folder
+keeps a copy, which `resume=RUN` loads.
+"""
+
+import importlib.util
+import os
+import re
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from conf import presets
+from experiments.cli import files
+
+__all__ = ["VARIABLE", "keep", "kept", "load_all", "offer", "preset_file", "taken"]
+
+VARIABLE, FOLDER = "TURBIDOSTAT_EXTEND", "extensions"
+_loaded: dict[Path, str] = {}  # file -> name of its module
+
+
+def taken(argv: Sequence[str]) -> list[str]:
+    """Arguments without `extend=FILE.py[,FILE.py]`; those files are loaded here and in every process started later.
+
+    Raises: ValueError naming a file and what is wrong with it.
+    """
+    given = [arg.removeprefix("extend=").split(",") for arg in argv if arg.startswith("extend=")]
+    paths = [str(Path(name).expanduser().resolve()) for names in given for name in names if name]
+    _remember(paths)
+    load_all()
+    return [arg for arg in argv if not arg.startswith("extend=")]
+
+
+def _remember(paths: Sequence[str]) -> None:
+    known = [p for p in os.environ.get(VARIABLE, "").split(os.pathsep) if p]
+    os.environ[VARIABLE] = os.pathsep.join(dict.fromkeys([*known, *paths]))
+
+
+def load_all() -> None:
+    """Load every file that `TURBIDOSTAT_EXTEND` names and that is not loaded yet. Raises: ValueError as `taken`."""
+    for name in filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)):
+        _load(Path(name))
+
+
+def _load(path: Path) -> None:
+    if path in _loaded:
+        return
+    module = path.stem
+    if path.suffix != ".py" or not path.is_file():
+        raise ValueError(f"extend={path}: no such Python file; give the file that registers what you add")
+    if not module.isidentifier() or module in sys.modules:
+        raise ValueError(f"extend={path}: a module {module} is there already; give the file another name")
+    spec = importlib.util.spec_from_file_location(module, path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"extend={path}: no Python file")
+    sys.modules[module] = importlib.util.module_from_spec(spec)  # so that what it defines can be sent to a worker
+    try:
+        spec.loader.exec_module(sys.modules[module])
+    except Exception as error:
+        del sys.modules[module]
+        line = _line_in(path, error)
+        raise ValueError(f"extend={path}{line}: {type(error).__name__}: {error}; mend that file") from None
+    _loaded[path] = module
+
+
+def _line_in(path: Path, error: Exception) -> str:
+    """Where in the file it went wrong, ":12"."""
+    numbers = [error.lineno or 0] if isinstance(error, SyntaxError) else []
+    trace = error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == str(path):
+            numbers.append(trace.tb_lineno)
+        trace = trace.tb_next
+    return f":{numbers[-1]}" if numbers else ""
+
+
+def preset_file(group: str, option: str) -> str:
+    """The name under which `group=FILE.yaml` is a preset from now on; any other option as it is.
+
+    Raises: ValueError naming the file and what is wrong with it.
+    """
+    if not option.endswith(".yaml"):
+        return option
+    path, name = Path(option).expanduser(), re.sub(r"\W", "_", Path(option).stem)
+    try:
+        content = files.load_yaml(path)
+        if not isinstance(content, DictConfig):
+            raise ValueError("it holds no keys and values")
+        values = OmegaConf.to_container(content)
+        assert isinstance(values, dict)
+        presets.add(f"{group}/{name}", {str(k): v for k, v in values.items()}, f"The file {option}.")
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise ValueError(f"{group}={option}: {why}; give a YAML file with values of {group}") from None
+    return name
+
+
+def offer() -> None:
+    """Hydra finds the presets that were added."""
+    for name, preset in presets.added().items():
+        group, _, option = name.rpartition("/")
+        ConfigStore.instance().store(name=option, group=group, node=preset.values)
+
+
+def keep(folder: Path) -> None:
+    """Copy the loaded files into a run folder."""
+    for path in _loaded:
+        target = folder / FOLDER / path.name
+        target.parent.mkdir(exist_ok=True)
+        if target.resolve() != path:
+            shutil.copyfile(path, target)
+
+
+def kept(folder: Path) -> None:
+    """Load the files that a run folder keeps, if it keeps any. Raises: ValueError as `taken`."""
+    names = set(_loaded.values())
+    _remember([str(path.resolve()) for path in sorted((folder / FOLDER).glob("*.py")) if path.stem not in names])
+    load_all()

@@ -1,0 +1,89 @@
+"""Reactor families: how the reactors that a backend's config describes are opened, by kind of backend."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from conf import presets
+from envs.plant.plant import Plant, PlantConfig
+from experiments.control.config import BACKENDS
+from experiments.control.device import check, linked, load_calibrations
+from hardware.chibio.reactors import ChiBioReactors
+from hardware.chibio.resume import replay
+from hardware.errors import RecordingError
+from hardware.reactor import Reactor
+from hardware.simulated import SimulatedReactors
+from hardware.storage.journal import Journal
+
+__all__ = ["Opening", "add", "opened"]
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What a family is given to open its reactors.
+
+    backend: its config. plant: of simulated vials. journal: of the run, into which a driver writes every command before
+    it is carried out; `journal.rows` is what an earlier life of the run wrote. folder: of the run. resumed: there was
+    such a life.
+    """
+
+    backend: Any
+    plant: PlantConfig
+    journal: Journal
+    folder: Path
+    resumed: bool
+
+
+Opener = Callable[[Opening], AbstractContextManager[Reactor]]
+
+
+@contextmanager
+def _simulated(opening: Opening) -> Iterator[Reactor]:
+    """Vials in this process."""
+    backend = opening.backend
+    vials = Plant(opening.plant, len(backend.reactors), np.random.default_rng(backend.seed))
+    yield SimulatedReactors(vials, backend)
+
+
+@contextmanager
+def _chibio(opening: Opening) -> Iterator[Reactor]:
+    """A Chi.Bio or its emulator, checked before a run begins. Raises: ReactorError, UserError."""
+    backend, earlier = opening.backend, opening.journal.rows
+    with linked(backend) as (transport, clock):
+        calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
+        if opening.resumed and not earlier:
+            raise RecordingError(f"journal {opening.journal.path}: missing or empty; put it back, or start a new run")
+        if not earlier:
+            check(backend, transport, clock, calibrations, opening.folder)
+        reactors = ChiBioReactors(transport, clock, backend, calibrations, opening.journal.append)
+        elapsed_s = (time.time() - float(earlier[0]["wall"])) * backend.speed if earlier else 0.0
+        reactors.begin(replay(earlier), elapsed_s)
+        yield reactors
+
+
+OPENERS: dict[str, Opener] = {"sim": _simulated, "chibio": _chibio, "emulator": _chibio}
+
+
+def add(kind: str, config: type[Any], opener: Opener, what: str) -> None:
+    """Make a family known as `backend=KIND`.
+
+    Args:
+      kind: its name, the default of the field `kind` of `config`.
+      config: dataclass of its values, whose fields are made by `conf.schema.setting`; it needs `reactors`, their names,
+        and `control_min`, the time between samples.
+      opener: called with an `Opening`; inside the context its reactors are ready, on leaving it they are released.
+      what: the sentence that the help shows.
+    Raises: ValueError for a kind that exists.
+    """
+    presets.add(f"backend/{kind}", {"kind": kind}, what)
+    BACKENDS[kind], OPENERS[kind] = config, opener
+
+
+def opened(opening: Opening) -> AbstractContextManager[Reactor]:
+    """The reactors of a run. Raises, on entering: what the family raises; ReactorError, UserError for a Chi.Bio."""
+    return OPENERS[opening.backend.kind](opening)

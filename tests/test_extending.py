@@ -1,0 +1,150 @@
+"""Every file and command of docs/extending.md, as a user would type them, in an empty folder."""
+
+import csv
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+NAMED = re.compile(r"`(\w+\.(?:py|yaml))`(?:(?!`\w+\.(?:py|yaml)`)[\s\S])*?```(?:python|yaml)\n([\s\S]*?)```")
+FILES = {name: text for name, text in NAMED.findall(PAGE)}
+COMMANDS = [line.removeprefix("    ") for line in PAGE.splitlines() if line.startswith("    python ")]
+SHORT = {"experiments.benchmark": ["replicates=1"], "experiments.train": ["agent.total_steps=500"]}
+
+
+def run(words: list[str], folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **more}
+    return subprocess.run(
+        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, timeout=240, check=False
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+def summary(folder: Path) -> dict[str, object]:
+    [path] = folder.glob("runs/*/*/summary.json")
+    found: dict[str, object] = json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+def test_the_page_names_every_file_it_shows() -> None:
+    assert set(FILES) == {"steps.yaml", "gentle.py", "heat_shock.py", "logged.py", "log_error.py", "sb3.py"}
+    assert len(COMMANDS) == 8
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if "sb3" not in c and "policy.npz" not in c])
+def test_a_command_of_the_page_works(command: str, folder: Path) -> None:
+    words = shlex.split(command)[1:]
+    done = run([*words, *SHORT.get(words[1], [])], folder)
+    assert done.returncode == 0, done.stderr
+    assert summary(folder)
+
+
+def test_another_library_trains_and_its_policy_pumps(folder: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is in the extra [bench]")
+    for command in [c for c in COMMANDS if "sb3" in c or "policy.npz" in c]:
+        done = run(shlex.split(command)[1:], folder)
+        assert done.returncode == 0, done.stderr
+    assert summary(folder)["reactors"]
+
+
+def test_a_policy_file_of_another_library_chooses_as_its_network_does(folder: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is in the extra [bench]")
+    check = """
+import runpy, torch
+from pathlib import Path
+from dqn import policy as policies
+made = runpy.run_path("sb3.py")
+seen = made["np"].random.default_rng(0).uniform(0.05, 1.2, (500, 2)).astype("float32")
+theirs, _ = made["model"].predict(seen, deterministic=True)
+assert (policies.load(Path("policy.npz")).act(seen) == theirs).mean() > 0.995
+"""
+    done = run(["-c", check], folder)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_controller_of_ones_own_decides(folder: Path) -> None:
+    """With gain 0 it pumps what balances growth, mu tau = 0.01 mL/s, whatever it measures."""
+    words = "extend=gentle.py controller=gentle controller.gain=0 scenario=./steps.yaml"
+    done = run(["-m", "experiments.deploy", *words.split()], folder)
+    assert done.returncode == 0, done.stderr
+    [recording] = folder.glob("runs/deploy/*/recordings/M0.csv")
+    with open(recording, encoding="utf-8") as f:
+        proposed = [float(row["proposed_ml_s"]) for row in csv.DictReader(f) if row["proposed_ml_s"]]
+    assert len(proposed) >= 30
+    np.testing.assert_allclose(proposed, 0.03 / 3.0, rtol=1e-6)
+
+
+def test_the_run_folder_keeps_the_file_and_resumes_without_it(folder: Path) -> None:
+    first = ["-m", "experiments.train", "extend=log_error.py", "env=log_error", "agent.total_steps=300"]
+    done = run([*first, "checkpoint_every=100", "hydra.run.dir=here"], folder)
+    assert done.returncode == 0, done.stderr
+    (folder / "log_error.py").unlink()
+    again = run(["-m", "experiments.train", "resume=here"], folder)
+    assert again.returncode == 0, again.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "no such Python file"),
+        ("import numpy\nnumpy.nothing\n", "mine.py:2: AttributeError"),
+        ("def (:\n", "mine.py:1: SyntaxError"),
+        (
+            "from experiments.controllers import registry\nregistry.add('pi', int, int, 'x')\n",
+            "controller = pi: there is a preset of this name already",
+        ),
+        ("from envs.plant import disturbance\ndisturbance.add('', print)\n", "a name that is not taken"),
+    ],
+)
+def test_a_file_that_does_not_load_is_one_line(text: str | None, said: str, tmp_path: Path) -> None:
+    if text is not None:
+        (tmp_path / "mine.py").write_text(text, encoding="utf-8")
+    done = run(["-m", "experiments.deploy", "extend=mine.py"], tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: ")
+    assert said in done.stderr
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("setpoint: [0.5]\n", "setpoint"), ("[1, 2]\n", "no keys and values"), ("a: [\n", "not YAML")],
+)
+def test_a_preset_file_that_does_not_fit_is_one_line(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")
+    done = run(["-m", "experiments.deploy", "scenario=mine.yaml"], tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert said in done.stderr
+
+
+def test_cleanrl_s_way_to_an_environment() -> None:
+    """What its dqn.py builds: SyncVectorEnv of wrapped copies by their id."""
+    import gymnasium
+
+    def copy() -> gymnasium.Env[object, object]:
+        return gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.make("envs:Bioreactor-v0"))
+
+    env = gymnasium.vector.SyncVectorEnv([copy, copy])
+    env.reset(seed=1)
+    for _ in range(101):
+        _, reward, _, _, infos = env.step(env.action_space.sample())
+        if "episode" in infos:
+            np.testing.assert_array_equal(infos["episode"]["l"], [100, 100])
+            return
+    raise AssertionError(reward)
