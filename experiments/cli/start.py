@@ -13,7 +13,8 @@ HOME = Path(__file__).parents[2]  # where all packages of ours stand side by sid
 
 def begin() -> None:
     """Raises: SystemExit with one line for a command that would import other packages, ImportError for a library."""
-    command = sys.argv[:1] == ["-m"]  # the interpreter still looks for the command
+    first = Path(sys.argv[0] if sys.argv else "").name
+    command = first in ("-m", "turbidostat")  # the interpreter still looks for the command, or the script imports it
     if line := _other_package():
         raise SystemExit(f"error: {line}") if command else ImportError(line)
     if command:

@@ -1,0 +1,81 @@
+"""The commands of the program, `python -m experiments` or `turbidostat`: what there is, and one of them."""
+
+import importlib
+import sys
+import textwrap
+from collections.abc import Iterator
+from difflib import get_close_matches
+
+from conf.presets import commands, sentence
+from experiments.cli import completion
+
+KINDS = {
+    "From a recording to a reactor": ("demo", "calibrate", "train", "certify", "deploy", "report"),
+    "At the device": ("calibrate_pump", "blank"),
+    "Comparisons and studies": ("benchmark", "ablate", "degradation", "dual_chamber", "speed"),
+    "Rehearsing what goes wrong": ("fault_matrix", "kill_campaign", "soak"),
+}
+DEMO = "The whole way in one command: calibrate, train, deploy, report."
+USAGE = """\
+usage: turbidostat COMMAND [key=value ...]     the same as  python -m experiments.COMMAND [key=value ...]
+"""
+END = """\
+turbidostat COMMAND --help     what a command takes, with units, ranges and defaults
+turbidostat COMMAND --cfg job  the config it would run with
+eval "$(turbidostat completion bash)"     completes commands, groups and keys; also zsh and fish
+
+An emulated Chi.Bio is started by  python -m hardware.emulator --help
+
+Exit codes
+  0    done
+  1    refused or failed; one line on standard error says why and what to do
+  2    no such command
+  130  stopped by Ctrl-C, SIGTERM or SIGHUP; one line says what is kept and how to go on"""
+
+
+def names() -> list[str]:
+    """Every command, in the order in which they are listed."""
+    listed = [name for group in KINDS.values() for name in group]
+    return [*listed, *(name for name in commands() if name not in listed)]
+
+
+def _line(name: str, what: str) -> str:
+    return textwrap.fill(f"  {name:<15} {what}", 110, subsequent_indent=" " * 18)
+
+
+def page() -> Iterator[str]:
+    """What is printed without a command, line by line."""
+    yield USAGE
+    others = tuple(name for name in names() if not any(name in group for group in KINDS.values()))
+    for kind, group in {**KINDS, **({"Others": others} if others else {})}.items():
+        yield kind
+        yield from (_line(name, DEMO if name == "demo" else sentence(name)) for name in group)
+        yield ""
+    yield END
+
+
+def main() -> None:
+    """Entry point of the console script. Exits: as the command does; 2 for one that does not exist."""
+    name, *rest = sys.argv[1:] or ["--help"]
+    if name in ("--help", "-h", "help"):
+        print("\n".join(page()))
+    elif name == "completion" and len(rest) == 1 and rest[0] in completion.SHELLS:
+        print(completion.SHELLS[rest[0]], end="")
+    elif name == "complete":
+        for word in completion.candidates(" ".join(rest), names()):
+            print(word)
+    elif name in names():
+        sys.argv = [f"turbidostat {name}", *rest]
+        importlib.import_module(f"experiments.{name}").main()
+    elif name == "completion":
+        print(f"error: completion: allowed {', '.join(completion.SHELLS)}", file=sys.stderr)
+        sys.exit(2)
+    else:
+        near = get_close_matches(name, names(), 1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names())}"
+        print(f"error: {name}: no such command; {hint}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""The list of commands, the console script's words, and what a real shell completes."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from conf.presets import commands
+
+ROOT = Path(__file__).parents[1]
+FILES = sorted(p.stem for p in (ROOT / "experiments").glob("*.py") if not p.stem.startswith("__"))
+
+
+def run(*words: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        [sys.executable, "-m", "experiments", *words], cwd=cwd, env=environment, capture_output=True, text=True
+    )
+
+
+def listed(page: str) -> list[list[str]]:
+    """Words of every line that names a command."""
+    lines = [line for line in page.splitlines() if line[:2] == "  " and line[2] != " "]
+    return [line.split() for line in lines if line.split()[0] in {*FILES, *commands()}]
+
+
+def offered(line: str) -> list[str]:
+    return run("complete", line).stdout.splitlines()
+
+
+@pytest.mark.parametrize("words", [[], ["--help"], ["help"]])
+def test_every_command_is_listed_with_a_sentence(words: list[str]) -> None:
+    done = run(*words)
+    assert done.returncode == 0
+    said = {name: what for name, *what in listed(done.stdout)}
+    assert set(FILES) <= set(said)
+    assert all(len(" ".join(said[name])) > 20 for name in FILES)
+
+
+def test_a_command_of_another_name_is_one_line_and_exit_code_2() -> None:
+    done = run("depoly")
+    assert (done.returncode, done.stderr) == (2, "error: depoly: no such command; did you mean deploy?\n")
+    assert run("xyzzy").stderr.startswith("error: xyzzy: no such command; there are demo, ")
+
+
+def test_a_command_runs_as_by_its_own_module(tmp_path: Path) -> None:
+    assert (
+        run("train", "--cfg", "job").stdout
+        == (
+            subprocess.run(
+                [sys.executable, "-m", "experiments.train", "--cfg", "job"], cwd=ROOT, capture_output=True, text=True
+            )
+        ).stdout
+    )
+    refused = run("train", "seed=-1", cwd=tmp_path)
+    assert (refused.returncode, refused.stderr) == (1, "error: seed = -1: allowed at least 0\n")
+    assert run("calibrate", cwd=tmp_path).returncode == 0
+    assert list(tmp_path.glob("runs/calibrate/*/summary.json"))
+
+
+def test_only_the_command_s_own_groups_are_offered() -> None:
+    assert [word for word in offered("turbidostat certify ") if word.startswith("backend")] == []
+    assert "backend=" in offered("turbidostat deploy ba")
+    assert offered("turbidostat train agent=p") == ["agent=paper "]
+    assert offered("turbidostat train +env=rel") == ["+env=relative "]
+
+
+def test_keys_are_offered_part_by_part_and_follow_the_rest_of_the_line() -> None:
+    assert offered("turbidostat deploy plant.growth.temperature_l") == ["plant.growth.temperature_law="]
+    assert "plant.growth.temperature_law=arrhenius " in offered("turbidostat deploy plant.growth.temperature_law=")
+    assert offered("turbidostat deploy backend.stir") == []
+    assert offered("turbidostat deploy backend=chibio backend.stir") == ["backend.stir="]
+
+
+def test_every_command_can_be_completed() -> None:
+    listing = [name for name, *_ in listed(run().stdout)]
+    assert [word.strip() for word in offered("turbidostat ")] == [n for n in listing if n.isidentifier()] + [
+        "completion"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("typed", "reply"),
+    [
+        ("turbidostat cali", ["calibrate ", "calibrate_pump "]),
+        ("turbidostat train agent=tu", ["tuned "]),  # bash's new word begins behind the =
+        ("turbidostat deploy plant.growth.mu_", ["plant.growth.mu_cv="]),
+    ],
+)
+def test_bash_completes(typed: str, reply: list[str], tmp_path: Path) -> None:
+    if shutil.which("bash") is None:
+        pytest.skip("no bash on this machine")
+    program = tmp_path / "turbidostat"
+    program.write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m experiments "$@"\n')
+    program.chmod(0o755)
+    script = f"""
+eval "$(turbidostat completion bash)"
+COMP_LINE='{typed}' COMP_POINT={len(typed)} COMP_WORDBREAKS=$' \\t\\n"=:'
+_turbidostat
+printf '%s\\n' "${{COMPREPLY[@]}}"
+complete -p turbidostat
+"""
+    environment = {**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True)
+    *words, registered = done.stdout.splitlines()
+    assert words == reply, done.stderr
+    assert registered.endswith("-F _turbidostat turbidostat")
