@@ -48,7 +48,7 @@ class CertifyConfig:
 
     policy: str = setting("latest", "a policy.npz, a run folder, or `latest`: what train or demo wrote last")
     env: EnvConfig | None = setting(None, "the nominal model: its mu and tau; null: the one the policy was trained on")
-    env_file: str | None = setting(None, "a calibrated.yaml; replaces env")
+    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: what calibrate wrote last; replaces env")
     uncertainty: float = setting(
         0.3, "mu and tau are anywhere within +- this share of the nominal ones, in every period anew", within=(0, 0.9)
     )

@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from conf import presets
 from conf.schema import build, old_name
-from experiments.cli import extensions, files, help_page, stop
+from experiments.cli import extensions, files, help_page, latest, stop
 
 __all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config"]
 
@@ -77,8 +77,9 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
     Raises: UserError for a group or option that the command does not take, naming those that it does, and for a file
       that cannot be used.
     """
-    resumed = _resumed(argv)
     try:
+        argv = [latest.resolved(arg, command) for arg in argv]
+        resumed = _resumed(argv)
         if resumed:
             extensions.kept(Path(resumed))
         argv = [_with_preset_files(arg) for arg in extensions.taken(argv)]
@@ -262,7 +263,7 @@ class Command(Generic[T]):
         sys.argv[1:] = [*normalise(given, self.name), f"hydra.job.name={self.name}"]
         if not flags:  # a sweep or another flag is Hydra's to read; a plain run is checked before it has a folder
             self.config(given)
-            resumed = _resumed(given)
+            resumed = _resumed([latest.resolved(arg, self.name) for arg in given])
             others = [a for a in given if not a.startswith(("resume=", "hydra.", "extend="))]
             if resumed and others:
                 raise UserError(f"{others[0]}: a resumed run takes every value from {resumed}/config.yaml; drop it")

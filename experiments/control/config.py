@@ -65,11 +65,11 @@ class DeployConfig:
         "shipped", "of composition=dqn and dqn_preview: `shipped`, a policy.npz, or a run folder"
     )
     share_warnings: ShareWarnings = part(ShareWarnings, "when a share is said to be out of control")
-    env_file: str | None = setting(None, "a calibrated.yaml whose model the simulated plant takes")
-    plant_file: str | None = setting(None, "a twin.yaml of calibrate, in place of `plant`; backend=sim")
+    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`, whose model the simulated plant takes")
+    plant_file: str | None = setting(None, "a twin.yaml of calibrate, or `latest`, in place of `plant`; backend=sim")
     fsync: bool = setting(True, "every row on the disk before the next command")
     preflight_only: bool = setting(False, "check the device and stop")
-    resume: str | None = setting(None, "a run folder to continue after a crash")
+    resume: str | None = setting(None, "a run folder to continue after a crash, or `latest`")
 
     def __post_init__(self) -> None:
         check(self)

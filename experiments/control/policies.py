@@ -13,6 +13,7 @@ from dqn.policy import Policy
 from envs.scenario import Scenario
 from experiments.certification import certificate
 from experiments.cli import frame
+from experiments.cli.latest import newest
 from experiments.control.config import DeployConfig
 from hardware.chibio.preflight import Check
 from hardware.storage import atomic
@@ -100,10 +101,10 @@ def find_policy(name: str, root: Path = Path("runs")) -> Path:
     if name == "shipped":
         return SHIPPED
     if name == "latest":
-        found = sorted((p for pattern in TRAINED for p in root.glob(pattern)), key=lambda p: p.stat().st_mtime)
-        if not found:
+        found = newest(TRAINED, root)
+        if found is None:
             raise NoPolicyError(f"policy=latest: no training run under {root}/; train one first or give policy=PATH")
-        return found[-1]
+        return found
     path = Path(name)
     return path / "policy.npz" if path.is_dir() else path
 

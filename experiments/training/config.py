@@ -31,7 +31,7 @@ class TrainConfig:
 
     env: Any = part(EnvConfig, "the training model and its episodes")
     agent: DQNConfig = part(DQNConfig, "the agent's hyper-parameters")
-    env_file: str | None = setting(None, "a calibrated.yaml; replaces env")
+    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: what calibrate wrote last; replaces env")
     seed: int = setting(0, "of the first agent", at_least=0)
     n_agents: int = setting(1, "with seeds seed, seed + 1, ... in one process", within=(1, 100_000))
     device: str = setting("cpu", "where networks are trained", choices=("cpu", "cuda"))
@@ -48,7 +48,7 @@ class TrainConfig:
         above=0.0,
     )
     checkpoint_every: int = setting(1000, "between checkpoints", "steps", at_least=1)
-    resume: str | None = setting(None, "a run folder to continue")
+    resume: str | None = setting(None, "a run folder to continue, or `latest`")
 
     def __post_init__(self) -> None:
         check(self)

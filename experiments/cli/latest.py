@@ -1,0 +1,36 @@
+"""`latest`: what a command wrote last below runs/, so that a line can be typed without a folder's name."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+__all__ = ["newest", "resolved"]
+
+ROOT = Path("runs")
+WRITTEN = {
+    "env_file": (("calibrate/**/calibrated.yaml", "demo/*/1_calibrate/calibrated.yaml"), "calibrate"),
+    "plant_file": (("calibrate/**/twin.yaml", "demo/*/1_calibrate/twin.yaml"), "calibrate"),
+}
+"""Key -> where its files are below runs/, and the command that writes them."""
+
+
+def newest(patterns: Sequence[str], root: Path = ROOT) -> Path | None:
+    """The file written last of those that match, None if there is none."""
+    found = [path for pattern in patterns for path in root.glob(pattern)]
+    return max(found, key=lambda path: path.stat().st_mtime, default=None)
+
+
+def resolved(arg: str, command: str) -> str:
+    """`env_file=latest`, `plant_file=latest` and `resume=latest` with the path in its place, any other word as it is.
+
+    Args: command: whose run is resumed.
+    Raises: ValueError where nothing was written yet, saying what writes it.
+    """
+    key, _, value = arg.partition("=")
+    name = key.lstrip("+")
+    if value != "latest" or name not in (*WRITTEN, "resume"):
+        return arg
+    patterns, writer = WRITTEN.get(name, ((f"{command}/*/config.yaml",), command))
+    path = newest(patterns)
+    if path is None:
+        raise ValueError(f"{arg}: nothing under {ROOT}/; run python -m experiments.{writer} first, or give a path")
+    return f"{key}={path.parent if name == 'resume' else path}"
