@@ -1,18 +1,22 @@
 # make run    calibrate on the shipped recording, train on the result, deploy on the simulated reactor, report
 # make test   style, types and the whole test suite
+# make docs   the pages and the API reference as a site, build/docs/index.html; a warning is an error
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-DEMO := runs/demo
+EXTRAS := dev,bench,sweep,docs
 
-.PHONY: run test lint clean
+.PHONY: run test lint docs clean
 .DELETE_ON_ERROR:
 
 $(STAMP): pyproject.toml constraints.txt
+	@echo "Setting up $(VENV), once: Python packages of about 1 GB, one to three minutes."
+	@$(PYTHON) -c 'import sys; sys.exit("error: Python %d.%d is too old: allowed 3.11 and newer; make PYTHON=python3.11" % sys.version_info[:2] if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench]'
-	touch $@
+	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
+	@echo "$(VENV) is ready; use it in a terminal with: . $(BIN)/activate"
+	@touch $@
 
 run: $(STAMP)
 	$(BIN)/python -m experiments.demo
@@ -25,5 +29,9 @@ lint: $(STAMP)
 test: $(STAMP) lint
 	$(BIN)/python -m pytest
 
+docs: $(STAMP)
+	$(BIN)/python -m sphinx -W --keep-going -q docs build/docs
+	@echo "the pages: build/docs/index.html"
+
 clean:
-	rm -rf $(VENV) runs .pytest_cache .mypy_cache .ruff_cache build *.egg-info
+	rm -rf $(VENV) runs .pytest_cache .mypy_cache .ruff_cache build docs/api *.egg-info

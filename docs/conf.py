@@ -1,0 +1,71 @@
+"""How the pages are built: `make docs`, or `python -m sphinx -W docs build/docs`. Warnings are errors."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("conf", "dqn", "envs", "hardware", "experiments")
+
+project = "turbidostat-dqn"
+copyright = "the authors, MIT licence"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.apidoc", "sphinx_copybutton", "sphinxcontrib.mermaid"]
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_heading_anchors = 4
+myst_fence_as_directive = ["mermaid"]
+html_theme = "furo"
+html_title = "turbidostat-dqn"
+highlight_language = "none"
+exclude_patterns = ["figures"]
+apidoc_modules = [{"path": f"../{name}", "destination": f"api/{name}", "separate_modules": True} for name in PACKAGES]
+autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_member_order = "bysource"
+suppress_warnings = ["myst.xref_missing"]  # links to files outside docs/; the tests follow each of them
+
+LABEL = re.compile(r"^(Args|Attributes|Raises|Returns|State|Yields)\b([^:]*):\s*(.*)$")
+
+
+def _plain(text: str) -> str:
+    """A line of a docstring as reStructuredText: only `code` is markup."""
+    parts = text.split("`")
+    escaped = [re.sub(r"([\\*|_])", r"\\\1", part) if k % 2 == 0 else part for k, part in enumerate(parts)]
+    return "``".join(escaped) if len(parts) % 2 else re.sub(r"([\\*|_`])", r"\\\1", text)
+
+
+def _blocks(lines: list[str]) -> Iterator[list[str]]:
+    block: list[str] = []
+    for line in [*lines, ""]:
+        if line.strip():
+            block.append(line)
+        elif block:
+            yield block
+            block = []
+
+
+def _rendered(block: list[str]) -> Iterator[str]:
+    """One paragraph: equations and tables as they stand, labelled parts as lists, everything else as text."""
+    if block[0][0] in " |-+":
+        yield from ("::", "", *(f"    {line}" for line in block))
+        return
+    labelled = False
+    for line in block:
+        if found := LABEL.match(line):
+            labelled = True
+            yield from ("", f"**{found[1]}{_plain(found[2])}:** {_plain(found[3])}".rstrip(), "")
+        elif labelled and re.match(r"^ {1,3}\S", line):
+            yield from ("", f"- {_plain(line.strip())}")
+        elif labelled and line.startswith(" "):
+            yield f"  {_plain(line.strip())}"
+        else:
+            yield _plain(line.strip())
+
+
+def _docstring(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """The docstrings are written for a terminal; a page shows them without changing a word."""
+    lines[:] = [line for block in _blocks(lines) for line in (*_rendered(block), "")]
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", _docstring)

@@ -1,0 +1,35 @@
+"""The commands that README and docs show, as a user would type them."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PROGRAM = re.compile(
+    r"(?:^|[`\s])((?:python3?|\.venv/bin/python) -m (?:experiments|hardware)[\w.]*|turbidostat)(?![\w.])((?: [^`\n]*)?)", re.M
+)
+    r"(?:^|[`\s])((?:python3?|\.venv/bin/python) -m (?:experiments|hardware)[\w.]*|turbidostat)(?![\w.])((?: [^`\n]*)?)",
+    re.M,
+)
+OPEN = re.compile(r"\.\.\.|NAME|COMMAND|KEY|GROUP|PRESET|\bFILE\b(?!\.)| \| ")  # a pattern, not a command
+
+
+def commands(page: Path) -> Iterator[list[str]]:
+    """Program and arguments of every command of a page, without the comment behind it; patterns are left out."""
+    text = re.sub(r"\\\n\s*", "", page.read_text(encoding="utf-8"))
+    for program, rest in PROGRAM.findall(text):
+        line = re.split(r"\s#|\s{2,}| > | \| |; |\)\.?$", program + rest)[0].rstrip(" .,;:)")
+        if OPEN.search(rest) or OPEN.search(line):
+            continue
+        try:
+            words = shlex.split(line.replace("turbidostat ", "python -m experiments.", 1))
+        except ValueError:  # an apostrophe of the sentence around it
+            continue
+        yield words[words.index("-m") + 1 :] if "-m" in words else words
+
+
+def needs_hardware(words: list[str]) -> bool:
+    """A command that talks to a device, or weighs what a device pumped."""
+    return "backend=chibio" in words or words[0] in ("experiments.blank", "experiments.calibrate_pump")
