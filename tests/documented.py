@@ -7,12 +7,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-PROGRAM = re.compile(
-    r"(?:^|[`\s])((?:python3?|\.venv/bin/python) -m (?:experiments|hardware)[\w.]*|turbidostat)(?![\w.])((?: [^`\n]*)?)", re.M
-)
-    r"(?:^|[`\s])((?:python3?|\.venv/bin/python) -m (?:experiments|hardware)[\w.]*|turbidostat)(?![\w.])((?: [^`\n]*)?)",
-    re.M,
-)
+PYTHON = r"(?:python3?|\.venv/bin/python) -m (?:experiments|hardware)[\w.]*"
+PROGRAM = re.compile(rf"(?:^|[`\s])({PYTHON}|turbidostat)(?![\w.])((?: [^`\n]*)?)", re.MULTILINE)
 OPEN = re.compile(r"\.\.\.|NAME|COMMAND|KEY|GROUP|PRESET|\bFILE\b(?!\.)| \| ")  # a pattern, not a command
 
 
