@@ -62,7 +62,7 @@ def _run(loop: ClosedLoop, record: Record) -> str:
     return outcome
 
 
-def _finish(record: Record, setup: Setup, outcome: str) -> str:
+def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str:
     """Figure and summary.json, whatever the outcome; returns the outcome, failed if they could not be written."""
     config, folder = setup.config, record.folder
     if not outcome.startswith(("completed", "stopped by the interlock")):
@@ -78,7 +78,7 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
             record.events.picture(f"figures/{name}", path, record.series("time_min").shape[1])
         roles = [config.role(name) for name in record.names]
         summary = {
-            **summarise(record, setup.scenarios, roles, outcome),
+            **summarise(record, setup.scenarios, roles, outcome, loop.progress),
             "figure": str(folder / "figures" / "closed_loop.png"),
         }
         files.write_json(folder / "summary.json", summary)
@@ -112,7 +112,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
                 log.warning("%s", repair)
             with assemble.opened(setup, record) as loop:
                 outcome = _run(loop, record)
-            outcome = _finish(record, setup, outcome)
+            outcome = _finish(record, setup, loop, outcome)
     except ReactorError as error:
         raise frame.UserError(str(error)) from None
     if outcome.startswith("failed"):

@@ -13,6 +13,7 @@ from envs.scenario import Scenario
 from experiments.control.composition import TRUE
 from experiments.control.loop import ClosedLoop, Step
 from experiments.control.metrics import mean_errors, window_metrics
+from experiments.control.progress import Progress
 from experiments.control.record import Record
 from experiments.control.recovery import Rows
 from experiments.reporting import charts
@@ -45,7 +46,7 @@ class ChangeLog:
     """Logs what changes, once: phases, who decides, words of the interlock, notes of the reactors."""
 
     def __init__(self, loop: ClosedLoop) -> None:
-        self._names = loop.reactors.names
+        self._names, self._progress = loop.reactors.names, loop.progress
         self._phase = [-2] * len(self._names)
         self._reason: list[str | None] = [None] * len(self._names)
         self._supervised = [False] * len(self._names)
@@ -54,6 +55,8 @@ class ChangeLog:
     def __call__(self, step: Step) -> None:
         """Log what is new in this step."""
         for n, name in enumerate(self._names):
+            if step.ended is not None and step.ended[n]:
+                log.info("%s: %s at OD %.3f", name, self._ended(step, n), step.od[n])
             if step.rows[n] and int(step.phase[n]) != self._phase[n]:
                 self._phase[n] = int(step.phase[n])
                 share = step.composition.get("ratio_setpoint", np.full(len(self._names), np.nan))[n]
@@ -74,6 +77,12 @@ class ChangeLog:
             if kind not in self._noted:  # the journal has every one of them
                 self._noted.add(kind)
                 log.info("%s (noted once here, every time in the journal)", note)
+
+    def _ended(self, step: Step, n: int) -> str:
+        """Which step of reactor n's schedule this sample ended, and why."""
+        k = int(self._progress.phase(step.elapsed)[n]) - (not step.done[n])
+        start, end, _ = self._progress.steps(n)[k]
+        return f"step {k + 1} ended after {end - start:.0f} min: {self._progress.conditions.texts[n][k]}"
 
     def _who_decides(self, step: Step, n: int) -> None:
         """Where a supervisor stands over the policy: from when on its law acts, and until when."""
@@ -106,8 +115,17 @@ def reasons_line(rows: Rows) -> str:
     )
 
 
-def summarise(record: Record, scenarios: Sequence[Scenario], roles: Sequence[str], outcome: str) -> dict[str, Any]:
-    """Every number of a run. Args: scenarios, roles: one per reactor. outcome: how it ended."""
+def summarise(
+    record: Record,
+    scenarios: Sequence[Scenario],
+    roles: Sequence[str],
+    outcome: str,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Every number of a run.
+
+    Args: scenarios, roles: one per reactor. outcome: how it ended. progress: when each step ended; None: by its time.
+    """
     volume, minute = np.nansum(record.series("volume_ml"), axis=1), record.series("time_min")
     reactors = {
         name: {
@@ -122,22 +140,24 @@ def summarise(record: Record, scenarios: Sequence[Scenario], roles: Sequence[str
     return {
         "outcome": outcome,
         "minutes": float(np.nanmax(minute)) if np.isfinite(minute).any() else 0.0,
-        "windows": _windows(record, scenarios),
+        "windows": _windows(record, scenarios, progress or Progress(scenarios)),
         "volume_ml": float(volume.sum()),
         "reactors": reactors,
         "repairs": record.repairs,
     }
 
 
-def _windows(record: Record, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
-    """Metrics of every phase of every reactor."""
+def _windows(record: Record, scenarios: Sequence[Scenario], progress: Progress) -> list[dict[str, Any]]:
+    """Metrics of every phase of every reactor; `ended` is what ended it, null if it is not over."""
     elapsed, od = record.series("elapsed_min"), record.series("od")
     rows = []
     for n, (name, scenario) in enumerate(zip(record.names, scenarios, strict=True)):
-        for phase, setpoint in enumerate(scenario.setpoints):
-            start, end = float(scenario.edges[phase]), float(scenario.edges[phase + 1])
+        latest = float(np.nanmax(elapsed[n], initial=-1.0))
+        for phase, (setpoint, step) in enumerate(zip(scenario.setpoints, progress.steps(n), strict=True)):
+            start, end = round(step[0], 4), round(step[1], 4)  # as the recording has its minutes
             m = window_metrics(elapsed[n : n + 1], od[n : n + 1], setpoint, start, end)
             window = {"reactor": name, "phase": phase, "setpoint": setpoint, "start_min": start, "end_min": end}
+            window["ended"] = step[2] if latest >= end - 1e-6 else None
             window["temperature"] = scenario.temperatures[phase]
             window |= {key: float(getattr(m, key)[0]) for key in FORMATS}
             if "ratio" in record.columns:
