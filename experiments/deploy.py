@@ -1,5 +1,6 @@
 """Run a controller in closed loop and record everything: `python -m experiments.deploy`."""
 
+from datetime import datetime
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -12,6 +13,8 @@ def deploy(config: DeployConfig, folder: Path) -> None:
     """One closed loop over the scenario."""
     from experiments.control import run  # matplotlib and SciPy, only once the config has been checked
 
+    if config.dry_run:
+        raise frame.UserError("dry_run=true: a sweep has no timetable; drop --multirun")
     run.deploy(config, folder)
 
 
@@ -22,7 +25,22 @@ def _schema(cfg: DictConfig) -> DeployConfig:
     )
 
 
-main = frame.Command("deploy", DeployConfig(), deploy, _schema, resumes="state.json")
+class _Deploy(frame.Command[DeployConfig]):
+    """`deploy`, whose `dry_run=true` answers before there is a run folder."""
+
+    def _answer(self, given: list[str]) -> None:
+        plain = [a for a in given if not a.startswith("-")]
+        if len(plain) < len(given) or not self.config(plain).dry_run:
+            super()._answer(given)
+            return
+        from experiments.control.timetable import timetable
+
+        named = [a.removeprefix("hydra.run.dir=") for a in plain if a.startswith("hydra.run.dir=")]
+        place = named[-1] if named else "a new folder of runs/deploy/"
+        print(timetable(self.config(plain), place, datetime.now()))
+
+
+main = _Deploy("deploy", DeployConfig(), deploy, _schema, resumes="state.json")
 
 
 if __name__ == "__main__":

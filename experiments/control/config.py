@@ -68,6 +68,7 @@ class DeployConfig:
     env_file: str | None = setting(None, "a calibrated.yaml whose model the simulated plant takes")
     plant_file: str | None = setting(None, "a twin.yaml of calibrate, in place of `plant`; backend=sim")
     fsync: bool = setting(True, "every row on the disk before the next command")
+    dry_run: bool = setting(False, "print the timetable and what would be used, ask no device, write nothing")
     preflight_only: bool = setting(False, "check the device and stop")
     resume: str | None = setting(None, "a run folder to continue after a crash")
 
