@@ -1,5 +1,6 @@
 """Run a controller in closed loop and record everything: `python -m experiments.deploy`."""
 
+import os
 from datetime import datetime
 from pathlib import Path
 
@@ -7,6 +8,7 @@ from omegaconf import DictConfig
 
 from experiments.cli import frame
 from experiments.control.config import DeployConfig, deploy_schema
+from experiments.control.notify import hidden
 
 
 def deploy(config: DeployConfig, folder: Path) -> None:
@@ -26,9 +28,10 @@ def _schema(cfg: DictConfig) -> DeployConfig:
 
 
 class _Deploy(frame.Command[DeployConfig]):
-    """`deploy`, whose `dry_run=true` answers before there is a run folder."""
+    """`deploy`, whose `dry_run=true` answers before there is a run folder, and whose hook's address is kept nowhere."""
 
     def _answer(self, given: list[str]) -> None:
+        given = hidden(given, os.environ)
         plain = [a for a in given if not a.startswith("-")]
         if len(plain) < len(given) or not self.config(plain).dry_run:
             super()._answer(given)

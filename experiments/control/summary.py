@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -43,10 +43,15 @@ FORMATS = {  # of the metrics of a window
 
 
 class ChangeLog:
-    """Logs what changes, once: phases, who decides, words of the interlock, notes of the reactors."""
+    """Logs what changes, once: phases, who decides, words of the interlock, notes of the reactors.
 
-    def __init__(self, loop: ClosedLoop) -> None:
-        self._names, self._progress = loop.reactors.names, loop.progress
+    Args: loop: that is watched. tell: is told of alarms and hand-overs, too: event, text, reactor.
+    """
+
+    def __init__(self, loop: ClosedLoop, tell: Callable[[str, str, str], None] | None = None) -> None:
+        self._names, self._progress, self._reactors = loop.reactors.names, loop.progress, loop.reactors
+        self._tell = tell or (lambda event, text, reactor: None)
+        self._handed_over = loop.reactors.handed_over.copy()
         self._phase = [-2] * len(self._names)
         self._reason: list[str | None] = [None] * len(self._names)
         self._supervised = [False] * len(self._names)
@@ -71,7 +76,12 @@ class ChangeLog:
             kinds = " ".join(kinds_of(reason)) or reason
             if kinds != (self._reason[n] or ""):
                 self._reason[n] = kinds
-                log.warning("%s: %s", name, step.reasons[n] or "interlock: all well again")
+                said = step.reasons[n] or "interlock: all well again"
+                log.warning("%s: %s", name, said)
+                self._tell("alarm", said, name)
+        for n in map(int, np.flatnonzero(self._reactors.handed_over & ~self._handed_over)):
+            self._tell("hand_over", "the device regulates by itself from now on", self._names[n])
+        self._handed_over = self._reactors.handed_over.copy()
         for note in step.notes:
             kind = re.sub(r"[\d.]+", "#", note)
             if kind not in self._noted:  # the journal has every one of them
@@ -91,6 +101,7 @@ class ChangeLog:
             self._supervised[n] = supervised
             who = "the supervisor's law acts, the estimate is in doubt," if supervised else "the policy acts again"
             log.info("%s: %s from minute %.0f", self._names[n], who, step.minute[n])
+            self._tell("hand_over", f"{who} from minute {step.minute[n]:.0f}", self._names[n])
 
 
 def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:

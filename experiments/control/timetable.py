@@ -131,7 +131,7 @@ def _reactor(setup: Setup, name: str, scenario: Scenario, now: datetime) -> Iter
     if scenario.recovery_od:
         longest = f"at most {scenario.recovery_limit_min:g} min; the times below count from its end"
         yield f"  {'recovery':>8} grows undiluted to OD {scenario.recovery_od:g}, {longest}"
-    for k, (setpoint, longest, degc) in enumerate(
+    for k, (setpoint, most_min, degc) in enumerate(
         zip(scenario.setpoints, scenario.minutes, scenario.temperatures, strict=True)
     ):
         step = expected(scenario, k, od, growth, dilution, safety.volume_ml)
@@ -139,7 +139,7 @@ def _reactor(setup: Setup, name: str, scenario: Scenario, now: datetime) -> Iter
         share = scenario.ratios[k] if scenario.ratios else None
         said = f"{until}{'' if share is None else f'; share {share:g}, which decides the temperature'}"
         yield (
-            f"  {k + 1:>8} {_clock(now, at)} {_clock(now, at + step.minutes)} {step.minutes:7.0f} {longest:8.0f} "
+            f"  {k + 1:>8} {_clock(now, at)} {_clock(now, at + step.minutes)} {step.minutes:7.0f} {most_min:8.0f} "
             f"{setpoint:6.2f} {degc:6.1f} {step.ml:7.1f}  {said}"
         )
         od, at, ml, most = step.od, at + step.minutes, ml + step.ml, most + step.longest_ml
