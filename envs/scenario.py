@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
+from envs.until import Condition
 
 __all__ = ["Scenario"]
 
@@ -16,6 +17,8 @@ Array = NDArray[np.float64]
 class Scenario:
     """Phases one after another, counted from the end of the recovery.
 
+    Where `until` gives a phase a condition, its minutes are the longest it may take, and `edges`, `phase` and `at` are
+    those of a schedule in which no condition is met (`experiments/control/progress.py` has them as they came).
     The share of a second species may be asked for, phase by phase or as mean - amplitude sin(2 pi t / period), t since
     the recovery ended. Where it is, whoever controls the composition decides on the temperature, elsewhere
     `temperatures` holds. Raises: ValueError naming key, value and allowed range.
@@ -40,6 +43,17 @@ class Scenario:
     announce_min: float = setting(
         360.0, "how long before it a change of the share is told to its controller; 0: never", "min", within=(0, 1440)
     )
+    until: tuple[str | None, ...] = setting(
+        (),
+        "what ends each phase before its minutes are over: 'od >= 0.8', 'od <= 0.3', settled, or null; empty: nothing",
+    )
+    settled_band: float = setting(
+        0.05,
+        "settled: |OD - setpoint| within this share of the setpoint, as the settling time of the summary",
+        "",
+        within=(0.005, 0.5),
+    )
+    settled_min: float = setting(10.0, "and so for so long without a reading outside", "min", within=(1, 1440))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ratios", tuple(None if r is None or r != r else r for r in self.ratios))
@@ -51,8 +65,22 @@ class Scenario:
             lists,
             "three lists of the same length, one entry per phase",
         )
+        object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
         check(self, "scenario")
+        self._check_until()
         self._check_composition()
+
+    def _check_until(self) -> None:
+        whole = len(self.until) in (0, len(self.setpoints))
+        require(whole, "scenario.until", self.until, f"none or one for each of the {len(self.setpoints)} phases")
+        for text in self.until:
+            try:
+                Condition(text)
+            except ValueError as error:
+                raise ValueError(f"scenario.until: {error}") from None
+        if any(self.until):
+            why = "[] where a share is asked for, whose controller plans by the minutes"
+            require(not self.composed, "scenario.until", self.until, why)
 
     def _check_composition(self) -> None:
         whole = len(self.ratios) in (0, len(self.setpoints))

@@ -1,17 +1,22 @@
 """Run a controller in closed loop and record everything: `python -m experiments.deploy`."""
 
+import os
+from datetime import datetime
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from experiments.cli import frame
 from experiments.control.config import DeployConfig, deploy_schema
+from experiments.control.notify import hidden
 
 
 def deploy(config: DeployConfig, folder: Path) -> None:
     """One closed loop over the scenario."""
     from experiments.control import run  # matplotlib and SciPy, only once the config has been checked
 
+    if config.dry_run:
+        raise frame.UserError("dry_run=true: a sweep has no timetable; drop --multirun")
     run.deploy(config, folder)
 
 
@@ -22,7 +27,23 @@ def _schema(cfg: DictConfig) -> DeployConfig:
     )
 
 
-main = frame.Command("deploy", DeployConfig(), deploy, _schema, resumes="state.json")
+class _Deploy(frame.Command[DeployConfig]):
+    """`deploy`, whose `dry_run=true` answers before there is a run folder, and whose hook's address is kept nowhere."""
+
+    def _answer(self, given: list[str]) -> None:
+        given = hidden(given, os.environ)
+        plain = [a for a in given if not a.startswith("-")]
+        if len(plain) < len(given) or not self.config(plain).dry_run:
+            super()._answer(given)
+            return
+        from experiments.control.timetable import timetable
+
+        named = [a.removeprefix("hydra.run.dir=") for a in plain if a.startswith("hydra.run.dir=")]
+        place = named[-1] if named else "a new folder of runs/deploy/"
+        print(timetable(self.config(plain), place, datetime.now()))
+
+
+main = _Deploy("deploy", DeployConfig(), deploy, _schema, resumes="state.json")
 
 
 if __name__ == "__main__":

@@ -67,12 +67,20 @@ class DeployConfig:
     share_warnings: ShareWarnings = part(ShareWarnings, "when a share is said to be out of control")
     env_file: str | None = setting(None, "a calibrated.yaml, or `latest`, whose model the simulated plant takes")
     plant_file: str | None = setting(None, "a twin.yaml of calibrate, or `latest`, in place of `plant`; backend=sim")
+    notify: str = setting(
+        "",
+        "who is told of start, alarms, hand-overs and end: a command that reads lines of JSON, or env:NAME, a variable "
+        "with a command or an address; an address on the command line goes on as env:DEPLOY_HOOK; empty: nobody",
+    )
     fsync: bool = setting(True, "every row on the disk before the next command")
+    dry_run: bool = setting(False, "print the timetable and what would be used, ask no device, write nothing")
     preflight_only: bool = setting(False, "check the device and stop")
     resume: str | None = setting(None, "a run folder to continue after a crash, or `latest`")
 
     def __post_init__(self) -> None:
         check(self)
+        if "://" in self.notify.split(" ")[0]:
+            raise ValueError("notify: an address is a secret and not kept in files; allowed env:NAME, a variable of it")
         if self.plant_file is not None:
             require(
                 self.env_file is None, "env_file", self.env_file, "null beside plant_file, which has a model already"

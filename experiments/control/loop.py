@@ -3,7 +3,7 @@
 It is a generator of what happened. Clocks and wires belong to the reactors, files and screens to the caller.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from envs.scenario import Scenario
 from experiments.control.composition import Composition
+from experiments.control.progress import Progress
 from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Remembers, Watches
 from hardware.reactor import Command, Reactor, Receipt
 from hardware.safety.config import Response
@@ -31,6 +32,8 @@ class Step:
     begun. reasons: of the interlock, for all reactors.
     response: of the interlock. notes: of the reactors. explanation: of the controller. done: schedule over.
     composition: further columns of the recording, where a composition is controlled.
+    position: of each reactor, where it stands in its schedule (`ClosedLoop.position`). ended: steps of the schedule
+      that this sample ended by their condition.
     """
 
     now_s: float
@@ -50,6 +53,8 @@ class Step:
     explanation: dict[str, Array]
     done: Mask
     composition: dict[str, Array] = field(default_factory=dict)
+    position: Sequence[dict[str, Any]] = ()
+    ended: Mask | None = None
 
 
 class ClosedLoop:
@@ -88,7 +93,7 @@ class ClosedLoop:
         self._at_end = np.array([at_end] * n if isinstance(at_end, str) else list(at_end))
         self._recovery_od = np.array([s.recovery_od for s in self.schedules])
         self._recovery_limit = np.array([s.recovery_limit_min for s in self.schedules])
-        self._total = np.array([s.total_min for s in self.schedules])
+        self.progress = Progress(self.schedules)
         self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
         self.done = np.zeros(n, dtype=np.bool_)
         self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
@@ -106,15 +111,6 @@ class ClosedLoop:
         """Whether every reactor's schedule is over, or the reactor was given up."""
         return bool((self.done | self.stopped | self.gone).all())
 
-    def _asked(self, elapsed: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Phase, setpoint and temperature of each reactor, each (N,)."""
-        first = self.schedules[0]
-        if all(s is first for s in self.schedules):
-            return (first.phase(elapsed), *first.at(elapsed))
-        phase = np.array([int(s.phase(elapsed[i : i + 1])[0]) for i, s in enumerate(self.schedules)])
-        pairs = [s.at(elapsed[i : i + 1]) for i, s in enumerate(self.schedules)]
-        return phase, np.array([p[0][0] for p in pairs]), np.array([p[1][0] for p in pairs])
-
     def step(self) -> Step:
         """Wait for a sample of at least one reactor (or for trouble), and act on it."""
         m = self.reactors.measure()
@@ -126,8 +122,9 @@ class ClosedLoop:
         recovered = (believed & (m.od >= self._recovery_od)) | (minute >= self._recovery_limit)
         self.began = np.where(rows & np.isnan(self.began) & recovered, minute, self.began)
         elapsed = minute - self.began
-        phase, setpoint, temperature = self._asked(elapsed)
-        self.done = self.done | (rows & (elapsed >= self._total - 1e-6))
+        ended = self.progress.watch(elapsed, m.od, believed)
+        phase, setpoint, temperature = self.progress.asked(elapsed)
+        self.done = self.done | (rows & (elapsed >= self.progress.totals - 1e-6))
 
         composed = None
         if self.composition is not None:
@@ -152,6 +149,7 @@ class ClosedLoop:
             now, rows, minute, elapsed, phase, m.od, m.temperature, setpoint, proposed, verdict.rate,
             np.full(len(self.done), np.nan), reasons, verdict.response, (), explanation, self.done.copy(),
             {} if composed is None else composed.columns,
+            [self.position(n) for n in range(len(self.done))], ended,
         )  # fmt: skip
         if self._before_dose is not None:
             self._before_dose(decision)
@@ -204,10 +202,23 @@ class ClosedLoop:
         """Reactors that a list of failures speaks of."""
         return np.array([any(line.startswith(f"{name}:") for line in failures) for name in self.reactors.names])
 
+    def position(self, n: int) -> dict[str, Any]:
+        """What a decision for reactor n has to keep of where its schedule stands; plain numbers."""
+        return {"began": float(self.began[n]), **self.progress.row(n)}
+
+    def take(self, n: int, position: Mapping[str, Any]) -> None:
+        """Put reactor n where a decision kept it. Raises: ValueError naming what does not fit."""
+        began = position.get("began")
+        if began is not None and not isinstance(began, int | float):
+            raise ValueError(f"began: {str(began)[:40]}, expected a number")
+        self.began[n] = np.nan if began is None else began
+        self.progress.take(n, position)
+
     def state(self) -> dict[str, Any]:
         """Where each reactor's schedule, the interlock and the controllers stand; plain numbers and lists."""
         known = {"began": self.began, "done": self.done, "stopped": self.stopped}
         state = {**{key: values.tolist() for key, values in known.items()}, "interlock": self.interlock.state()}
+        state |= self.progress.state()
         state |= {} if self.composition is None else {"composition": self.composition.state()}
         return state | ({"controller": self.controller.state()} if isinstance(self.controller, Remembers) else {})
 
@@ -228,6 +239,7 @@ class ClosedLoop:
         self.began = np.array(state["began"], dtype=np.float64)
         self.done = np.array(state["done"], dtype=np.bool_)
         self.stopped = np.array(state["stopped"], dtype=np.bool_)
+        self.progress.restore(state.get("steps", "missing"))
         self.interlock.restore(state.get("interlock", "missing"))
         if self.composition is not None:
             self.composition.restore(state.get("composition", "missing"))

@@ -80,7 +80,7 @@ class Record:
         for n in range(len(self.names)):
             if step.rows[n]:
                 why = {key: value[n] for key, value in step.explanation.items()}  # a number, or an MPC's plan
-                fields = {"reactor": self.names[n], "row": row_of(step, n), "why": why}
+                fields = {"reactor": self.names[n], "row": row_of(step, n), "why": why, "position": step.position[n]}
                 self.journal.append("decision", fields)
             elif step.reasons[n] is not None:
                 self.journal.append("trouble", {"reactor": self.names[n], "interlock": step.reasons[n]})

@@ -230,6 +230,7 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
     doses = [dose for dose in dosed(journal.rows) if dose.n >= state["journal_row"]]
     try:
         loop.restore(state)
+        _catch_up(loop, [row for row in journal.rows if row["n"] >= state["journal_row"]])
     except ValueError as error:
         raise _no_state(path, str(error)) from None
     if isinstance(loop.controller, Remembers) and "controller" not in state:
@@ -248,6 +249,17 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
         loop.controller.dosed(_put_off(journal.rows, loop) - _put_off(before, loop))
     minute = loop.reactors.elapsed() / 60.0
     log.info("resumed at minute %.1f; %d dose(s) booked from the journal", minute, len(doses))
+
+
+def _catch_up(loop: ClosedLoop, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Put every schedule where the newest decision left it that the saved state does not know of.
+
+    Raises: ValueError for a decision that does not fit.
+    """
+    names = list(loop.reactors.names)
+    for row in rows:
+        if row["kind"] == "decision" and isinstance(row.get("position"), Mapping) and row.get("reactor") in names:
+            loop.take(names.index(row["reactor"]), row["position"])
 
 
 def _put_off(rows: Sequence[Mapping[str, Any]], loop: ClosedLoop) -> Array:

@@ -9,11 +9,12 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from experiments.cli import files, frame
-from experiments.control import assemble
+from experiments.control import assemble, notify
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
 from experiments.control.device import one_interrupt
 from experiments.control.loop import ClosedLoop
+from experiments.control.notify import Notifier
 from experiments.control.record import Record
 from experiments.control.summary import (
     ChangeLog,
@@ -32,9 +33,9 @@ __all__ = ["deploy"]
 log = logging.getLogger(__name__)
 
 
-def _run(loop: ClosedLoop, record: Record) -> str:
+def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
     """The loop until its end or trouble; returns the outcome. Pumps are verified off, whatever happens."""
-    log_changes, reactors = ChangeLog(loop), loop.reactors
+    log_changes, reactors = ChangeLog(loop, tell), loop.reactors
     outcome = "failed: see the log"
     record.journal.append("start", {"time_s": round(reactors.elapsed(), 3), "pid": os.getpid()})
     try:
@@ -62,7 +63,7 @@ def _run(loop: ClosedLoop, record: Record) -> str:
     return outcome
 
 
-def _finish(record: Record, setup: Setup, outcome: str) -> str:
+def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str:
     """Figure and summary.json, whatever the outcome; returns the outcome, failed if they could not be written."""
     config, folder = setup.config, record.folder
     if not outcome.startswith(("completed", "stopped by the interlock")):
@@ -78,7 +79,7 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
             record.events.picture(f"figures/{name}", path, record.series("time_min").shape[1])
         roles = [config.role(name) for name in record.names]
         summary = {
-            **summarise(record, setup.scenarios, roles, outcome),
+            **summarise(record, setup.scenarios, roles, outcome, loop.progress),
             "figure": str(folder / "figures" / "closed_loop.png"),
         }
         files.write_json(folder / "summary.json", summary)
@@ -103,17 +104,32 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         config = whole
         frame.save_config(config, folder)
     setup = assemble.unpack(config, folder)
-    try:
-        if config.preflight_only:
+    if config.preflight_only:
+        try:
             assemble.run_preflight(setup, folder)
-            return
-        with one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync, config.columns)) as record:
-            for repair in record.repairs:
-                log.warning("%s", repair)
-            with assemble.opened(setup, record) as loop:
-                outcome = _run(loop, record)
-            outcome = _finish(record, setup, outcome)
-    except ReactorError as error:
+        except ReactorError as error:
+            raise frame.UserError(str(error)) from None
+        return
+    tell, outcome = notify.opened(config.notify, folder, setup.resumed), "stopped before the loop began"
+    try:
+        outcome = _recorded(setup, folder, tell)
+    except (ReactorError, frame.UserError) as error:
+        outcome = f"failed: {error}"
         raise frame.UserError(str(error)) from None
+    finally:
+        tell("end", outcome)
+        tell.close()
     if outcome.startswith("failed"):
         raise frame.UserError(outcome)
+
+
+def _recorded(setup: Setup, folder: Path, tell: Notifier) -> str:
+    """The loop with everything that it leaves behind; returns the outcome. Raises: ReactorError, UserError."""
+    config = setup.config
+    with one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync, config.columns)) as record:
+        for repair in record.repairs:
+            log.warning("%s", repair)
+        with assemble.opened(setup, record) as loop:
+            tell("start", f"{'resumed' if setup.resumed else 'started'}: {', '.join(loop.reactors.names)}")
+            outcome = _run(loop, record, tell)
+        return _finish(record, setup, loop, outcome)

@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -13,6 +13,7 @@ from envs.scenario import Scenario
 from experiments.control.composition import TRUE
 from experiments.control.loop import ClosedLoop, Step
 from experiments.control.metrics import mean_errors, window_metrics
+from experiments.control.progress import Progress
 from experiments.control.record import Record
 from experiments.control.recovery import Rows
 from experiments.reporting import charts
@@ -42,10 +43,15 @@ FORMATS = {  # of the metrics of a window
 
 
 class ChangeLog:
-    """Logs what changes, once: phases, who decides, words of the interlock, notes of the reactors."""
+    """Logs what changes, once: phases, who decides, words of the interlock, notes of the reactors.
 
-    def __init__(self, loop: ClosedLoop) -> None:
-        self._names = loop.reactors.names
+    Args: loop: that is watched. tell: is told of alarms and hand-overs, too: event, text, reactor.
+    """
+
+    def __init__(self, loop: ClosedLoop, tell: Callable[[str, str, str], None] | None = None) -> None:
+        self._names, self._progress, self._reactors = loop.reactors.names, loop.progress, loop.reactors
+        self._tell = tell or (lambda event, text, reactor: None)
+        self._handed_over = loop.reactors.handed_over.copy()
         self._phase = [-2] * len(self._names)
         self._reason: list[str | None] = [None] * len(self._names)
         self._supervised = [False] * len(self._names)
@@ -54,6 +60,8 @@ class ChangeLog:
     def __call__(self, step: Step) -> None:
         """Log what is new in this step."""
         for n, name in enumerate(self._names):
+            if step.ended is not None and step.ended[n]:
+                log.info("%s: %s at OD %.3f", name, self._ended(step, n), step.od[n])
             if step.rows[n] and int(step.phase[n]) != self._phase[n]:
                 self._phase[n] = int(step.phase[n])
                 share = step.composition.get("ratio_setpoint", np.full(len(self._names), np.nan))[n]
@@ -68,12 +76,23 @@ class ChangeLog:
             kinds = " ".join(kinds_of(reason)) or reason
             if kinds != (self._reason[n] or ""):
                 self._reason[n] = kinds
-                log.warning("%s: %s", name, step.reasons[n] or "interlock: all well again")
+                said = step.reasons[n] or "interlock: all well again"
+                log.warning("%s: %s", name, said)
+                self._tell("alarm", said, name)
+        for n in map(int, np.flatnonzero(self._reactors.handed_over & ~self._handed_over)):
+            self._tell("hand_over", "the device regulates by itself from now on", self._names[n])
+        self._handed_over = self._reactors.handed_over.copy()
         for note in step.notes:
             kind = re.sub(r"[\d.]+", "#", note)
             if kind not in self._noted:  # the journal has every one of them
                 self._noted.add(kind)
                 log.info("%s (noted once here, every time in the journal)", note)
+
+    def _ended(self, step: Step, n: int) -> str:
+        """Which step of reactor n's schedule this sample ended, and why."""
+        k = int(self._progress.phase(step.elapsed)[n]) - (not step.done[n])
+        start, end, _ = self._progress.steps(n)[k]
+        return f"step {k + 1} ended after {end - start:.0f} min: {self._progress.conditions.texts[n][k]}"
 
     def _who_decides(self, step: Step, n: int) -> None:
         """Where a supervisor stands over the policy: from when on its law acts, and until when."""
@@ -82,6 +101,7 @@ class ChangeLog:
             self._supervised[n] = supervised
             who = "the supervisor's law acts, the estimate is in doubt," if supervised else "the policy acts again"
             log.info("%s: %s from minute %.0f", self._names[n], who, step.minute[n])
+            self._tell("hand_over", f"{who} from minute {step.minute[n]:.0f}", self._names[n])
 
 
 def metrics_table(windows: Sequence[Mapping[str, Any]]) -> str:
@@ -106,8 +126,17 @@ def reasons_line(rows: Rows) -> str:
     )
 
 
-def summarise(record: Record, scenarios: Sequence[Scenario], roles: Sequence[str], outcome: str) -> dict[str, Any]:
-    """Every number of a run. Args: scenarios, roles: one per reactor. outcome: how it ended."""
+def summarise(
+    record: Record,
+    scenarios: Sequence[Scenario],
+    roles: Sequence[str],
+    outcome: str,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Every number of a run.
+
+    Args: scenarios, roles: one per reactor. outcome: how it ended. progress: when each step ended; None: by its time.
+    """
     volume, minute = np.nansum(record.series("volume_ml"), axis=1), record.series("time_min")
     reactors = {
         name: {
@@ -122,22 +151,24 @@ def summarise(record: Record, scenarios: Sequence[Scenario], roles: Sequence[str
     return {
         "outcome": outcome,
         "minutes": float(np.nanmax(minute)) if np.isfinite(minute).any() else 0.0,
-        "windows": _windows(record, scenarios),
+        "windows": _windows(record, scenarios, progress or Progress(scenarios)),
         "volume_ml": float(volume.sum()),
         "reactors": reactors,
         "repairs": record.repairs,
     }
 
 
-def _windows(record: Record, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
-    """Metrics of every phase of every reactor."""
+def _windows(record: Record, scenarios: Sequence[Scenario], progress: Progress) -> list[dict[str, Any]]:
+    """Metrics of every phase of every reactor; `ended` is what ended it, null if it is not over."""
     elapsed, od = record.series("elapsed_min"), record.series("od")
     rows = []
     for n, (name, scenario) in enumerate(zip(record.names, scenarios, strict=True)):
-        for phase, setpoint in enumerate(scenario.setpoints):
-            start, end = float(scenario.edges[phase]), float(scenario.edges[phase + 1])
+        latest = float(np.nanmax(elapsed[n], initial=-1.0))
+        for phase, (setpoint, step) in enumerate(zip(scenario.setpoints, progress.steps(n), strict=True)):
+            start, end = round(step[0], 4), round(step[1], 4)  # as the recording has its minutes
             m = window_metrics(elapsed[n : n + 1], od[n : n + 1], setpoint, start, end)
             window = {"reactor": name, "phase": phase, "setpoint": setpoint, "start_min": start, "end_min": end}
+            window["ended"] = step[2] if latest >= end - 1e-6 else None
             window["temperature"] = scenario.temperatures[phase]
             window |= {key: float(getattr(m, key)[0]) for key in FORMATS}
             if "ratio" in record.columns:

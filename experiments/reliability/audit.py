@@ -110,7 +110,7 @@ def audit_rows(
 def _last_due(r: Rehearsal, n: int, rows: NDArray[np.float64]) -> float:
     """Clock time after which reactor `n` owes no row: its schedule was over, or it was given up; inf if neither."""
     if r.loop.done[n]:
-        return r.spans[0][0] + 60.0 * float(r.loop.began[n] + r.loop.schedules[n].total_min)
+        return r.spans[0][0] + 60.0 * float(r.loop.began[n] + r.loop.progress.totals[n])
     return float(rows[-1]) if r.loop.stopped[n] and rows.size else math.inf
 
 

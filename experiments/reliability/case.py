@@ -40,7 +40,6 @@ class _Watch:
         self.struck_s = INF
         self.tracking = Tracking(_bands(fault, len(rehearsal.names)))
         self.tracking.counting = fault is None
-        self._schedules = rehearsal.config.schedules()
         self._fed_ml = INF  # by the faulty reactor's pump when it should have stopped
         rehearsal.clock.at(0.0, self._look)
 
@@ -50,8 +49,8 @@ class _Watch:
         r.device.run_until(now)
         if hasattr(r, "loop"):
             elapsed = (now - r.spans[0][0]) / 60.0 - r.loop.began
-            asked = np.array([s.at(elapsed[n : n + 1])[0][0] for n, s in enumerate(self._schedules)])
-            over = r.loop.done | (elapsed >= [s.total_min for s in self._schedules])
+            _, asked, _ = r.loop.progress.asked(elapsed)
+            over = r.loop.done | (elapsed >= r.loop.progress.totals)
             self.tracking.look(now / 60.0, asked, self._od(), ~over)
         if now >= self.struck_s + self.result.detected_s + STOPPED_S:
             fed_ml = float(r.device.vials[FAULTY].plant.feed.delivered_ml[0])

@@ -1,0 +1,184 @@
+"""Tell somebody: a line of JSON to a command or an HTTP address at the start, at alarms, hand-overs and at the end.
+
+Telling never stands in the way of a dose: messages wait in a short queue for a thread of their own, each try has a
+time limit, and what does not fit into the queue is dropped and counted. An address is a secret, because many services
+know their user by it: it is only ever in the environment, and what is logged of it is scheme and host.
+"""
+
+import json
+import logging
+import os
+import queue
+import shlex
+import shutil
+import signal
+import subprocess
+import threading
+from collections.abc import MutableMapping, Sequence
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import httpx
+
+from experiments.cli import frame
+
+__all__ = ["HOOK", "Hook", "Notifier", "hidden", "opened"]
+
+log = logging.getLogger(__name__)
+
+HOOK = "DEPLOY_HOOK"  # variable in which an address of the command line goes on
+LIMIT_S, LAST_S, WAITING = 10.0, 3.0, 32  # for one try; for what is left at the end; messages that may wait
+ADDRESS = ("http://", "https://")
+
+
+def hidden(arguments: Sequence[str], environment: MutableMapping[str, str]) -> list[str]:
+    """A command line whose `notify=https://...` has become `notify=env:DEPLOY_HOOK`, with the address put there."""
+    out = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        value = value.strip("'\"")
+        if key.lstrip("+") == "notify" and value.lower().startswith(ADDRESS):
+            environment[HOOK] = value
+            argument = f"notify=env:{HOOK}"
+        out.append(argument)
+    return out
+
+
+class Hook:
+    """Where messages go: a command that reads one from its standard input, or an address that is sent it by POST.
+
+    Args: target: command line or address. limit_s: for one try.
+    Attributes: name, as it may be logged.
+    Raises: UserError for a command line that cannot be read, or an address without a host.
+    """
+
+    def __init__(self, target: str, limit_s: float = LIMIT_S) -> None:
+        self._limit_s, self._target = limit_s, target
+        self._child: subprocess.Popen[bytes] | None = None
+        self._by_http = target.lower().startswith(ADDRESS)
+        if self._by_http:
+            self.name = self._public(target)
+            return
+        try:
+            self._command = shlex.split(target)
+        except ValueError as error:
+            raise frame.UserError(f"notify = {target}: {error}; allowed a command, https://... or env:NAME") from None
+        if not self._command or shutil.which(self._command[0]) is None:
+            raise frame.UserError("notify: there is no such command; allowed a command, https://... or env:NAME")
+        self.name = Path(self._command[0]).name
+
+    @staticmethod
+    def _public(address: str) -> str:
+        try:
+            parts = urlsplit(address)
+            host = parts.hostname
+        except ValueError:
+            host = None
+        if not host:
+            raise frame.UserError("notify: the address has no host; allowed https://HOST/...")
+        return f"{parts.scheme}://{host}/…"
+
+    def send(self, line: bytes) -> str:
+        """Deliver one line; what went wrong in a few words that name no secret, "" if nothing did."""
+        try:
+            return self._post(line) if self._by_http else self._run(line)
+        except (httpx.HTTPError, httpx.InvalidURL, OSError, subprocess.SubprocessError, ValueError) as error:
+            return type(error).__name__
+
+    def _post(self, line: bytes) -> str:
+        headers = {"Content-Type": "application/json"}
+        status = httpx.post(self._target, content=line, headers=headers, timeout=self._limit_s).status_code
+        return "" if status < 300 else f"status {status}"
+
+    def _run(self, line: bytes) -> str:
+        quiet = subprocess.DEVNULL
+        self._child = subprocess.Popen(
+            self._command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, start_new_session=True
+        )
+        try:
+            self._child.communicate(line, timeout=self._limit_s)
+        finally:
+            self.give_up()
+        return f"exit status {self._child.returncode}" if self._child.returncode else ""
+
+    def give_up(self) -> None:
+        """End a command that has not ended by itself, with what it started."""
+        if self._child is not None and self._child.poll() is None:
+            with suppress(ProcessLookupError):
+                os.killpg(self._child.pid, signal.SIGKILL)
+            with suppress(subprocess.TimeoutExpired):
+                self._child.wait(1.0)
+
+
+class Notifier:
+    """Messages of one run. Calling it never waits, never raises.
+
+    Args: hook: None drops every message. run: folder of the run.
+    Attributes: sent, failed, dropped: how many messages.
+    """
+
+    def __init__(self, hook: Hook | None, run: Path) -> None:
+        self._hook, self._run = hook, str(run)
+        self.sent = self.failed = self.dropped = 0
+        self._waiting: queue.Queue[bytes | None] = queue.Queue(WAITING)
+        self._thread: threading.Thread | None = None
+        if hook is not None:
+            self._thread = threading.Thread(target=self._deliver, args=(hook,), name="notify", daemon=True)
+            self._thread.start()
+
+    def __call__(self, event: str, text: str, reactor: str = "") -> None:
+        """Queue a message. Args: event: start, alarm, hand_over or end. reactor: "" for all."""
+        if self._thread is None:
+            return
+        at = datetime.now().astimezone().isoformat(timespec="seconds")
+        message = {"event": event, "time": at, "run": self._run, "reactor": reactor, "text": text}
+        try:
+            self._waiting.put_nowait(json.dumps({k: v for k, v in message.items() if v}).encode() + b"\n")
+        except queue.Full:
+            self.dropped += 1
+            if self.dropped == 1:
+                log.warning("notify: messages are dropped, the hook does not keep up")
+
+    def _deliver(self, hook: Hook) -> None:
+        while (line := self._waiting.get()) is not None:
+            if problem := hook.send(line):
+                self.failed += 1
+                if self.failed == 1:
+                    log.warning("notify: %s did not take a message (%s); the run goes on", hook.name, problem)
+            else:
+                self.sent += 1
+
+    def close(self) -> None:
+        """Wait a few seconds for what is still queued, then give it up; say how many messages arrived. Idempotent."""
+        if self._thread is None or self._hook is None:
+            return
+        with suppress(queue.Full):
+            self._waiting.put_nowait(None)
+        self._thread.join(LAST_S)
+        if self._thread.is_alive():
+            self._hook.give_up()
+        left = self._waiting.qsize()
+        self._thread = None
+        log.info(
+            "notify: %s took %d messages; %d failed, %d were dropped, %d were left at the end",
+            self._hook.name, self.sent, self.failed, self.dropped, left,
+        )  # fmt: skip
+
+
+def opened(target: str, run: Path, resumed: bool) -> Notifier:
+    """The notifier of a config's `notify`.
+
+    Raises: UserError for a variable that is not set, unless the run is resumed: a culture waits for that, so it goes
+      on untold and says so.
+    """
+    if target.startswith("env:"):
+        name = target.removeprefix("env:")
+        target = os.environ.get(name, "").strip()
+        if not target:
+            missing = f"notify=env:{name}: the environment has no {name}; set it to a command or an address"
+            if not resumed:
+                raise frame.UserError(missing)
+            log.warning("%s, then resume again; until then nobody is told", missing)
+    return Notifier(Hook(target) if target else None, run)

@@ -1,0 +1,127 @@
+"""Where each reactor stands in its own schedule, whose steps may end before their longest time."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.scenario import Scenario
+from envs.until import Conditions
+from experiments.controllers.base import Array, Mask
+
+__all__ = ["CONDITION", "TIME", "Progress"]
+
+CONDITION, TIME = "condition", "time"  # why a step ended
+Phases = NDArray[np.intp]
+
+
+def _padded(rows: Sequence[Sequence[float]], by: float | None = None) -> Array:
+    """Rows of unequal length as one array, filled up with `by`, or each with its last value."""
+    longest = max(map(len, rows))
+    return np.array([[*row, *[row[-1] if by is None else by] * (longest - len(row))] for row in rows], dtype=np.float64)
+
+
+class Progress:
+    """The edges of N schedules as they come: a condition that is met moves every later edge of its reactor forward.
+
+    A step is judged at believed samples after its beginning, so it lasts a control period at least; it ends at the
+    sample that meets its condition, which is the first of the next step. Settled: |OD - setpoint| within
+    `settled_band` times the setpoint at every believed sample of `settled_min`, counted anew in every step.
+
+    Attributes: edges, start of each step and end of the last, min since the schedule began, (N, P + 1), inf behind the
+    last. conditional, whether any step has a condition.
+    """
+
+    def __init__(self, schedules: Sequence[Scenario]) -> None:
+        self._counts = np.array([len(s.setpoints) for s in schedules])
+        self._minutes = _padded([s.minutes for s in schedules])
+        self._setpoints = _padded([s.setpoints for s in schedules])
+        self._temperatures = _padded([s.temperatures for s in schedules])
+        width = int(self._counts.max())
+        self.conditions = Conditions([[*s.until, *[None] * (width - len(s.until))] for s in schedules])
+        self.conditional = self.conditions.any
+        self._band = np.array([s.settled_band for s in schedules])
+        self._settled_min = np.array([s.settled_min for s in schedules])
+        self.edges = _padded([s.edges.tolist() for s in schedules], np.inf)
+        self._within_since = np.full(len(schedules), np.nan)  # min, from which on no reading was outside the band
+
+    @property
+    def totals(self) -> Array:
+        """End of each reactor's last step as things stand, min, (N,)."""
+        return np.asarray(self.edges[np.arange(self._counts.size), self._counts])
+
+    def phase(self, elapsed: Array) -> Phases:
+        """Step of each reactor, (N,); -1 before the start (and for nan), the last after the end."""
+        minute = np.nan_to_num(elapsed, nan=-1.0)
+        index = (minute[:, None] + 1e-9 >= self.edges[:, 1:]).sum(axis=1)
+        return np.where(minute >= 0.0, np.minimum(index, self._counts - 1), -1).astype(np.intp)
+
+    def asked(self, elapsed: Array) -> tuple[Phases, Array, Array]:
+        """Step, setpoint and temperature of each reactor, each (N,); before the start those of the first step."""
+        phase = self.phase(elapsed)
+        at = np.arange(phase.size), np.maximum(phase, 0)
+        return phase, self._setpoints[at], self._temperatures[at]
+
+    def watch(self, elapsed: Array, od: Array, believed: Mask) -> Mask:
+        """Take a sample; True where it ends a step, (N,). Args: believed: rows whose OD is new and believed."""
+        if not self.conditional:
+            return np.zeros(elapsed.size, dtype=np.bool_)
+        phase, setpoint, _ = self.asked(elapsed)
+        rows, step = np.arange(phase.size), np.maximum(phase, 0)
+        begun = self.edges[rows, step]
+        judged = believed & (phase >= 0) & (elapsed < self.totals - 1e-6)
+        within = judged & self._near(od, setpoint)
+        anew = ~(self._within_since >= begun - 1e-9)  # also nan; what an earlier step counted is over
+        since = np.where(anew, elapsed, self._within_since)
+        self._within_since = np.where(judged, np.where(within, since, np.nan), self._within_since)
+        settled = within & (elapsed - since >= self._settled_min - 1e-6)
+        ends = judged & (elapsed > begun + 1e-6) & self.conditions.met(step, od, settled)
+        shift = np.where(ends, elapsed - self.edges[rows, step + 1], 0.0)
+        later = np.arange(self.edges.shape[1]) > step[:, None]
+        self.edges = np.where(later, self.edges + shift[:, None], self.edges)
+        first = np.where(self._near(od, self.asked(elapsed)[1]), elapsed, np.nan)  # this sample is the next step's too
+        self._within_since = np.where(ends, first, self._within_since)
+        return ends
+
+    def _near(self, od: Array, setpoint: Array) -> Mask:
+        return np.asarray(np.abs(od - setpoint) <= self._band * setpoint)
+
+    def steps(self, n: int) -> list[tuple[float, float, str]]:
+        """Start, end and what ended each step of reactor n: as it came, or as it will if no condition is met."""
+        edges = self.edges[n, : self._counts[n] + 1]
+        early = np.diff(edges) < self._minutes[n, : self._counts[n]] - 1e-6
+        why = [CONDITION if e else TIME for e in early]
+        return list(zip(edges[:-1].tolist(), edges[1:].tolist(), why, strict=True))
+
+    def row(self, n: int) -> dict[str, Any]:
+        """What a decision for reactor n has to keep, so that a kill after it forgets nothing; plain numbers."""
+        if not self.conditional:
+            return {}
+        return {"edges": self.edges[n, : self._counts[n] + 1].tolist(), "within_since": float(self._within_since[n])}
+
+    def take(self, n: int, row: Mapping[str, Any]) -> None:
+        """Put reactor n where `row` was. Raises: ValueError naming what is missing or does not fit."""
+        if not self.conditional:
+            return
+        try:
+            edges = np.array(row["edges"], dtype=np.float64)
+            since = float("nan") if row["within_since"] is None else float(row["within_since"])
+        except (KeyError, TypeError, ValueError):
+            raise ValueError(f"steps: {str(row)[:60]}, expected edges and within_since") from None
+        if edges.shape != (self._counts[n] + 1,) or not (np.diff(edges) > 0.0).all() or edges[0] != 0.0:
+            raise ValueError(f"steps: edges {str(row['edges'])[:60]}, expected {self._counts[n] + 1} rising from 0")
+        self.edges[n, : edges.size], self._within_since[n] = edges, since
+
+    def state(self) -> dict[str, Any]:
+        """Every reactor's `row`; nothing where no step has a condition."""
+        return {"steps": [self.row(n) for n in range(self._counts.size)]} if self.conditional else {}
+
+    def restore(self, state: Any) -> None:
+        """Continue as saved. Raises: ValueError as `take`."""
+        if not self.conditional:
+            return
+        if not (isinstance(state, list) and len(state) == self._counts.size):
+            raise ValueError(f"steps: {str(state)[:40]}, expected one entry for each of {self._counts.size} reactors")
+        for n, row in enumerate(state):
+            self.take(n, row if isinstance(row, Mapping) else {})

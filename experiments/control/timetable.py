@@ -1,0 +1,161 @@
+"""What a run would do: steps by the clock, expected medium, who would decide, where it would record."""
+
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+
+from envs.scenario import Scenario
+from envs.until import Condition
+from experiments.cli import frame
+from experiments.control import assemble
+from experiments.control.assemble import Setup
+from experiments.control.config import DeployConfig
+from experiments.control.device import load_calibrations
+
+__all__ = ["Expected", "expected", "timetable"]
+
+HEAD = f"  {'step':>8} {'from':>12} {'to':>12} {'min':>7} {'at most':>8} {'OD':>6} {'degC':>6} {'mL':>7}  until"
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Of one step: minutes it takes, mL it needs, the OD it ends at, and mL if it takes its longest."""
+
+    minutes: float
+    ml: float
+    od: float
+    longest_ml: float
+
+
+def _reaches(od: float, level: float, growth: float, dilution: float) -> float:
+    """Minutes until a culture of OD `od` grows undiluted to `level`, or is diluted at full rate down to it."""
+    rate = growth if level > od else dilution - growth
+    return 0.0 if level == od else math.log(max(level, od) / min(level, od)) / rate if rate > 0.0 else math.inf
+
+
+def _fed_ml(minutes: float, reached: float, down: bool, growth: float, dilution: float, volume_ml: float) -> float:
+    """mL that `minutes` need: full rate on the way down, none on the way up, then as much as grows."""
+    held = max(minutes - reached, 0.0) * growth
+    return volume_ml * (held + (min(minutes, reached) * dilution if down else 0.0))
+
+
+def expected(s: Scenario, k: int, od: float, growth: float, dilution: float, volume_ml: float) -> Expected:
+    """Step k of a scenario from OD `od`: undiluted growth or full dilution to the setpoint, then growth is balanced.
+
+    Args: growth, dilution: growth rate and largest dilution rate, 1/min. volume_ml: of the culture.
+    """
+    setpoint, longest = s.setpoints[k], s.minutes[k]
+    reached = _reaches(od, setpoint, growth, dilution)
+    minutes = min(longest, _ends(s, k, od, growth, dilution, reached))
+    near = _after(od, setpoint, minutes, growth, dilution)
+    ml, most = (_fed_ml(t, reached, od > setpoint, growth, dilution, volume_ml) for t in (minutes, longest))
+    return Expected(minutes, ml, near, max(ml, most))
+
+
+def _ends(s: Scenario, k: int, od: float, growth: float, dilution: float, reached: float) -> float:
+    """Minutes after which the condition of step k is expected to be met; inf where it is not."""
+    text, setpoint = (s.until[k] if s.until else None), s.setpoints[k]
+    if text == "settled":
+        edge = setpoint * (1.0 + math.copysign(s.settled_band, od - setpoint))
+        inside = abs(od - setpoint) <= s.settled_band * setpoint
+        return s.settled_min + (0.0 if inside else _reaches(od, edge, growth, dilution))
+    least, most = Condition(text).bounds
+    if od >= least or od <= most:
+        return 1.0  # a step lasts a control period at least
+    for level, passed in ((least, od < least <= setpoint), (most, od > most >= setpoint)):
+        if passed:
+            return min(_reaches(od, level, growth, dilution), reached)
+    return math.inf
+
+
+def _after(od: float, setpoint: float, minutes: float, growth: float, dilution: float) -> float:
+    """OD after so many minutes on the way to the setpoint."""
+    if od <= setpoint:
+        return min(od * math.exp(growth * minutes), setpoint)
+    return max(od * math.exp((growth - dilution) * minutes), setpoint)
+
+
+def timetable(config: DeployConfig, place: str, now: datetime) -> str:
+    """Everything that `dry_run=true` prints; reads files, asks no device and writes nothing.
+
+    Args: place: where the run would record. now: when it would start.
+    Raises: UserError as the run itself would, for all that can be known without a device.
+    """
+    if config.resume is not None:
+        raise frame.UserError("dry_run=true: a resumed run goes on where it was; drop dry_run or resume")
+    with tempfile.TemporaryDirectory() as scratch:
+        setup = assemble.unpack(assemble.completed(config), Path(scratch))
+    lines = [*_deciders(setup), *_device(setup)]
+    for name, scenario in zip(setup.config.backend.reactors, setup.scenarios, strict=True):
+        lines += _reactor(setup, name, scenario, now)
+    return "\n".join([*lines, f"would record in {place}; nothing was asked of a device and nothing was written"])
+
+
+def _deciders(setup: Setup) -> Iterator[str]:
+    c = setup.config
+    policy = ""
+    if setup.policy is not None:
+        policy = f", policy {c.policy} (regret {float(setup.policy.metadata.get('regret_pct', math.nan)):.2g} %)"
+    share = "" if c.composition is None else f"; share: {c.composition.kind}"
+    yield f"controller {c.controller.kind}{policy}{share}; at_end {c.at_end}"
+
+
+def _device(setup: Setup) -> Iterator[str]:
+    backend = setup.config.backend
+    where = getattr(backend, "url", "") if backend.kind == "chibio" else "in this computer"
+    yield f"backend {backend.kind} ({where}), reactors {', '.join(backend.reactors)}"
+    if backend.kind == "sim":
+        return
+    found = load_calibrations(Path(backend.calibration), backend.reactors)
+    if nominal := [name for name, c in zip(backend.reactors, found, strict=True) if not c.calibrated]:
+        yield f"pumps not weighed, taken as 1 mL/s: {', '.join(nominal)}"
+
+
+def _start_od(setup: Setup, scenario: Scenario) -> float:
+    """The OD a reactor starts from, as far as that is known; else the one its first step asks for."""
+    backend = setup.config.backend
+    known = {"sim": setup.plant.start_od, "emulator": getattr(backend, "od", 0.0)}
+    return max(known.get(backend.kind, 0.0), scenario.recovery_od) or scenario.setpoints[0]
+
+
+def _reactor(setup: Setup, name: str, scenario: Scenario, now: datetime) -> Iterator[str]:
+    """The steps of one reactor, each in a line, and whether its medium lasts."""
+    safety, growth = setup.config.safety, setup.model.mu
+    dilution = setup.model.max_pump_rate / setup.model.tau
+    od, at, ml, most = max(_start_od(setup, scenario), 1e-3), 0.0, 0.0, 0.0
+    yield f"{name} ({setup.config.role(name)}), from OD {od:g}, growth {growth:g} 1/min"
+    yield HEAD
+    if scenario.recovery_od:
+        longest = f"at most {scenario.recovery_limit_min:g} min; the times below count from its end"
+        yield f"  {'recovery':>8} grows undiluted to OD {scenario.recovery_od:g}, {longest}"
+    for k, (setpoint, most_min, degc) in enumerate(
+        zip(scenario.setpoints, scenario.minutes, scenario.temperatures, strict=True)
+    ):
+        step = expected(scenario, k, od, growth, dilution, safety.volume_ml)
+        until = (scenario.until[k] if scenario.until else None) or "its time"
+        share = scenario.ratios[k] if scenario.ratios else None
+        said = f"{until}{'' if share is None else f'; share {share:g}, which decides the temperature'}"
+        yield (
+            f"  {k + 1:>8} {_clock(now, at)} {_clock(now, at + step.minutes)} {step.minutes:7.0f} {most_min:8.0f} "
+            f"{setpoint:6.2f} {degc:6.1f} {step.ml:7.1f}  {said}"
+        )
+        od, at, ml, most = step.od, at + step.minutes, ml + step.ml, most + step.longest_ml
+    yield f"  {ml:.0f} mL of medium expected, {most:.0f} mL if every step takes its longest; {_lasts(setup, ml, most)}"
+
+
+def _lasts(setup: Setup, ml: float, most: float) -> str:
+    """Whether bottle and budget last."""
+    safety = setup.config.safety
+    key = "bottle_ml" if safety.bottle_ml <= safety.ml_per_run else "ml_per_run"
+    limit = getattr(safety, key)
+    if most <= limit:
+        return f"safety.{key}={limit:g} lasts"
+    word = "does NOT last" if ml > limit else "may not last"
+    return f"safety.{key}={limit:g} {word}: the interlock stops feeding there; give the run more"
+
+
+def _clock(now: datetime, minutes: float) -> str:
+    return f"{now + timedelta(minutes=minutes):%a %d %H:%M}".rjust(12)

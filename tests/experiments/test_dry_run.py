@@ -1,0 +1,71 @@
+"""`dry_run=true`: the timetable by hand, no device asked, nothing left behind."""
+
+import math
+import os
+import subprocess
+import sys
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+
+from envs.scenario import Scenario
+from experiments.cli import frame
+from experiments.control.config import DeployConfig
+from experiments.control.timetable import expected, timetable
+from experiments.deploy import main
+from tests.experiments.test_deploy import ROOT
+
+NOON = datetime(2026, 3, 2, 12, 0)
+GROWTH, DILUTION, VOLUME_ML = 0.03, 0.06, 20.0
+
+
+def step(setpoint: float, minutes: float, od: float, until: str | None = None) -> tuple[float, float, float]:
+    e = expected(Scenario((setpoint,), (minutes,), (37.0,), until=(until,)), 0, od, GROWTH, DILUTION, VOLUME_ML)
+    return e.minutes, e.ml, e.od
+
+
+def test_what_a_step_takes_by_hand() -> None:
+    up, down = math.log(2.0) / 0.03, math.log(2.0) / (0.06 - 0.03)  # 0.4 to 0.8 and back
+    assert step(0.8, 60.0, 0.4) == pytest.approx((60.0, (60.0 - up) * 0.03 * 20.0, 0.8))
+    assert step(0.4, 60.0, 0.8) == pytest.approx((60.0, (down * 0.06 + (60.0 - down) * 0.03) * 20.0, 0.4))
+    assert step(0.8, 600.0, 0.4, "od >= 0.8") == pytest.approx((up, 0.0, 0.8))
+    assert step(0.3, 600.0, 0.8, "od <= 0.4") == pytest.approx((down, down * 0.06 * 20.0, 0.4))
+    assert step(0.8, 600.0, 0.8, "settled") == pytest.approx((10.0, 10.0 * 0.03 * 20.0, 0.8))
+    assert step(0.5, 60.0, 0.5, "od >= 0.8")[0] == 60.0  # held at 0.5 it never gets there
+    assert step(0.5, 60.0, 0.9, "od >= 0.8")[0] == 1.0  # it is there already
+
+
+def told(*overrides: str) -> str:
+    return timetable(main.config(["dry_run=true", *overrides]), "HERE", NOON)
+
+
+def test_steps_clock_and_bottle_are_told() -> None:
+    text = told("scenario=hold", "scenario.minutes=[1500]", "safety.bottle_ml=500", "backend.reactors=[M0,M1]")
+    assert text.count("Mon 02 12:00 Tue 03 13:00    1500     1500") == 2
+    assert text.count("900 mL of medium expected") == 2  # 1500 min x 0.03 1/min x 20 mL
+    assert text.count("safety.bottle_ml=500 does NOT last") == 2
+    assert "controller dqn, policy shipped" in text
+    assert "would record in HERE" in text
+    assert "safety.bottle_ml=2000 lasts" in told("scenario=hold")
+    longer = told("scenario=hold", "scenario.minutes=[1500]", "scenario.until=[settled]", "safety.bottle_ml=500")
+    assert "may not last" in longer
+
+
+def test_what_the_run_would_refuse_is_refused() -> None:
+    with pytest.raises(frame.UserError, match="nowhere"):
+        told("policy=nowhere.npz")
+    with pytest.raises(frame.UserError, match="drop dry_run"):
+        timetable(DeployConfig(resume="RUN"), "HERE", NOON)
+
+
+def test_no_device_is_asked_and_no_folder_left(tmp_path: Path) -> None:
+    """The address answers nobody, so a run would fail."""
+    command = [sys.executable, "-m", "experiments.deploy", "backend=chibio", "backend.url=http://127.0.0.1:9"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [*command, "dry_run=true"], capture_output=True, text=True, env=environment, timeout=60, cwd=tmp_path
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "pumps not weighed, taken as 1 mL/s: M0" in done.stdout
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,208 @@
+"""Who is told, by real commands and real servers; a hook that hangs changes nothing, an address is kept nowhere."""
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from envs.scenario import Scenario
+from experiments.cli import frame
+from experiments.control import notify
+from experiments.control.config import DeployConfig
+from experiments.control.notify import Hook, Notifier, hidden
+from experiments.control.summary import ChangeLog
+from experiments.reliability.rehearsal import Rehearsal, rehearsed
+from hardware.emulator.faults import inject
+from tests.experiments.test_deploy import ROOT
+from tests.hardware.emulator_lab import quiet
+
+SECRET = "T0SECRET"
+
+
+class Server(ThreadingHTTPServer):
+    """A hook; with `hangs` it takes requests and answers none until `released`."""
+
+    daemon_threads = True
+
+    def __init__(self, hangs: bool = False, status: int = 200) -> None:
+        self.lines: list[dict[str, str]] = []
+        self.paths: list[str] = []
+        self.hangs, self.status, self.released, self.asked = hangs, status, threading.Event(), threading.Event()
+        super().__init__(("127.0.0.1", 0), Handler)
+        threading.Thread(target=self.serve_forever, daemon=True).start()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_address[1]}/hook/{SECRET}?key={SECRET}"
+
+
+class Handler(BaseHTTPRequestHandler):
+    def do_POST(self) -> None:
+        server = self.server
+        assert isinstance(server, Server)
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        server.asked.set()
+        if server.hangs:
+            server.released.wait(60.0)
+        server.paths.append(self.path)
+        server.lines.append(json.loads(body))
+        self.send_response(server.status)
+        self.end_headers()
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    made = Server()
+    yield made
+    made.shutdown()
+    made.server_close()
+
+
+def deployed(folder: Path, *overrides: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **variables}
+    command = [sys.executable, "-m", "experiments.deploy", f"hydra.run.dir={folder}", "controller=pi"]
+    short = ["scenario=hold", "scenario.minutes=[5]"]
+    return subprocess.run(
+        [*command, *short, *overrides], capture_output=True, text=True, env=environment, timeout=100, check=False
+    )
+
+
+def test_an_address_is_told_of_start_and_end_and_stands_in_no_file(tmp_path: Path, server: Server) -> None:
+    done = deployed(tmp_path / "run", f"notify={server.url}")
+    assert done.returncode == 0, done.stderr
+    assert [line["event"] for line in server.lines] == ["start", "end"]
+    assert server.lines[1]["text"] == "completed"
+    assert server.lines[0]["run"].endswith("run")
+    assert server.paths == [f"/hook/{SECRET}?key={SECRET}"] * 2
+    assert SECRET not in done.stdout + done.stderr
+    files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
+    assert len(files) > 8
+    assert not [path for path in files if SECRET.encode() in path.read_bytes()]
+    assert "notify: env:DEPLOY_HOOK" in (tmp_path / "run" / "config.yaml").read_text()
+
+
+def test_a_run_that_fails_says_so_by_a_command_of_the_environment(tmp_path: Path) -> None:
+    told = tmp_path / "told.jsonl"
+    (tmp_path / "hook.py").write_text(f"import sys; open({str(told)!r}, 'a').write(sys.stdin.read())")
+    command = f"{sys.executable} {tmp_path / 'hook.py'}"
+    done = deployed(
+        tmp_path / "run", "notify=env:MY_HOOK", "backend=chibio", "backend.url=http://127.0.0.1:9", MY_HOOK=command
+    )
+    assert done.returncode == 1
+    (line,) = map(json.loads, told.read_text().splitlines())
+    assert line["event"] == "end"
+    assert line["text"].startswith("failed: ")
+
+
+def rehearsal(folder: Path, tell: Notifier | None = None) -> Rehearsal:
+    """Half an hour at 0.4 in which the spectrometer fails for a while."""
+    folder.mkdir()
+    run = Rehearsal(folder, rehearsed(("M0",), Scenario((0.4,), (30.0,), (37.0,))), quiet(mu=0.03), od=0.4)
+    run.begin()
+    changes = ChangeLog(run.loop, tell)
+    for step in run.run():
+        changes(step)
+        minute = float(step.minute[0])
+        inject(run.device, "spectrometer_dead", "M0", int(10.0 < minute < 14.0))
+    return run
+
+
+def test_a_hook_that_hangs_changes_no_sample_and_no_dose(tmp_path: Path) -> None:
+    plain = rehearsal(tmp_path / "plain")
+    server = Server(hangs=True)
+    tell = Notifier(Hook(server.url, limit_s=15.0), tmp_path)
+    told = rehearsal(tmp_path / "told", tell)
+    assert server.asked.wait(10.0)  # it has been asked, and has not answered
+    assert (tell.sent, tell.failed) == (0, 0)  # nobody waited for it: not even one try has ended
+    for column in plain.record.columns:
+        if column != "interlock":
+            np.testing.assert_array_equal(told.record.series(column), plain.record.series(column))
+    assert [(d.pump, d.start_s, d.seconds) for d in told.device.vials["M0"].doses] == [
+        (d.pump, d.start_s, d.seconds) for d in plain.device.vials["M0"].doses
+    ]
+    server.released.set()
+    tell.close()
+    assert [line["event"] for line in server.lines][:2] == ["alarm", "alarm"]
+    assert server.lines[0]["text"].startswith("spectrometer: ")
+    assert server.lines[0]["reactor"] == "M0"
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_hand_over_is_told(tmp_path: Path) -> None:
+    events: list[tuple[str, str]] = []
+    config = replace(rehearsed(("M0",), Scenario((0.4,), (5.0,), (37.0,))), at_end="regulate")
+    run = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.4)
+    run.begin()
+    changes = ChangeLog(run.loop, lambda event, text, reactor: events.append((event, reactor)))
+    for step in run.run():
+        changes(step)
+    assert events == [("hand_over", "M0")]
+
+
+def test_what_does_not_fit_into_the_queue_is_dropped_and_counted(tmp_path: Path, caplog) -> None:  # type: ignore[no-untyped-def]
+    caplog.set_level(logging.INFO)
+    server = Server(hangs=True)
+    tell = Notifier(Hook(server.url), tmp_path)
+    tell("alarm", "first")
+    assert server.asked.wait(10.0)
+    for _ in range(notify.WAITING + 5):
+        tell("alarm", "more")
+    assert tell.dropped == 5
+    tell.close()  # comes back although the hook does not
+    assert "5 were dropped" in caplog.text
+    assert SECRET not in caplog.text
+    server.released.set()
+
+
+def test_a_command_that_hangs_is_ended_with_its_children(tmp_path: Path) -> None:
+    pid = tmp_path / "pid"
+    script = f"import os,time; open({str(pid)!r}, 'w').write(str(os.getpid())); time.sleep(600)"
+    hook = Hook(f'{sys.executable} -c "{script}"', limit_s=3.0)
+    assert hook.send(b"{}\n") == "TimeoutExpired"
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), 0)
+
+
+def test_what_a_hook_answers_is_said_without_the_address(caplog) -> None:  # type: ignore[no-untyped-def]
+    server = Server(status=403)
+    hook = Hook(server.url)
+    assert hook.name == "http://127.0.0.1/…"
+    assert hook.send(b"{}\n") == "status 403"
+    server.shutdown()
+    server.server_close()
+    assert hook.send(b"{}\n") == "ConnectError"
+    with pytest.raises(frame.UserError, match="notify: there is no such command"):
+        Hook("no-such-command --now")
+    assert Hook("false").send(b"{}\n") == "exit status 1"
+    assert SECRET not in caplog.text
+
+
+def test_the_command_line_is_cleaned_of_an_address() -> None:
+    environment: dict[str, str] = {}
+    given = ["backend=sim", f"+notify=https://h/{SECRET}=1"]
+    assert hidden(given, environment) == ["backend=sim", "notify=env:DEPLOY_HOOK"]
+    assert environment == {"DEPLOY_HOOK": f"https://h/{SECRET}=1"}
+    assert hidden(["notify=mail lab"], environment) == ["notify=mail lab"]
+
+
+def test_an_address_in_a_file_and_a_variable_that_is_missing_are_refused(tmp_path: Path, caplog) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match="notify: an address is a secret") as error:
+        DeployConfig(notify=f"https://h/{SECRET}")
+    assert SECRET not in str(error.value)
+    with pytest.raises(frame.UserError, match="notify=env:NO_SUCH_HOOK: the environment has no NO_SUCH_HOOK"):
+        notify.opened("env:NO_SUCH_HOOK", tmp_path, resumed=False)
+    notify.opened("env:NO_SUCH_HOOK", tmp_path, resumed=True)("end", "nobody is told")
+    assert "until then nobody is told" in caplog.text

@@ -1,0 +1,181 @@
+"""Steps of a schedule that end by a condition: when, for whom, and over a kill; expected minutes by hand."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from envs.scenario import Scenario
+from experiments.control.progress import Progress
+from experiments.control.summary import summarise
+from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
+from tests.hardware.emulator_lab import quiet
+
+ALL = np.array([True, True])
+STEPS = Scenario((0.8, 0.8, 0.3), (60.0, 30.0, 20.0), (37.0, 37.0, 30.0), until=("od >= 0.7", "settled", None))
+GROWS = Scenario((0.6, 0.3), (600.0, 10.0), (37.0, 30.0), until=("od >= 0.5", None))
+
+
+def fed(progress: Progress, minute: float, *od: float, believed: np.ndarray = ALL) -> list[bool]:
+    return progress.watch(np.full(len(od), minute), np.array(od), believed).tolist()
+
+
+def test_each_reactor_moves_on_by_itself_and_its_later_steps_begin_earlier() -> None:
+    progress = Progress([STEPS, STEPS])
+    assert fed(progress, 0.0, 0.9, 0.2) == [False, False]  # a step is judged after its first sample
+    assert fed(progress, 5.0, 0.72, 0.69) == [True, False]
+    phase, setpoint, temperature = progress.asked(np.array([5.0, 5.0]))
+    assert phase.tolist() == [1, 0]
+    assert setpoint.tolist() == [0.8, 0.8]
+    assert temperature.tolist() == [37.0, 37.0]
+    assert progress.edges.tolist() == [[0.0, 5.0, 35.0, 55.0], [0.0, 60.0, 90.0, 110.0]]
+    assert progress.totals.tolist() == [55.0, 110.0]
+    assert progress.phase(np.array([35.0, 35.0])).tolist() == [2, 0]
+    assert progress.phase(np.array([np.nan, -1.0])).tolist() == [-1, -1]
+    assert progress.steps(0) == [(0.0, 5.0, "condition"), (5.0, 35.0, "time"), (35.0, 55.0, "time")]
+
+
+def test_a_reading_that_is_not_believed_ends_nothing() -> None:
+    progress = Progress([STEPS, STEPS])
+    assert fed(progress, 5.0, 0.9, math.nan, believed=np.array([False, True])) == [False, False]
+
+
+def test_below_a_level() -> None:
+    progress = Progress([replace(STEPS, until=("od <= 0.3", None, None))])
+    one = np.array([True])
+    assert [fed(progress, k, od, believed=one)[0] for k, od in ((1.0, 0.31), (2.0, 0.3))] == [False, True]
+
+
+def test_settled_is_the_band_for_the_time_and_begins_anew_after_a_reading_outside() -> None:
+    """Within 0.76 to 0.84 from minute 5 to 10, outside at 11, within from 12: settled at 22, ten minutes later."""
+    scenario = replace(STEPS, until=("settled", "settled", None))
+    progress, one = Progress([scenario]), np.array([True])
+    ended = [
+        minute
+        for minute in range(40)
+        if fed(progress, float(minute), 0.85 if minute < 5 or minute == 11 else 0.77, believed=one)[0]
+    ]
+    assert ended == [22, 32]  # the second step counts from its own beginning
+    assert progress.edges.tolist() == [[0.0, 22.0, 32.0, 52.0]]
+
+
+def test_what_was_counted_is_kept_and_goes_on() -> None:
+    progress, one = Progress([replace(STEPS, until=("settled", None, None))]), np.array([True])
+    for minute in range(8):
+        fed(progress, float(minute), 0.8, believed=one)
+    second = Progress([replace(STEPS, until=("settled", None, None))])
+    second.restore(json.loads(json.dumps(progress.state()))["steps"])
+    assert [fed(second, float(m), 0.8, believed=one)[0] for m in (8, 9, 10)] == [False, False, True]
+    for damaged in ("missing", [], [{"edges": [0, 5], "within_since": None}], [{"edges": [0, 5, 4, 9]}]):
+        with pytest.raises(ValueError, match="steps: "):
+            second.restore(damaged)
+
+
+@pytest.mark.parametrize("text", ["od => 0.8", "od >= high", "OD >= 0.8", "setled", "od >= 0", "od <= 7", "time"])
+def test_a_misspelt_condition_is_named(text: str) -> None:
+    with pytest.raises(ValueError, match=rf"scenario\.until: '{text}': allowed "):
+        Scenario(until=(text,))
+
+
+def test_conditions_do_not_go_with_shares_and_need_one_for_each_step() -> None:
+    with pytest.raises(ValueError, match=r"scenario\.until = .*: allowed \[\] where a share is asked for"):
+        Scenario(until=("settled",), ratios=(0.3,))
+    with pytest.raises(ValueError, match=r"scenario\.until = .*: allowed none or one for each of the 1 phases"):
+        Scenario(until=("settled", None))
+    assert Scenario(until=(None,), ratios=(0.3,)).composed
+
+
+def _run(folder: Path, schedule: Scenario = GROWS, **each: object) -> Rehearsal:
+    """M0 and M1 grow with 0.03 1/min from 0.4: 0.5 is reached after 7.4 min, M1's 0.45 after 3.9."""
+    folder.mkdir(exist_ok=True)
+    own = {"M1": {"until": ["od >= 0.45", None]} | each}
+    run = Rehearsal(folder, replace(rehearsed(("M0", "M1"), schedule), each=own), quiet(mu=0.03), od=0.4)
+    run.begin()
+    return run
+
+
+def test_on_the_device_steps_end_where_growth_by_hand_has_them_and_windows_follow(tmp_path: Path) -> None:
+    run = _run(tmp_path)
+    for _ in run.run():
+        pass
+    first = [window for window in _windows(run) if window["phase"] == 0]
+    for window, level in zip(first, (0.5, 0.45), strict=True):
+        assert window["ended"] == "condition"
+        late = window["end_min"] - math.log(level / 0.4) / 0.03
+        assert -0.1 < late <= 1.6  # the next sample; one that comes later than the culture's start by part of a minute
+    second = [window for window in _windows(run) if window["phase"] == 1]
+    for a, b, n in zip(first, second, (0, 1), strict=True):
+        assert (b["start_min"], b["end_min"]) == (a["end_min"], pytest.approx(a["end_min"] + 10.0, abs=1e-3))
+        assert b["ended"] == "time"
+        minute, setpoint = run.record.rows[n].columns["elapsed_min"], run.record.rows[n].columns["setpoint"]
+        assert [s for m, s in zip(minute, setpoint, strict=True) if m < a["end_min"] - 1e-6 and m >= 0] == [0.6] * (
+            sum(0 <= m < a["end_min"] - 1e-6 for m in minute)
+        )
+        assert {s for m, s in zip(minute, setpoint, strict=True) if m >= a["end_min"] - 1e-6} == {0.3}
+        errors = [o - 0.3 for m, o in zip(minute, run.record.rows[n].columns["od"], strict=True)
+                  if a["end_min"] - 1e-6 <= m <= b["end_min"] + 1e-6]  # fmt: skip
+        times = [m for m in minute if a["end_min"] - 1e-6 <= m <= b["end_min"] + 1e-6]
+        assert b["ise"] == pytest.approx(float(np.trapezoid(np.square(errors), times)))
+
+
+def _windows(run: Rehearsal) -> list[dict[str, object]]:
+    summary = summarise(run.record, run.loop.schedules, ["replicate"] * 2, "completed", run.loop.progress)
+    return list(summary["windows"])
+
+
+def test_a_run_killed_between_the_decision_that_ends_a_step_and_its_record_goes_on_in_the_next(tmp_path: Path) -> None:
+    whole = _run(tmp_path / "whole")
+    for _ in whole.run():
+        pass
+    run = _run(tmp_path / "killed")
+    decided = run.loop._before_dose
+    assert decided is not None
+
+    def dies(step):  # type: ignore[no-untyped-def]
+        decided(step)
+        if step.ended[0]:
+            run.kill()
+
+    run.loop._before_dose = dies
+    with pytest.raises(Killed):
+        for _ in run.run():
+            pass
+    assert json.loads((run.folder / "state.json").read_text())["steps"][0]["edges"][1] == 600.0  # it does not know
+    run.close()
+    run.wait(30.0)
+    run.begin()
+    assert run.loop.progress.edges[0, 1] == pytest.approx(whole.loop.progress.edges[0, 1], abs=0.05)
+    moved = run.loop.progress.edges.tolist()
+    for step in run.run():
+        assert step.phase[0] == 1
+    assert run.loop.progress.edges.tolist() == moved
+    (window,) = [w for w in _windows(run) if w["reactor"] == "M0" and w["phase"] == 0]
+    assert window["ended"] == "condition"
+    assert run.record.series("phase")[0].tolist().count(0.0) == whole.record.series("phase")[0].tolist().count(0.0)
+
+
+def test_a_run_killed_after_its_first_decision_began_only_once(tmp_path: Path) -> None:
+    run = _run(tmp_path)
+    decided = run.loop._before_dose
+    assert decided is not None
+
+    def dies(step):  # type: ignore[no-untyped-def]
+        decided(step)
+        if step.elapsed[1] == 0.0:
+            run.kill()
+
+    run.loop._before_dose = dies
+    with pytest.raises(Killed):
+        for _ in run.run():
+            pass
+    run.close()
+    run.begin()
+    for _ in run.run(run.clock.now() + 120.0):
+        pass
+    minute, elapsed = run.record.series("time_min")[1], run.record.series("elapsed_min")[1]
+    began = (minute - elapsed)[np.isfinite(elapsed)]
+    assert began.size >= 2
+    np.testing.assert_allclose(began, began[0], atol=1e-3)
