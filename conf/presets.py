@@ -14,11 +14,11 @@ ROOT = Path(str(resources.files("conf")))
 
 
 def groups() -> dict[str, list[str]]:
-    """Config groups and their presets: {"env": ["sim"], ...}."""
+    """Config groups and their presets: {"env": ["sim"], ...}. Hydra's own groups are not among them."""
     found: dict[str, list[str]] = {}
     for path in sorted(ROOT.rglob("*.yaml")):
         group = path.parent.relative_to(ROOT).as_posix()
-        if group != ".":
+        if group != "." and not group.startswith("hydra"):
             found.setdefault(group, []).append(path.stem)
     return found
 
