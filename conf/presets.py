@@ -50,7 +50,7 @@ def added() -> dict[str, Added]:
 
 
 def groups() -> dict[str, list[str]]:
-    """Config groups and their presets: {"env": ["sim"], ...}."""
+    """Config groups and their presets: {"env": ["sim"], ...}. Hydra's own groups are not among them."""
     found = _files()
     for name in _added:
         group, _, option = name.rpartition("/")
@@ -62,7 +62,7 @@ def _files() -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for path in sorted(ROOT.rglob("*.yaml")):
         group = path.parent.relative_to(ROOT).as_posix()
-        if group != ".":
+        if group != "." and not group.startswith("hydra"):
             found.setdefault(group, []).append(path.stem)
     return found
 

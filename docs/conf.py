@@ -21,7 +21,6 @@ exclude_patterns = ["figures"]
 apidoc_modules = [{"path": f"../{name}", "destination": f"api/{name}", "separate_modules": True} for name in PACKAGES]
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
-suppress_warnings = ["myst.xref_missing"]  # links to files outside docs/; the tests follow each of them
 
 LABEL = re.compile(r"^(Args|Attributes|Raises|Returns|State|Yields)\b([^:]*):\s*(.*)$")
 

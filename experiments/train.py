@@ -9,7 +9,7 @@ from experiments.training.config import TrainConfig, env_schema
 
 
 def train(config: TrainConfig, folder: Path) -> float:
-    """Train, export and report; returns the median regret, the objective of a sweep."""
+    """Train, export and report; returns the objective of a sweep, the merit of the worst seed."""
     from experiments.training import run  # torch, only once the config has been checked
 
     return run.train(config, folder)
@@ -20,7 +20,7 @@ def _schema(cfg: DictConfig) -> TrainConfig:
     return TrainConfig(env=env_schema(str(cfg.env.get("kind", "density"))))
 
 
-main = frame.Command("train", TrainConfig(), train, _schema, resumes="checkpoint.pt")
+main = frame.Command("train", TrainConfig(), train, _schema, resumes="checkpoint.pt", goes_on=True)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,8 @@ import shlex
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any, Generic, TextIO, TypeVar, cast
@@ -25,9 +26,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from conf import presets
-from conf.schema import build, old_name
-from experiments.cli import extensions, files, help_page, latest, stop
+from conf.schema import build
+from experiments.cli import extensions, files, help_page, latest, stop, sweep, words
+from experiments.cli.words import UserError, normalise
 
 __all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config"]
 
@@ -45,77 +46,6 @@ REFUSALS = {
     **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG), PLACE),
 }
 """What a disk answers that will not take a file, and the remedy."""
-
-
-class UserError(Exception):
-    """Something the user can mend; the message is one line and is all that is shown."""
-
-
-def _choose(command: str, group: str, option: str) -> None:
-    """Whether a command can be told `group=option`. Raises: UserError naming what it takes, or the right command."""
-    given, own = f"{group}={option}", presets.chosen(command)
-    known = presets.groups()[group]
-    of = presets.owner(f"{group}/{option}") if option in known else None
-    if of not in (None, command):
-        what = "recipe" if group == "experiment" else "preset"
-        raise UserError(f"{given}: a {what} of {of}; python -m experiments.{of} +{given}")
-    if group not in own:
-        others = [name for name in presets.commands() if group in presets.chosen(name)]
-        takes = ", ".join(own) or "no group"
-        raise UserError(f"{given}: {command} takes {takes}; {group}= is for {', '.join(others)}")
-    if re.fullmatch(r"[\w./-]+", option) and option not in (*known, "null"):
-        allowed = ", ".join(presets.options(command, group))
-        raise UserError(old_name(given) or f"{given}: no such option; allowed: {allowed}")
-
-
-def normalise(argv: Sequence[str], command: str) -> list[str]:
-    """Arguments in the one form that Hydra takes for each of them, whatever the YAML files hold.
-
-    A group is chosen by `group=option` or `+group=option`, where the option may be a YAML file of one's own. Every
-    other key is forced in, because a default stands in the dataclass and not in YAML, and an unknown key is named by
-    the schema. `resume=RUN` makes RUN the run folder; `extend=FILE.py` has been obeyed when this returns.
-    Raises: UserError for a group or option that the command does not take, naming those that it does, and for a file
-      that cannot be used.
-    """
-    try:
-        argv = [latest.resolved(arg, command) for arg in argv]
-        resumed = _resumed(argv)
-        if resumed:
-            extensions.kept(Path(resumed))
-        argv = [_with_preset_files(arg) for arg in extensions.taken(argv)]
-    except ValueError as error:
-        raise UserError(_one_line(error)) from None
-    extensions.offer()
-    known = presets.groups()
-    out: list[str] = []
-    for arg in argv:
-        match = re.match(r"^\+?([\w/]+)=(.*)$", arg)
-        if match and match[1] in known:
-            arg = f"{match[1]}={match[2]}"
-            for option in match[2].split(","):
-                _choose(command, match[1], option)
-        elif re.split("[@=]", arg.lstrip("+"))[0] not in known and not arg.startswith("hydra."):
-            arg = re.sub(r"^\+*(?=\w+[^=]*=)", "++", arg)
-        out.append(arg)
-    if resumed:
-        if not (Path(resumed) / "config.yaml").is_file():
-            raise UserError(f"resume={resumed}: no run folder (it holds no config.yaml); give the folder of a run")
-        out += [f"hydra.run.dir={resumed}", "hydra.output_subdir=null"]
-    return out
-
-
-def _with_preset_files(arg: str) -> str:
-    """`group=FILE.yaml` as `group=FILE`, a preset from here on."""
-    match = re.match(r"^(\+?([\w/]+)=)(.*\.yaml)$", arg)
-    if match is None or match[2] not in presets.groups():
-        return arg
-    return match[1] + ",".join(extensions.preset_file(match[2], option) for option in match[3].split(","))
-
-
-def _resumed(argv: Sequence[str]) -> str | None:
-    """The run folder to go on in."""
-    given = [arg.removeprefix("resume=") for arg in argv if arg.startswith("resume=") and arg != "resume=null"]
-    return given[-1] if given else None
 
 
 def _one_line(error: Exception) -> str:
@@ -204,6 +134,7 @@ class Command(Generic[T]):
     body: called with the checked config and the run folder; a float it returns is the sweep's objective.
     choose: gives the schema that fits a composed config, where it depends on one (a backend has fields of its own).
     resumes: the file in a run folder without which `resume=` cannot go on, "" for a command that has no `resume=`.
+    goes_on: a job of a sweep that was stopped goes on from that file by itself, to the same result; others start anew.
     """
 
     name: str
@@ -211,7 +142,7 @@ class Command(Generic[T]):
     body: Callable[[T, Path], float | None]
     choose: Callable[[DictConfig], T] | None = None
     resumes: str = ""
-    _failed: list[Path] = field(default_factory=list, init=False)  # jobs of a sweep
+    goes_on: bool = False
 
     def fitting(self, cfg: DictConfig) -> T:
         """The schema of a composed config."""
@@ -230,8 +161,6 @@ class Command(Generic[T]):
             with stop.interrupts():
                 self._answer(sys.argv[1:])
             sys.stdout.flush()
-            if self._failed:
-                sys.exit(1)
         except BrokenPipeError:  # `--help | head`: whoever reads has seen enough
             _silence(sys.stdout)
         except KeyboardInterrupt:
@@ -251,6 +180,10 @@ class Command(Generic[T]):
 
     def _answer(self, given: list[str]) -> None:
         """Help, the config, or a run or sweep of it."""
+        try:
+            given = [latest.resolved(arg, self.name) for arg in given]
+        except ValueError as error:
+            raise UserError(str(error)) from None
         flags = {a for a in given if a.startswith("-")}
         plain = [a for a in given if not a.startswith("-")]
         if flags & {"--help", "-h"}:
@@ -260,22 +193,60 @@ class Command(Generic[T]):
             plain.remove("job")
             print(OmegaConf.to_yaml(asdict(cast(Any, self.config(plain)))))
             return
-        sys.argv[1:] = [*normalise(given, self.name), f"hydra.job.name={self.name}"]
-        if not flags:  # a sweep or another flag is Hydra's to read; a plain run is checked before it has a folder
+        try:
+            swept = sweep.asked(given, self.name)
+        except sweep.Again as error:
+            raise UserError(str(error)) from None
+        if swept:
+            self._sweep(swept)
+            return
+        sys.argv[1:] = normalise(given, self.name)
+        if not flags:  # another flag is Hydra's to read; a plain run is checked before it has a folder
             self.config(given)
-            resumed = _resumed([latest.resolved(arg, self.name) for arg in given])
+            resumed = words.resumed(given)
             others = [a for a in given if not a.startswith(("resume=", "hydra.", "extend="))]
             if resumed and others:
                 raise UserError(f"{others[0]}: a resumed run takes every value from {resumed}/config.yaml; drop it")
+        self._hydra()
+
+    def _hydra(self) -> None:
+        """What the command line says, by Hydra."""
+        sys.argv.append(f"hydra.job.name={self.name}")
         GlobalHydra.instance().clear()
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print; how it is shown is decided above
         hydra.main(version_base="1.3", config_path="pkg://conf", config_name=self.name)(self._job)()
 
+    def _sweep(self, swept: sweep.Sweep) -> None:
+        """Every job of a sweep, and a line about how many came to their end. Exits: 1 where one failed."""
+        sys.argv[1:] = normalise(swept.line(), self.name)
+        expected = sweep.jobs(sys.argv[1:])
+        compose(
+            self.name, expected[0] if expected else swept.arguments
+        )  # a wrong word is told before there is a folder
+        try:
+            swept.save()
+        except sweep.Again as error:
+            raise UserError(str(error)) from None
+        try:
+            self._hydra()
+        except (KeyboardInterrupt, SystemExit):
+            print(f"stopped; {sweep.told(swept, expected)}", file=sys.stderr)
+            sys.exit(stop.STATUS)
+        except Exception:  # a bug in a job, which Hydra raises again once all have ended; or in a launcher
+            print(sweep.told(swept, expected), file=sys.stderr)
+            raise
+        errors = sweep.errors(swept.folder, expected)
+        print(f"{errors}{sweep.told(swept, expected)}", file=sys.stderr if errors else sys.stdout, flush=True)
+        if errors:
+            sys.exit(1)
+
     def _job(self, cfg: DictConfig) -> float | None:
         """One run in its folder."""
         folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
+        extensions.load_all()  # in a worker of a sweep they are not loaded yet
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            return self._swept_job(cfg, folder)
         try:
-            extensions.load_all()  # in a worker of a sweep they are not loaded yet
             if cfg.get("resume"):
                 config = _stored(folder / "config.yaml", str(cfg.resume), self.fitting)
             else:
@@ -294,9 +265,48 @@ class Command(Generic[T]):
             if refused is None and not isinstance(error, UserError):
                 raise
             print(f"error: {f'{refused}; {self._left(folder)}' if refused else error}", file=sys.stderr)
-            if HydraConfig.get().mode != RunMode.MULTIRUN:
-                sys.exit(1)
-            self._failed.append(folder)  # the launcher goes on with the other jobs
+            sys.exit(1)
+
+    def _swept_job(self, cfg: DictConfig, folder: Path) -> float | None:
+        """One job of a sweep: what it has done before stands, also if the process that did it was killed.
+
+        A job that fails is written down as such; the launcher goes on with the others.
+        """
+        try:
+            with sweep.working(folder):
+                return self._once(cfg, folder, sweep.Job.at(folder))
+        except KeyboardInterrupt:
+            sys.exit(stop.STATUS)
+        except sweep.Busy as error:
+            log.error("%s", error)
+            return None
+
+    def _once(self, cfg: DictConfig, folder: Path, job: sweep.Job) -> float | None:
+        """What is missing of a job."""
+        try:
+            config = load(cfg, self.fitting(cfg))
+            job.begin(config)
+            if job.state == "finished":
+                return job.objective
+            if self.goes_on and (folder / self.resumes).is_file():
+                config = _stored(folder / "config.yaml", str(folder), self.fitting)
+            else:
+                job.put_aside()
+                save_config(config, folder)
+                extensions.keep(folder)
+            objective = self.body(config, folder)
+            job.save("finished", objective)
+            return objective
+        except BrokenPipeError:
+            _silence(sys.stdout)
+            return None
+        except Exception as error:
+            line = _refusal(error) or _one_line(error) or type(error).__name__
+            with suppress(OSError):  # a disk that is full
+                job.save("failed", error=line)
+            if not isinstance(error, UserError | sweep.Again) and _refusal(error) is None:
+                raise
+            log.error("%s", line)
             return None
 
     def _left(self, folder: Path) -> str:

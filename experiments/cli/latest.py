@@ -29,7 +29,8 @@ def resolved(arg: str, command: str) -> str:
     name = key.lstrip("+")
     if value != "latest" or name not in (*WRITTEN, "resume"):
         return arg
-    patterns, writer = WRITTEN.get(name, ((f"{command}/*/config.yaml",), command))
+    runs = (f"{command}/*/config.yaml", f"{command}/*/sweep.json")
+    patterns, writer = WRITTEN.get(name, (runs, command))
     path = newest(patterns)
     if path is None:
         raise ValueError(f"{arg}: nothing under {ROOT}/; run python -m experiments.{writer} first, or give a path")

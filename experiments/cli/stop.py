@@ -13,12 +13,13 @@ from typing import ParamSpec, TypeVar
 
 from experiments.cli import extensions
 
-__all__ = ["SIGNALS", "STATUS", "Workers", "handled", "interrupts", "pausing"]
+__all__ = ["SIGNALS", "STATUS", "Pause", "Workers", "handled", "interrupts", "pausing"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+CLUSTER = (signal.SIGUSR1, signal.SIGUSR2)  # how a batch system says that a job's time is nearly over
 STATUS = 130  # of a stopped command, as shells have it for Ctrl-C
 
 
@@ -46,23 +47,56 @@ def interrupts() -> Iterator[None]:
         yield
 
 
+class Pause:
+    """Signals that wait until the work can be saved, and then go to whoever listened for them before.
+
+    Args: until: when it will look, for the user.
+    """
+
+    def __init__(self, until: str) -> None:
+        self._until = until
+        self._before = {int(n): signal.getsignal(n) for n in (*SIGNALS, *CLUSTER)}
+        self._came: list[int] = []
+
+    def __call__(self) -> bool:
+        """Whether a signal waits."""
+        return bool(self._came)
+
+    def answer(self, number: int, stack: FrameType | None) -> None:
+        """Handle a signal. A second one from the user ends the program at once; a cluster may repeat its own."""
+        if self._came and self._ours(number):
+            print("stopped at once; what was saved before is whole", file=sys.stderr, flush=True)
+            os._exit(STATUS)
+        if not self._came:
+            print(f"stopping {self._until}; once more stops at once", flush=True)
+        self._came.append(number)
+
+    def _ours(self, number: int) -> bool:
+        old = self._before[number]
+        return number in SIGNALS and (not callable(old) or old.__module__ in (__name__, "_signal", "signal"))
+
+    def pass_on(self) -> None:
+        """Give what came to whoever listened before: a batch system queues the job again, or lets it work on.
+
+        Raises: KeyboardInterrupt where nobody listened, or whatever the listener raises.
+        """
+        came, self._came = self._came, []
+        for number in dict.fromkeys(came):
+            old = self._before[number]
+            if not callable(old):
+                raise KeyboardInterrupt
+            old(number, None)
+
+
 @contextmanager
-def pausing(until: str) -> Iterator[Callable[[], bool]]:
-    """Inside, the first signal only makes the yielded function true; a second one ends the program at once.
+def pausing(until: str) -> Iterator[Pause]:
+    """Inside, the first signal only makes the yielded pause true; a second one from the user ends the program at once.
 
     For work that can be saved between two of its steps only. Args: until: when it will look, for the user.
     """
-    asked = threading.Event()
-
-    def answer(number: int, stack: FrameType | None) -> None:
-        if asked.is_set():
-            print("stopped at once; what was saved before is whole", file=sys.stderr, flush=True)
-            os._exit(STATUS)
-        asked.set()
-        print(f"stopping {until}; once more stops at once", flush=True)
-
-    with handled(answer, *SIGNALS):
-        yield asked.is_set
+    pause = Pause(until)
+    with handled(pause.answer, *SIGNALS, *CLUSTER):
+        yield pause
 
 
 def _begin_worker() -> None:

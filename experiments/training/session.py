@@ -190,7 +190,8 @@ class Session:
     def run(self) -> None:
         """Train to the end, or until the limits are met: log every episode, evaluate, checkpoint, show progress.
 
-        Raises: KeyboardInterrupt after a signal, with a checkpoint of the episode that was going on.
+        Raises: KeyboardInterrupt after a signal, with a checkpoint of the episode that was going on. A batch system's
+        own handler may end the job in its own way instead, or let it go on.
         """
         c = self.config
         if self.met():  # resumed after its end
@@ -216,7 +217,7 @@ class Session:
                     self.seconds = earlier + time.perf_counter() - started
                     self._save()
                 if stopped:
-                    raise KeyboardInterrupt
+                    stopping.pass_on()
                 if self.met():
                     log.info("step %d of %d: ended, %s", record.step, total, self.ended)
                     break

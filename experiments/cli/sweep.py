@@ -1,0 +1,256 @@
+"""A sweep: a folder named once, a record of every job in it, and going on with the jobs that are missing."""
+
+import fcntl
+import hashlib
+import itertools
+import json
+import os
+import shlex
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from experiments.cli import files
+
+__all__ = [
+    "JOB",
+    "RECORD",
+    "Again",
+    "Busy",
+    "Job",
+    "Sweep",
+    "asked",
+    "errors",
+    "jobs",
+    "read",
+    "survey",
+    "told",
+    "working",
+]
+
+RECORD, JOB = "sweep.json", "job.json"
+SEARCH = "hparams_search="
+FLAGS = ("-m", "--multirun")
+FOLDER = "hydra.sweep.dir="
+LATER = ("hydra/launcher=", "hydra.launcher.", "hydra.sweeper.")  # what another start of a sweep may say differently
+
+
+class Busy(Exception):
+    """Another process works on this job; the message is one line."""
+
+
+class Again(Exception):
+    """A sweep cannot go on in a folder; the message is one line with the remedy."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """folder: of the sweep. command: that swept. arguments: of it, without folder and flag, as they were typed."""
+
+    folder: Path
+    command: str
+    arguments: list[str]
+
+    def line(self) -> list[str]:
+        """The command line, in which the folder stands as it is: workers and later starts all find it there."""
+        return [FLAGS[0], *self.arguments, f"{FOLDER}{self.folder}"]  # argparse takes the flag only in front
+
+    def save(self) -> None:
+        """Write down what was asked for. Raises: Again where the folder holds a sweep of something else."""
+        before = read(self.folder)
+        if before and (before.command, _lasting(before.arguments)) != (self.command, _lasting(self.arguments)):
+            told = shlex.join([f"experiments.{before.command}", *before.line()])
+            raise Again(f"{FOLDER}{self.folder}: holds another sweep ({told}); give another folder")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        files.write_json(self.folder / RECORD, {"command": self.command, "arguments": self.arguments})
+
+    def again(self) -> str:
+        """The command that does what is missing."""
+        return f"python -m experiments.{self.command} -m resume={shlex.quote(str(self.folder))}"
+
+
+def _lasting(arguments: Sequence[str]) -> list[str]:
+    """Without what may differ between two starts of one sweep."""
+    return [a for a in arguments if not a.startswith(LATER)]
+
+
+def read(folder: Path) -> Sweep | None:
+    """The sweep in a folder, None where there is none or its record is damaged."""
+    try:
+        found = json.loads((folder / RECORD).read_text("utf-8"))
+        return Sweep(folder, str(found["command"]), [str(a) for a in found["arguments"]])
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+
+
+def asked(given: Sequence[str], command: str) -> Sweep | None:
+    """The sweep that a command line asks for, None where it asks for a single run.
+
+    `resume=SWEEP` is the sweep that was begun there, by whatever launcher it names now.
+    Raises: Again where it names anything else beside.
+    """
+    plain = [a for a in given if a not in FLAGS]
+    folder = next((Path(a.removeprefix("resume=")) for a in reversed(plain) if a.startswith("resume=")), None)
+    before = read(folder) if folder else None
+    if before:
+        others = [a for a in plain if not a.startswith(("resume=", *LATER))]
+        if others or before.command != command:
+            what = others[0] if others else f"experiments.{command}"
+            raise Again(f"{what}: a resumed sweep is {before.again()}, with all its values; drop it")
+        new = [a for a in plain if not a.startswith("resume=")]
+        keys = {a.partition("=")[0] for a in new}
+        return Sweep(before.folder, command, [a for a in before.arguments if a.partition("=")[0] not in keys] + new)
+    searched = any(a.lstrip("+").startswith(SEARCH) and not a.endswith("=null") for a in plain)
+    if len(plain) == len(given) and not searched:
+        return None
+    named = [a.removeprefix(FOLDER) for a in plain if a.startswith(FOLDER)]
+    stamp = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}_sweep"
+    own = [a for a in plain if not a.startswith(FOLDER)]
+    return Sweep(Path(named[-1]) if named else Path("runs") / command / stamp, command, own)
+
+
+def jobs(arguments: Sequence[str]) -> list[list[str]] | None:
+    """The overrides of every job, in order; None for a search, whose jobs follow from each other.
+
+    Args: arguments: in the form that Hydra takes. Raises: hydra.errors.HydraException for what is none.
+    """
+    if any(a.startswith(SEARCH) for a in arguments):
+        return None
+    own = [a for a in arguments if not a.startswith(("-", "hydra.", "hydra/"))]
+    values: dict[str, list[str]] = {}
+    for one in OverridesParser.create().parse_overrides(own):
+        several = one.is_sweep_override() and one.is_discrete_sweep()
+        values[one.get_key_element()] = (
+            list(map(str, one.sweep_string_iterator())) if several else [one.get_value_element_as_str()]
+        )
+    return [list(job) for job in itertools.product(*([f"{key}={v}" for v in each] for key, each in values.items()))]
+
+
+@dataclass
+class Job:
+    """What job.json says of a job.
+
+    state: running (or stopped, if no process works on it), finished, failed. config: hash of what it was told.
+    objective: what it returned. error: why it failed, one line.
+    """
+
+    folder: Path
+    state: str = "missing"
+    config: str = ""
+    objective: float | None = None
+    error: str = ""
+    overrides: list[str] = field(default_factory=list)
+
+    @classmethod
+    def at(cls, folder: Path) -> "Job":
+        """The job of a folder, whatever there is of it."""
+        try:
+            found = json.loads((folder / JOB).read_text("utf-8"))
+            return cls(folder, found["state"], found["config"], found["objective"], found["error"])
+        except (OSError, ValueError, LookupError, TypeError):
+            return cls(folder)
+
+    def save(self, state: str, objective: float | None = None, error: str = "") -> None:
+        """Write down where the job stands."""
+        self.state, self.objective, self.error = state, objective, error
+        kept = {"state": state, "config": self.config, "objective": objective, "error": error}
+        files.write_json(self.folder / JOB, kept)
+
+    def begin(self, config: Any) -> None:
+        """The job is to do this. Raises: Again where its folder holds a run of another config."""
+        told = hashlib.sha256(json.dumps(asdict(config), sort_keys=True, default=str).encode()).hexdigest()
+        if self.config not in ("", told):
+            raise Again(f"{self.folder}: holds a run of another config; give another {FOLDER}FOLDER")
+        self.config = told
+        if self.state != "finished":
+            self.save("running")
+
+    def put_aside(self) -> None:
+        """What an earlier life of the job left and nobody can go on with goes to stopped_1, stopped_2, ..."""
+        own = (JOB, ".hydra", ".lock")
+        left = [p for p in self.folder.iterdir() if p.name not in own and p.suffix != ".log"]
+        left = [p for p in left if not p.name.startswith("stopped_")]
+        if left:
+            count = len(list(self.folder.glob("stopped_*")))
+            aside = self.folder / f"stopped_{count + 1}"
+            aside.mkdir()
+            for path in left:
+                path.rename(aside / path.name)
+
+
+@contextmanager
+def working(folder: Path) -> Iterator[None]:
+    """Inside, no other process works on the job of a folder. Raises: Busy where one does already."""
+    with open(folder / ".lock", "w") as lock:
+        try:
+            fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise Busy(f"{folder}: another process works on it; wait for its end") from error
+        yield
+
+
+def _free(folder: Path) -> bool:
+    """Whether no process works on a job."""
+    try:
+        with working(folder):
+            return True
+    except Busy:
+        return False
+    except OSError:  # a folder of somebody else's: nothing of ours runs there
+        return True
+
+
+def _state(job: Job) -> str:
+    """A job as it stands now: a process that was killed leaves `running` behind."""
+    if job.state == "missing" and (job.folder / "summary.json").is_file():  # of a sweep without records
+        return "finished"
+    return "stopped" if job.state == "running" and _free(job.folder) else job.state
+
+
+def survey(folder: Path, expected: list[list[str]] | None = None) -> list[Job]:
+    """Every job of a sweep as it stands, in order of its number.
+
+    Args: expected: overrides of every job there should be; None: those that have a folder.
+    """
+    there = sorted((p for p in folder.glob("*") if p.name.isdigit()), key=lambda p: int(p.name))
+    found = (
+        [Job.at(folder / str(k)) for k in range(len(expected))] if expected is not None else list(map(Job.at, there))
+    )
+    for k, job in enumerate(found):
+        job.state = _state(job)
+        job.overrides = expected[k] if expected is not None else _given(job.folder)
+    return found
+
+
+def _given(folder: Path) -> list[str]:
+    """The overrides of a job that has begun, as Hydra wrote them down."""
+    try:
+        lines = files.load_yaml(folder / ".hydra" / "overrides.yaml")
+        return [str(line).lstrip("+") for line in lines]
+    except (OSError, ValueError):
+        return []
+
+
+def told(sweep: Sweep, expected: list[list[str]] | None) -> str:
+    """How many jobs of a sweep came to their end, and what to do about the others, one line."""
+    found = survey(sweep.folder, expected)
+    done = sum(job.state == "finished" for job in found)
+    line = f"{done} of {len(found)} jobs finished in {sweep.folder}"
+    if any(job.state == "running" for job in found):
+        line += f"; {sum(job.state == 'running' for job in found)} still at work in other processes"
+    if done == len(found):
+        return f"{line}; compare them: python -m experiments.report runs={shlex.quote(str(sweep.folder))}"
+    return f"{line}; what is missing: {sweep.again()}"
+
+
+def errors(folder: Path, expected: list[list[str]] | None, most: int = 3) -> str:
+    """Why jobs failed, and which, at the head of a line; empty where none did."""
+    failed = [job for job in survey(folder, expected) if job.state == "failed"]
+    each = [f"{job.error} (job {job.folder.name}: {' '.join(job.overrides)})" for job in failed[:most]]
+    more = [f"and {len(failed) - most} more"] if len(failed) > most else []
+    return f"error: {'; '.join(each + more)}; " if failed else ""

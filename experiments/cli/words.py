@@ -1,0 +1,98 @@
+"""The words of a command line in the form that Hydra takes, and the line about those that nobody can take."""
+
+import re
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from conf import presets
+from conf.schema import old_name
+from experiments.cli import extensions, latest
+
+__all__ = ["UserError", "normalise", "resumed"]
+
+SWEEP_EXTRA = "pip install 'turbidostat-dqn[sweep]'"
+
+
+class UserError(Exception):
+    """Something the user can mend; the message is one line and is all that is shown."""
+
+
+def _choose(command: str, group: str, option: str) -> None:
+    """Whether a command can be told `group=option`. Raises: UserError naming what it takes, or the right command."""
+    given, own = f"{group}={option}", presets.chosen(command)
+    known = presets.groups()[group]
+    of = presets.owner(f"{group}/{option}") if option in known else None
+    if of not in (None, command):
+        what = "recipe" if group == "experiment" else "preset"
+        raise UserError(f"{given}: a {what} of {of}; python -m experiments.{of} +{given}")
+    if group not in own:
+        others = [name for name in presets.commands() if group in presets.chosen(name)]
+        takes = ", ".join(own) or "no group"
+        raise UserError(f"{given}: {command} takes {takes}; {group}= is for {', '.join(others)}")
+    if re.fullmatch(r"[\w./-]+", option) and option not in (*known, "null"):
+        allowed = ", ".join(presets.options(command, group))
+        raise UserError(old_name(given) or f"{given}: no such option; allowed: {allowed}")
+
+
+def normalise(argv: Sequence[str], command: str) -> list[str]:
+    """Arguments in the one form that Hydra takes for each of them, whatever the YAML files hold.
+
+    A group is chosen by `group=option` or `+group=option`, where the option may be a YAML file of one's own. Every
+    other key is forced in, because a default stands in the dataclass and not in YAML, and an unknown key is named by
+    the schema. `resume=RUN` makes RUN the run folder; `extend=FILE.py` has been obeyed when this returns.
+    Raises: UserError for a group or option that the command does not take, naming those that it does, and for a file
+      that cannot be used.
+    """
+    try:
+        argv = [latest.resolved(arg, command) for arg in argv]
+        old = resumed(argv)
+        if old:
+            extensions.kept(Path(old))
+        argv = [_with_preset_files(arg) for arg in extensions.taken(argv)]
+    except ValueError as error:
+        raise UserError(str(error)) from None
+    extensions.offer()
+    known = presets.groups()
+    out: list[str] = []
+    for arg in argv:
+        match = re.match(r"^\+?([\w/]+)=(.*)$", arg)
+        if match and match[1].startswith("hydra/"):
+            arg = f"{match[1]}={_engine(match[1], match[2])}"
+        elif match and match[1] in known:
+            arg = f"{match[1]}={match[2]}"
+            for option in match[2].split(","):
+                _choose(command, match[1], option)
+        elif re.split("[@=]", arg.lstrip("+"))[0] not in known and not arg.startswith("hydra."):
+            arg = re.sub(r"^\+*(?=\w+[^=]*=)", "++", arg)
+        out.append(arg)
+    if old:
+        if not (Path(old) / "config.yaml").is_file():
+            raise UserError(f"resume={old}: no run folder (it holds no config.yaml); give the folder of a run")
+        out += [f"hydra.run.dir={old}", "hydra.output_subdir=null"]
+    return out
+
+
+def _with_preset_files(arg: str) -> str:
+    """`group=FILE.yaml` as `group=FILE`, a preset from here on."""
+    match = re.match(r"^(\+?([\w/]+)=)(.*\.yaml)$", arg)
+    if match is None or match[2] not in presets.groups():
+        return arg
+    return match[1] + ",".join(extensions.preset_file(match[2], option) for option in match[3].split(","))
+
+
+def _engine(group: str, option: str) -> str:
+    """A launcher of Hydra's that is there. Raises: UserError with the remedy for one that is not installed."""
+    needs = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm": "submitit", "slurm": "submitit"}
+    if group == "hydra/launcher":
+        if option not in ("basic", *needs):
+            raise UserError(f"{group}={option}: no such option; allowed: basic, {', '.join(needs)}")
+        if option != "basic" and find_spec(needs[option]) is None:
+            raise UserError(f"{group}={option}: needs hydra-{needs[option]}-launcher; {SWEEP_EXTRA}")
+    return option
+
+
+def resumed(argv: Sequence[str]) -> str | None:
+    """The run folder to go on in."""
+    given = [arg.removeprefix("resume=") for arg in argv if arg.startswith("resume=") and arg != "resume=null"]
+    return given[-1] if given else None
