@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from conf.schema import build
-from experiments.cli import extensions, files, help_page, latest, stop, sweep, words
+from experiments.cli import extensions, files, help_page, latest, search, stop, sweep, words
 from experiments.cli.words import UserError, normalise
 
 __all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config"]
@@ -227,6 +227,8 @@ class Command(Generic[T]):
             swept.save()
         except sweep.Again as error:
             raise UserError(str(error)) from None
+        if expected is None:
+            search.register()
         try:
             self._hydra()
         except (KeyboardInterrupt, SystemExit):

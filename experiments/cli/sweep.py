@@ -105,8 +105,7 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
         new = [a for a in plain if not a.startswith("resume=")]
         keys = {a.partition("=")[0] for a in new}
         return Sweep(before.folder, command, [a for a in before.arguments if a.partition("=")[0] not in keys] + new)
-    searched = any(a.lstrip("+").startswith(SEARCH) and not a.endswith("=null") for a in plain)
-    if len(plain) == len(given) and not searched:
+    if len(plain) == len(given) and not searches(plain):
         return None
     named = [a.removeprefix(FOLDER) for a in plain if a.startswith(FOLDER)]
     stamp = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}_sweep"
@@ -114,12 +113,17 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
     return Sweep(Path(named[-1]) if named else Path("runs") / command / stamp, command, own)
 
 
+def searches(arguments: Sequence[str]) -> bool:
+    """Whether the jobs of a sweep follow from each other's results."""
+    return any(a.lstrip("+").startswith(SEARCH) and not a.endswith("=null") for a in arguments)
+
+
 def jobs(arguments: Sequence[str]) -> list[list[str]] | None:
     """The overrides of every job, in order; None for a search, whose jobs follow from each other.
 
     Args: arguments: in the form that Hydra takes. Raises: hydra.errors.HydraException for what is none.
     """
-    if any(a.startswith(SEARCH) for a in arguments):
+    if searches(arguments):
         return None
     own = [a for a in arguments if not a.startswith(("-", "hydra.", "hydra/"))]
     values: dict[str, list[str]] = {}

@@ -9,9 +9,9 @@ from conf import presets
 from conf.schema import old_name
 from experiments.cli import extensions, latest
 
-__all__ = ["UserError", "normalise", "resumed"]
+__all__ = ["EXTRA", "UserError", "normalise", "resumed"]
 
-SWEEP_EXTRA = "pip install 'turbidostat-dqn[sweep]'"
+EXTRA = "pip install 'turbidostat-dqn[sweep]'"
 
 
 class UserError(Exception):
@@ -88,7 +88,7 @@ def _engine(group: str, option: str) -> str:
         if option not in ("basic", *needs):
             raise UserError(f"{group}={option}: no such option; allowed: basic, {', '.join(needs)}")
         if option != "basic" and find_spec(needs[option]) is None:
-            raise UserError(f"{group}={option}: needs hydra-{needs[option]}-launcher; {SWEEP_EXTRA}")
+            raise UserError(f"{group}={option}: needs hydra-{needs[option]}-launcher; {EXTRA}")
     return option
 
 

@@ -1,0 +1,159 @@
+"""Hydra's jobs one after the other, each at values that Optuna chooses from the results of the earlier ones.
+
+Any number of processes share one search: whoever is started with the same `hydra.sweep.dir` takes part. A trial that
+its process did not end is taken up by the next one that looks, in the same folder. hydra-optuna-sweeper 1.3.0 does
+neither: it stands on Optuna 2, whose shared storage needs SQLAlchemy 1, numbers the folders of each process from 0, and
+leaves a killed trial running for ever.
+"""
+
+import fcntl
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import IO, Any
+
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn
+from hydra.plugins.launcher import Launcher
+from hydra.plugins.sweeper import Sweeper
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig
+
+from experiments.cli import files
+from experiments.cli.words import EXTRA, UserError
+
+__all__ = ["JOURNAL", "Search", "register"]
+
+log = logging.getLogger(__name__)
+
+NAME = "hydra_plugins.search.Search"  # as conf/hydra/sweeper/search.yaml calls it; Hydra takes no other package
+JOURNAL = "search.journal"
+
+
+def _optuna(name: str = "optuna") -> Any:
+    """A module of Optuna, which only a search needs."""
+    return import_module(name)
+
+
+def register() -> None:
+    """Make the search known to Hydra. Raises: UserError where Optuna is missing or too old."""
+    try:
+        _optuna("optuna.storages.journal")
+    except ImportError:
+        raise UserError(f"hparams_search: needs optuna 4 or newer; {EXTRA}") from None
+    Plugins.instance().class_name_to_class[NAME] = Search
+
+
+def _distribution(name: str, said: Mapping[str, Any]) -> Any:
+    """An entry of `space`: {choices: [...]} or {low, high, log, step}. Raises: UserError naming it."""
+    of = _optuna("optuna.distributions")
+    try:
+        if "choices" in said:
+            return of.CategoricalDistribution(list(said["choices"]))
+        whole = isinstance(said["low"], int) and isinstance(said["high"], int)
+        kind = of.IntDistribution if whole else of.FloatDistribution
+        return kind(**said)
+    except (ValueError, TypeError, LookupError) as error:
+        form = "{low: 1, high: 9}, with log: true or step: 2, or {choices: [1, 2]}"
+        raise UserError(f"hydra.sweeper.space.{name}: {error}; write {form}") from None
+
+
+class Search(Sweeper):
+    """Least objective over a space of values, shared by processes through one file in the sweep's folder.
+
+    Args:
+      trials: of the whole search, by all processes in all their lives, failed ones among them.
+      at_once: jobs given to the launcher together. space: dotted key -> what it may be.
+    """
+
+    def __init__(self, trials: int, at_once: int, space: DictConfig) -> None:
+        self.trials, self.at_once = trials, at_once
+        self.space = {str(name): _distribution(str(name), said) for name, said in space.items()}
+        self._held: dict[int, IO[str]] = {}
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """As Hydra calls it, before `sweep`."""
+        self.hydra_context, self.config = hydra_context, config
+        self.folder = Path(str(config.hydra.sweep.dir))
+        self.launcher: Launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=hydra_context, task_function=task_function, config=config
+        )
+
+    def _open(self) -> Any:
+        """The study in the folder, begun by whoever comes first."""
+        optuna = _optuna()
+        optuna.logging.set_verbosity(logging.WARNING)
+        (self.folder / ".trials").mkdir(parents=True, exist_ok=True)
+        file = _optuna("optuna.storages.journal").JournalFileBackend(str(self.folder / JOURNAL))
+        storage = optuna.storages.JournalStorage(file)
+        sampler = optuna.samplers.TPESampler(constant_liar=True)  # trials at work elsewhere count as poor ones
+        with self._alone():
+            return optuna.create_study(storage=storage, sampler=sampler, study_name="search", load_if_exists=True)
+
+    def sweep(self, arguments: list[str]) -> None:
+        """Trials until there are as many as asked for. Args: arguments: overrides of every trial."""
+        study = self._open()
+        while batch := self._take(study):
+            overrides = [[*arguments, *self._values(t), f"hydra.sweep.subdir={t.number}"] for t in batch]
+            returned = self.launcher.launch(overrides, initial_job_idx=batch[0].number)
+            for trial, job in zip(batch, returned, strict=True):
+                self._tell(study, trial.number, job)
+        self._best(study)
+
+    def _values(self, trial: Any) -> list[str]:
+        return [f"++{name}={value}" for name, value in trial.params.items()]
+
+    def _take(self, study: Any) -> list[Any]:
+        """Trials for the next launch: first those whose process is gone, then new ones while there are any to come."""
+        taken: list[Any] = []
+        with self._alone():
+            for trial in study.get_trials(deepcopy=False):
+                if len(taken) < self.at_once and not trial.state.is_finished() and self._hold(trial.number):
+                    log.info("trial %d goes on: its process is gone", trial.number)
+                    taken.append(trial)
+            while len(taken) < self.at_once and len(study.get_trials(deepcopy=False)) < self.trials:
+                trial = study.ask(self.space)
+                self._hold(trial.number)
+                taken.append(trial)
+        return taken
+
+    def _hold(self, number: int) -> bool:
+        """Take a trial for this process, until it is told or the process ends; False where another one has it."""
+        if number in self._held:
+            return False
+        file = open(self.folder / ".trials" / str(number), "w")  # noqa: SIM115  (open as long as it is held)
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            file.close()
+            return False
+        self._held[number] = file
+        return True
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Inside, no other process takes trials."""
+        with open(self.folder / ".trials" / "all", "w") as file:
+            fcntl.lockf(file, fcntl.LOCK_EX)
+            yield
+
+    def _tell(self, study: Any, number: int, job: JobReturn) -> None:
+        """Give a result to the study; a job without one has failed."""
+        try:
+            study.tell(number, float(job.return_value))
+        except Exception as error:  # whatever the job raised
+            log.warning("trial %d failed: %s", number, error)
+            study.tell(number, state=_optuna().trial.TrialState.FAIL)
+        self._held.pop(number).close()
+
+    def _best(self, study: Any) -> None:
+        """Log the best trial, and write it as best.json."""
+        done = [t for t in study.get_trials(deepcopy=False) if t.value is not None]
+        if not done:
+            return
+        best = min(done, key=lambda t: t.value)
+        values = [line.removeprefix("++") for line in self._values(best)]
+        files.write_json(self.folder / "best.json", {"trial": best.number, "objective": best.value, "values": values})
+        log.info("best of %d trials: %d with objective %.4g: %s", len(done), best.number, best.value, " ".join(values))
