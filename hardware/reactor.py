@@ -41,11 +41,13 @@ class Vitals:
     age_s: time since the newest sample arrived, by this computer's monotonic clock, shape (N,).
     raw: spectrometer counts of the newest sample, shape (N,); nan is a reading that is not to be believed.
     faults: what is wrong with each reactor, or None; N entries.
+    blank: counts that read as OD 0 when that sample was taken, shape (N,); None where the device has none.
     """
 
     age_s: Array
     raw: Array
     faults: tuple[Fault | None, ...]
+    blank: Array | None = None
 
 
 @dataclass(frozen=True)

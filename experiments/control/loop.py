@@ -32,6 +32,7 @@ class Step:
     begun. reasons: of the interlock, for all reactors.
     response: of the interlock. notes: of the reactors. explanation: of the controller. done: schedule over.
     composition: further columns of the recording, where a composition is controlled.
+    raw, blank: counts behind the OD and those of clear medium; nan where the reactors have none.
     position: of each reactor, where it stands in its schedule (`ClosedLoop.position`). ended: steps of the schedule
       that this sample ended by their condition.
     """
@@ -55,6 +56,8 @@ class Step:
     composition: dict[str, Array] = field(default_factory=dict)
     position: Sequence[dict[str, Any]] = ()
     ended: Mask | None = None
+    raw: Array | None = None
+    blank: Array | None = None
 
 
 class ClosedLoop:
@@ -150,6 +153,7 @@ class ClosedLoop:
             np.full(len(self.done), np.nan), reasons, verdict.response, (), explanation, self.done.copy(),
             {} if composed is None else composed.columns,
             [self.position(n) for n in range(len(self.done))], ended,
+            None if m.vitals is None else m.vitals.raw, None if m.vitals is None else m.vitals.blank,
         )  # fmt: skip
         if self._before_dose is not None:
             self._before_dose(decision)

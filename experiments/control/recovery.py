@@ -38,8 +38,9 @@ Row = dict[str, float | int | str | bool | None]
 REBUILD = "move it away and resume again: it is written anew from the last 20 MB of the journal"
 COLUMNS = (
     "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
-    "temperature_degc", "interlock",
+    "temperature_degc", "interlock", "raw_counts", "blank_counts",
 )  # fmt: skip
+ADDED = ("raw_counts", "blank_counts")  # columns of a later version
 
 
 def row_of(step: Step, n: int) -> Row:
@@ -56,6 +57,8 @@ def row_of(step: Step, n: int) -> Row:
         "volume_ml": float(step.volume_ml[n]),
         "temperature_degc": round(float(step.temperature[n]), 3),
         "interlock": step.reasons[n] or "",
+        "raw_counts": math.nan if step.raw is None else float(step.raw[n]),
+        "blank_counts": math.nan if step.blank is None else float(step.blank[n]),
         **further,
     }
 
@@ -157,7 +160,13 @@ def cut_short(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Ro
     given = volumes(journal, name)[decisions[-1]["n"]]
     if given >= rows.last()["volume_ml"] - 1e-6:
         return None
-    return {c: decisions[-1]["row"][c] for c in rows.names} | {"volume_ml": given}
+    return {c: _kept(decisions[-1]["row"], c) for c in rows.names} | {"volume_ml": given}
+
+
+def _kept(row: Mapping[str, Any], column: str) -> float | int | str | bool | None:
+    """A cell of a decision; nan where there is none, also of a column that an earlier version did not have."""
+    value: float | int | str | bool | None = row.get(column) if column in ADDED else row[column]
+    return math.nan if value is None else value
 
 
 def _unwritten(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> Iterator[Row]:
@@ -166,7 +175,7 @@ def _unwritten(journal: Sequence[Mapping[str, Any]], name: str, rows: Rows) -> I
     volume = volumes(journal, name)
     for earlier, this, following in zip([{}, *mine], mine, [*mine[1:], {}], strict=False):
         if this["kind"] == "decision":
-            row: Row = {c: math.nan if this["row"][c] is None else this["row"][c] for c in rows.names}
+            row: Row = {c: _kept(this["row"], c) for c in rows.names}
             row["volume_ml"] = volume[this["n"]]
         elif not following and earlier.get("kind") != "sample":
             row = _undecided(this, rows)
@@ -187,6 +196,7 @@ def _undecided(sample: Mapping[str, Any], rows: Rows) -> Row:
         elapsed = round(before["elapsed_min"] + time - before["time_min"], 4)
         row |= {"phase": int(before["phase"]), "setpoint": before["setpoint"], "elapsed_min": elapsed}
     reading = {"od": sample["od"], "temperature_degc": sample["temperature"]}
+    reading |= {"raw_counts": sample.get("raw"), "blank_counts": sample.get("blank")}
     if "fluorescence" in rows.columns:
         reading["fluorescence"] = sample.get("fluorescence")
     row |= {"time_min": time, **{k: math.nan if v is None else float(v) for k, v in reading.items()}}

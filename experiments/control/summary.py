@@ -18,7 +18,9 @@ from experiments.control.record import Record
 from experiments.control.recovery import Rows
 from experiments.reporting import charts
 from experiments.reporting.composition_chart import composition_figure
+from hardware.errors import RecordingError
 from hardware.safety.interlock import kinds_of
+from hardware.storage.marks import Mark, read_marks
 
 __all__ = [
     "ChangeLog",
@@ -155,6 +157,7 @@ def summarise(
         "volume_ml": float(volume.sum()),
         "reactors": reactors,
         "repairs": record.repairs,
+        "marks": [asdict(mark) for mark in _marks(record)],
     }
 
 
@@ -214,7 +217,17 @@ def figure_of(record: Record, scenarios: Sequence[Scenario], title: str) -> Figu
     switched = any(len(set(s.temperatures)) > 1 for s in scenarios)
     temperature = record.series("temperature_degc").T if switched else None
     series = (record.series("time_min").T, record.series("od").T, setpoint.T, record.series("pump_rate_ml_s").T)
-    return charts.closed_loop(*series, record.names, temperature, title)
+    marks = [(m.time_min, f"{m.reactor} {m.text}".strip()) for m in _marks(record)]
+    return charts.closed_loop(*series, record.names, temperature, title, marks)
+
+
+def _marks(record: Record) -> list[Mark]:
+    """What somebody did at the bench; a damaged file of it is said and costs the figure nothing else."""
+    try:
+        return read_marks(record.folder)
+    except RecordingError as error:
+        log.warning("%s", error)
+        return []
 
 
 def composition_figure_of(record: Record, title: str) -> Figure:

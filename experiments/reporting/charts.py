@@ -213,10 +213,12 @@ def closed_loop(
     names: Sequence[str],
     temperature: Array | None = None,
     title: str = "",
+    marks: Sequence[tuple[float, str]] = (),
 ) -> Figure:
     """A recorded closed loop: OD over setpoint, above pump rate (and temperature).
 
     Args: minutes, od, setpoint, rate, temperature: (K, N), nan where a reactor has no sample. names: N labels.
+      marks: minute and text of vertical lines.
     """
     rows = 2 if temperature is None else 3
     ratios = [2.2, 1.0] if temperature is None else [2.2, 1.0, 0.8]
@@ -231,6 +233,11 @@ def closed_loop(
         axes[1].step(minutes[:, n], rate[:, n] * 1000.0, where="post", color=colour, linewidth=1.0)
         if temperature is not None:
             axes[2].plot(minutes[:, n], temperature[:, n], color=colour, linewidth=1.0)
+    for minute, text in marks:
+        for ax in axes:
+            ax.axvline(minute, color="#7f7f7f", linewidth=0.9, linestyle=":")
+        place: dict[str, Any] = {"rotation": 90, "fontsize": 7, "va": "bottom", "ha": "right", "color": "#4d4d4d"}
+        axes[0].text(minute, 0.02, text, transform=axes[0].get_xaxis_transform(), **place)
     axes[0].set_ylabel("OD")
     axes[0].set_title(title)
     axes[0].legend(ncols=3)

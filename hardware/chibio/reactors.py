@@ -157,7 +157,8 @@ class ChiBioReactors:
         for station in self.stations:
             station.book.news = False
         age = self._clock.now() - column("arrived_s")
-        vitals = Vitals(age, column("raw"), tuple(station.book.fault for station in self.stations))
+        faults = tuple(station.book.fault for station in self.stations)
+        vitals = Vitals(age, column("raw"), faults, column("blank"))
         light = column("fluorescence") if self.config.fluorescence.measure else None
         return Measurement(column("time_s"), column("od"), column("temperature"), fresh, vitals, light)
 

@@ -20,7 +20,7 @@ class Sampling:
     sample that was waited for appeared when it was seen. The smallest offset between the two clocks among such samples
     shows how late any other one was seen.
 
-    Attributes: key, (record time, cycles) of the newest sample, None before the first; od, temperature, raw,
+    Attributes: key, (record time, cycles) of the newest sample, None before the first; od, temperature, raw, blank,
       fluorescence, time_s (run time) of it, nan before the first; arrived_s, the clock time at which it was seen;
       late_s, how long after it appeared that was; next_poll, the clock time of the next look.
     """
@@ -28,7 +28,7 @@ class Sampling:
     def __init__(self, config: ChiBioConfig, clock: Clock) -> None:
         self._config, self._clock = config, clock
         self.key: tuple[float, int] | None = None
-        self.od = self.temperature = self.raw = self.fluorescence = self.time_s = math.nan
+        self.od = self.temperature = self.raw = self.blank = self.fluorescence = self.time_s = math.nan
         self.arrived_s = self.next_poll = clock.now()
         self.late_s = 0.0
         self._offsets: deque[float] = deque(maxlen=3)  # arrival minus the device's own time, samples seen at once
@@ -78,7 +78,8 @@ class Sampling:
         """
         self.key = (state.sample_s, state.cycles)
         self.arrived_s, self.time_s = now, time_s
-        self.od, self.temperature, self.raw = state.sample_od, state.sample_temperature, state.raw
+        self.od, self.temperature = state.sample_od, state.sample_temperature
+        self.raw, self.blank = state.raw, state.blank
         note = self._measure_lateness(now - state.sample_s)
         self.next_poll = now + CYCLE_S - (2.5 if self._looked else 20.0)
         self._looked = False

@@ -1,0 +1,88 @@
+"""Note in a run's folder what was done at the bench: `python -m experiments.mark run=RUN text=inoculated`."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from conf.schema import check, require, setting
+from experiments.cli import files, frame
+from hardware.errors import RecordingError
+from hardware.storage.journal import read_journal
+from hardware.storage.marks import Mark, add_mark
+
+__all__ = ["MarkConfig", "main", "mark"]
+
+
+@dataclass(frozen=True)
+class MarkConfig:
+    """What happened, to which reactor of which run, and when."""
+
+    run: str = setting("", "folder of a deployment, running or over")
+    reactor: str = setting("", "which one; empty: all of them")
+    text: str = setting("inoculated", "what happened, in one line of at most 80 characters")
+    minute: float | None = setting(
+        None, "of the run at which it happened; null: now", "min", within=(-1440.0, 1_000_000.0)
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+        require(
+            0 < len(self.text) <= 80 and self.text.isprintable(),
+            "text",
+            repr(self.text),
+            "1 to 80 characters, one line",
+        )
+
+
+def _minute_now(folder: Path, stored: Any) -> float:
+    """The minute of a run that is under way. Raises: UserError for one that is over, or has not begun."""
+    kind = str(OmegaConf.select(stored, "backend.kind"))
+    if kind == "sim" or (folder / "summary.json").is_file():
+        raise frame.UserError(f"run={folder}: not under way; give minute=MINUTE of the run")
+    rows, _ = read_journal(folder / "journal.jsonl")
+    if not rows:
+        raise frame.UserError(f"run={folder}: has not begun; wait for its first sample")
+    speed = float(OmegaConf.select(stored, "backend.speed") or 1.0)  # an emulated device may run faster
+    return (time.time() - float(rows[0]["wall"])) * speed / 60.0
+
+
+def mark(config: MarkConfig) -> str:
+    """Append a mark; returns what was done, in one line. Raises: UserError naming what to give."""
+    folder = Path(config.run)
+    known = sorted(path.stem for path in (folder / "recordings").glob("*.csv")) if config.run else []
+    if not known:
+        raise frame.UserError(f"run={config.run}: no deployment (it has no recordings); give the folder of one")
+    if config.reactor and config.reactor not in known:
+        raise frame.UserError(f"reactor={config.reactor}: not in this run; allowed {', '.join(known)}")
+    try:
+        minute = config.minute
+        if minute is None:
+            minute = _minute_now(folder, files.load_yaml(folder / "config.yaml"))
+        path = add_mark(folder, Mark(minute, config.reactor, config.text))
+    except (OSError, RecordingError) as error:
+        raise frame.UserError(f"run={folder}: {error}") from None
+    return f"{config.reactor or 'all reactors'}: {config.text} at minute {minute:.1f}, in {path}"
+
+
+def _body(config: MarkConfig, folder: Path) -> None:
+    print(mark(config))
+
+
+class _Mark(frame.Command[MarkConfig]):
+    """A command that works in another run's folder and needs none of its own."""
+
+    def _answer(self, given: list[str]) -> None:
+        if any(a.startswith("-") for a in given):
+            super()._answer(given)
+        else:
+            print(mark(self.config(given)))
+
+
+main = _Mark("mark", MarkConfig(), _body)
+
+
+if __name__ == "__main__":
+    main()

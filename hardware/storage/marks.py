@@ -1,0 +1,49 @@
+"""Marks of a run: what somebody did at the bench and when, beside the recordings of the run."""
+
+import csv
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from hardware.errors import RecordingError
+from hardware.storage.recorder import Recorder
+
+__all__ = ["NAME", "Mark", "add_mark", "read_marks"]
+
+NAME = "marks.csv"
+COLUMNS = ("time_min", "reactor", "text", "written")
+
+
+@dataclass(frozen=True)
+class Mark:
+    """What happened at minute `time_min` of a run to `reactor`; "" is all of them."""
+
+    time_min: float
+    reactor: str
+    text: str
+
+
+def add_mark(folder: Path, mark: Mark) -> Path:
+    """Append a mark to a run folder, on the disk when this returns; the running program takes no notice.
+
+    Raises: RecordingError if the disk refuses or the file is another one.
+    """
+    written = datetime.now().astimezone().isoformat(timespec="seconds")
+    with Recorder(folder / NAME, COLUMNS) as file:
+        file.write(
+            {"time_min": round(mark.time_min, 3), "reactor": mark.reactor, "text": mark.text, "written": written}
+        )
+    return folder / NAME
+
+
+def read_marks(folder: Path) -> list[Mark]:
+    """The marks of a run folder, in the order of time; none where there is no file. Raises: RecordingError."""
+    path = folder / NAME
+    if not path.is_file():
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            found = [Mark(float(row["time_min"]), row["reactor"], row["text"]) for row in csv.DictReader(file)]
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
+        raise RecordingError(f"{path}: damaged ({type(error).__name__}: {error}); mend it or move it away") from None
+    return sorted(found, key=lambda mark: mark.time_min)

@@ -1,0 +1,167 @@
+"""What was done at the bench, and the counts behind every OD: in the run folder, the figure and after a resume."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from envs.plant.sensor import counts_from_od, od_from_counts
+from envs.scenario import Scenario
+from experiments.cli import frame
+from experiments.control.record import Record
+from experiments.control.recovery import COLUMNS
+from experiments.control.summary import figure_of, summarise
+from experiments.mark import MarkConfig, mark
+from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
+from hardware.emulator.vial import DARK_COUNTS
+from hardware.errors import RecordingError
+from hardware.storage.marks import Mark, add_mark, read_marks
+from hardware.storage.recording_reader import read_recording
+from tests.experiments.test_deploy import ROOT
+from tests.hardware.emulator_lab import BLANK, quiet
+
+SCHEDULE = Scenario((0.6,), (20.0,), (37.0,))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Rehearsal:
+    """Twenty minutes of growth from 0.4, killed at the sixth decision and resumed."""
+    config = replace(rehearsed(("M0",), SCHEDULE), fsync=False)
+    made = Rehearsal(tmp_path_factory.mktemp("marks"), config, quiet(mu=0.03), od=0.4)
+    made.begin()
+    decided = made.loop._before_dose
+    assert decided is not None
+
+    def dies(step):  # type: ignore[no-untyped-def]
+        decided(step)
+        if step.elapsed[0] > 5.0:
+            made.kill()
+
+    made.loop._before_dose = dies
+    with pytest.raises(Killed):
+        for _ in made.run():
+            pass
+    made.close()
+    made.begin()
+    for _ in made.run():
+        pass
+    return made
+
+
+def test_every_od_has_its_counts_and_the_blank_also_in_a_row_from_the_journal(run: Rehearsal) -> None:
+    series = {key: run.record.series(key)[0] for key in ("od", "raw_counts", "blank_counts")}
+    assert series["od"].size > 15
+    assert any("completed from the journal" in line for line in run.record.repairs)
+    blank = BLANK + DARK_COUNTS
+    assert np.isfinite(series["raw_counts"]).all()
+    np.testing.assert_allclose(series["blank_counts"], blank, rtol=0.01)
+    formula = od_from_counts(series["raw_counts"], series["blank_counts"])
+    np.testing.assert_allclose(formula, series["od"], atol=2e-3)  # the last of four readings, whole counts
+
+
+def test_another_blank_afterwards_gives_what_the_device_would_have_shown(run: Rehearsal) -> None:
+    """By the device's formula at R + log10(b'/b), of the blank alone."""
+    od, blank = run.record.series("od")[0], run.record.series("blank_counts")[0]
+    again = od_from_counts(counts_from_od(od, blank), 1.1 * blank)
+    half = 1.833 / (2.0 * 0.226)
+    ratio = np.sqrt(od / 0.226 + half**2) - half + np.log10(1.1)
+    np.testing.assert_allclose(again, 1.833 * ratio + 0.226 * ratio**2, atol=1e-9)
+
+
+def test_a_recording_of_before_these_columns_is_read_and_resumed_from(run: Rehearsal, tmp_path: Path) -> None:
+    lines = (run.folder / "recordings" / "M0.csv").read_text().splitlines()
+    old = tmp_path / "old.csv"
+    old.write_text("".join(",".join(line.split(",")[:10]) + "\n" for line in lines))
+    assert old.read_text().splitlines()[0].split(",") == list(COLUMNS[:10])
+    np.testing.assert_array_equal(read_recording(old).od, read_recording(run.folder / "recordings" / "M0.csv").od)
+    rows = (run.folder / "journal.jsonl").read_text().splitlines()
+    for key in ("raw_counts", "blank_counts"):
+        rows = [json.dumps({**r, "row": {k: v for k, v in r["row"].items() if k != key}} if "row" in r else r)
+                for r in map(json.loads, rows)]  # fmt: skip
+    (tmp_path / "journal.jsonl").write_text("\n".join(rows) + "\n")
+    rebuilt = Record(tmp_path, ("M0",), fsync=False)
+    np.testing.assert_array_equal(rebuilt.series("od"), run.record.series("od"))
+    assert np.isnan(rebuilt.series("raw_counts")).all()
+    rebuilt.close()
+
+
+def test_a_mark_stands_in_the_figure_and_in_the_summary(run: Rehearsal) -> None:
+    (run.folder / "marks.csv").unlink(missing_ok=True)
+    add_mark(run.folder, Mark(9.0, "", "new bottle"))
+    add_mark(run.folder, Mark(3.5, "M0", "inoculated, twice"))
+    assert read_marks(run.folder) == [Mark(3.5, "M0", "inoculated, twice"), Mark(9.0, "", "new bottle")]
+    axes = figure_of(run.record, [SCHEDULE], "").axes
+    assert [text.get_text() for text in axes[0].texts] == ["M0 inoculated, twice", "new bottle"]
+    for ax in axes:
+        at = [line.get_xdata()[0] for line in ax.lines if len(set(line.get_xdata())) == 1]
+        assert at == [3.5, 9.0]
+    summary = summarise(run.record, [SCHEDULE], ["replicate"], "completed", run.loop.progress)
+    assert [m["text"] for m in summary["marks"]] == ["inoculated, twice", "new bottle"]
+
+
+def test_a_damaged_file_of_marks_costs_no_summary(run: Rehearsal, caplog: pytest.LogCaptureFixture) -> None:
+    (run.folder / "marks.csv").write_text("time_min,reactor,text,written\nnever,M0,x,y\n")
+    assert not figure_of(run.record, [SCHEDULE], "").axes[0].texts
+    assert "marks.csv: damaged" in caplog.text
+    with pytest.raises(RecordingError, match="mend it or move it away"):
+        read_marks(run.folder)
+    (run.folder / "marks.csv").unlink()
+
+
+def _under_way(folder: Path, kind: str = "emulator") -> Path:
+    """A run that began two minutes ago, ten times faster than the clock."""
+    (folder / "recordings").mkdir(parents=True)
+    (folder / "recordings" / "M0.csv").write_text("time_min\n")
+    (folder / "config.yaml").write_text(f"backend: {{kind: {kind}, speed: 10}}\n")
+    row = {"n": 0, "wall": time.time() - 120.0, "mono": 1.0, "kind": "command"}
+    (folder / "journal.jsonl").write_text(json.dumps(row) + "\n")
+    return folder
+
+
+def test_now_is_the_minute_of_the_run(tmp_path: Path) -> None:
+    folder = _under_way(tmp_path / "run")
+    mark(MarkConfig(str(folder), "M0", "inoculated"))
+    mark(MarkConfig(str(folder), "", "bottle", minute=1.25))
+    (first, second) = read_marks(folder)
+    assert first == Mark(1.25, "", "bottle")
+    assert second.time_min == pytest.approx(20.0, abs=2.0)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"run": "nowhere"}, "run=nowhere: no deployment"),
+        ({}, "run=: no deployment"),
+        ({"run": "run", "reactor": "M7"}, "reactor=M7: not in this run; allowed M0"),
+        ({"run": "over"}, "run=over: not under way; give minute="),
+        ({"run": "simulated"}, "run=simulated: not under way; give minute="),
+    ],
+)
+def test_what_is_wrong_is_named(
+    config: dict[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _under_way(tmp_path / "run")
+    _under_way(tmp_path / "simulated", "sim")
+    (_under_way(tmp_path / "over") / "summary.json").write_text("{}")
+    with pytest.raises(frame.UserError, match=message):
+        mark(MarkConfig(**config))
+    for text in ("", "two\nlines", "x" * 81):
+        with pytest.raises(ValueError, match="text = .*allowed 1 to 80 characters"):
+            MarkConfig("run", text=text)
+
+
+def test_the_command_leaves_a_mark_and_no_folder_of_its_own(tmp_path: Path) -> None:
+    _under_way(tmp_path / "run")
+    command = [sys.executable, "-m", "experiments.mark", "run=run", "reactor=M0", "text=new bottle"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("M0: new bottle at minute ")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
