@@ -75,7 +75,7 @@ def texts(node: ast.expr | None, scope: Scope) -> set[str]:
         case ast.JoinedStr(values=parts):
             return joined([texts(part, scope) for part in parts])
         case ast.FormattedValue(value=ast.Name() | ast.Call() as value):
-            return texts(value, scope) - {""} or {GAP}  # nothing to say is not said
+            return texts(value, scope)
         case ast.IfExp(body=body, orelse=orelse):
             return texts(body, scope) | texts(orelse, scope)
         case ast.BoolOp(values=values):
@@ -157,7 +157,10 @@ def first(call: ast.Call, scope: Scope) -> set[str]:
 
 
 Reader = Callable[[ast.Call, Scope], set[str]]
-TELLS: dict[str, Reader] = {"tell": first, "Fault": fault, "DeviceStateError": first, "IdentityError": first}
+ERRORS: dict[str, Reader] = dict.fromkeys(
+    ("DeviceStateError", "IdentityError", "LinkError", "ProtocolError", "RecordingError"), first
+)
+TELLS: dict[str, Reader] = {"tell": first, "Fault": fault, **ERRORS}
 LOGS: dict[str, Reader] = {"warning": formatted, "error": formatted, "exception": formatted}
 SAID: dict[str, dict[str, Reader]] = {  # which call says something, in which files
     "hardware/safety/*.py": {"Finding": finding, "_Reason": finding},
@@ -165,6 +168,10 @@ SAID: dict[str, dict[str, Reader]] = {  # which call says something, in which fi
         "connection", "diagnosis", "dose_sequence", "fluorescence", "onboard_regulation", "overflow_pump", "reactors",
         "station",
     )},
+    "hardware/chibio/protocol.py": ERRORS,
+    "hardware/link/*.py": ERRORS,
+    "hardware/storage/journal.py": ERRORS,
+    "hardware/storage/recorder.py": ERRORS,
     "experiments/control/*.py": LOGS,
     "hardware/board/board_agent.py": LOGS,
 }  # fmt: skip
@@ -228,8 +235,9 @@ def words() -> set[str]:
         found |= returned(module(ROOT / name).functions[function], module(ROOT / name))
     for name, names in NAMED.items():
         found |= named_in(ROOT / name, names)
-    plain = {re.sub(rf"^{GAP}(: )?(?=\w)", "", text).strip() for text in found}
-    return {text for text in plain if re.search(r"\w", text)}
+    plain = {re.sub(rf"^({GAP} )*{GAP}(: |(?=\w))", "", text).strip() for text in found}  # whose words they are
+    empty = re.compile(r"  | ;|:$|^\W*$")  # a name that may be "" is not when this is said
+    return {text for text in plain if not empty.search(text)}
 
 
 def tables() -> Iterator[list[str]]:
