@@ -3,6 +3,7 @@
 import logging
 import os
 from contextlib import closing, suppress
+from dataclasses import asdict
 from pathlib import Path
 
 from tqdm import tqdm
@@ -73,15 +74,14 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
         figures = {"closed_loop": figure_of(record, setup.scenarios, title)}
         if setup.keeper is not None:
             figures["composition"] = composition_figure_of(record, title)
-        for name, figure in figures.items():
-            path = charts.save(figure, folder / "figures", name)
-            record.events.picture(f"figures/{name}", path, record.series("time_min").shape[1])
+        pictures = {name: charts.save(figure, folder / "figures", name) for name, figure in figures.items()}
         roles = [config.role(name) for name in record.names]
         summary = {
             **summarise(record, setup.scenarios, roles, outcome),
             "figure": str(folder / "figures" / "closed_loop.png"),
         }
         files.write_json(folder / "summary.json", summary)
+        record.curves.end(summary, asdict(config), pictures)
     except OSError as error:
         why = f"figure and summary not written ({error.strerror or error})"
         return f"failed: {outcome.removeprefix('failed: ')}; {why}"
