@@ -91,16 +91,7 @@ class Curves:
         windows = summary["windows"]
         self.run.text("run/summary", f"{summary['outcome']}\n\n{_table(windows)}", self._last)
         self.run.scalars({tag: v for tag, v in _results(summary).items() if np.isfinite(v)}, self._last, when)
-        chosen = choices(self._folder)
-        values: dict[str, float | str] = {
-            "command": "deploy",
-            "controller": str(config["controller"]["kind"]),
-            "plant": _plant(chosen, config),
-            "scenario": chosen.get("scenario", "given"),
-        }
-        if config["backend"]["kind"] == "sim":
-            values |= {"seed": config["backend"]["seed"], "mu": config["plant"]["growth"]["mu"]}
-        self.run.hyper_parameters(values, str(self._folder))
+        self.run.hyper_parameters(_parameters(choices(self._folder), config), str(self._folder))
 
     def flush(self) -> None:
         """Make everything so far visible to a reader. Raises: OSError of a full disk."""
@@ -111,6 +102,21 @@ class Curves:
         """Flush and close. Idempotent."""
         for events in {self.run, *self._each}:
             events.close()
+
+
+def _parameters(chosen: Mapping[str, str], config: Mapping[str, Any]) -> dict[str, float | str]:
+    """The row of a deployment but its results; growth and pump of a simulated vial."""
+    values: dict[str, float | str] = {
+        "command": "deploy",
+        "decides": str(config["controller"]["kind"]),
+        "on": _plant(chosen, config),
+        "scenario": chosen.get("scenario", "given"),
+    }
+    if config["backend"]["kind"] == "sim" and not (config["plant_file"] or config["env_file"]):
+        plant = config["plant"]
+        tau = plant["vessel"]["volume_ml"] / (60.0 * plant["pump"]["gain_ml_s"])
+        values |= {"seed": config["backend"]["seed"], "mu": plant["growth"]["mu"], "tau": tau}
+    return values
 
 
 def _plant(chosen: Mapping[str, str], config: Mapping[str, Any]) -> str:

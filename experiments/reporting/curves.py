@@ -160,18 +160,18 @@ class Column:
 
 
 PARAMETERS = {
-    "command": Column("command", "train or deploy"),
+    "decides": Column("agent or controller", "preset of hyper-parameters, or what decided the pump rate"),
+    "on": Column("model or plant", "what was learned on, or controlled"),
     "seed": Column("seed", "of the agent, or of the simulated vials", number=True),
-    "agent": Column("agent", "preset of hyper-parameters"),
-    "env": Column("model", "preset of the training model"),
-    "mu": Column("mu, 1/min", "growth rate of the model", number=True),
-    "tau": Column("tau", "volume over 60 times the pump's gain", number=True),
+    "mu": Column("mu, 1/min", "growth rate of the model or plant", number=True),
+    "tau": Column("tau", "volume over 60 times the flow of the pump", number=True),
+    "command": Column("command", "train or deploy"),
+    "scenario": Column("scenario", "what a deployment was asked for"),
     "steps": Column("steps", "of training", number=True),
-    "controller": Column("controller", "what decided the pump rate"),
-    "plant": Column("plant", "what was controlled"),
-    "scenario": Column("scenario", "what was asked for"),
 }
-"""The same columns for every command: TensorBoard reads them from one run and shows all runs under them."""
+"""The same columns for every command: TensorBoard reads them from one run and shows all runs under them, the first five
+unasked.
+"""
 
 METRICS = {
     "result/regret_pct": "regret, %",

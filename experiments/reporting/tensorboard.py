@@ -114,7 +114,7 @@ class Events:
         experiment = api_pb2.Experiment(hparam_infos=columns, metric_infos=metrics)
         said = hparams.create_summary_metadata(plugin_data_pb2.HParamsPluginData(experiment=experiment))
         self._add([Summary.Value(tag=hparams.EXPERIMENT_TAG, metadata=said, tensor=hparams.NULL_TENSOR)], 0)
-        self._add(summary_v2.hparams_pb(dict(values), trial_id=name).value, 0)
+        self._add(summary_v2.hparams_pb({_ordered(key): values[key] for key in values}, trial_id=name).value, 0)
 
     def flush(self) -> None:
         """Make everything so far visible to a reader."""
@@ -134,9 +134,14 @@ def _chart(title: str, chart: Chart) -> layout_pb2.Chart:
     return layout_pb2.Chart(title=title, multiline=layout_pb2.MultilineChartContent(tag=tags))
 
 
+def _ordered(key: str) -> str:
+    """A name that sorts as `PARAMETERS` are written; its title is what is shown."""
+    return f"{list(PARAMETERS).index(key)}_{key}"
+
+
 def _column(key: str, column: Column) -> api_pb2.HParamInfo:
     kind = api_pb2.DATA_TYPE_FLOAT64 if column.number else api_pb2.DATA_TYPE_STRING
-    return api_pb2.HParamInfo(name=key, display_name=column.title, description=column.what, type=kind)
+    return api_pb2.HParamInfo(name=_ordered(key), display_name=column.title, description=column.what, type=kind)
 
 
 def interquartile_mean(values: NDArray[np.float64]) -> float:

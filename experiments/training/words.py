@@ -118,8 +118,8 @@ def show(writer: PopulationWriter, config: TrainConfig, seeds: Sequence[int], fo
     chosen, model = choices(folder), getattr(config, "env", None)
     values: dict[str, float | str] = {
         "command": "train",
-        "agent": chosen.get("agent", "given"),
-        "env": chosen.get("env", _kind(config)),
+        "decides": chosen.get("agent", "given"),
+        "on": chosen.get("env", _kind(config)),
         "steps": config.agent.total_steps,
     }
     values |= {key: float(getattr(model, key)) for key in ("mu", "tau") if hasattr(model, key)}
