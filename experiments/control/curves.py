@@ -14,7 +14,7 @@ from experiments.reporting import tables
 from experiments.reporting.curves import BAND, DEPLOYMENT, SHARES
 from experiments.reporting.tensorboard import Events
 
-__all__ = ["Curves"]
+__all__ = ["Curves", "controlled"]
 
 Array = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def _parameters(chosen: Mapping[str, str], config: Mapping[str, Any]) -> dict[st
     values: dict[str, float | str] = {
         "command": "deploy",
         "decides": str(config["controller"]["kind"]),
-        "on": _plant(chosen, config),
+        "on": controlled(chosen, config),
         "scenario": chosen.get("scenario", "given"),
     }
     if config["backend"]["kind"] == "sim" and not (config["plant_file"] or config["env_file"]):
@@ -119,8 +119,8 @@ def _parameters(chosen: Mapping[str, str], config: Mapping[str, Any]) -> dict[st
     return values
 
 
-def _plant(chosen: Mapping[str, str], config: Mapping[str, Any]) -> str:
-    """What is controlled: a simulated vial by its preset, else the backend."""
+def controlled(chosen: Mapping[str, str], config: Mapping[str, Any]) -> str:
+    """What a run controls, from its presets and config: a simulated vial by its preset, else the backend."""
     kind = str(config["backend"]["kind"])
     if kind != "sim":
         return kind

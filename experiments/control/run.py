@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shlex
 from contextlib import closing, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -18,12 +19,14 @@ from experiments.control.loop import ClosedLoop
 from experiments.control.record import Record
 from experiments.control.summary import (
     ChangeLog,
+    began,
     composition_figure_of,
     figure_of,
     metrics_table,
     reasons_line,
     shares_table,
     summarise,
+    title_of,
 )
 from experiments.reporting import charts
 from hardware.errors import ReactorError, RecordingError
@@ -70,7 +73,7 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
         with suppress(RecordingError):  # a signal or an error in a dose ends the loop before its row is written
             record.complete()
     try:
-        title = f"{config.backend.kind}: {outcome}"
+        title = title_of(config, folder, outcome)
         figures = {"closed_loop": figure_of(record, setup.scenarios, title)}
         if setup.keeper is not None:
             figures["composition"] = composition_figure_of(record, title)
@@ -93,7 +96,8 @@ def _finish(record: Record, setup: Setup, outcome: str) -> str:
     log.info("%s\n%s", what, metrics_table(summary["windows"]))
     if shares := shares_table(summary["windows"]):
         log.info("share of the second species, estimated unless it says true\n%s", shares)
-    log.info("recordings %s; figure %s; tensorboard --logdir %s", folder / "recordings", summary["figure"], folder)
+    log.info("recordings %s; figure %s", folder / "recordings", summary["figure"])
+    log.info("next, all of it on one page: python -m experiments.report run=%s", shlex.quote(str(folder)))
     return outcome
 
 
@@ -110,6 +114,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         with one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync, config.columns)) as record:
             for repair in record.repairs:
                 log.warning("%s", repair)
+            began(config, setup.scenarios, folder)
             with assemble.opened(setup, record) as loop:
                 outcome = _run(loop, record)
             outcome = _finish(record, setup, outcome)
