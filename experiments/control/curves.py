@@ -91,7 +91,7 @@ class Curves:
         windows = summary["windows"]
         self.run.text("run/summary", f"{summary['outcome']}\n\n{_table(windows)}", self._last)
         self.run.scalars({tag: v for tag, v in _results(summary).items() if np.isfinite(v)}, self._last, when)
-        self.run.hyper_parameters(_parameters(choices(self._folder), config), str(self._folder))
+        self.run.hyper_parameters(_parameters(choices(self._folder), config), self._folder)
 
     def flush(self) -> None:
         """Make everything so far visible to a reader. Raises: OSError of a full disk."""

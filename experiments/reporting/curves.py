@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 __all__ = [
     "BAND", "CURVES", "DEPLOYMENT", "METRICS", "PARAMETERS", "PICTURES", "POPULATION", "SHARES", "TRAINING",
-    "Chart", "Column", "Curve", "described", "folded",
+    "Chart", "Column", "Curve", "described", "folded", "of_population",
 ]  # fmt: skip
 
 BAND = 0.05  # of the setpoint: the band in which a culture counts as settled
@@ -120,25 +120,42 @@ def _line(tag: str) -> tuple[str, str, str]:
 
 TRAINING: Mapping[str, Mapping[str, Chart]] = {
     "Learning": {
-        "Regret of the greedy policy, its limit, %": Chart(["eval/regret_pct", "kept/regret_pct", "limit/regret_pct"]),
-        "Error at rest at the worst setpoint, its limit": Chart(
-            ["eval/steady_abs_error", "kept/steady_abs_error", "limit/steady_abs_error"]
-        ),
+        "Regret of the greedy policy, its limit, %": Chart(["eval/regret_pct", "limit/regret_pct"]),
+        "Error at rest at the worst setpoint, its limit": Chart(["eval/steady_abs_error", "limit/steady_abs_error"]),
         "Loss": Chart(["train/loss"]),
         "Q values": Chart(["q/min", "q/max"]),
         "Exploration, share of random actions": Chart(["train/epsilon"]),
         "Reward per episode": Chart(["train/return"]),
     }
 }
+
+
+def of_population(pages: Mapping[str, Mapping[str, Chart]]) -> Mapping[str, Mapping[str, Chart]]:
+    """The same charts of several agents: mean of the middle half, with the range of all as its band."""
+
+    def band(tag: str) -> tuple[str, str, str]:
+        one = tag.startswith("limit/") or tag == "train/epsilon"
+        return _line(tag) if one else (f"{tag}/iqm", f"{tag}/min", f"{tag}/max")
+
+    return {
+        f"{page}, several agents": {
+            title: Chart(bands=[band(t) for t in chart.lines]) for title, chart in charts.items()
+        }
+        for page, charts in pages.items()
+    }
+
+
 DEPLOYMENT: Mapping[str, Mapping[str, Chart]] = {
-    "Culture": {
+    "Density": {
         "OD and setpoint with its band of 5 %": Chart(
             bands=[("culture/setpoint", "culture/setpoint_low", "culture/setpoint_high"), _line("culture/od")]
         ),
+    },
+    "Pump, heat, interlock": {
         "Pump rate, mL/s": Chart(["pump/rate_ml_s"]),
         "Temperature, °C": Chart(["culture/temperature_degc", "culture/temperature_target_degc"]),
         "Interlock and warnings": Chart(["safety/interlock", "controller/supervised"]),
-    }
+    },
 }
 SHARES: Mapping[str, Mapping[str, Chart]] = {
     "Two species": {

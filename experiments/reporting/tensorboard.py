@@ -26,7 +26,7 @@ from tensorboard.plugins.scalar import metadata as scalar
 from tensorboard.plugins.text import metadata as text
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-from experiments.reporting.curves import METRICS, PARAMETERS, POPULATION, Chart, Column, described
+from experiments.reporting.curves import METRICS, PARAMETERS, Chart, Column, described
 
 __all__ = ["Events", "PopulationWriter", "interquartile_mean"]
 
@@ -101,11 +101,13 @@ class Events:
         said = custom.create_summary_metadata()
         self._add([Summary.Value(tag=custom.CONFIG_SUMMARY_TAG, tensor=line, metadata=said)], 0)
 
-    def hyper_parameters(self, values: Mapping[str, float | str], name: str) -> None:
+    def hyper_parameters(self, values: Mapping[str, float | str], folder: Path, part: str = "") -> None:
         """A row of TensorBoard's HPARAMS table; its results are the last values of the tags in `METRICS`.
 
-        Args: values: by the names in `PARAMETERS`. name: of the row; runs of one name would be averaged.
+        Args: values: by the names in `PARAMETERS`. folder: run folder, whose last two names are those of the row; rows
+          of one name would be averaged. part: of it, where a run has several rows.
         """
+        name = "/".join([*folder.resolve().parts[-2:], *([part] if part else [])])
         columns = [_column(key, column) for key, column in PARAMETERS.items()]
         metrics = [
             api_pb2.MetricInfo(name=api_pb2.MetricName(tag=tag), display_name=title, description=described(tag))
@@ -130,7 +132,7 @@ def _chart(title: str, chart: Chart) -> layout_pb2.Chart:
     if chart.bands:
         series = [layout_pb2.MarginChartContent.Series(value=v, lower=low, upper=up) for v, low, up in chart.bands]
         return layout_pb2.Chart(title=title, margin=layout_pb2.MarginChartContent(series=series))
-    tags = [f"{tag}(/({'|'.join(POPULATION)}))?$" for tag in chart.lines]
+    tags = [f"{tag}$" for tag in chart.lines]
     return layout_pb2.Chart(title=title, multiline=layout_pb2.MultilineChartContent(tag=tags))
 
 

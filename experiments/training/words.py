@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from experiments.cli.choices import choices
 from experiments.reporting import tables
-from experiments.reporting.curves import TRAINING
+from experiments.reporting.curves import TRAINING, of_population
 from experiments.reporting.tensorboard import PopulationWriter
 from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Score
@@ -111,11 +111,11 @@ def ended(folder: Path, config: TrainConfig, task: Task, kept: Score, myopic: Sc
 
 def show(writer: PopulationWriter, config: TrainConfig, seeds: Sequence[int], folder: Path) -> None:
     """The custom page of TensorBoard and the configuration, at the start."""
-    writer.events.layout(TRAINING)
+    writer.events.layout(TRAINING if len(seeds) == 1 else of_population(TRAINING))
     path = folder / "config.yaml"
     if path.is_file():
         writer.events.text("run/config", f"```yaml\n{path.read_text(encoding='utf-8')}\n```")
-    chosen, model = choices(folder), getattr(config, "env", None)
+    chosen, model = choices(folder), config.env
     values: dict[str, float | str] = {
         "command": "train",
         "decides": chosen.get("agent", "given"),
@@ -124,8 +124,7 @@ def show(writer: PopulationWriter, config: TrainConfig, seeds: Sequence[int], fo
     }
     values |= {key: float(getattr(model, key)) for key in ("mu", "tau") if hasattr(model, key)}
     for seed, events in zip(seeds, writer.agents, strict=False):
-        name = f"{folder}/{seed}" if len(seeds) > 1 else str(folder)
-        events.hyper_parameters(values | {"seed": seed}, name)
+        events.hyper_parameters(values | {"seed": seed}, folder, f"seed{seed:04d}" if len(seeds) > 1 else "")
     writer.flush()
 
 

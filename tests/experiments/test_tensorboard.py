@@ -25,6 +25,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "tensorboard.md"
 ROW = re.compile(r"^\| `(\w+/\w+)` \| (.*?) ?\|", re.MULTILINE)
 TEN = ["fsync=false", "scenario=hold", "scenario.setpoints=[0.45]", "scenario.minutes=[12]", "scenario.recovery_od=0.1"]
 SHORT = ["agent.total_steps=300", "agent.learn_start=100"]
+PAGES = ["Density", "Pump, heat, interlock"]  # of a deployment
 RUNS = {
     "learning": [*SHORT, "seed=3"],
     "population": [*SHORT, "n_agents=2"],
@@ -102,7 +103,12 @@ def test_points_are_dated_by_the_minute_of_the_culture(runs: Path) -> None:
 
 def test_charts_of_the_custom_page_show_curves_that_exist(runs: Path) -> None:
     """Learning with its limits; OD with the setpoint's band; share with its band."""
-    for name, titles in (("learning", ["Learning"]), ("dqn", ["Culture"]), ("shares", ["Culture", "Two species"])):
+    for name, titles in (
+        ("learning", ["Learning"]),
+        ("population", ["Learning, several agents"]),
+        ("dqn", PAGES),
+        ("shares", [*PAGES, "Two species"]),
+    ):
         *_, events = sorted(parts(runs / name), key=lambda e: custom.CONFIG_SUMMARY_TAG in e.Tags()["tensors"])
         tags = {tag for part in parts(runs / name) for tag in scalars(part)}
         (point,) = events.Tensors(custom.CONFIG_SUMMARY_TAG)
@@ -116,7 +122,7 @@ def test_charts_of_the_custom_page_show_curves_that_exist(runs: Path) -> None:
             assert shown, chart.title
             assert shown == patterns or "supervised" in str(patterns) or "target" in str(patterns), chart.title
         bands = [(s.value, s.lower, s.upper) for chart in charts for s in chart.margin.series]
-        if name != "learning":
+        if name in ("dqn", "shares"):
             assert ("culture/setpoint", "culture/setpoint_low", "culture/setpoint_high") in bands
             assert ("culture/od",) * 3 in bands
 
@@ -134,8 +140,8 @@ def test_hparams_has_a_row_for_each_policy_with_seed_model_and_results(runs: Pat
         assert {m.name.tag: m.display_name for m in columns.metric_infos} == METRICS
         names = {c.name: c.display_name for c in columns.hparam_infos}
         given = {names[key]: v.string_value or v.number_value for key, v in start.hparams.items()}
-        rows[Path(start.group_name).relative_to(runs).as_posix()] = (given, events)
-    assert set(rows) == {"learning", "population/0", "population/1", *RUNS} - {"population"}
+        rows[start.group_name.removeprefix(f"{runs.name}/")] = (given, events)
+    assert set(rows) == {*RUNS, "population/seed0000", "population/seed0001"} - {"population"}
     given, events = rows["learning"]
     summary = json.loads((runs / "learning" / "summary.json").read_text())
     assert (given["seed"], given["mu, 1/min"], given["tau"]) == (3.0, 0.03, pytest.approx(1 / 3))

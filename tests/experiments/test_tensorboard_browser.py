@@ -94,7 +94,7 @@ def browser() -> Iterator[Any]:
 
 def show(browser: Any, url: str, *texts: str, height: int = 1000) -> Any:
     """A page once it shows all these texts. Raises: TimeoutError naming the one that is missing."""
-    page = browser.new_page(viewport={"width": 1600, "height": height})
+    page = browser.new_page(viewport={"width": 1900, "height": height})
     page.goto(url)
     for text in texts:
         page.get_by_text(text, exact=True).first.wait_for(state="attached", timeout=10_000)
@@ -108,9 +108,11 @@ def ink(chart: Any) -> int:
     return int(coloured.sum())
 
 
-def draw(page: Any, name: str) -> None:
-    """The figure of the documentation, where it is asked for."""
+def draw(page: Any, name: str, shown: str = "") -> None:
+    """The figure of the documentation, where it is asked for. Args: shown: the one run it shows."""
     if DRAWN:
+        if shown:
+            page.get_by_label("Write a regex to filter runs").fill(f"^{shown}$")
         page.wait_for_timeout(3000)
         page.screenshot(path=str(ROOT / DRAWN / f"tensorboard_{name}.png"))
     page.close()
@@ -135,14 +137,19 @@ def test_time_series_show_a_card_with_a_line_for_each_tag(address: str, browser:
 def test_custom_scalars_show_learning_against_its_limits(address: str, browser: Any) -> None:
     titles = ("Regret of the greedy policy, its limit, %", "Error at rest at the worst setpoint, its limit", "Loss",
               "Q values", "Exploration, share of random actions", "Reward per episode")  # fmt: skip
-    page = show(browser, f"{address}/?runFilter=learning#custom_scalars", "Learning", *titles)
-    draw(page, "learning")
+    page = show(
+        browser,
+        f"{address}/?runFilter=learning#custom_scalars",
+        f"Learning{', several agents' if DRAWN else ''}",
+        *titles,
+    )
+    draw(page, "learning", "learning")
 
 
 def test_custom_scalars_show_the_culture_with_its_band(address: str, browser: Any) -> None:
     titles = ("OD and setpoint with its band of 5 %", "Pump rate, mL/s", "Temperature, °C", "Interlock and warnings")
-    page = show(browser, f"{address}/#custom_scalars", "Culture", *titles, height=1300)
-    draw(page, "deployment")
+    page = show(browser, f"{address}/#custom_scalars", "Density", "Pump, heat, interlock", *titles)
+    draw(page, "deployment", "deployment")
 
 
 def test_hparams_show_what_was_varied_and_what_came_out(address: str, browser: Any) -> None:
