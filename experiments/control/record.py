@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from experiments.cli import files
+from experiments.control.curves import Curves
 from experiments.control.loop import Step
 from experiments.control.recovery import COLUMNS, REBUILD, Array, Row, complete, cut_short, read_rows, row_of
-from experiments.reporting.tensorboard import Events
 from hardware.errors import RecordingError
 from hardware.storage.journal import Journal
 from hardware.storage.recorder import Recorder
@@ -29,7 +29,7 @@ class Record:
 
     Args:
       folder: run folder; what an earlier life of the run left there is continued. names: of the reactors.
-      fsync: each row on the disk before the call returns. columns: of the recordings.
+      fsync: each row on the disk before the call returns, and its curves visible. columns: of the recordings.
     Attributes: journal (the driver writes into it, too); state_path; columns; rows, of each reactor; repairs, what was
       mended on opening, one line each.
     Raises: RecordingError.
@@ -48,8 +48,10 @@ class Record:
         self._paths, self.columns = paths, tuple(columns)
         self.rows = [read_rows(path, columns) for path in paths]
         self.repairs += self._completed(self.journal.rows)
-        self._points = max(map(len, self.rows), default=0)  # of the curves: the newest minute
-        self.events = Events(folder, self._points)
+        began = float(self.journal.rows[0]["wall"]) if self.journal.rows else None
+        newest = max((float(rows.columns["time_min"][-1]) for rows in self.rows if len(rows)), default=-1.0)
+        self.curves = Curves(folder, self.names, round(newest) + 1, began)
+        self.curves.begin(composed="ratio" in columns)
 
     def complete(self) -> None:
         """Write what the end of the loop kept from being written, as the journal has it: rows, and a dose cut short.
@@ -89,15 +91,10 @@ class Record:
         """Write a step's rows, the state after it, and its curves. Raises: RecordingError when the disk refuses."""
         for n in map(int, np.flatnonzero(step.rows)):
             self._write(n, row_of(step, n))
-            minute = self._points = max(self._points, round(float(step.minute[n])))
-            curves = {"od": step.od, "setpoint": step.setpoint, "pump_rate_ml_s": step.rate}
-            curves |= {"temperature_degc": step.temperature, **step.composition, **step.explanation}
-            for tag, value in curves.items():
-                if value.ndim == 1 and np.isfinite(value[n]):
-                    self.events.scalar(f"{self.names[n]}/{tag}", float(value[n]), minute)
         try:
+            self.curves.step(step)
             if self._fsync:
-                self.events.flush()
+                self.curves.flush()
             self.save(state)
         except OSError as error:
             remedy = "free disk space, then resume the run"
@@ -121,4 +118,4 @@ class Record:
             recorder.close()
         self.journal.close()
         with contextlib.suppress(OSError):  # on a full disk the last points of the curves are lost, no row is
-            self.events.close()
+            self.curves.close()

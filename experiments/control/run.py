@@ -2,7 +2,9 @@
 
 import logging
 import os
+import shlex
 from contextlib import closing, suppress
+from dataclasses import asdict
 from pathlib import Path
 
 from tqdm import tqdm
@@ -18,12 +20,14 @@ from experiments.control.notify import Notifier
 from experiments.control.record import Record
 from experiments.control.summary import (
     ChangeLog,
+    began,
     composition_figure_of,
     figure_of,
     metrics_table,
     reasons_line,
     shares_table,
     summarise,
+    title_of,
 )
 from experiments.reporting import charts
 from hardware.errors import ReactorError, RecordingError
@@ -70,19 +74,18 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
         with suppress(RecordingError):  # a signal or an error in a dose ends the loop before its row is written
             record.complete()
     try:
-        title = f"{config.backend.kind}: {outcome}"
+        title = title_of(config, folder, outcome)
         figures = {"closed_loop": figure_of(record, setup.scenarios, title)}
         if setup.keeper is not None:
             figures["composition"] = composition_figure_of(record, title)
-        for name, figure in figures.items():
-            path = charts.save(figure, folder / "figures", name)
-            record.events.picture(f"figures/{name}", path, record.series("time_min").shape[1])
+        pictures = {name: charts.save(figure, folder / "figures", name) for name, figure in figures.items()}
         roles = [config.role(name) for name in record.names]
         summary = {
             **summarise(record, setup.scenarios, roles, outcome, loop.progress),
             "figure": str(folder / "figures" / "closed_loop.png"),
         }
         files.write_json(folder / "summary.json", summary)
+        record.curves.end(summary, asdict(config), pictures)
     except OSError as error:
         why = f"figure and summary not written ({error.strerror or error})"
         return f"failed: {outcome.removeprefix('failed: ')}; {why}"
@@ -94,7 +97,8 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
     log.info("%s\n%s", what, metrics_table(summary["windows"]))
     if shares := shares_table(summary["windows"]):
         log.info("share of the second species, estimated unless it says true\n%s", shares)
-    log.info("recordings %s; figure %s; tensorboard --logdir %s", folder / "recordings", summary["figure"], folder)
+    log.info("recordings %s; figure %s", folder / "recordings", summary["figure"])
+    log.info("next, all of it on one page: python -m experiments.report run=%s", shlex.quote(str(folder)))
     return outcome
 
 
@@ -129,6 +133,7 @@ def _recorded(setup: Setup, folder: Path, tell: Notifier) -> str:
     with one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync, config.columns)) as record:
         for repair in record.repairs:
             log.warning("%s", repair)
+        began(config, setup.scenarios, folder)
         with assemble.opened(setup, record) as loop:
             tell("start", f"{'resumed' if setup.resumed else 'started'}: {', '.join(loop.reactors.names)}")
             outcome = _run(loop, record, tell)

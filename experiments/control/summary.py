@@ -2,15 +2,20 @@
 
 import logging
 import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from envs.scenario import Scenario
+from experiments.cli.choices import choices
 from experiments.control.composition import TRUE
+from experiments.control.config import DeployConfig
+from experiments.control.curves import controlled
 from experiments.control.loop import ClosedLoop, Step
 from experiments.control.metrics import mean_errors, window_metrics
 from experiments.control.progress import Progress
@@ -24,12 +29,14 @@ from hardware.storage.marks import Mark, read_marks
 
 __all__ = [
     "ChangeLog",
+    "began",
     "composition_figure_of",
     "figure_of",
     "metrics_table",
     "reasons_line",
     "shares_table",
     "summarise",
+    "title_of",
 ]
 
 log = logging.getLogger(__name__)
@@ -42,6 +49,25 @@ FORMATS = {  # of the metrics of a window
     "settling_min": "8.1f",
     "steady_abs_error": "8.4f",
 }
+
+
+def began(config: DeployConfig, scenarios: Sequence[Scenario], folder: Path) -> None:
+    """Log what is run, for how long, and where to watch it."""
+    longest = max(s.total_min for s in scenarios)
+    who = f"{_title(config, folder)}, {', '.join(config.backend.reactors)}"
+    log.info("%s: %g min (%.1f h) of schedule once the culture has grown", who, longest, longest / 60.0)
+    log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
+
+
+def _title(config: DeployConfig, folder: Path) -> str:
+    values = asdict(config)
+    law = "" if config.composition is None else f" and {config.composition.kind}"
+    return f"{config.controller.kind}{law} on {controlled(choices(folder), values)}"
+
+
+def title_of(config: DeployConfig, folder: Path, outcome: str) -> str:
+    """Of the figures: who controlled what, and how it ended."""
+    return f"{_title(config, folder)}: {outcome}"
 
 
 class ChangeLog:
@@ -58,6 +84,7 @@ class ChangeLog:
         self._reason: list[str | None] = [None] * len(self._names)
         self._supervised = [False] * len(self._names)
         self._noted: set[str] = set()
+        self._error, self._samples = np.zeros(len(self._names)), np.zeros(len(self._names))  # of the window so far
 
     def __call__(self, step: Step) -> None:
         """Log what is new in this step."""
@@ -65,6 +92,7 @@ class ChangeLog:
             if step.ended is not None and step.ended[n]:
                 log.info("%s: %s at OD %.3f", name, self._ended(step, n), step.od[n])
             if step.rows[n] and int(step.phase[n]) != self._phase[n]:
+                self._window(step, n)
                 self._phase[n] = int(step.phase[n])
                 share = step.composition.get("ratio_setpoint", np.full(len(self._names), np.nan))[n]
                 what = "recovery" if self._phase[n] < 0 else f"setpoint {step.setpoint[n]:g}"
@@ -72,6 +100,11 @@ class ChangeLog:
                 log.info("%s: %s from minute %.0f, OD %.3f", name, what, step.minute[n], step.od[n])
             if step.rows[n]:
                 self._who_decides(step, n)
+                if step.done[n]:
+                    self._window(step, n)
+                elif self._phase[n] >= 0 and np.isfinite(step.od[n]):
+                    self._error[n] += abs(step.od[n] - step.setpoint[n])
+                    self._samples[n] += 1
             reason = step.reasons[n] or ""
             if not step.rows[n] and (not reason or reason.endswith("earlier in this run")):
                 continue  # what a sample was refused for is not over because there is no new one yet
@@ -95,6 +128,13 @@ class ChangeLog:
         k = int(self._progress.phase(step.elapsed)[n]) - (not step.done[n])
         start, end, _ = self._progress.steps(n)[k]
         return f"step {k + 1} ended after {end - start:.0f} min: {self._progress.conditions.texts[n][k]}"
+
+    def _window(self, step: Step, n: int) -> None:
+        """How well the window was held that ends with this step."""
+        if self._samples[n]:
+            mean = self._error[n] / self._samples[n]
+            log.info("%s: window ends at minute %.0f, mean error %.4f OD", self._names[n], step.minute[n], mean)
+        self._error[n] = self._samples[n] = 0.0
 
     def _who_decides(self, step: Step, n: int) -> None:
         """Where a supervisor stands over the policy: from when on its law acts, and until when."""

@@ -1,6 +1,7 @@
 """Where the numbers of a run go for looking at: TensorBoard events, and a CSV of the same scalars.
 
-TensorBoard's own event writer is used, so that a bench without torch can show a run live.
+TensorBoard's own event writer is used, so that a bench without torch can show a run live. Every tag carries what
+`reporting/curves.py` says of it.
 """
 
 from __future__ import annotations
@@ -13,17 +14,30 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-from tensorboard.compat.proto.summary_pb2 import Summary
-from tensorboard.plugins.hparams import summary_v2
+from tensorboard.compat.proto.summary_pb2 import Summary, SummaryMetadata
+from tensorboard.compat.proto.tensor_pb2 import TensorProto
+from tensorboard.compat.proto.tensor_shape_pb2 import TensorShapeProto
+from tensorboard.compat.proto.types_pb2 import DT_FLOAT, DT_STRING
+from tensorboard.plugins.custom_scalar import layout_pb2
+from tensorboard.plugins.custom_scalar import metadata as custom
+from tensorboard.plugins.hparams import api_pb2, plugin_data_pb2, summary_v2
+from tensorboard.plugins.hparams import metadata as hparams
+from tensorboard.plugins.scalar import metadata as scalar
+from tensorboard.plugins.text import metadata as text
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+from experiments.reporting.curves import METRICS, PARAMETERS, Chart, Column, described
 
 __all__ = ["Events", "PopulationWriter", "interquartile_mean"]
 
 MOST_CURVES = 64  # a population larger than this gets its statistics only
+LIVE_S = 5.0  # what was written is visible after so long
+NUMBER = TensorShapeProto()
+LINE = TensorShapeProto(dim=[TensorShapeProto.Dim(size=1)])
 
 
 class Events:
-    """TensorBoard events of one run.
+    """TensorBoard events of one run, visible within seconds of being written as long as more is written.
 
     Args:
       folder: where the event file goes.
@@ -32,36 +46,104 @@ class Events:
 
     def __init__(self, folder: Path, first_step: int = 0) -> None:
         self._writer = EventFileWriter(str(folder))
+        self._known: set[str] = set()
+        self._flushed = time.monotonic()
         if first_step:
             self._writer.add_event(
                 Event(step=first_step, wall_time=time.time(), session_log=SessionLog(status=SessionLog.START))
             )
 
-    def _add(self, summary: Summary, step: int) -> None:
-        self._writer.add_event(Event(step=step, wall_time=time.time(), summary=summary))
+    def _add(self, values: Sequence[Summary.Value], step: int, wall: float | None = None) -> None:
+        when = time.time() if wall is None else wall
+        self._writer.add_event(Event(step=step, wall_time=when, summary=Summary(value=values)))
+        if time.monotonic() - self._flushed >= LIVE_S:
+            self.flush()
+
+    def _point(self, tag: str, number: float) -> Summary.Value:
+        """A value; the first of a tag says what the tag means."""
+        point = Summary.Value(tag=tag, tensor=TensorProto(dtype=DT_FLOAT, float_val=[number], tensor_shape=NUMBER))
+        if tag not in self._known:
+            self._known.add(tag)
+            point.metadata.CopyFrom(scalar.create_summary_metadata("", described(tag)))
+        return point
+
+    def scalars(self, values: Mapping[str, float], step: int, wall: float | None = None) -> None:
+        """One point of each curve. Args: values: by tag. wall: s since 1970, where it is not now."""
+        self._add([self._point(tag, value) for tag, value in values.items()], step, wall)
 
     def scalar(self, tag: str, value: float, step: int) -> None:
         """One point of a curve."""
-        self._add(Summary(value=[Summary.Value(tag=tag, simple_value=value)]), step)
+        self.scalars({tag: value}, step)
 
     def picture(self, tag: str, png: Path, step: int) -> None:
         """A PNG file under TensorBoard's images. Raises: OSError for one that cannot be read."""
-        image = Summary.Image(encoded_image_string=png.read_bytes(), colorspace=3, height=1, width=1)
-        self._add(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
+        data = png.read_bytes()
+        width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))
+        image = Summary.Image(encoded_image_string=data, colorspace=3, height=height, width=width)
+        said = SummaryMetadata(summary_description=described(tag))
+        self._add([Summary.Value(tag=tag, image=image, metadata=said)], step)
 
-    def hyper_parameters(self, values: Mapping[str, float | str | bool], metrics: Sequence[str]) -> None:
-        """A row of TensorBoard's HPARAMS table; the metrics are the last values of these scalar tags."""
-        keys = [summary_v2.HParam(name) for name in values]
-        self._add(summary_v2.hparams_config_pb(keys, [summary_v2.Metric(tag) for tag in metrics]), 0)
-        self._add(summary_v2.hparams_pb(dict(values)), 0)
+    def text(self, tag: str, markdown: str, step: int = 0) -> None:
+        """A text in Markdown."""
+        said = text.create_summary_metadata("", "")
+        line = TensorProto(dtype=DT_STRING, string_val=[markdown.encode()], tensor_shape=LINE)
+        self._add([Summary.Value(tag=tag, tensor=line, metadata=said)], step)
+
+    def layout(self, categories: Mapping[str, Mapping[str, Chart]]) -> None:
+        """What the custom page shows: category -> title -> chart."""
+        made = layout_pb2.Layout(
+            category=[
+                layout_pb2.Category(title=name, chart=[_chart(title, chart) for title, chart in charts.items()])
+                for name, charts in categories.items()
+            ]
+        )
+        line = TensorProto(dtype=DT_STRING, string_val=[made.SerializeToString()], tensor_shape=NUMBER)
+        said = custom.create_summary_metadata()
+        self._add([Summary.Value(tag=custom.CONFIG_SUMMARY_TAG, tensor=line, metadata=said)], 0)
+
+    def hyper_parameters(self, values: Mapping[str, float | str], folder: Path, part: str = "") -> None:
+        """A row of TensorBoard's HPARAMS table; its results are the last values of the tags in `METRICS`.
+
+        Args: values: by the names in `PARAMETERS`. folder: run folder, whose last two names are those of the row; rows
+          of one name would be averaged. part: of it, where a run has several rows.
+        """
+        name = "/".join([*folder.resolve().parts[-2:], *([part] if part else [])])
+        columns = [_column(key, column) for key, column in PARAMETERS.items()]
+        metrics = [
+            api_pb2.MetricInfo(name=api_pb2.MetricName(tag=tag), display_name=title, description=described(tag))
+            for tag, title in METRICS.items()
+        ]
+        experiment = api_pb2.Experiment(hparam_infos=columns, metric_infos=metrics)
+        said = hparams.create_summary_metadata(plugin_data_pb2.HParamsPluginData(experiment=experiment))
+        self._add([Summary.Value(tag=hparams.EXPERIMENT_TAG, metadata=said, tensor=hparams.NULL_TENSOR)], 0)
+        self._add(summary_v2.hparams_pb({_ordered(key): values[key] for key in values}, trial_id=name).value, 0)
 
     def flush(self) -> None:
         """Make everything so far visible to a reader."""
         self._writer.flush()
+        self._flushed = time.monotonic()
 
     def close(self) -> None:
         """Flush and close. Idempotent."""
         self._writer.close()
+
+
+def _chart(title: str, chart: Chart) -> layout_pb2.Chart:
+    if chart.bands:
+        series = [layout_pb2.MarginChartContent.Series(value=v, lower=low, upper=up) for v, low, up in chart.bands]
+        return layout_pb2.Chart(title=title, margin=layout_pb2.MarginChartContent(series=series))
+    tags = [f"{tag}$" for tag in chart.lines]
+    return layout_pb2.Chart(title=title, multiline=layout_pb2.MultilineChartContent(tag=tags))
+
+
+def _ordered(key: str) -> str:
+    """A name that sorts as `PARAMETERS` are written; its title is what is shown."""
+    return f"{list(PARAMETERS).index(key)}_{key}"
+
+
+def _column(key: str, column: Column) -> api_pb2.HParamInfo:
+    kind = api_pb2.DATA_TYPE_FLOAT64 if column.number else api_pb2.DATA_TYPE_STRING
+    return api_pb2.HParamInfo(name=_ordered(key), display_name=column.title, description=column.what, type=kind)
 
 
 def interquartile_mean(values: NDArray[np.float64]) -> float:
@@ -93,6 +175,11 @@ class PopulationWriter:
         self._csv.writerow(["step", "seed", "tag", "value"])
         self._csv.writerows(kept)
 
+    @property
+    def agents(self) -> Sequence[Events]:
+        """Where each agent's curves are; none where a population is too large for them."""
+        return self._agents if len(self._seeds) > 1 else [self.events]
+
     def _rows_until(self, step: int) -> list[list[str]]:
         """Rows of an earlier life that belong to steps already in the checkpoint."""
         if not self._path.is_file():
@@ -103,20 +190,28 @@ class PopulationWriter:
 
     def scalars(self, step: int, values: Mapping[str, NDArray[np.float64] | float]) -> None:
         """Write tag -> value at an environment step; arrays have one entry per agent."""
+        shared: dict[str, float] = {}
+        single: list[dict[str, float]] = [{} for _ in self._agents]
         for tag, value in values.items():
             each = np.atleast_1d(np.asarray(value, dtype=np.float64))
             if not np.isfinite(each).any():
                 continue
             if each.size == 1:
-                self.events.scalar(tag, float(each[0]), step)
+                shared[tag] = float(each[0])
             else:
-                self.events.scalar(f"{tag}/iqm", interquartile_mean(each), step)
-                self.events.scalar(f"{tag}/min", float(np.nanmin(each)), step)
-                self.events.scalar(f"{tag}/max", float(np.nanmax(each)), step)
-                for events, v in zip(self._agents, each, strict=False):
-                    events.scalar(tag, float(v), step)
+                middle = interquartile_mean(each)
+                shared |= {
+                    f"{tag}/iqm": middle,
+                    f"{tag}/min": float(np.nanmin(each)),
+                    f"{tag}/max": float(np.nanmax(each)),
+                }
+                for own, v in zip(single, each, strict=False):
+                    own[tag] = float(v)
             names: Sequence[int | str] = self._seeds if each.size == len(self._seeds) else ["all"]
             self._csv.writerows([step, name, tag, repr(float(v))] for name, v in zip(names, each, strict=True))
+        for events, own in zip((self.events, *self._agents), (shared, *single), strict=True):
+            if own:
+                events.scalars(own, step)
 
     def flush(self) -> None:
         """Make everything so far visible to a reader."""

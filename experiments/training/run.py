@@ -16,7 +16,7 @@ from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
 from experiments.controllers.estimator import EstimatorConfig
 from experiments.reporting import charts
-from experiments.training import tasks
+from experiments.training import tasks, words
 from experiments.training.config import TrainConfig, read_env_file
 from experiments.training.evaluation import Score
 from experiments.training.session import Session
@@ -106,19 +106,9 @@ def _finish(session: Session) -> None:
         "config_hash": fingerprint(c),
     }
     files.write_json(session.folder / "summary.json", summary)
-    numbers = {k: v for k, v in (asdict(c.env) | asdict(c.agent)).items() if isinstance(v, int | float)}
-    session.writer.events.hyper_parameters(numbers, ["eval/regret_pct", "eval/steady_abs_error"])
-    log.info(
-        "%d agent(s), %d steps and %d updates each in %.1f s; reported grid: regret %.2f %% (worst %.2f %%), "
-        "steady error at its worst %.4f %s (worst seed %.4f)",
-        agents.n_agents, agents.steps, agents.updates, session.seconds, np.median(kept.regret_pct),
-        kept.regret_pct.max(), np.median(kept.steady_abs_error), session.task.unit, kept.steady_abs_error.max(),
-    )  # fmt: skip
-    log.info(
-        "the one-line law that looks one period ahead: regret %.2f %%, steady error %.4f %s",
-        abs(myopic.regret_pct[0]), myopic.steady_abs_error[0], session.task.unit,
-    )  # fmt: skip
-    log.info("policy %s; figures %s; tensorboard --logdir %s", path, session.folder / "figures", session.folder)
+    words.results(session.writer, agents.steps, kept, session.task, session.seeds)
+    spent = f"{agents.steps} steps and {agents.updates} updates of each agent in {session.seconds:.1f} s"
+    words.ended(session.folder, c, session.task, kept, myopic, spent, path)
 
 
 def fingerprint(config: TrainConfig) -> str:

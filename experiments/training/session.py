@@ -19,7 +19,7 @@ from dqn import checkpoint
 from dqn.trainer import TrainRecord
 from experiments.cli import stop
 from experiments.reporting.tensorboard import PopulationWriter
-from experiments.training import build, tasks
+from experiments.training import build, tasks, words
 from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Evaluation, Score
 from experiments.training.tasks import Task
@@ -113,15 +113,18 @@ class Session:
         if resume:
             self._restore(checkpoint.load(folder / "checkpoint.pt"))
         self.writer = PopulationWriter(folder, self.seeds, self.agents.steps)
+        words.show(self.writer, config, self.seeds, folder)
 
     def evaluate(self, step: int) -> Score:
         """Score the greedy policies on the selection grid, keep the best, log."""
         weights = self.agents.weights()
         score = self.selection(build.act_with(self.agents.network, weights), self.agents.n_agents)
         self.best.update(step, score, merit(score, self.task), weights)
-        self.writer.scalars(
-            step, {"eval/regret_pct": score.regret_pct, "eval/steady_abs_error": score.steady_abs_error}
-        )
+        kept = {"kept/regret_pct": self.best.regret, "kept/steady_abs_error": self.best.steady}
+        now = {"eval/regret_pct": score.regret_pct, "eval/steady_abs_error": score.steady_abs_error}
+        self.writer.scalars(step, now | kept)
+        limits = {"limit/regret_pct": self.task.regret_unit, "limit/steady_abs_error": self.task.steady_unit}
+        self.writer.events.scalars(limits, step)
         self.writer.flush()
         return score
 
@@ -142,12 +145,8 @@ class Session:
         """Medians over agents on the selection grid, now and of what is kept; nothing is scored before an update."""
         if not record.updates and record.step < self.config.agent.total_steps:
             return f"untrained until step {self.config.agent.learn_start}"
-        score, best, unit = self.evaluate(record.step), self.best, self.task.unit
-        now, kept = (
-            f"{np.median(regret):.2f} % regret, {np.median(steady):.4f} {unit} steady error"
-            for regret, steady in ((score.regret_pct, score.steady_abs_error), (best.regret, best.steady))
-        )
-        return f"selection grid: {now}; kept: {kept}"
+        score, kept = self.evaluate(record.step), (self.best.regret, self.best.steady)
+        return words.progress(record.step, self.config.agent.total_steps, self.seconds, score, kept, self.task)
 
     def report(self) -> tuple[Evaluation, Score, Score]:
         """The reported grid with the scores of the kept policies and of the last iterates on it."""
@@ -199,6 +198,7 @@ class Session:
         total, last = c.agent.total_steps, self.agents.steps
         told = max(c.eval_every, total // TOLD)
         started, earlier = time.perf_counter(), self.seconds
+        words.began(c, self.task, self.seeds, self.folder, last)
         bars = tqdm(total=total, initial=last, disable=None, unit="step")
         with stop.pausing("at the end of this episode") as stopping, logging_redirect_tqdm(), bars as bar:
             for record in self.agents.run():
@@ -211,7 +211,7 @@ class Session:
                     bar.set_postfix_str(line)
                     final = final or self.met()
                     if bar.disable and (final or record.step // told > last // told):
-                        log.info("step %d of %d: %s", record.step, total, line)
+                        log.info("step %d of %d, %s", record.step, total, line)
                 stopped = stopping()
                 if final or stopped or record.step // c.checkpoint_every > last // c.checkpoint_every:
                     self.seconds = earlier + time.perf_counter() - started

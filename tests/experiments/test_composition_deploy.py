@@ -92,9 +92,11 @@ def test_figure_curves_and_page_show_it(deployed: Path, tmp_path: Path) -> None:
     picture = (deployed / "figures" / "composition.svg").read_text()
     for word in ("share of the second species", "truth", "thermostat", "fluorescence, counts", "M1, estimate"):
         assert word in picture
-    (events,) = deployed.glob("events*")
-    for tag in ("ratio", "ratio_setpoint", "fluorescence", "temperature_target_degc", "true_ratio", "bias_e"):
-        assert f"M0/{tag}".encode() in events.read_bytes()
+    (events,) = (deployed / "reactors" / "M0").glob("events*")
+    written = events.read_bytes()
+    for tag in ("share/estimate", "share/setpoint", "share/fluorescence", "culture/temperature_target_degc",
+                "share/true", "controller/bias_e"):  # fmt: skip
+        assert tag.encode() in written
     page = report.write(deployed).read_text()
     assert "ratio_abs_error_last2h" in page
     assert ">composition<" in page

@@ -92,11 +92,11 @@ def check(folder: Path, kind: str) -> None:
     for decision in decisions:
         found = {key: len(value) if isinstance(value, list) else 1 for key, value in decision["why"].items()}
         assert WHY.get(kind, found) == found
-    tags = set(EventAccumulator(str(folder)).Reload().Tags()["scalars"])
-    curves = {f"{name}/{tag}" for name in NAMES for tag in ("od", "setpoint", "pump_rate_ml_s")}
-    assert curves <= tags
-    numbers = {tag for tag, values in WHY.get(kind, {}).items() if values == 1}
-    assert {f"M0/{tag}" for tag in numbers} <= tags
+    for name in NAMES:
+        tags = set(EventAccumulator(str(folder / "reactors" / name)).Reload().Tags()["tensors"])
+        assert {"culture/od", "culture/setpoint", "culture/setpoint_low", "pump/rate_ml_s"} <= tags
+        numbers = {tag for tag, values in WHY.get(kind, {}).items() if values == 1}
+        assert {f"controller/{tag}" for tag in numbers} <= tags
     if kind == "mpc":  # a plan is no curve
         assert not {tag for tag in tags if "plan" in tag or "predicted" in tag}
 

@@ -93,7 +93,7 @@ def test_every_file_is_there(whole):
 
 def test_tensorboard_reads_grouped_scalars_and_figures(whole):
     events = EventAccumulator(str(whole)).Reload()
-    tags = set(events.Tags()["scalars"])
+    tags = set(events.Tags()["tensors"])
     for tag in ("train/return", "train/loss", "q/min", "q/max", "eval/regret_pct", "eval/steady_abs_error"):
         assert {f"{tag}/iqm", f"{tag}/min", f"{tag}/max"} <= tags
     assert {"train/epsilon", "speed/steps_per_s"} <= tags
@@ -101,7 +101,7 @@ def test_tensorboard_reads_grouped_scalars_and_figures(whole):
         (image,) = events.Images(f"figures/{name}")
         assert image.encoded_image_string == (whole / "figures" / f"{name}.png").read_bytes()
     single = EventAccumulator(str(whole / "agents" / "seed0005")).Reload()
-    assert [e.step for e in single.Scalars("train/return")] == list(range(100, 1001, 100))
+    assert [e.step for e in single.Tensors("train/return")] == list(range(100, 1001, 100))
 
 
 def test_the_summary_can_be_recomputed_from_the_exported_policy(whole):
@@ -262,10 +262,15 @@ def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path, caplog):
     with caplog.at_level("INFO"):
         first.run()
     first.writer.close()
-    assert caplog.messages[0] == "step 100 of 600: untrained until step 100"
-    assert re.fullmatch(
-        r"step 200 of 600: selection grid: \d+\.\d\d % regret, \d\.\d{4} OD steady error; kept: .*", caplog.messages[1]
+    learns, good, writes, untrained, step, *_ = caplog.messages
+    assert learns == (
+        "learns env=density agent=given: mu 0.03 1/min, tau 0.3333, a decision every 1 min; seed 0, for 600 steps"
     )
+    assert good.startswith("good is a policy within 0.5 % regret and 0.003 OD at rest at its worst setpoint")
+    assert writes == f"writes to {tmp_path / 'a'}; watch it with: tensorboard --logdir {tmp_path / 'a'}"
+    assert untrained == "step 100 of 600, untrained until step 100"
+    number = r"\d+\.\d\d % regret, \d\.\d{4} OD steady error"
+    assert re.fullmatch(rf"step 200 of 600, 33 %, \d:\d\d min left: selection grid: {number}; kept: {number}", step)
     assert [step for step, _, _ in first.best.history] == [200, 300, 400, 500, 600]
     half = replace(c, agent=replace(c.agent, total_steps=300))
     (tmp_path / "b").mkdir()

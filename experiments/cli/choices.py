@@ -1,0 +1,16 @@
+"""Which presets a run was started with, as its folder tells."""
+
+import re
+from pathlib import Path
+
+__all__ = ["choices"]
+
+BLOCK = re.compile(r"^    choices:\n((?:      .*\n)+)", re.MULTILINE)
+
+
+def choices(folder: Path) -> dict[str, str]:
+    """group -> preset of a run folder, {} where it does not say; a group without a preset is left out."""
+    path = folder / ".hydra" / "hydra.yaml"
+    block = BLOCK.search(path.read_text(encoding="utf-8")) if path.is_file() else None
+    pairs = (line.strip().partition(": ") for line in (block[1].splitlines() if block else ()))
+    return {key: value for key, _, value in pairs if value and value != "null" and not key.startswith("hydra/")}

@@ -1,0 +1,150 @@
+"""A closed loop in TensorBoard, while it runs and at its end."""
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.cli.choices import choices
+from experiments.control.loop import Step
+from experiments.reporting import tables
+from experiments.reporting.curves import BAND, DEPLOYMENT, SHARES
+from experiments.reporting.tensorboard import Events
+
+__all__ = ["Curves", "controlled"]
+
+Array = NDArray[np.float64]
+
+NAMES = {  # of the columns that a composition adds to a recording
+    "fluorescence": "share/fluorescence",
+    "ratio_setpoint": "share/setpoint",
+    "ratio": "share/estimate",
+    "ratio_low": "share/low",
+    "ratio_high": "share/high",
+    "true_ratio": "share/true",
+    "temperature_target_degc": "culture/temperature_target_degc",
+}
+WINDOW = {
+    "reactor": "reactor", "setpoint": "setpoint, OD", "start_min": "from, min", "end_min": "to, min",
+    "steady_abs_error": "steady error, OD", "settling_min": "settled after, min", "ise": "ISE, OD² min",
+    "ratio_abs_error_mean": "error of the share",
+}  # fmt: skip
+
+
+class Curves:
+    """Curves of N reactors over minutes of the run: one reactor's in the run folder, several in reactors/NAME/.
+
+    Points are dated by their minute, so that the axes "relative" and "wall" show hours of the culture, in a simulation
+    of some seconds too.
+
+    Args:
+      folder: run folder. names: of the reactors. first_minute: where a resumed run goes on, or 0.
+      began: when the run began, s since 1970; None: now.
+    """
+
+    def __init__(self, folder: Path, names: Sequence[str], first_minute: int = 0, began: float | None = None) -> None:
+        self._folder, self._names, self._last = folder, tuple(names), first_minute
+        self._began = time.time() if began is None else began
+        self.run = Events(folder, first_minute)
+        single = len(names) == 1
+        self._each = [self.run if single else Events(folder / "reactors" / name, first_minute) for name in names]
+
+    def begin(self, composed: bool) -> None:
+        """The custom page and the configuration. Args: composed: a share is controlled."""
+        self.run.layout({**DEPLOYMENT, **(SHARES if composed else {})})
+        path = self._folder / "config.yaml"
+        if path.is_file():
+            self.run.text("run/config", f"```yaml\n{path.read_text(encoding='utf-8')}\n```")
+        self.run.flush()
+
+    def step(self, step: Step) -> None:
+        """One point of every curve of the reactors that have a new sample. Raises: OSError of a full disk."""
+        setpoint = np.where(step.phase >= 0, step.setpoint, np.nan)
+        named: dict[str, Array] = {
+            "culture/od": step.od,
+            "culture/setpoint": setpoint,
+            "culture/setpoint_low": setpoint * (1.0 - BAND),
+            "culture/setpoint_high": setpoint * (1.0 + BAND),
+            "culture/temperature_degc": step.temperature,
+            "pump/rate_ml_s": step.rate,
+            **{NAMES[key]: value for key, value in step.composition.items()},
+            **{f"controller/{key}": value for key, value in step.explanation.items() if value.ndim == 1},
+        }
+        for n in map(int, np.flatnonzero(step.rows)):
+            minute = max(self._last, round(float(step.minute[n])))
+            values = {tag: float(value[n]) for tag, value in named.items() if np.isfinite(value[n])}
+            values["safety/interlock"] = float(bool(step.reasons[n]))
+            self._each[n].scalars(values, minute, self._began + 60.0 * minute)
+            self._last = minute
+
+    def end(self, summary: Mapping[str, Any], config: Mapping[str, Any], pictures: Mapping[str, Path]) -> None:
+        """What came out: figures, the windows as a table, and a row of the HPARAMS table.
+
+        Args: summary: content of summary.json. config: that of the run, as plain values. pictures: name -> PNG.
+        """
+        when = self._began + 60.0 * self._last
+        for name, path in pictures.items():
+            self.run.picture(f"figures/{name}", path, self._last)
+        windows = summary["windows"]
+        self.run.text("run/summary", f"{summary['outcome']}\n\n{_table(windows)}", self._last)
+        self.run.scalars({tag: v for tag, v in _results(summary).items() if np.isfinite(v)}, self._last, when)
+        self.run.hyper_parameters(_parameters(choices(self._folder), config), self._folder)
+
+    def flush(self) -> None:
+        """Make everything so far visible to a reader. Raises: OSError of a full disk."""
+        for events in {self.run, *self._each}:
+            events.flush()
+
+    def close(self) -> None:
+        """Flush and close. Idempotent."""
+        for events in {self.run, *self._each}:
+            events.close()
+
+
+def _parameters(chosen: Mapping[str, str], config: Mapping[str, Any]) -> dict[str, float | str]:
+    """The row of a deployment but its results; growth and pump of a simulated vial."""
+    values: dict[str, float | str] = {
+        "command": "deploy",
+        "decides": str(config["controller"]["kind"]),
+        "on": controlled(chosen, config),
+        "scenario": chosen.get("scenario", "given"),
+    }
+    if config["backend"]["kind"] == "sim" and not (config["plant_file"] or config["env_file"]):
+        plant = config["plant"]
+        tau = plant["vessel"]["volume_ml"] / (60.0 * plant["pump"]["gain_ml_s"])
+        values |= {"seed": config["backend"]["seed"], "mu": plant["growth"]["mu"], "tau": tau}
+    return values
+
+
+def controlled(chosen: Mapping[str, str], config: Mapping[str, Any]) -> str:
+    """What a run controls, from its presets and config: a simulated vial by its preset, else the backend."""
+    kind = str(config["backend"]["kind"])
+    if kind != "sim":
+        return kind
+    return "plant_file" if config.get("plant_file") else chosen.get("plant", "given")
+
+
+def _results(summary: Mapping[str, Any]) -> dict[str, float]:
+    """The tags of a deployment's results, nan where there is none."""
+
+    def known(key: str) -> Array:
+        values = [w.get(key) for w in summary["windows"]]
+        return np.array([v for v in values if v is not None and np.isfinite(v)])
+
+    steady, ise, shares = (known(key) for key in ("steady_abs_error", "ise", "ratio_abs_error_mean"))
+    return {
+        "result/steady_abs_error": float(steady.max()) if steady.size else float("nan"),
+        "result/ise": float(ise.sum()) if ise.size else float("nan"),
+        "result/share_abs_error": float(shares.mean()) if shares.size else float("nan"),
+        "result/medium_ml": float(summary["volume_ml"]),
+    }
+
+
+def _table(windows: Sequence[Mapping[str, Any]]) -> str:
+    """The windows in Markdown."""
+    columns = [key for key in WINDOW if any(key in w for w in windows)]
+    rows = [[w[key] if key == "reactor" else tables.number(w.get(key)) for key in columns] for w in windows]
+    return tables.markdown([WINDOW[key] for key in columns], rows)

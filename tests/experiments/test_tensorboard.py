@@ -1,0 +1,181 @@
+"""What runs write for TensorBoard: every tag explained, named and laid out, and dated for whoever reads it."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar import layout_pb2
+from tensorboard.plugins.custom_scalar import metadata as custom
+from tensorboard.plugins.hparams import metadata as hparams
+
+from experiments.cli import frame
+from experiments.control import run as control
+from experiments.deploy import main as deploy
+from experiments.reporting.curves import METRICS, PARAMETERS, described, folded
+from experiments.reporting.tensorboard import Events
+from experiments.train import main as train
+from experiments.training import run as training
+from hardware.storage.recording_reader import read_recording
+
+PAGE = Path(__file__).parents[2] / "docs" / "tensorboard.md"
+ROW = re.compile(r"^\| `(\w+/\w+)` \| (.*?) ?\|", re.MULTILINE)
+TEN = ["fsync=false", "scenario=hold", "scenario.setpoints=[0.45]", "scenario.minutes=[12]", "scenario.recovery_od=0.1"]
+SHORT = ["agent.total_steps=300", "agent.learn_start=100"]
+PAGES = ["Density", "Pump, heat, interlock"]  # of a deployment
+RUNS = {
+    "learning": [*SHORT, "seed=3"],
+    "population": [*SHORT, "n_agents=2"],
+    "dqn": [*TEN, "backend.seed=5"],
+    "pi": [*TEN, "controller=pi", "backend.reactors=[M0,M1]"],
+    "pi_tuned": [*TEN, "controller=pi_tuned"],
+    "shares": [*TEN, "plant=coculture", "composition=proportional", "scenario.ratios=[0.4]"],
+}
+pytestmark = pytest.mark.xdist_group("curves")  # its tests share these runs
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs that together write every curve."""
+    root = tmp_path_factory.mktemp("runs")
+    for name, words in RUNS.items():
+        command = train if name in ("learning", "population") else deploy
+        config, folder = command.config(words), root / name
+        folder.mkdir()
+        frame.save_config(config, folder)
+        (training.train if command is train else control.deploy)(config, folder)
+    return root
+
+
+def parts(folder: Path) -> Iterator[EventAccumulator]:
+    """The events of a run folder, and of the agents or reactors below it."""
+    for path in sorted({p.parent for p in folder.rglob("events.out*")}):
+        yield EventAccumulator(str(path), size_guidance={"tensors": 0}).Reload()
+
+
+def curve(events: EventAccumulator, tag: str) -> np.ndarray:
+    """Step and value of each point, (K, 2)."""
+    return np.array([[e.step, e.tensor_proto.float_val[0]] for e in events.Tensors(tag)])
+
+
+def scalars(events: EventAccumulator) -> set[str]:
+    return set(events.summary_metadata and events.PluginTagToContent("scalars"))
+
+
+def test_the_page_explains_the_curves_that_runs_write_and_no_other(runs: Path) -> None:
+    written = {folded(tag) for events in parts(runs) for tag in scalars(events)}
+    explained = dict(ROW.findall(PAGE.read_text(encoding="utf-8")))
+    assert written == set(explained)
+    assert not [tag for tag, unit in explained.items() if len(unit) > 25]  # the unit, and not the meaning
+
+
+def test_every_curve_and_figure_says_what_it_is(runs: Path) -> None:
+    for events in parts(runs):
+        for tag in (*scalars(events), *events.Tags()["images"]):
+            assert events.SummaryMetadata(tag).summary_description == described(tag) != "", tag
+
+
+def test_the_curves_of_a_deployment_are_its_recording_over_minutes(runs: Path) -> None:
+    """Several reactors: a run each, with the same tags, so that they can be laid over each other."""
+    for name in ("M0", "M1"):
+        (events,) = parts(runs / "pi" / "reactors" / name)
+        recorded = read_recording(runs / "pi" / "recordings" / f"{name}.csv")
+        step, od = curve(events, "culture/od").T
+        np.testing.assert_allclose(od, recorded.od, rtol=1e-6)
+        np.testing.assert_array_equal(step, recorded.time_min.round())
+        np.testing.assert_allclose(curve(events, "pump/rate_ml_s")[:, 1], recorded.pump_rate, rtol=1e-6)
+        for edge, factor in (("low", 0.95), ("high", 1.05)):
+            assert set(curve(events, f"culture/setpoint_{edge}")[:, 1]) == {np.float32(0.45 * factor)}
+    (events,) = parts(runs / "dqn")
+    assert len(curve(events, "culture/od")) == len(read_recording(runs / "dqn" / "recordings" / "M0.csv").od)
+
+
+def test_points_are_dated_by_the_minute_of_the_culture(runs: Path) -> None:
+    """12 min of culture that took a second: TensorBoard's relative axis shows them as 12 min."""
+    (events,) = parts(runs / "dqn")
+    points = events.Tensors("culture/od")
+    wall, step = np.array([e.wall_time for e in points]), np.array([e.step for e in points])
+    np.testing.assert_allclose(np.diff(wall), 60.0 * np.diff(step), atol=1e-3)
+
+
+def test_charts_of_the_custom_page_show_curves_that_exist(runs: Path) -> None:
+    """Learning with its limits; OD with the setpoint's band; share with its band."""
+    for name, titles in (
+        ("learning", ["Learning"]),
+        ("population", ["Learning, several agents"]),
+        ("dqn", PAGES),
+        ("shares", [*PAGES, "Two species"]),
+    ):
+        *_, events = sorted(parts(runs / name), key=lambda e: custom.CONFIG_SUMMARY_TAG in e.Tags()["tensors"])
+        tags = {tag for part in parts(runs / name) for tag in scalars(part)}
+        (point,) = events.Tensors(custom.CONFIG_SUMMARY_TAG)
+        layout = layout_pb2.Layout.FromString(point.tensor_proto.string_val[0])
+        assert [c.title for c in layout.category] == titles
+        charts = [chart for category in layout.category for chart in category.chart]
+        for chart in charts:
+            patterns = [t for t in chart.multiline.tag]
+            patterns += [f"{t}$" for s in chart.margin.series for t in (s.value, s.lower, s.upper)]
+            shown = [p for p in patterns if any(re.match(p, tag) for tag in tags)]
+            assert shown, chart.title
+            assert shown == patterns or "supervised" in str(patterns) or "target" in str(patterns), chart.title
+        bands = [(s.value, s.lower, s.upper) for chart in charts for s in chart.margin.series]
+        if name in ("dqn", "shares"):
+            assert ("culture/setpoint", "culture/setpoint_low", "culture/setpoint_high") in bands
+            assert ("culture/od",) * 3 in bands
+
+
+def test_hparams_has_a_row_for_each_policy_with_seed_model_and_results(runs: Path) -> None:
+    rows = {}
+    for events in parts(runs):
+        if hparams.SESSION_START_INFO_TAG not in events.summary_metadata:
+            continue
+        content = {tag: events.SummaryMetadata(tag).plugin_data.content for tag in events.summary_metadata}
+        start = hparams.parse_session_start_info_plugin_data(content[hparams.SESSION_START_INFO_TAG])
+        columns = hparams.parse_experiment_plugin_data(content[hparams.EXPERIMENT_TAG])
+        assert [c.display_name for c in columns.hparam_infos] == [c.title for c in PARAMETERS.values()]
+        assert [c.name for c in columns.hparam_infos] == sorted(c.name for c in columns.hparam_infos)
+        assert {m.name.tag: m.display_name for m in columns.metric_infos} == METRICS
+        names = {c.name: c.display_name for c in columns.hparam_infos}
+        given = {names[key]: v.string_value or v.number_value for key, v in start.hparams.items()}
+        rows[start.group_name.removeprefix(f"{runs.name}/")] = (given, events)
+    assert set(rows) == {*RUNS, "population/seed0000", "population/seed0001"} - {"population"}
+    given, events = rows["learning"]
+    summary = json.loads((runs / "learning" / "summary.json").read_text())
+    assert (given["seed"], given["mu, 1/min"], given["tau"]) == (3.0, 0.03, pytest.approx(1 / 3))
+    for key in ("regret_pct", "steady_abs_error"):
+        assert curve(events, f"result/{key}")[-1, 1] == pytest.approx(summary[key][0])
+    given, events = rows["dqn"]
+    summary = json.loads((runs / "dqn" / "summary.json").read_text())
+    assert (given["agent or controller"], given["seed"]) == ("dqn", 5.0)
+    assert curve(events, "result/steady_abs_error")[-1, 1] == pytest.approx(summary["windows"][0]["steady_abs_error"])
+    assert curve(events, "result/medium_ml")[-1, 1] == pytest.approx(summary["volume_ml"])
+
+
+def test_configuration_and_results_stand_as_text(runs: Path) -> None:
+    for name in RUNS:
+        texts = {tag: e for e in parts(runs / name) for tag in e.Tags()["tensors"] if tag.startswith("run/")}
+        assert set(texts) == {"run/config", "run/summary"}
+        (point,) = texts["run/config"].Tensors("run/config")
+        assert (runs / name / "config.yaml").read_text() in point.tensor_proto.string_val[0].decode()
+
+
+def test_a_run_can_be_watched_while_it_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A point a minute is visible at once, without a word from whoever writes; a burst of them at its end."""
+    now = [0.0]
+    monkeypatch.setattr("experiments.reporting.tensorboard.time.monotonic", lambda: now[0])
+    events = Events(tmp_path)
+    for minute in range(3):
+        now[0] += 60.0
+        events.scalar("culture/od", 0.5, minute)
+        (live,) = parts(tmp_path)
+        assert curve(live, "culture/od")[:, 0].tolist() == list(range(minute + 1))
+    events.close()
+
+
+def test_a_picture_has_its_size(runs: Path) -> None:
+    (events,) = parts(runs / "dqn")
+    (image,) = events.Images("figures/closed_loop")
+    assert image.width > image.height > 300

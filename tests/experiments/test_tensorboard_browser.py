@@ -1,0 +1,158 @@
+"""TensorBoard itself, in a browser: what a training and a deployment wrote is found on its pages, by its names.
+
+BOARD_FIGURES=docs/figures python -m pytest -n0 tests/experiments/test_tensorboard_browser.py     draws those figures
+"""
+
+import io
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from matplotlib.image import imread
+
+from experiments.reporting.curves import METRICS, PARAMETERS
+
+ROOT = Path(__file__).parents[2]
+BROWSER = next((b for b in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if b), None)
+DRAWN = os.environ.get("BOARD_FIGURES")
+playwright = pytest.importorskip("playwright.sync_api", reason="no playwright (python -m pip install playwright)")
+pytestmark = [
+    pytest.mark.xdist_group("tensorboard"),  # its tests share the runs and the browser
+    pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)"),
+]
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+SHORT = ["agent.total_steps=300", "agent.learn_start=100"]
+LONG = ["agent.total_steps=10000", "n_agents=3"]  # of the figures
+
+
+def start(*words: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", *words]
+    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training in `learning`, a deployment in `deployment`."""
+    folder = tmp_path_factory.mktemp("logs")
+    minutes = [] if DRAWN else ["scenario=hold", "scenario.minutes=[20]", "scenario.setpoints=[0.5]"]
+    commands = [
+        ("train", *(LONG if DRAWN else SHORT), f"hydra.run.dir={folder / 'learning'}"),
+        ("deploy", *minutes, f"hydra.run.dir={folder / 'deployment'}"),
+    ]
+    if DRAWN:
+        commands.append(("train", *LONG, "agent=paper", f"hydra.run.dir={folder / 'learning_paper'}"))
+    for process in [start(f"experiments.{name}", *words) for name, *words in commands]:
+        said, _ = process.communicate(timeout=280)
+        assert process.returncode == 0, said
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(logs: Path) -> Iterator[str]:
+    """TensorBoard on these runs, once it has read them."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    process = start("tensorboard.main", "--logdir", str(logs), "--host", "127.0.0.1", "--port", str(port))
+    url, deadline = f"http://127.0.0.1:{port}", time.monotonic() + 60.0
+    try:
+        while not has_read(url):
+            assert process.poll() is None, process.communicate()[0]
+            assert time.monotonic() < deadline, "TensorBoard does not answer"
+            time.sleep(0.1)
+        yield url
+    finally:
+        process.terminate()
+        process.communicate(timeout=20)
+
+
+def has_read(url: str) -> bool:
+    try:
+        with urllib.request.urlopen(f"{url}/data/plugin/scalars/tags", timeout=5) as answer:
+            text = answer.read().decode()
+    except OSError:
+        return False
+    return "result/ise" in text and "result/regret_pct" in text
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as engine:
+        # with --disable-gpu the lines of Time Series, which WebGL draws, would be blank
+        opened = engine.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+def show(browser: Any, url: str, *texts: str, height: int = 1000) -> Any:
+    """A page once it shows all these texts. Raises: TimeoutError naming the one that is missing."""
+    page = browser.new_page(viewport={"width": 1900, "height": height})
+    page.goto(url)
+    for text in texts:
+        page.get_by_text(text, exact=True).first.wait_for(state="attached", timeout=10_000)
+    return page
+
+
+def ink(chart: Any) -> int:
+    """How many dots of a chart are coloured: lines are, grid and text are not."""
+    image = (imread(io.BytesIO(chart.screenshot()))[..., :3] * 255).astype(int)
+    coloured = image.max(axis=-1) - image.min(axis=-1) > 25
+    return int(coloured.sum())
+
+
+def draw(page: Any, name: str, shown: str = "") -> None:
+    """The figure of the documentation, where it is asked for. Args: shown: the one run it shows."""
+    if DRAWN:
+        if shown:
+            page.get_by_label("Write a regex to filter runs").fill(f"^{shown}$")
+        page.wait_for_timeout(3000)
+        page.screenshot(path=str(ROOT / DRAWN / f"tensorboard_{name}.png"))
+    page.close()
+
+
+def test_time_series_show_a_card_with_a_line_for_each_tag(address: str, browser: Any) -> None:
+    """Called by their tags: how far learning has come, and the culture of the deployment."""
+    end = "/iqm" if DRAWN else ""
+    learned = [f"{group}/{name}{end}" for group in ("eval", "kept") for name in ("regret_pct", "steady_abs_error")]
+    tags = [*learned, f"train/return{end}", "train/epsilon", "culture/od", "culture/setpoint", "pump/rate_ml_s"]
+    page = show(browser, f"{address}/?tagFilter=^({'|'.join(tags)})$&smoothing=0#timeseries", height=3000)
+    for tag in tags:
+        card = page.locator("scalar-card", has=page.locator(f'[title="{tag}"]'))
+        card.wait_for(timeout=10_000)
+        deadline = time.monotonic() + 10.0
+        while ink(card) < 100:
+            assert time.monotonic() < deadline, f"{tag}: no line"
+            page.wait_for_timeout(100)
+    page.close()
+
+
+def test_custom_scalars_show_learning_against_its_limits(address: str, browser: Any) -> None:
+    titles = ("Regret of the greedy policy, its limit, %", "Error at rest at the worst setpoint, its limit", "Loss",
+              "Q values", "Exploration, share of random actions", "Reward per episode")  # fmt: skip
+    page = show(
+        browser,
+        f"{address}/?runFilter=learning#custom_scalars",
+        f"Learning{', several agents' if DRAWN else ''}",
+        *titles,
+    )
+    draw(page, "learning", "learning")
+
+
+def test_custom_scalars_show_the_culture_with_its_band(address: str, browser: Any) -> None:
+    titles = ("OD and setpoint with its band of 5 %", "Pump rate, mL/s", "Temperature, °C", "Interlock and warnings")
+    page = show(browser, f"{address}/#custom_scalars", "Density", "Pump, heat, interlock", *titles)
+    draw(page, "deployment", "deployment")
+
+
+def test_hparams_show_what_was_varied_and_what_came_out(address: str, browser: Any) -> None:
+    columns = [column.title for column in PARAMETERS.values()]
+    page = show(browser, f"{address}/#hparams", *columns, *METRICS.values())
+    draw(page, "hparams")
