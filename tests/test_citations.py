@@ -116,7 +116,8 @@ def test_a_wrong_citation_is_found(name, text, found):
 
 def test_every_page_is_in_the_readme():
     linked = {target.partition("#")[0] for target in LINK.findall((ROOT / "README.md").read_text(encoding="utf-8"))}
-    assert {page.relative_to(ROOT).as_posix() for page in (ROOT / "docs").glob("*.md")} <= linked
+    pages = {page.relative_to(ROOT).as_posix() for page in (ROOT / "docs").glob("*.md")}
+    assert pages - {"docs/index.md"} <= linked  # which is the README's counterpart on the site
 
 
 def test_every_figure_is_shown_on_a_page():

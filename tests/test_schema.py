@@ -12,7 +12,8 @@ from envs.plant.plant import PlantConfig
 from experiments.cli import frame
 
 PRESETS = [f"{group}/{option}" for group, found in presets.groups().items() for option in found]
-PRESETS = [name for name in PRESETS if not name.startswith("experiment/")]  # recipes are for the command line
+RECIPES = ("experiment/", "hparams_search/")  # for the command line
+PRESETS = [name for name in PRESETS if not name.startswith(RECIPES)]
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def test_equations_labels_and_code_of_a_docstring_are_on_its_page(site: Path) ->
     [
         ("lost.md", "# A page that no table of contents has\n"),
         ("index.md", "# Index\n\n```{toctree}\nnot_there\n```\n"),
-        ("index.md", "# Index\n\n[nowhere](not_there.md)\n"),
+        ("index.md", "# Index\n\n[nowhere]({lost}.md)\n".format(lost="not_there")),
     ],
 )
 def test_a_warning_is_an_error(page: str, text: str, tmp_path: Path) -> None:

@@ -54,8 +54,8 @@ FORMATS = {  # of the metrics of a window
 def began(config: DeployConfig, scenarios: Sequence[Scenario], folder: Path) -> None:
     """Log what is run, for how long, and where to watch it."""
     longest = max(s.total_min for s in scenarios)
-    who = f"{_title(config, folder)}, {', '.join(config.backend.reactors)}"
-    log.info("%s: %g min (%.1f h) of schedule once the culture has grown", who, longest, longest / 60.0)
+    title = f"{_title(config, folder)}, {', '.join(config.backend.reactors)}"
+    log.info("%s: %g min (%.1f h) of schedule once the culture has grown", title, longest, longest / 60.0)
     log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
 
 
