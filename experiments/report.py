@@ -11,6 +11,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from conf import presets
 from conf.schema import setting
 from experiments.cli import files, frame, sweep, words
 from experiments.reporting.sweep_results import Result
@@ -77,9 +78,7 @@ def compare(folder: Path) -> Path:
     expected = sweep.jobs(words.normalise(swept.arguments, swept.command)) if swept else None
     jobs = [_result(job) for job in sweep.survey(folder, expected)]
     if not jobs:
-        raise frame.UserError(
-            f"runs={folder}: holds no job of a sweep; give the folder of one, e.g. runs/train/..._sweep"
-        )
+        raise frame.UserError(f"runs={folder}: holds no job of a sweep; give the folder that train -m has written")
     command = swept.command if swept else folder.resolve().parent.name
     return page.save(
         sweep_page.of_sweep(folder, command, jobs, swept.again() if swept else "start the sweep anew"), folder
@@ -89,6 +88,10 @@ def compare(folder: Path) -> Path:
 def _result(job: sweep.Job) -> Result:
     """A job with what it found, as the page takes it. Overrides are those of the command line, key by key."""
     overrides = dict(line.split("=", 1) for line in job.overrides if "=" in line and not line.startswith("hydra."))
+    if preset := overrides.pop("hparams_search", None):  # a run of the same values is no search
+        own = files.load_yaml(presets.ROOT / "hparams_search" / f"{preset}.yaml")
+        fixed = {str(k): str(v) for k, v in own.items() if k not in ("defaults", "hydra")}
+        overrides = fixed | overrides
     done = job.state == "finished" and (job.folder / "summary.json").is_file()
     found = _summary(job.folder) if done else {}
     config = files.load_yaml(job.folder / "config.yaml") if done else None
