@@ -1,4 +1,7 @@
-"""A run folder as one self-contained HTML page, `python -m experiments.report run=RUN`, with its tables beside it."""
+"""A run folder or a sweep as one self-contained HTML page, with its tables beside it.
+
+`python -m experiments.report run=RUN` shows one run, `runs=SWEEP` compares the jobs of a sweep.
+"""
 
 import json
 import logging
@@ -6,10 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from conf.schema import setting
-from experiments.cli import frame
+from omegaconf import DictConfig
 
-__all__ = ["ReportConfig", "find", "main", "write"]
+from conf import presets
+from conf.schema import setting
+from experiments.cli import files, frame, sweep, words
+from experiments.reporting.sweep_results import Result
+
+__all__ = ["ReportConfig", "compare", "find", "main", "write"]
 
 log = logging.getLogger(__name__)
 
@@ -19,6 +26,7 @@ class ReportConfig:
     """What to report on."""
 
     run: str = setting("latest", "a run folder, a folder of run folders, or `latest`: the newest run below runs/")
+    runs: str | None = setting(None, "the folder of a sweep, whose jobs are compared on one page; replaces run")
 
 
 def _summary(run: Path) -> Any:
@@ -59,6 +67,39 @@ def write(folder: Path) -> Path:
         raise frame.UserError(f"run={folder}: not the summary.json of a benchmark ({why}); run it again") from None
 
 
+def compare(folder: Path) -> Path:
+    """Write report.html and tables/ into the folder of a sweep; returns the page's path.
+
+    Raises: frame.UserError where there is no sweep.
+    """
+    from experiments.reporting import page, sweep_page
+
+    swept = sweep.read(folder)
+    expected = sweep.jobs(words.normalise(swept.arguments, swept.command)) if swept else None
+    jobs = [_result(job) for job in sweep.survey(folder, expected)]
+    if not jobs:
+        raise frame.UserError(f"runs={folder}: holds no job of a sweep; give the folder that train -m has written")
+    command = swept.command if swept else folder.resolve().parent.name
+    return page.save(
+        sweep_page.of_sweep(folder, command, jobs, swept.again() if swept else "start the sweep anew"), folder
+    )
+
+
+def _result(job: sweep.Job) -> Result:
+    """A job with what it found, as the page takes it. Overrides are those of the command line, key by key."""
+    overrides = dict(line.split("=", 1) for line in job.overrides if "=" in line and not line.startswith("hydra."))
+    if preset := overrides.pop("hparams_search", None):  # a run of the same values is no search
+        own = files.load_yaml(presets.ROOT / "hparams_search" / f"{preset}.yaml")
+        fixed = {str(k): str(v) for k, v in own.items() if k not in ("defaults", "hydra")}
+        overrides = fixed | overrides
+    done = job.state == "finished" and (job.folder / "summary.json").is_file()
+    found = _summary(job.folder) if done else {}
+    config = files.load_yaml(job.folder / "config.yaml") if done else None
+    task = str((config.get("env") or {}).get("kind", "density")) if isinstance(config, DictConfig) else "density"
+    summary = found if isinstance(found, dict) else {}
+    return Result(job.folder, overrides, job.state, job.error, job.objective, summary, task)
+
+
 def find(name: str, root: Path = Path("runs")) -> Path:
     """A run folder from its path or `latest`. Raises: frame.UserError naming what to give."""
     if name != "latest":
@@ -73,7 +114,10 @@ def find(name: str, root: Path = Path("runs")) -> Path:
 
 def report(config: ReportConfig, folder: Path) -> None:
     """Write the report of a run; `folder` only takes the log."""
-    log.info("report %s", write(find(config.run)))
+    if config.runs is not None:
+        log.info("report %s", compare(find(config.runs)))
+    else:
+        log.info("report %s", write(find(config.run)))
 
 
 main = frame.Command("report", ReportConfig(), report)

@@ -227,7 +227,7 @@ def survey(folder: Path, expected: list[list[str]] | None = None) -> list[Job]:
     )
     for k, job in enumerate(found):
         job.state = _state(job)
-        job.overrides = expected[k] if expected is not None else _given(job.folder)
+        job.overrides = [a.lstrip("+") for a in (expected[k] if expected is not None else _given(job.folder))]
     return found
 
 
@@ -235,7 +235,7 @@ def _given(folder: Path) -> list[str]:
     """The overrides of a job that has begun, as Hydra wrote them down."""
     try:
         lines = files.load_yaml(folder / ".hydra" / "overrides.yaml")
-        return [str(line).lstrip("+") for line in lines]
+        return [str(line) for line in lines]
     except (OSError, ValueError):
         return []
 
@@ -247,14 +247,17 @@ def told(sweep: Sweep, expected: list[list[str]] | None) -> str:
     line = f"{done} of {len(found)} jobs finished in {sweep.folder}"
     if any(job.state == "running" for job in found):
         line += f"; {sum(job.state == 'running' for job in found)} still at work in other processes"
-    if done == len(found):
+    if all(job.state in ("finished", "running") for job in found):
         return f"{line}; compare them: python -m experiments.report runs={shlex.quote(str(sweep.folder))}"
     return f"{line}; what is missing: {sweep.again()}"
 
 
 def errors(folder: Path, expected: list[list[str]] | None, most: int = 3) -> str:
     """Why jobs failed, and which, at the head of a line; empty where none did."""
-    failed = [job for job in survey(folder, expected) if job.state == "failed"]
-    each = [f"{job.error} (job {job.folder.name}: {' '.join(job.overrides)})" for job in failed[:most]]
-    more = [f"and {len(failed) - most} more"] if len(failed) > most else []
-    return f"error: {'; '.join(each + more)}; " if failed else ""
+    why: dict[str, list[str]] = {}
+    for job in survey(folder, expected):
+        if job.state == "failed":
+            why.setdefault(job.error, []).append(f"job {job.folder.name}: {' '.join(job.overrides)}")
+    each = [f"{error} ({'; '.join(which[:most])}{'; ...' * (len(which) > most)})" for error, which in why.items()]
+    more = [f"and {len(each) - most} other errors"] if len(each) > most else []
+    return f"error: {'; '.join(each[:most] + more)}; " if why else ""

@@ -1,0 +1,144 @@
+"""One page that compares the configurations of a sweep, with its tables as CSV."""
+
+import shlex
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from experiments.reporting import charts, sweep_charts
+from experiments.reporting.page import Page
+from experiments.reporting.sweep_results import Configuration, Result, configurations, curve, label, statistics
+from experiments.reporting.tables import Best, Table, number
+
+__all__ = ["of_sweep", "repeats"]
+
+LONG = 40  # characters of a name that gives way to its place in the table
+DRAWN = 8  # configurations in a figure, as many as there are colours; the table has all
+SHOWN = 4  # measures on the page
+STATISTICS = ("n", "median", "IQM", "95 % of IQM", "worst")
+
+
+def repeats(command: str, one: Configuration) -> str:
+    """The command that runs a configuration again, with all its seeds."""
+    first = dict(one.jobs[0].overrides)
+    for key in first:
+        several = list(dict.fromkeys(job.overrides[key] for job in one.jobs if key in job.overrides))
+        if len(several) > 1:
+            first[key] = ",".join(several)
+    sweep = ["-m"] if any("," in value and not value.startswith("[") for value in first.values()) else []
+    return shlex.join(["python", "-m", f"experiments.{command}", *sweep, *(f"{k}={v}" for k, v in first.items())])
+
+
+def _measures(ranked: Sequence[Configuration]) -> list[str]:
+    return list(dict.fromkeys(name for one in ranked for name in one.measured))[:SHOWN]
+
+
+def _cells(one: Configuration, name: str) -> list[str]:
+    """n, median, interquartile mean, its interval, worst."""
+    if name not in one.measured:
+        return ["–"] * len(STATISTICS)
+    s = statistics(one.measured[name])
+    interval = "–" if s.n < 2 else f"{number(s.interval[0])} to {number(s.interval[1])}"
+    return [str(s.n), number(s.median), number(s.iqm), interval, number(s.worst)]
+
+
+def _row(place: int, one: Configuration, names: Sequence[str]) -> tuple[str, ...]:
+    cells = [f"#{place}", *map(number_or_text, one.values.values()), *(c for name in names for c in _cells(one, name))]
+    return tuple(Best(cell) if place == 1 else cell for cell in cells)
+
+
+def _tables(page: Page, ranked: Sequence[Configuration], called: Callable[[str], str], note: str) -> None:
+    """A table per measure, and folded away all of them side by side, as configurations.csv has them."""
+    names = _measures(ranked)
+    for name in names:
+        rows = tuple(_row(k + 1, one, [name]) for k, one in enumerate(ranked))
+        columns = ("#", *ranked[0].values, *STATISTICS)
+        page.table(
+            Table(f"configurations_{name}", f"Configurations, the best first: {called(name)}", columns, rows, note)
+        )
+    rows = tuple(_row(k + 1, one, names) for k, one in enumerate(ranked))
+    columns = ("#", *ranked[0].values, *(f"{name}: {what}" for name in names for what in STATISTICS))
+    page.table(Table("configurations", "All measures", columns, rows), folded="All measures in one table")
+
+
+def number_or_text(value: str) -> str:
+    """A number to four digits, anything else as it stands."""
+    try:
+        return number(float(value), 4)
+    except ValueError:
+        return value
+
+
+def _headline(ranked: Sequence[Configuration], jobs: Sequence[Result], called: Callable[[str], str]) -> str:
+    done = sum(job.state == "finished" for job in jobs)
+    if not ranked or not ranked[0].measured:
+        return f"{done} of {len(jobs)} jobs finished; none of them left a number to compare."
+    best, name = ranked[0], next(iter(ranked[0].measured))
+    s = statistics(best.measured[name])
+    what = called(name)
+    text = f"Of {len(ranked)} configurations, {best.name} is best: {what} {number(s.worst)} at its worst"
+    if len(ranked) == 1:
+        text = f"One configuration ({best.name}): {what} {number(s.worst)} at its worst"
+    text += f", interquartile mean {number(s.iqm)} over {s.n} {'value' if s.n == 1 else 'values'}"
+    if len(ranked) > 1:
+        other = statistics(ranked[1].measured[name])
+        apart = s.n < 2 or other.n < 2 or s.interval[1] < other.interval[0]
+        text += f"; the next has {number(other.worst)}"
+        text += "" if apart else ", and the intervals of the two do not tell them apart"
+    return f"{text}. {done} of {len(jobs)} jobs finished."
+
+
+def _missing(page: Page, jobs: Sequence[Result], again: str) -> None:
+    """The jobs that left nothing, by name."""
+    left = [job for job in jobs if job.state != "finished"]
+    if not left:
+        return
+    page.section("Jobs without a result")
+    rows = tuple(
+        (j.folder.name, " ".join(f"{k}={v}" for k, v in j.overrides.items()), j.state, j.error or "–") for j in left
+    )
+    page.table(Table("missing_jobs", f"{len(left)} of {len(jobs)} jobs", ("job", "overrides", "state", "error"), rows))
+    page.text("What is missing, and nothing else, is done by the command below.")
+    page.add("folded_text", heading="Command", text=again)
+
+
+def _figures(page: Page, folder: Path, ranked: Sequence[Configuration], called: Callable[[str], str]) -> None:
+    """Learning curves where there are any; the values of the first measure otherwise, and of the others."""
+    shown = {one.name if len(one.name) < LONG else f"#{k + 1}": one for k, one in enumerate(ranked[:DRAWN])}
+    note = f"The best {DRAWN} of {len(ranked)} configurations." if len(ranked) > DRAWN else ""
+    page.section("Figures")
+    for tag in ("eval/regret_pct", "eval/steady_abs_error"):
+        curves = [(key, *curve(one.jobs, tag)) for key, one in shown.items()]
+        curves = [(key, steps, each) for key, steps, each in curves if each.size]
+        if curves:
+            name = tag.partition("/")[2]
+            figure = sweep_charts.learning_curves(curves, called(name))
+            path = charts.save(figure, folder / "figures", f"learning_{name}").with_suffix(".svg")
+            page.figure(path, f"Greedy policy on the selection grid: {called(name)}", note)
+    for name in _measures(ranked):
+        measured = {key: one.measured[name] for key, one in shown.items() if name in one.measured}
+        path = charts.save(sweep_charts.values(measured, called(name)), folder / "figures", f"values_{name}")
+        page.figure(path.with_suffix(".svg"), f"Every value: {called(name)}", f"{note} Bar: interquartile mean.")
+
+
+def of_sweep(folder: Path, command: str, jobs: Sequence[Result], again: str) -> Page:
+    """The page of a sweep.
+
+    Args: jobs: all of them, also those without a result. again: the command that does what is missing.
+    """
+    ranked, common = configurations(jobs)
+    task = next((job.task for job in jobs if job.state == "finished"), "density")
+
+    def called(measure: str) -> str:
+        return label(measure, task, command)
+
+    page = Page(f"Sweep of {command}", str(folder))
+    page.section("Result")
+    page.text(_headline(ranked, jobs, called))
+    if ranked and ranked[0].measured:
+        page.add("keys", pairs=[("best", ranked[0].name), ("again, all its seeds", repeats(command, ranked[0]))])
+        shared = ", ".join(f"{key} = {value}" for key, value in common.items()) or "none"
+        note = f"Seeds are pooled, lower is better; IQM: interquartile mean. Overrides of all jobs: {shared}."
+        _tables(page, ranked, called, note)
+        _figures(page, folder, ranked, called)
+    _missing(page, jobs, again)
+    return page

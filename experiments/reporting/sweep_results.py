@@ -1,0 +1,172 @@
+"""The jobs of a sweep as configurations: what differs, their seeds pooled, and statistics of what they measured."""
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import trim_mean
+
+__all__ = ["Configuration", "Result", "Statistics", "configurations", "curve", "label", "measures", "statistics"]
+
+Array = NDArray[np.float64]
+RESAMPLES = 2000
+UNITS = {"density": "OD", "relative": "periods of full pump", "coculture": "of the share"}  # of a steady error
+LABELS = {
+    "regret_pct": "regret against the optimum, %",
+    "steady_abs_error": "steady error at the worst setpoint, {unit}",
+    "ise": "ISE over all windows, OD² min",
+    "itae": "ITAE over all windows, OD min²",
+    "volume_ml": "medium, mL",
+    "objective": "what the command returned",
+}
+MERIT = "merit of the worst seed, 1: the limit of the task"  # what train returns
+
+
+@dataclass(frozen=True)
+class Result:
+    """A job: name of its folder, overrides key -> value, state, why it failed, objective, summary, kind of its task."""
+
+    folder: Path
+    overrides: Mapping[str, str]
+    state: str
+    error: str = ""
+    objective: float | None = None
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    task: str = "density"
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """Jobs that differ in nothing but a seed. values: what makes them differ from others. measured: name -> (n,)."""
+
+    values: dict[str, str]
+    jobs: list[Result]
+    measured: dict[str, Array]
+
+    @property
+    def name(self) -> str:
+        """What it is called in a figure."""
+        return (
+            ", ".join(f"{key.rpartition('.')[2]} {_short(value)}" for key, value in self.values.items()) or "all jobs"
+        )
+
+
+def _short(value: str) -> str:
+    """A number to four digits."""
+    try:
+        return f"{float(value):.4g}"
+    except ValueError:
+        return value
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of n values, lower being better. interval: 95 % of the interquartile mean, by bootstrap; nan for one value."""
+
+    n: int
+    median: float
+    iqm: float
+    interval: tuple[float, float]
+    worst: float
+
+
+def statistics(values: Array) -> Statistics:
+    """Statistics of values (n,), n >= 1. The interquartile mean is the mean of the middle half (Agarwal 2021)."""
+    low = high = math.nan
+    if values.size > 1:
+        drawn = np.random.default_rng(0).choice(values, (RESAMPLES, values.size))
+        low, high = np.percentile(trim_mean(drawn, 0.25, axis=1), [2.5, 97.5])
+    middle = float(trim_mean(values, 0.25))
+    return Statistics(values.size, float(np.median(values)), middle, (float(low), float(high)), float(values.max()))
+
+
+def label(measure: str, task: str, command: str) -> str:
+    """A measure with its unit."""
+    if (measure, command) == ("objective", "train"):
+        return MERIT
+    return LABELS.get(measure, measure).format(unit=UNITS.get(task, ""))
+
+
+def measures(summary: Mapping[str, Any]) -> dict[str, list[float]]:
+    """What a run measured: name -> a value per seed or reactor, or one. Which numbers those are depends on the command.
+
+    A training has them per seed. A closed loop has them per window: ISE and ITAE are summed over the windows of a
+    reactor, the steady error is that of its worst window. Of any other command these are its plain numbers.
+    """
+    if isinstance(summary.get("seeds"), list):
+        return {name: _finite(summary.get(name)) for name in ("regret_pct", "steady_abs_error")}
+    if isinstance(summary.get("windows"), list):
+        return _of_windows(summary)
+    plain = {name: _finite([value]) for name, value in summary.items() if type(value) in (int, float)}
+    return {name: values for name, values in plain.items() if values}
+
+
+def _finite(values: Any) -> list[float]:
+    return [float(v) for v in values or [] if type(v) in (int, float) and math.isfinite(v)]
+
+
+def _of_windows(summary: Mapping[str, Any]) -> dict[str, list[float]]:
+    reactors: dict[str, list[Mapping[str, Any]]] = {}
+    for window in summary["windows"]:
+        reactors.setdefault(str(window.get("reactor")), []).append(window)
+    found: dict[str, list[float]] = {}
+    for name, pool in (("steady_abs_error", max), ("ise", sum), ("itae", sum)):
+        each = (_finite([w.get(name) for w in windows]) for windows in reactors.values())
+        found[name] = [float(pool(values)) for values in each if values]
+    found["volume_ml"] = _finite([r.get("volume_ml") for r in summary.get("reactors", {}).values()])
+    return {name: values for name, values in found.items() if values}
+
+
+def _seed(key: str) -> bool:
+    return key.rpartition(".")[2] == "seed"
+
+
+def configurations(jobs: Sequence[Result]) -> tuple[list[Configuration], dict[str, str]]:
+    """Finished jobs pooled over seeds, the best first, and the overrides that all jobs share.
+
+    The best has the least objective at its worst seed; where no objective was returned, the least worst first measure.
+    """
+    keys = list(dict.fromkeys(key for job in jobs for key in job.overrides if not _seed(key)))
+    done = [job for job in jobs if job.state == "finished"]
+    varied = [key for key in keys if len({job.overrides.get(key) for job in done or jobs}) > 1]
+    pooled: dict[tuple[str, ...], list[Result]] = {}
+    for job in done:
+        pooled.setdefault(tuple(job.overrides.get(key, "") for key in varied), []).append(job)
+    found = []
+    for values, members in pooled.items():
+        measured: dict[str, list[float]] = {}
+        for job in members:
+            own = measures(job.summary)
+            for name, each in ({"objective": _finite([job.objective])} | own).items():
+                measured.setdefault(name, []).extend(each)
+        arrays = {name: np.array(each) for name, each in measured.items() if each}
+        found.append(Configuration(dict(zip(varied, values, strict=True)), members, arrays))
+    first = (done or list(jobs))[0].overrides
+    common = {key: first[key] for key in keys if key not in varied and key in first}
+    return sorted(found, key=_rank), common
+
+
+def _rank(one: Configuration) -> float:
+    first = next(iter(one.measured.values()), None)
+    return math.inf if first is None else float(first.max())
+
+
+def curve(jobs: Sequence[Result], tag: str) -> tuple[Array, Array]:
+    """A tag of progress.csv: steps (K,), and a column per seed of all jobs, (K, S), nan where a seed has no value."""
+    found: dict[tuple[str, str], dict[int, float]] = {}
+    for job in jobs:
+        try:
+            with open(job.folder / "progress.csv", newline="", encoding="utf-8") as file:
+                for row in csv.reader(file):
+                    if len(row) == 4 and row[2] == tag:
+                        found.setdefault((job.folder.name, row[1]), {})[int(row[0])] = float(row[3])
+        except (OSError, ValueError):
+            continue
+    steps = sorted({step for each in found.values() for step in each})
+    values = [[each.get(step, math.nan) for each in found.values()] for step in steps]
+    return np.array(steps, dtype=float), np.array(values, dtype=float).reshape(len(steps), len(found))

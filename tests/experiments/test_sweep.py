@@ -1,0 +1,161 @@
+"""A sweep on one machine: one folder, the results of single runs, and going on after whatever ended it."""
+
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dqn import checkpoint
+from experiments.cli import frame, sweep
+from experiments.train import main, train
+from experiments.training.config import TrainConfig
+from experiments.training.session import Session
+
+ROOT = Path(__file__).parents[2]
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+SMOKE = ["+experiment=smoke", "agent.total_steps=300"]
+LONG = ["agent.total_steps=1000", "agent.learn_start=100", "eval_every=200", "checkpoint_every=100"]
+pytestmark = pytest.mark.xdist_group("sweep")  # its tests share what a single run gives
+
+
+def command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "experiments.train", *words]
+
+
+def run(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(*words), cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=200)
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    """What does not depend on where and how fast it ran."""
+    found = json.loads((folder / "summary.json").read_text())
+    return {key: value for key, value in found.items() if key not in ("train_seconds", "policy")}
+
+
+def until(there: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 100.0
+    while not there():
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory) -> list[dict[str, Any]]:
+    """Summaries of seeds 0 and 1 as single runs."""
+    folders = [tmp_path_factory.mktemp(f"alone{seed}") for seed in range(2)]
+    for seed, folder in enumerate(folders):
+        train(main.config([*SMOKE, f"seed={seed}"]), folder)
+    return [summary(folder) for folder in folders]
+
+
+@pytest.mark.parametrize("launcher", ["basic", "joblib", "submitit_local"])
+def test_every_launcher_gives_the_summaries_of_single_runs_in_one_folder(launcher, alone, tmp_path):
+    done = run("-m", "seed=range(0,2)", *SMOKE, f"hydra/launcher={launcher}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (folder,) = (tmp_path / "runs" / "train").iterdir()
+    assert sorted(p.name for p in folder.iterdir() if p.is_dir() and p.name.isdigit()) == ["0", "1"]
+    assert [summary(folder / str(k)) for k in range(2)] == alone
+    assert f"2 of 2 jobs finished in runs/train/{folder.name}" in done.stdout
+
+
+def test_a_stopped_sweep_does_only_what_is_missing(tmp_path):
+    """Ctrl-C in the second of three jobs; then the command that is named, and once more where nothing is missing."""
+    with open(tmp_path / "err", "w") as err:
+        process = subprocess.Popen(
+            command("-m", "seed=range(0,3)", *LONG, "hydra.sweep.dir=a sweep"),
+            cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=err, text=True,
+        )  # fmt: skip
+    folder = tmp_path / "a sweep"
+    until((folder / "1/checkpoint.pt").is_file, process)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60.0) == 130
+    (line,) = (tmp_path / "err").read_text().splitlines()
+    told = re.fullmatch(
+        r"stopped; 1 of 3 jobs finished in a sweep; what is missing: python -m experiments.train (.+)", line
+    )
+    assert told, line
+    before = (folder / "0/summary.json").stat().st_mtime_ns
+    assert 1 <= len(_returns(folder / "1")) < 10
+    again = run(*shlex.split(told[1]), cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert "3 of 3 jobs finished" in again.stdout
+    assert (folder / "0/summary.json").stat().st_mtime_ns == before
+    whole = Session(main.config([*LONG, "seed=1"]), tmp_path)
+    whole.run()
+    whole.writer.close()
+    ours = checkpoint.load(folder / "1/checkpoint.pt")
+    assert ours["best"]["weights"].equal(whole.best.weights)
+    assert ours["returns"] == whole.returns
+    times = [(folder / f"{k}/summary.json").stat().st_mtime_ns for k in range(3)]
+    assert "3 of 3 jobs finished" in run("resume=a sweep", cwd=tmp_path).stdout
+    assert [(folder / f"{k}/summary.json").stat().st_mtime_ns for k in range(3)] == times
+
+
+def _returns(folder: Path) -> list[Any]:
+    found: list[Any] = checkpoint.load(folder / "checkpoint.pt")["returns"]
+    return found
+
+
+def test_a_resumed_sweep_takes_no_other_values_but_another_launcher(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    begun = sweep.asked(["-m", "seed=0,1", "hydra/launcher=joblib", "hydra.sweep.dir=old"], "train")
+    assert begun == sweep.Sweep(Path("old"), "train", ["seed=0,1", "hydra/launcher=joblib"])
+    begun.save()
+    assert sweep.asked(["resume=old", "hydra/launcher=slurm"], "train").line() == [
+        "-m", "seed=0,1", "hydra/launcher=slurm", "hydra.sweep.dir=old",
+    ]  # fmt: skip
+    with pytest.raises(sweep.Again, match=r"^seed=3: a resumed sweep is python -m experiments\.train -m resume=old"):
+        sweep.asked(["-m", "resume=old", "seed=3"], "train")
+    with pytest.raises(sweep.Again, match=r"^hydra\.sweep\.dir=old: holds another sweep .*seed=0,1.*another folder$"):
+        sweep.asked(["-m", "seed=0,2", "hydra.sweep.dir=old"], "train").save()
+    sweep.asked(["-m", "seed=0,1", "hydra.sweep.dir=old"], "train").save()  # the same, by another launcher
+    assert sweep.asked(["seed=0"], "train") is None
+    assert sweep.asked(["+hparams_search=tuned"], "train") is not None
+
+
+def test_jobs_are_those_that_hydra_makes_of_the_command_line():
+    words = frame.normalise(
+        ["-m", "+agent=paper,tuned", "seed=range(0,2)", "env.mu=0.02", "hydra.sweep.dir=x"], "train"
+    )
+    assert sweep.jobs(words) == [
+        [f"agent={agent}", f"seed={seed}", "env.mu=0.02"] for agent in ("paper", "tuned") for seed in (0, 1)
+    ]
+    assert sweep.jobs(["hparams_search=tuned"]) is None
+
+
+def test_a_launcher_that_does_not_exist_is_one_line(tmp_path):
+    with pytest.raises(frame.UserError, match=r"^hydra/launcher=ray: no such option; allowed: basic, joblib"):
+        frame.normalise(["-m", "hydra/launcher=ray"], "train")
+
+
+def test_a_folder_goes_on_with_the_same_config_only_and_one_process_at_a_time(tmp_path):
+    job = sweep.Job.at(tmp_path)
+    job.begin(TrainConfig())
+    sweep.Job.at(tmp_path).begin(TrainConfig())
+    with pytest.raises(sweep.Again, match=r"holds a run of another config; give another hydra\.sweep\.dir="):
+        sweep.Job.at(tmp_path).begin(TrainConfig(seed=1))
+    (tmp_path / "progress.csv").touch()
+    job.put_aside()
+    assert (tmp_path / "stopped_1/progress.csv").is_file()
+    busy = "import sys; from pathlib import Path; from experiments.cli import sweep\n"
+    busy += f"with sweep.working(Path({str(tmp_path)!r})): print('in', flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", busy], env=ENVIRONMENT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "in\n"
+        with pytest.raises(sweep.Busy), sweep.working(tmp_path):
+            pass
+        other.kill()
+    with sweep.working(tmp_path):
+        pass

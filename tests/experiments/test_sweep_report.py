@@ -1,0 +1,107 @@
+"""The comparison page of a sweep, from numbers made up here: statistics by hand, jobs without a result by name."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments import report
+from experiments.cli import frame
+from experiments.reporting import sweep_results
+
+
+def job(folder: Path, overrides: list[str], state: str = "finished", error: str = "", **summary: Any) -> None:
+    """A job's folder as a run leaves it."""
+    (folder / ".hydra").mkdir(parents=True)
+    (folder / ".hydra/overrides.yaml").write_text("".join(f"- {line}\n" for line in overrides))
+    objective = summary.pop("objective", None)
+    (folder / "job.json").write_text(json.dumps({"state": state, "config": "", "objective": objective, "error": error}))
+    if state == "finished":
+        (folder / "summary.json").write_text(json.dumps(summary))
+        (folder / "config.yaml").write_text("env: {kind: density}\n")
+
+
+def training(folder: Path, agent: str, seed: int, regret: list[float]) -> None:
+    seeds = list(range(seed, seed + len(regret)))
+    words = [f"agent={agent}", f"++seed={seed}", f"++n_agents={len(regret)}"]
+    job(folder, words, objective=max(regret), seeds=seeds, regret_pct=regret, steady_abs_error=regret)
+    rows = [
+        f"{step},{s},eval/regret_pct,{r * 100 / step}"
+        for step in (100, 200)
+        for s, r in zip(seeds, regret, strict=True)
+    ]
+    (folder / "progress.csv").write_text("\n".join(["step,seed,tag,value", *rows, ""]))
+
+
+@pytest.fixture
+def trained(tmp_path: Path) -> Path:
+    """Two agents over two jobs of two seeds each, a job that failed, and one that never began."""
+    arguments = ["agent=tuned,paper", "seed=0,2,4", "n_agents=2"]
+    (tmp_path / "sweep.json").write_text(json.dumps({"command": "train", "arguments": arguments}))
+    training(tmp_path / "0", "tuned", 0, [1.0, 2.0])
+    training(tmp_path / "1", "tuned", 2, [3.0, 10.0])
+    job(tmp_path / "2", ["agent=tuned", "++seed=4", "++n_agents=2"], "failed", "the disk is full")
+    training(tmp_path / "3", "paper", 0, [20.0, 30.0])
+    training(tmp_path / "4", "paper", 2, [40.0, 50.0])
+    return tmp_path
+
+
+def table(folder: Path, name: str) -> list[dict[str, str]]:
+    with open(folder / "tables" / f"{name}.csv", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_seeds_are_pooled_and_the_best_configuration_comes_first(trained: Path) -> None:
+    """Of 1, 2, 3, 10: median 2.5, interquartile mean (2 + 3) / 2, worst 10."""
+    text = report.compare(trained).read_text(encoding="utf-8")
+    rows = table(trained, "configurations_regret_pct")
+    assert [row["agent"] for row in rows] == ["tuned", "paper"]
+    assert [(row["n"], row["median"], row["IQM"], row["worst"]) for row in rows] == [
+        ("4", "2.5", "2.5", "10"), ("4", "35", "35", "50"),
+    ]  # fmt: skip
+    assert "Of 2 configurations, agent tuned is best" in text
+    assert "4 of 6 jobs finished" in text
+    assert "python -m experiments.train -m agent=tuned seed=0,2 n_agents=2" in text
+    assert (trained / "figures/learning_regret_pct.svg").is_file()
+    assert "<script" not in text
+
+
+def test_jobs_without_a_result_are_named(trained: Path) -> None:
+    text = report.compare(trained).read_text(encoding="utf-8")
+    rows = table(trained, "missing_jobs")
+    assert [(row["job"], row["state"], row["error"]) for row in rows] == [
+        ("2", "failed", "the disk is full"), ("5", "missing", "–"),
+    ]  # fmt: skip
+    assert f"python -m experiments.train -m resume={trained}" in text
+
+
+def test_curves_are_those_of_every_seed_of_every_job(trained: Path) -> None:
+    jobs = [sweep_results.Result(trained / str(k), {}, "finished") for k in range(2)]
+    steps, values = sweep_results.curve(jobs, "eval/regret_pct")
+    np.testing.assert_array_equal(steps, [100, 200])
+    np.testing.assert_array_equal(values, [[1, 2, 3, 10], [0.5, 1, 1.5, 5]])
+
+
+def test_a_closed_loop_is_judged_by_its_worst_window(tmp_path: Path) -> None:
+    for k, (law, errors) in enumerate({"pi": [0.01, 0.03], "mpc": [0.02, 0.02]}.items()):
+        windows = [{"reactor": "M0", "ise": 1.0, "itae": 2.0, "steady_abs_error": e} for e in errors]
+        job(tmp_path / str(k), [f"controller={law}"], windows=windows, reactors={"M0": {"volume_ml": 60.0 + k}})
+    report.compare(tmp_path)
+    rows = table(tmp_path, "configurations")
+    assert [(row["controller"], row["steady_abs_error: worst"], row["ise: worst"]) for row in rows] == [
+        ("mpc", "0.02", "2"), ("pi", "0.03", "2"),
+    ]  # fmt: skip
+
+
+def test_the_interval_is_that_of_a_bootstrap() -> None:
+    """Of 0 and 1 two draws are 0, 1/2 or 1 in one, two and one of four cases: 95 % reach from 0 to 1."""
+    found = sweep_results.statistics(np.array([0.0, 1.0]))
+    assert (found.n, found.interval, found.iqm, found.worst) == (2, (0.0, 1.0), 0.5, 1.0)
+
+
+def test_a_folder_without_a_sweep_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(frame.UserError, match=r"holds no job of a sweep; give the folder that train -m has written"):
+        report.compare(tmp_path)

@@ -1,0 +1,69 @@
+"""A search of hyper-parameters by two processes on one file, of which one is killed."""
+
+import importlib.metadata
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from experiments.cli import frame, search, sweep
+from tests.experiments.test_sweep import ENVIRONMENT
+
+WORDS = ["+hparams_search=tuned", "+experiment=smoke", "n_agents=1", "agent.total_steps=300", "checkpoint_every=100"]
+TRIALS = 4
+
+
+def _optuna() -> int:
+    try:
+        return int(importlib.metadata.version("optuna").partition(".")[0])
+    except importlib.metadata.PackageNotFoundError:
+        return 0
+
+
+def worker(folder: Path, name: str) -> subprocess.Popen[str]:
+    """A process that takes part in the search."""
+    words = [*WORDS, f"hydra.sweeper.trials={TRIALS}", "hydra.sweep.dir=search"]
+    with open(folder / name, "w") as out:
+        return subprocess.Popen(
+            [sys.executable, "-m", "experiments.train", *words],
+            cwd=folder, env=ENVIRONMENT, stdout=out, stderr=out, text=True,
+        )  # fmt: skip
+
+
+@pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
+def test_two_processes_share_a_search_and_take_up_the_trial_of_a_killed_one(tmp_path: Path) -> None:
+    first = worker(tmp_path, "first")
+    folder = tmp_path / "search"
+    deadline = time.monotonic() + 60.0
+    while not (folder / "0/config.yaml").is_file():  # the first trial is at work
+        assert time.monotonic() < deadline
+        assert first.poll() is None, (tmp_path / "first").read_text()
+        time.sleep(0.01)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    assert sweep.Job.at(folder / "0").state == "running"
+    for each in [worker(tmp_path, "second"), worker(tmp_path, "third")]:
+        assert each.wait(120.0) == 0, [(tmp_path / name).read_text() for name in ("second", "third")]
+    said = "".join((tmp_path / name).read_text() for name in ("second", "third"))
+    assert said.count("trial 0 goes on: its process is gone") == 1
+    jobs = sweep.survey(folder)
+    assert [job.folder.name for job in jobs] == [str(k) for k in range(TRIALS)]
+    assert [job.state for job in jobs] == ["finished"] * TRIALS
+    assert len({job.overrides[-1] for job in jobs}) == TRIALS
+    ours = {job.folder.name: job.objective for job in jobs}
+    best = json.loads((folder / "best.json").read_text())
+    assert best["objective"] == min(v for v in ours.values() if v is not None) == ours[str(best["trial"])]
+    study = search.Search(TRIALS, 1, frame.OmegaConf.create({}))
+    study.folder = folder
+    trials = study._open().get_trials()
+    assert [(t.number, t.state.name, t.value) for t in trials] == [(k, "COMPLETE", ours[str(k)]) for k in range(TRIALS)]
+
+
+@pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
+def test_a_space_that_is_none_is_one_line() -> None:
+    with pytest.raises(frame.UserError, match=r"^hydra\.sweeper\.space\.env\.mu: .*; write \{low: 1, high: 9\}"):
+        search.Search(1, 1, frame.OmegaConf.create({"env.mu": {"low": 2.0, "high": 1.0}}))
