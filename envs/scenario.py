@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
+from envs.outputs import outputs_of
 from envs.until import Condition
 
 __all__ = ["Scenario"]
@@ -47,6 +48,10 @@ class Scenario:
         (),
         "what ends each phase before its minutes are over: 'od >= 0.8', 'od <= 0.3', settled, or null; empty: nothing",
     )
+    outputs: tuple[str | None, ...] = setting(
+        (),
+        "what each phase gives by a spare pump: 'pump3 2 mL/h', 'pump4 1.5 mL' at its start, or null; empty: nothing",
+    )
     settled_band: float = setting(
         0.05,
         "settled: |OD - setpoint| within this share of the setpoint, as the settling time of the summary",
@@ -66,8 +71,13 @@ class Scenario:
             "three lists of the same length, one entry per phase",
         )
         object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
+        object.__setattr__(self, "outputs", tuple(None if o is None or o != o else str(o) for o in self.outputs))
         check(self, "scenario")
         self._check_until()
+        whole = len(self.outputs) in (0, len(self.setpoints))
+        require(whole, "scenario.outputs", self.outputs, f"none or one for each of the {len(self.setpoints)} phases")
+        for text in self.outputs:
+            outputs_of(text)
         self._check_composition()
 
     def _check_until(self) -> None:
@@ -98,6 +108,11 @@ class Scenario:
     def composed(self) -> bool:
         """Whether a share is asked for at any time."""
         return bool(self.ratio_sine) or any(r is not None for r in self.ratios)
+
+    @property
+    def supplied(self) -> frozenset[int]:
+        """The spare pumps that any phase gives by."""
+        return frozenset(output.pump for text in self.outputs for output in outputs_of(text))
 
     @property
     def total_min(self) -> float:

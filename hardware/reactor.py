@@ -78,11 +78,13 @@ class Command:
     rows: True for the reactors to act on (the fresh ones), shape (N,).
     pump_rate: mean feed rate over the coming control period, mL/s, shape (N,), >= 0.
     temperature: thermostat target, degC, shape (N,); nan leaves it as it is.
+    pump: number of the pump that gives the dose, 1 (the feed), 3 or 4, shape (N,); None: the feed everywhere.
     """
 
     rows: Mask
     pump_rate: Array
     temperature: Array
+    pump: NDArray[np.intp] | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ class Receipt:
       pump was really told: less than the command where a limit cut it or a small dose was put off to the next.
     notes: what differs from the command, one line each.
     waste_ml: what the waste pump was told to be able to remove, mL, shape (N,); None where waste is not modelled.
+    pump: number of the spare pump that gave it, of a repetition; 0 for the feed, and where the command says it.
     kept_ml: by how much what is put off to the next dose has grown, mL, shape (N,), negative where that was given or
       lost; None where nothing is put off.
     """
@@ -101,6 +104,7 @@ class Receipt:
     notes: tuple[str, ...] = field(default=())
     waste_ml: Array | None = None
     kept_ml: Array | None = None
+    pump: int = 0
 
 
 class Reactor(Protocol):

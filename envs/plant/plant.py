@@ -145,6 +145,7 @@ class Plant:
         waste_s: Array | None = None,
         temperature_target: Array | float | None = None,
         overflow_s: Array | float = 0.0,
+        supply_ml: Array | float = 0.0,
     ) -> None:
         """Run pumps, growth and heater for an interval of any length; long ones are cut into minutes.
 
@@ -156,6 +157,7 @@ class Plant:
             Negative blows air and changes nothing.
           temperature_target: thermostat, degC, scalar or shape (N,); None or nan leaves it, 0 is off.
           overflow_s: on-time of the overflow pump, s, as `waste_s`; 0 = there is none.
+          supply_ml: another fluid without cells by a spare pump, mL, shape (N,) or scalar, with the feed.
         Raises: ValueError for an interval not positive or an on-time not finite.
         """
         if not (minutes > 0.0 and np.isfinite(minutes)):
@@ -173,13 +175,16 @@ class Plant:
         for k in range(pieces):
             share = 1.0 / pieces if continuous else float(k == 0)
             outlets = (waste * share, above * share) if share else (np.zeros(self.n), np.zeros(self.n))
-            self._advance_piece(minutes / pieces, feed * share, *outlets)
+            supply = np.broadcast_to(np.asarray(supply_ml, dtype=np.float64), (self.n,)) * share
+            self._advance_piece(minutes / pieces, feed * share, *outlets, supply)
 
-    def _advance_piece(self, minutes: float, feed_s: Array, waste_s: Array, overflow_s: Array) -> None:
+    def _advance_piece(
+        self, minutes: float, feed_s: Array, waste_s: Array, overflow_s: Array, supply_ml: Array
+    ) -> None:
         """At most one minute: this minute's draws, doses, heat, growth, evaporation."""
         self._draw_minutes()
         volume = self.vessel.volume_ml
-        fresh = self.feed.deliver(np.maximum(feed_s, 0.0), minutes, self.age_min)
+        fresh = self.feed.deliver(np.maximum(feed_s, 0.0), minutes, self.age_min) + supply_ml
         kept = self.vessel.exchange(fresh, waste_s, overflow_s)
         self.vessel.draw_out(self.feed.drawn_back(np.maximum(-feed_s, 0.0)))
         if self.config.pump.dosing == "pulse":

@@ -114,6 +114,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         gain = plant.vessel.volume_ml / (60.0 * model.tau)  # tau = V / (60 g)
         growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
         plant = replace(plant, growth=growth, pump=pump)
+    _check_supply(config, scenarios)
     keeper = _keeper(config, plant, folder, scenarios)
     if keeper is not None and hasattr(backend, "fluorescence"):  # the device has to measure what the estimate needs
         backend = replace(backend, fluorescence=replace(backend.fluorescence, measure=True))
@@ -126,6 +127,17 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         admit(policy, folder / "policy.npz", config, scenarios)
         bounds = certificate.bounds(policy, folder / "policy.npz")
     return Setup(config, scenarios, plant, model, policy, bounds, resumed, keeper)
+
+
+def _check_supply(config: DeployConfig, scenarios: list[Scenario]) -> None:
+    """Whether every pump that a scenario gives by has a tube. Raises: UserError naming the pump."""
+    if config.backend.kind == "sim":
+        return
+    for name, scenario in zip(config.backend.reactors, scenarios, strict=True):
+        for number in sorted(scenario.supplied):
+            if f"Pump{number}" not in config.backend.supply.pumps:
+                remedy = f"weigh it and give its flow, backend.supply.pump{number}_ml_s"
+                raise frame.UserError(f"scenario.outputs of {name}: Pump{number} has no tube; {remedy}")
 
 
 def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Keeper | None:

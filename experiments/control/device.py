@@ -59,6 +59,7 @@ def linked(backend: ChiBioConfig) -> Iterator[tuple[Transport, RealClock]]:
             arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
             if (overflow := backend.overflow_pump).pump:
                 arguments |= {"overflow-pump": overflow.pump, "overflow-flow": overflow.flow_ml_s}
+            arguments |= {f"{pump.lower()}-flow": backend.supply.flow_ml_s(pump) for pump in backend.supply.pumps}
             words = [word for k, v in arguments.items() for word in (f"--{k}", str(v))]
             device = stack.enter_context(EmulatorProcess(words))
             log.info(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from envs.scenario import Scenario
 from experiments.control.composition import Composition
 from experiments.control.progress import Progress
+from experiments.control.supply import Supply
 from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Remembers, Watches
 from hardware.reactor import Command, Reactor, Receipt
 from hardware.safety.config import Response
@@ -33,6 +34,7 @@ class Step:
     response: of the interlock. notes: of the reactors. explanation: of the controller. done: schedule over.
     composition: further columns of the recording, where a composition is controlled.
     raw, blank: counts behind the OD and those of clear medium; nan where the reactors have none.
+    pump: number of the pump that gives the dose, 1 (the feed), 3 or 4.
     position: of each reactor, where it stands in its schedule (`ClosedLoop.position`). ended: steps of the schedule
       that this sample ended by their condition.
     """
@@ -58,6 +60,7 @@ class Step:
     ended: Mask | None = None
     raw: Array | None = None
     blank: Array | None = None
+    pump: NDArray[np.intp] | None = None
 
 
 class ClosedLoop:
@@ -97,6 +100,7 @@ class ClosedLoop:
         self._recovery_od = np.array([s.recovery_od for s in self.schedules])
         self._recovery_limit = np.array([s.recovery_limit_min for s in self.schedules])
         self.progress = Progress(self.schedules)
+        self.supply = Supply(self.schedules, interlock.config.max_rate * interlock.config.period_s)
         self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
         self.done = np.zeros(n, dtype=np.bool_)
         self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
@@ -138,6 +142,8 @@ class ClosedLoop:
             self.controller.watch(m.od, m.temperature, minute, believed)
         decided = self.controller.act(np.where(rows & ~believed, np.nan, m.od), setpoint, minute, steered)
         proposed = np.where(steered & ~(self.done & (self._at_end != "hold")), decided, 0.0)
+        pump, extra_ml = self.supply.due(elapsed, phase, steered & ~self.done)
+        proposed = np.where(pump == 1, proposed, extra_ml / self.interlock.config.period_s)
         verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
         sound = rows & (verdict.response == Response.PASS)  # the device will dose by the same sensor
         left = self.done & (self._at_end == "regulate") & sound
@@ -153,7 +159,7 @@ class ClosedLoop:
             np.full(len(self.done), np.nan), reasons, verdict.response, (), explanation, self.done.copy(),
             {} if composed is None else composed.columns,
             [self.position(n) for n in range(len(self.done))], ended,
-            None if m.vitals is None else m.vitals.raw, None if m.vitals is None else m.vitals.blank,
+            None if m.vitals is None else m.vitals.raw, None if m.vitals is None else m.vitals.blank, pump,
         )  # fmt: skip
         if self._before_dose is not None:
             self._before_dose(decision)
@@ -162,7 +168,8 @@ class ClosedLoop:
         self.gone = absent & (verdict.response == Response.STOP)
         failures = self._respond(verdict, left)
         heat = np.where(verdict.heat_off, np.nan, temperature)
-        receipt = self.reactors.actuate(Command(rows, verdict.rate, heat))
+        receipt = self.reactors.actuate(Command(rows, verdict.rate, heat, pump))
+        self.supply.given(pump, receipt.volume_ml)
         self.book(receipt, now)
         volume = receipt.volume_ml + np.where(rows, self.repeated_ml, 0.0)
         self.repeated_ml = np.where(rows, 0.0, self.repeated_ml)
@@ -172,6 +179,7 @@ class ClosedLoop:
         """What the devices dosed by themselves counts when it happened, before the sample after it is judged."""
         for at_s, receipt in self.reactors.repeated():
             self.book(receipt, at_s)
+            self.supply.given(np.full(len(self.done), receipt.pump), receipt.volume_ml)
             self.repeated_ml = self.repeated_ml + receipt.volume_ml
 
     def book(self, receipt: Receipt, at_s: float) -> None:
@@ -208,7 +216,7 @@ class ClosedLoop:
 
     def position(self, n: int) -> dict[str, Any]:
         """What a decision for reactor n has to keep of where its schedule stands; plain numbers."""
-        return {"began": float(self.began[n]), **self.progress.row(n)}
+        return {"began": float(self.began[n]), **self.progress.row(n), **self.supply.row(n)}
 
     def take(self, n: int, position: Mapping[str, Any]) -> None:
         """Put reactor n where a decision kept it. Raises: ValueError naming what does not fit."""
@@ -217,12 +225,13 @@ class ClosedLoop:
             raise ValueError(f"began: {str(began)[:40]}, expected a number")
         self.began[n] = np.nan if began is None else began
         self.progress.take(n, position)
+        self.supply.take(n, position)
 
     def state(self) -> dict[str, Any]:
         """Where each reactor's schedule, the interlock and the controllers stand; plain numbers and lists."""
         known = {"began": self.began, "done": self.done, "stopped": self.stopped}
         state = {**{key: values.tolist() for key, values in known.items()}, "interlock": self.interlock.state()}
-        state |= self.progress.state()
+        state |= self.progress.state() | self.supply.state()
         state |= {} if self.composition is None else {"composition": self.composition.state()}
         return state | ({"controller": self.controller.state()} if isinstance(self.controller, Remembers) else {})
 
@@ -244,6 +253,7 @@ class ClosedLoop:
         self.done = np.array(state["done"], dtype=np.bool_)
         self.stopped = np.array(state["stopped"], dtype=np.bool_)
         self.progress.restore(state.get("steps", "missing"))
+        self.supply.restore(state.get("supply", "missing"))
         self.interlock.restore(state.get("interlock", "missing"))
         if self.composition is not None:
             self.composition.restore(state.get("composition", "missing"))

@@ -38,9 +38,9 @@ Row = dict[str, float | int | str | bool | None]
 REBUILD = "move it away and resume again: it is written anew from the last 20 MB of the journal"
 COLUMNS = (
     "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
-    "temperature_degc", "interlock", "raw_counts", "blank_counts",
+    "temperature_degc", "interlock", "raw_counts", "blank_counts", "feed_pump",
 )  # fmt: skip
-ADDED = ("raw_counts", "blank_counts")  # columns of a later version
+ADDED = ("raw_counts", "blank_counts", "feed_pump")  # columns of a later version
 
 
 def row_of(step: Step, n: int) -> Row:
@@ -59,6 +59,7 @@ def row_of(step: Step, n: int) -> Row:
         "interlock": step.reasons[n] or "",
         "raw_counts": math.nan if step.raw is None else float(step.raw[n]),
         "blank_counts": math.nan if step.blank is None else float(step.blank[n]),
+        "feed_pump": 1 if step.pump is None else int(step.pump[n]),
         **further,
     }
 
@@ -252,6 +253,7 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
     for dose in doses:
         mine = np.array([name == dose.reactor for name in loop.reactors.names])
         loop.book(Receipt(mine * dose.feed_ml, (), mine * dose.waste_ml), dose.at_s)
+        loop.supply.given(np.where(mine, dose.pump, 0), mine * dose.feed_ml)
         if dose.again and dose.n > decided.get(dose.reactor, -1):  # in no row yet
             loop.repeated_ml += mine * dose.feed_ml
     if isinstance(loop.controller, Accounts):

@@ -20,7 +20,7 @@ from experiments.control.loop import ClosedLoop, Step
 from experiments.control.record import Record
 from experiments.controllers import registry
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration, SupplyConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
@@ -63,10 +63,11 @@ class ScriptedClock(VirtualClock):
         super().sleep(end - self.now())
 
 
-def _plumbed(options: DeviceOptions, overflow: OverflowPumpConfig) -> DeviceOptions:
-    """The same device with a second waste tube on the overflow pump."""
+def _plumbed(options: DeviceOptions, overflow: OverflowPumpConfig, supply: SupplyConfig) -> DeviceOptions:
+    """The same device with a second waste tube on the overflow pump, and the bottles of supply pumps."""
     pump = replace(options.plant.pump, overflow_ml_s=overflow.flow_ml_s)
-    vial = replace(options.vial, overflow_pump=overflow.pump)
+    flows = {"pump3_ml_s": supply.pump3_ml_s, "pump4_ml_s": supply.pump4_ml_s}
+    vial = replace(options.vial, overflow_pump=overflow.pump, **flows)
     return replace(options, vial=vial, plant=replace(options.plant, pump=pump))
 
 
@@ -100,7 +101,7 @@ class Rehearsal:
         self.names: tuple[str, ...] = config.backend.reactors
         self.clock = ScriptedClock()
         rng = np.random.default_rng(seed)
-        plumbed = _plumbed(options or DeviceOptions(), config.backend.overflow_pump)
+        plumbed = _plumbed(options or DeviceOptions(), config.backend.overflow_pump, config.backend.supply)
         self.device = ChiBioDevice(self.names, self.clock, rng, plumbed, od=od, temperature=37.0, blanked=True)
         self.spans: list[list[float]] = []
         self.lives = 0

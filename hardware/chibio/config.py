@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from conf.presets import groups
 from conf.schema import check, part, require, setting
-from hardware.chibio.dosing import DosingConfig
+from hardware.chibio.dosing import DosingConfig, SupplyConfig
 from hardware.chibio.fluorescence import FluorescenceSlotConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import POSITIONS
@@ -33,6 +33,7 @@ class ChiBioConfig:
     volume_ml: float = setting(20.0, "culture, only told to the device's own regulator", "mL", within=(10, 30))
     dosing: DosingConfig = part(DosingConfig, "how a rate becomes a dose")
     overflow_pump: OverflowPumpConfig = part(OverflowPumpConfig, "a second waste line against overflow")
+    supply: SupplyConfig = part(SupplyConfig, "spare pumps that steps of a scenario give by")
     fluorescence: FluorescenceSlotConfig = part(FluorescenceSlotConfig, "a second measurement of the culture")
     stale_s: float = setting(100.0, "age at which a newest sample is no basis for a dose", "s", within=(65, 600))
     lost_s: float = setting(
@@ -64,6 +65,8 @@ class ChiBioConfig:
         require(unique, "backend.reactors", self.reactors, "1 to 8 different ones of M0 to M7")
         at = self.dosing.period_s
         require(abs(at - 60.0) <= 1e-9, "backend.dosing.period_s", at, "60 (the device measures so often)")
+        both = self.overflow_pump.pump in self.supply.pumps
+        require(not both, "backend.supply", self.overflow_pump.pump, "another pump than the overflow pump")
         later = f"more than stale_s = {self.stale_s} s"
         require(self.lost_s > self.stale_s, "backend.lost_s", f"{self.lost_s} s", later)
 

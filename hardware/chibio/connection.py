@@ -54,6 +54,7 @@ class Connection:
       log: takes every command and its answer.
       overflow_pump: spare pump that may be switched on; "" if there is none.
       slot_command: the one toggle that may be sent, that of the fluorescence slot; "" if none may be.
+      supply_pumps: spare pumps that may give doses.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class Connection:
         log: Log,
         overflow_pump: str = "",
         slot_command: str = "",
+        supply_pumps: Sequence[str] = (),
     ) -> None:
         self.name = name
         self.device_id = ""  # pinned at the first read
@@ -74,6 +76,7 @@ class Connection:
         self._seen_s = -math.inf  # clock time at which this reactor was last known to be present
         self.clock, self._transport, self._log = clock, transport, log
         self._reactors, self._overflow_pump, self._slot_command = tuple(reactors), overflow_pump, slot_command
+        self._supply_pumps = tuple(supply_pumps)
 
     def read(self, tries: int = 3) -> DeviceState:
         """The reactor's state, certainly its own.
@@ -144,7 +147,7 @@ class Connection:
         return self.read()
 
     def _post(self, path: str, quiet: bool = False) -> None:
-        check_command(path, self._reactors, self._overflow_pump, self._slot_command)
+        check_command(path, self._reactors, self._overflow_pump, self._slot_command, self._supply_pumps)
         start = self.clock.now()
         answer: int | str = ""
         before, self._unsure = self._unsure, True

@@ -10,10 +10,10 @@ from hardware.chibio.agenda import Agenda, Task
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.diagnosis import fault_of
-from hardware.chibio.dosing import DosePlan, ReactorCalibration, plan_dose
+from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, plan_dose
 from hardware.chibio.ending import Ending, repeats_until
 from hardware.chibio.logbook import Logbook
-from hardware.chibio.protocol import FEED, WASTE, DeviceState
+from hardware.chibio.protocol import FEED, PUMPS, WASTE, DeviceState
 from hardware.chibio.resume import ReactorHistory, conclude
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 
@@ -87,7 +87,9 @@ class DoseSequence:
         """The device's records begin anew: no dose was decided for any sample in them."""
         self._acted = None
 
-    def begin(self, rate: float, sample: tuple[float, int] | None, appeared_s: float, refusal: str) -> DosePlan:
+    def begin(
+        self, rate: float, sample: tuple[float, int] | None, appeared_s: float, refusal: str, pump: str = FEED
+    ) -> DosePlan:
         """Begin the dose for `sample`; returns what was, or may have been, begun.
 
         Nothing is begun, and a note says why, if that sample was acted on already, is too old for a dose to end
@@ -97,15 +99,18 @@ class DoseSequence:
           rate: mean feed rate, mL/s.
           sample: its key, None if there is none; appeared_s: clock time at which it appeared, -inf if unknown.
           refusal: why the reactor may not be dosed, "" if it may.
+          pump: that gives it: the feed pump, or a supply pump, whose doses are carried nowhere.
         Raises: ValueError for a rate that is negative or not finite; what the intent's log raises.
         """
-        plan = plan_dose(rate, self._carry_ml, self._doses, self._calibration, self._config.dosing)
+        plan = self._plan(rate, pump)
         if reason := refusal or self._obstacle(sample, appeared_s, plan.waste_s):
             self._book.tell(f"no dose: {reason}")
             return DosePlan()
-        self._acted, self._carry_ml = sample, plan.carry_ml
+        self._acted = sample
+        if pump == FEED:
+            self._carry_ml = plan.carry_ml
         self._doses += plan.feed_duty > 0.0
-        if plan.carry_ml > 0.0 and rate > 0.0:
+        if plan.carry_ml > 0.0 and rate > 0.0 and pump == FEED:
             self._book.tell(f"{plan.carry_ml:.3f} mL is less than the pump can deliver: kept for the next dose")
         if plan.shortfall_ml > 0.0:
             self._book.tell(f"the dose was cut by {plan.shortfall_ml:.3f} mL to the feed limit")
@@ -113,6 +118,20 @@ class DoseSequence:
             self._begun = _Begun(plan, self._book.elapsed())
         self._intend(plan, rate)
         return plan if plan.feed_duty > 0.0 and self._switch_on(plan, appeared_s) else DosePlan()
+
+    def _plan(self, rate: float, pump: str) -> DosePlan:
+        """The dose by a pump; every pump but the feed has its declared flow and starts without a carry."""
+        if pump == FEED:
+            return plan_dose(rate, self._carry_ml, self._doses, self._calibration, self._config.dosing)
+        if pump not in self._config.supply.pumps:
+            return DosePlan(pump=pump)
+        own = replace(self._calibration, feed=self._calibrated(pump))
+        return replace(plan_dose(rate, 0.0, self._doses, own, self._config.dosing), pump=pump)
+
+    def _calibrated(self, pump: str) -> PumpCalibration:
+        """Flow of the pump that feeds."""
+        own = pump == FEED
+        return self._calibration.feed if own else PumpCalibration(flow_ml_s=self._config.supply.flow_ml_s(pump))
 
     def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> str:
         """Why no dose may be given for this sample now; "" if nothing stands against it."""
@@ -131,7 +150,8 @@ class DoseSequence:
         """Write down what is about to be done. Only then may it be done: a resumed run acts once per sample."""
         self._book.intend(
             sample=self._acted, rate=rate, feed_duty=plan.feed_duty, waste_duty=plan.waste_duty, feed_ml=plan.feed_ml,
-            waste_ml=plan.waste_ml, carry_ml=plan.carry_ml, doses=self._doses, on_s=self._book.elapsed(),
+            waste_ml=plan.waste_ml, carry_ml=self._carry_ml, doses=self._doses, on_s=self._book.elapsed(),
+            **({} if plan.pump == FEED else {"feed_pump": plan.pump}),
         )  # fmt: skip
 
     def _switch_on(self, plan: DosePlan, appeared_s: float) -> bool:
@@ -143,7 +163,7 @@ class DoseSequence:
             self._agenda.add(self._finish())
             return False
         self.running = True
-        self._agenda.add(self._feed_off(), WASTE_FIRST_S + plan.feed_s + DOSE_OFF_S)
+        self._agenda.add(self._feed_off(plan.pump), WASTE_FIRST_S + plan.feed_s + DOSE_OFF_S)
         self._agenda.add(self._finish(), plan.waste_s + DOSE_OFF_S)
         fed = False
         try:
@@ -153,7 +173,7 @@ class DoseSequence:
             fed, on_s = True, self._book.elapsed()
             self._mark(fed=True, on_s=on_s)
             self._book.log("feed_on", on_s=on_s)  # before it is done: a resumed run must know that it may have been fed
-            self._connection.switch(FEED, True)
+            self._connection.switch(plan.pump, True)
         except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
             counted = "counted as dosed" if fed else "no dose was begun"
             self._book.tell(f"the answer to a pump command was lost, {counted}: {error}")
@@ -168,22 +188,23 @@ class DoseSequence:
         """Set both duties and read them back. Raises: ReactorError if the device is not ready for this dose in time."""
         connection = self._connection
         connection.target(WASTE, plan.waste_duty)
-        connection.target(FEED, plan.feed_duty)
+        connection.target(plan.pump, plan.feed_duty)
         state = connection.read()
-        as_set = np.allclose(state.pump_targets[:2], (plan.feed_duty, plan.waste_duty), rtol=0.0, atol=1e-5)
+        targets = [state.pump_targets[PUMPS.index(pump)] for pump in (plan.pump, WASTE)]
+        as_set = np.allclose(targets, (plan.feed_duty, plan.waste_duty), rtol=0.0, atol=1e-5)
         on = self._config.overflow_pump.others_on(state)
         if not as_set or on or not state.running or state.regulating:
-            raise DeviceStateError(f"targets {state.pump_targets[:2]}, pumps on: {on or 'none'}: not as set")
+            raise DeviceStateError(f"targets {tuple(targets)}, pumps on: {on or 'none'}: not as set")
         self._mark(experiment=state.start_time)
         past = self._clock.now() - appeared_s
         if past + plan.waste_s > self._config.window_s:
             raise DeviceStateError(f"the device answers too slowly ({past:.0f} s after the sample)")
 
-    def _feed_off(self) -> Task:
+    def _feed_off(self, pump: str) -> Task:
         """Task: feed pump off, again and again until the device has heard it."""
         while self.running:
             try:
-                self._connection.switch(FEED, False)
+                self._connection.switch(pump, False)
                 self._mark(feed_off_s=self._book.elapsed())
                 return
             except (LinkError, ProtocolError) as error:
@@ -207,7 +228,7 @@ class DoseSequence:
                     pause = 30.0  # absent or exchanged: nothing may be sent to it
                 else:
                     self.stuck = str(error)
-                    if FEED in self._connection.state.running_pumps:
+                    if self._begun is not None and self._begun.plan.pump in self._connection.state.running_pumps:
                         self._mark(feed_off_s=math.nan)  # it was answered, not done
                     if refusals == 3:
                         self.escalated = True
@@ -234,12 +255,12 @@ class DoseSequence:
         """What a dose gave until its pumps were off: less than planned where it was cut short, more where late."""
         plan, calibration = begun.plan, self._calibration
         feed_off_s = off_s if math.isnan(begun.feed_off_s) else begun.feed_off_s
-        ending = Ending(begun.on_s)
+        ending = Ending(begun.on_s, pump=0 if plan.pump == FEED else PUMPS.index(plan.pump) + 1)
         if begun.wasted:
             waste_ml = calibration.waste.volume(min(plan.waste_s, off_s - begun.on_s))
             ending = replace(ending, waste_ml=waste_ml, waste_times=repeats_until(off_s, begun.on_s))
         if begun.fed:
-            feed_ml = calibration.feed.volume(min(plan.feed_s, feed_off_s - begun.on_s))
+            feed_ml = self._calibrated(plan.pump).volume(min(plan.feed_s, feed_off_s - begun.on_s))
             ending = replace(ending, feed_ml=feed_ml, feed_times=repeats_until(feed_off_s, begun.on_s))
         return ending
 

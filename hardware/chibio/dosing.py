@@ -10,9 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
-from hardware.chibio.protocol import PERIOD_S
+from hardware.chibio.protocol import FEED, PERIOD_S, SPARE
 
-__all__ = ["DosePlan", "DosingConfig", "PumpCalibration", "PumpFit", "ReactorCalibration", "fit_pump", "plan_dose"]
+__all__ = [
+    "DosePlan",
+    "DosingConfig",
+    "PumpCalibration",
+    "PumpFit",
+    "ReactorCalibration",
+    "SupplyConfig",
+    "fit_pump",
+    "plan_dose",
+]
 
 Array = NDArray[np.float64]
 
@@ -115,11 +124,33 @@ class DosingConfig:
 
 
 @dataclass(frozen=True)
+class SupplyConfig:
+    """Spare pumps that give a second medium, an inducer or a stressor; none as a rule, as their tubes are not there."""
+
+    pump3_ml_s: float = setting(
+        0.0, "flow of Pump3 at full power, as weighed; 0: it has no tube", "mL/s", within=(0, 1.5)
+    )
+    pump4_ml_s: float = setting(0.0, "of Pump4", "mL/s", within=(0, 1.5))
+
+    def __post_init__(self) -> None:
+        check(self, "backend.supply")
+
+    def flow_ml_s(self, pump: str) -> float:
+        """Flow of a spare pump, 0 for every other one."""
+        return {"Pump3": self.pump3_ml_s, "Pump4": self.pump4_ml_s}.get(pump, 0.0)
+
+    @property
+    def pumps(self) -> tuple[str, ...]:
+        """Those that have a tube."""
+        return tuple(pump for pump in SPARE if self.flow_ml_s(pump) > 0.0)
+
+
+@dataclass(frozen=True)
 class DosePlan:
     """One dose: feed and waste duty (targets of the device), their volumes in mL, and what is carried to the next.
 
     carry_ml: asked but not dosed, because it is less than the pump can deliver; shortfall_ml: cut off by the limit of
-    the feed duty and not carried.
+    the feed duty and not carried. pump: that feeds.
     """
 
     feed_duty: float = 0.0
@@ -128,6 +159,7 @@ class DosePlan:
     waste_ml: float = 0.0
     carry_ml: float = 0.0
     shortfall_ml: float = 0.0
+    pump: str = FEED
 
     @property
     def feed_s(self) -> float:

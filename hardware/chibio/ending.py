@@ -17,7 +17,8 @@ class Ending:
     """How a dose ended.
 
     on_s: run time at which its pumps were switched on, s. feed_ml, waste_ml: what it gave. feed_times, waste_times: how
-    often the device gave the same again, every 63 s from `on_s` on, before the pump was off.
+    often the device gave the same again, every 63 s from `on_s` on, before the pump was off. pump: number of the spare
+    pump that gave it, 0 for the feed.
     """
 
     on_s: float
@@ -25,6 +26,7 @@ class Ending:
     waste_ml: float = 0.0
     feed_times: int = 0
     waste_times: int = 0
+    pump: int = 0
 
     @property
     def repeated_ml(self) -> float:
@@ -40,13 +42,14 @@ class Ending:
 
     def row(self) -> dict[str, Any]:
         """As the journal keeps it."""
-        return {"verified_off": True, "repeated_ml": self.repeated_ml, **asdict(self)}
+        known = {key: value for key, value in asdict(self).items() if key != "pump" or value}
+        return {"verified_off": True, "repeated_ml": self.repeated_ml, **known}
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> Ending:
         """The inverse of `row`. Raises: KeyError, TypeError, ValueError for a damaged row."""
         on_s, feed_ml, waste_ml = (float(row[key]) for key in ("on_s", "feed_ml", "waste_ml"))
-        return cls(on_s, feed_ml, waste_ml, int(row["feed_times"]), int(row["waste_times"]))
+        return cls(on_s, feed_ml, waste_ml, int(row["feed_times"]), int(row["waste_times"]), int(row.get("pump", 0)))
 
 
 def repeats_until(off_s: float, on_s: float) -> int:

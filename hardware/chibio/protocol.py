@@ -257,16 +257,22 @@ def parse_state(body: bytes) -> DeviceState:
     )
 
 
-def check_command(path: str, reactors: Sequence[str], overflow_pump: str = "", slot_command: str = "") -> None:
+def check_command(
+    path: str,
+    reactors: Sequence[str],
+    overflow_pump: str = "",
+    slot_command: str = "",
+    supply_pumps: Sequence[str] = (),
+) -> None:
     """The last gate before the wire: only these POSTs, only for these reactors, only within these limits.
 
     Args: overflow_pump: which of the spare pumps is one; "" if none is. slot_command: the one that toggles the
-      fluorescence slot of the selected reactor; "" if none may be.
+      fluorescence slot of the selected reactor; "" if none may be. supply_pumps: spare pumps that may give doses.
 
     Allowed are changeDevice; SetOutputTarget of feed (at most 0.05), waste (0.5), Stir, Thermostat (42 degC), OD,
     Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; both for the overflow
-    pump (at most 0.95); CalibrateOD to a blank; MeasureTemp/IR; Experiment. Everything else the device understands
-    wipes, toggles or kills something (docs/device.md, Routes and Client rules).
+    pump (at most 0.95) and supply pumps (0.05); CalibrateOD to a blank; MeasureTemp/IR; Experiment. Everything else
+    the device understands wipes, toggles or kills something (docs/device.md, Routes and Client rules).
 
     Raises: DeviceStateError if the command is not one of them.
     """
@@ -278,10 +284,12 @@ def check_command(path: str, reactors: Sequence[str], overflow_pump: str = "", s
         case "changeDevice", [_]:
             allowed = True
         case "SetOutputTarget", [item, _, value] if item in _LIMITS and re.fullmatch(_NUMBER, value):
-            low, high = (0.0, MAX_OVERFLOW_DUTY) if item == spare else _LIMITS[item]
+            low, high = _LIMITS[FEED] if item in supply_pumps and item in SPARE else _LIMITS[item]
+            low, high = (0.0, MAX_OVERFLOW_DUTY) if item == spare else (low, high)
             allowed = low <= float(value) <= high
         case "SetOutputOn", [item, force, _] if item in _SWITCHES:
-            allowed = force == "0" or (force == "1" and item in (*_MAY_GO_ON, spare))
+            may_go_on = (*_MAY_GO_ON, spare, *(p for p in supply_pumps if p in SPARE))
+            allowed = force == "0" or (force == "1" and item in may_go_on)
         case "CalibrateOD", ["OD0", _, raw, "0"] if re.fullmatch(_NUMBER, raw):
             allowed = 3000.0 <= float(raw) <= 60000.0
         case ("MeasureTemp", ["IR", _]) | ("Experiment", ["0" | "1", _]):

@@ -16,6 +16,7 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection, Log, no_log
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.logbook import Logbook
+from hardware.chibio.protocol import FEED
 from hardware.chibio.resume import ReactorHistory
 from hardware.chibio.station import Station
 from hardware.clock import Clock
@@ -64,6 +65,7 @@ class ChiBioReactors:
                     self._note_down,
                     config.overflow_pump.pump,
                     config.fluorescence.command,
+                    config.supply.pumps,
                 ),
                 calibration,
                 config,
@@ -182,7 +184,8 @@ class ChiBioReactors:
             if command.rows[i]:
                 station.set_temperature(float(command.temperature[i]))
                 before_ml = station.doses.carry_ml
-                plan = station.dose(float(command.pump_rate[i]))
+                pump = FEED if command.pump is None else f"Pump{command.pump[i]}"
+                plan = station.dose(float(command.pump_rate[i]), pump)
                 volume[i], waste[i] = plan.feed_ml, plan.waste_ml
                 kept[i] = station.doses.carry_ml - before_ml
                 self._work()
@@ -197,8 +200,9 @@ class ChiBioReactors:
         for i, station in enumerate(self.stations):
             mine = np.arange(len(self.stations)) == i
             endings, station.doses.endings = station.doses.endings, []
-            for at_s, feed_ml, waste_ml in (again for ending in endings for again in ending.repeats()):
-                found.append((at_s, Receipt(mine * feed_ml, (), mine * waste_ml)))
+            for ending in endings:
+                for at_s, feed_ml, waste_ml in ending.repeats():
+                    found.append((at_s, Receipt(mine * feed_ml, (), mine * waste_ml, pump=ending.pump)))
         return sorted(found, key=lambda one: one[0])
 
     def pumps_off(self, rows: Mask) -> list[str]:

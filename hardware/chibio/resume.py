@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hardware.chibio.ending import Ending, repeats_until
-from hardware.chibio.protocol import FEED, DeviceState
+from hardware.chibio.protocol import FEED, PUMPS, WASTE, DeviceState
 from hardware.errors import RecordingError
 from hardware.storage.journal import REMEDY
 
@@ -28,7 +28,8 @@ class ReactorHistory:
     overflow_pump_on: it was verified on. handed_over: OD at which it was handed over to the on-board regulation.
     sample: (record time, cycles) of the last sample a dose was decided for. start_time: of the device's experiment.
     open: a dose was begun and its end was never recorded; then feed_ml, waste_ml are its volumes, on_s the run time at
-    which it began, s, fed, whether its feed pump was switched on, feed_off, whether it was switched off again.
+    which it began, s, feed_pump, which pump fed ("": the feed pump), fed, whether it was switched on, feed_off,
+    whether it was switched off again.
     seen_s: run time of the newest row, s.
     """
 
@@ -44,6 +45,7 @@ class ReactorHistory:
     feed_ml: float = 0.0
     waste_ml: float = 0.0
     on_s: float = 0.0
+    feed_pump: str = ""
     fed: bool = False
     feed_off: bool = False
     start_time: str = ""
@@ -55,7 +57,7 @@ class Dosed:
     """What was dosed at one moment.
 
     n: row of the journal that tells: the intent, or, where the device repeated a dose (again), its end. at_s: run time,
-    s. Volumes in mL.
+    s. Volumes in mL. pump: number of the pump that gave the medium.
     """
 
     n: int
@@ -64,6 +66,15 @@ class Dosed:
     feed_ml: float
     waste_ml: float
     again: bool = False
+    pump: int = 1
+
+
+def _pump(row: Mapping[str, Any]) -> str:
+    """The pump that an intent feeds by. Raises: ValueError for one that there is not."""
+    pump = str(row.get("feed_pump", FEED))
+    if pump not in PUMPS or pump == WASTE:
+        raise ValueError(f"feed_pump {pump}")
+    return pump
 
 
 def _take(entry: dict[str, Any], row: Mapping[str, Any]) -> None:
@@ -71,11 +82,12 @@ def _take(entry: dict[str, Any], row: Mapping[str, Any]) -> None:
     entry.update({key: kind(row[key]) for key, kind in KEYS.items() if row.get(key) is not None})
     if row["kind"] == "intent":
         sample, volumes = row["sample"], (float(row["feed_ml"]), float(row["waste_ml"]))
+        entry["feed_pump"] = "" if _pump(row) == FEED else _pump(row)
         entry.update(sample=(float(sample[0]), int(sample[1])), open=volumes[0] > 0.0, fed=False, feed_off=False)
     elif row["kind"] == "feed_on":
         entry["fed"] = True
     elif row["kind"] == "command":
-        if row["path"] == f"/SetOutputOn/{FEED}/0/{row['reactor']}" and row["answer"] == 204:
+        if row["path"] == f"/SetOutputOn/{entry.get('feed_pump') or FEED}/0/{row['reactor']}" and row["answer"] == 204:
             entry["feed_off"] = True
     elif row["kind"] == "dose_end":
         entry["open"] = False
@@ -137,14 +149,17 @@ class _Ledger:
         kind, name = row["kind"], str(row["reactor"])
         if kind == "intent":
             volumes = float(row["feed_ml"]), float(row["waste_ml"])
-            self._begun[name] = Dosed(row["n"], name, float(row["on_s"]), *volumes)
+            number = PUMPS.index(_pump(row)) + 1
+            self._begun[name] = Dosed(row["n"], name, float(row["on_s"]), *volumes, pump=number)
         elif kind == "feed_on" and name in self._begun:
             self.given[self._begun[name].n] = self._begun[name]
         elif kind == "dose_end" and "feed_times" in row:
             ending = Ending.of_row(row)
-            if dose := self._begun.pop(name, None):
-                self.given[dose.n] = Dosed(dose.n, name, ending.on_s, ending.feed_ml, ending.waste_ml)
-            self.repeated += [Dosed(row["n"], name, *one, again=True) for one in ending.repeats()]
+            dose = self._begun.pop(name, None)
+            if dose is not None:
+                self.given[dose.n] = replace(dose, at_s=ending.on_s, feed_ml=ending.feed_ml, waste_ml=ending.waste_ml)
+            pump = 1 if dose is None else dose.pump
+            self.repeated += [Dosed(row["n"], name, *one, again=True, pump=pump) for one in ending.repeats()]
 
 
 def _damaged(row: Mapping[str, Any], error: Exception) -> RecordingError:
@@ -163,9 +178,10 @@ def conclude(history: ReactorHistory, state: DeviceState, now_s: float, silence_
       state: as the device was found, before its pumps were switched off. now_s: run time at which they were, s.
       silence_s: after which the board agent switches pumps off.
     """
-    feed_on, waste_on = state.pumps_on[:2]
+    feed_on, waste_on = (state.pumps_on[PUMPS.index(pump)] for pump in (history.feed_pump or FEED, WASTE))
     fed, what = history.fed or feed_on, f"a dose of {history.feed_ml:.2f} mL was left open"
-    whole = Ending(history.on_s, history.feed_ml if fed else 0.0, history.waste_ml)
+    pump = PUMPS.index(history.feed_pump) + 1 if history.feed_pump else 0
+    whole = Ending(history.on_s, history.feed_ml if fed else 0.0, history.waste_ml, pump=pump)
     if history.start_time and (state.start_time != history.start_time or not state.started):
         return whole, f"{what}; the device was restarted since, which ends every dose: nothing more is booked"
     found_on = feed_on or waste_on
@@ -173,7 +189,7 @@ def conclude(history: ReactorHistory, state: DeviceState, now_s: float, silence_
     times = repeats_until(off_s, history.on_s)
     feeding = feed_on or (fed and not history.feed_off and not waste_on)
     wasting = waste_on or (fed and not found_on)
-    ending = Ending(whole.on_s, whole.feed_ml, whole.waste_ml, times * feeding, times * wasting)
+    ending = replace(whole, feed_times=times * feeding, waste_times=times * wasting)
     if not fed:
         return ending, f"{what} before its feed pump was switched on: no medium was given"
     if not feeding:

@@ -17,7 +17,7 @@ from hardware.chibio.fluorescence import Fluorescence
 from hardware.chibio.logbook import Logbook
 from hardware.chibio.onboard_regulation import OnboardRegulation
 from hardware.chibio.overflow_pump import OverflowPump
-from hardware.chibio.protocol import DeviceState
+from hardware.chibio.protocol import FEED, DeviceState
 from hardware.chibio.resume import ReactorHistory
 from hardware.chibio.sampling import Sampling
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
@@ -254,14 +254,16 @@ class Station:
 
     # --------------------------------------------------------------------------------------------------- actuation
 
-    def dose(self, rate: float) -> DosePlan:
+    def dose(self, rate: float, pump: str = FEED) -> DosePlan:
         """Begin the dose for the newest sample (`DoseSequence.begin`), unless the reactor may not be dosed now."""
         refusal = ""
         if self.regulation.active:
             refusal = "handed over to the on-board regulation"
         elif self.busy or self.book.fault is not None:
             refusal = str(self.book.fault or "being started")
-        return self.doses.begin(rate, self.sampling.key, self.sampling.appeared_s, refusal)
+        elif pump not in (FEED, *self._config.supply.pumps):
+            refusal = f"{pump} has no tube; weigh it and give backend.supply.{pump.lower()}_ml_s"
+        return self.doses.begin(rate, self.sampling.key, self.sampling.appeared_s, refusal, pump)
 
     def pumps_off(self, tries: int = 3) -> None:
         """All pumps but the overflow pump off, verified. Raises: as `Connection.pumps_off`."""

@@ -256,6 +256,13 @@ def parser() -> argparse.ArgumentParser:
     plants = groups()["plant"]
     add("--plant", choices=plants, default="healthy", help="preset of cultures and pumps (default %(default)s)")
     add("--overflow-pump", choices=SPARE, default="", help="pump that keeps a vial from overflowing (default: none)")
+    for pump in SPARE:
+        add(
+            f"--{pump.lower()}-flow",
+            type=float,
+            default=0.0,
+            help=f"{pump} supplies a second fluid, mL/s (default: no)",
+        )
     add("--overflow-flow", type=float, default=1.0, help="of it at full power, mL/s (default %(default)s)")
     add(
         "--pump-start",
@@ -277,7 +284,10 @@ def build(arguments: argparse.Namespace) -> ChiBioDevice:
     except ValueError:
         raise ValueError(f"od = {arguments.od}: allowed a number, or one per reactor, e.g. 0.3,0.4") from None
     low, high = arguments.pump_start
-    vial = VialConfig(overflow_pump=arguments.overflow_pump, pump_start_low_s=low, pump_start_high_s=high)
+    vial = VialConfig(
+        overflow_pump=arguments.overflow_pump, pump_start_low_s=low, pump_start_high_s=high,
+        pump3_ml_s=arguments.pump3_flow, pump4_ml_s=arguments.pump4_flow,
+    )  # fmt: skip
     plant = plant_preset(arguments.plant)
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=arguments.overflow_flow))
     return ChiBioDevice(

@@ -75,6 +75,8 @@ class VialConfig:
     )
     pump_start_high_s: float = setting(0.7, "and most", "s", at_most=5.0)
     air_c: float = setting(24.0, "air outside", "degC", within=(0, 45))
+    pump3_ml_s: float = setting(0.0, "flow of Pump3 where it supplies a second fluid", "mL/s", within=(0, 5))
+    pump4_ml_s: float = setting(0.0, "of Pump4", "mL/s", within=(0, 5))
     overflow_pump: str = setting("", "pump whose tube ends a little above the waste tube", choices=(*SPARE, ""))
 
     def __post_init__(self) -> None:
@@ -179,6 +181,7 @@ class Vial:
         self.samples: deque[Sample] = deque(maxlen=DOSES_KEPT)
         self.reads: deque[float] = deque(maxlen=READS_KEPT)
         self.on_s = dict.fromkeys((FEED, WASTE, *SPARE), 0.0)
+        self.supplied_ml = dict.fromkeys(SPARE, 0.0)
         self.peak_ml = float(plant.vessel.volume_ml[0])
         self.powered = True
         self.heat, self.stir = 0.0, 0.0
@@ -229,17 +232,27 @@ class Vial:
 
     def _book(self, before: dict[str, int], at: float) -> None:
         """Close and open dose records for the motors that changed from `before`."""
-        media = float(self.plant.feed.delivered_ml[0])
         for pump, direction in before.items():
+            media = self._delivered(pump)
             now = self.motor(pump)
             if now == direction:
                 continue
             if direction != 0:
                 start, had = self._since.pop(pump)
-                delivered = media - had if pump == FEED else 0.0
-                self.doses.append(Dose(pump, start, at - start, direction, delivered))
+                self.doses.append(Dose(pump, start, at - start, direction, media - had))
             if now != 0:
                 self._since[pump] = (at, media)
+
+    def _delivered(self, pump: str) -> float:
+        """Fluid that a pump has brought in so far, mL."""
+        return float(self.plant.feed.delivered_ml[0]) if pump == FEED else self.supplied_ml.get(pump, 0.0)
+
+    def _supply(self, seconds: float) -> float:
+        """What the spare pumps bring in meanwhile, mL; backwards they bring nothing."""
+        flows = dict(zip(SPARE, (self.config.pump3_ml_s, self.config.pump4_ml_s), strict=True))
+        fluid = {pump: flow * max(self.motor(pump), 0) * seconds for pump, flow in flows.items()}
+        self.supplied_ml = {pump: self.supplied_ml[pump] + ml for pump, ml in fluid.items()}
+        return sum(fluid.values())
 
     def set_heat(self, duty: float, at: float) -> None:
         """Heater power, 0 to 1."""
@@ -279,7 +292,9 @@ class Vial:
         cooled = thermal.ambient_c + (plant.thermal.temperature - thermal.ambient_c) * kept
         still = self.stir == 0.0 and self._at + seconds - self._stirred_at > STIR_STOPPED_S
         plant.culture.stir_factor[:] = 0.0 if still else 1.0
-        plant.advance(minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, overflow)
+        plant.advance(
+            minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, overflow, self._supply(seconds)
+        )
         self._at += seconds
         self.peak_ml = max(self.peak_ml, float(plant.vessel.volume_ml[0]))
 

@@ -1,0 +1,297 @@
+"""What a step gives by a spare pump: how much, by whom, never twice, never two pumps at one time."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.outputs import Output, outputs_of
+from envs.plant.plant import Plant, PlantConfig
+from envs.scenario import Scenario
+from experiments.cli import frame
+from experiments.control import assemble
+from experiments.control.loop import ClosedLoop
+from experiments.control.supply import Supply
+from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.dosing import SupplyConfig
+from hardware.chibio.overflow_pump import OverflowPumpConfig
+from hardware.chibio.protocol import check_command
+from hardware.emulator.faults import inject
+from hardware.errors import DeviceStateError
+from hardware.safety.interlock import Interlock
+from hardware.simulated import SimulatedConfig, SimulatedReactors
+from hardware.storage.journal import read_journal
+from tests.hardware.emulator_lab import BIAS_S, quiet
+
+STEPS = Scenario((0.4, 0.4), (60.0, 20.0), (37.0, 37.0), outputs=("pump3 3 mL/h, pump4 1.5 mL", None))
+FEEDS = ("Pump1", "Pump3", "Pump4")
+ONE = np.array([True])
+
+
+def test_outputs_are_read() -> None:
+    assert outputs_of(None) == ()
+    assert outputs_of("Pump3 2 mL/h, pump4 1.5 mL") == (Output(3, ml_h=2.0), Output(4, ml=1.5))
+    assert STEPS.supplied == {3, 4}
+    assert Scenario().supplied == frozenset()
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["pump1 2 mL/h", "pump3 2", "pump3 2 L", "pump3 -1 mL", "pump3 21 mL/h", "pump3 0.2 mL", "pump3 50 mL",
+     "pump3 1 mL, pump3 2 mL/h", "LEDD 0.3", "pump3 1 mL,", ""],
+)  # fmt: skip
+def test_what_is_no_output_is_named(text: str) -> None:
+    if text == "":
+        assert Scenario(outputs=(text,)).supplied == frozenset()
+        return
+    with pytest.raises(ValueError, match="scenario.outputs = .*allowed"):
+        Scenario(outputs=(text,))
+
+
+def given(supply: Supply, minutes: range, phase: int = 0) -> list[tuple[float, int, float]]:
+    found = []
+    for minute in minutes:
+        pump, ml = supply.due(np.array([float(minute)]), np.array([phase]), ONE)
+        supply.given(pump, ml)
+        if ml[0] > 0.0:
+            found.append((float(minute), int(pump[0]), round(float(ml[0]), 6)))
+    return found
+
+
+def test_a_rate_becomes_doses_of_half_a_millilitre_and_a_volume_equal_parts() -> None:
+    """2 mL/h owe 0.5 mL every 15 min; 1.5 mL at most 1.2 at a time are 0.75 twice; 3 mL are 1 three times."""
+    hourly = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 2 mL/h",))
+    assert given(Supply([hourly], 1.2), range(61)) == [(15.0 * k, 3, 0.5) for k in (1, 2, 3, 4)]
+    once = replace(hourly, outputs=("pump4 1.5 mL",))
+    assert given(Supply([once], 1.2), range(61)) == [(0.0, 4, 0.75), (1.0, 4, 0.75)]
+    assert given(Supply([replace(hourly, outputs=("pump4 3 mL",))], 1.2), range(9)) == [(k, 4, 1.0) for k in (0, 1, 2)]
+
+
+def test_what_was_owed_in_a_long_pause_or_by_an_earlier_step_is_left_out() -> None:
+    hourly = Scenario((0.4, 0.4), (600.0, 60.0), (37.0, 37.0), outputs=("pump3 6 mL/h", None))
+    supply = Supply([hourly], 1.2)
+    assert given(supply, range(3)) == []
+    assert given(supply, range(300, 301)) == [(300.0, 3, 0.7)]  # 0.2 of two minutes and 0.5 of five
+    assert given(supply, range(301, 305)) == []
+    assert given(supply, range(605, 620), phase=1) == []
+
+
+def test_where_no_dose_may_be_decided_nothing_is_owed_or_given() -> None:
+    supply = Supply([Scenario((0.4,), (60.0,), (37.0,), outputs=("pump4 1 mL",))], 1.2)
+    pump, ml = supply.due(np.array([np.nan]), np.array([-1]), np.array([False]))
+    assert (pump[0], ml[0]) == (1, 0.0)
+    assert given(supply, range(2)) == [(0.0, 4, 1.0)]
+
+
+def config(schedule: Scenario = STEPS, **flows: float) -> Any:
+    made = rehearsed(("M0",), schedule)
+    supply = SupplyConfig(**({"pump3_ml_s": 1.0, "pump4_ml_s": 1.0} | flows))
+    return replace(made, backend=replace(made.backend, supply=supply))
+
+
+def whole(folder: Path, schedule: Scenario = STEPS) -> Rehearsal:
+    run = Rehearsal(folder, config(schedule), quiet(mu=0.03), od=0.4)
+    run.begin()
+    for _ in run.run():
+        pass
+    return run
+
+
+def never_together(run: Rehearsal) -> None:
+    """No two pumps that bring fluid in run at one time, and the waste pump runs whenever one of them does."""
+    doses = sorted((d.start_s, d.start_s + d.seconds, d.pump) for d in run.device.vials["M0"].doses)
+    feeds = [d for d in doses if d[2] in FEEDS]
+    assert feeds
+    assert all(end <= start for (_, end, _), (start, _, _) in pairwise(feeds))
+    waste = [d for d in doses if d[2] == "Pump2"]
+    assert all(any(a <= start and end <= b for a, b, _ in waste) for start, end, _ in feeds)
+
+
+def test_on_the_device_both_pumps_give_what_the_step_says_and_it_counts(tmp_path: Path) -> None:
+    run = whole(tmp_path)
+    vial = run.device.vials["M0"]
+    never_together(run)
+    doses = {pump: [d for d in vial.doses if d.pump == pump] for pump in FEEDS}
+    assert (len(doses["Pump3"]), len(doses["Pump4"])) == (5, 2)  # 0.5 mL every 10 min, the sixth at the step's end
+    by_hand = 3.0 - 0.5 + 5 * BIAS_S  # less than a dose is left out; the device runs so much longer, at 1 mL/s
+    assert by_hand - 0.05 <= vial.supplied_ml["Pump3"] <= by_hand + 0.5
+    assert vial.supplied_ml["Pump4"] == pytest.approx(1.5 + 2 * BIAS_S, abs=0.05)
+    columns = {key: run.record.series(key)[0] for key in ("feed_pump", "volume_ml", "elapsed_min", "od")}
+    for number, runs in ((3, 5), (4, 2)):
+        mine = columns["feed_pump"] == number
+        flowed = vial.supplied_ml[f"Pump{number}"] - runs * BIAS_S
+        assert columns["volume_ml"][mine].sum() == pytest.approx(flowed, abs=0.01)
+        assert columns["elapsed_min"][mine].max() < 60.0
+    assert run.loop.interlock.budget.fed_ml[0] == pytest.approx(np.nansum(columns["volume_ml"]))
+    assert columns["od"][10:] == pytest.approx(0.4, abs=0.03)  # the controller makes up for it
+    assert "falls" not in run.record.rows[0].told
+    assert vial.peak_ml < 21.5
+    run.reactors.stop()
+    assert not any(run.truth("M0")["motors"].values())
+
+
+def test_a_dose_by_a_spare_pump_dilutes_as_much_as_one_by_the_feed(tmp_path: Path) -> None:
+    """Without growth 3 mL into 20 mL at the tube: od exp(-3 / 20), in three doses that run 0.1 s longer."""
+    schedule = Scenario((1.0,), (15.0,), (37.0,), outputs=("pump3 3 mL",))
+    run = Rehearsal(tmp_path, config(schedule), quiet(mu=0.0), od=0.4)
+    run.begin()
+    for _ in run.run():
+        pass
+    assert run.truth("M0")["od"] == pytest.approx(0.4 * np.exp(-3.3 / 20.0), rel=0.02)
+
+
+REQUESTS = {  # what the program is killed at, in the first dose of 1 mL by Pump3 -> whether it was given
+    "/SetOutputTarget/Pump3/M0/": False,
+    "/SetOutputOn/Pump2/1/M0": False,
+    "/SetOutputOn/Pump3/1/M0": True,
+    "/SetOutputOn/Pump3/0/M0": True,
+}
+TWICE = Scenario((1.0, 1.0), (3.0, 40.0), (37.0, 37.0), outputs=(None, "pump3 2 mL"))
+
+
+def cut(folder: Path, request: str, stops: bool = False) -> Rehearsal:
+    """Nobody but Pump3 gives anything; the program is killed at a request, or stopped as on a signal."""
+    run = Rehearsal(folder, config(TWICE), quiet(mu=0.005), od=0.4)
+    run.begin()
+    inner = run.device.submit
+
+    def submit(method: str, path: str, *rest: Any) -> Any:
+        exchange = inner(method, path, *rest)
+        if path.startswith(request) and journal(run, "intent"):
+            run.device.submit = inner  # type: ignore[method-assign]
+            run.clock.sleep(0.6)
+            if stops:
+                raise KeyboardInterrupt
+            run.kill()
+        return exchange
+
+    run.device.submit = submit  # type: ignore[method-assign]
+    with pytest.raises((Killed, KeyboardInterrupt)):
+        for _ in run.run():
+            pass
+    if stops:
+        run.reactors.stop()
+    run.close()
+    return run
+
+
+def journal(run: Rehearsal, kind: str) -> list[dict[str, Any]]:
+    rows = read_journal(run.folder / "journal.jsonl")[0]
+    return [row for row in rows if row["kind"] == kind and row.get("feed_pump") == "Pump3"]
+
+
+@pytest.mark.parametrize("request_", REQUESTS)
+@pytest.mark.parametrize("away_s", [5.0, 200.0])
+def test_a_kill_in_a_dose_never_gives_it_twice_and_what_flowed_is_booked(
+    request_: str, away_s: float, tmp_path: Path
+) -> None:
+    """2 mL in two doses. One cut before its pump ran was not given; the device repeats one that ran every 63 s."""
+    run = cut(tmp_path, request_)
+    run.wait(away_s)
+    run.begin()
+    assert not any(run.truth("M0")["motors"].values())
+    before = len([d for d in run.device.vials["M0"].doses if d.pump == "Pump3"])
+    for _ in run.run():
+        pass
+    run.wait(10.0)
+    vial = run.device.vials["M0"]
+    samples = [tuple(row["sample"]) for row in journal(run, "intent")]
+    assert len(set(samples)) == len(samples)
+    runs = [d for d in vial.doses if d.pump == "Pump3"]
+    repeats = 3 if request_ == "/SetOutputOn/Pump3/1/M0" and away_s > 63.0 else 0
+    assert before == REQUESTS[request_] * (1 + repeats)
+    assert len(runs) - repeats == (1 if repeats else 2)  # after three repetitions the step owes nothing any more
+    booked = float(run.loop.interlock.budget.fed_ml[0])
+    assert booked == pytest.approx(vial.supplied_ml["Pump3"], abs=0.12 * len(runs) + 0.01)
+    assert booked >= 2.0 - 0.01
+    assert vial.peak_ml < 23.5
+    assert not any(run.truth("M0")["motors"].values())
+    never_together(run)
+
+
+def test_a_stop_in_a_dose_switches_its_pump_off_verified(tmp_path: Path) -> None:
+    run = cut(tmp_path, "/SetOutputOn/Pump3/1/M0", stops=True)
+    run.wait(130.0)
+    assert not any(run.truth("M0")["motors"].values())
+    assert len([d for d in run.device.vials["M0"].doses if d.pump == "Pump3"]) == 1
+    assert run.device.apps["M0"].data["Pump3"]["ON"] == 0
+
+
+def test_what_the_interlock_holds_is_held_for_a_spare_pump_too(tmp_path: Path) -> None:
+    """A dead spectrometer: no dose while it lasts, and the step's volume afterwards."""
+    run = Rehearsal(tmp_path, config(TWICE), quiet(mu=0.005), od=0.4)
+    run.begin()
+    inject(run.device, "spectrometer_dead", "M0", 1)
+    for _ in run.run(600.0):
+        pass
+    assert run.device.vials["M0"].supplied_ml["Pump3"] == 0.0
+    inject(run.device, "spectrometer_dead", "M0", 0)
+    for _ in run.run():
+        pass
+    assert run.device.vials["M0"].supplied_ml["Pump3"] == pytest.approx(2.0, abs=0.25)
+
+
+def test_a_saved_state_goes_on_and_a_damaged_one_is_named() -> None:
+    hourly = [Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 2 mL/h",))]
+    first, second = Supply(hourly, 1.2), Supply(hourly, 1.2)
+    given(first, range(10))
+    second.restore(json.loads(json.dumps(first.state()))["supply"])
+    assert given(second, range(10, 16)) == [(15.0, 3, 0.5)]
+    for damaged in ("missing", [], [{}], [{"owed_ml": [1.0], "supplied_at": 0.0, "supplied_step": 0}]):
+        with pytest.raises(ValueError, match="supply: "):
+            second.restore(damaged)
+
+
+def test_a_pump_without_a_tube_is_refused_before_anything_begins(tmp_path: Path) -> None:
+    with pytest.raises(frame.UserError, match="Pump4 has no tube; .*backend.supply.pump4_ml_s"):
+        assemble.unpack(config(pump4_ml_s=0.0), tmp_path)
+    with pytest.raises(ValueError, match="backend.supply = Pump3: allowed another pump"):
+        ChiBioConfig(overflow_pump=OverflowPumpConfig("Pump3"), supply=SupplyConfig(pump3_ml_s=1.0))
+    with pytest.raises(ValueError, match="backend.supply.pump3_ml_s = 2"):
+        SupplyConfig(pump3_ml_s=2.0)
+
+
+@pytest.mark.parametrize(
+    ("path", "allowed"),
+    [
+        ("/SetOutputTarget/Pump3/M0/0.050000", True),
+        ("/SetOutputOn/Pump3/1/M0", True),
+        ("/SetOutputTarget/Pump3/M0/0.060000", False),
+        ("/SetOutputTarget/Pump4/M0/0.010000", False),
+        ("/SetOutputOn/Pump4/1/M0", False),
+        ("/SetOutputOn/Pump3/2/M0", False),
+    ],
+)
+def test_the_last_gate_lets_only_declared_pumps_pass_and_only_small_doses(path: str, allowed: bool) -> None:
+    if allowed:
+        check_command(path, ("M0",), supply_pumps=("Pump3",))
+    else:
+        with pytest.raises(DeviceStateError, match="refused"):
+            check_command(path, ("M0",), supply_pumps=("Pump3",))
+    with pytest.raises(DeviceStateError, match="refused"):
+        check_command(path, ("M0",))
+
+
+class Still:
+    """Asks for nothing."""
+
+    def reset(self, n: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, od: np.ndarray, setpoint: np.ndarray, minute: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return np.zeros(od.shape)
+
+
+def test_in_a_simulation_it_dilutes_too_each_reactor_by_its_own_schedule() -> None:
+    with_it = Scenario((0.5,), (30.0,), (37.0,), outputs=("pump3 2 mL",))
+    plant = PlantConfig(start_od=0.4, growth=replace(PlantConfig().growth, mu=0.0))
+    reactors = SimulatedReactors(Plant(plant, 2, np.random.default_rng(0)), SimulatedConfig(reactors=("M0", "M1")))
+    loop = ClosedLoop(reactors, Still(), Interlock(2), [with_it, replace(with_it, outputs=())])
+    for _ in loop.run():
+        pass
+    np.testing.assert_allclose(reactors.plant.culture.od, [0.4 * np.exp(-2.0 / 20.0), 0.4], rtol=0.005)
