@@ -28,6 +28,7 @@ pytestmark = [
     pytest.mark.xdist_group("tensorboard"),  # its tests share the runs and the browser
     pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)"),
 ]
+LEARNING, DEPLOYMENT = "Learning, several agents" if DRAWN else "Learning", ("Density", "Pump, heat, interlock")
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 SHORT = ["agent.total_steps=300", "agent.learn_start=100"]
 LONG = ["agent.total_steps=10000", "n_agents=3"]  # of the figures
@@ -108,11 +109,13 @@ def ink(chart: Any) -> int:
     return int(coloured.sum())
 
 
-def draw(page: Any, name: str, shown: str = "") -> None:
-    """The figure of the documentation, where it is asked for. Args: shown: the one run it shows."""
+def draw(page: Any, name: str, shown: str = "", hidden: tuple[str, ...] = ()) -> None:
+    """The figure of the documentation, where it is asked for. Args: shown: the one run. hidden: categories."""
     if DRAWN:
         if shown:
             page.get_by_label("Write a regex to filter runs").fill(f"^{shown}$")
+        for category in hidden:
+            page.get_by_text(category, exact=True).first.click()
         page.wait_for_timeout(3000)
         page.screenshot(path=str(ROOT / DRAWN / f"tensorboard_{name}.png"))
     page.close()
@@ -143,13 +146,13 @@ def test_custom_scalars_show_learning_against_its_limits(address: str, browser: 
         f"Learning{', several agents' if DRAWN else ''}",
         *titles,
     )
-    draw(page, "learning", "learning")
+    draw(page, "learning", "learning", DEPLOYMENT)
 
 
 def test_custom_scalars_show_the_culture_with_its_band(address: str, browser: Any) -> None:
     titles = ("OD and setpoint with its band of 5 %", "Pump rate, mL/s", "Temperature, °C", "Interlock and warnings")
-    page = show(browser, f"{address}/#custom_scalars", "Density", "Pump, heat, interlock", *titles)
-    draw(page, "deployment", "deployment")
+    page = show(browser, f"{address}/#custom_scalars", *DEPLOYMENT, *titles)
+    draw(page, "deployment", "deployment", (LEARNING,))
 
 
 def test_hparams_show_what_was_varied_and_what_came_out(address: str, browser: Any) -> None:
