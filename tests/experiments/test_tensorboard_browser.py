@@ -48,9 +48,15 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     if DRAWN:
         commands.append(("train", *LONG, "agent=paper", f"hydra.run.dir={folder / 'learning_paper'}"))
-    for process in [start(f"experiments.{name}", *words) for name, *words in commands]:
-        said, _ = process.communicate(timeout=280)
-        assert process.returncode == 0, said
+    processes = [start(f"experiments.{name}", *words) for name, *words in commands]
+    try:
+        for process in processes:
+            said, _ = process.communicate(timeout=280)
+            assert process.returncode == 0, said
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
     return folder
 
 
