@@ -3,6 +3,7 @@
 Also the generator of the paper's open-loop protocol (generate=true) and the coverage study (coverage=N).
 """
 
+from contextlib import closing
 from importlib import resources
 from pathlib import Path
 
@@ -100,20 +101,14 @@ def _draw(folder: Path, raw: Series, result: Calibration, behind: Twin, name: st
         "drift": drift_figure(result, f"{name}: segments of about {segment_min:g} min, fitted alone"),
         "twin": twin_figure(raw, result, behind, f"{name}: its twin"),
     }
-    events = Events(folder)
-    for tag, value in (
-        ("mu_per_min", result.mu.value),
-        ("tau", result.tau.value),
-        ("pmse_pct", result.pmse_pct),
-    ):
-        events.scalar(f"calibration/{tag}", value, 0)
-    for i, segment in enumerate(result.segments):
-        for name, parameter in (("mu_per_min", segment.mu), ("tau", segment.tau)):
-            if parameter is not None:
-                events.scalar(f"drift/{name}", parameter.value, i)
-    for key, figure in figures.items():
-        events.picture(f"calibration/{key}", save(figure, folder / "figures", key), 0)
-    events.close()
+    with closing(Events(folder)) as events:
+        results = {"mu_per_min": result.mu.value, "tau": result.tau.value, "pmse_pct": result.pmse_pct}
+        events.scalars({f"calibration/{tag}": value for tag, value in results.items()}, 0)
+        for i, segment in enumerate(result.segments):
+            found = {"mu_per_min": segment.mu, "tau": segment.tau}
+            events.scalars({f"drift/{tag}": p.value for tag, p in found.items() if p is not None}, i)
+        for key, figure in figures.items():
+            events.picture(f"calibration/{key}", save(figure, folder / "figures", key), 0)
 
 
 def _generate(config: CalibrateConfig, folder: Path) -> None:

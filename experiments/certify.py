@@ -2,6 +2,7 @@
 
 import logging
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ def body(config: CertifyConfig, folder: Path) -> None:
     if config.env_file is not None:
         config = replace(config, env=read_env_file(config.env_file), env_file=None)
     began = time.perf_counter()
+    log.info("proving the closed loop of %s, for every reading, setpoint and case; a minute or less", source)
     try:
         policy = policies.load(source)
         config = replace(config, env=model_of(policy, config))
@@ -50,6 +52,7 @@ def _write(folder: Path, source: Path, policy: Policy, config: CertifyConfig, fo
     """The certificate, here and beside the policy; summary, figure and page."""
     from experiments.certification.figure import figure
     from experiments.reporting import charts, page
+    from experiments.reporting.tensorboard import Events
 
     content = certificate.content(policy, config, found)
     files.write_json(folder / "certificate.json", content, indent=None)
@@ -58,8 +61,11 @@ def _write(folder: Path, source: Path, policy: Policy, config: CertifyConfig, fo
     except OSError as error:
         log.warning("%s: not written (%s); %s/certificate.json is the same", certificate.beside(source),
                     error.strerror, folder)  # fmt: skip
-    charts.save(figure(found), folder / "figures", "certificate")
+    drawn = charts.save(figure(found), folder / "figures", "certificate")
     files.write_json(folder / "summary.json", _summary(source, content, found))
+    with closing(Events(folder)) as events:
+        events.picture("figures/certificate", drawn, 0)
+        events.text("run/summary", "\n".join(f"- {'pass' if c.holds else 'FAIL'}: {c}" for c in found.checks))
     log.info("certificate %s; report %s", certificate.beside(source), page.save(page.of_runs(folder, [folder]), folder))
 
 

@@ -62,7 +62,14 @@ def save(figure: Figure, folder: Path, name: str) -> Path:
 def _plain(axis: Axis) -> None:
     """0.01 instead of a power of ten at the ticks of a logarithmic axis: superscripts cost more than all the rest."""
     axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
+    axis.set_minor_formatter(_Plain(labelOnlyBase=False))
+
+
+class _Plain(LogFormatter):
+    """Labels the ticks that its base would, as plain numbers."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return f"{x:g}" if super().__call__(x, pos) else ""
 
 
 def _population(ax: Axes, x: Array, curves: Array, colour: str, label: str) -> None:

@@ -137,10 +137,8 @@ def of_population(pages: Mapping[str, Mapping[str, Chart]]) -> Mapping[str, Mapp
         one = tag.startswith("limit/") or tag == "train/epsilon"
         return _line(tag) if one else (f"{tag}/iqm", f"{tag}/min", f"{tag}/max")
 
-    return {
-        f"{page}, several agents": {
-            title: Chart(bands=[band(t) for t in chart.lines]) for title, chart in charts.items()
-        }
+    return {  # TensorBoard shows charts with bands in reverse
+        f"{page}, several agents": {t: Chart(bands=[band(x) for x in charts[t].lines]) for t in reversed(list(charts))}
         for page, charts in pages.items()
     }
 

@@ -14,16 +14,33 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import yaml  # type: ignore[import-untyped]
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from experiments.reporting import tables
 from experiments.reporting.tables import Best, Table, number, typeset
+from experiments.reporting.verdict import verdict
 
 __all__ = ["Page", "flat", "of_runs", "provenance", "save"]
 
 PACKAGE = "turbidostat-dqn"
 HERE = Path(__file__).parent
 PICTURES = {".svg": ("svg+xml", b"<svg"), ".png": ("png", b"\x89PNG")}  # suffix -> media type, what such a file holds
+
+LARGEST = 200_000  # characters of a configuration
+ALIAS = re.compile(r"(?:^|[\s\[,:-])[&*]\w", re.MULTILINE)
+PLACE = re.compile(r"(?<![\w.:/~…])/(?:[^\s/:;,'\"]+/)+[^\s/:;,'\"\])]+")
+UNITS = {
+    "ise": "OD² min", "itae": "OD min²", "ise_mean": "OD²", "itae_mean": "OD min", "setpoint": "OD",
+    "temperature": "°C", "steady_abs_error": "OD", "steady_abs_error_by_setpoint": "OD", "mean_abs_error": "OD",
+    "steady_abs_error_last": "OD",
+    "optimum_steady_abs_error": "OD", "optimum_mean_abs_error": "OD", "myopic_steady_abs_error": "OD",
+    "od_abs_error_mean": "OD", "mu": "1/min", "regret_pct_last": "%",
+    "optimum_cost": "squared error",
+}  # fmt: skip
+"""Of keys of summary.json; a key with one of `ENDINGS` has its unit in it."""
+ENDINGS = {"_pct": "%", "_min": "min", "_ml": "mL", "_s": "s"}
+OTHER_ERRORS = {"relative": "periods of full pump", "coculture": "of the share"}
 
 templates = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
 templates.filters["typeset"] = typeset
@@ -105,13 +122,13 @@ def provenance(page: Page, run: Path) -> None:
     config = run / "config.yaml"
     text = config.read_text(encoding="utf-8") if config.is_file() else ""
     seed = re.search(r"^seed: (\d+)", text, re.MULTILINE)
-    pairs = [("run folder", run.name), ("overrides", " ".join(given) or "none")]
+    pairs = [("run folder", run.name), ("overrides", _near(" ".join(given)) or "none")]
     if seed:
         pairs.append(("seed", seed[1]))
     pairs += [(PACKAGE, _version()), ("with", _other_versions())]
     page.add("keys", pairs=pairs)
     if text:
-        page.add("folded_text", heading="Configuration, every value", text=text)
+        page.add("folded_text", heading="Configuration, every value", text=_near(text))
 
 
 def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -123,7 +140,44 @@ def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
             yield f"{prefix}{key}", item
 
 
+def _config(text: str) -> Mapping[str, Any]:
+    """The configuration of a run; {} for one that cannot be read, or that refers to itself."""
+    if len(text) > LARGEST or ALIAS.search(text):
+        return {}
+    try:
+        loaded = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return {}
+    return loaded if isinstance(loaded, Mapping) else {}
+
+
+def _near(text: str) -> str:
+    """Without paths of this machine: relative to where the command runs, or the last two names."""
+
+    def short(match: re.Match[str]) -> str:
+        path = Path(match[0])
+        return (
+            str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else "…/" + "/".join(path.parts[-2:])
+        )
+
+    return PLACE.sub(short, text)
+
+
+def _labelled(key: str, kind: str) -> str:
+    """A key of summary.json with its unit. Args: kind: of the task whose error it may be."""
+    *parents, name = key.split(".")
+    unit = UNITS.get(parents[-1] if parents and name in ("value", "ci95") else name, "")
+    if unit == "OD" and kind in OTHER_ERRORS and "error" in name:
+        unit = OTHER_ERRORS[kind]
+    for ending, own in ENDINGS.items():
+        if name.endswith(ending):
+            key, unit = key.removesuffix(ending), own
+    return f"{key}, {unit}" if unit else key
+
+
 def _show(value: Any) -> str:
+    if isinstance(value, str):
+        return _near(value)
     if isinstance(value, float):
         return number(value, 5)
     if value == []:
@@ -138,12 +192,25 @@ def _results(page: Page, run: Path, prefix: str) -> None:
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     leaves = dict(flat(summary if isinstance(summary, Mapping) else {"summary": summary}))
     lists = {k: v for k, v in leaves.items() if isinstance(v, list) and v and all(isinstance(e, Mapping) for e in v)}
-    page.add("keys", pairs=[(k, _show(v)) for k, v in leaves.items() if k not in lists])
+    path = run / "config.yaml"
+    config = _config(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    env = config.get("env")
+    kind = str(env.get("kind", "")) if isinstance(env, Mapping) and "regret_pct" in leaves else ""
+    said = verdict(summary, config) if isinstance(summary, Mapping) else None
+    if said is not None:
+        page.add("verdict", claim=said.claim, items=said.items, remark=said.remark)
+    _figures(page, run)
+    page.add("keys", pairs=[(_labelled(k, kind), _show(v)) for k, v in leaves.items() if k not in lists])
     for key, value in lists.items():
         entries = [dict(flat(entry)) for entry in value]
         columns = tuple(dict.fromkeys(c for entry in entries for c in entry))
         rows = tuple(tuple(_show(entry.get(c)) for c in columns) for entry in entries)
-        page.table(Table(prefix + re.sub(r"\W+", "_", key), key.replace("_", " "), columns, rows))
+        heads = tuple(_labelled(column, kind) for column in columns)
+        page.table(Table(prefix + re.sub(r"\W+", "_", key), key.replace("_", " "), heads, rows))
+
+
+def _figures(page: Page, run: Path) -> None:
+    """Every figure of a run folder."""
     for path in (p for folder in (run / "figures", run) for p in sorted(folder.glob("*.*"))):
         if path.suffix == ".svg" or (path.suffix == ".png" and not path.with_suffix(".svg").exists()):
             page.figure(path, path.stem.replace("_", " "))

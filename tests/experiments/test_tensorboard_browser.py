@@ -18,8 +18,6 @@ from typing import Any
 import pytest
 from matplotlib.image import imread
 
-from experiments.reporting.curves import METRICS, PARAMETERS
-
 ROOT = Path(__file__).parents[2]
 BROWSER = next((b for b in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if b), None)
 DRAWN = os.environ.get("BOARD_FIGURES")
@@ -28,6 +26,7 @@ pytestmark = [
     pytest.mark.xdist_group("tensorboard"),  # its tests share the runs and the browser
     pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)"),
 ]
+LEARNING, DEPLOYMENT = "Learning, several agents" if DRAWN else "Learning", ("Density", "Pump, heat, interlock")
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 SHORT = ["agent.total_steps=300", "agent.learn_start=100"]
 LONG = ["agent.total_steps=10000", "n_agents=3"]  # of the figures
@@ -49,9 +48,15 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     if DRAWN:
         commands.append(("train", *LONG, "agent=paper", f"hydra.run.dir={folder / 'learning_paper'}"))
-    for process in [start(f"experiments.{name}", *words) for name, *words in commands]:
-        said, _ = process.communicate(timeout=280)
-        assert process.returncode == 0, said
+    processes = [start(f"experiments.{name}", *words) for name, *words in commands]
+    try:
+        for process in processes:
+            said, _ = process.communicate(timeout=280)
+            assert process.returncode == 0, said
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
     return folder
 
 
@@ -108,11 +113,13 @@ def ink(chart: Any) -> int:
     return int(coloured.sum())
 
 
-def draw(page: Any, name: str, shown: str = "") -> None:
-    """The figure of the documentation, where it is asked for. Args: shown: the one run it shows."""
+def draw(page: Any, name: str, shown: str = "", hidden: tuple[str, ...] = ()) -> None:
+    """The figure of the documentation, where it is asked for. Args: shown: the one run. hidden: categories."""
     if DRAWN:
         if shown:
             page.get_by_label("Write a regex to filter runs").fill(f"^{shown}$")
+        for category in hidden:
+            page.get_by_text(category, exact=True).first.click()
         page.wait_for_timeout(3000)
         page.screenshot(path=str(ROOT / DRAWN / f"tensorboard_{name}.png"))
     page.close()
@@ -143,16 +150,17 @@ def test_custom_scalars_show_learning_against_its_limits(address: str, browser: 
         f"Learning{', several agents' if DRAWN else ''}",
         *titles,
     )
-    draw(page, "learning", "learning")
+    draw(page, "learning", "learning", DEPLOYMENT)
 
 
 def test_custom_scalars_show_the_culture_with_its_band(address: str, browser: Any) -> None:
     titles = ("OD and setpoint with its band of 5 %", "Pump rate, mL/s", "Temperature, °C", "Interlock and warnings")
-    page = show(browser, f"{address}/#custom_scalars", "Density", "Pump, heat, interlock", *titles)
-    draw(page, "deployment", "deployment")
+    page = show(browser, f"{address}/#custom_scalars", *DEPLOYMENT, *titles)
+    draw(page, "deployment", "deployment", (LEARNING,))
 
 
 def test_hparams_show_what_was_varied_and_what_came_out(address: str, browser: Any) -> None:
-    columns = [column.title for column in PARAMETERS.values()]
-    page = show(browser, f"{address}/#hparams", *columns, *METRICS.values())
+    columns = ("agent or controller", "model or plant", "seed", "mu, 1/min", "tau", "command", "scenario", "steps")
+    results = ("regret, %", "worst-setpoint error, OD", "ISE, OD² min", "error of the share")
+    page = show(browser, f"{address}/#hparams", *columns, *results)
     draw(page, "hparams")

@@ -1,0 +1,119 @@
+"""The sentence with which the page of a run begins, from its configuration and summary: what was run, what came out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from experiments.reporting.tables import number
+
+__all__ = ["Verdict", "verdict"]
+
+Summary = Mapping[str, Any]
+REGRET, STEADY = 0.5, 0.003
+"""Per cent and OD that `env=sim` aims for (experiments/training/density.py); half a per cent is not seen in a
+recording, and 0.003 OD is the noise of the sensor."""
+SETTLED = 0.05  # of the setpoint
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """claim: what was run. items: what came out, each with its unit. remark: good or not, against which limit."""
+
+    claim: str
+    items: list[str] = field(default_factory=list)
+    remark: str = ""
+
+
+def verdict(summary: Summary, config: Mapping[str, Any]) -> Verdict | None:
+    """Of a training, deployment, calibration or certificate; None for any other run, or one that is not whole."""
+    for key, of in KINDS.items():
+        if key in summary:
+            try:
+                return of(summary, config)
+            except (LookupError, TypeError, ValueError, AttributeError):
+                return None
+    return None
+
+
+def _within(holds: bool) -> str:
+    return "within" if holds else "beyond"
+
+
+def _training(summary: Summary, config: Mapping[str, Any]) -> Verdict:
+    regret, steady, env = np.array(summary["regret_pct"]), np.array(summary["steady_abs_error"]), config["env"]
+    agents = f"{regret.size} agents" if regret.size > 1 else f"one agent, seed {summary['seeds'][0]},"
+    kind = env.get("kind", "density")
+    model = f"mu {number(env['mu'])} 1/min, tau {number(env['tau'])}" if "tau" in env else f"the task env={kind}"
+    claim = f"Training: {agents} learned {model} for {summary['env_steps']} steps in {summary['train_seconds']:.0f} s."
+    unit = "OD" if kind == "density" else "of the share" if kind == "coculture" else "periods of full pump"
+    worst = "of the worst agent " if regret.size > 1 else ""
+    items = [
+        f"regret {worst}{number(regret.max())} %: what the policy costs beyond the exact optimum",
+        f"error at rest at its worst setpoint {worst}{number(steady.max())} {unit}",
+        f"the one-line law that looks one period ahead: regret {number(summary['myopic_regret_pct'])} %, error "
+        f"{number(summary['myopic_steady_abs_error'])} {unit}",
+    ]
+    if kind != "density":
+        return Verdict(claim, items)
+    good = float(regret.max()) <= REGRET, float(steady.max()) <= STEADY
+    return Verdict(
+        claim,
+        items,
+        f"{'Good' if all(good) else 'Not good yet'}: the regret is {_within(good[0])} the limit of {REGRET:g} %, the "
+        f"error {_within(good[1])} that of {STEADY:g} OD.",
+    )
+
+
+def _deployment(summary: Summary, config: Mapping[str, Any]) -> Verdict:
+    windows: Sequence[Summary] = summary["windows"]
+    backend = config["backend"]["kind"]
+    where = "simulated vials" if backend == "sim" else "the emulated device" if backend == "emulator" else "the Chi.Bio"
+    hours = summary["minutes"] / 60.0
+    claim = (
+        f"Deployment: {config['controller']['kind']} held {', '.join(summary['reactors'])} on {where} for "
+        f"{hours:.1f} h; {summary['outcome']}."
+    )
+    steady = [w["steady_abs_error"] / w["setpoint"] for w in windows if w["steady_abs_error"] is not None]
+    items = [f"fresh medium {number(summary['volume_ml'])} mL"]
+    items += [f"interlock spoke in {sum(r['interlock'] for r in summary['reactors'].values())} samples"]
+    shares = [w["ratio_abs_error_mean"] for w in windows if w.get("ratio_abs_error_mean") is not None]
+    if shares:
+        items.append(f"mean error of the share {number(float(np.mean(shares)))}, as estimated")
+    if not steady:
+        return Verdict(claim, items, "No window was long enough to say how well its setpoint was held.")
+    worst = max(w["steady_abs_error"] for w in windows if w["steady_abs_error"] is not None)
+    items.insert(0, f"largest error at rest {number(worst)} OD, the mean over the last 10 min of a window")
+    held = sum(error <= SETTLED for error in steady)
+    word = "Good" if held == len(windows) else "Not good"
+    return Verdict(claim, items, f"{word}: {held} of {len(windows)} windows ended within 5 % of their setpoint.")
+
+
+def _calibration(summary: Summary, config: Mapping[str, Any]) -> Verdict:
+    mu, tau = ((p["value"], *p["ci95"]) for p in (summary["mu"], summary["tau"]))
+    claim = f"Calibration: growth and pump of {summary['source']}."
+    items = [
+        f"mu {number(mu[0])} 1/min, 95 % interval {number(mu[1])} to {number(mu[2])}; doubling time "
+        f"{number(summary['doubling_min'])} min",
+        f"tau {number(tau[0])}, 95 % interval {number(tau[1])} to {number(tau[2])}",
+        f"PMSE {number(summary['pmse_pct'])} % of the squared OD; {summary['n_used']} readings used, "
+        f"{summary['n_rejected']} rejected",
+    ]
+    told = "; ".join(summary["warnings"])
+    return Verdict(claim, items, f"Warnings: {told}." if told else "Good: nothing to warn of.")
+
+
+def _certificate(summary: Summary, config: Mapping[str, Any]) -> Verdict:
+    checks: Sequence[Any] = summary["checks"]
+    claim = f"Certificate of a policy for {', '.join(summary['observation'])}."
+    good = "Good: certified" if summary["passed"] else "Not certified"
+    return Verdict(claim, [f"{len(checks)} requirements were judged, listed below"], f"{good}.")
+
+
+KINDS = {
+    "train_seconds": _training,
+    "windows": _deployment,
+    "pmse_pct": _calibration,
+    "cannot_hold": _certificate,
+}

@@ -1,0 +1,91 @@
+"""What a report says first: what was run, what came out, and whether that is good, from a run's own numbers."""
+
+from pathlib import Path
+
+import pytest
+
+from experiments import report
+from experiments.cli import files
+from experiments.reporting.verdict import verdict
+
+TRAINED = {
+    "seeds": [4, 5], "regret_pct": [0.2, 0.4], "steady_abs_error": [0.001, 0.002], "env_steps": 20000,
+    "train_seconds": 31.4, "myopic_regret_pct": 0.01, "myopic_steady_abs_error": 0.001,
+}  # fmt: skip
+MODEL = {"env": {"mu": 0.02, "tau": 0.5}}
+WINDOW = {"setpoint": 0.5, "steady_abs_error": 0.004}
+DEPLOYED = {
+    "outcome": "completed", "minutes": 90.0, "volume_ml": 65.0, "windows": [WINDOW, {**WINDOW, "setpoint": 0.8}],
+    "reactors": {"M0": {"interlock": 2}, "M1": {"interlock": 1}},
+}  # fmt: skip
+LOOP = {"controller": {"kind": "pi"}, "backend": {"kind": "chibio"}}
+
+
+def test_a_training_is_judged_by_its_worst_agent() -> None:
+    said = verdict(TRAINED, MODEL)
+    assert said.claim == "Training: 2 agents learned mu 0.02 1/min, tau 0.5 for 20000 steps in 31 s."
+    assert said.items[:2] == [
+        "regret of the worst agent 0.4 %: what the policy costs beyond the exact optimum",
+        "error at rest at its worst setpoint of the worst agent 0.002 OD",
+    ]
+    assert said.remark == "Good: the regret is within the limit of 0.5 %, the error within that of 0.003 OD."
+
+
+@pytest.mark.parametrize(
+    ("found", "remark"),
+    [
+        ({"regret_pct": [0.2, 0.6]}, "the regret is beyond the limit of 0.5 %, the error within that of 0.003 OD."),
+        ({"steady_abs_error": [0.004, 0.0]}, "the regret is within the limit of 0.5 %, the error beyond that of"),
+    ],
+)
+def test_one_agent_beyond_a_limit_is_not_good(found: dict[str, list[float]], remark: str) -> None:
+    said = verdict(TRAINED | found, MODEL)
+    assert said.remark.startswith(f"Not good yet: {remark}")
+
+
+def test_errors_of_other_tasks_are_not_called_od() -> None:
+    said = verdict(TRAINED, {"env": {"kind": "coculture"}})
+    assert said.items[1].endswith("0.002 of the share")
+    assert said.remark == ""
+
+
+def test_a_deployment_is_good_if_every_window_ends_at_its_setpoint() -> None:
+    said = verdict(DEPLOYED, LOOP)
+    assert said.claim == "Deployment: pi held M0, M1 on the Chi.Bio for 1.5 h; completed."
+    assert said.items == [
+        "largest error at rest 0.004 OD, the mean over the last 10 min of a window",
+        "fresh medium 65 mL",
+        "interlock spoke in 3 samples",
+    ]
+    assert said.remark == "Good: 2 of 2 windows ended within 5 % of their setpoint."
+    away = {**WINDOW, "steady_abs_error": 0.026}  # 5 % of 0.5 is 0.025
+    missing = {**WINDOW, "steady_abs_error": None}
+    for windows, held in (([WINDOW, away], "1 of 2"), ([WINDOW, missing], "1 of 2")):
+        said = verdict(DEPLOYED | {"windows": windows}, LOOP)
+        assert said.remark == f"Not good: {held} windows ended within 5 % of their setpoint."
+
+
+@pytest.mark.parametrize("summary", [{}, {"windows": 3}, {"train_seconds": 1.0}, {"pmse_pct": None}])
+def test_what_is_not_whole_is_not_judged(summary: dict[str, object]) -> None:
+    assert verdict(summary, {}) is None
+
+
+def test_the_page_begins_with_it_and_names_units_and_no_place_of_this_machine(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "runs" / "deploy" / "one"
+    folder.mkdir(parents=True)
+    place = str(tmp_path / "runs" / "train" / "two" / "policy.npz")
+    files.write_json(folder / "summary.json", DEPLOYED | {"figure": place})
+    (folder / "config.yaml").write_text(
+        f"policy: {place}\nother: /srv/far/away/policy.npz\nbase_url: http://192.168.7.2:5000/x\n"
+        "controller:\n  kind: pi\nbackend:\n  kind: chibio\n"
+    )
+    text = report.write(folder).read_text(encoding="utf-8")
+    body = text[text.index("<h2>") :]
+    assert body.index("Deployment: pi held") < body.index("<table")
+    assert str(tmp_path) not in text
+    assert "policy: runs/train/two/policy.npz" in text
+    assert "other: …/away/policy.npz" in text
+    assert "http://192.168.7.2:5000/x" in text
+    for words in ("<th>volume, mL</th>", "<th>setpoint, OD</th>", "<th>steady_abs_error, OD</th>"):
+        assert words in text
