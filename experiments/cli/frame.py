@@ -37,8 +37,7 @@ log = logging.getLogger(__name__)
 for talker in ("httpx", "torch"):  # of every request, which journal and summary do better; of its caches at the end
     logging.getLogger(talker).setLevel(logging.WARNING)
 
-OmegaConf.register_new_resolver("pid", os.getpid)  # makes run folders of processes started in one second differ
-
+BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}  # deprecated from 1.4 on
 
 SPACE, PLACE = "free disk space", "choose a folder that can be written, with hydra.run.dir=FOLDER"
 REFUSALS = {
@@ -100,7 +99,7 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
     """
     try:
         GlobalHydra.instance().clear()
-        with hydra.initialize_config_module("conf", version_base="1.3"):
+        with hydra.initialize_config_module("conf", **BASE):
             return hydra.compose(name, overrides=[a for a in normalise(overrides, name) if not a.startswith("hydra.")])
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra's own checks of a group's name
         raise UserError(_one_line(error)) from None
@@ -208,9 +207,11 @@ class Command(Generic[T]):
     def _hydra(self) -> None:
         """What the command line says, by Hydra."""
         sys.argv.append(f"hydra.job.name={self.name}")
+        if not any(a.startswith((words.RUN, sweep.FOLDER)) for a in sys.argv):
+            sys.argv.append(f"{words.RUN}{sweep.fresh(self.name)}")
         GlobalHydra.instance().clear()
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print; how it is shown is decided above
-        hydra.main(version_base="1.3", config_path="pkg://conf", config_name=self.name)(self._job)()
+        hydra.main(config_path="pkg://conf", config_name=self.name, **BASE)(self._job)()
 
     def _sweep(self, swept: sweep.Sweep) -> None:
         """Every job of a sweep, and a line about how many came to their end. Exits: 1 where one failed."""
