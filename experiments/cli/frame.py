@@ -100,7 +100,9 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
     try:
         GlobalHydra.instance().clear()
         with hydra.initialize_config_module("conf", **BASE):
-            return hydra.compose(name, overrides=[a for a in normalise(overrides, name) if not a.startswith("hydra.")])
+            return hydra.compose(
+                name, overrides=[a for a in normalise(overrides, name) if not a.startswith(("hydra.", "hydra/"))]
+            )
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra's own checks of a group's name
         raise UserError(_one_line(error)) from None
 
@@ -189,14 +191,14 @@ class Command(Generic[T]):
             print(OmegaConf.to_yaml(asdict(cast(Any, self.config(plain)))))
             return
         try:
-            swept = sweep.asked(given, self.name)
+            swept = sweep.asked(given, self.name) if flags <= set(sweep.FLAGS) else None  # others are Hydra's to read
         except sweep.Again as error:
             raise UserError(str(error)) from None
         if swept:
             self._sweep(swept)
             return
         sys.argv[1:] = normalise(given, self.name)
-        if not flags:  # another flag is Hydra's to read; a plain run is checked before it has a folder
+        if not flags:  # a plain run is checked before it has a folder
             self.config(given)
             resumed = words.resumed(given)
             others = [a for a in given if not a.startswith(("resume=", "hydra."))]
@@ -207,7 +209,7 @@ class Command(Generic[T]):
     def _hydra(self) -> None:
         """What the command line says, by Hydra."""
         sys.argv.append(f"hydra.job.name={self.name}")
-        if not any(a.startswith((words.RUN, sweep.FOLDER)) for a in sys.argv):
+        if not any(a in sweep.FLAGS or a.startswith(words.RUN) for a in sys.argv):
             sys.argv.append(f"{words.RUN}{sweep.fresh(self.name)}")
         GlobalHydra.instance().clear()
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print; how it is shown is decided above
@@ -217,15 +219,13 @@ class Command(Generic[T]):
         """Every job of a sweep, and a line about how many came to their end. Exits: 1 where one failed."""
         sys.argv[1:] = normalise(swept.line(), self.name)
         expected = sweep.jobs(sys.argv[1:])
-        compose(
-            self.name, expected[0] if expected else swept.arguments
-        )  # a wrong word is told before there is a folder
+        compose(self.name, expected[0] if expected else swept.arguments)  # a wrong word leaves no folder
+        if expected is None:
+            search.register()
         try:
             swept.save()
         except sweep.Again as error:
             raise UserError(str(error)) from None
-        if expected is None:
-            search.register()
         try:
             self._hydra()
         except (KeyboardInterrupt, SystemExit):

@@ -18,6 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from experiments.cli import files
 
 __all__ = [
+    "FLAGS",
     "FOLDER",
     "JOB",
     "RECORD",

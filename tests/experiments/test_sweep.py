@@ -129,7 +129,7 @@ def test_jobs_are_those_that_hydra_makes_of_the_command_line():
         ["-m", "+agent=paper,tuned", "seed=range(0,2)", "env.mu=0.02", "hydra.sweep.dir=x"], "train"
     )
     assert sweep.jobs(words) == [
-        [f"agent={agent}", f"seed={seed}", "env.mu=0.02"] for agent in ("paper", "tuned") for seed in (0, 1)
+        [f"agent={agent}", f"++seed={seed}", "++env.mu=0.02"] for agent in ("paper", "tuned") for seed in (0, 1)
     ]
     assert sweep.jobs(["hparams_search=tuned"]) is None
 
