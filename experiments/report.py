@@ -74,6 +74,8 @@ def compare(folder: Path) -> Path:
     """
     from experiments.reporting import page, sweep_page
 
+    if not folder.is_dir():
+        raise frame.UserError(f"runs={folder}: no such folder; give the folder of a sweep")
     swept = sweep.read(folder)
     expected = sweep.jobs(words.normalise(swept.arguments, swept.command)) if swept else None
     jobs = [_result(job) for job in sweep.survey(folder, expected)]
@@ -115,7 +117,7 @@ def find(name: str, root: Path = Path("runs")) -> Path:
 def report(config: ReportConfig, folder: Path) -> None:
     """Write the report of a run; `folder` only takes the log."""
     if config.runs is not None:
-        log.info("report %s", compare(find(config.runs)))
+        log.info("report %s", compare(Path(config.runs)))
     else:
         log.info("report %s", write(find(config.run)))
 

@@ -37,8 +37,7 @@ log = logging.getLogger(__name__)
 for talker in ("httpx", "torch"):  # of every request, which journal and summary do better; of its caches at the end
     logging.getLogger(talker).setLevel(logging.WARNING)
 
-OmegaConf.register_new_resolver("pid", os.getpid)  # makes run folders of processes started in one second differ
-
+BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}  # deprecated from 1.4 on
 
 SPACE, PLACE = "free disk space", "choose a folder that can be written, with hydra.run.dir=FOLDER"
 REFUSALS = {
@@ -100,8 +99,10 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
     """
     try:
         GlobalHydra.instance().clear()
-        with hydra.initialize_config_module("conf", version_base="1.3"):
-            return hydra.compose(name, overrides=[a for a in normalise(overrides, name) if not a.startswith("hydra.")])
+        with hydra.initialize_config_module("conf", **BASE):
+            return hydra.compose(
+                name, overrides=[a for a in normalise(overrides, name) if not a.startswith(("hydra.", "hydra/"))]
+            )
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra's own checks of a group's name
         raise UserError(_one_line(error)) from None
 
@@ -194,14 +195,14 @@ class Command(Generic[T]):
             print(OmegaConf.to_yaml(asdict(cast(Any, self.config(plain)))))
             return
         try:
-            swept = sweep.asked(given, self.name)
+            swept = sweep.asked(given, self.name) if flags <= set(sweep.FLAGS) else None  # others are Hydra's to read
         except sweep.Again as error:
             raise UserError(str(error)) from None
         if swept:
             self._sweep(swept)
             return
         sys.argv[1:] = normalise(given, self.name)
-        if not flags:  # another flag is Hydra's to read; a plain run is checked before it has a folder
+        if not flags:  # a plain run is checked before it has a folder
             self.config(given)
             resumed = words.resumed(given)
             others = [a for a in given if not a.startswith(("resume=", "hydra.", "extend="))]
@@ -212,23 +213,23 @@ class Command(Generic[T]):
     def _hydra(self) -> None:
         """What the command line says, by Hydra."""
         sys.argv.append(f"hydra.job.name={self.name}")
+        if not any(a in sweep.FLAGS or a.startswith(words.RUN) for a in sys.argv):
+            sys.argv.append(f"{words.RUN}{sweep.fresh(self.name)}")
         GlobalHydra.instance().clear()
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print; how it is shown is decided above
-        hydra.main(version_base="1.3", config_path="pkg://conf", config_name=self.name)(self._job)()
+        hydra.main(config_path="pkg://conf", config_name=self.name, **BASE)(self._job)()
 
     def _sweep(self, swept: sweep.Sweep) -> None:
         """Every job of a sweep, and a line about how many came to their end. Exits: 1 where one failed."""
         sys.argv[1:] = normalise(swept.line(), self.name)
         expected = sweep.jobs(sys.argv[1:])
-        compose(
-            self.name, expected[0] if expected else swept.arguments
-        )  # a wrong word is told before there is a folder
+        compose(self.name, expected[0] if expected else swept.arguments)  # a wrong word leaves no folder
+        if expected is None:
+            search.register()
         try:
             swept.save()
         except sweep.Again as error:
             raise UserError(str(error)) from None
-        if expected is None:
-            search.register()
         try:
             self._hydra()
         except (KeyboardInterrupt, SystemExit):

@@ -18,6 +18,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from experiments.cli import files
 
 __all__ = [
+    "FLAGS",
+    "FOLDER",
     "JOB",
     "RECORD",
     "Again",
@@ -26,6 +28,7 @@ __all__ = [
     "Sweep",
     "asked",
     "errors",
+    "fresh",
     "jobs",
     "read",
     "survey",
@@ -79,6 +82,11 @@ def _lasting(arguments: Sequence[str]) -> list[str]:
     return [a for a in arguments if not a.startswith(LATER)]
 
 
+def fresh(command: str) -> Path:
+    """Where a run of a command writes. The name holds the second and the process number: two runs never meet."""
+    return Path("runs") / command / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"
+
+
 def read(folder: Path) -> Sweep | None:
     """The sweep in a folder, None where there is none or its record is damaged."""
     try:
@@ -108,9 +116,8 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
     if len(plain) == len(given) and not searches(plain):
         return None
     named = [a.removeprefix(FOLDER) for a in plain if a.startswith(FOLDER)]
-    stamp = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}_sweep"
     own = [a for a in plain if not a.startswith(FOLDER)]
-    return Sweep(Path(named[-1]) if named else Path("runs") / command / stamp, command, own)
+    return Sweep(Path(named[-1] if named else f"{fresh(command)}_sweep"), command, own)
 
 
 def searches(arguments: Sequence[str]) -> bool:

@@ -9,8 +9,9 @@ from conf import presets
 from conf.schema import old_name
 from experiments.cli import extensions, latest
 
-__all__ = ["EXTRA", "UserError", "normalise", "resumed"]
+__all__ = ["EXTRA", "RUN", "UserError", "normalise", "resumed"]
 
+RUN = "hydra.run.dir="
 EXTRA = "pip install 'turbidostat-dqn[sweep]'"
 
 
@@ -69,7 +70,7 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
     if old:
         if not (Path(old) / "config.yaml").is_file():
             raise UserError(f"resume={old}: no run folder (it holds no config.yaml); give the folder of a run")
-        out += [f"hydra.run.dir={old}", "hydra.output_subdir=null"]
+        out += [f"{RUN}{old}", "hydra.output_subdir=null"]
     return out
 
 

@@ -89,6 +89,7 @@ def test_a_stopped_sweep_does_only_what_is_missing(tmp_path):
     again = run(*shlex.split(told[1]), cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert "3 of 3 jobs finished" in again.stdout
+    assert not list(folder.glob("*/stopped_*"))  # job 1 went on from its checkpoint
     assert (folder / "0/summary.json").stat().st_mtime_ns == before
     whole = Session(main.config([*LONG, "seed=1"]), tmp_path)
     whole.run()
@@ -128,7 +129,7 @@ def test_jobs_are_those_that_hydra_makes_of_the_command_line():
         ["-m", "+agent=paper,tuned", "seed=range(0,2)", "env.mu=0.02", "hydra.sweep.dir=x"], "train"
     )
     assert sweep.jobs(words) == [
-        [f"agent={agent}", f"seed={seed}", "env.mu=0.02"] for agent in ("paper", "tuned") for seed in (0, 1)
+        [f"agent={agent}", f"++seed={seed}", "++env.mu=0.02"] for agent in ("paper", "tuned") for seed in (0, 1)
     ]
     assert sweep.jobs(["hparams_search=tuned"]) is None
 

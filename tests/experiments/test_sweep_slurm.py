@@ -82,6 +82,7 @@ def test_jobs_killed_or_told_to_end_are_queued_again_and_end_with_the_weights_of
     assert status == 0, (tmp_path / "out").read_text()
     lives = [log(folder, array, k).count("Starting with") for k in range(4)]
     assert lives == [2, 2, 1, 1]
+    assert not list(folder.glob("*/stopped_*"))  # the second life went on, it did not begin anew
     assert [job.state for job in sweep.survey(folder)] == ["finished"] * 4
     assert [json.loads((folder / f"{k}/summary.json").read_text())["seeds"] for k in range(4)] == [
         [k] for k in range(4)
