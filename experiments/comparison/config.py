@@ -77,6 +77,14 @@ class BenchmarkConfig:
                 for given in getattr(study, key):
                     if given not in known:
                         raise ValueError(f"studies.{name}.{key}: {given} is none of {', '.join(known)}")
+        for name, scenario in self.scenarios.items():
+            timed = not any((*scenario.until, *scenario.outputs))
+            require(
+                timed,
+                f"scenarios.{name}",
+                scenario.until or scenario.outputs,
+                "no until and no outputs in a comparison",
+            )
         for name in self.composition_policies:
             learned = [key for key, c in self.compositions.items() if c.kind in LEARNED]
             require(name in learned, "composition_policies", name, ", ".join(learned) or "none: no learned law")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
+from envs.outputs import outputs_of
 from envs.scenario import Scenario
 from envs.until import Condition
 from experiments.cli import frame
@@ -142,8 +143,16 @@ def _reactor(setup: Setup, name: str, scenario: Scenario, now: datetime) -> Iter
             f"  {k + 1:>8} {_clock(now, at)} {_clock(now, at + step.minutes)} {step.minutes:7.0f} {most_min:8.0f} "
             f"{setpoint:6.2f} {degc:6.1f} {step.ml:7.1f}  {said}"
         )
+        if scenario.outputs and scenario.outputs[k]:
+            yield f"  {'':>8} gives {scenario.outputs[k]}: {_supplied(scenario, k, most_min)}"
         od, at, ml, most = step.od, at + step.minutes, ml + step.ml, most + step.longest_ml
     yield f"  {ml:.0f} mL of medium expected, {most:.0f} mL if every step takes its longest; {_lasts(setup, ml, most)}"
+
+
+def _supplied(scenario: Scenario, k: int, minutes: float) -> str:
+    """What each spare pump gives in a step that takes its longest."""
+    given = [(o.pump, o.ml + o.ml_h * minutes / 60.0) for o in outputs_of(scenario.outputs[k])]
+    return ", ".join(f"at most {ml:.1f} mL by Pump{pump}" for pump, ml in given)
 
 
 def _lasts(setup: Setup, ml: float, most: float) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from experiments.reliability.rehearsal import Rehearsal
 from hardware.emulator.vial import Dose, Sample
 
-__all__ = ["Served", "audit_doses", "audit_rows", "rows_per_sample"]
+__all__ = ["Served", "audit_doses", "audit_rows", "fed_by", "rows_per_sample"]
 
 DEVICE_PERIOD_S = (60.0, 68.0)  # a pump left on repeats its dose so often
 ON_ITS_WAY_S = 5.0  # from the read that showed a sample to the time of its row, at most: requests before it is judged
@@ -114,8 +114,13 @@ def _last_due(r: Rehearsal, n: int, rows: NDArray[np.float64]) -> float:
     return float(rows[-1]) if r.loop.stopped[n] and rows.size else math.inf
 
 
+def fed_by(rows: Iterable[Mapping[str, Any]]) -> set[str]:
+    """The pumps that the intents among some rows of a journal feed by, and the feed pump."""
+    return {"Pump1"} | {str(row["feed_pump"]) for row in rows if row["kind"] == "intent" and "feed_pump" in row}
+
+
 def audit_doses(journal: Sequence[Mapping[str, Any]], doses: Sequence[Dose], name: str, zero: float) -> tuple[int, int]:
-    """Runs of a feed motor against the intents of a journal: (doubled, repeated by the device).
+    """Runs of the motors that intents name against the intents of a journal: (doubled, repeated by the device).
 
     A run belongs to the newest intent before it. A second one for the same intent is the device's own repetition if it
     begins a pump period after the one before, else it is a doubled dose; so are two intents for one sample.
@@ -131,10 +136,10 @@ def audit_doses(journal: Sequence[Mapping[str, Any]], doses: Sequence[Dose], nam
             samples.append((experiment, *row["sample"]))
     doubled = sum(a == b for a, b in itertools.pairwise(samples))
     starts = np.array([float(row["on_s"]) + zero for row in intents if row["feed_ml"] > 0.0])
-    repeats = 0
+    repeats, feeding = 0, fed_by(intents)
     before: dict[int, float] = {}
     for dose in doses:
-        if dose.pump != "Pump1":
+        if dose.pump not in feeding:
             continue
         k = int(np.searchsorted(starts, dose.start_s)) - 1
         if k < 0 or k in before:

@@ -20,7 +20,7 @@ import numpy as np
 from conf.presets import groups
 from conf.schema import check, require, setting
 from experiments.controllers.registry import on_device
-from experiments.reliability.audit import Served, audit_doses, rows_per_sample
+from experiments.reliability.audit import Served, audit_doses, fed_by, rows_per_sample
 from experiments.reliability.tracking import reachable
 from hardware.emulator.process import EmulatorProcess
 from hardware.emulator.vial import Dose, Sample
@@ -137,7 +137,7 @@ def killed_run(
     """
     findings = Findings(kills=kills)
     arguments = {"reactors": ",".join(config.reactors), "speed": config.speed, "seed": seed, "od": SETPOINT}
-    arguments["plant"] = config.plant
+    arguments |= {"plant": config.plant, "pump3-flow": 1.0}  # a second fluid, for overrides that ask for it
     with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
         rng = np.random.default_rng([config.seed, seed])
         clients = _Clients(config, device, folder, rng, findings, stop or threading.Event())
@@ -281,7 +281,7 @@ class _Comparison:
         f = self.findings
         doses = [Dose(**d) for d in self._ask(f"doses/{name}")]
         doubled, repeats = audit_doses(journal, doses, name, self._zero)
-        starts = np.array([d.start_s for d in doses if d.pump == "Pump1"])
+        starts = np.array([d.start_s for d in doses if d.pump in fed_by(journal)])
         f.doses += starts.size
         f.doses_doubled += doubled
         f.doses_repeated += repeats

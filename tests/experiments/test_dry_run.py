@@ -48,6 +48,8 @@ def test_steps_clock_and_bottle_are_told() -> None:
     assert "controller dqn, policy shipped" in text
     assert "would record in HERE" in text
     assert "safety.bottle_ml=2000 lasts" in told("scenario=hold")
+    both = told("scenario=hold", "scenario.minutes=[90]", "scenario.outputs=['pump3 2 mL/h, pump4 1.5 mL']")
+    assert "at most 3.0 mL by Pump3, at most 1.5 mL by Pump4" in both
     longer = told("scenario=hold", "scenario.minutes=[1500]", "scenario.until=[settled]", "safety.bottle_ml=500")
     assert "may not last" in longer
 

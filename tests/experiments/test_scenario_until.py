@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
+from experiments.comparison.config import BenchmarkConfig
 from experiments.control.progress import Progress
 from experiments.control.summary import summarise
 from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
@@ -179,3 +180,8 @@ def test_a_run_killed_after_its_first_decision_began_only_once(tmp_path: Path) -
     began = (minute - elapsed)[np.isfinite(elapsed)]
     assert began.size >= 2
     np.testing.assert_allclose(began, began[0], atol=1e-3)
+
+
+def test_a_comparison_takes_no_steps_of_unequal_length() -> None:
+    with pytest.raises(ValueError, match=r"scenarios\.mine = \['settled'\]: allowed no until and no outputs"):
+        BenchmarkConfig(scenarios={"mine": Scenario(until=("settled",))})
