@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-from tensorboard.compat.proto.summary_pb2 import Summary, SummaryMetadata
+from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.compat.proto.tensor_pb2 import TensorProto
 from tensorboard.compat.proto.tensor_shape_pb2 import TensorShapeProto
 from tensorboard.compat.proto.types_pb2 import DT_FLOAT, DT_STRING
@@ -22,6 +22,7 @@ from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.custom_scalar import metadata as custom
 from tensorboard.plugins.hparams import api_pb2, plugin_data_pb2, summary_v2
 from tensorboard.plugins.hparams import metadata as hparams
+from tensorboard.plugins.image import metadata as image
 from tensorboard.plugins.scalar import metadata as scalar
 from tensorboard.plugins.text import metadata as text
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
@@ -33,7 +34,7 @@ __all__ = ["Events", "PopulationWriter", "interquartile_mean"]
 MOST_CURVES = 64  # a population larger than this gets its statistics only
 LIVE_S = 5.0  # what was written is visible after so long
 NUMBER = TensorShapeProto()
-LINE = TensorShapeProto(dim=[TensorShapeProto.Dim(size=1)])
+LINE, THREE = (TensorShapeProto(dim=[TensorShapeProto.Dim(size=n)]) for n in (1, 3))
 
 
 class Events:
@@ -78,10 +79,10 @@ class Events:
     def picture(self, tag: str, png: Path, step: int) -> None:
         """A PNG file under TensorBoard's images. Raises: OSError for one that cannot be read."""
         data = png.read_bytes()
-        width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))
-        image = Summary.Image(encoded_image_string=data, colorspace=3, height=height, width=width)
-        said = SummaryMetadata(summary_description=described(tag))
-        self._add([Summary.Value(tag=tag, image=image, metadata=said)], step)
+        size = [str(int.from_bytes(data[i : i + 4], "big")).encode() for i in (16, 20)]  # width and height
+        shown = TensorProto(dtype=DT_STRING, string_val=[*size, data], tensor_shape=THREE)
+        said = image.create_summary_metadata("", described(tag))
+        self._add([Summary.Value(tag=tag, tensor=shown, metadata=said)], step)
 
     def text(self, tag: str, markdown: str, step: int = 0) -> None:
         """A text in Markdown."""

@@ -29,7 +29,7 @@ pytestmark = [
 LEARNING, DEPLOYMENT = "Learning, several agents" if DRAWN else "Learning", ("Density", "Pump, heat, interlock")
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 SHORT = ["agent.total_steps=300", "agent.learn_start=100"]
-LONG = ["agent.total_steps=10000", "n_agents=3"]  # of the figures
+LONG = ["agent.total_steps=4000", "n_agents=3"]  # of the figures
 
 
 def start(*words: str) -> subprocess.Popen[str]:
@@ -66,17 +66,20 @@ def address(logs: Path) -> Iterator[str]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    process = start("tensorboard.main", "--logdir", str(logs), "--host", "127.0.0.1", "--port", str(port))
-    url, deadline = f"http://127.0.0.1:{port}", time.monotonic() + 60.0
+    words = ["-m", "tensorboard.main", "--logdir", str(logs), "--host", "127.0.0.1", "--port", str(port)]
+    said = logs / "tensorboard.log"
+    with open(said, "w", encoding="utf-8") as f:
+        process = subprocess.Popen([sys.executable, *words], env=ENVIRONMENT, stdout=f, stderr=f)
+    url, deadline = f"http://127.0.0.1:{port}", time.monotonic() + 120.0
     try:
         while not has_read(url):
-            assert process.poll() is None, process.communicate()[0]
+            assert process.poll() is None, said.read_text(encoding="utf-8")
             assert time.monotonic() < deadline, "TensorBoard does not answer"
             time.sleep(0.1)
         yield url
     finally:
         process.terminate()
-        process.communicate(timeout=20)
+        process.wait(timeout=60)
 
 
 def has_read(url: str) -> bool:
@@ -100,9 +103,9 @@ def browser() -> Iterator[Any]:
 def show(browser: Any, url: str, *texts: str, height: int = 1000) -> Any:
     """A page once it shows all these texts. Raises: TimeoutError naming the one that is missing."""
     page = browser.new_page(viewport={"width": 1900, "height": height})
-    page.goto(url)
+    page.goto(url, timeout=60_000)
     for text in texts:
-        page.get_by_text(text, exact=True).first.wait_for(state="attached", timeout=10_000)
+        page.get_by_text(text, exact=True).first.wait_for(state="attached", timeout=40_000)
     return page
 
 
@@ -133,8 +136,8 @@ def test_time_series_show_a_card_with_a_line_for_each_tag(address: str, browser:
     page = show(browser, f"{address}/?tagFilter=^({'|'.join(tags)})$&smoothing=0#timeseries", height=3000)
     for tag in tags:
         card = page.locator("scalar-card", has=page.locator(f'[title="{tag}"]'))
-        card.wait_for(timeout=10_000)
-        deadline = time.monotonic() + 10.0
+        card.wait_for(timeout=40_000)
+        deadline = time.monotonic() + 40.0
         while ink(card) < 100:
             assert time.monotonic() < deadline, f"{tag}: no line"
             page.wait_for_timeout(100)
