@@ -57,7 +57,8 @@ def _rendered(block: list[str]) -> Iterator[str]:
         elif labelled and line.startswith(" "):
             yield f"  {_plain(line.strip())}"
         else:
-            yield _plain(line.strip())
+            yield from ("", _plain(line)) if labelled else (_plain(line),)
+            labelled = False
 
 
 def _docstring(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
