@@ -29,7 +29,7 @@ pytestmark = [
 LEARNING, DEPLOYMENT = "Learning, several agents" if DRAWN else "Learning", ("Density", "Pump, heat, interlock")
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 SHORT = ["agent.total_steps=300", "agent.learn_start=100"]
-LONG = ["agent.total_steps=4000", "n_agents=3"]  # of the figures
+LONG = ["agent.total_steps=3000", "n_agents=3"]  # of the figures
 
 
 def start(*words: str) -> subprocess.Popen[str]:
