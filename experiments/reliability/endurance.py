@@ -127,7 +127,7 @@ class _Meter:
             memory_mb=round(_memory_mb(), 1),
             journal_mb=round(_size_mb(folder, "journal.jsonl"), 2),
             csv_mb=round(_size_mb(folder, "recordings/*.csv"), 2),
-            events_mb=round(_size_mb(folder, "events*"), 2),
+            events_mb=round(_size_mb(folder, "**/events*"), 2),
             state_kb=round(_size_mb(folder, "state.json") * 1024.0, 1),
             wall_s=round(time.perf_counter() - self._began, 1),
             error=round(float(np.mean([e for errors in self.errors for e in errors] or [np.nan])), 4),

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,8 @@ def _deployment(summary: Summary, config: Mapping[str, Any]) -> Verdict:
 
 def _calibration(summary: Summary, config: Mapping[str, Any]) -> Verdict:
     mu, tau = ((p["value"], *p["ci95"]) for p in (summary["mu"], summary["tau"]))
-    claim = f"Calibration: growth and pump of {summary['source']}."
+    data = Path(config["data"]).name if config.get("data") else "the shipped recording"
+    claim = f"Calibration: growth and pump of {data}."
     items = [
         f"mu {number(mu[0])} 1/min, 95 % interval {number(mu[1])} to {number(mu[2])}; doubling time "
         f"{number(summary['doubling_min'])} min",

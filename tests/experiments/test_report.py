@@ -233,7 +233,7 @@ def test_any_run_gets_a_page(tmp_path):
     for word in ("mu.value", "0.0301", "0.02, 0.04", "x &amp; y", "both", "fit", "seed: 7", "&lt;1/min&gt;"):
         assert word in text
     assert list(csv.reader((run / "tables" / "w.csv").read_text().splitlines())) == [
-        ["reactor", "ise", "note"], ["M0", "0.25", "–"], ["M1", "–", "x & y"]
+        ["reactor", "ise, OD² min", "note"], ["M0", "0.25", "–"], ["M1", "–", "x & y"]
     ]  # fmt: skip
 
 
