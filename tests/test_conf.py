@@ -348,7 +348,11 @@ def test_help_lists_what_the_command_takes_and_every_option_of_it_composes(name,
             "experiment=smoke: a recipe of train; python -m experiments.train +experiment=s",
         ),
         ("train", "+experiment=nope", "experiment=nope: no such option; allowed: shipped, smoke"),
-        ("train", "plant=bench", "plant=bench: train takes env, agent, experiment; plant= is for deploy"),
+        (
+            "train",
+            "plant=bench",
+            "plant=bench: train takes env, agent, experiment, hparams_search; plant= is for deploy",
+        ),
         ("benchmark", "plant=bench", "plant=bench: benchmark takes env, experiment; plant= is for deploy"),
         ("speed", "agent=tuned", "agent=tuned: speed takes no group; agent= is for ablate, degradation, train"),
         (
