@@ -75,10 +75,13 @@ def _headline(ranked: Sequence[Configuration], jobs: Sequence[Result], called: C
     best, name = ranked[0], next(iter(ranked[0].measured))
     s = statistics(best.measured[name])
     what = called(name)
-    text = f"Of {len(ranked)} configurations, {best.name} is best: {what} {number(s.worst)} at its worst"
-    if len(ranked) == 1:
-        text = f"One configuration ({best.name}): {what} {number(s.worst)} at its worst"
-    text += f", interquartile mean {number(s.iqm)} over {s.n} {'value' if s.n == 1 else 'values'}"
+    head = (
+        f"Of {len(ranked)} configurations, {best.name} is best"
+        if len(ranked) > 1
+        else f"One configuration, {best.name}"
+    )
+    middle = f", with an interquartile mean of {number(s.iqm)} over {s.n}" if s.n > 1 else ""
+    text = f"{head}: {what}, {number(s.worst)} at its worst{middle}"
     if len(ranked) > 1:
         other = statistics(ranked[1].measured[name])
         apart = s.n < 2 or other.n < 2 or s.interval[1] < other.interval[0]

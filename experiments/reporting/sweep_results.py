@@ -24,7 +24,7 @@ LABELS = {
     "volume_ml": "medium, mL",
     "objective": "what the command returned",
 }
-MERIT = "merit of the worst seed, 1: the limit of the task"  # what train returns
+MERIT = "merit of the worst seed (1: limit of the task)"  # what train returns
 
 
 @dataclass(frozen=True)
