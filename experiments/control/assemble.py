@@ -13,6 +13,7 @@ from pathlib import Path
 from conf.presets import load
 from conf.schema import build
 from dqn.policy import Policy
+from envs.outputs import DOSE_ML
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
@@ -130,7 +131,11 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
 
 
 def _check_supply(config: DeployConfig, scenarios: list[Scenario]) -> None:
-    """Whether every pump that a scenario gives by has a tube. Raises: UserError naming the pump."""
+    """Whether every pump that a scenario gives by has a tube, and doses may be large enough for it. Raises: UserError."""
+    most_ml, needed = config.safety.max_rate * config.safety.period_s, 2.0 * DOSE_ML  # halves are doses, too
+    if any(s.supplied for s in scenarios) and most_ml < needed:
+        remedy = f"allowed {needed / config.safety.period_s:.4f} mL/s or more beside scenario.outputs"
+        raise frame.UserError(f"safety.max_rate = {config.safety.max_rate:g} mL/s: {remedy}")
     if config.backend.kind == "sim":
         return
     for name, scenario in zip(config.backend.reactors, scenarios, strict=True):

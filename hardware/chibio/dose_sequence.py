@@ -130,8 +130,7 @@ class DoseSequence:
 
     def _calibrated(self, pump: str) -> PumpCalibration:
         """Flow of the pump that feeds."""
-        own = pump == FEED
-        return self._calibration.feed if own else PumpCalibration(flow_ml_s=self._config.supply.flow_ml_s(pump))
+        return self._calibration.feed if pump == FEED else self._config.supply.calibration(pump)
 
     def _obstacle(self, sample: tuple[float, int] | None, appeared_s: float, waste_s: float) -> str:
         """Why no dose may be given for this sample now; "" if nothing stands against it."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from conf.schema import check, setting
+from conf.schema import check, require, setting
 from hardware.chibio.protocol import FEED, PERIOD_S, SPARE
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 MAX_FEED_DUTY = 0.05  # docs/device.md, Client rules; the lowest layer (`protocol.check_command`) refuses more
+DOSE_ML = 0.5  # smallest dose of a spare pump, envs/outputs.py
 MAX_WASTE_DUTY = 0.5  # 63 s * duty must end before the next measurement
 
 
@@ -131,9 +132,22 @@ class SupplyConfig:
         0.0, "flow of Pump3 at full power, as weighed; 0: it has no tube", "mL/s", within=(0, 1.5)
     )
     pump4_ml_s: float = setting(0.0, "of Pump4", "mL/s", within=(0, 1.5))
+    bias_s: float = setting(0.0, "both run so much longer than asked, as weighed", "s", within=(-0.2, 0.5))
 
     def __post_init__(self) -> None:
         check(self, "backend.supply")
+        for pump in self.pumps:  # else a dose that it cannot deliver would be owed for ever, in the feed's place
+            key, flow, least = (
+                f"backend.supply.{pump.lower()}_ml_s",
+                self.flow_ml_s(pump),
+                self.calibration(pump).min_dose_ml,
+            )
+            require(flow >= 0.2, key, flow, "0 or 0.2 to 1.5 mL/s")
+            require(least <= DOSE_ML, key, flow, f"so much that 0.3 s and bias_s give at most {DOSE_ML:g} mL")
+
+    def calibration(self, pump: str) -> PumpCalibration:
+        """Of a spare pump, as declared."""
+        return PumpCalibration(flow_ml_s=self.flow_ml_s(pump), bias_s=self.bias_s)
 
     def flow_ml_s(self, pump: str) -> float:
         """Flow of a spare pump, 0 for every other one."""

@@ -45,7 +45,7 @@ REMEDIES = {
     "falls": "check for a pump that runs on, a leak, a stopped stirrer",
     "stale": "check link and device",
     "lost": "check link and device; pumps are swept off as soon as it answers",
-    "silent": "repair the link or the device, then resume the run",
+    "silent": "repair the link or the device, then start a new run; a stopped reactor stays so when resumed",
     "hot": "check heater and thermometer; heating stays off in this run",
     "thermometer": "check that the vial is seated; heating stays off in this run",
     "device": "see the text",

@@ -250,10 +250,24 @@ def test_a_saved_state_goes_on_and_a_damaged_one_is_named() -> None:
 def test_a_pump_without_a_tube_is_refused_before_anything_begins(tmp_path: Path) -> None:
     with pytest.raises(frame.UserError, match="Pump4 has no tube; .*backend.supply.pump4_ml_s"):
         assemble.unpack(config(pump4_ml_s=0.0), tmp_path)
+    weak = config()
+    with pytest.raises(frame.UserError, match=r"safety.max_rate = 0.005 mL/s: allowed 0.0167 mL/s or more"):
+        assemble.unpack(replace(weak, safety=replace(weak.safety, max_rate=0.005)), tmp_path)
     with pytest.raises(ValueError, match="backend.supply = Pump3: allowed another pump"):
         ChiBioConfig(overflow_pump=OverflowPumpConfig("Pump3"), supply=SupplyConfig(pump3_ml_s=1.0))
-    with pytest.raises(ValueError, match="backend.supply.pump3_ml_s = 2"):
-        SupplyConfig(pump3_ml_s=2.0)
+    for flow, bias in ((2.0, 0.0), (0.1, 0.0), (1.5, 0.1)):  # the last would owe half a millilitre for ever
+        with pytest.raises(ValueError, match=f"backend.supply.pump3_ml_s = {flow:g}"):
+            SupplyConfig(pump3_ml_s=flow, bias_s=bias)
+
+
+def test_the_declared_bias_is_taken_off_a_dose(tmp_path: Path) -> None:
+    made = config(Scenario((1.0,), (8.0,), (37.0,), outputs=("pump3 2 mL",)))
+    supply = SupplyConfig(pump3_ml_s=1.0, bias_s=BIAS_S)
+    run = Rehearsal(tmp_path, replace(made, backend=replace(made.backend, supply=supply)), quiet(), od=0.4)
+    run.begin()
+    for _ in run.run():
+        pass
+    assert run.device.vials["M0"].supplied_ml["Pump3"] == pytest.approx(2.0, abs=0.01)
 
 
 @pytest.mark.parametrize(
