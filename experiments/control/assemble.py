@@ -131,7 +131,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
 
 
 def _check_supply(config: DeployConfig, scenarios: list[Scenario]) -> None:
-    """Whether every pump that a scenario gives by has a tube, and doses may be large enough for it. Raises: UserError."""
+    """Whether pumps that a scenario gives by have a tube, and doses may be large enough. Raises: UserError."""
     most_ml, needed = config.safety.max_rate * config.safety.period_s, 2.0 * DOSE_ML  # halves are doses, too
     if any(s.supplied for s in scenarios) and most_ml < needed:
         remedy = f"allowed {needed / config.safety.period_s:.4f} mL/s or more beside scenario.outputs"
