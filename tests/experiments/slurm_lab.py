@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-PROGRAMS = ("slurmctld", "slurmd", "munged", "sbatch", "srun", "scontrol", "squeue")
+PROGRAMS = ("slurmctld", "slurmd", "munged", "sbatch", "srun", "scontrol", "scancel", "setpriv")
 
 CONFIG = """
 ClusterName=test
@@ -85,7 +85,8 @@ def cluster(folder: Path, cpus: int = 2) -> Iterator[dict[str, str]]:
 
     def start(*words: str) -> None:
         with open(folder / f"{words[0]}.out", "wb") as out:
-            daemons.append(subprocess.Popen(words, env=environment, stdout=out, stderr=out))
+            command = ["setpriv", "--pdeathsig", "KILL", *words]  # also when the test is killed
+            daemons.append(subprocess.Popen(command, env=environment, stdout=out, stderr=out))
 
     try:
         start(*munge)
