@@ -9,7 +9,9 @@ ROOT = Path("runs")
 WRITTEN = {
     "env_file": (("calibrate/**/calibrated.yaml", "demo/*/1_calibrate/calibrated.yaml"), "calibrate"),
     "plant_file": (("calibrate/**/twin.yaml", "demo/*/1_calibrate/twin.yaml"), "calibrate"),
+    "runs": (("*/*/sweep.json",), "train -m 'seed=range(0,4)'"),
 }
+FOLDERS = ("resume", "runs")  # keys that are given the folder of the file that is found
 """Key -> where its files are below runs/, and the command that writes them."""
 
 
@@ -20,7 +22,7 @@ def newest(patterns: Sequence[str], root: Path = ROOT) -> Path | None:
 
 
 def resolved(arg: str, command: str) -> str:
-    """`env_file=latest`, `plant_file=latest` and `resume=latest` with the path in its place, any other word as it is.
+    """`latest` of these keys and of `resume` with the path in its place, any other word as it is.
 
     Args: command: whose run is resumed.
     Raises: ValueError where nothing was written yet, saying what writes it.
@@ -34,4 +36,4 @@ def resolved(arg: str, command: str) -> str:
     path = newest(patterns)
     if path is None:
         raise ValueError(f"{arg}: nothing under {ROOT}/; run python -m experiments.{writer} first, or give a path")
-    return f"{key}={path.parent if name == 'resume' else path}"
+    return f"{key}={path.parent if name in FOLDERS else path}"
