@@ -22,6 +22,7 @@ apidoc_modules = [{"path": f"../{name}", "destination": f"api/{name}", "separate
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
 
+FIELD = re.compile(r"^[a-z_]\w*(, [a-z_]\w*)*( \(.*\))?: ")  # of a dataclass
 LABEL = re.compile(r"^(Args|Attributes|Raises|Returns|State|Yields)\b([^:]*):\s*(.*)$")
 
 
@@ -43,22 +44,25 @@ def _blocks(lines: list[str]) -> Iterator[list[str]]:
 
 
 def _rendered(block: list[str]) -> Iterator[str]:
-    """One paragraph: equations and tables as they stand, labelled parts as lists, everything else as text."""
+    """One paragraph: equations and tables as they stand, labelled parts and fields as lists, everything else as text."""
     if block[0][0] in " |-+":
         yield from ("::", "", *(f"    {line}" for line in block))
         return
-    labelled = False
+    labelled = listed = False
     for line in block:
         if found := LABEL.match(line):
-            labelled = True
+            labelled, listed = True, False
             yield from ("", f"**{found[1]}{_plain(found[2])}:** {_plain(found[3])}".rstrip(), "")
-        elif labelled and re.match(r"^ {1,3}\S", line):
+        elif FIELD.match(line) or (labelled and re.match(r"^ {1,3}\S", line)):
+            listed = True
             yield from ("", f"- {_plain(line.strip())}")
-        elif labelled and line.startswith(" "):
+        elif line.startswith(" ") and listed:
             yield f"  {_plain(line.strip())}"
+        elif line.startswith(" "):
+            yield _plain(line.strip())
         else:
-            yield from ("", _plain(line)) if labelled else (_plain(line),)
-            labelled = False
+            yield from ("", _plain(line)) if listed else (_plain(line),)
+            labelled = listed = False
 
 
 def _docstring(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:

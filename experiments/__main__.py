@@ -11,7 +11,7 @@ from experiments.cli import completion
 
 KINDS = {
     "From a recording to a reactor": ("demo", "calibrate", "train", "certify", "deploy", "report"),
-    "At the device": ("calibrate_pump", "blank"),
+    "At the device": ("calibrate_pump", "blank", "mark"),
     "Comparisons and studies": ("benchmark", "ablate", "degradation", "dual_chamber", "speed"),
     "Rehearsing what goes wrong": ("fault_matrix", "kill_campaign", "soak"),
 }
@@ -30,7 +30,8 @@ Exit codes
   0    done
   1    refused or failed; one line on standard error says why and what to do
   2    no such command
-  130  stopped by Ctrl-C, SIGTERM or SIGHUP; one line says what is kept and how to go on"""
+  130  stopped by Ctrl-C, SIGTERM or SIGHUP; one line says what is kept and how to go on;
+       a deployment that was stopped ends with 0, once its pumps are verified off"""
 
 
 def names() -> list[str]:

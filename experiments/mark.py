@@ -40,9 +40,12 @@ class MarkConfig:
 def _minute_now(folder: Path, stored: Any) -> float:
     """The minute of a run that is under way. Raises: UserError for one that is over, or has not begun."""
     kind = str(OmegaConf.select(stored, "backend.kind"))
-    if kind == "sim" or (folder / "summary.json").is_file():
-        raise frame.UserError(f"run={folder}: not under way; give minute=MINUTE of the run")
+    over = frame.UserError(f"run={folder}: not under way; give minute=MINUTE of the run")
+    if kind == "sim":
+        raise over
     rows, _ = read_journal(folder / "journal.jsonl")
+    if [row["kind"] for row in rows if row["kind"] in ("start", "stop")][-1:] == ["stop"]:
+        raise over
     if not rows:
         raise frame.UserError(f"run={folder}: has not begun; wait for its first sample")
     speed = float(OmegaConf.select(stored, "backend.speed") or 1.0)  # an emulated device may run faster
@@ -71,6 +74,15 @@ def _body(config: MarkConfig, folder: Path) -> None:
     print(mark(config))
 
 
+def _quoted(argument: str) -> str:
+    """A text as it was typed, whatever Hydra's grammar would make of it."""
+    key, _, value = argument.partition("=")
+    if key.lstrip("+") != "text" or value[:1] in ("'", '"'):
+        return argument
+    escaped = value.replace("'", "\\'")
+    return f"{key}='{escaped}'"
+
+
 class _Mark(frame.Command[MarkConfig]):
     """A command that works in another run's folder and needs none of its own."""
 
@@ -78,7 +90,7 @@ class _Mark(frame.Command[MarkConfig]):
         if any(a.startswith("-") for a in given):
             super()._answer(given)
         else:
-            print(mark(self.config(given)))
+            print(mark(self.config([_quoted(a) for a in given])))
 
 
 main = _Mark("mark", MarkConfig(), _body)

@@ -79,7 +79,11 @@ def compare(folder: Path) -> Path:
     if not folder.is_dir():
         raise frame.UserError(f"runs={folder}: no such folder; give the folder of a sweep")
     swept = sweep.read(folder)
-    expected = sweep.jobs(words.normalise(swept.arguments, swept.command)) if swept else None
+    try:
+        own = [a for a in swept.arguments if not a.startswith("hydra/")] if swept else []
+        expected = sweep.jobs(words.normalise(own, swept.command)) if swept else None
+    except frame.UserError:
+        expected = None  # files that it named are gone: the jobs that have a folder
     jobs = [_result(job) for job in sweep.survey(folder, expected)]
     if not jobs:
         raise frame.UserError(f"runs={folder}: holds no job of a sweep; give the folder that train -m has written")
@@ -93,7 +97,8 @@ def _result(job: sweep.Job) -> Result:
     """A job with what it found, as the page takes it. Overrides are those of the command line, key by key."""
     overrides = dict(line.split("=", 1) for line in job.overrides if "=" in line and not line.startswith("hydra."))
     if preset := overrides.pop("hparams_search", None):  # a run of the same values is no search
-        own = files.load_yaml(presets.ROOT / "hparams_search" / f"{preset}.yaml")
+        path = presets.ROOT / "hparams_search" / f"{preset}.yaml"
+        own: Any = files.load_yaml(path) if path.is_file() else {}
         fixed = {str(k): str(v) for k, v in own.items() if k not in ("defaults", "hydra")}
         overrides = fixed | overrides
     done = job.state == "finished" and (job.folder / "summary.json").is_file()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.xdist_group("site")  # one worker makes what its tests look at
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
 NEEDED = ("sphinx", "myst_parser", "furo", "sphinx_copybutton", "sphinxcontrib.mermaid")

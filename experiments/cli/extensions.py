@@ -22,6 +22,7 @@ from experiments.cli import files
 __all__ = ["VARIABLE", "keep", "kept", "load_all", "offer", "preset_file", "taken"]
 
 VARIABLE, FOLDER = "TURBIDOSTAT_EXTEND", "extensions"
+RECIPES = ("experiment", "hparams_search")  # groups whose presets stand at the root of the config
 _loaded: dict[Path, str] = {}  # file -> name of its module
 
 
@@ -94,7 +95,10 @@ def preset_file(group: str, option: str) -> str:
             raise ValueError("it holds no keys and values")
         values = OmegaConf.to_container(content)
         assert isinstance(values, dict)
-        presets.add(f"{group}/{name}", {str(k): v for k, v in values.items()}, f"The file {option}.")
+        known, what = presets.added().get(f"{group}/{name}"), f"The file {path.resolve()}."
+        if known is not None and known.what != what:
+            raise ValueError("another file of this name is given; rename one")
+        presets.add(f"{group}/{name}", {str(k): v for k, v in values.items()}, what)
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise ValueError(f"{group}={option}: {why}; give a YAML file with values of {group}") from None
@@ -105,7 +109,8 @@ def offer() -> None:
     """Hydra finds the presets that were added."""
     for name, preset in presets.added().items():
         group, _, option = name.rpartition("/")
-        ConfigStore.instance().store(name=option, group=group, node=preset.values)
+        package = "_global_" if group in RECIPES else None
+        ConfigStore.instance().store(name=option, group=group, node=preset.values, package=package)
 
 
 def keep(folder: Path) -> None:

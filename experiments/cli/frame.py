@@ -30,7 +30,7 @@ from conf.schema import build
 from experiments.cli import extensions, files, help_page, latest, search, stop, sweep, words
 from experiments.cli.words import UserError, normalise
 
-__all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config"]
+__all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config", "swept"]
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -105,6 +105,11 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
             )
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra's own checks of a group's name
         raise UserError(_one_line(error)) from None
+
+
+def swept() -> bool:
+    """Whether what runs here is a job of a sweep."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def save_config(config: Any, folder: Path) -> None:
@@ -205,7 +210,7 @@ class Command(Generic[T]):
         if not flags:  # a plain run is checked before it has a folder
             self.config(given)
             resumed = words.resumed(given)
-            others = [a for a in given if not a.startswith(("resume=", "hydra.", "extend="))]
+            others = [a for a in given if not a.startswith(("resume=", "hydra."))]
             if resumed and others:
                 raise UserError(f"{others[0]}: a resumed run takes every value from {resumed}/config.yaml; drop it")
         self._hydra()
@@ -223,7 +228,7 @@ class Command(Generic[T]):
         """Every job of a sweep, and a line about how many came to their end. Exits: 1 where one failed."""
         sys.argv[1:] = normalise(swept.line(), self.name)
         expected = sweep.jobs(sys.argv[1:])
-        compose(self.name, expected[0] if expected else swept.arguments)  # a wrong word leaves no folder
+        self.config(expected[0] if expected else swept.arguments)  # a wrong word leaves no folder
         if expected is None:
             search.register()
         try:
@@ -247,7 +252,7 @@ class Command(Generic[T]):
         """One run in its folder."""
         folder = Path(os.path.relpath(HydraConfig.get().runtime.output_dir))
         extensions.load_all()  # in a worker of a sweep they are not loaded yet
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
+        if swept():
             return self._swept_job(cfg, folder)
         try:
             if cfg.get("resume"):
@@ -276,7 +281,8 @@ class Command(Generic[T]):
         A job that fails is written down as such; the launcher goes on with the others.
         """
         try:
-            with sweep.working(folder):
+            searched = HydraConfig.get().runtime.choices.get("hparams_search") not in (None, "null")
+            with sweep.working(folder, wait=searched):  # a search needs the result, whoever finds it
                 return self._once(cfg, folder, sweep.Job.at(folder))
         except KeyboardInterrupt:
             sys.exit(stop.STATUS)
@@ -305,8 +311,9 @@ class Command(Generic[T]):
             return None
         except Exception as error:
             line = _refusal(error) or _one_line(error) or type(error).__name__
-            with suppress(OSError):  # a disk that is full
-                job.save("failed", error=line)
+            if job.state != "finished":  # what it found stands, whatever was asked of it now
+                with suppress(OSError):  # a disk that is full
+                    job.save("failed", error=line)
             if not isinstance(error, UserError | sweep.Again) and _refusal(error) is None:
                 raise
             log.error("%s", line)
@@ -314,7 +321,7 @@ class Command(Generic[T]):
 
     def _left(self, folder: Path) -> str:
         """What a run that did not come to its end leaves, and how to go on."""
-        own = re.compile(rf"\.|events\.|config\.yaml|{self.name}\.log|.*\.part$")
+        own = re.compile(rf"\.|events\.|config\.yaml|{self.name}\.log|.*\.part$|reactors$|agents$")
         names = sorted(p.name + "/" * p.is_dir() for p in folder.glob("*") if not own.match(p.name))
         kept = f"{folder} keeps {', '.join(names)}" if names else f"{folder} keeps no result"
         if self.resumes and (folder / self.resumes).is_file():

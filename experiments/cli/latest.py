@@ -31,7 +31,7 @@ def resolved(arg: str, command: str) -> str:
     name = key.lstrip("+")
     if value != "latest" or name not in (*WRITTEN, "resume"):
         return arg
-    runs = (f"{command}/*/config.yaml", f"{command}/*/sweep.json")
+    runs = tuple(f"{command}/*/{name}" for name in ("checkpoint.pt", "state.json", "sweep.json"))
     patterns, writer = WRITTEN.get(name, (runs, command))
     path = newest(patterns)
     if path is None:

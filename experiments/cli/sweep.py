@@ -112,7 +112,12 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
             raise Again(f"{what}: a resumed sweep is {before.again()}, with all its values; drop it")
         new = [a for a in plain if not a.startswith("resume=")]
         keys = {a.partition("=")[0] for a in new}
-        return Sweep(before.folder, command, [a for a in before.arguments if a.partition("=")[0] not in keys] + new)
+        kept = [a for a in before.arguments if a.partition("=")[0] not in keys]
+        if any(a.startswith("hydra/launcher=") for a in new):  # what the launcher before was told is not for this one
+            kept = [a for a in kept if not a.startswith("hydra.launcher.")]
+        return Sweep(before.folder, command, kept + new)
+    if folder and len(plain) < len(given):
+        raise Again(f"resume={folder}: no sweep; a single run goes on without -m")
     if len(plain) == len(given) and not searches(plain):
         return None
     named = [a.removeprefix(FOLDER) for a in plain if a.startswith(FOLDER)]
@@ -195,11 +200,14 @@ class Job:
 
 
 @contextmanager
-def working(folder: Path) -> Iterator[None]:
-    """Inside, no other process works on the job of a folder. Raises: Busy where one does already."""
+def working(folder: Path, wait: bool = False) -> Iterator[None]:
+    """Inside, no other process works on the job of a folder.
+
+    Args: wait: for one that does already. Raises: Busy where one does and nobody waits.
+    """
     with open(folder / ".lock", "w") as lock:
         try:
-            fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.lockf(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except OSError as error:
             raise Busy(f"{folder}: another process works on it; wait for its end") from error
         yield
@@ -254,7 +262,8 @@ def told(sweep: Sweep, expected: list[list[str]] | None) -> str:
     line = f"{done} of {len(found)} jobs finished in {sweep.folder}"
     if any(job.state == "running" for job in found):
         line += f"; {sum(job.state == 'running' for job in found)} still at work in other processes"
-    if all(job.state in ("finished", "running") for job in found):
+    over = ("finished", "running") if expected is not None else ("finished", "running", "failed")
+    if all(job.state in over for job in found):
         return f"{line}; compare them: python -m experiments.report runs={shlex.quote(str(sweep.folder))}"
     return f"{line}; what is missing: {sweep.again()}"
 

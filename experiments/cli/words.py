@@ -49,6 +49,8 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
         argv = [latest.resolved(arg, command) for arg in argv]
         old = resumed(argv)
         if old:
+            if others := [arg for arg in argv if arg.startswith("extend=")]:
+                raise ValueError(f"{others[0]}: a resumed run loads its own copy from {old}/extensions; drop it")
             extensions.kept(Path(old))
         argv = [_with_preset_files(arg) for arg in extensions.taken(argv)]
     except ValueError as error:

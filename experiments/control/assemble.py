@@ -31,8 +31,11 @@ from experiments.control.plant_file import read_plant_file
 from experiments.control.policies import admit, composition_policy, policy_check, run_policy
 from experiments.control.record import Record
 from experiments.control.recovery import continue_loop
+from experiments.control.supply import MADE_UP_MIN
 from experiments.controllers import registry
 from experiments.training.config import read_env_file
+from hardware.chibio.dosing import MAX_FEED_DUTY
+from hardware.chibio.protocol import PERIOD_S
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Reactor
 from hardware.safety.interlock import Interlock
@@ -132,17 +135,31 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
 
 def _check_supply(config: DeployConfig, scenarios: list[Scenario]) -> None:
     """Whether pumps that a scenario gives by have a tube, and doses may be large enough. Raises: UserError."""
-    most_ml, needed = config.safety.max_rate * config.safety.period_s, 2.0 * DOSE_ML  # halves are doses, too
-    if any(s.supplied for s in scenarios) and most_ml < needed:
-        remedy = f"allowed {needed / config.safety.period_s:.4f} mL/s or more beside scenario.outputs"
-        raise frame.UserError(f"safety.max_rate = {config.safety.max_rate:g} mL/s: {remedy}")
-    if config.backend.kind == "sim":
+    if not any(s.supplied for s in scenarios):
         return
-    for name, scenario in zip(config.backend.reactors, scenarios, strict=True):
+    backend, safety = config.backend, config.safety
+    most_ml, needed, period_s = safety.max_rate * safety.period_s, 2.0 * DOSE_ML, 60.0 * backend.control_min
+    if most_ml < needed:
+        remedy = f"allowed {needed / safety.period_s:.4f} mL/s or more beside scenario.outputs"
+        raise frame.UserError(f"safety.max_rate = {safety.max_rate:g} mL/s: {remedy}")
+    if abs(period_s - safety.period_s) > 1e-6 or backend.control_min > MADE_UP_MIN:
+        remedy = f"allowed the same, and at most {MADE_UP_MIN:g} min, beside scenario.outputs"
+        given = f"safety.period_s = {safety.period_s:g} s, backend.control_min = {backend.control_min:g} min"
+        raise frame.UserError(f"{given}: {remedy}")
+    if backend.kind == "sim":
+        return
+    if not hasattr(backend, "supply"):
+        raise frame.UserError(f"scenario.outputs: backend={backend.kind} has no spare pumps; drop them")
+    for name, scenario in zip(backend.reactors, scenarios, strict=True):
         for number in sorted(scenario.supplied):
-            if f"Pump{number}" not in config.backend.supply.pumps:
-                remedy = f"weigh it and give its flow, backend.supply.pump{number}_ml_s"
+            key = f"backend.supply.pump{number}_ml_s"
+            if f"Pump{number}" not in backend.supply.pumps:
+                remedy = f"weigh what it gives in a second at full power (docs/scenarios.md) and give its flow, {key}"
                 raise frame.UserError(f"scenario.outputs of {name}: Pump{number} has no tube; {remedy}")
+            can = backend.supply.calibration(f"Pump{number}").volume(PERIOD_S * MAX_FEED_DUTY)
+            if can < most_ml - 1e-9:
+                remedy = f"allowed {most_ml:.2f} mL a dose; take a wider tube or a smaller safety.max_rate"
+                raise frame.UserError(f"{key}: Pump{number} gives at most {can:.2f} mL a dose: {remedy}")
 
 
 def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Keeper | None:

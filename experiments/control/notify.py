@@ -38,7 +38,7 @@ def hidden(arguments: Sequence[str], environment: MutableMapping[str, str]) -> l
     out = []
     for argument in arguments:
         key, _, value = argument.partition("=")
-        value = value.strip("'\"")
+        value = value.strip(" \t'\"")
         if key.lstrip("+") == "notify" and value.lower().startswith(ADDRESS):
             environment[HOOK] = value
             argument = f"notify=env:{HOOK}"
@@ -64,7 +64,8 @@ class Hook:
         try:
             self._command = shlex.split(target)
         except ValueError as error:
-            raise frame.UserError(f"notify = {target}: {error}; allowed a command, https://... or env:NAME") from None
+            remedy = "allowed a command, https://... or env:NAME"
+            raise frame.UserError(f"notify: the command cannot be read ({error}); {remedy}") from None
         if not self._command or shutil.which(self._command[0]) is None:
             raise frame.UserError("notify: there is no such command; allowed a command, https://... or env:NAME")
         self.name = Path(self._command[0]).name
@@ -84,7 +85,7 @@ class Hook:
         """Deliver one line; what went wrong in a few words that name no secret, "" if nothing did."""
         try:
             return self._post(line) if self._by_http else self._run(line)
-        except (httpx.HTTPError, httpx.InvalidURL, OSError, subprocess.SubprocessError, ValueError) as error:
+        except Exception as error:  # whatever it is, it is the hook's and not the run's
             return type(error).__name__
 
     def _post(self, line: bytes) -> str:
@@ -122,6 +123,7 @@ class Notifier:
     def __init__(self, hook: Hook | None, run: Path) -> None:
         self._hook, self._run = hook, str(run)
         self.sent = self.failed = self.dropped = 0
+        self._over = False
         self._waiting: queue.Queue[bytes | None] = queue.Queue(WAITING)
         self._thread: threading.Thread | None = None
         if hook is not None:
@@ -142,7 +144,7 @@ class Notifier:
                 log.warning("notify: messages are dropped, the hook does not keep up")
 
     def _deliver(self, hook: Hook) -> None:
-        while (line := self._waiting.get()) is not None:
+        while (line := self._waiting.get()) is not None and not self._over:
             if problem := hook.send(line):
                 self.failed += 1
                 if self.failed == 1:
@@ -158,6 +160,7 @@ class Notifier:
             self._waiting.put_nowait(None)
         self._thread.join(LAST_S)
         if self._thread.is_alive():
+            self._over = True
             self._hook.give_up()
         left = self._waiting.qsize()
         self._thread = None
@@ -181,4 +184,10 @@ def opened(target: str, run: Path, resumed: bool) -> Notifier:
             if not resumed:
                 raise frame.UserError(missing)
             log.warning("%s, then resume again; until then nobody is told", missing)
-    return Notifier(Hook(target) if target else None, run)
+    try:
+        return Notifier(Hook(target) if target else None, run)
+    except frame.UserError as error:
+        if not resumed:
+            raise
+        log.warning("%s; mend it, then resume again; until then nobody is told", error)
+        return Notifier(None, run)

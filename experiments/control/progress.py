@@ -25,8 +25,8 @@ def _padded(rows: Sequence[Sequence[float]], by: float | None = None) -> Array:
 class Progress:
     """The edges of N schedules as they come: a condition that is met moves every later edge of its reactor forward.
 
-    A step is judged at believed samples after its beginning, so it lasts a control period at least; it ends at the
-    sample that meets its condition, which is the first of the next step. Settled: |OD - setpoint| within
+    A step is judged at believed samples after its first one, so it is asked for a control period at least; it ends at
+    the sample that meets its condition, which is the first of the next step. Settled: |OD - setpoint| within
     `settled_band` times the setpoint at every believed sample of `settled_min`, counted anew in every step.
 
     Attributes: edges, start of each step and end of the last, min since the schedule began, (N, P + 1), inf behind the
@@ -45,6 +45,7 @@ class Progress:
         self._settled_min = np.array([s.settled_min for s in schedules])
         self.edges = _padded([s.edges.tolist() for s in schedules], np.inf)
         self._within_since = np.full(len(schedules), np.nan)  # min, from which on no reading was outside the band
+        self._judged_at = np.full(len(schedules), np.nan)  # min, newest sample that was judged
 
     @property
     def totals(self) -> Array:
@@ -76,7 +77,8 @@ class Progress:
         since = np.where(anew, elapsed, self._within_since)
         self._within_since = np.where(judged, np.where(within, since, np.nan), self._within_since)
         settled = within & (elapsed - since >= self._settled_min - 1e-6)
-        ends = judged & (elapsed > begun + 1e-6) & self.conditions.met(step, od, settled)
+        ends = judged & (self._judged_at >= begun - 1e-6) & self.conditions.met(step, od, settled)
+        self._judged_at = np.where(judged, elapsed, self._judged_at)
         shift = np.where(ends, elapsed - self.edges[rows, step + 1], 0.0)
         later = np.arange(self.edges.shape[1]) > step[:, None]
         self.edges = np.where(later, self.edges + shift[:, None], self.edges)
@@ -98,7 +100,11 @@ class Progress:
         """What a decision for reactor n has to keep, so that a kill after it forgets nothing; plain numbers."""
         if not self.conditional:
             return {}
-        return {"edges": self.edges[n, : self._counts[n] + 1].tolist(), "within_since": float(self._within_since[n])}
+        edges, times = (
+            self.edges[n, : self._counts[n] + 1],
+            {"within_since": self._within_since, "judged_at": self._judged_at},
+        )
+        return {"edges": edges.tolist(), **{key: float(minute[n]) for key, minute in times.items()}}
 
     def take(self, n: int, row: Mapping[str, Any]) -> None:
         """Put reactor n where `row` was. Raises: ValueError naming what is missing or does not fit."""
@@ -106,12 +112,12 @@ class Progress:
             return
         try:
             edges = np.array(row["edges"], dtype=np.float64)
-            since = float("nan") if row["within_since"] is None else float(row["within_since"])
+            since, judged = (float("nan") if row[k] is None else float(row[k]) for k in ("within_since", "judged_at"))
         except (KeyError, TypeError, ValueError):
-            raise ValueError(f"steps: {str(row)[:60]}, expected edges and within_since") from None
+            raise ValueError(f"steps: {str(row)[:60]}, expected edges, within_since and judged_at") from None
         if edges.shape != (self._counts[n] + 1,) or not (np.diff(edges) > 0.0).all() or edges[0] != 0.0:
             raise ValueError(f"steps: edges {str(row['edges'])[:60]}, expected {self._counts[n] + 1} rising from 0")
-        self.edges[n, : edges.size], self._within_since[n] = edges, since
+        self.edges[n, : edges.size], self._within_since[n], self._judged_at[n] = edges, since, judged
 
     def state(self) -> dict[str, Any]:
         """Every reactor's `row`; nothing where no step has a condition."""

@@ -253,7 +253,8 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
     for dose in doses:
         mine = np.array([name == dose.reactor for name in loop.reactors.names])
         loop.book(Receipt(mine * dose.feed_ml, (), mine * dose.waste_ml), dose.at_s)
-        loop.supply.given(np.where(mine, dose.pump, 0), mine * dose.feed_ml)
+        if dose.n > decided.get(dose.reactor, -1):  # what came before the newest decision is in its position already
+            loop.supply.given(np.where(mine, dose.pump, 0), mine * dose.feed_ml)
         if dose.again and dose.n > decided.get(dose.reactor, -1):  # in no row yet
             loop.repeated_ml += mine * dose.feed_ml
     if isinstance(loop.controller, Accounts):

@@ -11,6 +11,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from experiments.cli import files, frame
+from experiments.cli.frame import swept
 from experiments.control import assemble, notify
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
@@ -114,7 +115,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         except ReactorError as error:
             raise frame.UserError(str(error)) from None
         return
-    tell, outcome = notify.opened(config.notify, folder, setup.resumed), "stopped before the loop began"
+    tell, outcome = notify.opened(config.notify, folder, setup.resumed), "ended before its summary: see the log"
     try:
         outcome = _recorded(setup, folder, tell)
     except (ReactorError, frame.UserError) as error:
@@ -125,6 +126,8 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         tell.close()
     if outcome.startswith("failed"):
         raise frame.UserError(outcome)
+    if outcome == "stopped by the operator" and swept():
+        raise KeyboardInterrupt  # the job is not done, and its sweep ends, too
 
 
 def _recorded(setup: Setup, folder: Path, tell: Notifier) -> str:

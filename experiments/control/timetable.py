@@ -108,7 +108,7 @@ def _device(setup: Setup) -> Iterator[str]:
     backend = setup.config.backend
     where = getattr(backend, "url", "") if backend.kind == "chibio" else "in this computer"
     yield f"backend {backend.kind} ({where}), reactors {', '.join(backend.reactors)}"
-    if backend.kind == "sim":
+    if not hasattr(backend, "calibration"):
         return
     found = load_calibrations(Path(backend.calibration), backend.reactors)
     if nominal := [name for name, c in zip(backend.reactors, found, strict=True) if not c.calibrated]:
@@ -145,7 +145,12 @@ def _reactor(setup: Setup, name: str, scenario: Scenario, now: datetime) -> Iter
         )
         if scenario.outputs and scenario.outputs[k]:
             yield f"  {'':>8} gives {scenario.outputs[k]}: {_supplied(scenario, k, most_min)}"
-        od, at, ml, most = step.od, at + step.minutes, ml + step.ml, most + step.longest_ml
+        at += step.minutes
+        ml, most = (
+            ml + max(step.ml, _spare(scenario, k, step.minutes)),
+            most + max(step.longest_ml, _spare(scenario, k, most_min)),
+        )
+        od = step.od
     yield f"  {ml:.0f} mL of medium expected, {most:.0f} mL if every step takes its longest; {_lasts(setup, ml, most)}"
 
 
@@ -153,6 +158,12 @@ def _supplied(scenario: Scenario, k: int, minutes: float) -> str:
     """What each spare pump gives in a step that takes its longest."""
     given = [(o.pump, o.ml + o.ml_h * minutes / 60.0) for o in outputs_of(scenario.outputs[k])]
     return ", ".join(f"at most {ml:.1f} mL by Pump{pump}" for pump, ml in given)
+
+
+def _spare(scenario: Scenario, k: int, minutes: float) -> float:
+    """What all spare pumps give in so many minutes of a step, mL; it dilutes as feed does, which is then left out."""
+    outputs = outputs_of(scenario.outputs[k]) if scenario.outputs else []
+    return sum(o.ml + o.ml_h * minutes / 60.0 for o in outputs)
 
 
 def _lasts(setup: Setup, ml: float, most: float) -> str:

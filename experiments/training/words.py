@@ -106,7 +106,10 @@ def ended(folder: Path, config: TrainConfig, task: Task, kept: Score, myopic: Sc
     file = shlex.quote(str(path))
     log.info("policy %s; figures %s", path, folder / "figures")
     log.info("next, prove its closed loop: python -m experiments.certify policy=%s", file)
-    log.info("next, try it: python -m experiments.deploy %s", TRIED[_kind(config)].format(file, law=law))
+    log.info(
+        "next, try it: python -m experiments.deploy %s",
+        TRIED.get(_kind(config), TRIED["density"]).format(file, law=law),
+    )
 
 
 def show(writer: PopulationWriter, config: TrainConfig, seeds: Sequence[int], folder: Path) -> None:
