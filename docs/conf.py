@@ -18,7 +18,7 @@ html_theme = "furo"
 html_title = "turbidostat-dqn"
 highlight_language = "none"
 exclude_patterns = ["figures"]
-apidoc_modules = [{"path": f"../{name}", "destination": f"api/{name}", "separate_modules": True} for name in PACKAGES]
+apidoc_modules = [{"path": f"../{name}", "destination": f"api/{name}", "separate_modules": False} for name in PACKAGES]
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
 
@@ -44,7 +44,7 @@ def _blocks(lines: list[str]) -> Iterator[list[str]]:
 
 
 def _rendered(block: list[str]) -> Iterator[str]:
-    """One paragraph: equations and tables as they stand, labelled parts and fields as lists, everything else as text."""
+    """One paragraph: equations and tables as they stand, labelled parts and fields as lists, all else as text."""
     if block[0][0] in " |-+":
         yield from ("::", "", *(f"    {line}" for line in block))
         return

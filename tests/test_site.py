@@ -37,10 +37,10 @@ def test_every_page_is_built_and_reached_from_the_first(site: Path) -> None:
 
 
 def test_equations_labels_and_code_of_a_docstring_are_on_its_page(site: Path) -> None:
-    page = (site / "api" / "envs" / "envs.task.html").read_text(encoding="utf-8")
+    page = (site / "api" / "envs" / "envs.html").read_text(encoding="utf-8")
     assert "r = -(x - setpoint)^2" in page
     assert "<strong>Raises:</strong>" in page
-    assert "<p>Everything" in (site / "api" / "envs" / "envs.plant.plant.html").read_text(encoding="utf-8")
+    assert "<p>Everything" in (site / "api" / "envs" / "envs.plant.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

@@ -325,21 +325,6 @@ def test_a_bad_env_file_ends_in_one_line(content, tmp_path):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_a_sweep_gives_each_run_its_folder(tmp_path):
-    done = run(
-        "train",
-        "-m",
-        "seed=range(0,2)",
-        *SHORT,
-        "agent.total_steps=200",
-        f"hydra.sweep.dir={tmp_path}",
-        "+experiment=smoke",
-    )
-    assert done.returncode == 0, done.stderr
-    seeds = [json.loads((tmp_path / str(k) / "summary.json").read_text())["seeds"] for k in range(2)]
-    assert seeds == [[0], [1]]
-
-
 def test_help_that_nobody_reads_to_the_end_says_nothing_about_it():
     line = f"{sys.executable} -m experiments.train --help | head -1"
     done = subprocess.run(["bash", "-o", "pipefail", "-c", line], cwd=ROOT, capture_output=True, text=True)
