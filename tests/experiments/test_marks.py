@@ -18,6 +18,7 @@ from experiments.control.record import Record
 from experiments.control.recovery import COLUMNS
 from experiments.control.summary import figure_of, summarise
 from experiments.mark import MarkConfig, mark
+from experiments.mark import main as command
 from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.emulator.vial import DARK_COUNTS
 from hardware.errors import RecordingError
@@ -124,6 +125,28 @@ def _under_way(folder: Path, kind: str = "emulator") -> Path:
     return folder
 
 
+def _ends(folder: Path, *kinds: str) -> None:
+    with open(folder / "journal.jsonl", "a", encoding="utf-8") as f:
+        for n, kind in enumerate(kinds, 1):
+            f.write(json.dumps({"n": n, "wall": time.time(), "mono": 2.0, "kind": kind}) + "\n")
+
+
+def test_a_run_that_was_stopped_and_resumed_is_under_way_again(tmp_path: Path) -> None:
+    folder = _under_way(tmp_path / "run")
+    (folder / "summary.json").write_text("{}")
+    _ends(folder, "start", "stop", "start")
+    mark(MarkConfig(str(folder), "M0", "inoculated"))
+    assert len(read_marks(folder)) == 1
+
+
+@pytest.mark.parametrize("text", ["foam (2 mL)", "pH=7", "a, b", "it's in", "'quoted already'"])
+def test_a_note_is_taken_as_it_was_typed(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = _under_way(tmp_path / "run")
+    monkeypatch.setattr("sys.argv", ["mark", f"run={folder}", f"text={text}"])
+    command()
+    assert [m.text for m in read_marks(folder)] == [text.strip("'")]
+
+
 def test_now_is_the_minute_of_the_run(tmp_path: Path) -> None:
     folder = _under_way(tmp_path / "run")
     mark(MarkConfig(str(folder), "M0", "inoculated"))
@@ -149,7 +172,7 @@ def test_what_is_wrong_is_named(
     monkeypatch.chdir(tmp_path)
     _under_way(tmp_path / "run")
     _under_way(tmp_path / "simulated", "sim")
-    (_under_way(tmp_path / "over") / "summary.json").write_text("{}")
+    _ends(_under_way(tmp_path / "over"), "stop")
     with pytest.raises(frame.UserError, match=message):
         mark(MarkConfig(**config))
     for text in ("", "two\nlines", "x" * 81):

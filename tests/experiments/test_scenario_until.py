@@ -44,6 +44,14 @@ def test_a_reading_that_is_not_believed_ends_nothing() -> None:
     assert fed(progress, 5.0, 0.9, math.nan, believed=np.array([False, True])) == [False, False]
 
 
+def test_a_step_that_begins_between_two_samples_is_asked_for_before_it_is_judged() -> None:
+    """The first step ends by its time at minute 10, samples come at 9.4, 10.4 and 11.4; OD is above 0.7 all along."""
+    progress = Progress([Scenario((0.8, 0.8, 0.3), (10.0, 30.0, 20.0), (37.0,) * 3, until=(None, "od >= 0.7", None))])
+    one = np.array([True])
+    assert [fed(progress, minute, 0.75, believed=one)[0] for minute in (9.4, 10.4, 11.4)] == [False, False, True]
+    assert progress.steps(0)[1] == (10.0, pytest.approx(11.4), "condition")
+
+
 def test_below_a_level() -> None:
     progress = Progress([replace(STEPS, until=("od <= 0.3", None, None))])
     one = np.array([True])
