@@ -21,6 +21,7 @@ exclude_patterns = ["figures"]
 apidoc_modules = [{"path": f"../{name}", "destination": f"api/{name}", "separate_modules": False} for name in PACKAGES]
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
+autodoc_use_type_comments = False  # there are none; looking for them takes half the time
 
 FIELD = re.compile(r"^[a-z_]\w*(, [a-z_]\w*)*( \(.*\))?: ")  # of a dataclass
 LABEL = re.compile(r"^(Args|Attributes|Raises|Returns|State|Yields)\b([^:]*):\s*(.*)$")

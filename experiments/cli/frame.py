@@ -228,7 +228,7 @@ class Command(Generic[T]):
         """Every job of a sweep, and a line about how many came to their end. Exits: 1 where one failed."""
         sys.argv[1:] = normalise(swept.line(), self.name)
         expected = sweep.jobs(sys.argv[1:])
-        self.config(expected[0] if expected else swept.arguments)  # a wrong word leaves no folder
+        self._refuse([swept.arguments] if expected is None else expected)
         if expected is None:
             search.register()
         try:
@@ -247,6 +247,18 @@ class Command(Generic[T]):
         print(f"{errors}{sweep.told(swept, expected)}", file=sys.stderr if errors else sys.stdout, flush=True)
         if errors:
             sys.exit(1)
+
+    def _refuse(self, jobs: list[list[str]]) -> None:
+        """A word that no job can take leaves no folder. Raises: UserError of the first job where all are refused."""
+        refusals = []
+        for job in jobs:
+            try:
+                self.config(job)
+                return
+            except UserError as error:
+                refusals.append(error)
+        if refusals:
+            raise refusals[0]
 
     def _job(self, cfg: DictConfig) -> float | None:
         """One run in its folder."""

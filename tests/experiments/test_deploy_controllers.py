@@ -22,7 +22,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from dqn import policy
 from envs.scenario import Scenario
 from experiments.cli import frame
-from experiments.control import assemble, run
+from experiments.control import families, run
 from experiments.control.config import DeployConfig, deploy_schema
 from experiments.controllers.registry import KINDS
 from hardware.chibio.config import EmulatorConfig
@@ -64,7 +64,7 @@ def emulated(monkeypatch: pytest.MonkeyPatch) -> list[ChiBioDevice]:
         devices.append(ChiBioDevice(backend.reactors, clock, rng, od=0.5, temperature=37.0, blanked=True))
         yield EmulatorTransport(devices[-1]), clock
 
-    monkeypatch.setattr(assemble, "linked", linked)
+    monkeypatch.setattr(families, "linked", linked)
     return devices
 
 
