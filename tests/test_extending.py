@@ -148,3 +148,20 @@ def test_cleanrl_s_way_to_an_environment() -> None:
             np.testing.assert_array_equal(infos["episode"]["l"], [100, 100])
             return
     raise AssertionError(reward)
+
+
+def test_two_preset_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "steps.yaml").write_text(FILES["steps.yaml"], encoding="utf-8")
+    done = run(["-m", "experiments.deploy", "-m", "scenario=a/steps.yaml,b/steps.yaml"], tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "another file of this name is given; rename one" in done.stderr
+
+
+def test_a_recipe_of_ones_own_stands_at_the_root(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("seed: 7\nagent: {total_steps: 300}\n", encoding="utf-8")
+    done = run(["-m", "experiments.train", "experiment=mine.yaml", "--cfg", "job"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "seed: 7\n" in done.stdout
+    assert "total_steps: 300\n" in done.stdout

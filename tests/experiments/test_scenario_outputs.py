@@ -253,6 +253,12 @@ def test_a_pump_without_a_tube_is_refused_before_anything_begins(tmp_path: Path)
     weak = config()
     with pytest.raises(frame.UserError, match=r"safety.max_rate = 0.005 mL/s: allowed 0.0167 mL/s or more"):
         assemble.unpack(replace(weak, safety=replace(weak.safety, max_rate=0.005)), tmp_path)
+    for backend in (weak.backend, SimulatedConfig(control_min=5.0)):  # a dose is a rate over the same period everywhere
+        other = replace(weak, backend=backend, safety=replace(weak.safety, period_s=75.0))
+        with pytest.raises(frame.UserError, match=r"safety.period_s = 75 s, .*: allowed the same"):
+            assemble.unpack(other, tmp_path)
+    with pytest.raises(frame.UserError, match=r"pump4_ml_s: Pump4 gives at most 0.63 mL a dose"):
+        assemble.unpack(config(pump4_ml_s=0.2), tmp_path)
     with pytest.raises(ValueError, match="backend.supply = Pump3: allowed another pump"):
         ChiBioConfig(overflow_pump=OverflowPumpConfig("Pump3"), supply=SupplyConfig(pump3_ml_s=1.0))
     for flow, bias in ((2.0, 0.0), (0.1, 0.0), (1.5, 0.1)):  # the last would owe half a millilitre for ever

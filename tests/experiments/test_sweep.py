@@ -160,3 +160,32 @@ def test_a_folder_goes_on_with_the_same_config_only_and_one_process_at_a_time(tm
         other.kill()
     with sweep.working(tmp_path):
         pass
+
+
+def test_what_a_finished_job_found_stands_when_it_is_asked_for_something_else(tmp_path):
+    ran = []
+    calm = frame.Command("train", TrainConfig(), lambda config, folder: ran.append(config.seed) or 0.5)
+    for seed in (1, 2):
+        calm._once(frame.compose("train", [f"seed={seed}"]), tmp_path, sweep.Job.at(tmp_path))
+    job = sweep.Job.at(tmp_path)
+    assert (job.state, job.objective, ran) == ("finished", 0.5, [1])
+
+
+def test_another_launcher_is_not_told_what_the_one_before_was(tmp_path):
+    first = ["seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    sweep.Sweep(tmp_path, "train", first).save()
+    again = sweep.asked(["-m", f"resume={tmp_path}", "hydra/launcher=submitit_local"], "train")
+    assert again is not None
+    assert again.arguments == ["seed=0,1", "hydra/launcher=submitit_local"]
+
+
+def test_a_single_run_is_not_resumed_as_a_sweep(tmp_path):
+    with pytest.raises(sweep.Again, match="no sweep; a single run goes on without -m"):
+        sweep.asked(["-m", f"resume={tmp_path}"], "train")
+
+
+def test_a_word_that_no_job_can_take_leaves_no_folder(tmp_path):
+    done = run("-m", "seed=0,1", "agent.learning_rat=1", "hydra.sweep.dir=all", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "agent.learning_rat" in done.stderr
+    assert not (tmp_path / "all").exists()
