@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ import pytest
 
 from dqn import checkpoint
 from experiments.cli import frame, sweep
+from experiments.control import run as control
+from experiments.control.config import DeployConfig
 from experiments.train import main, train
 from experiments.training.config import TrainConfig
 from experiments.training.session import Session
@@ -189,3 +192,11 @@ def test_a_word_that_no_job_can_take_leaves_no_folder(tmp_path):
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert "agent.learning_rat" in done.stderr
     assert not (tmp_path / "all").exists()
+
+
+@pytest.mark.parametrize("swept", [True, False])
+def test_a_deployment_that_was_stopped_is_a_job_to_be_done_again(swept, tmp_path, monkeypatch):
+    monkeypatch.setattr(control, "_recorded", lambda *_: "stopped by the operator")
+    monkeypatch.setattr(control, "swept", lambda: swept)
+    with pytest.raises(KeyboardInterrupt) if swept else nullcontext():
+        control.deploy(DeployConfig(), tmp_path)
