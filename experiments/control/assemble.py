@@ -24,7 +24,6 @@ from experiments.composition import registry as compositions
 from experiments.control import families
 from experiments.control.composition import Composition, Keeper, program_of
 from experiments.control.config import DeployConfig
-from experiments.control.device import check, linked, load_calibrations
 from experiments.control.families import Opening
 from experiments.control.loop import ClosedLoop
 from experiments.control.plant_file import read_plant_file
@@ -229,7 +228,5 @@ def run_preflight(setup: Setup, folder: Path) -> None:
     config, backend = setup.config, setup.config.backend
     if backend.kind == "sim":
         raise frame.UserError("preflight_only=true: a simulated reactor needs no preflight; use backend=chibio")
-    calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
     policy = [policy_check(config, setup.scenarios)] if config.controller.kind == "dqn" else []
-    with linked(backend) as (transport, clock):
-        check(backend, transport, clock, calibrations, folder, policy)
+    families.preflight(backend, folder, policy)

@@ -12,6 +12,7 @@ from experiments.control.recovery import COLUMNS
 from experiments.controllers import registry
 from experiments.controllers.learned import LearnedConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
+from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
 
@@ -20,7 +21,13 @@ __all__ = ["BACKENDS", "DeployConfig", "deploy_schema"]
 
 AT_END = ("hold", "stop", "regulate")
 OF_RUN = ("role", "at_end")  # keys of `each` that are not of its scenario
-BACKENDS: dict[str, type[Any]] = {"sim": SimulatedConfig, "chibio": ChiBioConfig, "emulator": EmulatorConfig}
+BACKENDS: dict[str, type[Any]] = {
+    "sim": SimulatedConfig,
+    "chibio": ChiBioConfig,
+    "emulator": EmulatorConfig,
+    "pioreactor": PioreactorConfig,
+    "pioreactor_rig": RigBackendConfig,
+}
 
 
 @dataclass(frozen=True)

@@ -12,17 +12,18 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from experiments.cli import files, frame, stop
+from hardware.check import Check
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.chibio.connection import identity
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
-from hardware.chibio.preflight import Check, preflight
+from hardware.chibio.preflight import preflight
 from hardware.clock import RealClock
 from hardware.emulator.process import EmulatorProcess
 from hardware.link.open import DeviceLock, open_transport
 from hardware.link.transport import Transport
 from hardware.storage import atomic
 
-__all__ = ["check", "linked", "load_calibrations", "one_interrupt", "save_calibration"]
+__all__ = ["check", "linked", "load_calibrations", "one_interrupt", "report", "save_calibration"]
 
 log = logging.getLogger(__name__)
 EMULATED = ("speed", "seed", "od", "plant")  # values of backend=emulator that its process is started with
@@ -82,7 +83,11 @@ def check(
     others: Sequence[Check] = (),
 ) -> None:
     """Log the preflight line by line, after it `others`. Raises: UserError if a required check failed."""
-    checks = [*preflight(transport, clock, backend, calibrations, folder), *others]
+    report([*preflight(transport, clock, backend, calibrations, folder), *others])
+
+
+def report(checks: Sequence[Check]) -> None:
+    """Log the lines of a preflight. Raises: UserError if a required check failed."""
     for one in checks:
         log.log(logging.INFO if one.ok else logging.WARNING, "%s", one)
     failed = [one for one in checks if one.required and not one.ok]

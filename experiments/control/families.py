@@ -1,9 +1,10 @@
 """Reactor families: how the reactors that a backend's config describes are opened, by kind of backend."""
 
+import logging
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,26 @@ import numpy as np
 from conf import presets
 from envs.plant.plant import Plant, PlantConfig
 from experiments.control.config import BACKENDS
-from experiments.control.device import check, linked, load_calibrations
+from experiments.control.device import check, linked, load_calibrations, report
+from hardware.check import Check
+from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
+from hardware.clock import RealClock
 from hardware.errors import RecordingError
+from hardware.link.open import DeviceLock
+from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
+from hardware.pioreactor.preflight import preflight as preflight_units
+from hardware.pioreactor.reactors import PioreactorReactors
+from hardware.pioreactor.resume import replay as replay_units
+from hardware.pioreactor.rig.processes import Rig
 from hardware.reactor import Reactor
 from hardware.simulated import SimulatedReactors
 from hardware.storage.journal import Journal
 
-__all__ = ["Opening", "add", "opened"]
+__all__ = ["Opening", "add", "opened", "preflight"]
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -66,7 +78,61 @@ def _chibio(opening: Opening) -> Iterator[Reactor]:
         yield reactors
 
 
-OPENERS: dict[str, Opener] = {"sim": _simulated, "chibio": _chibio, "emulator": _chibio}
+@contextmanager
+def _units(opening: Opening) -> Iterator[PioreactorReactors]:
+    """Pioreactors that no other client on this computer has, or those of a rig. Raises: ReactorError."""
+    backend, rows = opening.backend, opening.journal.rows
+    began = float(rows[0]["wall"]) if rows else time.time()
+    with ExitStack() as stack:
+        if isinstance(backend, RigBackendConfig):
+            vials = replace(backend.rig, growth_x=backend.speed)
+            rig = stack.enter_context(Rig(backend.reactors, vials, opening.folder))
+            backend = replace(backend, broker="127.0.0.1", broker_port=rig.broker, addresses=dict(rig.web))
+            log.info("the vendor's software at %s, cultures %g times real time", rig.web, backend.speed)
+        for unit in backend.reactors:
+            stack.enter_context(closing(DeviceLock(f"unit {unit} of {backend.broker}:{backend.broker_port}")))
+        reactors = PioreactorReactors(
+            backend, RealClock(backend.speed), opening.journal.append, format(int(began), "x")
+        )
+        yield stack.enter_context(closing(reactors))
+
+
+@contextmanager
+def _pioreactor(opening: Opening) -> Iterator[Reactor]:
+    """Pioreactors, checked before a run begins. Raises: ReactorError, UserError."""
+    earlier = opening.journal.rows
+    if opening.resumed and not earlier:
+        raise RecordingError(f"journal {opening.journal.path}: missing or empty; put it back, or start a new run")
+    with _units(opening) as reactors:
+        if not earlier:
+            report(preflight_units(reactors))
+        elapsed_s = (time.time() - float(earlier[0]["wall"])) * opening.backend.speed if earlier else 0.0
+        reactors.begin(replay_units(earlier), elapsed_s)
+        yield reactors
+
+
+OPENERS: dict[str, Opener] = {
+    "sim": _simulated,
+    "chibio": _chibio,
+    "emulator": _chibio,
+    "pioreactor": _pioreactor,
+    "pioreactor_rig": _pioreactor,
+}
+
+
+def preflight(backend: Any, folder: Path, others: Sequence[Check]) -> None:
+    """Every check of a family's reactors a line, after them `others`. Raises: UserError if one failed; ReactorError."""
+    if isinstance(backend, ChiBioConfig):
+        calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
+        with linked(backend) as (transport, clock):
+            check(backend, transport, clock, calibrations, folder, others)
+    elif isinstance(backend, PioreactorConfig):
+        with closing(Journal(folder / "journal.jsonl")) as journal:
+            opening = Opening(backend, PlantConfig(), journal, folder, False)
+            with _units(opening) as reactors:
+                report([*preflight_units(reactors), *others])
+    else:
+        report(others)
 
 
 def add(kind: str, config: type[Any], opener: Opener, what: str) -> None:

@@ -15,7 +15,7 @@ from experiments.certification import certificate
 from experiments.cli import frame
 from experiments.cli.latest import newest
 from experiments.control.config import DeployConfig
-from hardware.chibio.preflight import Check
+from hardware.check import Check
 from hardware.storage import atomic
 
 __all__ = [
@@ -25,7 +25,11 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 
-REHEARSED = ("sim", "emulator")  # backends without a culture; on any other a doubtful policy is refused
+REHEARSED = (
+    "sim",
+    "emulator",
+    "pioreactor_rig",
+)  # backends without a culture; on any other a doubtful policy is refused
 SHIPPED = Path(str(resources.files("dqn"))) / "shipped" / "policy.npz"
 SHIPPED_COMPOSITION = {
     "dqn": SHIPPED.with_name("coculture.npz"),

@@ -3,10 +3,10 @@
 import math
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
 from pathlib import Path
 
+from hardware.check import Check
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection, no_log
 from hardware.chibio.dosing import MAX_FEED_DUTY, ReactorCalibration
@@ -22,21 +22,6 @@ MARGIN = 1.1  # over the feed pump's flow: pumps differ from their calibration
 VIAL_ML = 30.0  # up to its rim (docs/biology.md, Volume)
 FULL_SCALE = 65535.0  # counts of the spectrometer
 FREE_MB = 1000.0  # a week of eight reactors writes about 240 MB (docs/faults.md)
-
-
-@dataclass(frozen=True)
-class Check:
-    """One line: what was checked, whether it passed, what was seen, what to do. `required` ones stop a run."""
-
-    name: str
-    ok: bool
-    detail: str
-    remedy: str = ""
-    required: bool = True
-
-    def __str__(self) -> str:
-        mark = "pass" if self.ok else ("FAIL" if self.required else "note")
-        return f"{mark}  {self.name}: {self.detail}" + ("" if self.ok else f" -> {self.remedy}")
 
 
 def preflight(

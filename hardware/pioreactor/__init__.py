@@ -1,0 +1,3 @@
+"""The driver of Pioreactors: from the vendor's HTTP and MQTT to samples, doses and faults of one to many units.
+
+Entered through `reactors` and `preflight`. Knows no policy and no simulation."""

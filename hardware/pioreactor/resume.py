@@ -1,0 +1,76 @@
+"""What a run must remember of each unit and its doses, and how the journal gives it back after a crash.
+
+The rows are those of every family: intent before a dose, feed_on before its request, dose_end after it.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from hardware.errors import RecordingError
+from hardware.storage.journal import REMEDY
+
+__all__ = ["History", "replay"]
+
+
+@dataclass(frozen=True)
+class History:
+    """One unit's past.
+
+    sample: key of the last sample that a dose was decided for. carry_ml: put off to the next dose. doses: ids given
+    out. handed_over: OD at which the vendor's turbidostat was started, nan if it was not. open: a dose has no end on
+    record; then id, feed_ml, waste_ml are its, on_s the run time at which it was intended, fed whether its request was
+    sent.
+    """
+
+    sample: tuple[float, int] | None = None
+    carry_ml: float = 0.0
+    doses: int = 0
+    temperature: float = math.nan
+    handed_over: float = math.nan
+    open: bool = False
+    fed: bool = False
+    id: str = ""
+    feed_ml: float = 0.0
+    waste_ml: float = 0.0
+    on_s: float = 0.0
+
+
+def _after(known: History, row: Mapping[str, Any]) -> History:
+    """What is known after one more row."""
+    kind = row["kind"]
+    if kind == "intent":
+        time, number = row["sample"]
+        return replace(
+            known, sample=(float(time), int(number)), carry_ml=float(row["carry_ml"]), doses=int(row["doses"]),
+            open=float(row["feed_ml"]) > 0.0, fed=False, id=str(row["id"]), feed_ml=float(row["feed_ml"]),
+            waste_ml=float(row["waste_ml"]), on_s=float(row["on_s"]),
+        )  # fmt: skip
+    if kind == "feed_on":
+        return replace(known, fed=True)
+    if kind == "dose_end" and not int(row["feed_times"]):
+        return replace(known, open=False)
+    if kind == "regulate":
+        return replace(known, handed_over=float(row["setpoint"]))
+    if kind == "temperature":
+        return replace(known, temperature=float(row["temperature"]))
+    return known
+
+
+def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, History]:
+    """What the journal of a run says of each unit. Args: rows: oldest first.
+
+    Raises: RecordingError for a row that is not as the driver wrote it.
+    """
+    known: dict[str, History] = {}
+    for row in rows:
+        if row.get("kind") not in ("intent", "feed_on", "dose_end", "regulate", "temperature"):
+            continue
+        try:
+            name = str(row["reactor"])
+            known[name] = _after(known.get(name, History()), row)
+        except (KeyError, TypeError, ValueError) as error:
+            what = f"row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error})"
+            raise RecordingError(f"journal.jsonl: {what}; {REMEDY}") from None
+    return known

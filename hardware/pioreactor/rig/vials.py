@@ -1,0 +1,174 @@
+"""Our vials as the vendor's software meets them: volts of a photodiode, duties of pins, a temperature."""
+
+import json
+import os
+import socket
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from conf.presets import load
+from conf.schema import build
+from envs.plant.plant import Plant, PlantConfig
+from hardware.pioreactor.rig.files import PINS
+
+__all__ = ["VOLTS_PER_OD", "Pulse", "VialServer", "vial_preset"]
+
+VOLTS_PER_OD = 0.1  # of the photodiode at 90 degrees: with the reference at 0.1 V one unit of the reading is one OD
+HELD = (12, 13)  # pins that a chip drives on when the process that set them is killed
+MEDIA, WASTE = PINS["media"], PINS["waste"]
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """One run of a pump: where, when (s since 1970), how long, and the fresh medium it moved."""
+
+    unit: str
+    pump: str
+    start: float
+    seconds: float
+    feed_ml: float
+
+
+def vial_preset(name: str, volume_ml: float, od: float) -> PlantConfig:
+    """Preset `conf/plant/NAME.yaml`, pulse dosing, in a vial of this volume. Raises: ValueError for an unknown name."""
+    plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
+    vessel = replace(plant.vessel, volume_ml=volume_ml, capacity_ml=max(40.0, volume_ml + 4.5))
+    return replace(plant, pump=replace(plant.pump, dosing="pulse"), vessel=vessel, start_od=od)
+
+
+class _Vial:
+    """One culture with its two pumps, in real seconds; growth alone runs `growth_x` times faster."""
+
+    def __init__(self, unit: str, plant: Plant, growth_x: float, log: Any) -> None:
+        self.unit, self.plant, self._growth_x, self._log = unit, plant, growth_x, log
+        self.at = time.time()
+        self.duty = {MEDIA: 0.0, WASTE: 0.0}
+        self.owner: dict[int, int] = {}
+        self._since: dict[int, tuple[float, float]] = {}
+        self.pulses: list[Pulse] = []
+        self.peak_ml = float(plant.vessel.volume_ml[0])
+
+    def sync(self, now: float) -> None:
+        """Let time pass up to now."""
+        seconds = now - self.at
+        if seconds <= 1e-4:
+            return
+        on = {pin: np.array([self.duty[pin] / 100.0 * seconds]) for pin in (MEDIA, WASTE)}
+        self.plant.advance(seconds * self._growth_x / 60.0, on[MEDIA], on[WASTE])
+        self.at = now
+        self.peak_ml = max(self.peak_ml, float(self.plant.vessel.volume_ml[0]))
+
+    def drive(self, pin: int, duty: float, pid: int, now: float) -> None:
+        """A pin's duty changes, in percent."""
+        if pin not in self.duty:
+            return
+        self.sync(now)
+        was, fed = self.duty[pin], float(self.plant.feed.delivered_ml[0])
+        if duty > 0.0 and was == 0.0:
+            self._since[pin] = (now, fed)
+        if duty == 0.0 and was > 0.0:
+            start, had = self._since.pop(pin)
+            pump = "media" if pin == MEDIA else "waste"
+            pulse = Pulse(self.unit, pump, start, now - start, fed - had if pin == MEDIA else 0.0)
+            self.pulses.append(pulse)
+            self._log({"unit": pulse.unit, "pump": pump, "start": start, "s": pulse.seconds, "ml": pulse.feed_ml})
+        self.duty[pin], self.owner[pin] = duty, pid
+
+    def reap(self, now: float) -> None:
+        """A pin whose process is gone falls back to 0, unless a chip drives it on."""
+        for pin, duty in self.duty.items():
+            if duty > 0.0 and pin not in HELD and not _alive(self.owner[pin]):
+                self.drive(pin, 0.0, 0, now)
+
+    def truth(self) -> dict[str, Any]:
+        """What is really in the vial and what was really moved."""
+        return {
+            "od": float(self.plant.apparent_od[0]),
+            "volume_ml": float(self.plant.vessel.volume_ml[0]),
+            "peak_ml": self.peak_ml,
+            "fed_ml": float(self.plant.feed.delivered_ml[0]),
+            "duty": {str(pin): duty for pin, duty in self.duty.items()},
+            "doses": len([p for p in self.pulses if p.pump == "media"]),
+            "temperature": float(self.plant.thermal.temperature[0]),
+        }
+
+
+class VialServer:
+    """All vials behind one UDP port, on a thread of its own.
+
+    Args:
+      units: their names. plant: of each vial. growth_x: how much faster than real time the culture grows.
+      folder: truth.jsonl, every run of a pump and once a second every vial, is written here.
+    Attributes: port.
+    """
+
+    def __init__(self, units: Sequence[str], plant: PlantConfig, growth_x: float, folder: Path, seed: int = 0) -> None:
+        self._file = (folder / "truth.jsonl").open("a", encoding="utf-8", buffering=1)
+        streams = np.random.default_rng(seed).spawn(len(units))
+        self.vials = {
+            u: _Vial(u, Plant(plant, 1, [r]), growth_x, self._log) for u, r in zip(units, streams, strict=True)
+        }
+        self._wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._wire.bind(("127.0.0.1", 0))
+        self._wire.settimeout(0.05)
+        self.port = int(self._wire.getsockname()[1])
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="vials", daemon=True)
+        self._thread.start()
+
+    def _log(self, row: Mapping[str, Any]) -> None:
+        self._file.write(json.dumps({"wall": round(time.time(), 3), **row}) + "\n")
+
+    def _serve(self) -> None:
+        told = 0.0
+        while not self._ended.is_set():
+            try:
+                data, sender = self._wire.recvfrom(4096)
+                self._wire.sendto(json.dumps(self._answer(json.loads(data))).encode(), sender)
+            except TimeoutError:
+                pass
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                self._log({"error": f"{type(error).__name__}: {error}"})
+            now = time.time()
+            for vial in self.vials.values():
+                vial.sync(now)
+                vial.reap(now)
+                if now - told >= 1.0:
+                    self._log({"unit": vial.unit, **vial.truth()})
+            told = now if now - told >= 1.0 else told
+
+    def _answer(self, asked: Mapping[str, Any]) -> dict[str, Any]:
+        now = time.time()
+        if asked.get("ask") == "truth":
+            return {unit: vial.truth() for unit, vial in self.vials.items()}
+        vial = self.vials[asked["unit"]]
+        vial.sync(now)
+        if "pin" in asked:
+            vial.drive(int(asked["pin"]), float(asked["dc"]), int(asked["pid"]), now)
+            return {"ok": True}
+        if asked.get("ask") == "temperature":
+            return {"temperature": float(vial.plant.thermal.temperature[0])}
+        return {"volts": VOLTS_PER_OD * float(vial.plant.apparent_od[0])}
+
+    def close(self) -> None:
+        """End the thread. Idempotent."""
+        self._ended.set()
+        self._thread.join(2.0)
+        self._wire.close()
+        self._file.close()
+
+
+def _alive(pid: int) -> bool:
+    """Whether a process runs: not gone, and not only waiting to be collected."""
+    try:
+        os.kill(pid, 0)
+        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+    except (OSError, IndexError):
+        return False
+    return state != "Z"

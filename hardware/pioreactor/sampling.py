@@ -1,0 +1,70 @@
+"""From the vendor's readings to one sample per control period: the median of those that no dose disturbed."""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.mailbox import Reading
+
+__all__ = ["Sample", "Sampling"]
+
+FEWEST = 2  # readings of a sample
+COUNTS = 10_000.0  # the interlock's counts: tenths of a millivolt
+
+
+@dataclass(frozen=True)
+class Sample:
+    """at: clock time of the readings' middle. od, spread: their median and its robust sd. raw: as the interlock's
+    counts. number: of readings."""
+
+    at: float
+    od: float
+    spread: float
+    raw: float
+    number: int
+
+
+class Sampling:
+    """Readings of one unit.
+
+    Attributes: newest, the last sample; arrived_s, clock time at which it was made; read_s, of the newest reading.
+    """
+
+    def __init__(self, config: PioreactorConfig, now: float) -> None:
+        self._config = config
+        self._readings: deque[Reading] = deque(maxlen=1000)
+        self.newest = Sample(math.nan, math.nan, math.nan, math.nan, 0)
+        self.arrived_s, self.read_s, self.count = now, now, 0
+        self._due = now
+
+    def take(self, readings: list[Reading]) -> None:
+        """Readings that arrived."""
+        self._readings.extend(r for r in readings if math.isfinite(r.value))
+        if readings:
+            self.read_s = readings[-1].at
+
+    def look(self, now: float, undisturbed_s: float, dosing: bool) -> Sample | None:
+        """The sample that is due, None if none is, or the readings for one are not there yet.
+
+        Args: undisturbed_s: clock time from which readings count. dosing: a dose is under way.
+        """
+        if now < self._due or dosing:
+            return None
+        used = [r for r in self._readings if r.at >= max(undisturbed_s, now - self._config.window_s)]
+        if len(used) < FEWEST:
+            return None
+        values = np.array([r.value for r in used])
+        middle = float(np.median(values))
+        spread = 1.4826 * float(np.median(np.abs(values - middle))) / math.sqrt(len(used))
+        scale, zero = self._config.od_scale, self._config.od_zero
+        self.newest = Sample(
+            float(np.mean([r.at for r in used])), (middle - zero) * scale, spread * scale,
+            min(max(middle * COUNTS, 0.0), 60_000.0), len(used),
+        )  # fmt: skip
+        self.arrived_s, self.count = now, self.count + 1
+        late = now - self._due > 0.5 * self._config.period_s
+        self._due = (now if late or self.count == 1 else self._due) + self._config.period_s
+        return self.newest

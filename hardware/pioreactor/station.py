@@ -1,0 +1,291 @@
+"""One unit: its jobs brought up and kept, its samples, its doses, what is wrong with it."""
+
+import math
+import time
+from collections.abc import Callable
+from datetime import datetime
+
+from hardware.clock import Clock
+from hardware.errors import DeviceStateError, LinkError, ReactorError
+from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.doses import MEDIA, WASTE, Doses, Plan
+from hardware.pioreactor.logbook import Log, Logbook
+from hardware.pioreactor.mailbox import Mailbox, Mqtt
+from hardware.pioreactor.resume import History
+from hardware.pioreactor.sampling import Sampling
+from hardware.pioreactor.web import Web
+from hardware.reactor import Fault
+
+__all__ = ["Station"]
+
+OD, HEAT, STIR, AUTOMATION = "od_reading", "temperature_automation", "stirring", "dosing_automation"
+GRACE_S = 20.0  # real seconds in which a job that was asked for may come up
+EXCHANGE_ML = 1.0  # of the vendor's turbidostat
+
+
+class Station:
+    """One unit of a cluster. Args: as of `PioreactorReactors`; run: part of every dose's id."""
+
+    def __init__(
+        self, unit: str, config: PioreactorConfig, mqtt: Mqtt, box: Mailbox, clock: Clock, log: Log,
+        elapsed: Callable[[], float], run: str,
+    ) -> None:  # fmt: skip
+        self.name, self._config, self._mqtt, self._box, self._clock = unit, config, mqtt, box, clock
+        self.web = Web(config.address(unit))
+        self.book = Logbook(unit, config.experiment, log, elapsed)
+        self.doses = Doses(unit, self.web, mqtt, box, config, clock, self.book, run)
+        self.sampling = Sampling(config, clock.now())
+        self.handed_over = math.nan
+        self.given_up, self.heat_is_off, self.news = False, False, False
+        self.fault: Fault | None = None
+        self._target = math.nan
+        self._asked_s = -math.inf
+        self._web_error = ""
+
+    # -- bringing up -----------------------------------------------------------------------------------------------
+
+    def bring_up(self, history: History) -> None:
+        """Pumps off, calibrations read, jobs adopted or started, an open dose of an earlier life looked for.
+
+        Raises: ReactorError for what no waiting can mend.
+        """
+        self.handed_over = history.handed_over
+        calibrations = self.web.get("/active_calibrations")
+        for job, pump in ((MEDIA, "media_pump"), (WASTE, "waste_pump")):
+            self.doses.flow_ml_s[job] = flow(calibrations, pump, self.name)
+        if self._box.live(AUTOMATION) and math.isnan(self.handed_over):
+            raise DeviceStateError(f"{self.name}: {self._automation()}")
+        self.doses.restore(history)
+        if not history.open and math.isnan(self.handed_over):
+            self._flush()
+        self.ask_for(OD)
+        if self._config.stirring:
+            self.ask_for(STIR)
+        target = history.temperature if math.isfinite(history.temperature) else self._config.temperature
+        if self._config.thermostat:
+            self.set_temperature(target)
+        self.book.note_down("device", device_id=self.name, url=self.web.url, flows=self.doses.flow_ml_s)
+
+    def _topic(self, job: str, setting: str) -> str:
+        return f"pioreactor/{self.name}/{self._config.experiment}/{job}/{setting}/set"
+
+    def _flush(self) -> None:
+        """Prove that the task queue takes what is written down, and that nothing older waits in it.
+
+        Raises: LinkError if it does not.
+        """
+        task, deadline = self.web.run(MEDIA, {"help": None}, self.book.env, []), self._now_in(GRACE_S)
+        while self.web.result(task) is None:
+            if self._clock.now() > deadline:
+                raise LinkError(
+                    f"{self.name}: the task queue takes nothing, so a dose would run at any later time; on the unit: "
+                    "sudo systemctl restart huey"
+                )
+            self._clock.sleep(0.2 * self._config.speed)
+
+    def _now_in(self, real_s: float) -> float:
+        return self._clock.now() + real_s * self._config.speed
+
+    def ask_for(self, job: str) -> None:
+        """Start one of the vendor's jobs unless it is there. Raises: ReactorError."""
+        if self._box.live(job):
+            return
+        options: dict[str, object] = {}
+        overrides: list[list[str]] = []
+        if job == OD:
+            rate = str(round(1.0 / self._config.reading_s, 4))
+            overrides = [[f"{OD}.config", "samples_per_second", rate], [f"{OD}.config", "smoothing_penalizer", "0"]]
+        if job == HEAT:
+            options = {"automation-name": "thermostat", "target-temperature": self._target}
+        if job == AUTOMATION:
+            target = self.handed_over / self._config.od_scale + self._config.od_zero
+            options = {"automation-name": "turbidostat", "target-od": target, "exchange-volume-ml": EXCHANGE_ML}
+        if self._box.lost(job):  # the vendor still counts a killed job as running, and would refuse another
+            self.web.post(f"/jobs/stop?job_name={job}")
+        self.web.run(job, options, self.book.env, overrides)
+        self._asked_s = self._clock.now()
+        self.book.note_down("command", job=job, options=options)
+
+    # -- what happens ----------------------------------------------------------------------------------------------
+
+    def poll(self) -> bool:
+        """Take in what the unit said, go on with a dose; whether there is a new sample."""
+        readings, events = self._box.drain()
+        self.sampling.take(readings)
+        self.doses.take(events)
+        self.doses.work()
+        found = self.sampling.look(
+            self._clock.now(), self.doses.ended_s + self._config.mix_s * (self.doses.ended_s > 0.0), self.doses.running
+        )
+        self._judge()
+        if found is None:
+            return False
+        age = self._clock.now() - found.at
+        self.book.note_down(
+            "sample", sample_s=round(self.book.elapsed() - age, 3), od=found.od, spread=found.spread,
+            readings=found.number, temperature=self._box.temperature,
+        )  # fmt: skip
+        return True
+
+    @property
+    def temperature(self) -> float:
+        """Of the culture, degC, nan while none was told."""
+        return self._box.temperature
+
+    @property
+    def key(self) -> tuple[float, int] | None:
+        """Of the newest sample, None before the first."""
+        return (round(self.sampling.newest.at, 3), self.sampling.count) if self.sampling.count else None
+
+    def _judge(self) -> None:
+        """What is wrong now."""
+        fault = self._wrong()
+        if (fault and fault.kind) != (self.fault and self.fault.kind):
+            self.news = True
+            self.book.note_down("fault", fault=str(fault) if fault else "none")
+        self.fault = fault
+
+    def _wrong(self) -> Fault | None:
+        if not self._mqtt.connected:
+            return Fault("link", "no MQTT broker", "the leader is off or its network is; doses wait")
+        if self.doses.trouble:
+            return Fault("pump", self.doses.trouble, "nothing is dosed until that is known")
+        if self._box.live(AUTOMATION) and math.isnan(self.handed_over):
+            return Fault("mode", "a dosing automation runs", "stop it in the vendor's page")
+        if not self.doses.running and self._box.running_pins(self._config.pump_pins) and math.isnan(self.handed_over):
+            return Fault("pump", "a pump runs without our command", self.doses.locks)
+        if self.doses.foreign:
+            return Fault("mode", self.doses.foreign, "one client per unit; it is counted")
+        if not self._box.live(OD) and self._clock.now() > self._asked_s + GRACE_S * self._config.speed:
+            self._again(OD)
+            return Fault("stopped", "the unit takes no OD readings", "it is asked for them again")
+        if self._web_error:
+            return Fault("link", self._web_error, "check the unit's web server")
+        return None
+
+    def _again(self, job: str) -> None:
+        try:
+            self.ask_for(job)
+            self._web_error = ""
+        except ReactorError as error:
+            self._web_error, self._asked_s = str(error), self._clock.now()
+
+    @staticmethod
+    def _automation() -> str:
+        return "a dosing automation of the vendor's runs, which would dose beside us; stop it in the vendor's page"
+
+    # -- commands --------------------------------------------------------------------------------------------------
+
+    def dose(self, rate: float) -> Plan:
+        """Begin the dose for the newest sample. Raises: ValueError; what the journal raises."""
+        refusal = ""
+        if self.given_up:
+            refusal = "the unit was given up"
+        elif math.isfinite(self.handed_over):
+            refusal = "the unit regulates itself"
+        elif self.fault is not None:
+            refusal = str(self.fault)
+        elif self._clock.now() - self.sampling.newest.at > self._config.stale_s:
+            refusal = "its sample is stale"
+        plan = self.doses.begin(rate, self.key, refusal)
+        self.doses.foreign = ""
+        return plan
+
+    def set_temperature(self, target: float) -> None:
+        """Thermostat to a target, degC; nan leaves it. Trouble becomes a note."""
+        if not math.isfinite(target) or not self._config.thermostat or self.heat_is_off or target == self._target:
+            return
+        self._target = target
+        self.book.note_down("temperature", temperature=target)
+        try:
+            if self._box.live(HEAT):
+                self._mqtt.publish(self._topic(HEAT, "target_temperature"), str(target))
+            else:
+                self.ask_for(HEAT)
+        except ReactorError as error:
+            self._target = math.nan
+            self.book.tell(f"thermostat: {error}")
+
+    def pumps_off(self, real_s: float) -> None:
+        """Every dosing job ended and every pump off, by MQTT first, then by HTTP, verified.
+
+        A dose under way is stopped and followed to its end. Raises: DeviceStateError, LinkError.
+        """
+        deadline, first = self._now_in(real_s), True
+        while True:
+            self.poll()
+            if self._mqtt.connected and self.doses.off() and not (self.doses.running and not self.doses.trouble):
+                break
+            if self._clock.now() > deadline:
+                raise DeviceStateError(self._still_on())
+            if not self.doses.off() or not self._mqtt.connected:
+                self._stop(first)
+                first = False
+            self._clock.sleep(0.3 * self._config.speed)
+
+    def _stop(self, first: bool) -> None:
+        if self.doses.stop_jobs() or not first:
+            try:
+                self.doses.stop_by_web()
+            except ReactorError as error:
+                self.book.tell(f"stop: {error}")
+
+    def _still_on(self) -> str:
+        pins = self._box.running_pins(self._config.pump_pins)
+        seen = f"pin {pins[0]} on" if pins else ("not verified off" if self._mqtt.connected else "no broker to ask")
+        return f"pumps of {self.name}: {seen}; pull the plug of its pumps. {self.doses.locks}"
+
+    def give_up(self) -> None:
+        """No dose in this run any more, by us or by the vendor's turbidostat. Raises: as `pumps_off`."""
+        self.given_up, self.handed_over = True, math.nan
+        if self._box.live(AUTOMATION):
+            self._mqtt.publish(
+                f"pioreactor/{self.name}/{self._config.experiment}/{AUTOMATION}/$state/set", "disconnected"
+            )
+        self.pumps_off(3.0)
+
+    def heat_off(self) -> None:
+        """Thermostat ended for the rest of the run. Raises: DeviceStateError."""
+        self.heat_is_off = True
+        self._mqtt.publish(self._topic(HEAT, "$state"), "disconnected")
+        deadline = self._now_in(5.0)
+        while self._box.live(HEAT):
+            if self._clock.now() > deadline:
+                raise DeviceStateError("the thermostat does not end; stop it in the vendor's page")
+            self._clock.sleep(0.2 * self._config.speed)
+
+    def regulate(self, setpoint: float) -> None:
+        """Hand over to the vendor's turbidostat for good. Raises: ReactorError if it does not come up."""
+        self.pumps_off(self._config.stop_s)
+        self.handed_over = setpoint
+        try:
+            self.ask_for(AUTOMATION)
+            deadline = self._now_in(GRACE_S)
+            while not self._box.live(AUTOMATION):
+                if self._clock.now() > deadline:
+                    raise DeviceStateError("the vendor's turbidostat does not start; look at its log")
+                self._clock.sleep(0.2 * self._config.speed)
+        except ReactorError:
+            self.handed_over = math.nan
+            raise
+        self.book.write("regulate", setpoint=setpoint)
+
+    def clock_error_s(self) -> float:
+        """The unit's clock minus ours, s. Raises: ReactorError."""
+        said = str(self.web.get("/health").get("utc_time", ""))
+        try:
+            return datetime.fromisoformat(said.replace("Z", "+00:00")).timestamp() - time.time()
+        except ValueError:
+            raise LinkError(f"{self.web.url}: {said!r} is no time") from None
+
+
+def flow(calibrations: object, pump: str, unit: str) -> float:
+    """mL per second at the calibrated duty. Raises: DeviceStateError if the unit has no usable calibration of it."""
+    remedy = f"calibrate it in the vendor's page (Calibrations, {pump}); doses in mL are refused without"
+    try:
+        slope = float(calibrations[pump]["curve_data_"][-2])  # type: ignore[index]
+    except (KeyError, TypeError, IndexError, ValueError):
+        raise DeviceStateError(f"{unit}: no active calibration of the {pump}; {remedy}") from None
+    if not slope > 0.0:
+        raise DeviceStateError(f"{unit}: calibration of the {pump} = {slope} mL/s: allowed > 0; {remedy}")
+    return slope
