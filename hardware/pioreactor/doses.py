@@ -217,17 +217,16 @@ class Doses:
         expected_s = ml / flow if flow > 0.0 else 60.0
         late = began + (expected_s + OVERRUN_S) * self._config.speed
         while self._box.running_pins(self._config.pump_pins) or self._box.live(job):
-            if self._clock.now() > late:
+            if self._clock.now() > late and self._mqtt.connected:
                 yield from self._overrun(job)
                 break
             yield STEP_S
         told = self._told.get(key, 0.0)
         if self._mqtt.breaks != breaks or self._box.lost(job):
-            ran_s = (self._clock.now() - began) / self._config.speed + self._config.start_s
             why = "its process was killed" if self._box.lost(job) else "the broker was lost"
-            return Given(
-                0.0, max(ml, ran_s * flow if ran_s > expected_s + OVERRUN_S else ml), f"{why} in a dose: counted whole"
-            )
+            ran_s = (self._clock.now() - began) / self._config.speed + ROUNDED_S
+            most = max(ml, ran_s * flow) if self._box.lost(job) and self._clock.now() > late else ml
+            return Given(0.0, most, f"{why} in a dose: counted whole")
         if told >= ml - 1e-6:
             return Given(told, told)
         settled = self._clock.now() + SETTLE_S * self._config.speed
