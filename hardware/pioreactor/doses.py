@@ -5,6 +5,7 @@ over when its events add up, its job is gone and its pin is off. One whose fate 
 counted whole; nothing more is dosed until the unit's task queue has proved that it cannot run any more.
 """
 
+import contextlib
 import math
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ from hardware.pioreactor.web import NotHeard, Web
 __all__ = ["Doses", "Given", "Plan"]
 
 STEP_S, ASK_S, OVERRUN_S, SETTLE_S = 0.1, 0.5, 6.0, 1.0  # real seconds
+UNSTARTED_S = 30.0  # real seconds that a process may take from the queue to its first word, on a busy unit
+SHORT_S, AGAIN_S = 0.1, 6.0  # real seconds: a run of a pump that ends with its pin off; between two of them
 ROUNDED_S = 0.5  # a dose that is stopped early is told up to the next half second of its pump
 OURS = "turbidostat/"
 MEDIA, WASTE = "add_media", "remove_waste"
@@ -78,6 +81,7 @@ class Doses:
         self.sample: tuple[float, int] | None = None
         self.carry_ml, self._count = 0.0, 0
         self._course: Course | None = None
+        self._cycled_s = -math.inf
         self._due = 0.0
         self._told: dict[tuple[str, str], float] = {}
         self._booked: dict[tuple[str, str], float] = {}
@@ -208,7 +212,7 @@ class Doses:
         while self._told.get(key, 0.0) <= 0.0 and self._clock.now() < deadline and self._mqtt.breaks == breaks:
             yield STEP_S
         if self._told.get(key, 0.0) <= 0.0:
-            return (yield from self._unknown(key, ml, task, breaks))
+            return (yield from self._unknown(key, ml, task, (breaks, asked)))
         return (yield from self._follow(key, ml, breaks))
 
     def _follow(self, key: tuple[str, str], ml: float, breaks: int) -> Steps:
@@ -245,6 +249,7 @@ class Doses:
         """A pump that runs on: stop it, again and again; while it runs, say what only the operator can do."""
         while pins := self._box.running_pins(self._config.pump_pins):
             self.stop_jobs()
+            self.cycle_pins()
             self.trouble = (
                 f"pin {pins[0]} runs on after {job} should have ended; pull the pump's plug, or on the unit: "
                 f"pio cache clear pwm_locks {pins[0]} --as-int && pio run {job} --duration 0.1"
@@ -252,16 +257,15 @@ class Doses:
             yield self._config.retry_s
         self.trouble = ""
 
-    def _unknown(self, key: tuple[str, str], ml: float, task: str | None, breaks: int) -> Steps:
+    def _unknown(self, key: tuple[str, str], ml: float, task: str | None, at: tuple[int, float]) -> Steps:
         """A request that was, or may have been, written down and did nothing yet: wait until it can do nothing more.
 
         It is over when its task, or one that was queued behind it, was taken from the queue, no job of its name runs
-        and no pin does. Without a break of the broker its events then are the truth.
+        and no pin does. Without a break of the broker its events then are the truth. Args: at: breaks of the broker
+        until it was asked for, and when that was.
         """
-        job = key[0]
-        self.trouble = (
-            f"the fate of a dose of {ml:.2f} mL ({job}) is unknown: the unit's task queue or broker does not answer"
-        )
+        job, (breaks, asked) = key[0], at
+        self.trouble = f"the fate of a dose of {ml:.2f} mL ({job}) is unknown: task queue or broker do not answer"
         self._book.tell(self.trouble)
         taken = False
         while not taken:
@@ -269,14 +273,12 @@ class Doses:
                 self.trouble = ""
                 self._book.tell(f"{job} of {ml:.2f} mL ran late")
                 return (yield from self._follow(key, ml, breaks))
-            try:
+            with contextlib.suppress(ReactorError):
                 task = task or self._web.run(MEDIA, {"help": None}, self._book.env, [])  # stands behind it in the queue
                 taken = self._web.result(task) is not None
-            except ReactorError:
-                pass
             yield ASK_S
-        quiet = self._clock.now() + 4.0 * SETTLE_S * self._config.speed
-        while self._clock.now() < quiet or self._box.live(job) or self._box.running_pins(self._config.pump_pins):
+        latest = self._clock.now() + UNSTARTED_S * self._config.speed  # a process may take long to start
+        while not (self._box.been(job, asked) or self._clock.now() > latest) or not self.off():
             if self._told.get(key, 0.0) > 0.0:
                 self.trouble = ""
                 return (yield from self._follow(key, ml, breaks))
@@ -310,13 +312,11 @@ class Doses:
             or self._box.live(MEDIA)
             or self._box.live(WASTE)
         ):
-            try:
+            with contextlib.suppress(ReactorError):
                 task = task or self._web.run(MEDIA, {"help": None}, self._book.env, [])
                 taken = taken or self._web.result(task) is not None
-            except ReactorError:
-                pass
             yield ASK_S
-        yield 4.0 * SETTLE_S
+        yield UNSTARTED_S
         self.trouble = ""
         given = Given(0.0, history.feed_ml, "its end was not on record: counted whole, its waste not at all")
         self._conclude(history.id, history.on_s, given, Given(0.0, history.waste_ml))
@@ -355,6 +355,23 @@ class Doses:
             ):
                 failed.append(f"{job}: the broker is not there")
         return failed
+
+    def cycle_pins(self) -> None:
+        """Switch a pin that runs although its job is gone on and off: what ends a pump that was left on.
+
+        The vendor refuses it where a killed process left its lock. It moves a tenth of a second's volume, which is
+        counted when its event comes. Asked for at most every few seconds; trouble is left to the next time.
+        """
+        jobs = dict(zip(self._config.pump_pins, (MEDIA, "add_alt_media", WASTE), strict=False))
+        pins = [
+            pin for pin in self._box.running_pins(self._config.pump_pins) if not self._box.live(jobs.get(pin, MEDIA))
+        ]
+        if not pins or self._clock.now() < self._cycled_s + AGAIN_S * self._config.speed:
+            return
+        self._cycled_s = self._clock.now()
+        source = f"{OURS}{self._run}/{self.unit}/off"
+        with contextlib.suppress(ReactorError):
+            self._web.run(jobs[pins[0]], {"duration": SHORT_S, "source-of-event": source}, self._book.env, [])
 
     def stop_by_web(self) -> None:
         """The same by HTTP, which rounds what was given. Raises: ReactorError."""

@@ -41,8 +41,8 @@ class Event(NamedTuple):
 class Mailbox:
     """What one unit said; filled by `take`, which may be called from another thread.
 
-    Attributes: readings and events, newest last, for the driver to take out; duty, of each pin that runs, by pin;
-      states, of each job; temperature, degC; refused, readings that were not believed.
+    Attributes: readings and events, newest last, for the driver to take out; duty, of each pin that runs, by
+      experiment; states, of each job; heard, when a job last told its state; temperature, degC; refused, messages.
     """
 
     def __init__(self, unit: str, experiment: str, channel: str, clock: Clock) -> None:
@@ -53,6 +53,7 @@ class Mailbox:
         self.events: deque[Event] = deque(maxlen=KEPT)
         self.duty: dict[str, dict[int, float]] = {}
         self.states: dict[tuple[str, str], str] = {}
+        self.heard: dict[str, float] = {}
         self.temperature = float("nan")
         self.refused = 0
         self._stamp = ""
@@ -71,7 +72,9 @@ class Mailbox:
     def _enter(self, experiment: str, rest: str, payload: bytes, retained: bool) -> None:
         now, mine = self._clock.now(), experiment == self.experiment
         if rest.endswith("/$state"):
-            self.states[experiment, rest.removesuffix("/$state")] = payload.decode()
+            job = rest.removesuffix("/$state")
+            self.states[experiment, job] = payload.decode()
+            self.heard[job] = self.heard[job] if retained and job in self.heard else now
         elif rest == "pwms/dc":
             self.duty[experiment] = {int(k): float(v) for k, v in json.loads(payload or b"{}").items()}
         elif rest == "dosing_events" and not retained:
@@ -114,6 +117,10 @@ class Mailbox:
         """Whether a job of this name is there, in whatever experiment."""
         with self._lock:
             return any(name == job and state in LIVE for (_, name), state in self.states.items())
+
+    def been(self, job: str, since: float) -> bool:
+        """Whether a job of this name came and went since that clock time."""
+        return self.heard.get(job, float("-inf")) > since and not self.live(job)
 
     def lost(self, job: str) -> bool:
         """Whether a job of this name in our experiment ended without a word: its process was killed."""

@@ -20,6 +20,7 @@ __all__ = ["Station"]
 
 OD, HEAT, STIR, AUTOMATION = "od_reading", "temperature_automation", "stirring", "dosing_automation"
 GRACE_S = 20.0  # real seconds in which a job that was asked for may come up
+WEB_STOP_S = 5.0  # real seconds between two stops by HTTP
 EXCHANGE_ML = 1.0  # of the vendor's turbidostat
 
 
@@ -39,7 +40,8 @@ class Station:
         self.given_up, self.heat_is_off, self.news = False, False, False
         self.fault: Fault | None = None
         self._target = math.nan
-        self._asked_s = -math.inf
+        self._asked_s = self._asked_web_s = -math.inf
+        self._tried = False
         self._web_error = ""
 
     # -- bringing up -----------------------------------------------------------------------------------------------
@@ -211,7 +213,7 @@ class Station:
 
         A dose under way is stopped and followed to its end. Raises: DeviceStateError, LinkError.
         """
-        deadline, first = self._now_in(real_s), True
+        deadline = self._now_in(real_s)
         while True:
             self.poll()
             if self._mqtt.connected and self.doses.off() and not (self.doses.running and not self.doses.trouble):
@@ -219,12 +221,16 @@ class Station:
             if self._clock.now() > deadline:
                 raise DeviceStateError(self._still_on())
             if not self.doses.off() or not self._mqtt.connected:
-                self._stop(first)
-                first = False
+                self._stop()
             self._clock.sleep(0.3 * self._config.speed)
 
-    def _stop(self, first: bool) -> None:
-        if self.doses.stop_jobs() or not first:
+    def _stop(self) -> None:
+        """By MQTT every time; by HTTP, which costs the unit two processes, seldom."""
+        self.doses.cycle_pins()
+        if not self.doses.stop_jobs() and not self._tried:
+            self._tried, self._asked_web_s = True, self._clock.now()  # MQTT first
+        elif self._clock.now() > self._asked_web_s + WEB_STOP_S * self._config.speed:
+            self._asked_web_s = self._clock.now()
             try:
                 self.doses.stop_by_web()
             except ReactorError as error:

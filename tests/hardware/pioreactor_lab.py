@@ -123,7 +123,7 @@ class World(VirtualClock):
     def take(self, task: str, job: str, options: Mapping[str, Any]) -> None:
         """The task queue takes a request."""
         self.results[task] = "help" not in options
-        if job in PINS and "help" not in options:
+        if job in PINS and "ml" in options:
             self.later(BEGIN_S, lambda: self.dose(job, options))
         if job == "od_reading":
             self.later(1.0, self.od_job)
@@ -167,7 +167,7 @@ class FakeWeb:
         world = self.world
         self._up()
         task = f"task{len(world.runs)}"
-        dose = job in PINS and "help" not in options
+        dose = job in PINS and "ml" in options
         if dose and world.heard == "429":
             raise NotHeard("turned away with status 429")
         world.runs.append((job, dict(options)))
@@ -256,4 +256,4 @@ class Lab:
 
     def asked(self, job: str) -> list[Mapping[str, Any]]:
         """Real requests for a pump job."""
-        return [options for name, options in self.world.runs if name == job and "help" not in options]
+        return [options for name, options in self.world.runs if name == job and "ml" in options]

@@ -239,13 +239,31 @@ def test_stop_that_cannot_be_verified_says_which_plug(lab):
         lab.reactors.stop()
 
 
+def test_a_pin_left_on_without_its_job_is_switched_on_and_off(lab):
+    lab.world.pin("remove_waste", True)  # what the vendor's job leaves when it is stopped just as its pump starts
+    lab.wait(1.0)
+    with pytest.raises(DeviceStateError, match="pull the plug"):
+        lab.reactors.stop()
+    shorts = [(job, o) for job, o in lab.world.runs if "duration" in o]
+    assert {job for job, _ in shorts} == {"remove_waste"}
+    assert 2 <= len(shorts) <= 6
+
+
+def test_a_process_that_starts_late_is_waited_for(lab, monkeypatch):
+    monkeypatch.setattr("tests.hardware.pioreactor_lab.BEGIN_S", 25.0)
+    lab.dose(0.5)
+    lab.wait(70.0)
+    assert [row["feed_ml"] for row in lab.of("dose_end")] == [pytest.approx(0.5)]
+    assert lab.world.moved["add_media"] == pytest.approx(0.5)
+
+
 def test_a_dose_left_open_is_counted_whole_and_never_sent_again(monkeypatch, lab):
     lab.dose(0.8)
     rows = [row for row in lab.rows]
     assert replay(rows)[UNIT].open
     again = Lab(monkeypatch, World())
     again.begin(replay(rows)[UNIT])
-    again.wait(20.0)
+    again.wait(50.0)
     (end,) = again.of("dose_end")
     assert (end["feed_low_ml"], end["feed_ml"], end["waste_ml"]) == (0.0, 0.8, 0.0)
     assert not again.asked("add_media")
@@ -263,7 +281,7 @@ def test_an_open_dose_waits_for_a_dead_queue(monkeypatch):
     assert lab.station.fault is not None
     lab.world.event("add_media", 0.5, "turbidostat/old/pio01/1")  # it runs late
     lab.world.revive()
-    lab.wait(10.0)
+    lab.wait(45.0)
     assert [row["feed_ml"] for row in lab.of("dose_end")] == [0.5]
     assert lab.reactors.repeated() == []
 

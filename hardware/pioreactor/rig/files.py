@@ -3,12 +3,14 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-__all__ = ["PINS", "calibration", "layout", "wrapper"]
+__all__ = ["FLOWS", "PINS", "calibration", "layout", "wrapper"]
 
 PINS = {"stirring": 17, "media": 13, "alt_media": 16, "waste": 12, "heating": 18}
 """GPIO pin of each output; 12 and 13 are the two that a chip drives on, whatever becomes of the process."""
 
 CHANNELS = {"stirring": 1, "media": 2, "alt_media": 3, "waste": 4, "heating": 5}  # wiring as shipped
+
+FLOWS = {"media_pump": 1.0, "waste_pump": 2.0}  # mL/s
 
 CONFIG = """[cluster.topology]
 leader_hostname={leader}
@@ -128,10 +130,10 @@ def layout(folder: Path, unit: str, units: Sequence[str], port: int, broker: int
         (folder / "hardware" / "hats" / "1.2" / f"{name}.yaml").write_text(content, encoding="utf-8")
     for pump in ("media_pump", "waste_pump"):
         path = folder / "storage" / "calibrations" / pump / f"rig-{pump}.yaml"
-        path.write_text(calibration(pump, unit), encoding="utf-8")
+        path.write_text(calibration(pump, unit, FLOWS[pump]), encoding="utf-8")
 
 
-def calibration(pump: str, unit: str, flow_ml_s: float = 1.0) -> str:
+def calibration(pump: str, unit: str, flow_ml_s: float) -> str:
     """A calibration of a pump in the vendor's format, which moves `flow_ml_s` at full duty."""
     points = [0.5, 1.0, 2.0]
     return (

@@ -15,7 +15,7 @@ import numpy as np
 from conf.presets import load
 from conf.schema import build
 from envs.plant.plant import Plant, PlantConfig
-from hardware.pioreactor.rig.files import PINS
+from hardware.pioreactor.rig.files import FLOWS, PINS
 
 __all__ = ["VOLTS_PER_OD", "Pulse", "VialServer", "vial_preset"]
 
@@ -39,7 +39,8 @@ def vial_preset(name: str, volume_ml: float, od: float) -> PlantConfig:
     """Preset `conf/plant/NAME.yaml`, pulse dosing, in a vial of this volume. Raises: ValueError for an unknown name."""
     plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
     vessel = replace(plant.vessel, volume_ml=volume_ml, capacity_ml=max(40.0, volume_ml + 4.5))
-    return replace(plant, pump=replace(plant.pump, dosing="pulse"), vessel=vessel, start_od=od)
+    pump = replace(plant.pump, dosing="pulse", gain_ml_s=FLOWS["media_pump"], waste_ml_s=FLOWS["waste_pump"])
+    return replace(plant, pump=pump, vessel=vessel, start_od=od)
 
 
 class _Vial:
