@@ -242,7 +242,7 @@ class Doses:
         return Given(
             max(told - ROUNDED_S * flow, 0.0),
             min(told + ROUNDED_S * flow, ml),
-            f"stopped early: {told:.2f} of {ml:.2f} mL told",
+            f"{told:.2f} of {ml:.2f} mL told: ended early, or its last event was not sent",
         )
 
     def _overrun(self, job: str) -> Course:

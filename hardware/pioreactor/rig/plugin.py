@@ -9,6 +9,7 @@ import json
 import os
 import random
 import socket
+import threading
 import time
 from typing import Any
 
@@ -30,6 +31,15 @@ def ask(what: dict[str, Any]) -> dict[str, Any]:
             return answer
         except OSError:
             return {}
+
+
+def leave_with_the_rig() -> None:
+    """End this process when the rig does not answer any more: somebody killed it."""
+    silent = 0
+    while silent < 3:
+        time.sleep(5.0)
+        silent = 0 if ask({"ask": "truth"}) else silent + 1
+    os._exit(1)
 
 
 def install() -> None:
@@ -73,3 +83,4 @@ def install() -> None:
 
 if PORT:
     install()
+    threading.Thread(target=leave_with_the_rig, daemon=True).start()

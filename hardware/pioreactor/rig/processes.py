@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import shutil
 import signal
@@ -116,8 +117,9 @@ class Rig:
             }[what]
         with (self.folder / f"{name.replace(' ', '-')}.log").open("ab") as log:
             self.processes[name] = subprocess.Popen(
-                command, env=variables, stdout=log, stderr=log, cwd=self.folder, start_new_session=True
-            )
+                command, env=variables, stdout=log, stderr=log, cwd=self.folder, start_new_session=True,
+                preexec_fn=_end_with_us,
+            )  # fmt: skip
 
     def _variables(self, unit: str) -> dict[str, str]:
         home, k = self.folder / unit, self.units.index(unit) + 1
@@ -175,6 +177,12 @@ class Rig:
     def __exit__(self, *raised: object) -> None:
         self.close()
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _end_with_us() -> None:
+    """In a child: be killed when the process that started us is, whatever ended it."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 def _free_port(host: str) -> int:
