@@ -22,7 +22,7 @@ from hardware.pioreactor.web import NotHeard, Web
 __all__ = ["Doses", "Given", "Plan"]
 
 STEP_S, ASK_S, OVERRUN_S, SETTLE_S = 0.1, 0.5, 6.0, 1.0  # real seconds
-UNSTARTED_S = 30.0  # real seconds that a process may take from the queue to its first word, on a busy unit
+UNSTARTED_S = 120.0  # real seconds that a process may take from the queue to its first word, on a busy unit
 SHORT_S, AGAIN_S = 0.1, 6.0  # real seconds: a run of a pump that ends with its pin off; between two of them
 ROUNDED_S = 0.5  # a dose that is stopped early is told up to the next half second of its pump
 OURS = "turbidostat/"

@@ -263,7 +263,7 @@ def test_a_dose_left_open_is_counted_whole_and_never_sent_again(monkeypatch, lab
     assert replay(rows)[UNIT].open
     again = Lab(monkeypatch, World())
     again.begin(replay(rows)[UNIT])
-    again.wait(50.0)
+    again.wait(140.0)
     (end,) = again.of("dose_end")
     assert (end["feed_low_ml"], end["feed_ml"], end["waste_ml"]) == (0.0, 0.8, 0.0)
     assert not again.asked("add_media")
@@ -281,7 +281,7 @@ def test_an_open_dose_waits_for_a_dead_queue(monkeypatch):
     assert lab.station.fault is not None
     lab.world.event("add_media", 0.5, "turbidostat/old/pio01/1")  # it runs late
     lab.world.revive()
-    lab.wait(45.0)
+    lab.wait(140.0)
     assert [row["feed_ml"] for row in lab.of("dose_end")] == [0.5]
     assert lab.reactors.repeated() == []
 
