@@ -209,7 +209,9 @@ class Doses:
         except ReactorError as error:
             self._book.tell(f"{job}: whether it was heard is unknown: {error}")
         deadline = asked + self._config.start_s * self._config.speed
-        while self._told.get(key, 0.0) <= 0.0 and self._clock.now() < deadline and self._mqtt.breaks == breaks:
+        while self._told.get(key, 0.0) <= 0.0 and self._mqtt.breaks == breaks:
+            if self._clock.now() > deadline and not self._box.live(job):  # one that is there is about to begin
+                break
             yield STEP_S
         if self._told.get(key, 0.0) <= 0.0:
             return (yield from self._unknown(key, ml, task, (breaks, asked)))
@@ -283,7 +285,10 @@ class Doses:
                 self.trouble = ""
                 return (yield from self._follow(key, ml, breaks))
             yield STEP_S
+        yield SETTLE_S  # events are sent by a thread of the job and may come after its state
         self.trouble = ""
+        if self._told.get(key, 0.0) > 0.0:
+            return (yield from self._follow(key, ml, breaks))
         if self._mqtt.breaks != breaks:
             return Given(0.0, ml, "asked for while the broker was lost: counted whole")
         return Given(0.0, 0.0, f"accepted and not carried out: {self.locks}")

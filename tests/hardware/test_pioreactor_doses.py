@@ -257,6 +257,15 @@ def test_a_process_that_starts_late_is_waited_for(lab, monkeypatch):
     assert lab.world.moved["add_media"] == pytest.approx(0.5)
 
 
+def test_a_job_that_is_there_is_about_to_begin_and_not_stopped(lab, monkeypatch):
+    monkeypatch.setattr("tests.hardware.pioreactor_lab.BEGIN_S", 20.0)
+    lab.dose(0.5)
+    lab.world.later(11.0, lambda: lab.world.say("add_media/$state", "init"))
+    lab.wait(30.0)
+    assert not lab.of("note")
+    assert [row["feed_ml"] for row in lab.of("dose_end")] == [pytest.approx(0.5)]
+
+
 def test_a_dose_left_open_is_counted_whole_and_never_sent_again(monkeypatch, lab):
     lab.dose(0.8)
     rows = [row for row in lab.rows]
