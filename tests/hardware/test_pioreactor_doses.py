@@ -162,6 +162,17 @@ def test_a_broker_lost_in_a_dose_makes_it_counted_whole(lab):
     assert (end["feed_low_ml"], end["feed_ml"]) == (0.0, 1.0)
 
 
+def test_a_dose_asked_for_just_before_the_broker_died_is_counted_whole(lab):
+    lab.dose(1.0)
+    lab.world.broker, lab.world.mqtt.breaks = False, 1
+    lab.wait(5.0)
+    lab.world.broker = True
+    lab.world.box.forget()
+    lab.wait(140.0)
+    (end,) = lab.of("dose_end")
+    assert (end["feed_low_ml"], end["feed_ml"]) == (0.0, 1.0)
+
+
 def test_events_of_a_dose_stopped_early_are_a_bound_not_the_truth(lab):
     lab.world.stop_after_s = 0.603
     lab.dose(1.4)
@@ -261,7 +272,9 @@ def test_a_job_that_is_there_is_about_to_begin_and_not_stopped(lab, monkeypatch)
     monkeypatch.setattr("tests.hardware.pioreactor_lab.BEGIN_S", 20.0)
     lab.dose(0.5)
     lab.world.later(11.0, lambda: lab.world.say("add_media/$state", "init"))
-    lab.wait(30.0)
+    lab.wait(15.0)
+    monkeypatch.setattr("tests.hardware.pioreactor_lab.BEGIN_S", 0.4)
+    lab.wait(15.0)
     assert not lab.of("note")
     assert [row["feed_ml"] for row in lab.of("dose_end")] == [pytest.approx(0.5)]
 

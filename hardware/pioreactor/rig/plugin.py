@@ -36,7 +36,7 @@ def ask(what: dict[str, Any]) -> dict[str, Any]:
 def leave_with_the_rig() -> None:
     """End this process when the rig does not answer any more: somebody killed it."""
     silent = 0
-    while silent < 3:
+    while silent < 12:
         time.sleep(5.0)
         silent = 0 if ask({"ask": "truth"}) else silent + 1
     os._exit(1)
