@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from hardware.check import Check
 from hardware.errors import ReactorError
 from hardware.pioreactor.config import PioreactorConfig
-from hardware.pioreactor.doses import MEDIA
 from hardware.pioreactor.mailbox import DOSING_JOBS
+from hardware.pioreactor.pump_jobs import MEDIA
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.station import Station, flow
 

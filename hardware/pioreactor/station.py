@@ -8,9 +8,10 @@ from datetime import datetime
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.pioreactor.config import PioreactorConfig
-from hardware.pioreactor.doses import MEDIA, WASTE, Doses, Plan
+from hardware.pioreactor.doses import Doses, Plan
 from hardware.pioreactor.logbook import Log, Logbook
 from hardware.pioreactor.mailbox import Mailbox, Mqtt
+from hardware.pioreactor.pump_jobs import MEDIA, WASTE
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.sampling import Sampling
 from hardware.pioreactor.web import Web
