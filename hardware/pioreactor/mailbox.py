@@ -42,7 +42,8 @@ class Mailbox:
     """What one unit said; filled by `take`, which may be called from another thread.
 
     Attributes: readings and events, newest last, for the driver to take out; duty, of each pin that runs, by
-      experiment; states, of each job; heard, when a job last told its state; temperature, degC; refused, messages.
+      experiment; states, of each job; heard, when a job last told its state; temperature, degC; refused, messages;
+      ran_s, how long each pin has run by the clock, s.
     """
 
     def __init__(self, unit: str, experiment: str, channel: str, clock: Clock) -> None:
@@ -54,6 +55,8 @@ class Mailbox:
         self.duty: dict[str, dict[int, float]] = {}
         self.states: dict[tuple[str, str], str] = {}
         self.heard: dict[str, float] = {}
+        self.ran_s: dict[int, float] = {}
+        self._on: dict[int, float] = {}
         self.temperature = float("nan")
         self.refused = 0
         self._stamp = ""
@@ -76,7 +79,7 @@ class Mailbox:
             self.states[experiment, job] = payload.decode()
             self.heard[job] = self.heard[job] if retained and job in self.heard else now
         elif rest == "pwms/dc":
-            self.duty[experiment] = {int(k): float(v) for k, v in json.loads(payload or b"{}").items()}
+            self._switched({int(k): float(v) for k, v in json.loads(payload or b"{}").items()}, experiment, now)
         elif rest == "dosing_events" and not retained:
             e = json.loads(payload)
             self.events.append(Event(now, e["event"], float(e["volume_change"]), str(e["source_of_event"])))
@@ -84,6 +87,14 @@ class Mailbox:
             self._reading(json.loads(payload), now, retained)
         elif rest == "temperature_automation/temperature" and mine:
             self.temperature = float(json.loads(payload)["temperature"])
+
+    def _switched(self, duty: dict[int, float], experiment: str, now: float) -> None:
+        """The pins that run now, and for how long those ran that do no more."""
+        before, self.duty[experiment] = self.duty.get(experiment, {}), duty
+        for pin in duty.keys() - before.keys():
+            self._on[pin] = now
+        for pin in before.keys() - duty.keys():
+            self.ran_s[pin] = self.ran_s.get(pin, 0.0) + now - self._on.pop(pin, now)
 
     def _reading(self, said: dict[str, Any], now: float, retained: bool) -> None:
         """A retained reading is the last one of whatever was before; one with the stamp of another is the same."""

@@ -21,6 +21,7 @@ __all__ = ["ASK_S", "MEDIA", "OURS", "UNSTARTED_S", "WASTE", "Course", "Given", 
 STEP_S, ASK_S, OVERRUN_S, SETTLE_S = 0.1, 0.5, 6.0, 1.0  # real seconds
 UNSTARTED_S = 120.0  # real seconds that a process may take from the queue to its first word, on a busy unit
 SHORT_S, AGAIN_S = 0.1, 6.0  # real seconds: a run of a pump that ends with its pin off; between two of them
+LATE_ML = 0.1  # messages are late by some hundredths of a second
 ROUNDED_S = 0.5  # a dose that is stopped early is told up to the next half second of its pump
 OURS = "turbidostat/"
 MEDIA, WASTE = "add_media", "remove_waste"
@@ -67,7 +68,7 @@ class PumpJobs:
     def pump(self, job: str, ml: float, dose: str) -> Steps:
         """Ask for one pump job and follow it; what it gave."""
         key = job, dose
-        breaks, asked = self._mqtt.breaks, self._clock.now()
+        breaks, asked, ran_s = self._mqtt.breaks, self._clock.now(), self._ran_s(job)
         task: str | None = None
         try:
             task = self._web.run(job, {"ml": round(ml, 4), "source-of-event": dose}, self._book.env, [])
@@ -81,8 +82,22 @@ class PumpJobs:
                 break
             yield STEP_S
         if self._told.get(key, 0.0) <= 0.0:
-            return (yield from self._unknown(key, ml, task, (breaks, asked)))
-        return (yield from self._follow(key, ml, breaks))
+            return self._at_most((yield from self._unknown(key, ml, task, (breaks, asked))), job, ran_s)
+        return self._at_most((yield from self._follow(key, ml, breaks)), job, ran_s)
+
+    def _at_most(self, given: Given, job: str, before_s: float) -> Given:
+        """What its pin's on-time says beyond its events: a job times itself, and on a busy unit it does that late."""
+        ran_ml = (self._ran_s(job) - before_s) / self._config.speed * self.flow_ml_s[job]
+        if not ran_ml > given.high + LATE_ML:
+            return given
+        return Given(
+            given.low, ran_ml, given.end or f"its pin was on for {ran_ml:.2f} mL, {given.high:.2f} mL were told"
+        )
+
+    def _ran_s(self, job: str) -> float:
+        """How long the pin of a job has run, clock seconds."""
+        pin = self._config.pump_pins[0 if job == MEDIA else -1]
+        return self._box.ran_s.get(pin, 0.0)
 
     def _follow(self, key: tuple[str, str], ml: float, breaks: int) -> Steps:
         """A pump that has begun, until its pin is off and its job gone."""

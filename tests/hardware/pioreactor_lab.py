@@ -32,7 +32,7 @@ class World(VirtualClock):
     """Time, the unit's processes and its vial; `sleep` lets happen what is due.
 
     Switches: web, queue, broker (up or not), lock (a pin lock left behind), heard (how a POST of a dose is answered),
-    kill_after_s (a dose's process is killed so long after its pump began), silent_pump (its events are lost).
+    kill_after_s (a dose's process is killed so long after its pump began), late_s (a job ends its pump so much late).
     """
 
     def __init__(self) -> None:
@@ -45,6 +45,7 @@ class World(VirtualClock):
         self.heard = "yes"
         self.kill_after_s = self.stop_after_s = np.inf
         self.reading, self.od_every_s, self.clock_jump_s = 0.5, 5.0, 0.0
+        self.late_s = 0.0
         self.waiting: list[Callable[[], None]] = []
         self.duty: dict[int, float] = {}
         self.since: dict[int, float] = {}
@@ -113,8 +114,8 @@ class World(VirtualClock):
         if self.kill_after_s < ml:
             self.later(0.03 + self.kill_after_s, lambda: self.say(f"{job}/$state", "lost"))
         else:
-            self.later(0.03 + cut, lambda: self.pin(job, False))
-            self.later(0.05 + cut, lambda: self.end(job))
+            self.later(0.03 + cut + self.late_s, lambda: self.pin(job, False))
+            self.later(0.05 + cut + self.late_s, lambda: self.end(job))
 
     def end(self, job: str) -> None:
         self.jobs.pop(job, None)

@@ -182,6 +182,15 @@ def test_events_of_a_dose_stopped_early_are_a_bound_not_the_truth(lab):
     assert end["feed_low_ml"] <= 0.603 <= end["feed_ml"]
 
 
+def test_a_job_that_ends_its_pump_late_is_counted_by_the_pin(lab):
+    lab.world.late_s = 1.0
+    lab.dose(0.5)
+    lab.wait(10.0)
+    (end,) = lab.of("dose_end")
+    assert lab.world.moved["add_media"] == pytest.approx(1.5)
+    assert (end["feed_low_ml"], end["feed_ml"]) == (pytest.approx(0.5), pytest.approx(1.5))
+
+
 def test_a_dose_of_somebody_else_is_counted_once_and_holds_ours(lab):
     lab.world.event("add_media", 0.5, "UI")
     lab.wait(1.0)
