@@ -22,6 +22,7 @@ from hardware.clock import RealClock
 from hardware.errors import RecordingError
 from hardware.link.open import DeviceLock
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
+from hardware.pioreactor.logbook import Log, no_log
 from hardware.pioreactor.preflight import preflight as preflight_units
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay as replay_units
@@ -79,22 +80,18 @@ def _chibio(opening: Opening) -> Iterator[Reactor]:
 
 
 @contextmanager
-def _units(opening: Opening) -> Iterator[PioreactorReactors]:
+def _units(
+    backend: PioreactorConfig, folder: Path, log_row: Log = no_log, run: str = ""
+) -> Iterator[PioreactorReactors]:
     """Pioreactors that no other client on this computer has, or those of a rig. Raises: ReactorError."""
-    backend, rows = opening.backend, opening.journal.rows
-    began = float(rows[0]["wall"]) if rows else time.time()
     with ExitStack() as stack:
         if isinstance(backend, RigBackendConfig):
-            vials = replace(backend.rig, growth_x=backend.speed)
-            rig = stack.enter_context(Rig(backend.reactors, vials, opening.folder))
+            rig = stack.enter_context(Rig(backend.reactors, replace(backend.rig, growth_x=backend.speed), folder))
             backend = replace(backend, broker="127.0.0.1", broker_port=rig.broker, addresses=dict(rig.web))
             log.info("the vendor's software at %s, cultures %g times real time", rig.web, backend.speed)
         for unit in backend.reactors:
             stack.enter_context(closing(DeviceLock(f"unit {unit} of {backend.broker}:{backend.broker_port}")))
-        reactors = PioreactorReactors(
-            backend, RealClock(backend.speed), opening.journal.append, format(int(began), "x")
-        )
-        yield stack.enter_context(closing(reactors))
+        yield stack.enter_context(closing(PioreactorReactors(backend, RealClock(backend.speed), log_row, run)))
 
 
 @contextmanager
@@ -103,10 +100,12 @@ def _pioreactor(opening: Opening) -> Iterator[Reactor]:
     earlier = opening.journal.rows
     if opening.resumed and not earlier:
         raise RecordingError(f"journal {opening.journal.path}: missing or empty; put it back, or start a new run")
-    with _units(opening) as reactors:
+    began = float(earlier[0]["wall"]) if earlier else time.time()
+    run = format(int(began), "x")
+    with _units(opening.backend, opening.folder, opening.journal.append, run) as reactors:
         if not earlier:
             report(preflight_units(reactors))
-        elapsed_s = (time.time() - float(earlier[0]["wall"])) * opening.backend.speed if earlier else 0.0
+        elapsed_s = (time.time() - began) * opening.backend.speed if earlier else 0.0
         reactors.begin(replay_units(earlier), elapsed_s)
         yield reactors
 
@@ -127,10 +126,8 @@ def preflight(backend: Any, folder: Path, others: Sequence[Check]) -> None:
         with linked(backend) as (transport, clock):
             check(backend, transport, clock, calibrations, folder, others)
     elif isinstance(backend, PioreactorConfig):
-        with closing(Journal(folder / "journal.jsonl")) as journal:
-            opening = Opening(backend, PlantConfig(), journal, folder, False)
-            with _units(opening) as reactors:
-                report([*preflight_units(reactors), *others])
+        with _units(backend, folder) as reactors:
+            report([*preflight_units(reactors), *others])
     else:
         report(others)
 
