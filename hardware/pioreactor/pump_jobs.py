@@ -136,7 +136,7 @@ class PumpJobs:
             self.cycle_pins()
             self.trouble = (
                 f"pin {pins[0]} runs on after {job} should have ended; pull the pump's plug, or on the unit: "
-                f"pio cache clear pwm_locks {pins[0]} --as-int && pio run {job} --duration 0.1"
+                f"pio cache clear pwm_locks {pins[0]} --as-int (it is then cycled from here)"
             )
             yield self._config.retry_s
         self.trouble = ""
