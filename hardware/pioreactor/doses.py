@@ -20,6 +20,7 @@ from hardware.pioreactor.web import Web
 
 __all__ = ["Doses", "Plan"]
 
+CYCLED = "/off"  # ends the id of a pin that we switched on and off
 REPEAT_S = 63.0  # the journal keeps a volume that nobody commanded as one repetition, so long after `on_s`
 
 
@@ -213,8 +214,9 @@ class Doses(PumpJobs):
             feed, waste = (0.0, over) if event.pump == WASTE else (over, 0.0)
             at_s = self._book.elapsed()
             self.extra.append((at_s, feed, waste))
-            self.foreign = f"{event.pump} of {over:.2f} mL without our command ({who})"
-            self._book.tell(self.foreign)
+            said = f"{event.pump} of {over:.2f} mL without our command ({who})"
+            self.foreign = self.foreign if event.source.endswith(CYCLED) else said
+            self._book.tell(said)
             self._book.note_down(
                 "dose_end", verified_off=True, on_s=at_s - REPEAT_S, feed_ml=feed, waste_ml=waste,
                 feed_times=int(feed > 0.0), waste_times=int(waste > 0.0), repeated_ml=feed, source=event.source,
