@@ -161,7 +161,11 @@ class Station:
             return Fault("mode", self.doses.foreign, "one client per unit; it is counted")
         if not self._box.live(OD) and self._clock.now() > self._asked_s + GRACE_S * self._config.speed:
             self._again(OD)
-            return Fault("stopped", "the unit takes no OD readings", "it is asked for them again")
+            return Fault(
+                "stopped",
+                "the unit takes no OD readings",
+                "asked for again; one that was killed bars its successor: reboot the unit",
+            )
         if self._web_error:
             return Fault("link", self._web_error, "check the unit's web server")
         return None

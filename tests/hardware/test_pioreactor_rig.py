@@ -176,6 +176,9 @@ def test_a_kill(bench, what, moment, repeat):
         subprocess.run(command, check=True, capture_output=True)  # the operator
     assert bench.settled(200.0)
     bench.judge()
+    if what == "od_reading":  # the vendor lets no second one start until the unit is rebooted
+        bench.reactors.stop()
+        return
     assert bench.sample(90.0)
     bench.dose(0.3)
     assert bench.settled()
