@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import getpass
 import os
 import shutil
 import signal
@@ -80,7 +81,9 @@ class Rig:
 
     def _start(self) -> None:
         conf = self.folder / "mosquitto.conf"
-        conf.write_text(f"listener {self.broker} 127.0.0.1\nallow_anonymous true\n", encoding="utf-8")
+        conf.write_text(
+            f"listener {self.broker} 127.0.0.1\nallow_anonymous true\nuser {getpass.getuser()}\n", encoding="utf-8"
+        )
         self.start("broker")
         _wait(lambda: _listens("127.0.0.1", self.broker), "the broker")
         for unit in self.units:
