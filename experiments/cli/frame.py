@@ -164,7 +164,7 @@ class Command(Generic[T]):
         logging.raiseExceptions = False  # a log that cannot be written costs its line, not the run
         threading.excepthook = _in_thread
         try:
-            with stop.interrupts():
+            with stop.interrupts(), stop.unmasked():
                 self._answer(sys.argv[1:])
             sys.stdout.flush()
         except BrokenPipeError:  # `--help | head`: whoever reads has seen enough
@@ -273,7 +273,8 @@ class Command(Generic[T]):
                 config = load(cfg, self.fitting(cfg))
                 save_config(config, folder)
                 extensions.keep(folder)
-            return self.body(config, folder)
+            with stop.unmasked():
+                return self.body(config, folder)
         except KeyboardInterrupt:
             print(f"stopped; {self._left(folder)}", file=sys.stderr)
             sys.exit(stop.STATUS)
@@ -315,7 +316,8 @@ class Command(Generic[T]):
                 job.put_aside()
                 save_config(config, folder)
                 extensions.keep(folder)
-            objective = self.body(config, folder)
+            with stop.unmasked():
+                objective = self.body(config, folder)
             job.save("finished", objective)
             return objective
         except BrokenPipeError:

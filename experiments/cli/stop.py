@@ -13,7 +13,7 @@ from typing import ParamSpec, TypeVar
 
 from experiments.cli import extensions
 
-__all__ = ["SIGNALS", "STATUS", "Pause", "Workers", "handled", "interrupts", "pausing"]
+__all__ = ["SIGNALS", "STATUS", "Pause", "Workers", "handled", "interrupts", "pausing", "unmasked"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -47,6 +47,20 @@ def interrupts() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def unmasked() -> Iterator[None]:
+    """A stop comes out as KeyboardInterrupt, also where an extension module was being loaded: it tells an ImportError."""
+    try:
+        yield
+    except (ImportError, SystemError) as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
+            raise
+        raise KeyboardInterrupt from error
+
+
 class Pause:
     """Signals that wait until the work can be saved, and then go to whoever listened for them before.
 
@@ -63,8 +77,11 @@ class Pause:
         return bool(self._came)
 
     def answer(self, number: int, stack: FrameType | None) -> None:
-        """Handle a signal. A second one from the user ends the program at once; a cluster may repeat its own."""
-        if self._came and self._ours(number):
+        """Handle a signal. A second one from the user ends the program at once; a cluster may repeat its own.
+
+        A worker hears it from the terminal and from its command, which then waits for it.
+        """
+        if self._came and self._ours(number) and multiprocessing.parent_process() is None:
             print("stopped at once; what was saved before is whole", file=sys.stderr, flush=True)
             os._exit(STATUS)
         if not self._came:

@@ -15,7 +15,7 @@ import pytest
 
 from dqn import checkpoint
 from experiments.ablate import AblateConfig, _read
-from experiments.cli import frame
+from experiments.cli import frame, stop
 from experiments.training.config import TrainConfig
 from experiments.training.session import Session
 
@@ -129,6 +129,36 @@ def test_a_stopped_benchmark_ends_its_workers(tmp_path: Path) -> None:
     os.killpg(run.process.pid, signal.SIGTERM)  # its workers get it too
     assert run.end() == "stopped; run keeps training/; to try again, start anew"
     assert (tmp_path / "run/training/dqn/checkpoint.pt").is_file()
+
+
+def _saves(folder: Path) -> None:
+    """Work that can be saved between two steps, of half a second each."""
+    with stop.pausing("at the end of this step") as stopping:
+        (folder / str(os.getpid())).touch()
+        while not stopping():
+            time.sleep(0.5)
+        (folder / "saved").touch()
+
+
+def test_a_worker_told_by_the_terminal_and_by_its_command_saves_what_it_did(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), stop.Workers(1) as workers:
+        workers.submit(_saves, tmp_path)
+        while not (there := list(tmp_path.iterdir())):
+            time.sleep(0.02)
+        os.kill(int(there[0].name), signal.SIGTERM)
+        time.sleep(0.1)
+        raise KeyboardInterrupt
+    assert (tmp_path / "saved").is_file()
+
+
+def test_a_stop_while_an_extension_module_loads_is_a_stop() -> None:
+    with pytest.raises(KeyboardInterrupt), stop.unmasked():
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as stopped:
+            raise ImportError("initialization failed") from stopped
+    with pytest.raises(ImportError, match="no module"), stop.unmasked():
+        raise ImportError("no module")
 
 
 def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
