@@ -13,7 +13,7 @@ KINDS = {
     "From a recording to a reactor": ("demo", "calibrate", "train", "certify", "deploy", "report"),
     "At the device": ("calibrate_pump", "blank", "mark"),
     "Comparisons and studies": ("benchmark", "ablate", "degradation", "dual_chamber", "speed"),
-    "Rehearsing what goes wrong": ("fault_matrix", "kill_campaign", "soak"),
+    "Rehearsing what goes wrong": ("fault_matrix", "kill_campaign", "soak", "rig_faults"),
 }
 DEMO = "The whole way in one command: calibrate, train, deploy, report."
 USAGE = """\

@@ -49,7 +49,7 @@ def interrupts() -> Iterator[None]:
 
 @contextmanager
 def unmasked() -> Iterator[None]:
-    """A stop comes out as KeyboardInterrupt, also where an extension module was being loaded: it tells an ImportError."""
+    """A stop is a KeyboardInterrupt, also where an extension module that was being loaded made an ImportError of it."""
     try:
         yield
     except (ImportError, SystemError) as error:

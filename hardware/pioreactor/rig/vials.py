@@ -1,6 +1,7 @@
 """Our vials as the vendor's software meets them: volts of a photodiode, duties of pins, a temperature."""
 
 import json
+import math
 import os
 import socket
 import threading
@@ -44,7 +45,10 @@ def vial_preset(name: str, volume_ml: float, od: float) -> PlantConfig:
 
 
 class _Vial:
-    """One culture with its two pumps, in real seconds; growth alone runs `growth_x` times faster."""
+    """One culture with its two pumps, in real seconds; growth alone runs `growth_x` times faster.
+
+    Attributes: offset_od, added to what the photodiode sees; held_od, what it sees for ever, nan for the culture.
+    """
 
     def __init__(self, unit: str, plant: Plant, growth_x: float, log: Any) -> None:
         self.unit, self.plant, self._growth_x, self._log = unit, plant, growth_x, log
@@ -54,6 +58,13 @@ class _Vial:
         self._since: dict[int, tuple[float, float]] = {}
         self.pulses: list[Pulse] = []
         self.peak_ml = float(plant.vessel.volume_ml[0])
+        self.offset_od, self.held_od = 0.0, math.nan
+
+    @property
+    def seen_od(self) -> float:
+        """What the photodiode sees."""
+        true = float(self.plant.apparent_od[0]) if math.isnan(self.held_od) else self.held_od
+        return true + self.offset_od
 
     def sync(self, now: float) -> None:
         """Let time pass up to now."""
@@ -155,7 +166,7 @@ class VialServer:
             return {"ok": True}
         if asked.get("ask") == "temperature":
             return {"temperature": float(vial.plant.thermal.temperature[0])}
-        return {"volts": VOLTS_PER_OD * float(vial.plant.apparent_od[0])}
+        return {"volts": VOLTS_PER_OD * vial.seen_od}
 
     def close(self) -> None:
         """End the thread. Idempotent."""
