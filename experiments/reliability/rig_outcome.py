@@ -158,7 +158,9 @@ def _volumes(fault: RigFault, mine: Sequence[Mapping[str, Any]], seen: Seen, fou
     found.low_ml = sum(row.get("feed_low_ml", row["feed_ml"]) for row in ends)
     found.high_ml = sum(row["feed_ml"] for row in ends)
     vials = seen.vials[SICK]
-    found.true_ml, found.peak_ml = vials[-1]["fed_ml"] - vials[0]["fed_ml"], vials[-1]["peak_ml"]
+    began = seen.journal[0]["wall"]
+    before = max((row["fed_ml"] for row in vials if row["wall"] <= began), default=0.0)
+    found.true_ml, found.peak_ml = vials[-1]["fed_ml"] - before, vials[-1]["peak_ml"]
     bounds = found.low_ml * (1.0 - SHARE) - SLACK_ML, found.high_ml * (1.0 + SHARE) + SLACK_ML
     if not (fault.flow or bounds[0] <= found.true_ml <= bounds[1]):
         found.wrong.append(f"fed {found.true_ml:.2f} mL, on record {found.low_ml:.2f} to {found.high_ml:.2f} mL")
