@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from experiments.control.loop import ClosedLoop, Step
 from experiments.controllers.base import Accounts, Remembers
-from hardware.chibio.resume import dosed, replay
+from hardware.chibio.resume import dosed
 from hardware.errors import RecordingError
 from hardware.reactor import Receipt
 from hardware.safety.config import Response
@@ -277,5 +277,5 @@ def _catch_up(loop: ClosedLoop, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def _put_off(rows: Sequence[Mapping[str, Any]], loop: ClosedLoop) -> Array:
     """What the driver last put off to the next dose by these rows of a journal, mL, (N,)."""
-    known = replay(rows)
-    return np.array([known[name].carry_ml if name in known else 0.0 for name in loop.reactors.names])
+    last = {row["reactor"]: float(row["carry_ml"]) for row in rows if row["kind"] == "intent"}
+    return np.array([last.get(name, 0.0) for name in loop.reactors.names])

@@ -132,6 +132,8 @@ class Doses(PumpJobs):
 
     def work(self) -> None:
         """Do what is due; called again and again."""
+        if self._course is None and (lost := [job for job in (MEDIA, WASTE) if self._box.lost(job)]):
+            self._course = self.prove_off(lost[0])
         if self._course is None or self._clock.now() < self._due:
             return
         try:
@@ -194,8 +196,14 @@ class Doses(PumpJobs):
                 taken = taken or self._web.result(task) is not None
             yield ASK_S
         yield UNSTARTED_S
+        most = history.feed_ml
+        for job in (MEDIA, WASTE):
+            if self._box.lost(job):
+                yield from self.prove_off(job)
+                on_s = (self._book.elapsed() - history.on_s) / self._config.speed
+                most = max(most, on_s * self.flow_ml_s[job]) if job == MEDIA else most
         self.trouble = ""
-        given = Given(0.0, history.feed_ml, "its end was not on record: counted whole, its waste not at all")
+        given = Given(0.0, most, "its end was not on record: counted whole, its waste not at all")
         self._conclude(history.id, history.on_s, given, Given(0.0, history.waste_ml))
 
     # -- what nobody commanded -------------------------------------------------------------------------------------

@@ -62,6 +62,7 @@ class PumpJobs:
         self._config, self._clock, self._book, self._run = config, clock, book, run
         self.flow_ml_s = {MEDIA: math.nan, WASTE: math.nan}
         self.trouble = ""
+        self.doubt: set[str] = set()  # jobs whose process was killed: whether their pumps run is not known
         self._cycled_s = -math.inf
         self._told: dict[tuple[str, str], float] = {}
 
@@ -104,17 +105,16 @@ class PumpJobs:
         job, began, flow = key[0], self._clock.now(), self.flow_ml_s[key[0]]
         expected_s = ml / flow if flow > 0.0 else 60.0
         late = began + (expected_s + OVERRUN_S) * self._config.speed
-        while self._box.running_pins(self._config.pump_pins) or self._box.live(job):
+        while (self._box.running_pins(self._config.pump_pins) or self._box.live(job)) and not self._box.lost(job):
             if self._clock.now() > late and self._mqtt.connected:
                 yield from self._overrun(job)
                 break
             yield STEP_S
         told = self._told.get(key, 0.0)
         if self._mqtt.breaks != breaks or self._box.lost(job):
-            why = "its process was killed" if self._box.lost(job) else "the broker was lost"
-            ran_s = (self._clock.now() - began) / self._config.speed + ROUNDED_S
-            most = max(ml, ran_s * flow) if self._box.lost(job) and self._clock.now() > late else ml
-            return Given(0.0, most, f"{why} in a dose: counted whole")
+            if not self._box.lost(job):
+                return Given(0.0, ml, "the broker was lost in a dose: counted whole")
+            return (yield from self._killed(job, ml, began))
         if told >= ml - 1e-6:
             return Given(told, told)
         settled = self._clock.now() + SETTLE_S * self._config.speed
@@ -141,6 +141,39 @@ class PumpJobs:
             yield self._config.retry_s
         self.trouble = ""
 
+    def _killed(self, job: str, ml: float, began: float) -> Steps:
+        """What a job gave whose process was killed: at most what its pump moves until it is proven off."""
+        yield from self.prove_off(job)
+        ran_s = (self._clock.now() - began) / self._config.speed + ROUNDED_S
+        why = "its process was killed: counted as if its pump had run until it was proven off"
+        return Given(0.0, max(ml, ran_s * self.flow_ml_s[job]), why)
+
+    def prove_off(self, job: str) -> Course:
+        """Switch the pin of a killed job on and off until the unit says that it did.
+
+        The process may have been killed between the pin and the word on it, so that what was told of the pin says
+        nothing. The lock that it left refuses every further job of that pump, also this one, until the operator clears
+        it; that is what the trouble says meanwhile.
+        """
+        self.doubt.add(job)
+        pin, source = self._config.pump_pins[0 if job == MEDIA else -1], f"{OURS}{self._run}/{self.unit}/off"
+        self.trouble = (
+            f"pin {pin} may run on after {job}, whose process was killed; pull the pump's plug, or on the unit: "
+            f"pio cache clear pwm_locks {pin} --as-int (it is then cycled from here)"
+        )
+        self._book.tell(self.trouble)
+        while True:
+            told, again = self._told.get((job, source), 0.0), self._clock.now() + AGAIN_S * self._config.speed
+            with contextlib.suppress(ReactorError):
+                self._web.run(job, {"duration": SHORT_S, "source-of-event": source}, self._book.env, [])
+            while self._clock.now() < again or self._box.live(job):
+                yield STEP_S
+                cycled = self._told.get((job, source), 0.0) > told and not self._box.lost(job)
+                if cycled and not self._box.live(job) and pin not in self._box.running_pins([pin]):
+                    self.doubt.discard(job)
+                    self.trouble = ""
+                    return
+
     def _unknown(self, key: tuple[str, str], ml: float, task: str | None, at: tuple[int, float]) -> Steps:
         """A request that was, or may have been, written down and did nothing yet: wait until it can do nothing more.
 
@@ -163,6 +196,8 @@ class PumpJobs:
             yield ASK_S
         latest = self._clock.now() + UNSTARTED_S * self._config.speed  # a process may take long to start
         while not (self._box.been(job, asked) or self._clock.now() > latest) or not self.off():
+            if self._box.lost(job):
+                return (yield from self._killed(job, ml, asked))
             if self._told.get(key, 0.0) > 0.0:
                 self.trouble = ""
                 return (yield from self._follow(key, ml, breaks))
@@ -217,5 +252,7 @@ class PumpJobs:
             self._web.post(f"/jobs/stop?job_name={job}")
 
     def off(self) -> bool:
-        """Whether no pump runs and no dosing job of ours is there, by what the unit said last."""
-        return not (self._box.running_pins(self._config.pump_pins) or self._box.live(MEDIA) or self._box.live(WASTE))
+        """Whether no pump runs, no dosing job of ours is there and none was killed, by what the unit said last."""
+        doubt = self.doubt or any(self._box.lost(job) for job in (MEDIA, WASTE))
+        live = self._box.live(MEDIA) or self._box.live(WASTE)
+        return not (self._box.running_pins(self._config.pump_pins) or live or doubt)

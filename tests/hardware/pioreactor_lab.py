@@ -32,7 +32,8 @@ class World(VirtualClock):
     """Time, the unit's processes and its vial; `sleep` lets happen what is due.
 
     Switches: web, queue, broker (up or not), lock (a pin lock left behind), heard (how a POST of a dose is answered),
-    kill_after_s (a dose's process is killed so long after its pump began), late_s (a job ends its pump so much late).
+    kill_after_s (a dose's process is killed so long after its pump began), late_s (a job ends its pump so much late),
+    mute (a pin that goes on is not told).
     """
 
     def __init__(self) -> None:
@@ -46,6 +47,7 @@ class World(VirtualClock):
         self.kill_after_s = self.stop_after_s = np.inf
         self.reading, self.od_every_s, self.clock_jump_s = 0.5, 5.0, 0.0
         self.late_s = 0.0
+        self.mute = False
         self.waiting: list[Callable[[], None]] = []
         self.duty: dict[int, float] = {}
         self.since: dict[int, float] = {}
@@ -92,11 +94,13 @@ class World(VirtualClock):
     def pin(self, job: str, on: bool) -> None:
         pin = PINS[job]
         if on:
-            self.duty[pin], self.since[pin] = 100.0, self.now()
+            self.duty[pin] = 100.0
+            self.since.setdefault(pin, self.now())
         elif pin in self.duty:
             del self.duty[pin]
-            self.moved[job] += self.now() - self.since[pin]
-        self.say("pwms/dc", json.dumps(self.duty), retained=True)
+            self.moved[job] += self.now() - self.since.pop(pin)
+        if not (on and self.mute):
+            self.say("pwms/dc", json.dumps(self.duty), retained=True)
 
     def dose(self, job: str, options: Mapping[str, Any]) -> None:
         """What one pump job does, 1 mL/s."""
@@ -112,10 +116,27 @@ class World(VirtualClock):
             self.later(0.5 * k, lambda part=part: self.event(job, part, source))  # type: ignore[misc]
         self.later(0.03, lambda: self.pin(job, True))
         if self.kill_after_s < ml:
-            self.later(0.03 + self.kill_after_s, lambda: self.say(f"{job}/$state", "lost"))
+            self.later(0.03 + self.kill_after_s, lambda: self.killed(job))
         else:
             self.later(0.03 + cut + self.late_s, lambda: self.pin(job, False))
             self.later(0.05 + cut + self.late_s, lambda: self.end(job))
+
+    def killed(self, job: str) -> None:
+        """kill -9 of a pump job: its lock stays, and its pin as it was."""
+        self.lock = True
+        self.jobs.pop(job, None)
+        self.say(f"{job}/$state", "lost")
+
+    def cycle(self, job: str, options: Mapping[str, Any]) -> None:
+        """A short run of a pump, which leaves its pin off whatever it was; a lock refuses it."""
+        self.jobs[job] = True
+        self.say(f"{job}/$state", "ready")
+        seconds = float(options["duration"])
+        if not self.lock:
+            self.event(job, seconds, str(options["source-of-event"]))
+            self.pin(job, True)
+            self.later(seconds, lambda: self.pin(job, False))
+        self.later(seconds + 0.1, lambda: self.end(job))
 
     def end(self, job: str) -> None:
         self.jobs.pop(job, None)
@@ -126,6 +147,8 @@ class World(VirtualClock):
         self.results[task] = "help" not in options
         if job in PINS and "ml" in options:
             self.later(BEGIN_S, lambda: self.dose(job, options))
+        if job in PINS and "duration" in options:
+            self.later(BEGIN_S, lambda: self.cycle(job, options))
         if job == "od_reading":
             self.later(1.0, self.od_job)
         if job == "dosing_automation":

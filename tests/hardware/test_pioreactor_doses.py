@@ -82,19 +82,25 @@ def test_a_pin_lock_left_behind_is_a_dose_that_was_accepted_and_not_given(lab):
     assert len(lab.asked("add_media")) == 1
 
 
-def test_a_killed_dose_whose_pin_runs_on_is_an_alarm_and_counted_until_it_is_off(lab):
-    lab.world.kill_after_s = 0.2
+@pytest.mark.parametrize("mute", [False, True], ids=["told", "killed before its pin was told"])
+def test_a_killed_dose_whose_pin_runs_on_is_an_alarm_and_counted_until_it_is_proven_off(lab, mute):
+    lab.world.kill_after_s, lab.world.mute = 0.2, mute
     lab.dose(0.5)
     lab.wait(15.0)
     assert lab.station.fault is not None
     assert lab.station.fault.kind == "pump"
     assert f"pwm_locks {MEDIA_PIN} --as-int" in lab.station.fault.detail
     assert not lab.of("dose_end")
-    lab.world.pin("add_media", False)  # the operator
-    lab.world.kill_after_s = np.inf
+    with pytest.raises(DeviceStateError, match="pull the plug"):
+        lab.reactors.stop()
+    lab.world.lock, lab.world.mute, lab.world.kill_after_s = False, False, np.inf  # the operator
     lab.wait(10.0)
-    (end,) = lab.of("dose_end")
-    assert end["feed_low_ml"] <= lab.world.moved["add_media"] <= end["feed_ml"]
+    end, cycled = lab.of("dose_end")
+    assert end["feed_low_ml"] <= lab.world.moved["add_media"] <= end["feed_ml"] + cycled["feed_ml"]
+    assert cycled["source"].endswith("/off")
+    assert lab.station.fault is None
+    assert not lab.world.duty
+    lab.reactors.stop()
     assert len(lab.asked("add_media")) == 1
 
 
@@ -255,6 +261,7 @@ def test_stop_ends_jobs_by_mqtt_and_is_verified(lab):
 
 def test_stop_that_cannot_be_verified_says_which_plug(lab):
     lab.world.pin("add_media", True)
+    lab.world.lock = True
     with pytest.raises(DeviceStateError, match="pull the plug"):
         lab.reactors.stop()
 
@@ -262,11 +269,27 @@ def test_stop_that_cannot_be_verified_says_which_plug(lab):
 def test_a_pin_left_on_without_its_job_is_switched_on_and_off(lab):
     lab.world.pin("remove_waste", True)  # what the vendor's job leaves when it is stopped just as its pump starts
     lab.wait(1.0)
+    lab.reactors.stop()
+    (short,) = [(job, o) for job, o in lab.world.runs if "duration" in o]
+    assert short[0] == "remove_waste"
+    assert not lab.world.duty
+
+
+def test_a_locked_pin_left_on_is_tried_seldom_and_told(lab):
+    lab.world.pin("remove_waste", True)
+    lab.world.lock = True
     with pytest.raises(DeviceStateError, match="pull the plug"):
         lab.reactors.stop()
-    shorts = [(job, o) for job, o in lab.world.runs if "duration" in o]
-    assert {job for job, _ in shorts} == {"remove_waste"}
-    assert 2 <= len(shorts) <= 6
+    assert 2 <= len([o for _, o in lab.world.runs if "duration" in o]) <= 6
+
+
+def test_a_job_that_was_killed_before_this_run_is_proven_off_first(lab):
+    lab.world.say("remove_waste/$state", "lost")
+    lab.wait(0.3)
+    assert lab.dose(0.5) == 0.0
+    lab.wait(10.0)
+    assert lab.station.fault is None
+    assert [row["waste_ml"] for row in lab.of("dose_end")] == [pytest.approx(0.1)]
 
 
 def test_a_process_that_starts_late_is_waited_for(lab, monkeypatch):
