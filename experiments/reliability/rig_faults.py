@@ -112,7 +112,7 @@ def left_lock(t: Trial) -> None:
     t.run_job("add_media", ml=0.2, source_of_event="before")
     t.until(t.pumping, 20.0)
     kill_job("add_media")(t)
-    t.rig.vials.vials[SICK].drive(MEDIA_PIN, 0.0, 0, time.time())  # somebody switched the power off and on
+    t.rig.vials.power_cut(SICK)  # of the pumps, by hand
 
 
 def cannot_start(t: Trial) -> None:

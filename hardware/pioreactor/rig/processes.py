@@ -32,6 +32,7 @@ WEB = (
     "web.create_app().run(host=os.environ['RIG_HOST'], port=int(os.environ['RIG_WEB_PORT']), threaded=True)\n"
 )
 BOOT_S = 40.0
+UNIT = ("web", "tasks", "monitor")  # what boots with a unit; without any job the list of jobs is an error
 CONSUMER = ("-n", "-b", "1.001", "-w", "4", "-f", "-C", "-d", "0.05")  # of the task queue, as on a unit
 
 
@@ -93,9 +94,8 @@ class Rig:
                 script.write_text(wrapper(self._bin / name, self._variables(unit)), encoding="utf-8")
                 script.chmod(0o755)
             shutil.copy(Path(__file__).with_name("plugin.py"), self.folder / unit / "plugins" / "rig_plugin.py")
-            self.start(f"{unit} web")
-            self.start(f"{unit} tasks")
-            self.start(f"{unit} monitor")  # as on every unit: without any job the list of jobs is an error
+            for name in UNIT:
+                self.start(f"{unit} {name}")
         for unit, url in self.web.items():
             _wait(lambda url=url: _answers(f"{url}/unit_api/health"), f"the web server of {unit}")
             for pump in ("media_pump", "waste_pump"):
@@ -143,6 +143,23 @@ class Rig:
         self.processes[name].kill()
         self.processes[name].wait()
 
+    def reboot(self, unit: str) -> None:
+        """A unit loses its power and boots: its processes end at once, its pins fall to 0, what lay in memory is gone.
+
+        Raises: DeviceStateError if its web server does not come back.
+        """
+        for name in UNIT:
+            self.kill(f"{unit} {name}")
+        for pid in self._left(f"{self.folder / unit}\0"):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.vials.power_cut(unit)
+        shutil.rmtree(self.folder / unit / "cache")
+        (self.folder / unit / "cache").mkdir()
+        for name in UNIT:
+            self.start(f"{unit} {name}")
+        _wait(lambda: _answers(f"{self.web[unit]}/unit_api/health"), f"the web server of {unit}")
+
     def jobs(self, unit: str, job: str) -> list[int]:
         """Process ids of the vendor's jobs of this name on a unit, by what the system says of them."""
         found = []
@@ -160,14 +177,14 @@ class Rig:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             process.wait()
-        for pid in self._left():
+        for pid in self._left(f"{self.folder}/"):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         self.vials.close()
 
-    def _left(self) -> list[int]:
+    def _left(self, place: str) -> list[int]:
         """Jobs that the task queues started: they have sessions of their own, and our folder in their environment."""
-        found, home = [], f"RUN_PIOREACTOR={self.folder}/".encode()
+        found, home = [], f"RUN_PIOREACTOR={place}".encode()
         for path in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 if home in (path / "environ").read_bytes() and int(path.name) != os.getpid():

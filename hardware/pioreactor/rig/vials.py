@@ -130,6 +130,7 @@ class VialServer:
         self._wire.bind(("127.0.0.1", 0))
         self._wire.settimeout(0.05)
         self.port = int(self._wire.getsockname()[1])
+        self._lock = threading.Lock()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="vials", daemon=True)
         self._thread.start()
@@ -142,17 +143,20 @@ class VialServer:
         while not self._ended.is_set():
             try:
                 data, sender = self._wire.recvfrom(4096)
-                self._wire.sendto(json.dumps(self._answer(json.loads(data))).encode(), sender)
+                with self._lock:
+                    answer = self._answer(json.loads(data))
+                self._wire.sendto(json.dumps(answer).encode(), sender)
             except TimeoutError:
                 pass
             except (OSError, ValueError, KeyError, TypeError) as error:
                 self._log({"error": f"{type(error).__name__}: {error}"})
             now = time.time()
-            for vial in self.vials.values():
-                vial.sync(now)
-                vial.reap(now)
-                if now - told >= 1.0:
-                    self._log({"unit": vial.unit, **vial.truth()})
+            with self._lock:
+                for vial in self.vials.values():
+                    vial.sync(now)
+                    vial.reap(now)
+                    if now - told >= 1.0:
+                        self._log({"unit": vial.unit, **vial.truth()})
             told = now if now - told >= 1.0 else told
 
     def _answer(self, asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,6 +171,13 @@ class VialServer:
         if asked.get("ask") == "temperature":
             return {"temperature": float(vial.plant.thermal.temperature[0])}
         return {"volts": VOLTS_PER_OD * vial.seen_od}
+
+    def power_cut(self, unit: str) -> None:
+        """Every pin of a unit falls to 0."""
+        vial = self.vials[unit]
+        with self._lock:
+            for pin in vial.duty:
+                vial.drive(pin, 0.0, 0, time.time())
 
     def close(self) -> None:
         """End the thread. Idempotent."""
