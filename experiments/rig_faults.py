@@ -95,6 +95,7 @@ def _strike(trial: Trial, fault: RigFault, moment: str, struck: list[float], sto
         return "stopped"
     if fault.mend is not None:
         fault.mend(trial)
+    trial.until(trial.near, LATE_S)
     return "" if trial.doses(2, LATE_S) else "no dose any more after it"
 
 

@@ -25,6 +25,7 @@ __all__ = ["MEDIA_PIN", "SETPOINT", "SICK", "WASTE_PIN", "WELL", "Seen", "Trial"
 SICK, WELL = "pio01", "pio02"
 MEDIA_PIN, WASTE_PIN = 13, 12
 SETPOINT = 0.5  # OD
+NEAR_OD = 0.03
 START_S, END_S = 90.0, 60.0  # real seconds for a client to dose, and to end
 
 
@@ -122,6 +123,10 @@ class Trial:
     def pumping(self, pin: int = MEDIA_PIN) -> bool:
         """Whether a pump of the sick unit runs."""
         return self.rig.vials.vials[SICK].duty[pin] > 0.0
+
+    def near(self) -> bool:
+        """Whether the sick culture is at its setpoint, in truth."""
+        return abs(float(self.rig.vials.vials[SICK].plant.apparent_od[0]) - SETPOINT) < NEAR_OD
 
     def journal(self) -> list[dict[str, Any]]:
         """The journal up to now."""
