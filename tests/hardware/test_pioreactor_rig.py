@@ -4,109 +4,18 @@ Each takes half a minute; `PIOREACTOR_KILLS=5` repeats every kill five times.
 """
 
 import os
-import subprocess
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hardware.clock import RealClock
 from hardware.errors import ReactorError
-from hardware.pioreactor.config import RigBackendConfig
-from hardware.pioreactor.preflight import preflight
-from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.resume import replay
-from hardware.pioreactor.rig.build import CACHE, missing
-from hardware.pioreactor.rig.processes import Rig, RigConfig
-from hardware.reactor import Command
-from hardware.storage.journal import Journal
+from tests.hardware.pioreactor_bench import EACH_ML, UNIT, Bench, need_the_rig
 
-pytest.importorskip("paho.mqtt.client", reason="pip install 'paho-mqtt>=2'")
-if not (CACHE / "env" / "done").exists():
-    pytest.skip("build it with: python -m hardware.pioreactor.rig", allow_module_level=True)
-if missing():
-    pytest.skip(f"the vendor's software cannot run here: {missing()}", allow_module_level=True)
-pytestmark = pytest.mark.slow
+need_the_rig()
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pioreactor")]  # one rig at a time
 
-UNIT, SPEED, EACH_ML = "pio01", 5.0, 0.1  # mL: a busy computer is late by 60 ms
 REPEATS = int(os.environ.get("PIOREACTOR_KILLS", "1"))
-
-
-class Bench:
-    """One unit in the rig, and lives of the driver that end without a word and go on from the journal."""
-
-    def __init__(self, folder: Path) -> None:
-        self.rig = Rig((UNIT,), RigConfig(growth_x=1.0, od=0.5))
-        self.folder, self.rates = folder, 0
-        self.config = RigBackendConfig(
-            reactors=(UNIT,), speed=SPEED, broker="127.0.0.1", broker_port=self.rig.broker, addresses=dict(self.rig.web)
-        )
-        self.live()
-
-    def live(self) -> None:
-        """A life of the driver, the first or the next."""
-        self.journal = Journal(self.folder / "journal.jsonl")
-        self.reactors = PioreactorReactors(self.config, RealClock(SPEED), self.journal.append, f"test{time.time():.0f}")
-        self.reactors.begin(replay(self.journal.rows), 1e4 * self.journal.next_row)
-        self.station = self.reactors.stations[0]
-
-    def die(self) -> None:
-        """What kill -9 leaves: nothing is stopped, the journal ends where it is."""
-        self.reactors.close()
-        self.journal.close()
-
-    def sample(self, real_s: float = 60.0) -> bool:
-        until = time.monotonic() + real_s
-        while time.monotonic() < until:
-            if self.reactors.measure().fresh[0]:
-                if self.station.fault is None:
-                    return True
-                self.dose(0.0)  # as the loop does with every sample
-        return False
-
-    def dose(self, ml: float) -> float:
-        rate = np.array([ml / self.config.period_s])
-        return float(self.reactors.actuate(Command(np.array([True]), rate, np.array([np.nan]))).volume_ml[0])
-
-    def go_on(self, real_s: float, until=lambda: False) -> bool:
-        """The driver works until something holds; whether it did."""
-        end = time.monotonic() + real_s
-        while time.monotonic() < end:
-            self.station.poll()
-            if until():
-                return True
-            time.sleep(0.05)
-        return bool(until())
-
-    def settled(self, real_s: float = 60.0) -> bool:
-        return self.go_on(real_s, lambda: not self.station.doses.running)
-
-    def truth(self) -> float:
-        return float(self.rig.vials.vials[UNIT].plant.feed.delivered_ml[0])
-
-    def pumping(self) -> bool:
-        return self.rig.vials.vials[UNIT].duty[13] > 0.0
-
-    def bounds(self) -> tuple[float, float, int, int]:
-        """Least and most that the journal says was fed; doses intended, doses ended."""
-        rows = self.journal.reread()
-        ends = [r for r in rows if r["kind"] == "dose_end"]
-        low = sum(r.get("feed_low_ml", 0.0) for r in ends)
-        high = sum(r["feed_ml"] for r in ends)
-        intended = [r for r in rows if r["kind"] == "intent" and r["feed_ml"] > 0.0]
-        assert len({r["id"] for r in intended}) == len(intended)
-        return low, high, len(intended), len([r for r in ends if r.get("id")])
-
-    def judge(self) -> None:
-        """Nothing twice, every dose with an end, the truth within the driver's own bounds."""
-        low, high, intended, ended = self.bounds()
-        assert ended == intended
-        slack = EACH_ML * max(intended, 1)
-        assert low - slack <= self.truth() <= high + slack
-        assert (
-            len([p for p in self.rig.vials.vials[UNIT].pulses if p.pump == "media"]) <= intended + 1
-        )  # one cycled pin
 
 
 @pytest.fixture
@@ -116,8 +25,7 @@ def bench(tmp_path):
         assert made.sample()
         yield made
     finally:
-        made.die()
-        made.rig.close()
+        made.end()
 
 
 def test_doses_are_what_was_asked_each_with_its_own_id(bench):
@@ -131,17 +39,6 @@ def test_doses_are_what_was_asked_each_with_its_own_id(bench):
     assert float(bench.rig.vials.vials[UNIT].plant.vessel.volume_ml[0]) == pytest.approx(20.0, abs=0.05)
     bench.judge()
     bench.reactors.stop()
-
-
-def test_the_sample_is_the_culture_s(bench):
-    assert bench.sample()
-    true = float(bench.rig.vials.vials[UNIT].plant.apparent_od[0])
-    assert bench.station.sampling.newest.od == pytest.approx(true, abs=0.02)
-
-
-def test_preflight_passes(bench):
-    failed = [str(check) for check in preflight(bench.reactors) if not check.ok]
-    assert not failed
 
 
 @pytest.mark.parametrize("repeat", range(REPEATS))
@@ -172,8 +69,7 @@ def test_a_kill(bench, what, moment, repeat):
     if what == "dose":
         assert bench.pumping(), "a chip drives it on"
         assert "pio cache clear pwm_locks 13 --as-int" in str(bench.station.fault)
-        command = [str(bench.rig.folder / UNIT / "pio"), "cache", "clear", "pwm_locks", "13", "--as-int"]
-        subprocess.run(command, check=True, capture_output=True)  # the operator
+        bench.clear_the_lock()
     assert bench.settled(200.0)
     bench.judge()
     if what == "od_reading":  # the vendor lets no second one start until the unit is rebooted

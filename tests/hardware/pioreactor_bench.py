@@ -1,0 +1,127 @@
+"""One unit in the rig with the driver at it: what the tests against the vendor's own software share."""
+
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware.clock import RealClock
+from hardware.pioreactor.config import RigBackendConfig
+from hardware.pioreactor.reactors import PioreactorReactors
+from hardware.pioreactor.resume import replay
+from hardware.pioreactor.rig.build import CACHE, missing
+from hardware.pioreactor.rig.processes import Rig, RigConfig
+from hardware.reactor import Command
+from hardware.storage.journal import Journal
+
+UNIT, EACH_ML = "pio01", 0.1  # mL: a busy computer is late by 60 ms
+
+
+def need_the_rig() -> None:
+    """Skip the calling module where the vendor's software cannot be run, and say what would help."""
+    pytest.importorskip("paho.mqtt.client", reason="pip install 'paho-mqtt>=2'")
+    if lack := missing():
+        pytest.skip(f"the vendor's software cannot run here: {lack}", allow_module_level=True)
+    if not (CACHE / "env" / "done").exists():
+        pytest.skip("build it with: python -m hardware.pioreactor.rig --build-only", allow_module_level=True)
+
+
+class Bench:
+    """One unit in the rig, and lives of the driver that end without a word and go on from the journal."""
+
+    def __init__(self, folder: Path, **values: Any) -> None:
+        self.rig = Rig((UNIT,), RigConfig(growth_x=1.0, od=0.5))
+        self.folder, self.run = folder, f"test{time.time():.0f}"
+        where = {"broker": "127.0.0.1", "broker_port": self.rig.broker, "addresses": dict(self.rig.web)}
+        self.config = RigBackendConfig(reactors=(UNIT,), **{"speed": 5.0, **where, **values})
+        try:
+            self.live()
+        except BaseException:
+            self.rig.__exit__()
+            raise
+
+    def live(self) -> None:
+        """A life of the driver, the first or the next."""
+        self.journal = Journal(self.folder / "journal.jsonl")
+        self.reactors = PioreactorReactors(self.config, RealClock(self.config.speed), self.journal.append, self.run)
+        self.reactors.begin(replay(self.journal.rows), 1e4 * self.journal.next_row)
+        self.station = self.reactors.stations[0]
+
+    def die(self) -> None:
+        """What kill -9 leaves: nothing is stopped, the journal ends where it is."""
+        self.reactors.close()
+        self.journal.close()
+
+    def end(self) -> None:
+        """Everything ended and put away."""
+        self.die()
+        self.rig.__exit__()
+
+    def sample(self, real_s: float = 60.0) -> bool:
+        until = time.monotonic() + real_s
+        while time.monotonic() < until:
+            if self.reactors.measure().fresh[0]:
+                if self.station.fault is None:
+                    return True
+                self.dose(0.0)  # as the loop does with every sample
+        return False
+
+    def dose(self, ml: float) -> float:
+        rate = np.array([ml / self.config.period_s])
+        return float(self.reactors.actuate(Command(np.array([True]), rate, np.array([np.nan]))).volume_ml[0])
+
+    def go_on(self, real_s: float, until=lambda: False) -> bool:
+        """The driver works until something holds; whether it did."""
+        end = time.monotonic() + real_s
+        while time.monotonic() < end:
+            self.station.poll()
+            if until():
+                return True
+            time.sleep(0.05)
+        return bool(until())
+
+    def settled(self, real_s: float = 60.0) -> bool:
+        return self.go_on(real_s, lambda: not self.station.doses.running)
+
+    def truth(self) -> float:
+        return float(self.rig.vials.vials[UNIT].plant.feed.delivered_ml[0])
+
+    def od(self) -> float:
+        """What the photodiode looks at."""
+        return float(self.rig.vials.vials[UNIT].plant.apparent_od[0])
+
+    def pumping(self) -> bool:
+        return self.rig.vials.vials[UNIT].duty[13] > 0.0
+
+    def bounds(self) -> tuple[float, float, int, int]:
+        """Least and most that the journal says was fed; doses intended, doses ended."""
+        rows = self.journal.reread()
+        ends = [r for r in rows if r["kind"] == "dose_end"]
+        low = sum(r.get("feed_low_ml", 0.0) for r in ends)
+        high = sum(r["feed_ml"] for r in ends)
+        intended = [r for r in rows if r["kind"] == "intent" and r["feed_ml"] > 0.0]
+        assert len({r["id"] for r in intended}) == len(intended)
+        return low, high, len(intended), len([r for r in ends if r.get("id")])
+
+    def pulses(self) -> int:
+        """How often the media pump ran."""
+        return len([p for p in self.rig.vials.vials[UNIT].pulses if p.pump == "media"])
+
+    def clear_the_lock(self) -> None:
+        """What the fault tells the operator to do on the unit."""
+        command = [str(self.rig.folder / UNIT / "pio"), "cache", "clear", "pwm_locks", "13", "--as-int"]
+        subprocess.run(command, check=True, capture_output=True)
+
+    def judge(self, each_ml: float = EACH_ML) -> None:
+        """Nothing twice, every dose with an end, the truth within the driver's own bounds.
+
+        Args: each_ml: by how much messages may be late for a dose; a matter of how busy the computer is.
+        """
+        low, high, intended, ended = self.bounds()
+        assert ended == intended
+        slack = each_ml * max(intended, 1)
+        assert low - slack <= self.truth() <= high + slack
+        assert self.pulses() <= intended + 1  # one cycled pin

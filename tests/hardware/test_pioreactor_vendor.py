@@ -1,0 +1,90 @@
+"""The driver against the vendor's own software, in the suite that always runs: one rig for all tests of this file.
+
+Judged by what was really in the vial and by the driver's own bounds; no deadline is one that a busy computer misses.
+The tests take turns at one unit, each leaves it settled; tests/hardware/test_pioreactor_rig.py has what takes longer.
+"""
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from hardware.pioreactor.preflight import preflight
+from tests.hardware.pioreactor_bench import UNIT, Bench, need_the_rig
+
+need_the_rig()
+pytestmark = [pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(300)]  # one rig
+
+LATE_ML = 0.3  # messages on a computer whose cores are all taken
+LONG_S = 120.0
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    made = Bench(tmp_path_factory.mktemp("unit"), speed=10.0, period_s=30.0, start_s=60.0, max_dose_ml=3.0)
+    try:
+        assert made.sample(LONG_S)
+        yield made
+    finally:
+        made.end()
+
+
+def asked_for(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The pump jobs that are asked for from now on, apart from short ones that switch a pin off."""
+    jobs: list[str] = []
+    run = bench.station.web.run
+
+    def noted(job, options, env, overrides):
+        jobs.extend([job] * ("ml" in options))
+        return run(job, options, env, overrides)
+
+    monkeypatch.setattr(bench.station.web, "run", noted)
+    return jobs
+
+
+def test_preflight_passes(bench):
+    assert not [str(check) for check in preflight(bench.reactors) if not check.ok]
+
+
+def test_a_sample_is_the_culture_s(bench):
+    assert bench.sample(LONG_S)
+    assert bench.station.sampling.newest.od == pytest.approx(bench.od(), abs=0.02)
+
+
+def test_a_dose_reaches_the_vial_once_and_as_much_leaves_it(bench, monkeypatch):
+    jobs, before = asked_for(bench, monkeypatch), bench.pulses()
+    assert bench.dose(0.8) == 0.8
+    assert bench.settled(LONG_S)
+    assert jobs == ["add_media", "remove_waste"]
+    assert bench.pulses() == before + 1
+    assert float(bench.rig.vials.vials[UNIT].plant.vessel.volume_ml[0]) == pytest.approx(20.0, abs=0.05)
+    bench.judge(LATE_ML)
+
+
+def test_a_dose_whose_process_is_killed_is_an_alarm_and_nothing_is_sent_until_its_pump_is_off(bench, monkeypatch):
+    assert bench.sample(LONG_S)
+    assert bench.dose(3.0) == 3.0
+    assert bench.go_on(LONG_S, bench.pumping)
+    for pid in bench.rig.jobs(UNIT, "add_media"):
+        os.kill(pid, 9)
+    assert bench.go_on(LONG_S, lambda: "pio cache clear pwm_locks 13 --as-int" in str(bench.station.fault))
+    jobs = asked_for(bench, monkeypatch)
+    assert bench.pumping(), "a chip drives it on"
+    assert bench.dose(0.5) == 0.0
+    bench.clear_the_lock()
+    assert bench.settled(LONG_S)
+    assert set(jobs) <= {"remove_waste"}
+    assert not bench.pumping()
+    bench.judge(LATE_ML)
+
+
+def test_a_killed_program_goes_on_from_its_journal_and_its_stop_is_verified(bench):
+    bench.die()
+    bench.live()
+    assert bench.sample(LONG_S)
+    assert bench.dose(0.5) == 0.5
+    assert bench.settled(LONG_S)
+    bench.judge(LATE_ML)  # ids among them: of both lives
+    bench.reactors.stop()
+    assert not any(bench.rig.vials.vials[UNIT].duty.values())
+    assert bench.journal.reread()[-1]["not_verified"] == []
