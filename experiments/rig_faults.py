@@ -36,7 +36,7 @@ class RigFaultsConfig:
     kills: int = setting(5, "times that each kill is repeated in its run", within=(1, 100))
     speed: float = setting(5.0, "growth faster than real time", within=(1, 30))
     workers: int = setting(2, "rigs at a time", within=(1, 16))
-    settle: int = setting(4, "doses after the last fault before the run is ended", within=(1, 100))
+    settle: int = setting(2, "doses after the last fault before the run is ended", within=(1, 100))
     seed: int = setting(0, "of the vials", at_least=0)
 
     def __post_init__(self) -> None:

@@ -6,7 +6,6 @@ import csv
 import json
 import math
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -73,7 +72,7 @@ class Trial:
         try:
             other.wait(END_S)
         except subprocess.TimeoutExpired:
-            other.send_signal(signal.SIGINT)
+            other.terminate()
             other.wait(END_S)
         return (self.folder / "second.log").read_text(encoding="utf-8")
 
@@ -100,9 +99,9 @@ class Trial:
             self.client.wait()
 
     def end(self) -> int | None:
-        """Ctrl-C, and the status with which the client ended; None if it did not."""
+        """SIGTERM, and the status with which the client ended; None if it did not."""
         assert self.client is not None
-        self.client.send_signal(signal.SIGINT)
+        self.client.terminate()  # a shell may have told us to ignore Ctrl-C
         try:
             return self.client.wait(END_S)
         except subprocess.TimeoutExpired:
