@@ -47,7 +47,7 @@ class RigFaultsConfig:
 def one_trial(config: RigFaultsConfig, fault: RigFault, moment: str, folder: Path, stop: threading.Event) -> RigOutcome:
     """One fault in a rig of its own. Raises: ReactorError if the rig does not start."""
     folder.mkdir(parents=True)
-    with Trial(folder, config.speed, config.seed) as trial:
+    with Trial(folder, config.speed, config.seed, stop) as trial:
         times = config.kills if fault.name in KILL_NAMES else 1
         struck: list[float] = []
         trouble = ""

@@ -8,6 +8,7 @@ import math
 import os
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Callable, Mapping, Sequence
@@ -48,11 +49,13 @@ class Seen:
 class Trial:
     """A rig of a sick and a well unit, and the client that runs both; use as a context manager.
 
-    Args: folder: of the trial, must exist. speed: growth faster than real time. seed: of the vials.
+    Args: folder: of the trial, must exist. speed: growth faster than real time. seed: of the vials. stop: nothing is
+      waited for any more.
     Raises: DeviceStateError if the rig does not start.
     """
 
-    def __init__(self, folder: Path, speed: float, seed: int) -> None:
+    def __init__(self, folder: Path, speed: float, seed: int, stop: threading.Event) -> None:
+        self._stop = stop
         self.folder, self.run, self.speed = folder, folder / "run", speed
         self.rig = Rig((SICK, WELL), RigConfig(growth_x=speed, od=SETPOINT, seed=seed), folder)
         self.client: subprocess.Popen[bytes] | None = None
@@ -114,9 +117,9 @@ class Trial:
         """Wait for something, at most so long; whether it came. A client that ended is waited for no longer."""
         deadline = time.monotonic() + real_s
         while not there():
-            if time.monotonic() > deadline or (self.client is not None and self.client.poll() is not None):
+            gone = self.client is not None and self.client.poll() is not None
+            if time.monotonic() > deadline or gone or self._stop.wait(0.02):
                 return there()
-            time.sleep(0.02)
         return True
 
     def pumping(self, pin: int = MEDIA_PIN) -> bool:
