@@ -36,7 +36,7 @@ class RigFaultsConfig:
     kills: int = setting(5, "times that each kill is repeated in its run", within=(1, 100))
     speed: float = setting(5.0, "growth faster than real time", within=(1, 30))
     workers: int = setting(2, "rigs at a time", within=(1, 16))
-    settle: int = setting(4, "doses after the last fault before the run is ended", within=(1, 100))
+    settle: int = setting(2, "doses after the last fault before the run is ended", within=(1, 100))
     seed: int = setting(0, "of the vials", at_least=0)
 
     def __post_init__(self) -> None:
@@ -47,7 +47,7 @@ class RigFaultsConfig:
 def one_trial(config: RigFaultsConfig, fault: RigFault, moment: str, folder: Path, stop: threading.Event) -> RigOutcome:
     """One fault in a rig of its own. Raises: ReactorError if the rig does not start."""
     folder.mkdir(parents=True)
-    with Trial(folder, config.speed, config.seed) as trial:
+    with Trial(folder, config.speed, config.seed, stop) as trial:
         times = config.kills if fault.name in KILL_NAMES else 1
         struck: list[float] = []
         trouble = ""
@@ -95,6 +95,7 @@ def _strike(trial: Trial, fault: RigFault, moment: str, struck: list[float], sto
         return "stopped"
     if fault.mend is not None:
         fault.mend(trial)
+    trial.until(trial.near, LATE_S)
     return "" if trial.doses(2, LATE_S) else "no dose any more after it"
 
 

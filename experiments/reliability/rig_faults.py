@@ -175,7 +175,7 @@ KILLS = (
     ),
     RigFault(
         "dose_killed", "kill -9 of the media pump's job: a chip drives its pump on", kill_job("add_media"),
-        clear_lock(MEDIA_PIN), ("in",), 15.0, by=("run on after add_media", "runs on after add_media"),
+        clear_lock(MEDIA_PIN), ("in",), 4.0, by=("run on after add_media", "runs on after add_media"),
         unheld="the pump that ran on diluted the culture",
     ),
     RigFault(
@@ -193,7 +193,7 @@ KILLS = (
 OTHERS = (
     RigFault(
         "waste_killed", "kill -9 of the waste pump's job: its pump runs on", kill_waste, clear_lock(WASTE_PIN), ("in",),
-        15.0, by=("run on after remove_waste", "runs on after remove_waste"), within_s=20.0,
+        4.0, by=("run on after remove_waste", "runs on after remove_waste"), within_s=20.0,
     ),
     RigFault("queue_hangs", "the task queue stands still for 25 s: requests run late", *hangs("tasks"),
              by=("fate of a dose", "takes nothing")),

@@ -6,9 +6,9 @@ import csv
 import json
 import math
 import os
-import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +25,7 @@ __all__ = ["MEDIA_PIN", "SETPOINT", "SICK", "WASTE_PIN", "WELL", "Seen", "Trial"
 SICK, WELL = "pio01", "pio02"
 MEDIA_PIN, WASTE_PIN = 13, 12
 SETPOINT = 0.5  # OD
+NEAR_OD = 0.03
 START_S, END_S = 90.0, 60.0  # real seconds for a client to dose, and to end
 
 
@@ -48,11 +49,13 @@ class Seen:
 class Trial:
     """A rig of a sick and a well unit, and the client that runs both; use as a context manager.
 
-    Args: folder: of the trial, must exist. speed: growth faster than real time. seed: of the vials.
+    Args: folder: of the trial, must exist. speed: growth faster than real time. seed: of the vials. stop: nothing is
+      waited for any more.
     Raises: DeviceStateError if the rig does not start.
     """
 
-    def __init__(self, folder: Path, speed: float, seed: int) -> None:
+    def __init__(self, folder: Path, speed: float, seed: int, stop: threading.Event) -> None:
+        self._stop = stop
         self.folder, self.run, self.speed = folder, folder / "run", speed
         self.rig = Rig((SICK, WELL), RigConfig(growth_x=speed, od=SETPOINT, seed=seed), folder)
         self.client: subprocess.Popen[bytes] | None = None
@@ -72,7 +75,7 @@ class Trial:
         try:
             other.wait(END_S)
         except subprocess.TimeoutExpired:
-            other.send_signal(signal.SIGINT)
+            other.terminate()
             other.wait(END_S)
         return (self.folder / "second.log").read_text(encoding="utf-8")
 
@@ -99,9 +102,9 @@ class Trial:
             self.client.wait()
 
     def end(self) -> int | None:
-        """Ctrl-C, and the status with which the client ended; None if it did not."""
+        """SIGTERM, and the status with which the client ended; None if it did not."""
         assert self.client is not None
-        self.client.send_signal(signal.SIGINT)
+        self.client.terminate()  # a shell may have told us to ignore Ctrl-C
         try:
             return self.client.wait(END_S)
         except subprocess.TimeoutExpired:
@@ -114,14 +117,18 @@ class Trial:
         """Wait for something, at most so long; whether it came. A client that ended is waited for no longer."""
         deadline = time.monotonic() + real_s
         while not there():
-            if time.monotonic() > deadline or (self.client is not None and self.client.poll() is not None):
+            gone = self.client is not None and self.client.poll() is not None
+            if time.monotonic() > deadline or gone or self._stop.wait(0.02):
                 return there()
-            time.sleep(0.02)
         return True
 
     def pumping(self, pin: int = MEDIA_PIN) -> bool:
         """Whether a pump of the sick unit runs."""
         return self.rig.vials.vials[SICK].duty[pin] > 0.0
+
+    def near(self) -> bool:
+        """Whether the sick culture is at its setpoint, in truth."""
+        return abs(float(self.rig.vials.vials[SICK].plant.apparent_od[0]) - SETPOINT) < NEAR_OD
 
     def journal(self) -> list[dict[str, Any]]:
         """The journal up to now."""

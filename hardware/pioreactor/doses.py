@@ -7,20 +7,21 @@ counted whole; nothing more is dosed until the unit's task queue has proved that
 
 import contextlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hardware.clock import Clock
 from hardware.errors import ReactorError
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.logbook import Logbook
 from hardware.pioreactor.mailbox import DOSING_JOBS, Event, Mailbox, Mqtt
-from hardware.pioreactor.pump_jobs import ASK_S, MEDIA, OURS, UNSTARTED_S, WASTE, Course, Given, PumpJobs
+from hardware.pioreactor.pump_jobs import ASK_S, LATE_ML, MEDIA, OURS, UNSTARTED_S, WASTE, Course, Given, PumpJobs
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.web import Web
 
 __all__ = ["Doses", "Plan"]
 
 CYCLED = "/off"  # ends the id of a pin that we switched on and off
+UNSEEN = "its end was not on record: counted whole, its waste as far as it was told"
 REPEAT_S = 63.0  # the journal keeps a volume that nobody commanded as one repetition, so long after `on_s`
 
 
@@ -162,8 +163,19 @@ class Doses(PumpJobs):
         media = yield from self.pump(MEDIA, plan.feed_ml, dose)
         waste = Given(0.0, 0.0)
         if media.high > 0.0:
-            waste = yield from self.pump(WASTE, plan.waste_ml, dose)
+            waste = yield from self.pump(WASTE, max(plan.waste_ml, self._waste_for(media)), dose)
         self._conclude(dose, on_s, media, waste)
+        self._correct(plan, media, waste)
+
+    def _waste_for(self, media: Given) -> float:
+        """Waste that brings the vial back to its tube, mL; of a pump that ran on, no more than it can be above it."""
+        return self._config.waste_factor * min(media.high, self._config.volume_ml)
+
+    def _correct(self, plan: Plan, media: Given, waste: Given) -> None:
+        """What was not as planned, for whoever booked the plan when the dose began: feed, and what the level rose."""
+        more, rise = media.high - plan.feed_ml, max(media.high - waste.low, 0.0)
+        if abs(more) > LATE_ML or rise > LATE_ML:
+            self.extra.append((self._book.elapsed(), more, more - rise))
 
     def _conclude(self, dose: str, on_s: float, media: Given, waste: Given) -> None:
         self._booked[MEDIA, dose], self._booked[WASTE, dose] = media.high, waste.low
@@ -196,15 +208,17 @@ class Doses(PumpJobs):
                 taken = taken or self._web.result(task) is not None
             yield ASK_S
         yield UNSTARTED_S
-        most = history.feed_ml
-        for job in (MEDIA, WASTE):
-            if self._box.lost(job):
-                yield from self.prove_off(job)
-                on_s = (self._book.elapsed() - history.on_s) / self._config.speed
-                most = max(most, on_s * self.flow_ml_s[job]) if job == MEDIA else most
+        media, waste = Given(0.0, history.feed_ml), Given(0.0, history.waste_ml)
+        if self._box.lost(WASTE):
+            yield from self.prove_off(WASTE)
+        if self._box.lost(MEDIA):
+            yield from self.prove_off(MEDIA)
+            on_s = (self._book.elapsed() - history.on_s) / self._config.speed
+            media = Given(0.0, max(history.feed_ml, on_s * self.flow_ml_s[MEDIA]))
+            waste = yield from self.pump(WASTE, self._waste_for(media), history.id)
         self.trouble = ""
-        given = Given(0.0, most, "its end was not on record: counted whole, its waste not at all")
-        self._conclude(history.id, history.on_s, given, Given(0.0, history.waste_ml))
+        self._conclude(history.id, history.on_s, replace(media, end=UNSEEN), waste)
+        self._correct(Plan(history.feed_ml, history.waste_ml), media, waste)
 
     # -- what nobody commanded -------------------------------------------------------------------------------------
 

@@ -79,6 +79,8 @@ class FeedBudget:
     def book(self, feed: Array, waste: Array, now: float) -> None:
         """Book what was dosed at `now`, mL, shape (N,): V <- max(V_tube, V + feed - waste), V + feed where waste is 0.
 
+        Either may be negative: it corrects what was booked before it was known.
+
         `now` may lie before what another reactor was booked at; what lies an hour back counts only for the run.
         """
         self._roll(now)
@@ -90,7 +92,7 @@ class FeedBudget:
             mine[dosed] = np.column_stack([mine[dosed, 1:], new[dosed]])
         self._owed_ml = np.where(dosed, 0.0, self._owed_ml)
         level = np.maximum(self.volume_ml + feed - waste, self._config.volume_ml)
-        self.volume_ml = np.where(waste > 0.0, level, self.volume_ml + feed)
+        self.volume_ml = np.where(waste != 0.0, level, self.volume_ml + feed)
 
     def state(self) -> dict[str, Array]:
         """What it remembers."""

@@ -1,7 +1,8 @@
 """Two doubles of the vendor's side in virtual time: a unit's web server and the broker, answering as recorded.
 
 The order and spacing of what a job says (init, ready, event, duty, event, duty off, disconnected) and every odd answer
-are those of version 25.11.19 around `add_media` of 0.7 mL, as the rig recorded them; docs/pioreactor.md, What is odd.
+are those of version 25.11.19 around `add_media` of 0.7 mL, as the rig recorded them;
+docs/pioreactor.md, What is odd in the vendor's software.
 """
 
 import heapq

@@ -5,6 +5,8 @@ import pytest
 
 from hardware.errors import DeviceStateError, LinkError, RecordingError
 from hardware.pioreactor.resume import History, replay
+from hardware.safety.budget import FeedBudget
+from hardware.safety.config import SafetyConfig
 from tests.hardware.pioreactor_lab import MEDIA_PIN, UNIT, Lab, World
 
 
@@ -94,8 +96,11 @@ def test_a_killed_dose_whose_pin_runs_on_is_an_alarm_and_counted_until_it_is_pro
     with pytest.raises(DeviceStateError, match="pull the plug"):
         lab.reactors.stop()
     lab.world.lock, lab.world.mute, lab.world.kill_after_s = False, False, np.inf  # the operator
-    lab.wait(10.0)
-    end, cycled = lab.of("dose_end")
+    lab.wait(80.0)
+    cycled, end = sorted(lab.of("dose_end"), key=lambda row: row["feed_ml"])
+    assert lab.world.moved["remove_waste"] == pytest.approx(40.0)  # twice what can stand above the tube
+    more = sum(r.volume_ml[0] for _, r in lab.reactors.repeated())
+    assert 0.5 + more == pytest.approx(end["feed_ml"] + 0.1)
     assert end["feed_low_ml"] <= lab.world.moved["add_media"] <= end["feed_ml"] + cycled["feed_ml"]
     assert cycled["source"].endswith("/off")
     assert lab.station.fault is None
@@ -337,7 +342,8 @@ def test_an_open_dose_waits_for_a_dead_queue(monkeypatch):
     lab.world.revive()
     lab.wait(140.0)
     assert [row["feed_ml"] for row in lab.of("dose_end")] == [0.5]
-    assert lab.reactors.repeated() == []
+    ((_, correction),) = lab.reactors.repeated()  # its waste is not on record, and was booked when it began
+    assert (correction.volume_ml[0], correction.waste_ml[0]) == (0.0, -0.5)
 
 
 def test_an_intent_whose_request_was_never_sent_gave_nothing(monkeypatch):
@@ -345,3 +351,19 @@ def test_an_intent_whose_request_was_never_sent_gave_nothing(monkeypatch):
     lab.begin(History(sample=(1.0, 1), doses=1, open=True, fed=False, id="turbidostat/old/pio01/1", feed_ml=0.5))
     lab.wait(2.0)
     assert [row["feed_ml"] for row in lab.of("dose_end")] == [0.0]
+
+
+@pytest.mark.parametrize(("given", "level"), [("nothing", 20.0), ("all but its waste", 20.6), ("as planned", 20.0)])
+def test_the_ledger_of_the_interlock_ends_where_the_vial_does(lab, given, level):
+    """A dose is booked when it begins; what became of it is booked as a correction."""
+    budget = FeedBudget(1, SafetyConfig(volume_ml=20.0))
+    lab.world.lock = given == "nothing"
+    planned = lab.dose(0.6)
+    budget.book(np.array([planned]), np.array([2.0 * planned]), 0.0)
+    if given == "all but its waste":
+        lab.world.later(0.9, lambda: setattr(lab.world, "lock", True))  # once the media pump runs
+    lab.wait(160.0)
+    for at, receipt in lab.reactors.repeated():
+        budget.book(receipt.volume_ml, receipt.waste_ml, at)
+    assert float(budget.volume_ml[0]) == pytest.approx(level, abs=0.01)
+    assert float(budget.fed_ml[0]) == pytest.approx(lab.world.moved["add_media"], abs=0.01)

@@ -1,0 +1,312 @@
+"""A deployment on the Pioreactor rig judged by its truth: rows in, findings out; no clocks, no sockets, no files.
+
+The rows are those of `journal.jsonl` and `truth.jsonl` of a run, of the vendor's `dosing_events`, and of the targets
+that the vendor's own turbidostat was given. Times are wall times, s since 1970, of one computer.
+"""
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from conf.schema import check, setting
+
+__all__ = [
+    "Account", "Dose", "Held", "Limits", "Span", "UnitTruth", "Vial", "account", "asked", "held", "phases", "targets",
+    "trouble", "vial",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+Rows = Sequence[Mapping[str, Any]]
+
+CLOCK_S = 0.05  # by which two times of one computer may be apart: of a row, and of what it speaks of
+LAST_MIN = 10.0  # device minutes at the end of a window
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a deployment on the rig has to keep. Raises: ValueError naming key, value and allowed range."""
+
+    error_od: float = setting(
+        0.01, "mean distance of the true OD from the setpoint in the last 10 min of a window", "OD", above=0.0
+    )
+    dose_ml: float = setting(
+        0.05, "by which a dose may differ from what was asked, and lie outside of the driver's bound", "mL", above=0.0
+    )
+    total_pct: float = setting(5.0, "difference of the sum of all doses from the journal's", "%", above=0.0)
+    volume_ml: float = setting(0.5, "at the end, from the volume up to the waste tube", "mL", above=0.0)
+
+    def __post_init__(self) -> None:
+        check(self, "limits")
+
+
+@dataclass(frozen=True)
+class Span:
+    """A setpoint, OD, that was to be held from `start` to `end`."""
+
+    setpoint: float
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Held:
+    """How a setpoint was held, by the true OD.
+
+    minutes: device min of the window. error_od: mean |OD - setpoint| of all of it; last_error_od, last_bias_od: mean
+    |OD - setpoint| and mean OD - setpoint of its last `LAST_MIN`; nan where nothing is on record. media_ml: given
+    meanwhile.
+    """
+
+    setpoint: float
+    minutes: float
+    error_od: float
+    last_error_od: float
+    last_bias_od: float
+    media_ml: float
+
+
+@dataclass(frozen=True)
+class Dose:
+    """A dose by the journal: its id, when it was intended and told as ended (inf: not), mL asked, least and most."""
+
+    id: str
+    start: float
+    end: float
+    ml: float
+    low_ml: float
+    high_ml: float
+
+
+@dataclass(frozen=True)
+class Account:
+    """The journal's doses against the runs of the media pump.
+
+    asked: doses of the journal. runs: of the pump. without_intent: runs in the time of no dose. twice: runs beyond the
+    first in the time of a dose. missing: doses that gave something by the journal, without a run. error_mean_ml,
+    error_max_ml: mean of given minus asked and its largest size. outside_ml: largest distance of what was given from
+    the driver's bound. given_ml, booked_ml: sums by the truth and by the journal; total_pct: how much more was given, %
+    of what was given. ids_repeated: ids of more than one dose. ids_untold: given doses whose id is in none of the
+    vendor's dosing events, None where those were not recorded. foreign_events: dosing events with an id of no dose,
+    None likewise.
+    """
+
+    asked: int
+    runs: int
+    without_intent: int
+    twice: int
+    missing: int
+    error_mean_ml: float
+    error_max_ml: float
+    outside_ml: float
+    given_ml: float
+    booked_ml: float
+    total_pct: float
+    ids_repeated: int
+    ids_untold: int | None
+    foreign_events: int | None
+
+
+@dataclass(frozen=True)
+class Vial:
+    """A vial: doses and medium that it really got, largest and last volume, mL, whether its pumps are off at last."""
+
+    doses: int
+    media_ml: float
+    peak_ml: float
+    end_ml: float
+    pumps_off: bool
+
+
+@dataclass(frozen=True)
+class UnitTruth:
+    """All that is found of one unit; account: None for a unit that is told and not judged."""
+
+    unit: str
+    held: tuple[Held, ...]
+    vial: Vial
+    account: Account | None
+
+
+# -- from rows to what they say ----------------------------------------------------------------------------------------
+
+
+def of_unit(rows: Rows, unit: str, key: str = "unit") -> list[Mapping[str, Any]]:
+    """The rows of one unit, oldest first."""
+    return [row for row in rows if row.get(key) == unit]
+
+
+def phases(journal: Rows, unit: str) -> list[Span]:
+    """The windows of a unit's schedule by its decisions, without the recovery before them; the last ends with its rows.
+
+    Args: journal: rows of all units.
+    """
+    mine = of_unit(journal, unit, "reactor")
+    decided = [(row["wall"], row["row"]) for row in mine if row["kind"] == "decision" and row["row"]["phase"] >= 0]
+    first = [next(group) for _, group in itertools.groupby(decided, key=lambda each: each[1]["phase"])]
+    return _spans([(wall, row["setpoint"]) for wall, row in first], mine[-1]["wall"] if mine else math.nan)
+
+
+def targets(rows: Rows) -> list[Span]:
+    """The windows of the vendor's turbidostat, by the targets it was given; a row without one ends the last."""
+    told = [(float(row["wall"]), row.get("setpoint")) for row in rows]
+    ends = [wall for wall, setpoint in told if setpoint is None]
+    return _spans([(wall, float(s)) for wall, s in told if s is not None], ends[-1] if ends else math.nan)
+
+
+def _spans(starts: Sequence[tuple[float, float]], end: float) -> list[Span]:
+    """Args: starts: wall time and setpoint of each window. end: of the last; nan: the last is left out."""
+    ends = [*(wall for wall, _ in starts[1:]), end]
+    return [Span(s, wall, e) for (wall, s), e in zip(starts, ends, strict=False) if e > wall]
+
+
+def media_runs(truth: Rows, unit: str) -> tuple[Array, Array]:
+    """Start, wall s, and volume, mL, of every run of a unit's media pump, by its start."""
+    runs = sorted((float(r["start"]), float(r["ml"])) for r in of_unit(truth, unit) if r.get("pump") == "media")
+    starts, volumes = np.array(runs, dtype=np.float64).reshape(-1, 2).T
+    return starts, volumes
+
+
+def asked(journal: Rows, unit: str) -> list[Dose]:
+    """Every dose that the journal has for a unit, oldest first; one without an end may have given all or nothing."""
+    mine = of_unit(journal, unit, "reactor")
+    ends = {row["id"]: row for row in mine if row["kind"] == "dose_end" and "id" in row}
+    found = []
+    for row in mine:
+        if row["kind"] == "intent" and float(row["feed_ml"]) > 0.0:
+            ml, end = float(row["feed_ml"]), ends.get(row["id"])
+            bound = (0.0, ml) if end is None else (float(end["feed_low_ml"]), float(end["feed_ml"]))
+            found.append(Dose(str(row["id"]), row["wall"], math.inf if end is None else end["wall"], ml, *bound))
+    return found
+
+
+# -- judged by the truth -----------------------------------------------------------------------------------------------
+
+
+def held(span: Span, truth: Rows, unit: str, speed: float) -> Held:
+    """One window. Args: truth: rows of all units. speed: device seconds per real second."""
+    seen = [(row["wall"], row["od"]) for row in of_unit(truth, unit) if "od" in row]
+    wall, od = np.array(seen, dtype=np.float64).reshape(-1, 2).T
+    inside = (wall >= span.start) & (wall < span.end)
+    last = inside & (wall >= span.end - LAST_MIN * 60.0 / speed)
+    starts, volumes = media_runs(truth, unit)
+    given = volumes[(starts >= span.start) & (starts < span.end)]
+    return Held(
+        span.setpoint, (span.end - span.start) * speed / 60.0, _mean(np.abs(od[inside] - span.setpoint)),
+        _mean(np.abs(od[last] - span.setpoint)), _mean(od[last] - span.setpoint), float(given.sum()),
+    )  # fmt: skip
+
+
+def _mean(values: Array) -> float:
+    return float(values.mean()) if values.size else math.nan
+
+
+def vial(truth: Rows, unit: str) -> Vial:
+    """What is to be said of a vial; nan where it is in no row."""
+    rows = [row for row in of_unit(truth, unit) if "volume_ml" in row]
+    _, volumes = media_runs(truth, unit)
+    if not rows:
+        return Vial(volumes.size, float(volumes.sum()), math.nan, math.nan, False)
+    peak, duties = max(float(row["peak_ml"]) for row in rows), rows[-1]["duty"].values()
+    return Vial(volumes.size, float(volumes.sum()), peak, float(rows[-1]["volume_ml"]), not any(duties))
+
+
+def account(journal: Rows, truth: Rows, events: Rows | None, unit: str) -> Account:
+    """The doses of a unit one to one.
+
+    Args: journal, truth: rows of all units. events: the vendor's dosing events, None where they were not recorded.
+    """
+    doses, (starts, volumes) = asked(journal, unit), media_runs(truth, unit)
+    known = starts < _handed_over(journal, unit)  # what the vendor's turbidostat gives after that is its own
+    starts, volumes = starts[known], volumes[known]
+    owner = _owners(doses, starts)
+    first = {int(k): run for run, k in reversed(list(enumerate(owner))) if k >= 0}
+    given = [(doses[k], float(volumes[run])) for k, run in sorted(first.items())]
+    errors = np.array([ml - dose.ml for dose, ml in given])
+    outside = [max(dose.low_ml - ml, ml - dose.high_ml, 0.0) for dose, ml in given]
+    given_ml, booked_ml = float(volumes.sum()), _booked(journal, doses, unit)
+    count = Counter(dose.id for dose in doses)
+    untold, foreign = (None, None) if events is None else _told(of_unit(events, unit), doses, first)
+    return Account(
+        asked=len(doses), runs=starts.size, without_intent=int((owner < 0).sum()),
+        twice=int((owner >= 0).sum()) - len(first),
+        missing=sum(dose.low_ml > 0.0 and k not in first for k, dose in enumerate(doses)),
+        error_mean_ml=_mean(errors), error_max_ml=float(np.abs(errors).max(initial=0.0)),
+        outside_ml=max(outside, default=0.0), given_ml=given_ml, booked_ml=booked_ml,
+        total_pct=100.0 * (given_ml - booked_ml) / given_ml if given_ml > 0.0 else (math.inf if booked_ml else 0.0),
+        ids_repeated=sum(n > 1 for n in count.values()), ids_untold=untold, foreign_events=foreign,
+    )  # fmt: skip
+
+
+def _handed_over(journal: Rows, unit: str) -> float:
+    """Wall time from which the unit regulated itself, inf if it never did."""
+    mine = of_unit(journal, unit, "reactor")
+    return min((float(row["wall"]) for row in mine if row["kind"] == "regulate"), default=math.inf)
+
+
+def _owners(doses: Sequence[Dose], starts: Array) -> NDArray[np.intp]:
+    """The dose in whose time each run of the pump began, -1 for none."""
+    if not doses:
+        return np.full(starts.size, -1, dtype=np.intp)
+    begun = np.searchsorted([dose.start for dose in doses], starts + CLOCK_S, side="right") - 1
+    ended = np.array([dose.end for dose in doses])[begun]
+    return np.where((begun >= 0) & (starts <= ended + CLOCK_S), begun, -1)
+
+
+def _booked(journal: Rows, doses: Sequence[Dose], unit: str) -> float:
+    """mL that the journal counts: of every end, also of what nobody commanded, and whole of a dose without an end."""
+    ends = [float(r["feed_ml"]) for r in of_unit(journal, unit, "reactor") if r["kind"] == "dose_end"]
+    return sum(ends) + sum(dose.ml for dose in doses if math.isinf(dose.end))
+
+
+def _told(events: Rows, doses: Sequence[Dose], given: Iterable[int]) -> tuple[int, int]:
+    """Given doses without an event of their own, and events of the media pump that are of no dose."""
+    sources = [str(row["source_of_event"]) for row in events if row["event"] == "add_media"]
+    ids = {dose.id for dose in doses}
+    return sum(doses[k].id not in sources for k in given), sum(source not in ids for source in sources)
+
+
+# -- against the limits ------------------------------------------------------------------------------------------------
+
+
+def trouble(found: UnitTruth, limits: Limits, volume_ml: float) -> list[str]:
+    """What a judged unit did not keep, one line each. Args: volume_ml: up to the waste tube."""
+    lines = [] if found.held else ["no window of its schedule is on record"]
+    for each in found.held:
+        if not each.last_error_od <= limits.error_od:
+            said = f"mean |OD - setpoint| of the last {LAST_MIN:.0f} min at {each.setpoint:g} is"
+            lines.append(f"{said} {each.last_error_od:.4f} (allowed {limits.error_od:g})")
+    if not abs(found.vial.end_ml - volume_ml) <= limits.volume_ml:
+        lines.append(f"{found.vial.end_ml:.2f} mL in the vial (allowed {volume_ml:g} +- {limits.volume_ml:g})")
+    if not found.vial.pumps_off:
+        lines.append("a pump is on at the end")
+    lines += _accounted(found.account, limits) if found.account else []
+    return [f"{found.unit}: {line}" for line in lines]
+
+
+def _accounted(a: Account, limits: Limits) -> list[str]:
+    """What is wrong with the doses."""
+    counts = {
+        "runs of the media pump without an intent": a.without_intent,
+        "doses given twice": a.twice,
+        "doses of the journal without a run of the pump": a.missing,
+        "ids given to more than one dose": a.ids_repeated,
+        "doses whose id is in none of the vendor's dosing events": a.ids_untold or 0,
+        "dosing events with an id of no dose": a.foreign_events or 0,
+    }
+    lines = [f"{what}: {number}" for what, number in counts.items() if number]
+    if not a.asked:
+        lines.append("no dose is on record")
+    if not a.error_max_ml <= limits.dose_ml:
+        lines.append(f"a dose is {a.error_max_ml:.3f} mL off (allowed {limits.dose_ml:g})")
+    if not a.outside_ml <= limits.dose_ml:
+        lines.append(f"a dose is {a.outside_ml:.3f} mL outside of the driver's bound (allowed {limits.dose_ml:g})")
+    if not abs(a.total_pct) <= limits.total_pct:
+        said = f"{a.given_ml:.2f} mL were given and {a.booked_ml:.2f} mL booked,"
+        lines.append(f"{said} {a.total_pct:+.1f} % (allowed {limits.total_pct:g})")
+    return lines
