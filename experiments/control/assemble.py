@@ -13,7 +13,6 @@ from pathlib import Path
 from conf.presets import load
 from conf.schema import build
 from dqn.policy import Policy
-from envs.outputs import DOSE_ML
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
@@ -25,16 +24,14 @@ from experiments.control import families
 from experiments.control.composition import Composition, Keeper, program_of
 from experiments.control.config import DeployConfig
 from experiments.control.families import Opening
+from experiments.control.fit import check_fit
 from experiments.control.loop import ClosedLoop
 from experiments.control.plant_file import read_plant_file
 from experiments.control.policies import admit, composition_policy, policy_check, run_policy
 from experiments.control.record import Record
 from experiments.control.recovery import continue_loop
-from experiments.control.supply import MADE_UP_MIN
 from experiments.controllers import registry
 from experiments.training.config import read_env_file
-from hardware.chibio.dosing import MAX_FEED_DUTY
-from hardware.chibio.protocol import PERIOD_S
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Reactor
 from hardware.safety.interlock import Interlock
@@ -117,7 +114,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         gain = plant.vessel.volume_ml / (60.0 * model.tau)  # tau = V / (60 g)
         growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
         plant = replace(plant, growth=growth, pump=pump)
-    _check_supply(config, scenarios)
+    check_fit(config, scenarios)
     keeper = _keeper(config, plant, folder, scenarios)
     if keeper is not None and hasattr(backend, "fluorescence"):  # the device has to measure what the estimate needs
         backend = replace(backend, fluorescence=replace(backend.fluorescence, measure=True))
@@ -130,35 +127,6 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         admit(policy, folder / "policy.npz", config, scenarios)
         bounds = certificate.bounds(policy, folder / "policy.npz")
     return Setup(config, scenarios, plant, model, policy, bounds, resumed, keeper)
-
-
-def _check_supply(config: DeployConfig, scenarios: list[Scenario]) -> None:
-    """Whether pumps that a scenario gives by have a tube, and doses may be large enough. Raises: UserError."""
-    if not any(s.supplied for s in scenarios):
-        return
-    backend, safety = config.backend, config.safety
-    most_ml, needed, period_s = safety.max_rate * safety.period_s, 2.0 * DOSE_ML, 60.0 * backend.control_min
-    if most_ml < needed:
-        remedy = f"allowed {needed / safety.period_s:.4f} mL/s or more beside scenario.outputs"
-        raise frame.UserError(f"safety.max_rate = {safety.max_rate:g} mL/s: {remedy}")
-    if abs(period_s - safety.period_s) > 1e-6 or backend.control_min > MADE_UP_MIN:
-        remedy = f"allowed the same, and at most {MADE_UP_MIN:g} min, beside scenario.outputs"
-        given = f"safety.period_s = {safety.period_s:g} s, backend.control_min = {backend.control_min:g} min"
-        raise frame.UserError(f"{given}: {remedy}")
-    if backend.kind == "sim":
-        return
-    if not hasattr(backend, "supply"):
-        raise frame.UserError(f"scenario.outputs: backend={backend.kind} has no spare pumps; drop them")
-    for name, scenario in zip(backend.reactors, scenarios, strict=True):
-        for number in sorted(scenario.supplied):
-            key = f"backend.supply.pump{number}_ml_s"
-            if f"Pump{number}" not in backend.supply.pumps:
-                remedy = f"weigh what it gives in a second at full power (docs/scenarios.md) and give its flow, {key}"
-                raise frame.UserError(f"scenario.outputs of {name}: Pump{number} has no tube; {remedy}")
-            can = backend.supply.calibration(f"Pump{number}").volume(PERIOD_S * MAX_FEED_DUTY)
-            if can < most_ml - 1e-9:
-                remedy = f"allowed {most_ml:.2f} mL a dose; take a wider tube or a smaller safety.max_rate"
-                raise frame.UserError(f"{key}: Pump{number} gives at most {can:.2f} mL a dose: {remedy}")
 
 
 def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Keeper | None:

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from experiments.control.loop import ClosedLoop, Step
 from experiments.controllers.base import Accounts, Remembers
-from hardware.chibio.resume import dosed
 from hardware.errors import RecordingError
 from hardware.reactor import Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import kinds_of
+from hardware.storage.doses import dosed
 from hardware.storage.journal import REMEDY, Journal
 
 __all__ = [

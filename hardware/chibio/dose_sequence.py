@@ -11,11 +11,11 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.diagnosis import fault_of
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, plan_dose
-from hardware.chibio.ending import Ending, repeats_until
 from hardware.chibio.logbook import Logbook
 from hardware.chibio.protocol import FEED, PUMPS, WASTE, DeviceState
-from hardware.chibio.resume import ReactorHistory, conclude
+from hardware.chibio.resume import ReactorHistory, conclude, repeats_until
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
+from hardware.storage.doses import Ending
 
 __all__ = ["DoseSequence"]
 

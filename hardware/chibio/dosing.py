@@ -153,6 +153,10 @@ class SupplyConfig:
         """Flow of a spare pump, 0 for every other one."""
         return {"Pump3": self.pump3_ml_s, "Pump4": self.pump4_ml_s}.get(pump, 0.0)
 
+    def most_ml(self, pump: str) -> float:
+        """The largest dose of a spare pump, mL."""
+        return self.calibration(pump).volume(PERIOD_S * MAX_FEED_DUTY)
+
     @property
     def pumps(self) -> tuple[str, ...]:
         """Those that have a tube."""

@@ -5,12 +5,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from hardware.chibio.ending import Ending, repeats_until
-from hardware.chibio.protocol import FEED, PUMPS, WASTE, DeviceState
-from hardware.errors import RecordingError
-from hardware.storage.journal import REMEDY
+from hardware.chibio.protocol import FEED, PERIOD_S, PUMPS, WASTE, DeviceState
+from hardware.storage.doses import Ending, damaged, feeds_by
 
-__all__ = ["Dosed", "ReactorHistory", "conclude", "dosed", "replay"]
+__all__ = ["ReactorHistory", "conclude", "repeats_until", "replay"]
 
 SWITCH_S = 10.0  # after its silence the board agent needs a moment, and the last request before it is not on record
 
@@ -52,37 +50,12 @@ class ReactorHistory:
     seen_s: float = 0.0
 
 
-@dataclass(frozen=True)
-class Dosed:
-    """What was dosed at one moment.
-
-    n: row of the journal that tells: the intent, or, where the device repeated a dose (again), its end. at_s: run time,
-    s. Volumes in mL. pump: number of the pump that gave the medium.
-    """
-
-    n: int
-    reactor: str
-    at_s: float
-    feed_ml: float
-    waste_ml: float
-    again: bool = False
-    pump: int = 1
-
-
-def _pump(row: Mapping[str, Any]) -> str:
-    """The pump that an intent feeds by. Raises: ValueError for one that there is not."""
-    pump = str(row.get("feed_pump", FEED))
-    if pump not in PUMPS or pump == WASTE:
-        raise ValueError(f"feed_pump {pump}")
-    return pump
-
-
 def _take(entry: dict[str, Any], row: Mapping[str, Any]) -> None:
     """What one row says."""
     entry.update({key: kind(row[key]) for key, kind in KEYS.items() if row.get(key) is not None})
     if row["kind"] == "intent":
         sample, volumes = row["sample"], (float(row["feed_ml"]), float(row["waste_ml"]))
-        entry["feed_pump"] = "" if _pump(row) == FEED else _pump(row)
+        entry["feed_pump"] = "" if feeds_by(row) == FEED else feeds_by(row)
         entry.update(sample=(float(sample[0]), int(sample[1])), open=volumes[0] > 0.0, fed=False, feed_off=False)
     elif row["kind"] == "feed_on":
         entry["fed"] = True
@@ -114,57 +87,13 @@ def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, ReactorHistory]:
         try:
             _take(known.setdefault(str(row["reactor"]), {}), row)
         except (IndexError, KeyError, TypeError, ValueError) as error:
-            raise _damaged(row, error) from None
+            raise damaged(row, error) from None
     return {name: ReactorHistory(**entry, seen_s=seen_s) for name, entry in known.items()}
 
 
-def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
-    """Every dose of a journal with what it really gave, and what the device repeated of it, in the order of time.
-
-    A dose whose feed pump was never switched on gave nothing. One whose end is not on record is counted whole; what the
-    device repeated of it is told by the `dose_end` that a resumed run writes.
-
-    Args: rows: of a journal, oldest first. Raises: RecordingError for a row that is not as the driver wrote it.
-    """
-    ledger = _Ledger()
-    for row in rows:
-        if row.get("kind") in ("intent", "feed_on", "dose_end"):
-            try:
-                ledger.take(row)
-            except (KeyError, TypeError, ValueError) as error:
-                raise _damaged(row, error) from None
-    return sorted([*ledger.given.values(), *ledger.repeated], key=lambda d: d.at_s)
-
-
-class _Ledger:
-    """Doses by the row of their intent, their repetitions, and by reactor the one that has not ended."""
-
-    def __init__(self) -> None:
-        self.given: dict[int, Dosed] = {}
-        self.repeated: list[Dosed] = []
-        self._begun: dict[str, Dosed] = {}
-
-    def take(self, row: Mapping[str, Any]) -> None:
-        """Enter what one row says."""
-        kind, name = row["kind"], str(row["reactor"])
-        if kind == "intent":
-            volumes = float(row["feed_ml"]), float(row["waste_ml"])
-            number = PUMPS.index(_pump(row)) + 1
-            self._begun[name] = Dosed(row["n"], name, float(row["on_s"]), *volumes, pump=number)
-        elif kind == "feed_on" and name in self._begun:
-            self.given[self._begun[name].n] = self._begun[name]
-        elif kind == "dose_end" and "feed_times" in row:
-            ending = Ending.of_row(row)
-            dose = self._begun.pop(name, None)
-            if dose is not None:
-                self.given[dose.n] = replace(dose, at_s=ending.on_s, feed_ml=ending.feed_ml, waste_ml=ending.waste_ml)
-            pump = 1 if dose is None else dose.pump
-            self.repeated += [Dosed(row["n"], name, *one, again=True, pump=pump) for one in ending.repeats()]
-
-
-def _damaged(row: Mapping[str, Any], error: Exception) -> RecordingError:
-    what = f"row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error})"
-    return RecordingError(f"journal.jsonl: {what}; {REMEDY}")
+def repeats_until(off_s: float, on_s: float) -> int:
+    """How often a pump that was switched on at `on_s` had begun its dose again by `off_s`."""
+    return max(math.floor((off_s - on_s) / PERIOD_S), 0)
 
 
 def conclude(history: ReactorHistory, state: DeviceState, now_s: float, silence_s: float) -> tuple[Ending, str]:

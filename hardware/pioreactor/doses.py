@@ -17,12 +17,12 @@ from hardware.pioreactor.mailbox import DOSING_JOBS, Event, Mailbox, Mqtt
 from hardware.pioreactor.pump_jobs import ASK_S, LATE_ML, MEDIA, OURS, UNSTARTED_S, WASTE, Course, Given, PumpJobs
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.web import Web
+from hardware.storage.doses import REPEAT_S
 
 __all__ = ["Doses", "Plan"]
 
 CYCLED = "/off"  # ends the id of a pin that we switched on and off
 UNSEEN = "its end was not on record: counted whole, its waste as far as it was told"
-REPEAT_S = 63.0  # the journal keeps a volume that nobody commanded as one repetition, so long after `on_s`
 
 
 @dataclass(frozen=True)

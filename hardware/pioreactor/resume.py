@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from hardware.errors import RecordingError
-from hardware.storage.journal import REMEDY
+from hardware.storage.doses import damaged
 
 __all__ = ["History", "replay"]
 
@@ -71,6 +70,5 @@ def replay(rows: Sequence[Mapping[str, Any]]) -> dict[str, History]:
             name = str(row["reactor"])
             known[name] = _after(known.get(name, History()), row)
         except (KeyError, TypeError, ValueError) as error:
-            what = f"row {row.get('n')} ({row['kind']}) is damaged ({type(error).__name__}: {error})"
-            raise RecordingError(f"journal.jsonl: {what}; {REMEDY}") from None
+            raise damaged(row, error) from None
     return known

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from hardware.chibio.ending import Ending, repeats_until
-from hardware.chibio.protocol import DeviceState, parse_state
-from hardware.chibio.resume import ReactorHistory, conclude, dosed, replay
+from hardware.chibio.protocol import PERIOD_S, DeviceState, parse_state
+from hardware.chibio.resume import ReactorHistory, conclude, repeats_until, replay
 from hardware.errors import RecordingError
+from hardware.storage.doses import REPEAT_S, Ending, dosed
 from tests.hardware.script import state
 
 OPEN = ReactorHistory(
@@ -26,6 +26,7 @@ def found(feed: bool, waste: bool, start_time: str = OPEN.start_time) -> DeviceS
 )  # fmt: skip
 def test_a_pump_left_on_begins_again_every_63_s(off_s: float, times: int) -> None:
     assert repeats_until(off_s, 100.0) == times
+    assert REPEAT_S == PERIOD_S  # as the journal counts
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from hardware.chibio.ending import Ending
 from hardware.chibio.resume import ReactorHistory, replay
 from hardware.errors import RecordingError
+from hardware.storage.doses import Ending
 
 
 def row(n: int, kind: str, reactor: str = "M0", **fields: Any) -> dict[str, Any]:

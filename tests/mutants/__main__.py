@@ -39,8 +39,8 @@ TABLE = {
     ),
     "dosing": (
         [f"{CHIBIO}/{name}.py" for name in (
-            "dosing", "dose_sequence", "ending", "sampling", "resume", "agenda", "overflow_pump", "diagnosis",
-        )],
+            "dosing", "dose_sequence", "sampling", "resume", "agenda", "overflow_pump", "diagnosis",
+        )] + [f"{STORAGE}/doses.py"],
         [f"hardware/test_{name}.py" for name in (
             "dosing", "dose_sequence", "ending", "history", "sampling", "agenda", "diagnosis", "overflow_pump",
             "reactors",

@@ -1,0 +1,64 @@
+"""What a backend cannot do is refused in one line, before anything is asked of a device or written."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envs.scenario import Scenario
+from experiments.cli import frame
+from experiments.control import assemble
+from experiments.control.config import DeployConfig
+from experiments.controllers import registry
+from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
+
+CALM = Scenario((0.5, 0.6), (10.0, 10.0), (37.0, 37.0))
+WARMER = replace(CALM, temperatures=(30.0, 37.0))
+
+
+def refused(tmp_path: Path, words: str, **values: Any) -> None:
+    config = DeployConfig(**{"backend": PioreactorConfig(), "scenario": CALM, "force_policy": True, **values})
+    with pytest.raises(frame.UserError, match=words) as told:
+        assemble.unpack(config, tmp_path)
+    assert "\n" not in str(told.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_fits_is_taken(tmp_path: Path) -> None:
+    for backend, scenario in ((PioreactorConfig(), WARMER), (RigBackendConfig(), CALM)):
+        assemble.unpack(DeployConfig(backend=backend, scenario=scenario, force_policy=True), tmp_path)
+
+
+def test_a_share_needs_fluorescence(tmp_path: Path) -> None:
+    shares = Scenario((0.5,), (60.0,), (33.0,), ratios=(0.5,))
+    refused(tmp_path, "scenario.ratios: backend=pioreactor measures no fluorescence", scenario=shares)
+    refused(tmp_path, "backend=pioreactor_rig measures", scenario=shares, backend=RigBackendConfig())
+
+
+def test_a_spare_pump_needs_pumps(tmp_path: Path) -> None:
+    supplied = replace(CALM, outputs=("pump3 2 mL/h", None))
+    refused(tmp_path, "scenario.outputs: backend=pioreactor has no spare pumps; drop them", scenario=supplied)
+
+
+def test_temperatures_need_a_thermostat(tmp_path: Path) -> None:
+    off = PioreactorConfig(thermostat=False)
+    refused(tmp_path, "30 to 37 degC: .* backend.thermostat=true", scenario=WARMER, backend=off)
+
+
+def test_a_controller_that_knows_the_plant_needs_a_simulated_one(tmp_path: Path) -> None:
+    refused(tmp_path, "oracle: .* not backend=pioreactor$", controller=registry.config("oracle"))
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"period_s": 120.0, "stale_s": 200.0}, "give safety.period_s=120$"),
+        ({"volume_ml": 15.0}, "safety.volume_ml = 20 mL: allowed the same; give safety.volume_ml=15$"),
+        ({"max_dose_ml": 0.9}, "interlock allows 1.2 mL in a period of 60 s; give safety.max_rate=0.015 or a larger"),
+    ],
+)
+def test_the_interlock_counts_with_the_units_own_period_volume_and_dose(
+    tmp_path: Path, values: dict[str, float], words: str
+) -> None:
+    refused(tmp_path, words, backend=PioreactorConfig(**values))
