@@ -42,8 +42,8 @@ class Mailbox:
     """What one unit said; filled by `take`, which may be called from another thread.
 
     Attributes: readings and events, newest last, for the driver to take out; duty, of each pin that runs, by
-      experiment; states, of each job; heard, when a job last told its state; temperature, degC; refused, messages;
-      ran_s, how long each pin has run by the clock, s.
+      experiment; states, of each job; heard, when a job last told its state; temperature, and target of the
+      thermostat, degC; refused, messages; ran_s, how long each pin has run by the clock, s.
     """
 
     def __init__(self, unit: str, experiment: str, channel: str, clock: Clock) -> None:
@@ -57,7 +57,7 @@ class Mailbox:
         self.heard: dict[str, float] = {}
         self.ran_s: dict[int, float] = {}
         self._on: dict[int, float] = {}
-        self.temperature = float("nan")
+        self.temperature = self.target = float("nan")
         self.refused = 0
         self._stamp = ""
 
@@ -87,6 +87,8 @@ class Mailbox:
             self._reading(json.loads(payload), now, retained)
         elif rest == "temperature_automation/temperature" and mine:
             self.temperature = float(json.loads(payload)["temperature"])
+        elif rest == "temperature_automation/target_temperature" and mine:
+            self.target = float(payload or "nan")
 
     def _switched(self, duty: dict[int, float], experiment: str, now: float) -> None:
         """The pins that run now, and for how long those ran that do no more."""

@@ -5,10 +5,11 @@ from collections.abc import Iterator
 from hardware.check import Check
 from hardware.errors import ReactorError
 from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.jobs import flow
 from hardware.pioreactor.mailbox import DOSING_JOBS
 from hardware.pioreactor.pump_jobs import MEDIA
 from hardware.pioreactor.reactors import PioreactorReactors
-from hardware.pioreactor.station import Station, flow
+from hardware.pioreactor.station import Station
 
 __all__ = ["KNOWN", "preflight"]
 
@@ -34,7 +35,7 @@ def _unit(station: Station, config: PioreactorConfig) -> Iterator[Check]:
     yield Check(f"{name} identity", who == name, f"the unit at {station.web.url} is {who}", "correct backend.addresses")
     version = str(station.web.get("/versions/app").get("version"))
     yield Check(f"{name} version", version in KNOWN, version, f"tried with {', '.join(KNOWN)}", required=False)
-    off = f"{(error_s := station.clock_error_s()):+.1f} s against this computer"
+    off = f"{(error_s := station.web.clock_error_s()):+.1f} s against this computer"
     yield Check(f"{name} clock", abs(error_s) < CLOCK_S, off, "only its logs suffer", required=False)
     calibrations = station.web.get("/active_calibrations")
     for pump in ("media_pump", "waste_pump"):

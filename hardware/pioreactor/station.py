@@ -1,14 +1,13 @@
 """One unit: its jobs brought up and kept, its samples, its doses, what is wrong with it."""
 
 import math
-import time
 from collections.abc import Callable
-from datetime import datetime
 
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.doses import Doses, Plan
+from hardware.pioreactor.jobs import AUTOMATION, HEAT, OD, STIR, flow, gone, request
 from hardware.pioreactor.logbook import Log, Logbook
 from hardware.pioreactor.mailbox import Mailbox, Mqtt
 from hardware.pioreactor.pump_jobs import MEDIA, WASTE
@@ -19,10 +18,9 @@ from hardware.reactor import Fault
 
 __all__ = ["Station"]
 
-OD, HEAT, STIR, AUTOMATION = "od_reading", "temperature_automation", "stirring", "dosing_automation"
 GRACE_S = 20.0  # real seconds in which a job that was asked for may come up
+TELL_S = 3.0  # real seconds between two words on the same target
 WEB_STOP_S = 5.0  # real seconds between two stops by HTTP
-EXCHANGE_ML = 1.0  # of the vendor's turbidostat
 
 
 class Station:
@@ -41,7 +39,9 @@ class Station:
         self.given_up, self.heat_is_off, self.news = False, False, False
         self.fault: Fault | None = None
         self._target = math.nan
-        self._asked_s = self._asked_web_s = -math.inf
+        self._asked_s: dict[str, float] = {}
+        self._gone, self._been = set[str](), set[str]()
+        self._asked_web_s, self._told_s = -math.inf, math.inf
         self._tried = False
         self._web_error = ""
 
@@ -93,20 +93,11 @@ class Station:
         """Start one of the vendor's jobs unless it is there. Raises: ReactorError."""
         if self._box.live(job):
             return
-        options: dict[str, object] = {}
-        overrides: list[list[str]] = []
-        if job == OD:
-            rate = str(round(1.0 / self._config.reading_s, 4))
-            overrides = [[f"{OD}.config", "samples_per_second", rate], [f"{OD}.config", "smoothing_penalizer", "0"]]
-        if job == HEAT:
-            options = {"automation-name": "thermostat", "target-temperature": self._target}
-        if job == AUTOMATION:
-            target = self.handed_over / self._config.od_scale + self._config.od_zero
-            options = {"automation-name": "turbidostat", "target-od": target, "exchange-volume-ml": EXCHANGE_ML}
+        options, overrides = request(job, self._config, self._target, self.handed_over)
         if self._box.lost(job):  # the vendor still counts a killed job as running, and would refuse another
             self.web.post(f"/jobs/stop?job_name={job}")
         self.web.run(job, options, self.book.env, overrides)
-        self._asked_s = self._clock.now()
+        self._asked_s[job] = self._clock.now()
         self.book.note_down("command", job=job, options=options)
 
     # -- what happens ----------------------------------------------------------------------------------------------
@@ -117,6 +108,7 @@ class Station:
         self.sampling.take(readings)
         self.doses.take(events)
         self.doses.work()
+        self._steer()
         found = self.sampling.look(
             self._clock.now(), self.doses.ended_s + self._config.mix_s * (self.doses.ended_s > 0.0), self.doses.running
         )
@@ -157,25 +149,43 @@ class Station:
             return Fault("mode", "a dosing automation runs", "stop it in the vendor's page")
         if not self.doses.running and self._box.running_pins(self._config.pump_pins) and math.isnan(self.handed_over):
             return Fault("pump", "a pump runs without our command", self.doses.locks)
-        if self.doses.foreign:
+        if self.doses.foreign and math.isnan(self.handed_over):
             return Fault("mode", self.doses.foreign, "one client per unit; it is counted")
-        if not self._box.live(OD) and self._clock.now() > self._asked_s + GRACE_S * self._config.speed:
-            self._again(OD)
-            return Fault(
-                "stopped",
-                "the unit takes no OD readings",
-                "asked for again; one that was killed bars its successor: reboot the unit",
-            )
+        if missing := [job for job in self._wanted() if self._is_gone(job)]:
+            remedy = "asked for again; one that was killed bars its successor: reboot the unit"
+            return Fault("stopped", gone(missing[0]), remedy)
         if self._web_error:
             return Fault("link", self._web_error, "check the unit's web server")
         return None
+
+    def _wanted(self) -> list[str]:
+        """The jobs that this run keeps going."""
+        heated = self._config.thermostat and not self.heat_is_off and math.isfinite(self._target)
+        wanted = {OD: True, STIR: self._config.stirring, HEAT: heated, AUTOMATION: math.isfinite(self.handed_over)}
+        return [job for job, it_is in wanted.items() if it_is]
+
+    def _is_gone(self, job: str) -> bool:
+        """Whether a job should run and does not: readings stopped in whatever way; others killed, or never there.
+
+        It is asked for again, and again; until it is there it is gone. What somebody stopped in the vendor's page stays
+        stopped.
+        """
+        if self._box.live(job):
+            self._gone.discard(job)
+            self._been.add(job)
+            return False
+        due = self._asked_s.get(job, -math.inf) + GRACE_S * self._config.speed
+        if (job == OD or job not in self._been or self._box.lost(job)) and self._clock.now() > due:
+            self._gone.add(job)
+            self._again(job)
+        return job in self._gone
 
     def _again(self, job: str) -> None:
         try:
             self.ask_for(job)
             self._web_error = ""
         except ReactorError as error:
-            self._web_error, self._asked_s = str(error), self._clock.now()
+            self._web_error, self._asked_s[job] = str(error), self._clock.now()
 
     @staticmethod
     def _automation() -> str:
@@ -202,16 +212,23 @@ class Station:
         """Thermostat to a target, degC; nan leaves it. Trouble becomes a note."""
         if not math.isfinite(target) or not self._config.thermostat or self.heat_is_off or target == self._target:
             return
-        self._target = target
+        self._target, self._told_s = target, -math.inf
         self.book.note_down("temperature", temperature=target)
         try:
-            if self._box.live(HEAT):
-                self._mqtt.publish(self._topic(HEAT, "target_temperature"), str(target))
-            else:
-                self.ask_for(HEAT)
+            self.ask_for(HEAT)
         except ReactorError as error:
             self._target = math.nan
             self.book.tell(f"thermostat: {error}")
+
+    def _steer(self) -> None:
+        """Tell the thermostat its target until it says it: what is told while it starts is not heard."""
+        if not self._told_s < math.inf or not self._box.live(HEAT):
+            return
+        if self._box.target == self._target:
+            self._told_s = math.inf
+        elif self._clock.now() > self._told_s + TELL_S * self._config.speed:
+            self._told_s = self._clock.now()
+            self._mqtt.publish(self._topic(HEAT, "target_temperature"), str(self._target))
 
     def pumps_off(self, real_s: float) -> None:
         """Every dosing job ended and every pump off, by MQTT first, then by HTTP, verified.
@@ -280,23 +297,3 @@ class Station:
             self.handed_over = math.nan
             raise
         self.book.write("regulate", setpoint=setpoint)
-
-    def clock_error_s(self) -> float:
-        """The unit's clock minus ours, s. Raises: ReactorError."""
-        said = str(self.web.get("/health").get("utc_time", ""))
-        try:
-            return datetime.fromisoformat(said.replace("Z", "+00:00")).timestamp() - time.time()
-        except ValueError:
-            raise LinkError(f"{self.web.url}: {said!r} is no time") from None
-
-
-def flow(calibrations: object, pump: str, unit: str) -> float:
-    """mL per second at the calibrated duty. Raises: DeviceStateError if the unit has no usable calibration of it."""
-    remedy = f"calibrate it in the vendor's page (Calibrations, {pump}); doses in mL are refused without"
-    try:
-        slope = float(calibrations[pump]["curve_data_"][-2])  # type: ignore[index]
-    except (KeyError, TypeError, IndexError, ValueError):
-        raise DeviceStateError(f"{unit}: no active calibration of the {pump}; {remedy}") from None
-    if not slope > 0.0:
-        raise DeviceStateError(f"{unit}: calibration of the {pump} = {slope} mL/s: allowed > 0; {remedy}")
-    return slope

@@ -1,8 +1,10 @@
 """The vendor's HTTP interface of one unit: what was said, and whether it can have been heard."""
 
 import json
+import time
 import urllib.error
 import urllib.request
+from datetime import datetime
 from typing import Any
 
 from hardware.errors import LinkError, ProtocolError
@@ -62,6 +64,14 @@ class Web:
         if not (isinstance(jobs, list) and all(isinstance(job, dict) and "job_name" in job for job in jobs)):
             raise ProtocolError(f"{self.url}: {str(jobs)[:60]} is no list of jobs")
         return jobs
+
+    def clock_error_s(self) -> float:
+        """The unit's clock minus ours, s. Raises: ReactorError."""
+        said = str(self.get("/health").get("utc_time", ""))
+        try:
+            return datetime.fromisoformat(said.replace("Z", "+00:00")).timestamp() - time.time()
+        except ValueError:
+            raise LinkError(f"{self.url}: {said!r} is no time") from None
 
     def _request(self, method: str, path: str, body: dict[str, Any] | None) -> Any:
         data = None if body is None else json.dumps(body).encode()

@@ -93,6 +93,15 @@ class Bench:
         """What the photodiode looks at."""
         return float(self.rig.vials.vials[UNIT].plant.apparent_od[0])
 
+    def temperature(self) -> float:
+        """Of the culture."""
+        return float(self.rig.vials.vials[UNIT].plant.thermal.temperature[0])
+
+    def target(self) -> float:
+        """Of the thermostat, as the unit says."""
+        said = self.station.web.get("/jobs/settings/job_name/temperature_automation")
+        return float(said["settings"]["target_temperature"])
+
     def pumping(self) -> bool:
         return self.rig.vials.vials[UNIT].duty[13] > 0.0
 

@@ -34,7 +34,7 @@ class World(VirtualClock):
 
     Switches: web, queue, broker (up or not), lock (a pin lock left behind), heard (how a POST of a dose is answered),
     kill_after_s (a dose's process is killed so long after its pump began), late_s (a job ends its pump so much late),
-    mute (a pin that goes on is not told).
+    mute (a pin that goes on is not told), barred (jobs beside the readings do not start).
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class World(VirtualClock):
         self.kill_after_s = self.stop_after_s = np.inf
         self.reading, self.od_every_s, self.clock_jump_s = 0.5, 5.0, 0.0
         self.late_s = 0.0
-        self.mute = False
+        self.mute = self.barred = False
         self.waiting: list[Callable[[], None]] = []
         self.duty: dict[int, float] = {}
         self.since: dict[int, float] = {}
@@ -152,8 +152,15 @@ class World(VirtualClock):
             self.later(BEGIN_S, lambda: self.cycle(job, options))
         if job == "od_reading":
             self.later(1.0, self.od_job)
-        if job == "dosing_automation":
-            self.later(1.0, lambda: self.say("dosing_automation/$state", "ready"))
+        if job in ("dosing_automation", "stirring", "temperature_automation") and not self.barred:
+            self.later(1.0, lambda: self.say(f"{job}/$state", "init"))
+            self.later(2.0, lambda: self.say(f"{job}/$state", "ready"))
+        if job == "temperature_automation":
+            self.later(2.0, lambda: self.target(str(options["target-temperature"])))
+
+    def target(self, payload: str) -> None:
+        """What a thermostat says once it is ready; it does not hear before."""
+        self.say("temperature_automation/target_temperature", payload, retained=True)
 
     def revive(self) -> None:
         """The task queue comes back and runs what waits in it."""
@@ -230,6 +237,11 @@ class FakeMqtt:
 
     def publish(self, topic: str, payload: str) -> bool:
         self.said.append((topic, payload))
+        heard = (
+            self.world.box is not None and self.world.box.states.get((EXPERIMENT, "temperature_automation")) == "ready"
+        )
+        if topic.endswith("/target_temperature/set") and heard:
+            self.world.target(payload)
         return self.world.broker
 
     def close(self) -> None:
@@ -245,7 +257,7 @@ class Lab:
         monkeypatch.setattr(station, "Web", lambda url: self.web)
         monkeypatch.setattr(reactors, "Mqtt", FakeMqtt)
         self.rows: list[dict[str, Any]] = []
-        config = PioreactorConfig(stirring=False, thermostat=False, **values)
+        config = PioreactorConfig(**{"stirring": False, "thermostat": False, **values})
         self.reactors = PioreactorReactors(config, self.world, self._log, "run")
         self.station = self.reactors.stations[0]
 

@@ -15,6 +15,7 @@ from tests.hardware.pioreactor_bench import EACH_ML, UNIT, Bench, need_the_rig
 need_the_rig()
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pioreactor")]  # one rig at a time
 
+ALL = np.array([True])
 REPEATS = int(os.environ.get("PIOREACTOR_KILLS", "1"))
 
 
@@ -72,9 +73,30 @@ def test_a_kill(bench, what, moment, repeat):
         bench.clear_the_lock()
     assert bench.settled(200.0)
     bench.judge()
-    if what == "od_reading":  # the vendor lets no second one start until the unit is rebooted
-        bench.reactors.stop()
-        return
+    if what == "od_reading":  # the vendor lets no second one start until then
+        assert "reboot the unit" in str(bench.station.fault)
+        bench.rig.reboot(UNIT)
+    assert bench.sample(90.0)
+    bench.dose(0.3)
+    assert bench.settled()
+    bench.judge()
+    bench.reactors.stop()
+
+
+@pytest.mark.parametrize("moment", ["between", "in"])
+def test_a_unit_that_reboots_is_measured_and_dosed_again(bench, moment):
+    before = bench.truth()
+    if moment == "in":
+        assert bench.dose(1.2) == 1.2
+        assert bench.go_on(30.0, bench.pumping)
+    bench.rig.reboot(UNIT)
+    assert not bench.pumping()
+    assert bench.settled(60.0)
+    if moment == "in":
+        end = next(row for row in bench.journal.reread() if row["kind"] == "dose_end")
+        assert end["feed_ml"] >= 1.2
+        assert bench.truth() - before < 1.2
+    bench.judge()
     assert bench.sample(90.0)
     bench.dose(0.3)
     assert bench.settled()
@@ -90,12 +112,64 @@ def test_a_second_client_is_counted(bench):
     assert sum(r.volume_ml[0] for _, r in bench.reactors.repeated()) == pytest.approx(0.5)
 
 
-def test_the_vendors_turbidostat_takes_over(bench):
-    failed = bench.reactors.regulate(np.array([True]), np.array([0.4]))
+def test_the_vendors_turbidostat_takes_over_and_is_ended(bench):
+    failed = bench.reactors.regulate(ALL, np.array([0.4]))
     assert not failed
     assert bench.reactors.handed_over[0]
     assert bench.dose(0.5) == 0.0
-    bench.reactors.give_up(np.array([True]))
+    assert bench.go_on(90.0, bench.pumping), "the culture is above its target"
+    assert bench.station.fault is None
+    assert bench.reactors.give_up(ALL) == []
+    assert not bench.pumping()
+    before = bench.truth()
+    assert not bench.go_on(25.0, bench.pumping), "it looks every 15 s"
+    assert bench.truth() == before
+    assert not bench.rig.jobs(UNIT, "dosing_automation")
+
+
+def test_an_automation_that_somebody_starts_is_a_fault_and_holds_ours(bench):
+    options = {"automation-name": "turbidostat", "target-od": 3.0, "exchange-volume-ml": 0.5}
+    bench.station.web.run("dosing_automation", options, bench.station.book.env, [])
+    assert bench.go_on(30.0, lambda: bench.station.fault is not None and bench.station.fault.kind == "mode")
+    assert bench.dose(0.5) == 0.0
+    bench.station.web.post("/jobs/stop?job_name=dosing_automation")
+    assert bench.sample(60.0)
+    assert bench.dose(0.5) == 0.5
+    assert bench.settled()
+    bench.judge()
+
+
+def test_stirring_and_thermostat_run_follow_their_target_and_come_back_after_a_reboot(tmp_path):
+    """The rig's culture stays at its temperature whatever its heater does."""
+    bench = Bench(tmp_path, thermostat=True, stirring=True, temperature=30.0)
+    try:
+        box = bench.station._box
+
+        def running():
+            return all(
+                box.states.get((box.experiment, job)) == "ready" for job in ("stirring", "temperature_automation")
+            )
+
+        assert bench.go_on(40.0, running)
+        assert bench.go_on(20.0, lambda: bench.station.temperature > 20.0)
+        assert bench.station.temperature == pytest.approx(bench.temperature(), abs=0.5)
+        bench.station.set_temperature(33.0)
+        assert bench.go_on(20.0, lambda: box.target == 33.0)
+        assert bench.target() == 33.0
+        bench.rig.reboot(UNIT)
+        assert bench.go_on(30.0, lambda: bench.station.fault is not None)
+        assert bench.go_on(90.0, running)
+        assert bench.target() == 33.0
+        assert bench.sample(60.0)
+        assert bench.dose(0.4) == 0.4
+        assert bench.settled()
+        assert bench.reactors.heat_off(ALL) == []
+        assert not bench.rig.jobs(UNIT, "temperature_automation")
+        assert bench.rig.vials.vials[UNIT].duty.get(18, 0.0) == 0.0
+        bench.reactors.stop()
+        assert box.live("stirring")
+    finally:
+        bench.end()
 
 
 def test_stop_says_what_it_could_not_verify(bench):

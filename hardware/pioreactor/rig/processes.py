@@ -93,6 +93,9 @@ class Rig:
                 script = self.folder / unit / name
                 script.write_text(wrapper(self._bin / name, self._variables(unit)), encoding="utf-8")
                 script.chmod(0o755)
+            stand_in = self.folder / unit / "sudo"  # what a unit would shut down, reboot or restart is this computer
+            stand_in.write_text("#!/bin/sh\nexit 1\n", encoding="utf-8")
+            stand_in.chmod(0o755)
             shutil.copy(Path(__file__).with_name("plugin.py"), self.folder / unit / "plugins" / "rig_plugin.py")
             for name in UNIT:
                 self.start(f"{unit} {name}")
@@ -127,7 +130,7 @@ class Rig:
     def _variables(self, unit: str) -> dict[str, str]:
         home, k = self.folder / unit, self.units.index(unit) + 1
         return {
-            "PATH": f"{self._bin}:/usr/local/bin:/usr/bin:/bin",
+            "PATH": f"{home}:{self._bin}:/usr/local/bin:/usr/bin:/bin",
             "HOME": str(home), "TESTING": "1", "HOSTNAME": unit, "ACTIVE": "1",
             "DOT_PIOREACTOR": str(home), "RUN_PIOREACTOR": str(home), "GLOBAL_CONFIG": str(home / "config.ini"),
             "LOCAL_CONFIG": str(home / "unit_config.ini"), "PLUGINS_DEV": str(home / "plugins"),
