@@ -127,7 +127,7 @@ def draw(run: Recorded, folder: Path) -> None:
             style: dict[str, Any] = {"color": "black", "linewidth": 0.9, "linestyle": "--", "zorder": 4}
             top.plot(edges, [span.setpoint] * 2, label=None if n else "setpoint", **style)
     top.set_ylabel("true OD")
-    top.legend()
+    top.legend(handles=sorted(top.get_legend_handles_labels()[0], key=lambda line: line.get_label() == "setpoint"))
     bottom.set(ylabel="dose, mL", xlabel="time, min of the culture", ylim=(0.0, None))
     save(figure, folder / "figures", "rig_study")
 
