@@ -91,7 +91,7 @@ def table(run: Recorded, found: Sequence[UnitTruth]) -> str:
          f"{h.media_ml:.2f}") for u in found for h in u.held
     ]  # fmt: skip
     doses = ("unit", "doses", "runs of the pump", "error, mL: mean", "largest", "outside of the bound, mL",
-             "without intent", "twice", "missing", "ids told", "given, mL", "booked, mL", "difference",
+             "cut short", "without intent", "twice", "missing", "ids told", "given, mL", "booked, mL", "difference",
              "volume, mL: peak", "end")  # fmt: skip
     return "\n".join([*lines, markdown(head, rows), markdown(doses, map(_dose_row, found))])
 
@@ -99,12 +99,12 @@ def table(run: Recorded, found: Sequence[UnitTruth]) -> str:
 def _dose_row(u: UnitTruth) -> tuple[str, ...]:
     volumes, a = (f"{u.vial.peak_ml:.2f}", f"{u.vial.end_ml:.2f}"), u.account
     if a is None:
-        return u.unit, "–", str(u.vial.doses), *["–"] * 7, f"{u.vial.media_ml:.2f}", "–", "–", *volumes
+        return u.unit, "–", str(u.vial.doses), *["–"] * 8, f"{u.vial.media_ml:.2f}", "–", "–", *volumes
     told = "not recorded" if a.ids_untold is None else f"{a.asked - a.missing - a.ids_untold} of {a.asked - a.missing}"
     return (
         u.unit, str(a.asked), str(a.runs), f"{a.error_mean_ml:+.4f}", f"{a.error_max_ml:.4f}", number(a.outside_ml, 2),
-        str(a.without_intent), str(a.twice), str(a.missing), told, f"{a.given_ml:.2f}", f"{a.booked_ml:.2f}",
-        f"{a.total_pct:+.2f} %", *volumes,
+        str(a.cut), str(a.without_intent), str(a.twice), str(a.missing), told,
+        f"{a.given_ml:.2f}", f"{a.booked_ml:.2f}", f"{a.total_pct:+.2f} %", *volumes,
     )  # fmt: skip
 
 
@@ -127,7 +127,7 @@ def draw(run: Recorded, folder: Path) -> None:
             style: dict[str, Any] = {"color": "black", "linewidth": 0.9, "linestyle": "--", "zorder": 4}
             top.plot(edges, [span.setpoint] * 2, label=None if n else "setpoint", **style)
     top.set_ylabel("true OD")
-    top.legend()
+    top.legend(handles=sorted(top.get_legend_handles_labels()[0], key=lambda line: line.get_label() == "setpoint"))
     bottom.set(ylabel="dose, mL", xlabel="time, min of the culture", ylim=(0.0, None))
     save(figure, folder / "figures", "rig_study")
 

@@ -8,7 +8,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PYTHON = r"(?:python3?|\.venv/bin/python) -m (?:experiments|hardware)[\w.]*"
-PROGRAM = re.compile(rf"(?:^|[`\s])({PYTHON}|turbidostat)(?![\w.])((?: [^`\n]*)?)", re.MULTILINE)
+SHELL = rf"(?:^|[`\s])(?={PYTHON})|`|^    "  # the word turbidostat alone may be a reactor
+PROGRAM = re.compile(rf"(?:{SHELL})({PYTHON}|turbidostat)(?![\w.])((?: [^`\n]*)?)", re.MULTILINE)
 OPEN = re.compile(r"\.\.\.|NAME|COMMAND|KEY|GROUP|PRESET|\bFILE\b(?!\.)| \| ")  # a pattern, not a command
 
 
@@ -28,4 +29,5 @@ def commands(page: Path) -> Iterator[list[str]]:
 
 def needs_hardware(words: list[str]) -> bool:
     """A command that talks to a device, or weighs what a device pumped."""
-    return "backend=chibio" in words or words[0] in ("experiments.blank", "experiments.calibrate_pump")
+    device = {"backend=chibio", "backend=pioreactor"} & set(words)
+    return bool(device) or words[0] in ("experiments.blank", "experiments.calibrate_pump")

@@ -16,7 +16,10 @@ import pytest
 
 from tests.documented import PAGES, ROOT, commands, needs_hardware
 
-OTHERS = ("experiments", "experiments.demo", "experiments.cli.reference", "hardware.emulator", "turbidostat")
+OTHERS = (
+    "experiments", "experiments.demo", "experiments.cli.reference", "hardware.emulator", "hardware.pioreactor.rig",
+    "turbidostat",
+)  # fmt: skip
 SHOWN = {
     f"{page.name}: {' '.join(words)}": words
     for page in PAGES
@@ -25,6 +28,8 @@ SHOWN = {
 }
 SHIPPED = "+experiment=shipped"  # a minute; to its end it gives the policy that ships, which is put in its place
 LESS = {
+    "rig_study": ['overrides=[scenario.recovery_od=0.7,"scenario.minutes=[3,3,3]"]'],
+    "rig_faults": ["faults=[no_broker]"],
     "train": ["agent.total_steps=300", "n_agents=2"],
     "ablate": ["agent.total_steps=300", "n_agents=2"],
     "degradation": ["agent.total_steps=600", "n_agents=2"],

@@ -39,7 +39,9 @@ class Limits:
         0.05, "by which a dose may differ from what was asked, and lie outside of the driver's bound", "mL", above=0.0
     )
     total_pct: float = setting(5.0, "difference of the sum of all doses from the journal's", "%", above=0.0)
-    volume_ml: float = setting(0.5, "at the end, from the volume up to the waste tube", "mL", above=0.0)
+    volume_ml: float = setting(
+        2.0, "largest volume in a vial beyond that up to the waste tube", "mL", above=0.0, note="a dose is 1.5 at most"
+    )
 
     def __post_init__(self) -> None:
         check(self, "limits")
@@ -73,7 +75,10 @@ class Held:
 
 @dataclass(frozen=True)
 class Dose:
-    """A dose by the journal: its id, when it was intended and told as ended (inf: not), mL asked, least and most."""
+    """A dose by the journal: its id, when it was intended and told as ended (inf: not), mL asked, least and most.
+
+    whole: it went as asked; else the journal says why not, and that it may have given less.
+    """
 
     id: str
     start: float
@@ -81,6 +86,7 @@ class Dose:
     ml: float
     low_ml: float
     high_ml: float
+    whole: bool
 
 
 @dataclass(frozen=True)
@@ -88,12 +94,13 @@ class Account:
     """The journal's doses against the runs of the media pump.
 
     asked: doses of the journal. runs: of the pump. without_intent: runs in the time of no dose. twice: runs beyond the
-    first in the time of a dose. missing: doses that gave something by the journal, without a run. error_mean_ml,
-    error_max_ml: mean of given minus asked and its largest size. outside_ml: largest distance of what was given from
-    the driver's bound. given_ml, booked_ml: sums by the truth and by the journal; total_pct: how much more was given, %
-    of what was given. ids_repeated: ids of more than one dose. ids_untold: given doses whose id is in none of the
-    vendor's dosing events, None where those were not recorded. foreign_events: dosing events with an id of no dose,
-    None likewise.
+    first in the time of a dose. missing: doses that gave something by the journal, without a run. cut: doses that by
+    the journal ended early, as one does that the end of a run stops, and gave less than asked.
+    error_mean_ml, error_max_ml: mean of given minus asked and its largest size, without those. outside_ml: largest
+    distance of what was given from the driver's bound, with those. given_ml, booked_ml: sums by the truth and by the
+    journal; total_pct: how much more was given, % of what was given. ids_repeated: ids of more than one dose.
+    ids_untold: given doses whose id is in none of the vendor's dosing events, None where those were not recorded;
+    foreign_events: dosing events with an id of no dose, None likewise.
     """
 
     asked: int
@@ -101,6 +108,7 @@ class Account:
     without_intent: int
     twice: int
     missing: int
+    cut: int
     error_mean_ml: float
     error_max_ml: float
     outside_ml: float
@@ -181,7 +189,8 @@ def asked(journal: Rows, unit: str) -> list[Dose]:
         if row["kind"] == "intent" and float(row["feed_ml"]) > 0.0:
             ml, end = float(row["feed_ml"]), ends.get(row["id"])
             bound = (0.0, ml) if end is None else (float(end["feed_low_ml"]), float(end["feed_ml"]))
-            found.append(Dose(str(row["id"]), row["wall"], math.inf if end is None else end["wall"], ml, *bound))
+            ended, whole = (math.inf, False) if end is None else (end["wall"], not end["end"])
+            found.append(Dose(str(row["id"]), row["wall"], ended, ml, *bound, whole))
     return found
 
 
@@ -227,7 +236,7 @@ def account(journal: Rows, truth: Rows, events: Rows | None, unit: str) -> Accou
     owner = _owners(doses, starts)
     first = {int(k): run for run, k in reversed(list(enumerate(owner))) if k >= 0}
     given = [(doses[k], float(volumes[run])) for k, run in sorted(first.items())]
-    errors = np.array([ml - dose.ml for dose, ml in given])
+    errors = np.array([ml - dose.ml for dose, ml in given if dose.whole or ml > dose.ml])
     outside = [max(dose.low_ml - ml, ml - dose.high_ml, 0.0) for dose, ml in given]
     given_ml, booked_ml = float(volumes.sum()), _booked(journal, doses, unit)
     count = Counter(dose.id for dose in doses)
@@ -236,7 +245,7 @@ def account(journal: Rows, truth: Rows, events: Rows | None, unit: str) -> Accou
         asked=len(doses), runs=starts.size, without_intent=int((owner < 0).sum()),
         twice=int((owner >= 0).sum()) - len(first),
         missing=sum(dose.low_ml > 0.0 and k not in first for k, dose in enumerate(doses)),
-        error_mean_ml=_mean(errors), error_max_ml=float(np.abs(errors).max(initial=0.0)),
+        cut=len(given) - errors.size, error_mean_ml=_mean(errors), error_max_ml=float(np.abs(errors).max(initial=0.0)),
         outside_ml=max(outside, default=0.0), given_ml=given_ml, booked_ml=booked_ml,
         total_pct=100.0 * (given_ml - booked_ml) / given_ml if given_ml > 0.0 else (math.inf if booked_ml else 0.0),
         ids_repeated=sum(n > 1 for n in count.values()), ids_untold=untold, foreign_events=foreign,
@@ -281,8 +290,8 @@ def trouble(found: UnitTruth, limits: Limits, volume_ml: float) -> list[str]:
         if not each.last_error_od <= limits.error_od:
             said = f"mean |OD - setpoint| of the last {LAST_MIN:.0f} min at {each.setpoint:g} is"
             lines.append(f"{said} {each.last_error_od:.4f} (allowed {limits.error_od:g})")
-    if not abs(found.vial.end_ml - volume_ml) <= limits.volume_ml:
-        lines.append(f"{found.vial.end_ml:.2f} mL in the vial (allowed {volume_ml:g} +- {limits.volume_ml:g})")
+    if not found.vial.peak_ml - volume_ml <= limits.volume_ml:
+        lines.append(f"{found.vial.peak_ml:.2f} mL in the vial (allowed {volume_ml:g} + {limits.volume_ml:g})")
     if not found.vial.pumps_off:
         lines.append("a pump is on at the end")
     lines += _accounted(found.account, limits) if found.account else []

@@ -232,7 +232,10 @@ class Doses(PumpJobs):
             if over <= 1e-6 or event.pump not in (MEDIA, "add_alt_media", WASTE):
                 continue
             self._booked[key] = counted + over
-            who = "an earlier request of ours ran late" if event.source.startswith(OURS) else f"by {event.source}"
+            ours = (
+                "by which its pin was switched off" if event.source.endswith(CYCLED) else "an earlier request ran late"
+            )
+            who = ours if event.source.startswith(OURS) else f"by {event.source}"
             feed, waste = (0.0, over) if event.pump == WASTE else (over, 0.0)
             at_s = self._book.elapsed()
             self.extra.append((at_s, feed, waste))

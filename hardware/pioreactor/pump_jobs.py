@@ -68,11 +68,11 @@ class PumpJobs:
 
     def pump(self, job: str, ml: float, dose: str) -> Steps:
         """Ask for one pump job and follow it; what it gave."""
-        key = job, dose
+        key, ml = (job, dose), round(ml, 4)
         breaks, asked, ran_s = self._mqtt.breaks, self._clock.now(), self._ran_s(job)
         task: str | None = None
         try:
-            task = self._web.run(job, {"ml": round(ml, 4), "source-of-event": dose}, self._book.env, [])
+            task = self._web.run(job, {"ml": ml, "source-of-event": dose}, self._book.env, [])
         except NotHeard as error:
             return Given(0.0, 0.0, f"not given: {error}")
         except ReactorError as error:

@@ -43,7 +43,7 @@ class Run:
         """From intent to end, what the vendor told of it, and the pump's run 0.2 s after it."""
         self.say("intent", wall, feed_ml=ml, id=name)
         self.say("feed_on", wall, id=name)
-        self.say("dose_end", wall + 4.0, feed_ml=ml, feed_low_ml=ml, feed_times=0, id=name)
+        self.say("dose_end", wall + 4.0, feed_ml=ml, feed_low_ml=ml, feed_times=0, id=name, end="")
         self.events.append({"unit": UNIT, "event": "add_media", "volume_change": ml, "source_of_event": name})
         self.pump(wall + 0.2, given)
 
@@ -160,6 +160,21 @@ def test_a_dose_of_uncertain_volume_inside_of_the_bound_is_off_all_the_same(run:
     assert found == ["pio01: a dose is 0.500 mL off (allowed 0.05)"]
 
 
+def test_a_dose_that_ended_early_by_the_journal_is_held_against_its_bound_alone(run: Run) -> None:
+    run.of("dose_end", 1).update(feed_low_ml=0.2, end="0.70 of 1.20 mL told: ended early")
+    run_of_it = next(row for row in run.truth if row.get("start") == 1015.2)
+    run_of_it["ml"] = 0.7
+    account = run.judged().account
+    assert account is not None
+    assert account.cut == 1
+    assert (account.error_mean_ml, account.error_max_ml, account.outside_ml) == pytest.approx((0.003,) * 3)
+    run_of_it["ml"] = 0.1
+    assert "pio01: a dose is 0.100 mL outside of the driver's bound (allowed 0.05)" in run.trouble()
+    run.of("dose_end", 1).update(feed_ml=1.5)  # and one that gave too much is off, whatever the journal says
+    run_of_it["ml"] = 1.5
+    assert "pio01: a dose is 0.300 mL off (allowed 0.05)" in run.trouble()
+
+
 def test_every_dose_a_little_off_is_a_wrong_total(run: Run) -> None:
     for row in run.journal:
         if row["kind"] in ("intent", "dose_end"):
@@ -194,7 +209,8 @@ def test_an_open_dose_is_booked_whole_and_may_have_given_nothing(run: Run) -> No
 
 
 def test_an_id_that_the_vendor_s_software_never_told(run: Run) -> None:
-    run.events = [row for row in run.events if not row["source_of_event"].endswith("/7")]
+    seventh = next(row for row in run.events if row["source_of_event"].endswith("/7"))
+    seventh["event"] = "remove_waste"  # its waste alone was
     assert "pio01: doses whose id is in none of the vendor's dosing events: 1" in run.trouble()
 
 
@@ -222,9 +238,9 @@ def test_an_offset_of_the_true_od(run: Run) -> None:
 
 
 def test_a_vial_that_fills_and_a_pump_that_is_on(run: Run) -> None:
-    run.truth.append({**run.vial(1301), "volume_ml": 20.6, "duty": {"13": 100.0}})
+    run.truth.append({**run.vial(1301), "peak_ml": 22.1, "duty": {"13": 100.0}})
     found = run.trouble()
-    assert "pio01: 20.60 mL in the vial (allowed 20 +- 0.5)" in found
+    assert "pio01: 22.10 mL in the vial (allowed 20 + 2)" in found
     assert "pio01: a pump is on at the end" in found
 
 
