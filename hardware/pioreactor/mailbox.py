@@ -1,7 +1,10 @@
 """MQTT of a cluster: what each unit last said, kept by one listening thread and read by the driver's."""
 
+import contextlib
 import importlib
 import json
+import os
+import socket
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -13,6 +16,7 @@ from hardware.errors import LinkError
 __all__ = ["DOSING_JOBS", "Event", "Mailbox", "Mqtt", "Reading"]
 
 KEPT = 2000
+LOCKS = "turbidostat/lock/"  # who controls units of this cluster, retained, cleared by the last will
 DOSING_JOBS = (
     "add_media", "remove_waste", "add_alt_media", "circulate_media", "circulate_alt_media", "pumps",
     "dosing_automation",
@@ -161,6 +165,8 @@ class Mqtt:
         self._client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id=name)
         self._client.username_pw_set(*login)
         self._client.reconnect_delay_set(1, 5)
+        self._lock, self._held, self._others = LOCKS + name, "", dict[str, dict[str, Any]]()
+        self._client.will_set(self._lock, b"", qos=1, retain=True)
         self._client.on_connect, self._client.on_disconnect = self._up, self._down
         self._client.on_message = lambda _c, _u, m: self._message(m)
         try:
@@ -176,12 +182,36 @@ class Mqtt:
             for unit, box in self._boxes.items():
                 box.forget()
                 client.subscribe(f"pioreactor/{unit}/#", qos=1)
+            self._others.clear()
+            client.subscribe(f"{LOCKS}+", qos=1)
+            if self._held:  # the last will of the connection before cleared it
+                client.publish(self._lock, self._held, qos=1, retain=True)
             self.connected, self.since = True, self._clock.now()
 
     def _down(self, *_said: Any) -> None:
         self.connected, self.breaks = False, self.breaks + 1
 
+    def hold(self) -> None:
+        """Tell every other client of this cluster that these units are ours, as long as we are there."""
+        self._held = json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "units": list(self._boxes)})
+        self._client.publish(self._lock, self._held, qos=1, retain=True)
+
+    def holder(self, unit: str) -> str:
+        """Who else controls a unit, with the remedy, "" if nobody does; an earlier life of the same run is nobody."""
+        for topic, said in list(self._others.items()):
+            if unit in said.get("units", ()):
+                who = f"process {said.get('pid')} on {said.get('host')} controls {unit}: one client per unit"
+                return f"{who}; if it is not there any more: mosquitto_pub -r -n -t {topic}"
+        return ""
+
     def _message(self, message: Any) -> None:
+        if message.topic.startswith(LOCKS):
+            self._others.pop(message.topic, None)
+            with contextlib.suppress(ValueError):
+                said = json.loads(message.payload or b"null")
+                if isinstance(said, dict) and message.topic != self._lock:
+                    self._others[message.topic] = said
+            return
         unit = message.topic.split("/")[1]
         if unit in self._boxes:
             self._boxes[unit].take(message.topic, message.payload, bool(message.retain))
@@ -192,5 +222,9 @@ class Mqtt:
 
     def close(self) -> None:
         """Idempotent."""
+        if self._held and self.connected:
+            self._held = ""
+            with contextlib.suppress(RuntimeError, ValueError):
+                self._client.publish(self._lock, b"", qos=1, retain=True).wait_for_publish(1.0)
         self._client.loop_stop()
         self._client.disconnect()

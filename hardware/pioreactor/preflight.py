@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 from hardware.check import Check
 from hardware.errors import ReactorError
-from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.jobs import flow
 from hardware.pioreactor.mailbox import DOSING_JOBS
 from hardware.pioreactor.pump_jobs import MEDIA
@@ -22,13 +21,13 @@ def preflight(reactors: PioreactorReactors) -> list[Check]:
     checks: list[Check] = []
     for station in reactors.stations:
         try:
-            checks += list(_unit(station, reactors.config))
+            checks += list(_unit(station, reactors))
         except ReactorError as error:
             checks.append(Check(f"{station.name} link", False, str(error), "check power, network, backend.addresses"))
     return checks
 
 
-def _unit(station: Station, config: PioreactorConfig) -> Iterator[Check]:
+def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
     """Checks of one unit. Raises: ReactorError where it does not answer."""
     name = station.name
     who = str(station.web.get("/health").get("pioreactor_unit"))
@@ -44,10 +43,12 @@ def _unit(station: Station, config: PioreactorConfig) -> Iterator[Check]:
         except ReactorError as error:
             detail, _, remedy = str(error).partition("; ")
             yield Check(f"{name} {pump}", False, detail, remedy)
+    other, _, remedy = reactors.holder(name).partition("; ")
+    yield Check(f"{name} client", not other, other or "no other client of ours", remedy)
     jobs = {str(job["job_name"]) for job in station.web.running()}
     dosing = sorted(jobs & set(DOSING_JOBS))
     killed = f"POST /unit_api/jobs/stop?job_name={dosing[0] if dosing else MEDIA}"
     remedy = f"stop it in the vendor's page; one that was killed stays in its list until {killed}"
     yield Check(f"{name} dosing", not dosing, ", ".join(dosing) or "nothing else doses", remedy)
-    largest = f"the vendor has no limit of one dose; ours is {config.max_dose_ml:g} mL"
+    largest = f"the vendor has no limit of one dose; ours is {reactors.config.max_dose_ml:g} mL"
     yield Check(f"{name} dead man", True, f"{largest}, and every pump job times itself")

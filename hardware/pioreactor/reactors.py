@@ -69,7 +69,10 @@ class PioreactorReactors:
             if self._clock.now() > deadline:
                 raise LinkError(f"MQTT broker {self.config.broker}: no answer; check user name and password")
             self._clock.sleep(LOOK_S * self.config.speed)
-        self._clock.sleep(1.0 * self.config.speed)  # retained messages: which jobs are there
+        self._mqtt.hold()
+        self._clock.sleep(1.0 * self.config.speed)  # retained messages: which jobs are there, and who else is
+        if others := [other for unit in self.names if (other := self._mqtt.holder(unit))]:
+            raise DeviceStateError(others[0])
         for station in self.stations:
             station.bring_up((histories or {}).get(station.name, History()))
 
@@ -90,6 +93,10 @@ class PioreactorReactors:
             if fresh.any() or self._clock.now() >= deadline or any(s.news for s in self.stations):
                 return self._measurement(fresh)
             self._clock.sleep(LOOK_S * self.config.speed)
+
+    def holder(self, unit: str) -> str:
+        """Who else controls a unit, on whatever computer, "" if nobody does."""
+        return self._mqtt.holder(unit)
 
     def _measurement(self, fresh: Mask) -> Measurement:
         now = self._clock.now()

@@ -49,6 +49,7 @@ class World(VirtualClock):
         self.reading, self.od_every_s, self.clock_jump_s = 0.5, 5.0, 0.0
         self.late_s = 0.0
         self.mute = self.barred = False
+        self.holder = ""
         self.waiting: list[Callable[[], None]] = []
         self.duty: dict[int, float] = {}
         self.since: dict[int, float] = {}
@@ -243,6 +244,12 @@ class FakeMqtt:
         if topic.endswith("/target_temperature/set") and heard:
             self.world.target(payload)
         return self.world.broker
+
+    def hold(self) -> None:
+        self.held = True
+
+    def holder(self, unit: str) -> str:
+        return self.world.holder
 
     def close(self) -> None:
         pass

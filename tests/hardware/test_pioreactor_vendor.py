@@ -5,6 +5,8 @@ The tests take turns at one unit, each leaves it settled; tests/hardware/test_pi
 """
 
 import os
+import shutil
+import subprocess
 from collections.abc import Iterator
 
 import pytest
@@ -44,6 +46,13 @@ def asked_for(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def test_preflight_passes(bench):
     assert not [str(check) for check in preflight(bench.reactors) if not check.ok]
+
+
+def test_a_unit_of_the_rig_cannot_shut_this_computer_down(bench):
+    found = shutil.which("sudo", path=bench.rig._variables(UNIT)["PATH"])
+    assert found is not None
+    assert found.startswith(str(bench.rig.folder))
+    assert subprocess.run([found, "true"], check=False).returncode == 1
 
 
 def test_a_sample_is_the_culture_s(bench):

@@ -1,0 +1,118 @@
+"""One client per unit, on whatever computer: said at the broker, and cleared by it when the client is gone."""
+
+import multiprocessing
+import os
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from hardware.clock import RealClock
+from hardware.errors import DeviceStateError
+from hardware.pioreactor.mailbox import Mailbox, Mqtt
+from hardware.pioreactor.rig.build import broker
+from hardware.pioreactor.rig.processes import _free_port, _listens
+from tests.hardware.pioreactor_lab import UNIT, Lab
+
+HELD = "process 7 on elsewhere controls pio01: one client per unit; remedy"
+
+
+def holds(what: Callable[[], bool]) -> bool:
+    until = time.monotonic() + 60.0
+    while time.monotonic() < until and not what():
+        time.sleep(0.05)
+    return what()
+
+
+@pytest.fixture
+def port(tmp_path: Path) -> Iterator[int]:
+    pytest.importorskip("paho.mqtt.client", reason="pip install 'paho-mqtt>=2'")
+    program = broker()
+    if program is None:
+        pytest.skip("no MQTT broker: apt-get install mosquitto")
+    number = _free_port("127.0.0.1")
+    conf = tmp_path / "mosquitto.conf"
+    conf.write_text(f"listener {number} 127.0.0.1\nallow_anonymous true\n", encoding="utf-8")
+    with (
+        (tmp_path / "log").open("wb") as log,
+        subprocess.Popen([program, "-c", str(conf)], stdout=log, stderr=log) as p,
+    ):
+        try:
+            assert holds(lambda: _listens("127.0.0.1", number))
+            yield number
+        finally:
+            p.kill()
+
+
+def client(port: int, name: str, *units: str) -> Mqtt:
+    clock = RealClock(1.0)
+    boxes = {unit: Mailbox(unit, "e", "2", clock) for unit in units}
+    made = Mqtt("127.0.0.1", port, ("", ""), boxes, clock, name)
+    assert holds(lambda: made.connected)
+    return made
+
+
+def killed_client(port: int) -> None:
+    client(port, "run1", "pio01").hold()
+    time.sleep(600.0)
+
+
+def test_a_unit_is_held_until_its_client_leaves_or_dies_and_its_own_run_may_come_back(port: int) -> None:
+    other = client(port, "run2", "pio01", "pio02")
+    first = client(port, "run1", "pio01")
+    first.hold()
+    assert holds(lambda: f"process {os.getpid()} on " in other.holder("pio01"))
+    assert other.holder("pio02") == first.holder("pio01") == ""
+    first.close()
+    assert holds(lambda: other.holder("pio01") == "")
+    process = multiprocessing.get_context("spawn").Process(target=killed_client, args=(port,))
+    process.start()
+    try:
+        assert holds(lambda: f"process {process.pid} on " in other.holder("pio01"))
+        late = client(port, "run3", "pio01")
+        assert holds(lambda: late.holder("pio01") != "")  # it is retained
+        late.close()
+        again = client(port, "run1", "pio01")  # resumed while the broker still believes in the first
+        again.hold()
+        assert again.holder("pio01") == ""
+        again.close()
+    finally:
+        process.kill()
+        process.join()
+    assert holds(lambda: other.holder("pio01") == "")
+    other.close()
+
+
+def test_a_connection_that_was_lost_holds_its_units_again(port: int) -> None:
+    other, first = client(port, "run2", "pio01"), client(port, "run1", "pio01")
+    first.hold()
+    assert holds(lambda: other.holder("pio01") != "")
+    first._client.socket().shutdown(2)  # the broker sends the last will
+    assert holds(lambda: first.breaks == 1 and first.connected)
+    assert holds(lambda: other.holder("pio01") != "")
+    first.close()
+    other.close()
+
+
+def test_a_unit_of_another_client_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = Lab(monkeypatch)
+    lab.world.holder = HELD
+    with pytest.raises(DeviceStateError, match="process 7 on elsewhere controls pio01"):
+        lab.begin()
+    assert not lab.world.runs
+
+
+def test_a_second_client_in_the_run_holds_our_doses(monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = Lab(monkeypatch)
+    lab.begin()
+    assert lab.world.mqtt.held
+    lab.sample()
+    lab.world.holder = HELD
+    lab.wait(1.0)
+    assert lab.station.fault is not None
+    assert lab.station.fault.kind == "mode"
+    assert lab.dose(0.5) == 0.0
+    assert not lab.asked("add_media")
+    assert UNIT in str(lab.station.fault)
