@@ -2,9 +2,11 @@
 
 import multiprocessing
 import os
+import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -59,6 +61,19 @@ def killed_client(port: int) -> None:
     time.sleep(600.0)
 
 
+@contextmanager
+def killable(port: int) -> Iterator[int]:
+    """The process of a client that holds a unit; killed at the end."""
+    process = multiprocessing.get_context("spawn").Process(target=killed_client, args=(port,))
+    process.start()
+    try:
+        assert process.pid is not None
+        yield process.pid
+    finally:
+        process.kill()
+        process.join()
+
+
 def test_a_unit_is_held_until_its_client_leaves_or_dies_and_its_own_run_may_come_back(port: int) -> None:
     other = client(port, "run2", "pio01", "pio02")
     first = client(port, "run1", "pio01")
@@ -67,21 +82,20 @@ def test_a_unit_is_held_until_its_client_leaves_or_dies_and_its_own_run_may_come
     assert other.holder("pio02") == first.holder("pio01") == ""
     first.close()
     assert holds(lambda: other.holder("pio01") == "")
-    process = multiprocessing.get_context("spawn").Process(target=killed_client, args=(port,))
-    process.start()
-    try:
-        assert holds(lambda: f"process {process.pid} on " in other.holder("pio01"))
+    with killable(port) as pid:
+        assert holds(lambda: f"process {pid} on " in other.holder("pio01"))
         late = client(port, "run3", "pio01")
         assert holds(lambda: late.holder("pio01") != "")  # it is retained
         late.close()
-        again = client(port, "run1", "pio01")  # resumed while the broker still believes in the first
+    assert holds(lambda: other.holder("pio01") == "")
+    with killable(port) as pid:
+        assert holds(lambda: f"process {pid} on " in other.holder("pio01"))
+        os.kill(pid, signal.SIGSTOP)  # gone, and the broker still believes in it
+        again = client(port, "run1", "pio01")
         again.hold()
+        assert holds(lambda: f"process {os.getpid()} on " in other.holder("pio01"))
         assert again.holder("pio01") == ""
         again.close()
-    finally:
-        process.kill()
-        process.join()
-    assert holds(lambda: other.holder("pio01") == "")
     other.close()
 
 
