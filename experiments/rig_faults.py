@@ -95,8 +95,10 @@ def _strike(trial: Trial, fault: RigFault, moment: str, struck: list[float], sto
         return "stopped"
     if fault.mend is not None:
         fault.mend(trial)
+    if not trial.doses(2, LATE_S):
+        return "no dose any more after it"
     trial.until(trial.near, LATE_S)
-    return "" if trial.doses(2, LATE_S) else "no dose any more after it"
+    return ""
 
 
 def rig_faults(config: RigFaultsConfig, folder: Path) -> None:
