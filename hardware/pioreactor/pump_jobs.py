@@ -184,18 +184,20 @@ class PumpJobs:
         job, (breaks, asked) = key[0], at
         self.trouble = f"the fate of a dose of {ml:.2f} mL ({job}) is unknown: task queue or broker do not answer"
         self._book.tell(self.trouble)
-        taken = False
-        while not taken:
+        own = task
+        taken: bool | None = None
+        while taken is None:
             if self._told.get(key, 0.0) > 0.0:
                 self.trouble = ""
                 self._book.tell(f"{job} of {ml:.2f} mL ran late")
                 return (yield from self._follow(key, ml, breaks))
             with contextlib.suppress(ReactorError):
                 task = task or self._web.run(MEDIA, {"help": None}, self._book.env, [])  # stands behind it in the queue
-                taken = self._web.result(task) is not None
+                taken = self._web.result(task)
             yield ASK_S
+        died = own is not None and taken is False  # its process is over and did nothing
         latest = self._clock.now() + UNSTARTED_S * self._config.speed  # a process may take long to start
-        while not (self._box.been(job, asked) or self._clock.now() > latest) or not self.off():
+        while not (died or self._box.been(job, asked) or self._clock.now() > latest) or not self.off():
             if self._box.lost(job):
                 return (yield from self._killed(job, ml, asked))
             if self._told.get(key, 0.0) > 0.0:

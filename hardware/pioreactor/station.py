@@ -109,9 +109,9 @@ class Station:
         self.doses.take(events)
         self.doses.work()
         self._steer()
-        found = self.sampling.look(
-            self._clock.now(), self.doses.ended_s + self._config.mix_s * (self.doses.ended_s > 0.0), self.doses.running
-        )
+        undisturbed_s = self.doses.ended_s + self._config.mix_s * (self.doses.ended_s > 0.0)
+        dosing = self.doses.running and not self.doses.trouble  # a dose in doubt may take hours to be known
+        found = self.sampling.look(self._clock.now(), undisturbed_s, dosing)
         self._judge()
         if found is None:
             return False

@@ -42,15 +42,16 @@ class Web:
         return str(answer["task_id"])
 
     def result(self, task: str) -> bool | None:
-        """Whether the process that a task began was running half a second later; None while it waits in the queue.
+        """Whether the process that a task began may be there; False: it was over within half a second; None: it waits.
 
-        An answer is given once: a second question is answered as if it still waited. Raises: LinkError, ProtocolError.
+        An answer is given once: a second question is answered as if it still waited. A task that failed may have begun
+        its process. Raises: LinkError, ProtocolError.
         """
         try:
             answer = self.get(f"/task_results/{task}")
         except ProtocolError as error:
             if "status 500" in str(error):
-                return False
+                return True
             raise
         done = isinstance(answer, dict) and answer.get("status") == "complete"
         return bool(answer["result"]) if done else None
