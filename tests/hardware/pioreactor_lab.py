@@ -34,7 +34,7 @@ class World(VirtualClock):
 
     Switches: web, queue, broker (up or not), lock (a pin lock left behind), heard (how a POST of a dose is answered),
     kill_after_s (a dose's process is killed so long after its pump began), late_s (a job ends its pump so much late),
-    mute (a pin that goes on is not told), barred (jobs beside the readings do not start).
+    mute (a pin that goes on is not told), dies (a job is over at once), barred (jobs beside the readings do not start).
     """
 
     def __init__(self) -> None:
@@ -48,6 +48,7 @@ class World(VirtualClock):
         self.kill_after_s = self.stop_after_s = np.inf
         self.reading, self.od_every_s, self.clock_jump_s = 0.5, 5.0, 0.0
         self.late_s = 0.0
+        self.dies = False
         self.mute = self.barred = False
         self.holder = ""
         self.waiting: list[Callable[[], None]] = []
@@ -146,6 +147,9 @@ class World(VirtualClock):
 
     def take(self, task: str, job: str, options: Mapping[str, Any]) -> None:
         """The task queue takes a request."""
+        if self.dies and "help" not in options:
+            self.results[task] = False
+            return
         self.results[task] = "help" not in options
         if job in PINS and "ml" in options:
             self.later(BEGIN_S, lambda: self.dose(job, options))

@@ -109,6 +109,27 @@ def test_a_killed_dose_whose_pin_runs_on_is_an_alarm_and_counted_until_it_is_pro
     assert len(lab.asked("add_media")) == 1
 
 
+def test_a_job_that_was_accepted_and_died_at_once_did_nothing_and_is_told(lab):
+    lab.world.dies = True
+    lab.dose(0.5)
+    lab.wait(20.0)
+    (end,) = lab.of("dose_end")
+    assert (end["feed_ml"], lab.station.fault) == (0.0, None)
+    assert "accepted and not carried out" in end["end"]
+
+
+def test_samples_go_on_while_the_fate_of_a_dose_is_open(lab):
+    lab.world.queue = False
+    lab.dose(0.5)
+    before = len(lab.of("sample"))
+    for _ in range(30):
+        lab.reactors.measure()
+        lab.wait(10.0)
+    assert not lab.of("dose_end")
+    assert len(lab.of("sample")) >= before + 4
+    assert len(lab.asked("add_media")) == 1
+
+
 def test_a_request_in_a_dead_queue_is_never_sent_again_and_is_noticed_when_it_runs_late(lab):
     lab.world.queue = False
     lab.dose(0.5)
