@@ -248,7 +248,7 @@ OTHERS = (
     RigFault("sensor_jumps", "stray light: +1 OD", vial(offset_od=1.0), vial(offset_od=0.0), seconds=40.0,
              by=("jump:", "impossible:", "no_dilution:"), unheld="doses by stray light, if it lasts"),
     RigFault("sensor_dark", "the photodiode's plug is out", vial(held_od=0.0), vial(held_od=float("nan")), seconds=40.0,
-             by=("jump:", "impossible:", "falls:"), unheld="no dose while nothing is seen"),
+             by=("jump:", "impossible:", "falls:", "spectrometer:"), unheld="no dose while nothing is seen"),
     RigFault("media_empty", "the media bottle is empty", plant("feed", "gain_factor", 0.0),
              plant("feed", "gain_factor", 1.0), seconds=75.0, by=("no_dilution:",), within_s=75.0,
              flow=True, unheld="nothing dilutes"),

@@ -14,12 +14,25 @@ from hardware.errors import ReactorError
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.logbook import Logbook
 from hardware.pioreactor.mailbox import DOSING_JOBS, Event, Mailbox, Mqtt
-from hardware.pioreactor.pump_jobs import ASK_S, LATE_ML, MEDIA, OURS, UNSTARTED_S, WASTE, Course, Given, PumpJobs
+from hardware.pioreactor.pump_jobs import (
+    ASK_S,
+    LATE_ML,
+    MEDIA,
+    OURS,
+    UNSTARTED_S,
+    WASTE,
+    Course,
+    Given,
+    PumpJobs,
+    Steps,
+)
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.web import Web
 from hardware.storage.doses import REPEAT_S
 
 __all__ = ["Doses", "Plan"]
+
+DRAINS, QUIET = 5, 1.5  # attempts to empty a vial; control periods without a stop before each
 
 CYCLED = "/off"  # ends the id of a pin that we switched on and off
 UNSEEN = "its end was not on record: counted whole, its waste as far as it was told"
@@ -38,8 +51,9 @@ class Doses(PumpJobs):
     """The doses of one unit, one at a time, at most one per sample.
 
     Args: run: of this run, part of every id.
-    Attributes: ended_s, clock time at which the last dose was over; foreign, what was dosed without our command;
-      extra, such volumes: run time, feed and waste, mL, until somebody books and clears them.
+    Attributes: ended_s, clock time at which the last dose was over; stopped_s, at which pumps were last asked off;
+      foreign, what was dosed without our command; extra, such volumes and corrections of booked doses: run time, feed
+      and waste, mL, until somebody books and clears them.
     """
 
     def __init__(
@@ -54,7 +68,7 @@ class Doses(PumpJobs):
         run: str,
     ) -> None:
         super().__init__(unit, web, mqtt, box, config, clock, book, run)
-        self.ended_s = -math.inf
+        self.ended_s = self.stopped_s = -math.inf
         self.extra: list[tuple[float, float, float]] = []
         self.foreign = ""
         self.sample: tuple[float, int] | None = None
@@ -162,14 +176,33 @@ class Doses(PumpJobs):
             self._booked[pump, dose] = -1.0  # under way: its events are expected
         media = yield from self.pump(MEDIA, plan.feed_ml, dose)
         waste = Given(0.0, 0.0)
-        if media.high > 0.0:
-            waste = yield from self.pump(WASTE, max(plan.waste_ml, self._waste_for(media)), dose)
+        if media.high > plan.feed_ml + LATE_ML:
+            waste = yield from self._drain(media, dose)
+        elif media.high > 0.0:
+            waste = yield from self.pump(WASTE, plan.waste_ml, dose)
         self._conclude(dose, on_s, media, waste)
         self._correct(plan, media, waste)
 
-    def _waste_for(self, media: Given) -> float:
-        """Waste that brings the vial back to its tube, mL; of a pump that ran on, no more than it can be above it."""
-        return self._config.waste_factor * min(media.high, self._config.volume_ml)
+    def _drain(self, media: Given, dose: str) -> Steps:
+        """Waste after a media pump that ran on, until the vial is back at its tube; what was taken out.
+
+        It waits while anybody asks for pumps off, and goes on where it was stopped: a vial that is too full by the
+        ledger is given no dose, and so no waste, any more.
+        """
+        wanted, taken, k = self._config.waste_factor * min(media.high, self._config.volume_ml), 0.0, 0
+        while wanted - taken > LATE_ML and k < DRAINS:
+            self.trouble = f"{wanted - taken:.1f} mL are to be pumped out, after the media pump ran on"
+            if self._clock.now() < self.stopped_s + QUIET * self._config.period_s:
+                yield ASK_S
+                continue
+            k += 1
+            key = WASTE, f"{dose}/drain{k}"
+            self._booked[key] = -1.0
+            given = yield from self.pump(WASTE, wanted - taken, key[1])
+            self._booked[key] = given.low
+            taken += given.low
+        self.trouble = ""
+        return Given(taken, wanted)
 
     def _correct(self, plan: Plan, media: Given, waste: Given) -> None:
         """What was not as planned, for whoever booked the plan when the dose began: feed, and what the level rose."""
@@ -215,7 +248,7 @@ class Doses(PumpJobs):
             yield from self.prove_off(MEDIA)
             on_s = (self._book.elapsed() - history.on_s) / self._config.speed
             media = Given(0.0, max(history.feed_ml, on_s * self.flow_ml_s[MEDIA]))
-            waste = yield from self.pump(WASTE, self._waste_for(media), history.id)
+            waste = yield from self._drain(media, history.id)
         self.trouble = ""
         self._conclude(history.id, history.on_s, replace(media, end=UNSEEN), waste)
         self._correct(Plan(history.feed_ml, history.waste_ml), media, waste)

@@ -16,7 +16,7 @@ from hardware.pioreactor.logbook import Logbook
 from hardware.pioreactor.mailbox import Mailbox, Mqtt
 from hardware.pioreactor.web import NotHeard, Web
 
-__all__ = ["ASK_S", "LATE_ML", "MEDIA", "OURS", "UNSTARTED_S", "WASTE", "Course", "Given", "PumpJobs"]
+__all__ = ["ASK_S", "LATE_ML", "MEDIA", "OURS", "UNSTARTED_S", "WASTE", "Course", "Given", "PumpJobs", "Steps"]
 
 STEP_S, ASK_S, OVERRUN_S, SETTLE_S = 0.1, 0.5, 6.0, 1.0  # real seconds
 UNSTARTED_S = 120.0  # real seconds that a process may take from the queue to its first word, on a busy unit

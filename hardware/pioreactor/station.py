@@ -237,7 +237,7 @@ class Station:
 
         A dose under way is stopped and followed to its end. Raises: DeviceStateError, LinkError.
         """
-        deadline = self._now_in(real_s)
+        deadline, self.doses.stopped_s = self._now_in(real_s), self._clock.now()
         while True:
             self.poll()
             if self._mqtt.connected and self.doses.off() and not (self.doses.running and not self.doses.trouble):

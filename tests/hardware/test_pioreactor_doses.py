@@ -96,7 +96,7 @@ def test_a_killed_dose_whose_pin_runs_on_is_an_alarm_and_counted_until_it_is_pro
     with pytest.raises(DeviceStateError, match="pull the plug"):
         lab.reactors.stop()
     lab.world.lock, lab.world.mute, lab.world.kill_after_s = False, False, np.inf  # the operator
-    lab.wait(80.0)
+    lab.wait(200.0)  # it drains once nobody has asked for pumps off for a while
     cycled, end = sorted(lab.of("dose_end"), key=lambda row: row["feed_ml"])
     assert lab.world.moved["remove_waste"] == pytest.approx(40.0)  # twice what can stand above the tube
     more = sum(r.volume_ml[0] for _, r in lab.reactors.repeated())
@@ -128,6 +128,24 @@ def test_samples_go_on_while_the_fate_of_a_dose_is_open(lab):
     assert not lab.of("dose_end")
     assert len(lab.of("sample")) >= before + 4
     assert len(lab.asked("add_media")) == 1
+
+
+def test_a_vial_that_a_pump_filled_is_drained_although_a_stop_comes_in_between(lab):
+    lab.world.kill_after_s = 0.2
+    lab.dose(0.5)
+    lab.wait(8.0)
+    lab.world.lock, lab.world.kill_after_s = False, np.inf
+    assert lab.station.doses.running
+    lab.world.stop_after_s = 2.0  # somebody stops it in the middle of the draining
+    while "remove_waste" not in lab.world.jobs:
+        lab.wait(0.5)
+    lab.wait(5.0)
+    lab.world.stop_after_s = np.inf
+    lab.wait(300.0)
+    (end,) = [row for row in lab.of("dose_end") if row.get("id")]
+    assert end["feed_ml"] > 5.0
+    assert lab.world.moved["remove_waste"] >= 2.0 * end["feed_ml"] - 0.1
+    assert lab.station.fault is None
 
 
 def test_a_request_in_a_dead_queue_is_never_sent_again_and_is_noticed_when_it_runs_late(lab):
