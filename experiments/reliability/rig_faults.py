@@ -250,7 +250,7 @@ OTHERS = (
     RigFault("sensor_dark", "the photodiode's plug is out", vial(held_od=0.0), vial(held_od=float("nan")), seconds=40.0,
              by=("jump:", "impossible:", "falls:", "spectrometer:"), unheld="no dose while nothing is seen"),
     RigFault("media_empty", "the media bottle is empty", plant("feed", "gain_factor", 0.0),
-             plant("feed", "gain_factor", 1.0), seconds=75.0, by=("no_dilution:",), within_s=75.0,
+             plant("feed", "gain_factor", 1.0), seconds=100.0, by=("no_dilution:", "cannot_hold:"), within_s=100.0,
              flow=True, unheld="nothing dilutes"),
     RigFault("media_weak", "the media pump gives 60 %", plant("feed", "gain_factor", 0.6), seconds=60.0,
              why_not="the policy doses by what the culture answers", flow=True),
