@@ -277,5 +277,6 @@ class Doses(PumpJobs):
             self._book.tell(said)
             self._book.note_down(
                 "dose_end", verified_off=True, on_s=at_s - REPEAT_S, feed_ml=feed, waste_ml=waste,
-                feed_times=int(feed > 0.0), waste_times=int(waste > 0.0), repeated_ml=feed, feed_low_ml=0.0, source=event.source,
+                feed_times=int(feed > 0.0), waste_times=int(waste > 0.0), repeated_ml=feed, feed_low_ml=0.0,
+                source=event.source,
             )  # fmt: skip
