@@ -269,9 +269,8 @@ OTHERS = (
              by=("task queue takes nothing",), refused=True),
     RigFault("no_broker", "the broker is dead", process("broker")[0], moments=("start",), by=("MQTT broker",),
              refused=True),
-    RigFault("left_lock", "a lock on the media pump's pin was left behind", left_lock, clear_lock(MEDIA_PIN),
-             moments=("start",), seconds=60.0, by=("accepted and not carried out", "does not list", "dosing"),
-             within_s=140.0, foreign=1),
+    RigFault("left_lock", "a media pump's job was killed before, and left a lock on its pin", left_lock,
+             moments=("start",), by=("dosing: add_media",), refused=True),
 )  # fmt: skip
 
 RIG_FAULTS: tuple[RigFault, ...] = (*KILLS, *OTHERS)

@@ -66,6 +66,9 @@ def judged(fault: RigFault, moment: str, struck: Sequence[float], seen: Seen) ->
     if fault.refused:
         return _refused(fault, seen, found)
     mine = [row for row in seen.journal if row.get("reactor") == SICK]
+    if not mine:
+        found.wrong.append("nothing is on record")
+        return found
     _told(fault, struck, seen, mine, found)
     _doses(fault, mine, seen, found)
     _volumes(fault, mine, seen, found)

@@ -108,6 +108,7 @@ def test_cultures_and_pumps_are_judged_by_the_vials() -> None:
     assert "pump runs at the end" in wrong(vial(sound(), WELL, 119, duty={"12": 100.0, "13": 0.0}))
     assert "rose to" in wrong(vial(sound(), SICK, 50, peak_ml=25.0))
     assert "ended with" in wrong(replace(sound(), status=1))
+    assert "nothing is on record" in wrong(replace(sound(), journal=()))
 
 
 def test_what_must_not_start_is_refused_with_one_line() -> None:
