@@ -74,7 +74,7 @@ class Doses(PumpJobs):
         self.sample: tuple[float, int] | None = None
         self.carry_ml, self._count = 0.0, 0
         self._course: Course | None = None
-        self._due = 0.0
+        self._due, self._waits = 0.0, False
         self._booked: dict[tuple[str, str], float] = {}
         self._strange: list[Event] = []
 
@@ -82,6 +82,11 @@ class Doses(PumpJobs):
     def running(self) -> bool:
         """Whether a dose is under way, or the fate of one unknown."""
         return self._course is not None
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the dose under way waits: for what is not known, or for pumps to be allowed again."""
+        return bool(self.trouble) or self._waits
 
     def restore(self, history: History) -> None:
         """Continue as an earlier life of the run left it; a dose without an end is looked for, never sent again."""
@@ -189,10 +194,11 @@ class Doses(PumpJobs):
         It waits while anybody asks for pumps off, and goes on where it was stopped: a vial that is too full by the
         ledger is given no dose, and so no waste, any more.
         """
+        self._book.tell("the vial is drained of what the media pump gave while it ran on, before it is dosed again")
         wanted, taken, k = self._config.waste_factor * min(media.high, self._config.volume_ml), 0.0, 0
         while wanted - taken > LATE_ML and k < DRAINS:
-            self.trouble = f"{wanted - taken:.1f} mL are to be pumped out, after the media pump ran on"
-            if self._clock.now() < self.stopped_s + QUIET * self._config.period_s:
+            self._waits = self._clock.now() < self.stopped_s + QUIET * self._config.period_s
+            if self._waits:
                 yield ASK_S
                 continue
             k += 1
@@ -201,7 +207,6 @@ class Doses(PumpJobs):
             given = yield from self.pump(WASTE, wanted - taken, key[1])
             self._booked[key] = given.low
             taken += given.low
-        self.trouble = ""
         return Given(taken, wanted)
 
     def _correct(self, plan: Plan, media: Given, waste: Given) -> None:

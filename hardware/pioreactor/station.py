@@ -102,15 +102,19 @@ class Station:
 
     # -- what happens ----------------------------------------------------------------------------------------------
 
-    def poll(self) -> bool:
-        """Take in what the unit said, go on with a dose; whether there is a new sample."""
+    def go_on(self) -> None:
+        """Take in what the unit said, and go on with a dose."""
         readings, events = self._box.drain()
         self.sampling.take(readings)
         self.doses.take(events)
         self.doses.work()
         self._steer()
+
+    def poll(self) -> bool:
+        """Go on; whether there is a new sample, which whoever asked has to act on."""
+        self.go_on()
         undisturbed_s = self.doses.ended_s + self._config.mix_s * (self.doses.ended_s > 0.0)
-        dosing = self.doses.running and not self.doses.trouble  # a dose in doubt may take hours to be known
+        dosing = self.doses.running and not self.doses.at_rest  # a dose in doubt may take hours to be known
         found = self.sampling.look(self._clock.now(), undisturbed_s, dosing)
         self._judge()
         if found is None:
@@ -239,8 +243,8 @@ class Station:
         """
         deadline, self.doses.stopped_s = self._now_in(real_s), self._clock.now()
         while True:
-            self.poll()
-            if self._mqtt.connected and self.doses.off() and not (self.doses.running and not self.doses.trouble):
+            self.go_on()
+            if self._mqtt.connected and self.doses.off() and (self.doses.at_rest or not self.doses.running):
                 break
             if self._clock.now() > deadline:
                 raise DeviceStateError(self._still_on())

@@ -139,3 +139,12 @@ def test_addresses_have_a_default():
     config = RigBackendConfig(addresses={"pio01": "http://10.0.0.1/"})
     assert config.address("pio01") == "http://10.0.0.1"
     assert config.address("pio02") == "http://pio02.local"
+
+
+def test_a_sample_that_is_due_while_pumps_are_switched_off_is_kept_for_whoever_decides(lab):
+    before = len(lab.of("sample"))
+    lab.world.sleep(70.0)
+    lab.station.pumps_off(3.0)
+    assert len(lab.of("sample")) == before
+    assert lab.sample(1).fresh[0]
+    assert len(lab.of("sample")) == before + 1
