@@ -141,7 +141,10 @@ def test_addresses_have_a_default():
     assert config.address("pio02") == "http://pio02.local"
 
 
-def test_a_sample_that_is_due_while_pumps_are_switched_off_is_kept_for_whoever_decides(lab):
+def test_a_sample_that_is_due_while_pumps_are_switched_off_is_kept_for_whoever_decides(monkeypatch):
+    lab = Lab(monkeypatch)
+    lab.begin()
+    lab.sample()
     before = len(lab.of("sample"))
     lab.world.sleep(70.0)
     lab.station.pumps_off(3.0)
