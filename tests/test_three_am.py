@@ -169,6 +169,9 @@ SAID: dict[str, dict[str, Reader]] = {  # which call says something, in which fi
         "station",
     )},
     "hardware/chibio/protocol.py": ERRORS,
+    **{f"hardware/pioreactor/{name}.py": TELLS for name in (
+        "doses", "jobs", "mailbox", "pump_jobs", "reactors", "station", "web",
+    )},
     "hardware/link/*.py": ERRORS,
     "hardware/storage/journal.py": ERRORS,
     "hardware/storage/recorder.py": ERRORS,
@@ -188,6 +191,8 @@ NAMED = {  # names whose values are said elsewhere
     "experiments/control/summary.py": ("who",),
     "hardware/chibio/fluorescence.py": ("trouble",),
     "hardware/chibio/overflow_pump.py": ("trouble",),
+    "hardware/pioreactor/doses.py": ("trouble", "said"),
+    "hardware/pioreactor/pump_jobs.py": ("trouble",),
     "hardware/safety/interlock.py": ("texts",),
     "hardware/storage/recorder.py": ("repaired",),
 }

@@ -150,7 +150,8 @@ class Station:
         if self.doses.trouble:
             return Fault("pump", self.doses.trouble, "nothing is dosed until that is known")
         if other := self._mqtt.holder(self.name):
-            return Fault("mode", *other.split("; ", 1))
+            who, _, done = other.partition("; ")
+            return Fault("mode", who, done)
         if self._box.live(AUTOMATION) and math.isnan(self.handed_over):
             return Fault("mode", "a dosing automation runs", "stop it in the vendor's page")
         if not self.doses.running and self._box.running_pins(self._config.pump_pins) and math.isnan(self.handed_over):
