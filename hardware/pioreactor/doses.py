@@ -180,12 +180,12 @@ class Doses(PumpJobs):
         for pump in (MEDIA, WASTE):
             self._booked[pump, dose] = -1.0  # under way: its events are expected
         media = yield from self.pump(MEDIA, plan.feed_ml, dose)
-        waste = Given(0.0, 0.0)
-        if media.high > plan.feed_ml + LATE_ML:
-            waste = yield from self._drain(media, dose)
-        elif media.high > 0.0:
+        waste, ran_on = Given(0.0, 0.0), media.high > plan.feed_ml + LATE_ML
+        if media.high > 0.0 and not ran_on:
             waste = yield from self.pump(WASTE, plan.waste_ml, dose)
         self._conclude(dose, on_s, media, waste)
+        if ran_on:  # on record before: it may wait for long
+            waste = yield from self._drain(media, dose)
         self._correct(plan, media, waste)
 
     def _drain(self, media: Given, dose: str) -> Steps:
@@ -252,10 +252,11 @@ class Doses(PumpJobs):
         if self._box.lost(MEDIA):
             yield from self.prove_off(MEDIA)
             on_s = (self._book.elapsed() - history.on_s) / self._config.speed
-            media = Given(0.0, max(history.feed_ml, on_s * self.flow_ml_s[MEDIA]))
-            waste = yield from self._drain(media, history.id)
+            media, waste = Given(0.0, max(history.feed_ml, on_s * self.flow_ml_s[MEDIA])), Given(0.0, 0.0)
         self.trouble = ""
         self._conclude(history.id, history.on_s, replace(media, end=UNSEEN), waste)
+        if media.high > history.feed_ml:
+            waste = yield from self._drain(media, history.id)
         self._correct(Plan(history.feed_ml, history.waste_ml), media, waste)
 
     # -- what nobody commanded -------------------------------------------------------------------------------------

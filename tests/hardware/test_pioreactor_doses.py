@@ -139,6 +139,7 @@ def test_a_vial_that_a_pump_filled_is_drained_although_a_stop_comes_in_between(l
     lab.world.stop_after_s = 2.0  # somebody stops it in the middle of the draining
     while "remove_waste" not in lab.world.jobs:
         lab.wait(0.5)
+    assert not replay(lab.rows)[UNIT].open, "a program that is killed now knows what the dose was"
     lab.wait(5.0)
     lab.world.stop_after_s = np.inf
     lab.wait(300.0)
