@@ -77,8 +77,8 @@ class Findings:
     rows_doubled: rows beyond one for each sample: of a sample that has its row, or of none.
     doses: runs of the feed motors. doses_doubled: those without an intent of their own. doses_repeated: those that the
       device repeated by itself, every 63 s, while no client lived.
-    doses_not_given: intents without a dose. doses_lost: intents without a dose although the client was not killed
-      between the two, and no note says why none was given.
+    doses_not_given: intents without a dose. doses_lost: intents without a dose although the client was neither
+      killed nor asked to end between the two, and no note says why none was given.
     open_doses: kills in the middle of a dose.
     mean_error: mean distance of the true OD, of the worst reactor in the last client's life, its first minutes left
       out, from what growth and full dilution allowed since its first sample. out_min: longest time in the lives of
@@ -292,7 +292,8 @@ class _Comparison:
             f.booked_ml += float(row["feed_ml"])
             at = row["on_s"] + self._zero
             given = ((starts > at - 3.0) & (starts < at + 45.0)).any()
-            killed = any(row["wall"] - 0.1 <= t <= row["wall"] + 2.0 * self.config.answer_s for t in self._killed)
+            ends = (*self._killed, self._ended)  # asked to end, a client cuts its dose as short as a kill does
+            killed = any(row["wall"] - 0.1 <= t <= row["wall"] + 2.0 * self.config.answer_s for t in ends)
             f.doses_not_given += int(not given)
             if not given and not killed and "no dose" not in str(following.get("note")):
                 f.doses_lost += 1
