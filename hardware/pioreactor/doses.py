@@ -5,7 +5,6 @@ over when its events add up, its job is gone and its pin is off. One whose fate 
 counted whole; nothing more is dosed until the unit's task queue has proved that it cannot run any more.
 """
 
-import contextlib
 import math
 from dataclasses import dataclass, replace
 
@@ -234,16 +233,14 @@ class Doses(PumpJobs):
         for pump in (MEDIA, WASTE):
             self._booked[pump, history.id] = -1.0
         self.trouble = f"a dose of {history.feed_ml:.2f} mL was left open"
-        task, taken = "", False
+        barrier, taken = self._barrier(), False
         while (
             not taken
             or self._box.running_pins(self._config.pump_pins)
             or self._box.live(MEDIA)
             or self._box.live(WASTE)
         ):
-            with contextlib.suppress(ReactorError):
-                task = task or self._web.run(MEDIA, {"help": None}, self._book.env, [])
-                taken = taken or self._web.result(task) is not None
+            taken = taken or barrier.passed()
             yield ASK_S
         yield UNSTARTED_S
         media, waste = Given(0.0, history.feed_ml), Given(0.0, history.waste_ml)

@@ -20,6 +20,7 @@ __all__ = ["ASK_S", "LATE_ML", "MEDIA", "OURS", "UNSTARTED_S", "WASTE", "Course"
 
 STEP_S, ASK_S, OVERRUN_S, SETTLE_S = 0.1, 0.5, 6.0, 1.0  # real seconds
 UNSTARTED_S = 120.0  # real seconds that a process may take from the queue to its first word, on a busy unit
+PROBE_S = 30.0  # real seconds between two harmless requests that show whether the task queue works
 SHORT_S, AGAIN_S = 0.1, 6.0  # real seconds: a run of a pump that ends with its pin off; between two of them
 LATE_ML = 0.1  # messages are late by some hundredths of a second
 ROUNDED_S = 0.5  # a dose that is stopped early is told up to the next half second of its pump
@@ -38,6 +39,28 @@ class Given:
 
 Course = Iterator[float]
 Steps = Generator[float, None, Given]
+
+
+class Barrier:
+    """Whether nothing older waits in the task queue any more: a harmless request behind it was taken.
+
+    The request is made anew now and then, because a unit that boots forgets what was written down. Args: wait_s: real
+    seconds until it is made first.
+    """
+
+    def __init__(self, web: Web, book: Logbook, clock: Clock, speed: float, wait_s: float = 0.0) -> None:
+        self._web, self._book, self._clock, self._speed = web, book, clock, speed
+        self._task, self._due = "", clock.now() + wait_s * speed
+
+    def passed(self) -> bool:
+        """Ask; trouble on the way is an answer that is not there yet."""
+        with contextlib.suppress(ReactorError):
+            if self._task and self._web.result(self._task) is not None:
+                return True
+            if self._clock.now() >= self._due:
+                self._task = self._web.run(MEDIA, {"help": None}, self._book.env, [])
+                self._due = self._clock.now() + PROBE_S * self._speed
+        return False
 
 
 class PumpJobs:
@@ -64,6 +87,7 @@ class PumpJobs:
         self.trouble = ""
         self.doubt: set[str] = set()  # jobs whose process was killed: whether their pumps run is not known
         self._cycled_s = -math.inf
+        self._cycle: Barrier | None = None
         self._told: dict[tuple[str, str], float] = {}
 
     def pump(self, job: str, ml: float, dose: str) -> Steps:
@@ -164,14 +188,13 @@ class PumpJobs:
         self._book.tell(self.trouble)
         while True:
             told, again = self._told.get((job, source), 0.0), self._clock.now() + AGAIN_S * self._config.speed
-            with contextlib.suppress(ReactorError):
-                self._web.run(job, {"duration": SHORT_S, "source-of-event": source}, self._book.env, [])
+            self._switch(job)
             while self._clock.now() < again or self._box.live(job):
                 yield STEP_S
                 cycled = self._told.get((job, source), 0.0) > told and not self._box.lost(job)
                 if cycled and not self._box.live(job) and pin not in self._box.running_pins([pin]):
                     self.doubt.discard(job)
-                    self.trouble = ""
+                    self.trouble, self._cycle = "", None
                     return
 
     def _unknown(self, key: tuple[str, str], ml: float, task: str | None, at: tuple[int, float]) -> Steps:
@@ -184,18 +207,17 @@ class PumpJobs:
         job, (breaks, asked) = key[0], at
         self.trouble = f"the fate of a dose of {ml:.2f} mL ({job}) is unknown: task queue or broker do not answer"
         self._book.tell(self.trouble)
-        own = task
-        taken: bool | None = None
-        while taken is None:
+        barrier, taken, died = self._barrier(PROBE_S if task else 0.0), False, False
+        while not taken:
             if self._told.get(key, 0.0) > 0.0:
                 self.trouble = ""
                 self._book.tell(f"{job} of {ml:.2f} mL ran late")
                 return (yield from self._follow(key, ml, breaks))
             with contextlib.suppress(ReactorError):
-                task = task or self._web.run(MEDIA, {"help": None}, self._book.env, [])  # stands behind it in the queue
-                taken = self._web.result(task)
+                said = self._web.result(task) if task else None
+                taken, died = said is not None, said is False  # False: its process is over and did nothing
+            taken = taken or barrier.passed()
             yield ASK_S
-        died = own is not None and taken is False  # its process is over and did nothing
         latest = self._clock.now() + UNSTARTED_S * self._config.speed  # a process may take long to start
         while not (died or self._box.been(job, asked) or self._clock.now() > latest) or not self.off():
             if self._box.lost(job):
@@ -244,9 +266,18 @@ class PumpJobs:
         if not pins or self._clock.now() < self._cycled_s + AGAIN_S * self._config.speed:
             return
         self._cycled_s = self._clock.now()
-        source = f"{OURS}{self._run}/{self.unit}/off"
-        with contextlib.suppress(ReactorError):
-            self._web.run(jobs[pins[0]], {"duration": SHORT_S, "source-of-event": source}, self._book.env, [])
+        self._switch(jobs[pins[0]])
+
+    def _switch(self, job: str) -> None:
+        """Ask for a short run of a pump, unless an earlier one may still wait: requests do not expire."""
+        if self._cycle is None or self._cycle.passed():
+            self._cycle = self._barrier()
+            source = f"{OURS}{self._run}/{self.unit}/off"
+            with contextlib.suppress(ReactorError):
+                self._web.run(job, {"duration": SHORT_S, "source-of-event": source}, self._book.env, [])
+
+    def _barrier(self, wait_s: float = 0.0) -> Barrier:
+        return Barrier(self._web, self._book, self._clock, self._config.speed, wait_s)
 
     def stop_by_web(self) -> None:
         """The same by HTTP, which rounds what was given. Raises: ReactorError."""

@@ -130,6 +130,33 @@ def test_samples_go_on_while_the_fate_of_a_dose_is_open(lab):
     assert len(lab.asked("add_media")) == 1
 
 
+def test_short_runs_of_a_pump_do_not_pile_up_in_a_queue_that_is_dead(lab):
+    lab.world.kill_after_s = 0.2
+    lab.dose(0.5)
+    lab.wait(2.0)
+    lab.world.queue, lab.world.lock = False, False
+    lab.wait(300.0)
+    assert len([o for _, o in lab.world.runs if "duration" in o]) <= 2
+    before = lab.world.moved["add_media"]
+    lab.world.pin("add_media", False)
+    lab.world.revive()
+    lab.wait(30.0)
+    assert sum(r["feed_ml"] for r in lab.of("dose_end") if r.get("source")) <= 0.21
+    assert lab.world.moved["add_media"] >= before
+
+
+def test_a_unit_that_forgot_the_queue_in_a_reboot_is_asked_again(lab):
+    lab.world.queue = False
+    lab.dose(0.5)
+    lab.wait(20.0)
+    lab.world.waiting.clear()  # what lay in memory
+    lab.world.queue = True
+    lab.wait(220.0)
+    (end,) = lab.of("dose_end")
+    assert (end["feed_ml"], lab.station.fault) == (0.0, None)
+    assert len(lab.asked("add_media")) == 1
+
+
 def test_a_vial_that_a_pump_filled_is_drained_although_a_stop_comes_in_between(lab):
     lab.world.kill_after_s = 0.2
     lab.dose(0.5)
