@@ -56,6 +56,11 @@ class Experiment:
         yield from self._outputs.everything_off()
         self._position.terminal("Experiment Stopped")
 
+    def _cut_short(self) -> Steps:
+        """A cycle that was stopped before its record does not count."""
+        self._position.data["Experiment"]["cycles"] -= 1
+        yield from self._finish()
+
     def _cycle(self) -> Steps:
         """`runExperiment`: one cycle of about 60 s (docs/device.md, Cycle)."""
         data, experiment, computer = self._position.data, self._position.data["Experiment"], self._position.computer
@@ -69,10 +74,13 @@ class Experiment:
         yield from self._outputs.set_on("Stir", 0)
         yield SETTLE_S
         if experiment["ON"] == 0:
-            experiment["cycles"] -= 1
-            yield from self._finish()
+            yield from self._cut_short()
             return
         yield from self._measure()
+        if experiment["ON"] == 0:  # `Measuring` stays 1 (docs/device.md, Cycle)
+            yield from self._cut_short()
+            return
+        data["OD"]["Measuring"] = 0
         yield from self._act()
         yield from self._store(started)
         if experiment["ON"] == 0:
@@ -90,7 +98,7 @@ class Experiment:
             yield from self._finish()
 
     def _measure(self) -> Steps:
-        """Four readings, their mean OD, three temperatures, fluorescence; `Measuring` is 1 meanwhile."""
+        """Four readings, their mean OD, three temperatures, fluorescence; `Measuring` is 1 from here on."""
         od = self._position.data["OD"]
         od["Measuring"] = 1
         total = 0.0
@@ -103,7 +111,6 @@ class Experiment:
             self._position.measure_temperature(which)
             yield BUS_S
         yield from self._optics.measure_fluorescence()
-        od["Measuring"] = 0
 
     def _act(self) -> Steps:
         """Regulation and light; then wait for the waste pump, then stir. Custom programs end at once on Python 3."""

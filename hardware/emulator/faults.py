@@ -54,6 +54,11 @@ FAULTS: dict[str, tuple[str, str, str]] = {
     "waste_stuck_open": ("vial", "0 or 1", "Pump2 runs at full power whatever is commanded"),
     "heater_runaway": ("vial", "0 or 1", "heater at full power whatever is commanded"),
     "stirrer_dead": ("vial", "0 or 1", "the stirrer does not turn"),
+    "internal_zero": (
+        "vial",
+        "count",
+        "the air thermometer reads 0 so often: a thread that measures it ends, and `OD.Measuring` stays 1",
+    ),
     "pump_gain_factor": ("plant", "factor >= 0", "feed flow: 0 blocked, 0.5 weak, 1 sound"),
     "waste_gain_factor": ("plant", "factor >= 0", "waste flow: 0 blocked, 1 sound"),
     "overflow_gain_factor": ("plant", "factor >= 0", "flow of the overflow pump: 0 blocked, 1 sound"),

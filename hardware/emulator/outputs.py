@@ -55,6 +55,9 @@ class Position:
         if which == "Internal" and self.data["present"] and not self.answers:
             self.data["present"] = 0
             raise AppError("internal thermometer does not answer")
+        if which == "Internal" and self.hardware().faults.internal_zero:
+            self.hardware().faults.internal_zero -= 1
+            raise AppError("invalid literal for int() with base 2: ''")  # bin(0)[6:] is empty
         value = self.hardware().temperature(which, self.computer.now())
         meter["current"] = value if value <= 100.0 else meter["current"]
 

@@ -104,6 +104,7 @@ class VialFaults:
     waste_stuck_open: bool = False
     heater_runaway: bool = False
     stirrer_dead: bool = False
+    internal_zero: int = 0
 
 
 class Spectrometer:
