@@ -64,7 +64,7 @@ class Curves:
         """One point of every curve of the reactors that have a new sample. Raises: OSError of a full disk."""
         setpoint = np.where(step.phase >= 0, step.setpoint, np.nan)
         named: dict[str, Array] = {
-            "culture/od": step.od,
+            "culture/od": step.od if step.believed is None else np.where(step.believed, step.od, np.nan),
             "culture/setpoint": setpoint,
             "culture/setpoint_low": setpoint * (1.0 - BAND),
             "culture/setpoint_high": setpoint * (1.0 + BAND),

@@ -34,7 +34,8 @@ class Step:
     response: of the interlock. notes: of the reactors. explanation: of the controller. done: schedule over.
     composition: further columns of the recording, where a composition is controlled.
     raw, blank: counts behind the OD and those of clear medium; nan where the reactors have none.
-    pump: number of the pump that gives the dose, 1 (the feed), 3 or 4.
+    pump: number of the pump that gives the dose, 1 (the feed), 3 or 4. believed: rows whose OD the interlock takes for
+      the culture's.
     position: of each reactor, where it stands in its schedule (`ClosedLoop.position`). ended: steps of the schedule
       that this sample ended by their condition.
     """
@@ -61,6 +62,7 @@ class Step:
     raw: Array | None = None
     blank: Array | None = None
     pump: NDArray[np.intp] | None = None
+    believed: Mask | None = None
 
 
 class ClosedLoop:
@@ -159,7 +161,7 @@ class ClosedLoop:
             np.full(len(self.done), np.nan), reasons, verdict.response, (), explanation, self.done.copy(),
             {} if composed is None else composed.columns,
             [self.position(n) for n in range(len(self.done))], ended,
-            None if m.vitals is None else m.vitals.raw, None if m.vitals is None else m.vitals.blank, pump,
+            None if m.vitals is None else m.vitals.raw, None if m.vitals is None else m.vitals.blank, pump, believed,
         )  # fmt: skip
         if self._before_dose is not None:
             self._before_dose(decision)

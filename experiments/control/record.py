@@ -112,6 +112,10 @@ class Record:
             own[: len(rows)] = rows.columns[column]
         return values
 
+    def od(self, refused: bool = False) -> Array:
+        """OD of all recordings, nan where the interlock did not believe it, or, if `refused`, where it did; (N, K)."""
+        return np.where((self.series("believed") == 0.0) == refused, self.series("od"), np.nan)
+
     def close(self) -> None:
         """Close all files. Idempotent."""
         for recorder in self._recorders:

@@ -38,9 +38,9 @@ Row = dict[str, float | int | str | bool | None]
 REBUILD = "move it away and resume again: it is written anew from the last 20 MB of the journal"
 COLUMNS = (
     "time_min", "elapsed_min", "phase", "od", "setpoint", "pump_rate_ml_s", "proposed_ml_s", "volume_ml",
-    "temperature_degc", "interlock", "raw_counts", "blank_counts", "feed_pump",
+    "temperature_degc", "interlock", "raw_counts", "blank_counts", "feed_pump", "believed",
 )  # fmt: skip
-ADDED = ("raw_counts", "blank_counts", "feed_pump")  # columns of a later version
+ADDED = ("raw_counts", "blank_counts", "feed_pump", "believed")  # columns of a later version
 
 
 def row_of(step: Step, n: int) -> Row:
@@ -60,6 +60,7 @@ def row_of(step: Step, n: int) -> Row:
         "raw_counts": math.nan if step.raw is None else float(step.raw[n]),
         "blank_counts": math.nan if step.blank is None else float(step.blank[n]),
         "feed_pump": 1 if step.pump is None else int(step.pump[n]),
+        "believed": 1 if step.believed is None else int(step.believed[n]),
         **further,
     }
 

@@ -102,7 +102,7 @@ class ChangeLog:
                 self._who_decides(step, n)
                 if step.done[n]:
                     self._window(step, n)
-                elif self._phase[n] >= 0 and np.isfinite(step.od[n]):
+                elif self._phase[n] >= 0 and np.isfinite(step.od[n]) and (step.believed is None or step.believed[n]):
                     self._error[n] += abs(step.od[n] - step.setpoint[n])
                     self._samples[n] += 1
             reason = step.reasons[n] or ""
@@ -203,7 +203,7 @@ def summarise(
 
 def _windows(record: Record, scenarios: Sequence[Scenario], progress: Progress) -> list[dict[str, Any]]:
     """Metrics of every phase of every reactor; `ended` is what ended it, null if it is not over."""
-    elapsed, od = record.series("elapsed_min"), record.series("od")
+    elapsed, od = record.series("elapsed_min"), record.od()
     rows = []
     for n, (name, scenario) in enumerate(zip(record.names, scenarios, strict=True)):
         latest = float(np.nanmax(elapsed[n], initial=-1.0))
@@ -233,7 +233,7 @@ def _shares(record: Record, n: int, start: float, end: float) -> dict[str, Any]:
         if key in record.columns:
             whole, late = mean_errors(minute, record.series(key)[n : n + 1], asked, start, end)
             told |= {f"{key}_abs_error_mean": float(whole[0]), f"{key}_abs_error_last2h": float(late[0])}
-    density, _ = mean_errors(minute, record.series("od")[n : n + 1], record.series("setpoint")[n : n + 1], start, end)
+    density, _ = mean_errors(minute, record.od()[n : n + 1], record.series("setpoint")[n : n + 1], start, end)
     return told | {"od_abs_error_mean": float(density[0])}
 
 
@@ -256,9 +256,9 @@ def figure_of(record: Record, scenarios: Sequence[Scenario], title: str) -> Figu
     setpoint = np.where(record.series("phase") >= 0, record.series("setpoint"), np.nan)
     switched = any(len(set(s.temperatures)) > 1 for s in scenarios)
     temperature = record.series("temperature_degc").T if switched else None
-    series = (record.series("time_min").T, record.series("od").T, setpoint.T, record.series("pump_rate_ml_s").T)
+    series = (record.series("time_min").T, record.od().T, setpoint.T, record.series("pump_rate_ml_s").T)
     marks = [(m.time_min, f"{m.reactor} {m.text}".strip()) for m in _marks(record)]
-    return charts.closed_loop(*series, record.names, temperature, title, marks)
+    return charts.closed_loop(*series, record.names, temperature, title, marks, record.od(refused=True).T)
 
 
 def _marks(record: Record) -> list[Mark]:
@@ -273,5 +273,7 @@ def _marks(record: Record) -> list[Mark]:
 def composition_figure_of(record: Record, title: str) -> Figure:
     """Share, temperature, OD and fluorescence of all reactors, of a run that controlled a composition."""
     return composition_figure(
-        {key: record.series(key) for key in record.columns if key != "interlock"}, record.names, title
+        {key: record.series(key) for key in record.columns if key != "interlock"} | {"od": record.od()},
+        record.names,
+        title,
     )

@@ -221,11 +221,12 @@ def closed_loop(
     temperature: Array | None = None,
     title: str = "",
     marks: Sequence[tuple[float, str]] = (),
+    refused: Array | None = None,
 ) -> Figure:
     """A recorded closed loop: OD over setpoint, above pump rate (and temperature).
 
     Args: minutes, od, setpoint, rate, temperature: (K, N), nan where a reactor has no sample. names: N labels.
-      marks: minute and text of vertical lines.
+      marks: minute and text of vertical lines. refused: OD that was not believed, (K, N); at the edge where it is far.
     """
     rows = 2 if temperature is None else 3
     ratios = [2.2, 1.0] if temperature is None else [2.2, 1.0, 0.8]
@@ -245,6 +246,13 @@ def closed_loop(
             ax.axvline(minute, color="#7f7f7f", linewidth=0.9, linestyle=":")
         place: dict[str, Any] = {"rotation": 90, "fontsize": 7, "va": "bottom", "ha": "right", "color": "#4d4d4d"}
         axes[0].text(minute, 0.02, text, transform=axes[0].get_xaxis_transform(), **place)
+    if refused is not None and np.isfinite(refused).any():
+        low, high = axes[0].get_ylim()
+        axes[0].plot(
+            minutes, np.clip(refused, low, high), "x", color="#7f7f7f", markersize=4, clip_on=False,
+            label=["not believed", *[None] * (len(names) - 1)],
+        )  # fmt: skip
+        axes[0].set_ylim(low, high)
     axes[0].set_ylabel("OD")
     axes[0].set_title(title)
     axes[0].legend(ncols=3)

@@ -20,6 +20,7 @@ from experiments.control.summary import figure_of, summarise
 from experiments.mark import MarkConfig, mark
 from experiments.mark import main as command
 from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
+from hardware.emulator.faults import inject
 from hardware.emulator.vial import DARK_COUNTS
 from hardware.errors import RecordingError
 from hardware.storage.marks import Mark, add_mark, read_marks
@@ -90,6 +91,38 @@ def test_a_recording_of_before_these_columns_is_read_and_resumed_from(run: Rehea
     np.testing.assert_array_equal(rebuilt.series("od"), run.record.series("od"))
     assert np.isnan(rebuilt.series("raw_counts")).all()
     rebuilt.close()
+
+
+def test_a_reading_that_is_not_believed_counts_for_no_metric_and_is_a_cross_in_the_figure(tmp_path: Path) -> None:
+    whole = Rehearsal(tmp_path, rehearsed(("M0",), Scenario((0.5,), (40.0,), (37.0,))), quiet(mu=0.025), od=0.5)
+    whole.begin()
+    steps = whole.run()
+    for step in steps:
+        if step.rows.any() and float(step.minute[0]) > 12.0:
+            break
+    inject(whole.device, "spectrometer_dead")
+    for step in steps:
+        if step.rows.any() and float(step.minute[0]) > 15.0:
+            break
+    inject(whole.device, "spectrometer_dead", value=0.0)
+    for _ in steps:
+        pass
+    record, scenarios = whole.record, whole.loop.schedules
+    od, minute = record.series("od")[0], record.series("elapsed_min")[0]
+    wild = od > 5.0
+    assert 2 <= wild.sum() <= 5
+    assert (record.series("believed")[0] == 0.0)[wild].all()
+    [window] = summarise(record, scenarios, ["policy"], "completed")["windows"]
+    kept = record.series("believed")[0] == 1.0
+    by_hand = np.trapezoid((od[kept] - 0.5) ** 2, minute[kept])
+    assert window["ise"] == pytest.approx(by_hand, rel=1e-3)
+    assert window["ise"] < 0.5  # 400 with them
+    axis = figure_of(record, scenarios, "").axes[0]
+    assert axis.get_ylim()[1] < 1.5
+    lines = {str(line.get_label()): np.asarray(line.get_ydata(), dtype=float) for line in axis.get_lines()}
+    assert np.nanmax(lines["M0"]) < 1.5
+    assert np.isfinite(lines["not believed"]).sum() == (~kept).sum()
+    record.close()
 
 
 def test_a_mark_stands_in_the_figure_and_in_the_summary(run: Rehearsal) -> None:
