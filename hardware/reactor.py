@@ -4,13 +4,20 @@ All arrays have a leading axis of N reactors. A loop step is: `measure` (waits u
 sample), decide for the rows that are `fresh`, `actuate` those rows. `stop` is idempotent and always allowed.
 """
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Command", "Fault", "Measurement", "Reactor", "Receipt", "Vitals"]
+from hardware.errors import DeviceStateError, ReactorError
+
+__all__ = ["Command", "Fault", "Measurement", "Reactor", "Receipt", "Vitals", "left_off"]
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -98,6 +105,7 @@ class Receipt:
     pump: number of the spare pump that gave it, of a repetition; 0 for the feed, and where the command says it.
     kept_ml: by how much what is put off to the next dose has grown, mL, shape (N,), negative where that was given or
       lost; None where nothing is put off.
+    low_ml: the least that volume_ml can have been, mL, shape (N,); None: exactly that.
     """
 
     volume_ml: Array
@@ -105,6 +113,7 @@ class Receipt:
     waste_ml: Array | None = None
     kept_ml: Array | None = None
     pump: int = 0
+    low_ml: Array | None = None
 
 
 class Reactor(Protocol):
@@ -133,7 +142,7 @@ class Reactor(Protocol):
         ...
 
     def repeated(self) -> list[tuple[float, Receipt]]:
-        """Doses that were given again without a command and not told before: run time, s, and volumes, in order."""
+        """What was given beyond what receipts told, or less where negative: run time, s, and volumes, in order."""
         ...
 
     def elapsed(self) -> float:
@@ -159,3 +168,20 @@ class Reactor(Protocol):
     def stop(self) -> None:
         """All pumps off, verified. Idempotent. Raises: ReactorError if they could not be verified off."""
         ...
+
+
+@contextmanager
+def left_off(reactors: Reactor) -> Iterator[None]:
+    """What ends here by an error or a stop leaves all pumps off, verified, and says so, or that it could not.
+
+    Raises: what ended it; DeviceStateError naming the pumps that could not be verified off.
+    """
+    try:
+        yield
+    except BaseException as error:
+        try:
+            reactors.stop()
+        except ReactorError as failed:
+            raise DeviceStateError(f"{str(error) or 'stopped'}; {failed}") from error
+        log.info("ended before the run began: pumps verified off")
+        raise

@@ -160,7 +160,7 @@ Reader = Callable[[ast.Call, Scope], set[str]]
 ERRORS: dict[str, Reader] = dict.fromkeys(
     ("DeviceStateError", "IdentityError", "LinkError", "ProtocolError", "RecordingError"), first
 )
-TELLS: dict[str, Reader] = {"tell": first, "Fault": fault, **ERRORS}
+TELLS: dict[str, Reader] = {"tell": first, "say": first, "Fault": fault, **ERRORS}
 LOGS: dict[str, Reader] = {"warning": formatted, "error": formatted, "exception": formatted}
 SAID: dict[str, dict[str, Reader]] = {  # which call says something, in which files
     "hardware/safety/*.py": {"Finding": finding, "_Reason": finding},
@@ -173,13 +173,14 @@ SAID: dict[str, dict[str, Reader]] = {  # which call says something, in which fi
         "doses", "jobs", "mailbox", "pump_jobs", "reactors", "station", "web",
     )},
     "hardware/link/*.py": ERRORS,
+    "hardware/reactor.py": ERRORS,
     "hardware/storage/journal.py": ERRORS,
     "hardware/storage/recorder.py": ERRORS,
     "experiments/control/*.py": LOGS,
     "hardware/board/board_agent.py": LOGS,
 }  # fmt: skip
 RETURNED = {  # functions whose result is said elsewhere
-    "hardware/chibio/resume.py": "conclude",
+    "hardware/chibio/ending.py": "_words",
     "hardware/chibio/sampling.py": "_measure_lateness",
     "experiments/control/recovery.py": "complete",
 }

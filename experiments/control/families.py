@@ -27,7 +27,7 @@ from hardware.pioreactor.preflight import preflight as preflight_units
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay as replay_units
 from hardware.pioreactor.rig.processes import Rig
-from hardware.reactor import Reactor
+from hardware.reactor import Reactor, left_off
 from hardware.simulated import SimulatedReactors
 from hardware.storage.journal import Journal
 
@@ -76,7 +76,8 @@ def _chibio(opening: Opening) -> Iterator[Reactor]:
         reactors = ChiBioReactors(transport, clock, backend, calibrations, opening.journal.append)
         elapsed_s = (time.time() - float(earlier[0]["wall"])) * backend.speed if earlier else 0.0
         reactors.begin(replay(earlier), elapsed_s)
-        yield reactors
+        with left_off(reactors):
+            yield reactors
 
 
 @contextmanager
@@ -106,8 +107,9 @@ def _pioreactor(opening: Opening) -> Iterator[Reactor]:
         if not earlier:
             report(preflight_units(reactors))
         elapsed_s = (time.time() - began) * opening.backend.speed if earlier else 0.0
-        reactors.begin(replay_units(earlier), elapsed_s)
-        yield reactors
+        with left_off(reactors):
+            reactors.begin(replay_units(earlier), elapsed_s)
+            yield reactors
 
 
 OPENERS: dict[str, Opener] = {

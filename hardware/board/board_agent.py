@@ -37,9 +37,10 @@ Repeating a request is safe: a request equal to the previous one (same ID, METHO
 not carried out again. So a PC that got no reply, a damaged one or ID 0 sends the very same line again; it takes a new
 ID for every new request and starts with HELLO. HELLO and a trip of the dead-man switch clear that memory.
 
-HELLO, PING and BYE answer {"agent": "board_agent", "protocol": 2, "version": "2.0", "deadman_s": 120.0, "silent_s":
-0.0, "armed": true, "trips": 0, "last_trip": "", "url": "http://192.168.7.2:5000"}; silent_s is the silence before
-this request.
+HELLO, PING and BYE answer {"agent": "board_agent", "protocol": 2, "version": "2.1", "deadman_s": 120.0, "silent_s":
+0.0, "armed": true, "trips": 0, "last_trip": "", "switched_off": {"M0": {"Pump1": 12.5}}, "url":
+"http://192.168.7.2:5000"}; silent_s is the silence before this request, switched_off how many seconds ago the dead-man
+switch last found a pump on and took its off.
 
 GET /getSysdata/ is reduced to the fields that a client needs (under 1 KB): the same JSON with fewer keys; `record`
 lists hold their last value only, and "_records" {"time": n, "OD": n, "ThermometerIR": n} holds their lengths, which
@@ -106,7 +107,7 @@ import zlib
 from collections.abc import Iterable
 from typing import Any
 
-VERSION = "2.0"
+VERSION = "2.1"
 PROTOCOL = 2
 MAX_LINE = 512
 MAX_BODY = 262144
@@ -263,6 +264,7 @@ class Agent:
         self.lock = threading.RLock()
         self.armed, self.session, self.trips, self.last_trip = True, False, 0, ""
         self.silent_s = 0.0  # silence before the latest request
+        self._switched_off: dict[str, dict[str, float]] = {}  # reactor, pump: when it was last found on and stopped
         self._beat = time.monotonic()
         self._beats = 0
         self._settled = False  # this silence has been dealt with
@@ -297,10 +299,12 @@ class Agent:
 
     def status(self) -> bytes:
         """The JSON of HELLO, PING and BYE."""
+        now, off = time.monotonic(), self._switched_off.items()
         answer = {
             "agent": "board_agent", "protocol": PROTOCOL, "version": VERSION, "deadman_s": self.deadman_s,
             "silent_s": round(self.silent_s, 3), "armed": self.armed, "trips": self.trips,
             "last_trip": self.last_trip, "url": self.device.url,
+            "switched_off": {m: {pump: round(now - at, 3) for pump, at in pumps.items()} for m, pumps in off},
         }  # fmt: skip
         return json.dumps(answer).encode("ascii")
 
@@ -395,6 +399,9 @@ class Agent:
             status, _, _ = self.device.request("POST", f"/SetOutputOn/{pump}/0/{name}")
             if status != 204:
                 return [f"{pump} of {name}: status {status}"]
+            if state[pump]["ON"] != 0:
+                mine = {**self._switched_off.get(name, {}), pump: time.monotonic()}
+                self._switched_off = {**self._switched_off, name: mine}  # anew: another thread may be reading it
         state = self._state()
         running = [pump for pump in PUMPS if state[pump]["ON"] != 0]
         if state["UIDevice"] != name or running:

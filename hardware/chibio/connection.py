@@ -7,7 +7,7 @@ from typing import Any
 from hardware.chibio.protocol import PUMPS, DeviceState, check_command, parse_state
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
-from hardware.link.transport import Transport
+from hardware.link.transport import SharedLink, Transport
 
 __all__ = ["Connection", "Log", "identity", "no_log"]
 
@@ -74,9 +74,23 @@ class Connection:
         self.took_s = 0.0  # how long the last verified read took
         self._unsure = False  # a request was not answered as expected since presence was last seen
         self._seen_s = -math.inf  # clock time at which this reactor was last known to be present
-        self.clock, self._transport, self._log = clock, transport, log
+        self.clock, self._log = clock, log
+        self._transport = transport if isinstance(transport, SharedLink) else SharedLink(transport, clock)
         self._reactors, self._overflow_pump, self._slot_command = tuple(reactors), overflow_pump, slot_command
         self._supply_pumps = tuple(supply_pumps)
+
+    @property
+    def heard_s(self) -> float:
+        """Clock time of the newest answer over this link, to whichever reactor's request."""
+        return self._transport.heard_s
+
+    def switched_off(self) -> Mapping[str, float] | None:
+        """Pump, how many s ago a dead-man switch on the way found it on and switched it off; None: it does not say.
+
+        Raises: as `read`.
+        """
+        found = self._transport.switched_off()
+        return None if found is None else found.get(self.name, {})
 
     def read(self, tries: int = 3) -> DeviceState:
         """The reactor's state, certainly its own.

@@ -13,7 +13,7 @@ __all__ = ["diagnose", "fault_of"]
 
 def diagnose(
     state: DeviceState, config: ChiBioConfig, *, age_s: float, start_time: str, blank: float, setpoint: float,
-    dosing: bool, stuck: str, escalated: bool, overflow_trouble: str,
+    dosing: bool, stuck: str, ended: str, overflow_trouble: str,
 ) -> Fault | None:  # fmt: skip
     """The gravest fault that a verified state shows, against how the reactor should be found.
 
@@ -21,7 +21,7 @@ def diagnose(
       age_s: of the newest sample, s. start_time: of its experiment. blank: counts.
       setpoint: OD at which it was handed over to the on-board regulation, nan if this program controls.
       dosing: its pumps may be on. stuck: why its pumps could not be verified off, "" if they were.
-      escalated: this program ended its experiment for that.
+      ended: why this program ended its experiment, "" if it did not.
       overflow_trouble: why its overflow pump could not be verified on, "" if it was.
     """
     if state.start_time != start_time or not state.started:
@@ -30,9 +30,8 @@ def diagnose(
             f"the experiment of {start_time} is gone, cycles {state.cycles}, blank {state.blank:.0f}",
             "blank and targets are restored and the experiment is started again; check the board's power",
         )
-    if not state.running and escalated:
-        why = stuck or "its pumps could not be verified off"
-        return Fault("stopped", f"this program ended the experiment: {why}", "it is started again once they are off")
+    if not state.running and ended:
+        return Fault("stopped", f"this program ended the experiment: {ended}", "it is started again")
     if not state.running:
         return Fault("stopped", "the experiment was stopped by someone", "start it in the device's web page")
     if not abs(state.blank - blank) <= 0.5:  # also nan

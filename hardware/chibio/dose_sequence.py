@@ -1,8 +1,8 @@
 """One dose from intent to verified off, what is carried to the next, and what the device may have repeated."""
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,33 +11,18 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.diagnosis import fault_of
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, plan_dose
+from hardware.chibio.ending import conclude, found
 from hardware.chibio.logbook import Logbook
 from hardware.chibio.protocol import FEED, PUMPS, WASTE, DeviceState
-from hardware.chibio.resume import ReactorHistory, conclude, repeats_until
+from hardware.chibio.resume import ReactorHistory
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
-from hardware.storage.doses import Ending
+from hardware.storage.doses import Given
 
 __all__ = ["DoseSequence"]
 
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste motor must already turn when feed arrives
-
-
-@dataclass(frozen=True)
-class _Begun:
-    """A dose whose end is not on record.
-
-    on_s: run time at which its feed pump was switched on, before that at which it was intended, s. wasted, fed: its
-    pumps were, or may have been, switched on. feed_off_s: run time at which the device took the feed's off, else nan.
-    experiment: start time of the device's experiment in which it was begun.
-    """
-
-    plan: DosePlan
-    on_s: float
-    wasted: bool = False
-    fed: bool = False
-    feed_off_s: float = math.nan
-    experiment: str = ""
+SLOW_S = 1.0  # an answer to a pump command that takes longer is told
 
 
 class DoseSequence:
@@ -46,9 +31,10 @@ class DoseSequence:
     A dose is planned, written down, set, read back and switched on; its ends are tasks on the agenda. A pump that is ON
     repeats its dose every 63 s until it is switched off, so a late end means that more was dosed than planned.
 
+    Args: past: what this run knows of the reactor by the rows that it wrote, those of earlier lives too.
     Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
-      not be verified off; escalated, whether the experiment was ended for that, and not started again since; endings,
-      of doses that the device has repeated, until somebody books and clears them.
+      not be verified off; escalated, whether the experiment was ended for that, and not started again since; extra,
+      what doses gave beyond what was booked when they began, until somebody books and clears it.
     """
 
     def __init__(
@@ -58,30 +44,35 @@ class DoseSequence:
         config: ChiBioConfig,
         agenda: Agenda,
         book: Logbook,
+        past: Callable[[], ReactorHistory],
     ) -> None:
         self._connection, self._calibration, self._config = connection, calibration, config
-        self._agenda, self._clock, self._book = agenda, connection.clock, book
+        self._agenda, self._clock, self._book, self._past = agenda, connection.clock, book, past
         self.running = False
         self.stuck = ""
         self.escalated = False
-        self.endings: list[Ending] = []
-        self._begun: _Begun | None = None
+        self.extra: list[Given] = []
         self._acted: tuple[float, int] | None = None  # newest sample a dose was decided for
         self._carry_ml, self._doses = 0.0, 0
+        self._due_s = math.inf  # clock time at which the dose under way should be over
+        self._doubt_s = math.nan  # run time of the last answer before one was missing in a dose, nan if none was
 
-    def restore(self, history: ReactorHistory, state: DeviceState) -> None:
-        """Continue as an earlier life of the run left it; the pumps were verified off after `state` was read.
-
-        The device repeats a dose that was left open every 63 s, whatever becomes of the program.
-        """
+    def restore(self) -> None:
+        """Continue as an earlier life of the run left it; its pumps are to be verified off next."""
+        history = self._past()
         self._acted, self._carry_ml, self._doses = history.sample, history.carry_ml, history.doses
         if history.open:
-            self._conclude(*conclude(history, state, self._book.elapsed(), self._config.deadman_s))
+            self._book.tell(f"a dose of {history.feed_ml:.2f} mL was left open by an earlier life of the program")
 
     @property
     def carry_ml(self) -> float:
         """Asked for and put off to the next dose, because it is less than the pump can deliver, mL."""
         return self._carry_ml
+
+    @property
+    def unsettled(self) -> bool:
+        """Whether a dose is past its end and what it gave is not known yet: a sample waits for that a little."""
+        return self.running and not self.stuck and self._clock.now() > self._due_s and not math.isnan(self._doubt_s)
 
     def forget_sample(self) -> None:
         """The device's records begin anew: no dose was decided for any sample in them."""
@@ -114,8 +105,6 @@ class DoseSequence:
             self._book.tell(f"{plan.carry_ml:.3f} mL is less than the pump can deliver: kept for the next dose")
         if plan.shortfall_ml > 0.0:
             self._book.tell(f"the dose was cut by {plan.shortfall_ml:.3f} mL to the feed limit")
-        if plan.feed_duty > 0.0:  # before it is written down: a signal in between must not leave it without an end
-            self._begun = _Begun(plan, self._book.elapsed())
         self._intend(plan, rate)
         return plan if plan.feed_duty > 0.0 and self._switch_on(plan, appeared_s) else DosePlan()
 
@@ -154,34 +143,33 @@ class DoseSequence:
         )  # fmt: skip
 
     def _switch_on(self, plan: DosePlan, appeared_s: float) -> bool:
-        """Targets, read back, then on; True if the feed runs or may run. The end is planned before anything is on."""
+        """Targets, read back, then on; True if the feed runs or may run. Whatever comes of it, its end is planned."""
+        self.running, fed, wasted_s = True, False, self._clock.now()
         try:
             self._set_targets(plan, appeared_s)
-        except ReactorError as error:
-            self._book.tell(f"no dose: {error}")
-            self._agenda.add(self._finish())
-            return False
-        self.running = True
-        self._agenda.add(self._feed_off(plan.pump), WASTE_FIRST_S + plan.feed_s + DOSE_OFF_S)
-        self._agenda.add(self._finish(), plan.waste_s + DOSE_OFF_S)
-        fed = False
-        try:
-            self._mark(wasted=True)
             self._connection.switch(WASTE, True)
+            wasted_s = self._clock.now()
             self._clock.sleep(WASTE_FIRST_S)
-            fed, on_s = True, self._book.elapsed()
-            self._mark(fed=True, on_s=on_s)
-            self._book.log("feed_on", on_s=on_s)  # before it is done: a resumed run must know that it may have been fed
+            fed, asked_s = True, self._clock.now()
+            self._book.log("feed_on", on_s=self._book.elapsed())  # before it is done: a resumed run must know of it
             self._connection.switch(plan.pump, True)
+            if self._clock.now() - asked_s > SLOW_S:
+                took_s = self._clock.now() - asked_s
+                self._book.tell(f"the link is slow: the feed pump's command was answered after {took_s:.1f} s")
         except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
-            counted = "counted as dosed" if fed else "no dose was begun"
-            self._book.tell(f"the answer to a pump command was lost, {counted}: {error}")
+            self._in_doubt()
+            self._book.tell(
+                f"the answer to the feed pump's command was lost, what it did is looked for: {error}" if fed
+                else f"no dose: {error}"
+            )  # fmt: skip
+        finally:
+            now, fed_s = self._clock.now(), plan.feed_s + DOSE_OFF_S if fed else 0.0
+            if fed:
+                self._agenda.add(self._feed_off(plan.pump), fed_s)
+            left_s = max(wasted_s + plan.waste_s + DOSE_OFF_S - now, fed_s) if wasted_s < now else 0.0
+            self._due_s = now + left_s
+            self._agenda.add(self._finish(), left_s)
         return fed
-
-    def _mark(self, **known: Any) -> None:
-        """Note what has become of the dose under way."""
-        if self._begun is not None:
-            self._begun = replace(self._begun, **known)
 
     def _set_targets(self, plan: DosePlan, appeared_s: float) -> None:
         """Set both duties and read them back. Raises: ReactorError if the device is not ready for this dose in time."""
@@ -194,79 +182,101 @@ class DoseSequence:
         on = self._config.overflow_pump.others_on(state)
         if not as_set or on or not state.running or state.regulating:
             raise DeviceStateError(f"targets {tuple(targets)}, pumps on: {on or 'none'}: not as set")
-        self._mark(experiment=state.start_time)
         past = self._clock.now() - appeared_s
         if past + plan.waste_s > self._config.window_s:
             raise DeviceStateError(f"the device answers too slowly ({past:.0f} s after the sample)")
 
     def _feed_off(self, pump: str) -> Task:
         """Task: feed pump off, again and again until the device has heard it."""
-        while self.running:
+        while self.running and self._connection.state is not None:
             try:
+                self._look_first()
                 self._connection.switch(pump, False)
-                self._mark(feed_off_s=self._book.elapsed())
                 return
             except (LinkError, ProtocolError) as error:
+                self._in_doubt()
                 self._book.report(fault_of(error, present=True))
             except ReactorError:
                 pass
-            yield min(self._config.retry_s, 2.0)
+            yield self._pause_s()
+
+    def _pause_s(self) -> float:
+        """Until the next attempt; nothing may be sent to a reactor that is absent or exchanged."""
+        return min(self._config.retry_s, 2.0) if self._connection.state is not None else 30.0
 
     def _finish(self) -> Task:
         """Task: the pumps off, verified, however long it takes; then the dose is on record as ended."""
-        self.running = True
         for refusals in range(10**9):
-            pause = min(self._config.retry_s, 2.0)
             try:
-                self._connection.pumps_off(1, self._config.overflow_pump.others)
-                break
+                self.settle()
+                return
             except (LinkError, ProtocolError) as error:
                 self._book.report(fault_of(error, present=True))
             except DeviceStateError as error:
-                if self._connection.state is None:
-                    pause = 30.0  # absent or exchanged: nothing may be sent to it
-                else:
+                if self._connection.state is not None:
                     self.stuck = str(error)
-                    if self._begun is not None and self._begun.plan.pump in self._connection.state.running_pumps:
-                        self._mark(feed_off_s=math.nan)  # it was answered, not done
                     if refusals == 3:
                         self.escalated = True
                         self._connection.escalate()
-            yield pause
-        self.ended(self._book.elapsed())
+            yield self._pause_s()
 
-    def ended(self, off_s: float) -> None:
-        """The pumps were switched off at run time `off_s` and verified: a dose under way is over, and so on record."""
-        self.running, self.stuck = False, ""
-        if (begun := self._begun) is None:
+    def settle(self, tries: int = 1, overflow_pump: bool = False) -> None:
+        """All pumps off, verified; a dose under way is over then, and so on record.
+
+        After an answer that was missing the device is looked at first: what it shows says what became of the dose.
+        Args: overflow_pump: that one too. Raises: as `Connection.pumps_off`.
+        """
+        connection = self._connection
+        try:
+            self._look_first()
+            connection.pumps_off(tries, PUMPS if overflow_pump else self._config.overflow_pump.others)
+        except ReactorError as error:
+            if isinstance(error, DeviceStateError) and connection.state is not None:
+                self._look(connection.state, self._book.elapsed())
+            self._in_doubt()
+            raise
+        self.running, self.stuck, self._due_s, self._doubt_s = False, "", math.inf, math.nan
+        if (known := self._past()).open:
+            self._conclude(known)
+
+    def _in_doubt(self) -> None:
+        """A request of a dose was not answered: from the last answer on the device may have done otherwise."""
+        if math.isnan(self._doubt_s):
+            self._doubt_s = self._book.elapsed() - max(self._clock.now() - self._connection.heard_s, 0.0)
+
+    def _look_first(self) -> None:
+        """As pumps are found says what became of a dose: before they are switched off, where nobody saw its course.
+
+        That is after an answer was missing, and where an earlier life of the program left the dose open.
+        """
+        left = self._past().open and not self.running
+        if not math.isnan(seen_s := self._past().seen_s if left else self._doubt_s):
+            self._look(self._connection.read(), seen_s)
+            self._doubt_s = self._book.elapsed()
+
+    def _look(self, state: DeviceState, seen_s: float) -> None:
+        """Write down what a look at the device says of the pumps of an open dose. Args: seen_s: run time before it."""
+        known, now, stopped = self._past(), self._book.elapsed(), None
+        if not known.open:
             return
-        self._begun = None
-        ending, note = self._ending(begun, off_s), ""
-        state = self._connection.state
-        if begun.experiment and state is not None and state.start_time != begun.experiment:
-            note = "the device was restarted in a dose, which ended it"
-            ending = replace(ending, feed_times=0, waste_times=0)
-        elif ending.feed_times > 0:
-            note = f"the pumps were verified off late: the dose may have been repeated {ending.feed_times} times"
-        self._conclude(ending, note)
+        try:
+            if (ago_s := self._connection.switched_off()) is not None:
+                stopped = {pump: now - s for pump, s in ago_s.items() if now - s > known.on_s}
+        except ReactorError as error:
+            self._book.tell(f"the board agent does not say what it switched off: {error}")
+        if stopped:
+            self._book.tell(f"the board agent switched off in a dose: {', '.join(stopped)}")
+        if known.experiment not in ("", state.start_time):
+            self._book.tell("the device was restarted in a dose, which ended it")
+        if added := found(known, state, now, seen_s, self._config.deadman_s, stopped):
+            self._book.log("found", **added)
 
-    def _ending(self, begun: _Begun, off_s: float) -> Ending:
-        """What a dose gave until its pumps were off: less than planned where it was cut short, more where late."""
-        plan, calibration = begun.plan, self._calibration
-        feed_off_s = off_s if math.isnan(begun.feed_off_s) else begun.feed_off_s
-        ending = Ending(begun.on_s, pump=0 if plan.pump == FEED else PUMPS.index(plan.pump) + 1)
-        if begun.wasted:
-            waste_ml = calibration.waste.volume(min(plan.waste_s, off_s - begun.on_s))
-            ending = replace(ending, waste_ml=waste_ml, waste_times=repeats_until(off_s, begun.on_s))
-        if begun.fed:
-            feed_ml = self._calibrated(plan.pump).volume(min(plan.feed_s, feed_off_s - begun.on_s))
-            ending = replace(ending, feed_ml=feed_ml, feed_times=repeats_until(feed_off_s, begun.on_s))
-        return ending
-
-    def _conclude(self, ending: Ending, note: str) -> None:
-        """A dose is over: on record, and its repetitions wait to be booked."""
+    def _conclude(self, known: ReactorHistory) -> None:
+        """A dose is over: on record; what it gave beyond what was booked when it began waits to be booked."""
+        pump = self._calibrated(known.feed_pump)
+        ending, note = conclude(known, self._book.elapsed(), pump, self._calibration.waste)
         if note:
             self._book.tell(note)
         self._book.log("dose_end", **ending.row())
-        if ending.feed_times or ending.waste_times:
-            self.endings.append(ending)
+        booked_ml = known.feed_ml if known.fed else 0.0
+        self.extra += ending.beyond(booked_ml)

@@ -1,5 +1,6 @@
 """What one reactor has to report: rows for the journal, notes for the next receipt, its present fault."""
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -7,6 +8,8 @@ from hardware.chibio.connection import Log
 from hardware.reactor import Fault
 
 __all__ = ["Logbook"]
+
+screen = logging.getLogger(__name__)
 
 
 class Logbook:
@@ -38,6 +41,11 @@ class Logbook:
     def tell(self, note: str) -> None:
         """Write a note, and keep it for the next receipt."""
         self.notes.append(note)
+        self.log("note", note=note)
+
+    def say(self, note: str) -> None:
+        """Write a note and show it at once: of a wait, which no receipt would tell of before it is over."""
+        screen.info("%s: %s", self.name, note)
         self.log("note", note=note)
 
     def report(self, fault: Fault | None) -> None:

@@ -7,6 +7,7 @@ carried out even when other requests fail.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,12 @@ from hardware.chibio.connection import Connection, Log, no_log
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.logbook import Logbook
 from hardware.chibio.protocol import FEED
-from hardware.chibio.resume import ReactorHistory
+from hardware.chibio.resume import ReactorHistory, remember
 from hardware.chibio.station import Station
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, ReactorError
-from hardware.link.transport import Transport
-from hardware.reactor import Array, Command, Mask, Measurement, Receipt, Vitals
+from hardware.link.transport import SharedLink, Transport
+from hardware.reactor import Array, Command, Mask, Measurement, Receipt, Vitals, left_off
 
 __all__ = ["ChiBioReactors"]
 
@@ -51,7 +52,9 @@ class ChiBioReactors:
         calibrations = calibrations if calibrations is not None else [ReactorCalibration()] * len(config.reactors)
         if len(calibrations) != len(config.reactors):
             raise ValueError(f"calibrations for {len(calibrations)} reactors, reactors = {list(config.reactors)}")
-        self.config, self._transport, self._clock, self._log = config, transport, clock, log
+        self.config, self._clock, self._log = config, clock, log
+        self._link = SharedLink(transport, clock)
+        self._past = dict.fromkeys(config.reactors, ReactorHistory())
         self._log_error: Exception | None = None
         self._agenda = Agenda(clock)
         self._zero = clock.now()
@@ -60,7 +63,7 @@ class ChiBioReactors:
                 Connection(
                     m,
                     config.reactors,
-                    transport,
+                    self._link,
                     clock,
                     self._note_down,
                     config.overflow_pump.pump,
@@ -71,6 +74,7 @@ class ChiBioReactors:
                 config,
                 self._agenda,
                 Logbook(m, self._note_down, self._write, self.elapsed),
+                partial(self._past.__getitem__, m),
             )
             for m, calibration in zip(config.reactors, calibrations, strict=True)
         )
@@ -92,7 +96,8 @@ class ChiBioReactors:
     def begin(self, histories: Mapping[str, ReactorHistory] | None = None, elapsed_s: float = 0.0) -> None:
         """Sweep the pumps off, pin identities and blanks, start what does not run yet, staggered inside the minute.
 
-        An overflow pump is verified on before the first dose, and off again if the start fails.
+        An overflow pump is verified on before the first dose. A start that fails or is stopped leaves all pumps off,
+        verified, or says that it could not.
 
         An experiment that already runs is adopted, never started again (a second start would stop it); its next new
         sample is the first one delivered. So is a reactor that was handed over to the on-board regulation: it stays so.
@@ -100,31 +105,44 @@ class ChiBioReactors:
         Args:
           histories: `replay` of the journal of the run that is resumed.
           elapsed_s: run time that has passed since that run began.
-        Raises: ReactorError if a reactor cannot be brought into its running state.
+        Raises: ReactorError if a reactor cannot be brought into its running state; of a run that is resumed only if
+          none can: the others do not wait for one in trouble, which is told and tried again.
         """
         self._zero = self._clock.now() - elapsed_s
-        try:
-            self._bring_up(histories or {})
-        except (ReactorError, KeyboardInterrupt) as error:
-            switched = np.array([s.overflow_pump.was_on or s.overflow_pump.tried for s in self.stations])
-            if failed := self._each(switched & ~self.handed_over, lambda s: s.connection.pumps_off(tries=1)):
-                raise DeviceStateError(f"{error}; overflow pump not verified off: {'; '.join(failed)}") from error
-            raise
+        self._past |= histories or {}
+        with left_off(self):
+            self._take_over(resumed=bool(histories))
 
-    def _bring_up(self, histories: Mapping[str, ReactorHistory]) -> None:
+    def _take_over(self, resumed: bool) -> None:
+        """Every reactor as an earlier life left it, then into its running state."""
+        failed = list[ReactorError]()
         for station in self.stations:
-            station.restore(histories.get(station.name, ReactorHistory()))
+            try:
+                station.restore()
+            except ReactorError as error:
+                failed.append(error)
+                if not resumed or len(failed) == len(self.stations):
+                    raise
+                station.book.say(f"not taken over, the others go on and this one is tried again: {error}")
+        self._bring_up([station for station in self.stations if station.restored], resumed)
+
+    def _bring_up(self, stations: Sequence[Station], resumed: bool) -> None:
+        """Each into its running state, starts staggered inside the minute; a resumed run goes on meanwhile."""
         slot = 0
-        for station in self.stations:
+        for station in stations:
             running = station.connection.read().running
             station.busy = True
-            self._agenda.add(station.bring_up(), 0.0 if running else slot * 60.0 / len(self.stations))
+            wait_s = 0.0 if running else slot * 60.0 / len(self.stations)
+            if wait_s:
+                station.book.say(f"its experiment starts in {wait_s:.0f} s, one reactor after the other")
+            self._agenda.add(station.take_over() if resumed else station.bring_up(), wait_s)
             slot += not running
-        while any(station.busy for station in self.stations):
+        self._agenda.run_due()
+        while any(station.busy for station in stations) and not resumed:
             self._agenda.run_due()
             self._clock.sleep(min(self._agenda.next_due() - self._clock.now(), 1.0))
-        for station in self.stations:
-            if trouble := station.overflow_pump.trouble or station.fluorescence.trouble:
+        for station in stations:
+            if not resumed and (trouble := station.overflow_pump.trouble or station.fluorescence.trouble):
                 raise DeviceStateError(f"{station.name}: {trouble}; run the preflight")
 
     def measure(self) -> Measurement:
@@ -195,14 +213,15 @@ class ChiBioReactors:
         return Receipt(volume, notes, waste, kept)
 
     def repeated(self) -> list[tuple[float, Receipt]]:
-        """Doses that the device repeated by itself, not told before: run time, s, and volumes, in order."""
+        """What doses gave beyond what was booked when they began, not told before: run time, s, and volumes."""
         found = []
         for i, station in enumerate(self.stations):
             mine = np.arange(len(self.stations)) == i
-            endings, station.doses.endings = station.doses.endings, []
-            for ending in endings:
-                for at_s, feed_ml, waste_ml in ending.repeats():
-                    found.append((at_s, Receipt(mine * feed_ml, (), mine * waste_ml, pump=ending.pump)))
+            extra, station.doses.extra = station.doses.extra, []
+            found += [
+                (g.at_s, Receipt(mine * g.feed_ml, (), mine * g.waste_ml, pump=g.pump, low_ml=mine * g.low_ml))
+                for g in extra
+            ]
         return sorted(found, key=lambda one: one[0])
 
     def pumps_off(self, rows: Mask) -> list[str]:
@@ -258,17 +277,15 @@ class ChiBioReactors:
         if pending:
             reasons = "; ".join(f"{s.name}: {errors[s.name]}" for s in pending)
             raise DeviceStateError(f"pumps not verified off: {reasons}. Switch the pump boards off by hand now")
-        self._transport.disarm()
+        self._link.disarm()
 
     @staticmethod
     def _silence(station: Station, errors: dict[str, ReactorError]) -> bool:
-        off_s = station.book.elapsed()
         try:
-            station.connection.pumps_off(tries=1)
+            station.doses.settle(overflow_pump=True)
         except ReactorError as error:
             errors[station.name] = error
             return False
-        station.doses.ended(off_s)
         return True
 
     def end(self) -> None:
@@ -280,11 +297,25 @@ class ChiBioReactors:
                 raise DeviceStateError(f"{station.name}: the experiment does not end; stop it in the web page")
 
     def _write(self, kind: str, fields: Mapping[str, Any]) -> None:
-        self._log(kind, {"time_s": round(self.elapsed(), 3), **fields})
+        """Remember and log, or neither. Raises: what the log raises."""
+        row, before = {"time_s": round(self.elapsed(), 3), **fields}, dict(self._past)
+        self._remember(kind, row)  # first: a stop may come right after it was written
+        try:
+            self._log(kind, row)
+        except (OSError, ReactorError):
+            self._past.update(before)
+            raise
 
     def _note_down(self, kind: str, fields: Mapping[str, Any]) -> None:
         """Log without ever standing in the way of a pump-off: an error is kept for `measure` to raise."""
+        row = {"time_s": round(self.elapsed(), 3), **fields}
+        self._remember(kind, row)
         try:
-            self._write(kind, fields)
+            self._log(kind, row)
         except (OSError, ReactorError) as error:
             self._log_error = error
+
+    def _remember(self, kind: str, row: Mapping[str, Any]) -> None:
+        """What a row says is what a resumed run would know."""
+        if (name := str(row.get("reactor"))) in self._past:
+            self._past[name] = remember(self._past[name], {"kind": kind, **row})

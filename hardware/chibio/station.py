@@ -21,10 +21,15 @@ from hardware.chibio.protocol import FEED, DeviceState
 from hardware.chibio.resume import ReactorHistory
 from hardware.chibio.sampling import Sampling
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
+from hardware.reactor import Fault
 
 __all__ = ["Station"]
 
 OLD_CYCLE_S = 70.0  # a stopped cycle thread wakes up to 65 s later and switches everything off once more
+MEASURING_S = 20.0  # settling, four readings, three temperatures and three fluorescence slots take less
+HELD_S = 30.0  # for so long a new sample waits for what the last dose came to
+STARTS = 3  # attempts to start an experiment before it counts as failed
+AGAIN_S = 60.0  # from a restart that failed to the next one
 
 
 class Station:
@@ -32,10 +37,10 @@ class Station:
 
     Args:
       connection: its verified conversation. calibration: of its pumps and its zero. book: what it reports.
-      config, agenda: shared; what must happen later is put on the agenda.
+      config, agenda: shared; what must happen later is put on the agenda. past: what this run knows of the reactor.
 
-    Attributes: sampling, doses, regulation, overflow_pump, fluorescence: its parts; busy while the reactor is being
-      started or recovered.
+    Attributes: sampling, doses, regulation, overflow_pump, fluorescence: its parts; busy, while the reactor is being
+      started or recovered; restored, whether it goes on from what an earlier life left.
     """
 
     def __init__(
@@ -45,14 +50,18 @@ class Station:
         config: ChiBioConfig,
         agenda: Agenda,
         book: Logbook,
+        past: Callable[[], ReactorHistory],
     ) -> None:
         self.connection, self.book = connection, book
         self.sampling = Sampling(config, connection.clock)
-        self.doses = DoseSequence(connection, calibration, config, agenda, book)
+        self.doses = DoseSequence(connection, calibration, config, agenda, book, past)
         self.regulation = OnboardRegulation(connection, config.overflow_pump, book)
         self.overflow_pump = OverflowPump(connection, config.overflow_pump, book)
         self.fluorescence = Fluorescence(connection, config.fluorescence, book)
         self.busy = False
+        self._past, self.restored = past, False
+        self._held_s, self._restarts, self._again_s = math.nan, 0, -math.inf
+        self._ended = ""  # why this program ended the experiment, "" once it runs again
         self._calibration, self._config, self._agenda, self._clock = calibration, config, agenda, connection.clock
         self._target_c = config.temperature
         self._heat = True
@@ -66,25 +75,27 @@ class Station:
 
     # ------------------------------------------------------------------------------------------- start and recovery
 
-    def restore(self, history: ReactorHistory) -> None:
-        """Take over identity and memory of an earlier run; all pumps but the overflow pump are verified off afterwards.
+    def restore(self) -> None:
+        """Take over identity and memory of an earlier life; all pumps but the overflow pump are verified off then.
 
         A reactor that regulates itself as it was handed over is not interrupted.
         Raises: ReactorError if the reactor is not reachable, another unit, or its pumps stay on.
         """
+        history = self._past()
         self.connection.device_id = history.device_id
         if math.isfinite(history.temperature):
             self._target_c = history.temperature
         state = self.connection.read()
         self._blank = next((b for b in (history.blank, self._calibration.blank) if math.isfinite(b)), state.blank)
         self.overflow_pump.was_on, self.regulation.setpoint = history.overflow_pump_on, history.handed_over
+        self.doses.restore()
         if not self.regulation.as_handed_over(state):
             if state.regulating:
                 self.regulation.switch_off()
             self.pumps_off()
             if on := self._config.overflow_pump.others_on(state):
                 self.book.tell(f"pumps were found on and switched off: {on}")
-        self.doses.restore(history, state)
+        self.restored = True
 
     def bring_up(self, waited: bool = False) -> Task:
         """Task: an experiment that runs with the right blank and targets; a running one is adopted, not restarted.
@@ -95,17 +106,16 @@ class Station:
         """
         self.busy = True
         try:
+            yield from self._let_measure()
             state = self.connection.read()
-            while state.measuring:  # a blank changed in the middle of a measurement would spoil it
-                yield 2.0
-                state = self.connection.read()
             if not state.running and state.cycles > 0 and not waited and not state.ended:
+                self.book.say(f"an experiment was stopped, its last cycle may still end: waits {OLD_CYCLE_S:.0f} s")
                 yield OLD_CYCLE_S
             self._prepare()
             state = self.fluorescence.keep_on(self.connection.read())
             self.sampling.pass_over(state)
             if not state.running:
-                self._start()
+                yield from self._start()
                 if state.cycles == 0:
                     self.sampling.expect_first()
                 if not self._heat:  # a start switches the thermostat on
@@ -121,6 +131,29 @@ class Station:
             )  # fmt: skip
         finally:
             self.busy = False
+
+    def take_over(self) -> Task:
+        """Task: `bring_up` in a run that goes on meanwhile; what does not succeed is said and tried again."""
+        try:
+            yield from self.bring_up()
+        except ReactorError as error:
+            self.restored = False
+            self.book.report(
+                Fault("stopped", f"not taken over: {error}", "the others go on and this one is tried again")
+            )
+
+    def _let_measure(self) -> Task:
+        """Task: a measurement under way is over, because a blank changed in the middle of one would spoil it.
+
+        The device's flag says it only while an experiment runs: one that is stopped or dies in a measurement leaves it
+        for good, until the next start (docs/device.md, Cycle).
+        """
+        since = self.connection.clock.now()
+        while (state := self.connection.read()).running and state.measuring:
+            if self.connection.clock.now() - since > MEASURING_S:
+                self.book.say(f"the device has measured for {MEASURING_S:.0f} s, which is too long: not waited for")
+                return
+            yield 2.0
 
     def _prepare(self) -> None:
         """Blank and targets as they belong to this run; on-board regulation off, unless it was handed over to that."""
@@ -147,31 +180,41 @@ class Station:
                 f"{state.temperature_target} degC (asked {self._target_c}); run the preflight"
             )
 
-    def _start(self) -> None:
-        """Start the experiment; the state is read before every try, because a second start stops it."""
-        for _ in range(3):
+    def _start(self) -> Task:
+        """Task: start the experiment; the state is read before every try, because a second start stops it."""
+        for _ in range(STARTS):
             if self.connection.read().running:
                 return
             try:
                 self.connection.post(f"/Experiment/1/{self.name}")
                 self.overflow_pump.was_on = False  # a start switches every pump off
             except LinkError:
-                self._clock.sleep(self._config.retry_s)
+                yield self._config.retry_s
         if not self.connection.read().running:
             raise DeviceStateError(f"{self.name}: the experiment does not start; look at the device's terminal")
 
     def _recover(self, kind: str) -> Task:
-        """Task: pumps off, then a running experiment again, by way of a stop if its thread is dead."""
+        """Task: pumps off, then a running experiment again, by way of a stop if its thread is dead.
+
+        What does not succeed is said, and tried again when the fault is seen the next time.
+        """
+        self._restarts += 1
+        if self._restarts > 1:
+            self.book.tell(f"the restart before brought no sample, attempt {self._restarts} follows")
         try:
             self.pumps_off()
             if kind == "stalled":
+                self._ended = "it brought no sample any more"
                 self.connection.post(f"/Experiment/0/{self.name}")
                 yield OLD_CYCLE_S
             elif kind == "restarted":
                 self.sampling.key = None  # the device's records begin anew: any sample is a new one
                 self.doses.forget_sample()
             yield from self.bring_up(waited=kind != "stopped")
-            self.book.tell(f"recovered from: {kind}")
+            self.book.tell(f"restarted after: {kind}")
+        except ReactorError as error:
+            self._again_s = self._clock.now() + AGAIN_S
+            self.book.tell(f"the experiment could not be restarted after {kind}, tried again: {error}")
         finally:
             self.busy = False
             self.sampling.arrived_s = self._clock.now()  # a further recovery waits its time
@@ -182,11 +225,21 @@ class Station:
         """Look at the reactor; True if it has a new sample. Trouble becomes the logbook's fault."""
         self.sampling.retry_later()
         try:
+            if not self.restored:
+                return self._take_over_later()
             state = self._keep_on(self.connection.read())
         except (LinkError, ProtocolError, DeviceStateError) as error:
             self.book.report(fault_of(error, present=self.connection.state is not None))
             return False
         return False if self.busy else self._judge(state)
+
+    def _take_over_later(self) -> bool:
+        """The memory of an earlier life could not be taken over at the start; no sample yet. Raises: ReactorError."""
+        if not self.busy:
+            self.restore()
+            self.busy = True
+            self._agenda.add(self.take_over())
+        return False
 
     def _keep_on(self, state: DeviceState) -> DeviceState:
         """Overflow pump and fluorescence slot as this run has them; the reactor's state then."""
@@ -200,28 +253,40 @@ class Station:
         fault = diagnose(
             state, self._config, age_s=age, start_time=self._start_time, blank=self._blank,
             setpoint=self.regulation.setpoint, dosing=self.doses.running, stuck=self.doses.stuck,
-            escalated=self.doses.escalated, overflow_trouble=self.overflow_pump.trouble,
+            ended=self._why_ended(), overflow_trouble=self.overflow_pump.trouble,
         )  # fmt: skip
         self.book.report(fault)
         if state.running and not self.doses.running:
-            self.doses.escalated = False  # it never reached the device: a later stop is somebody else's
-        if fault is not None and self._config.recover and self._recoverable(fault.kind, age):
+            self.doses.escalated, self._ended = False, ""  # from here on a stop is somebody else's
+        if fault is not None and self._config.recover and now >= self._again_s and self._recoverable(fault.kind, age):
             self.busy = True
             self._agenda.add(self._recover(fault.kind))
-        if is_new and (fault is None or fault.kind in ("mode", "pump", "overflow_pump")):
+        if is_new and (fault is None or fault.kind in ("mode", "pump", "overflow_pump")) and not self._held(now):
             self._take(state, now, elapsed)
             return True
         self.sampling.not_taken(is_new)
         return False
 
+    def _held(self, now: float) -> bool:
+        """Whether a new sample waits a little, because what the dose before it gave is about to be known."""
+        if not self.doses.unsettled:
+            self._held_s = math.nan
+            return False
+        self._held_s = now if math.isnan(self._held_s) else self._held_s
+        return now - self._held_s < HELD_S
+
     def _recoverable(self, kind: str, age_s: float) -> bool:
         """Whether a fault is this program's to mend; what somebody else stopped stays so."""
-        own_stop = kind == "stopped" and self.doses.escalated and not self.doses.running
+        own_stop = kind == "stopped" and bool(self._why_ended()) and not self.doses.running
         return kind == "restarted" or own_stop or (kind == "stalled" and age_s > self._config.lost_s)
+
+    def _why_ended(self) -> str:
+        """Why this program ended the experiment, "" if it did not, or if it runs again."""
+        return (self.doses.stuck or "its pumps could not be verified off") if self.doses.escalated else self._ended
 
     def _take(self, state: DeviceState, now: float, elapsed: float) -> None:
         """Deliver a new sample, write it down, and put heater and stirrer right."""
-        sampling = self.sampling
+        sampling, self._restarts = self.sampling, 0
         if note := sampling.take(state, now, elapsed):
             self.book.tell(note)
         sampling.fluorescence = self.fluorescence.reading(state)
@@ -266,8 +331,8 @@ class Station:
         return self.doses.begin(rate, self.sampling.key, self.sampling.appeared_s, refusal, pump)
 
     def pumps_off(self, tries: int = 3) -> None:
-        """All pumps but the overflow pump off, verified. Raises: as `Connection.pumps_off`."""
-        self.connection.pumps_off(tries, self._config.overflow_pump.others)
+        """All pumps but the overflow pump off, verified; a dose is over then. Raises: as `Connection.pumps_off`."""
+        self.doses.settle(tries)
 
     def give_up(self) -> None:
         """All pumps off for good, verified; on-board regulation too, or it would dose again. Raises: ReactorError."""

@@ -9,7 +9,15 @@ from urllib.parse import urlsplit
 import httpx
 
 from hardware.errors import LinkError, ProtocolError, ReactorError
-from hardware.link.transport import MAX_BODY, Reply, Transport, TransportConfig, new_session
+from hardware.link.transport import (
+    MAX_BODY,
+    Reply,
+    SwitchedOff,
+    Transport,
+    TransportConfig,
+    new_session,
+    switched_off,
+)
 
 __all__ = ["HttpTransport"]
 
@@ -56,7 +64,7 @@ class HttpTransport(Transport):
         if not valid:
             raise ValueError(f"url = {url!r}: allowed http://host:port, for instance http://192.168.7.2:5000")
         self.url = url.rstrip("/")
-        self._read_s = config.timeout(config.read_s, speed)
+        self._read_s, self._speed = config.timeout(config.read_s, speed), speed
         self._token = read_token(config.token_file) if config.token_file else ""
         authority = {"Authorization": f"Bearer {self._token}", "X-Session": str(session or new_session())}
         self._client = httpx.Client(
@@ -72,6 +80,10 @@ class HttpTransport(Transport):
         if self._token:
             with contextlib.suppress(ReactorError):
                 self.post("/_agent/bye")
+
+    def switched_off(self) -> SwitchedOff | None:
+        """What the agent, if there is one, has switched off. Raises: LinkError, ProtocolError."""
+        return switched_off(self.get("/_agent/status").body, self._speed) if self._token else {}
 
     def close(self) -> None:
         """Close the client. Idempotent."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from hardware.errors import DeviceStateError
 from hardware.link.http import HttpTransport
 from hardware.link.serial import SerialTransport
-from hardware.link.transport import Reply, Transport, TransportConfig, new_session
+from hardware.link.transport import Reply, SwitchedOff, Transport, TransportConfig, new_session
 
 __all__ = ["DeviceLock", "open_transport"]
 
@@ -66,6 +66,9 @@ class _Owned(Transport):
 
     def disarm(self) -> None:
         self._link.disarm()
+
+    def switched_off(self) -> SwitchedOff | None:
+        return self._link.switched_off()
 
     def close(self) -> None:
         self._link.close()

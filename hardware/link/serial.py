@@ -15,7 +15,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hardware.errors import LinkError, ProtocolError
-from hardware.link.transport import MAX_BODY, Reply, Transport, TransportConfig, new_session
+from hardware.link.transport import (
+    MAX_BODY,
+    Reply,
+    SwitchedOff,
+    Transport,
+    TransportConfig,
+    new_session,
+    switched_off,
+)
 
 if TYPE_CHECKING:
     import serial
@@ -93,6 +101,12 @@ class SerialTransport(Transport):
         if self._line is not None:
             with contextlib.suppress(LinkError, ProtocolError):
                 self._exchange("BYE", "/")
+
+    def switched_off(self) -> SwitchedOff | None:
+        """What the agent has switched off. Raises: LinkError, ProtocolError."""
+        if self._line is None:
+            self._open()
+        return switched_off(self._exchange("PING", "/").body, self._speed)
 
     def close(self) -> None:
         """Release the port; the agent's switch stays as it is. Idempotent."""

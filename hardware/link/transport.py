@@ -3,13 +3,23 @@
 A transport raises `LinkError` when no answer came and `ProtocolError` when it was garbage.
 """
 
+import json
+import math
 import random
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 from conf.schema import check, setting
+from hardware.clock import Clock
+from hardware.errors import LinkError, ProtocolError
 
-__all__ = ["MAX_BODY", "Reply", "Transport", "TransportConfig", "new_session"]
+__all__ = [
+    "MAX_BODY", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session", "switched_off",
+]  # fmt: skip
+
+SwitchedOff = Mapping[str, Mapping[str, float]]
+"""Reactor, pump: how many device seconds ago a dead-man switch on the way found it on and switched it off."""
 
 MAX_BODY = 262_144
 """Bytes of the longest answer; a full state is 36 KB (docs/device.md, Routes), the board agent carries at most this."""
@@ -51,9 +61,68 @@ class Transport(Protocol):
         """
         return
 
+    def switched_off(self) -> SwitchedOff | None:
+        """What a dead-man switch on the way, if there is one, has switched off; None: it does not say.
+
+        Raises: as `get`.
+        """
+        return {}
+
     def close(self) -> None:
         """Release the line, if there is one. Idempotent."""
         return
+
+
+class SharedLink(Transport):
+    """One link to a device of several reactors: what one of them waited for in vain, the others do not wait for again.
+
+    After a request that took longer than `SILENT_S` and brought no answer, every request within the next `PAUSE_S`
+    fails at once. So a silent server costs all reactors together one time-out, and they are told of it within that.
+
+    Args: link: carries the requests. clock: device time.
+    Attributes: heard_s, clock time of the newest answer, -inf before the first.
+    """
+
+    SILENT_S, PAUSE_S = 1.0, 2.0
+
+    def __init__(self, link: Transport, clock: Clock) -> None:
+        self._link, self._clock = link, clock
+        self.heard_s, self._again_s, self._silence = -math.inf, -math.inf, ""
+
+    def _request(self, method: str, path: str) -> Reply:
+        asked_s = self._clock.now()
+        if asked_s < self._again_s:
+            raise LinkError(f"{method} {path}: not sent, a moment ago: {self._silence}")
+        try:
+            reply = self._link.get(path) if method == "GET" else self._link.post(path)
+        except LinkError as error:
+            now = self._clock.now()
+            if now - asked_s > self.SILENT_S:
+                self._again_s, self._silence = now + self.PAUSE_S, str(error)
+            raise
+        self.heard_s = self._clock.now()
+        return reply
+
+    def switched_off(self) -> SwitchedOff | None:
+        return self._link.switched_off()
+
+    def disarm(self) -> None:
+        self._link.disarm()
+
+    def close(self) -> None:
+        self._link.close()
+
+
+def switched_off(status: bytes, speed: float) -> SwitchedOff | None:
+    """What the status of a board agent says that it has switched off; None from an agent older than that.
+
+    Args: speed: device seconds per real second. Raises: ProtocolError for a status that is not an agent's.
+    """
+    try:
+        found = json.loads(status).get("switched_off")
+        return found and {m: {pump: float(ago) * speed for pump, ago in pumps.items()} for m, pumps in found.items()}
+    except (ValueError, RecursionError, TypeError, AttributeError) as error:
+        raise ProtocolError(f"the board agent's status is not readable: {status[:80]!r}") from error
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,9 @@ from hardware.safety.unexplained_change import UnexplainedChange
 
 __all__ = ["Interlock", "Verdict", "kinds_of"]
 
-ADDED = ("_helpless_od", "_eased", "_light", "_light_repeats", "_light_s")  # to the saved state of earlier versions
+ADDED = (  # to the saved state of earlier versions
+    "_helpless_od", "_eased", "_light", "_light_repeats", "_light_s", "_since_low_ml",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -182,7 +184,7 @@ class Interlock:
         feed = np.asarray(receipt.volume_ml, dtype=np.float64)
         waste = np.full(self.n, math.inf) if receipt.waste_ml is None else np.asarray(receipt.waste_ml)
         self.budget.book(feed, waste, now)
-        self._change.dosed(feed)
+        self._change.dosed(feed, feed if receipt.low_ml is None else np.asarray(receipt.low_ml))
 
     def latch(self, response: Response, rows: Mask) -> None:
         """Never respond with less than this for `rows`, shape (N,), in this run."""

@@ -25,7 +25,7 @@ class UnexplainedChange:
     def __init__(self, n: int, config: SafetyConfig) -> None:
         self._config = config
         self._od, self._at = np.full(n, math.nan), np.full(n, math.nan)  # newest believed reading and its minute
-        self._since_ml = np.zeros(n)  # dosed since then
+        self._since_ml, self._since_low_ml = np.zeros(n), np.zeros(n)  # dosed since then, at most and at least
         self._suspect, self._suspect_at = np.full(n, math.nan), np.full(n, math.nan)  # newest reading after a step
         self._suspects = np.zeros(n)  # readings in a row that agree with one another, not with the believed one
         self._mu = np.full(n, config.mu_max)  # slow estimate of the growth rate
@@ -56,7 +56,7 @@ class UnexplainedChange:
         self._excess, self._deficit = (np.where(settled, 0.0, s) for s in (self._excess, self._deficit))
         self._suspects = np.where(settled, 0, suspects)
         self._od, self._at = np.where(taken, od, before), np.where(taken, t, self._at)
-        self._since_ml = np.where(taken, 0.0, self._since_ml)
+        self._since_ml, self._since_low_ml = (np.where(taken, 0.0, ml) for ml in (self._since_ml, self._since_low_ml))
         return findings
 
     def takes(self, reading: Array, time_s: Array, believed: Mask) -> Mask:
@@ -91,20 +91,21 @@ class UnexplainedChange:
     def _accumulate(self, od: Array, t: Array, usual: Mask, setpoint: Array) -> list[Finding]:
         """Cumulated sums of what ln OD did beyond the best and the worst explanation.
 
-        With d = dosed / volume and x the change of ln OD in dt minutes, a sound pump gives x <= mu dt - gain_min d,
-        and no culture gives x < -gain_max d - death dt. mu is a slow estimate (60 min) plus 0.01 1/min. At full feed
-        (0.8 of the largest rate and more) x must be below -0.004 dt, or the culture outgrows the pump.
+        With d = dosed / volume and x the change of ln OD in dt minutes, a sound pump gives x <= mu dt - gain_min d, and
+        no culture gives x < -gain_max d - death dt; d is the least, and the most, that can have been dosed. mu is a
+        slow estimate (60 min) plus 0.01 1/min. At full feed (0.8 of the largest rate and more) x must be below
+        -0.004 dt, or the culture outgrows the pump.
         """
         c = self._config
         with np.errstate(invalid="ignore", divide="ignore"):
             usual = usual & (od > 0.05) & (self._od > 0.05)
             dt = np.where(usual, np.maximum(t - self._at, 1e-3), 1.0)
             x = np.where(usual, np.log(np.where(usual, od / self._od, 1.0)), 0.0)
-        d = self._since_ml / c.volume_ml
+        d, least = self._since_ml / c.volume_ml, self._since_low_ml / c.volume_ml
         cap = np.minimum(c.mu_max, self._mu + 0.01)
-        rise = np.where(d > 0.0, x - cap * dt + c.gain_min * d, np.minimum(x - c.mu_max * dt, 0.0))
+        rise = np.where(least > 0.0, x - cap * dt + c.gain_min * least, np.minimum(x - c.mu_max * dt, 0.0))
         fall = -x - c.gain_max * d - c.death * dt
-        full = d / dt >= 0.8 * c.max_rate * 60.0 / c.volume_ml
+        full = least / dt >= 0.8 * c.max_rate * 60.0 / c.volume_ml
         excess = np.where(usual, np.maximum(self._excess + rise, 0.0), self._excess)
         deficit = np.where(usual, np.maximum(self._deficit + fall, 0.0), self._deficit)
         futile = np.where(full, np.maximum(self._futile + x + 0.004 * dt, 0.0), 0.0)
@@ -150,14 +151,14 @@ class UnexplainedChange:
         self._helpless_od = np.where(begins & ~lasts, od, self._helpless_od)
         return np.asarray(np.isfinite(self._helpless_od))
 
-    def dosed(self, feed_ml: Array) -> None:
-        """Book what was dosed, mL, shape (N,)."""
-        self._since_ml = self._since_ml + feed_ml
+    def dosed(self, feed_ml: Array, low_ml: Array) -> None:
+        """Book what was dosed, at most and at least, mL, shape (N,)."""
+        self._since_ml, self._since_low_ml = self._since_ml + feed_ml, self._since_low_ml + low_ml
 
     def state(self) -> dict[str, Array]:
         """What it remembers."""
         return {
-            "_od": self._od, "_at": self._at, "_since_ml": self._since_ml,
+            "_od": self._od, "_at": self._at, "_since_ml": self._since_ml, "_since_low_ml": self._since_low_ml,
             "_suspect": self._suspect, "_suspect_at": self._suspect_at,
             "_suspects": self._suspects, "_mu": self._mu,
             "_excess": self._excess, "_deficit": self._deficit, "_futile": self._futile,
@@ -166,7 +167,8 @@ class UnexplainedChange:
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Continue as saved."""
-        self._od, self._at, self._since_ml = state["_od"], state["_at"], state["_since_ml"]
+        self._od, self._at = state["_od"], state["_at"]
+        self._since_ml, self._since_low_ml = state["_since_ml"], state["_since_low_ml"]
         self._suspect, self._suspect_at = state["_suspect"], state["_suspect_at"]
         self._suspects, self._mu = state["_suspects"], state["_mu"]
         self._excess, self._deficit, self._futile = state["_excess"], state["_deficit"], state["_futile"]

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 from hardware.errors import RecordingError
 from hardware.storage.journal import REMEDY
 
-__all__ = ["REPEAT_S", "Dosed", "Ending", "damaged", "dosed", "feeds_by"]
+__all__ = ["REPEAT_S", "Dosed", "Ending", "Given", "damaged", "dosed", "feeds_by"]
 
 REPEAT_S = 63.0
 """A row tells repetitions of a dose by their number, each so long after the one before: the period of a Chi.Bio."""
@@ -20,12 +21,27 @@ FEEDS = {"Pump1": 1, "Pump3": 3, "Pump4": 4}  # pumps that an intent may name, a
 
 
 @dataclass(frozen=True)
+class Given:
+    """What was given beyond what was booked: run time, s; volumes, mL, negative where less was given.
+
+    low_ml: the least that can have been fed. pump: number of the spare pump that gave it, 0 for the feed.
+    """
+
+    at_s: float
+    feed_ml: float
+    low_ml: float
+    waste_ml: float
+    pump: int = 0
+
+
+@dataclass(frozen=True)
 class Ending:
     """How a dose ended.
 
-    on_s: run time at which its pumps were switched on, s. feed_ml, waste_ml: what it gave. feed_times, waste_times: how
-    often the device gave the same again, every 63 s from `on_s` on, before the pump was off. pump: number of the spare
-    pump that gave it, 0 for the feed.
+    on_s: run time at which its pumps were switched on, s. feed_ml, waste_ml: what it gave, at most. feed_times,
+    waste_times: how often the device gave the same again, every 63 s from `on_s` on, before the pump was off; the last
+    time feed_last_ml, waste_last_ml, nan: the same too. pump: number of the spare pump that gave it, 0 for the feed.
+    feed_low_ml: the least that it gave with its repetitions, nan: as much as the most.
     """
 
     on_s: float
@@ -34,29 +50,55 @@ class Ending:
     feed_times: int = 0
     waste_times: int = 0
     pump: int = 0
+    feed_last_ml: float = math.nan
+    waste_last_ml: float = math.nan
+    feed_low_ml: float = math.nan
 
     @property
     def repeated_ml(self) -> float:
         """Fresh medium beyond the dose itself, mL."""
-        return self.feed_times * self.feed_ml
+        return sum(feed_ml for _, feed_ml, _ in self.repeats())
+
+    @property
+    def least(self) -> float:
+        """Which part of the most it gave at least, 0 to 1."""
+        most_ml = self.feed_ml + self.repeated_ml
+        return 1.0 if math.isnan(self.feed_low_ml) or most_ml <= 0.0 else min(self.feed_low_ml / most_ml, 1.0)
 
     def repeats(self) -> list[tuple[float, float, float]]:
         """Each repetition: run time, s, and volumes of feed and waste, mL."""
+
+        def nth(k: int, times: int, ml: float, last_ml: float) -> float:
+            return (last_ml if k == times and not math.isnan(last_ml) else ml) if k <= times else 0.0
+
         return [
-            (self.on_s + REPEAT_S * k, self.feed_ml * (k <= self.feed_times), self.waste_ml * (k <= self.waste_times))
+            (
+                self.on_s + REPEAT_S * k,
+                nth(k, self.feed_times, self.feed_ml, self.feed_last_ml),
+                nth(k, self.waste_times, self.waste_ml, self.waste_last_ml),
+            )
             for k in range(1, max(self.feed_times, self.waste_times) + 1)
         ]
 
+    def beyond(self, booked_ml: float) -> list[Given]:
+        """What it gave beyond the feed that was booked when it began, its waste with it, in the order of time."""
+        low_ml, more_ml = self.least * self.feed_ml - booked_ml, self.feed_ml - booked_ml
+        first = [Given(self.on_s, more_ml, low_ml, more_ml, self.pump)] if max(abs(more_ml), abs(low_ml)) > 1e-3 else []
+        again = [Given(at_s, ml, self.least * ml, waste_ml, self.pump) for at_s, ml, waste_ml in self.repeats()]
+        return first + again
+
     def row(self) -> dict[str, Any]:
         """As the journal keeps it."""
-        known = {key: value for key, value in asdict(self).items() if key != "pump" or value}
+        known = {key: value for key, value in asdict(self).items() if value == value and (key != "pump" or value)}
         return {"verified_off": True, "repeated_ml": self.repeated_ml, **known}
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> Ending:
         """The inverse of `row`. Raises: KeyError, TypeError, ValueError for a damaged row."""
         on_s, feed_ml, waste_ml = (float(row[key]) for key in ("on_s", "feed_ml", "waste_ml"))
-        return cls(on_s, feed_ml, waste_ml, int(row["feed_times"]), int(row["waste_times"]), int(row.get("pump", 0)))
+        last = (float(row.get(key, math.nan)) for key in ("feed_last_ml", "waste_last_ml", "feed_low_ml"))
+        times = int(row["feed_times"]), int(row["waste_times"])
+        return cls(on_s, feed_ml, waste_ml, *times, int(row.get("pump", 0)), *last)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from experiments.controllers.base import Array, Controller, Mask
 from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.emulator.faults import inject
 from hardware.emulator.process import EmulatorProcess
-from hardware.errors import DeviceStateError
 from hardware.safety.interlock import Response
 from hardware.storage.journal import read_journal
 from tests.experiments.test_exits import SPEED, Bench
@@ -151,7 +150,7 @@ def test_a_resumed_run_hands_over_again_what_lost_its_regulation_meanwhile(tmp_p
     assert len([note for note in notes if "handed over again, because its on-board OD regulation is" in note]) == 1
 
 
-def test_a_regulation_that_does_not_come_back_is_an_error_and_not_believed(
+def test_a_regulation_that_does_not_come_back_is_told_not_believed_and_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = handed_over(tmp_path)
@@ -160,8 +159,16 @@ def test_a_regulation_that_does_not_come_back_is_an_error_and_not_believed(
     monkeypatch.setattr(
         run.device, "submit", lambda m, p, *rest: whole(m, p.replace("/SetOutputOn/OD/1", "/SetOutputOn/OD/0"), *rest)
     )
-    with pytest.raises(DeviceStateError, match="M0: on-board OD regulation is off, target 0.5 after"):
-        run.begin()
+    run.begin()
+    run.live(3)
+    fault = run.reactors.stations[0].book.fault
+    assert fault is not None
+    assert "not taken over: M0: on-board OD regulation is off, target 0.5 after" in str(fault)
+    assert not run.data()["OD"]["ON"]
+    monkeypatch.undo()
+    run.live(3)
+    assert run.data()["OD"]["ON"]
+    assert run.reactors.stations[0].book.fault is None
 
 
 @pytest.mark.parametrize("dies_at", range(1, 17))

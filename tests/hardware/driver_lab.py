@@ -17,12 +17,12 @@ from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions
 from hardware.emulator.faults import inject
 from hardware.emulator.transport import EmulatorTransport
-from hardware.link.transport import Reply
+from hardware.link.transport import Reply, SwitchedOff, Transport
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
 
 
-class Spy:
+class Spy(Transport):
     """Passes everything on and remembers every POST with its time."""
 
     def __init__(self, inner: EmulatorTransport, clock: VirtualClock) -> None:
@@ -38,6 +38,9 @@ class Spy:
 
     def disarm(self) -> None:
         self.inner.disarm()
+
+    def switched_off(self) -> SwitchedOff:
+        return self.inner.switched_off()
 
     def close(self) -> None:
         self.inner.close()

@@ -9,7 +9,7 @@ import numpy as np
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
 from hardware.errors import LinkError
-from hardware.link.transport import Reply
+from hardware.link.transport import Reply, Transport
 
 DONE = Reply(204, b"")
 
@@ -37,7 +37,7 @@ def answer(data: dict[str, Any]) -> Reply:
     return Reply(200, json.dumps(data).encode())
 
 
-class Script:
+class Script(Transport):
     """Expects `steps` of (request, answer), request as "POST /path"; an answer that is an exception is raised."""
 
     def __init__(self, steps: Sequence[tuple[str, Reply | Exception]]) -> None:

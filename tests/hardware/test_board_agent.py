@@ -528,6 +528,9 @@ def test_silence_switches_all_pumps_of_all_present_reactors_off(short: AgentLab)
     assert hello["trips"] == 1
     assert hello["silent_s"] > 1.0
     assert hello["last_trip"].startswith("20")
+    ago_s = {(pump, m): s for m, pumps in hello["switched_off"].items() for pump, s in pumps.items()}
+    assert set(ago_s) == running  # what it found on, and nothing else
+    assert all(0.0 <= s < 10.0 for s in ago_s.values())
     short.until(lambda: "pumps verified off" in short.log.read_text())  # said once that is verified
     assert short.emulator.truth()["alive"] is True  # the absent reactors were not touched
 

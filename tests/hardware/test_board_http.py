@@ -18,10 +18,10 @@ import pytest
 
 from hardware.board import board_agent
 from hardware.board.board_agent import Agent, Device, Proxy
-from hardware.errors import LinkError
+from hardware.errors import LinkError, ProtocolError
 from hardware.link.http import HttpTransport
 from hardware.link.open import open_transport
-from hardware.link.transport import Transport, TransportConfig
+from hardware.link.transport import Transport, TransportConfig, switched_off
 from tests.hardware.test_board_agent import PYTHON, SOURCE, TOKEN, AgentLab, Recorder, make_token
 from tests.hardware.test_http_transport import Server
 
@@ -387,8 +387,34 @@ def test_after_silence_the_next_client_finds_the_pumps_off(tmp_path: Path) -> No
         lab.until(lambda: ask(lab.port, "POST", "/_agent/heartbeat", BEARER, "X-Session: 2")[0] == 204)
         assert lab.motors() == set()
         assert ask(lab.port, "POST", "/_agent/heartbeat", BEARER, "X-Session: 1")[0] == 409
+        before = time.monotonic()
+        config = TransportConfig(token_file=str(tmp_path / "token"))
+        link = HttpTransport(f"http://127.0.0.1:{lab.port}", speed=10.0, config=config)
+        found = link.switched_off()
+        time.sleep(0.5)
+        later = link.switched_off()
+        assert found is not None
+        assert later is not None
+        assert list(found) == ["M0"]
+        assert list(found["M0"]) == ["Pump1"]  # Pump2 to Pump4 were off before
+        passed_s = 10.0 * (time.monotonic() - before)  # device seconds
+        assert 5.0 <= later["M0"]["Pump1"] - found["M0"]["Pump1"] <= passed_s
     finally:
         lab.end()
+
+
+@pytest.mark.parametrize(
+    "body", [b"", b"[]", b"{", b'{"switched_off": 3}', b'{"switched_off": {"M0": {"Pump1": "x"}}}']
+)
+def test_a_status_that_is_no_agent_s_is_told_as_that(body: bytes) -> None:
+    with pytest.raises(ProtocolError, match="the board agent's status is not readable"):
+        switched_off(body, 1.0)
+
+
+def test_an_agent_that_keeps_no_record_says_nothing() -> None:
+    assert switched_off(b'{"agent": "board_agent", "version": "2.0"}', 1.0) is None
+    assert switched_off(b'{"switched_off": {}}', 1.0) == {}
+    assert HttpTransport("http://127.0.0.1:1").switched_off() == {}  # no agent, nothing that could have acted
 
 
 @pytest.fixture

@@ -13,9 +13,10 @@ from hardware.chibio.connection import Connection
 from hardware.chibio.dose_sequence import DoseSequence
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration
 from hardware.chibio.logbook import Logbook
+from hardware.chibio.resume import ReactorHistory, remember
 from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
-from hardware.link.transport import Reply
+from hardware.link.transport import Reply, Transport
 from tests.hardware.script import DONE, answer, state
 
 OFFS = [f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 2, 3, 4)]
@@ -27,7 +28,7 @@ WASTE_DUTY = math.ceil((4.0 * FEED_S + 4.4) / 63.0 * 1e6) / 1e6
 WASTE_S = 63.0 * WASTE_DUTY
 
 
-class Line:
+class Line(Transport):
     """Transport and device in one: targets and pump flags as they were sent.
 
     Attributes: posts, (time, path); trouble, called with each path before it is carried out, may raise; lost, paths
@@ -75,16 +76,21 @@ class Bench:
     def __init__(self, calibration: ReactorCalibration | None = None) -> None:
         self.clock = VirtualClock(1000.0)
         self.line, self.rows, self.agenda = Line(self.clock), [], Agenda(self.clock)
-        self.connection = Connection("M0", ("M0",), self.line, self.clock, lambda kind, fields: None)
+        self.known = ReactorHistory()
+        self.connection = Connection("M0", ("M0",), self.line, self.clock, self._log)
         self.book = Logbook("M0", self._log, self._log, lambda: self.clock.now() - 1000.0)
         self.doses = DoseSequence(
-            self.connection, calibration or ReactorCalibration(), ChiBioConfig(), self.agenda, self.book
-        )
-        self.connection.read()
+            self.connection, calibration or ReactorCalibration(), ChiBioConfig(), self.agenda, self.book,
+            lambda: self.known,
+        )  # fmt: skip
+        start = self.connection.read().start_time
+        self._log("device", {"start_time": start})
         self.line.posts.clear()
 
     def _log(self, kind: str, fields: Any) -> None:
-        self.rows.append({"kind": kind, "posts": len(self.line.posts), **fields})
+        row = {"kind": kind, "time_s": self.clock.now() - 1000.0, **fields}
+        self.known = remember(self.known, row)
+        self.rows.append({"posts": len(self.line.posts), **row})
 
     def begin(self, rate: float = 0.01, key: Any = (60.0, 2), past_s: float = 0.0, refusal: str = "") -> DosePlan:
         return self.doses.begin(rate, key, self.clock.now() - past_s, refusal)
@@ -113,7 +119,7 @@ def test_a_dose_is_written_down_set_read_back_and_ended_twice() -> None:
         (1001.0, FEED_ON),
     ]
     [intent] = bench.of("intent")
-    assert intent.pop("posts") == 0  # before anything was sent
+    assert (intent.pop("posts"), intent.pop("time_s")) == (0, 0.0)  # before anything was sent
     assert intent == {
         "kind": "intent", "reactor": "M0", "sample": (60.0, 2), "rate": 0.01, "feed_duty": FEED_DUTY,
         "waste_duty": WASTE_DUTY, "feed_ml": pytest.approx(FEED_S), "waste_ml": pytest.approx(WASTE_S),
@@ -133,8 +139,8 @@ def test_a_dose_is_written_down_set_read_back_and_ended_twice() -> None:
 @pytest.mark.parametrize(
     ("lost", "sent", "fed_ml", "words"),
     [
-        (WASTE_ON, [WASTE_ON], 0.0, "no dose was begun"),
-        (FEED_ON, [WASTE_ON, FEED_ON], pytest.approx(FEED_S), "counted as dosed"),
+        (WASTE_ON, [WASTE_ON], 0.0, "no dose: no answer"),
+        (FEED_ON, [WASTE_ON, FEED_ON], pytest.approx(FEED_S), "what it did is looked for: no answer"),
     ],
 )
 def test_a_pump_command_whose_answer_is_lost_is_not_sent_again(
@@ -145,9 +151,13 @@ def test_a_pump_command_whose_answer_is_lost_is_not_sent_again(
     assert bench.begin().feed_ml == fed_ml
     bench.run()
     assert [path for path in bench.line.sent() if path in (FEED_ON, WASTE_ON)] == sent
-    assert [OFFS[0], *END] == bench.line.sent()[-7:]
+    assert ["/changeDevice/M0", *END] == bench.line.sent()[-7:]  # looked at before it is switched off
     assert words in bench.book.notes[0]
     assert not bench.doses.running
+    [end] = bench.of("dose_end")  # it was carried out, and it was the answer that was lost
+    assert end["feed_ml"] == fed_ml
+    assert end["feed_low_ml"] == 0.0  # from when on it ran is not known
+    assert [given.feed_ml for given in bench.doses.extra] == ([0.0] if end["feed_ml"] else [])
 
 
 @pytest.mark.parametrize(
@@ -181,7 +191,7 @@ def test_a_read_back_that_takes_too_long_ends_the_dose_before_a_pump_is_on(late_
     bench.line.slow_s = 38.0 - 20.0 - WASTE_S + late_s
     plan = bench.begin(past_s=20.0)
     begun = late_s < 0.0
-    assert (plan.feed_ml > 0.0, bench.doses.running) == (begun, begun)
+    assert (plan.feed_ml > 0.0, bench.doses.running) == (begun, True)  # not before its pumps are verified off
     assert (FEED_ON in bench.line.sent()) == begun
     bench.line.slow_s = 0.0
     bench.run()
@@ -299,8 +309,9 @@ def test_what_the_device_repeats_until_it_has_heard_the_end_is_told(dead_s: floa
     bench.run()
     whole = {"feed_ml": round(FEED_S, 3), "waste_ml": round(WASTE_S, 3), "on_s": 1.0}
     assert ended(bench) == {**whole, "feed_times": times, "waste_times": times}
-    assert [(e.feed_times, e.waste_times) for e in bench.doses.endings] == ([(times, times)] if times else [])
-    assert [f"repeated {times} times" in note for note in bench.book.notes] == [True] * (times > 0)
+    again = [(given.at_s, given.feed_ml) for given in bench.doses.extra if given.feed_ml > 0.0]
+    assert again == [(1.0 + 63.0 * k, pytest.approx(FEED_S)) for k in range(1, times + 1)]
+    assert ["was repeated" in note and f"{times} times" in note for note in bench.book.notes] == [True] * (times > 0)
     assert bench.book.fault is not None
 
 
@@ -328,7 +339,7 @@ def test_a_feed_pump_that_answers_off_and_stays_on_has_gone_on() -> None:
     bench.run(130.0)
     bench.line.shown = {}
     bench.run()
-    assert (ended(bench)["feed_times"], ended(bench)["waste_times"]) == (2, 2)
+    assert (ended(bench)["feed_times"], ended(bench)["waste_times"]) == (2, 0)  # the waste pump took its off
 
 
 def test_a_device_that_was_restarted_in_a_dose_has_repeated_nothing() -> None:
@@ -345,9 +356,16 @@ def test_a_device_that_was_restarted_in_a_dose_has_repeated_nothing() -> None:
 def test_a_dose_that_is_cut_short_gave_less() -> None:
     bench = Bench()
     bench.begin()
-    bench.doses.ended(1.25)
-    assert ended(bench) == {"feed_ml": 0.25, "waste_ml": 0.25, "feed_times": 0, "waste_times": 0, "on_s": 1.0}
-    bench.doses.ended(2.0)
+    bench.clock.sleep(0.25)
+    bench.doses.settle()
+    assert ended(bench) == {"feed_ml": 0.25, "waste_ml": 1.25, "feed_times": 0, "waste_times": 0, "on_s": 1.0}
+    [less] = bench.doses.extra
+    assert (less.at_s, round(less.feed_ml, 3), round(less.low_ml, 3)) == (
+        1.0,
+        round(0.25 - FEED_S, 3),
+        -round(FEED_S, 3),
+    )
+    bench.doses.settle()
     assert len(bench.of("dose_end")) == 1
 
 

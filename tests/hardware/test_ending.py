@@ -1,83 +1,190 @@
-"""What became of a dose whose end nobody watched, case by case."""
+"""What became of a dose, case by case: from answers, from a look at the device, and from the board agent's own record.
+
+Pumps move 1 mL/s without bias, so volumes are seconds: 1.2 mL of feed asked on at run time 100, 9 mL of waste at 99.
+"""
 
 import json
+import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from hardware.chibio.dosing import PumpCalibration
+from hardware.chibio.ending import conclude, found
 from hardware.chibio.protocol import PERIOD_S, DeviceState, parse_state
-from hardware.chibio.resume import ReactorHistory, conclude, repeats_until, replay
+from hardware.chibio.resume import ReactorHistory, remember, replay
 from hardware.errors import RecordingError
-from hardware.storage.doses import REPEAT_S, Ending, dosed
+from hardware.storage.doses import REPEAT_S, Ending, Given, dosed
 from tests.hardware.script import state
 
+PUMP = PumpCalibration()
+START = "2026-01-01 00:00:00"
 OPEN = ReactorHistory(
-    open=True, feed_ml=1.2, waste_ml=9.0, on_s=100.0, fed=True, seen_s=101.0, start_time="2026-01-01 00:00:00"
-)
+    open=True, feed_ml=1.2, waste_ml=9.0, feed_s=1.2, waste_s=9.0, on_s=100.0, fed=True, wasted=True, experiment=START,
+    feed_on=(100.0, 100.1), waste_on=(99.0, 99.1),
+)  # fmt: skip
+UNHEARD = replace(OPEN, feed_on=(math.nan, math.nan))
+UNFED = replace(UNHEARD, on_s=98.0, fed=False)
+SILENCE_S = 120.0
 
 
-def found(feed: bool, waste: bool, start_time: str = OPEN.start_time) -> DeviceState:
-    read = parse_state(json.dumps(state()).encode())
-    return replace(read, pumps_on=(feed, waste, False, False), start_time=start_time, cycles=5)
+def read(feed: bool, waste: bool, start_time: str = START, **changes: Any) -> DeviceState:
+    found_so = parse_state(json.dumps(state()).encode())
+    return replace(found_so, pumps_on=(feed, waste, False, False), start_time=start_time, cycles=5, **changes)
+
+
+def after(
+    known: ReactorHistory,
+    state: DeviceState,
+    now_s: float,
+    seen_s: float = 101.0,
+    stopped: dict[str, float] | None = None,
+) -> tuple[Ending, str]:
+    """How the dose ended that is known and was looked at so, its pumps verified off at once."""
+    row = found(known, state, now_s, seen_s, SILENCE_S, stopped)
+    return conclude(remember(known, {"kind": "found", **json.loads(json.dumps(row))}), now_s, PUMP, PUMP)
+
+
+def test_a_dose_whose_every_command_was_answered_gave_what_was_planned() -> None:
+    known = replace(OPEN, feed_off=(103.2, 103.3), waste_off=(110.0, 110.1))
+    ending, words = conclude(known, 110.5, PUMP, PUMP)
+    assert ending == Ending(100.0, 1.2, 9.0, 0, 0, 0, 0.0, 0.0, 1.2)
+    assert words == ""
+    assert ending.beyond(1.2) == []
 
 
 @pytest.mark.parametrize(
-    ("off_s", "times"), [(100.0, 0), (162.9, 0), (163.0, 1), (225.9, 1), (226.0, 2), (50.0, 0)]
-)  # fmt: skip
-def test_a_pump_left_on_begins_again_every_63_s(off_s: float, times: int) -> None:
-    assert repeats_until(off_s, 100.0) == times
+    ("off", "most_ml", "least_ml"),
+    [
+        ((100.6, 100.7), 0.7, 0.0),  # asked off .5 s after on was answered: its motor may not have started
+        ((101.2, 101.3), 1.2, 0.4),
+        ((102.0, 102.1), 1.2, 1.2),
+    ],
+)
+def test_a_dose_that_was_cut_short_lies_between_two_volumes(
+    off: tuple[float, float], most_ml: float, least_ml: float
+) -> None:
+    ending, words = conclude(replace(OPEN, feed_off=off, waste_off=off), 105.0, PUMP, PUMP)
+    assert (ending.feed_ml, ending.feed_low_ml) == pytest.approx((most_ml, least_ml))
+    assert ("gave" in words) == (least_ml < 1.0)
+
+
+@pytest.mark.parametrize(
+    ("answered_s", "off_s", "most_ml", "least_ml"),
+    [(102.65, 105.85, 1.2, 1.2), (104.5, 107.7, 1.2, 1.2), (104.5, 104.6, 1.2, 0.0), (119.9, 123.2, 1.2, 1.2)],
+)
+def test_a_feed_command_that_was_slow_is_counted_from_its_answer(
+    answered_s: float, off_s: float, most_ml: float, least_ml: float
+) -> None:
+    known = replace(OPEN, feed_on=(100.0, answered_s), feed_off=(off_s, off_s + 0.1), waste_off=(130.0, 130.1))
+    ending, _ = conclude(known, 131.0, PUMP, PUMP)
+    assert (ending.feed_ml, ending.feed_low_ml) == pytest.approx((most_ml, least_ml))
+
+
+@pytest.mark.parametrize(
+    ("on_s", "times", "last_ml"),
+    [(62.9, 0, 0.0), (63.5, 1, 0.5), (64.2, 1, 1.2), (125.9, 1, 1.2), (126.3, 2, 0.3), (900.0, 14, 1.2)],
+)
+def test_a_pump_left_on_begins_again_every_63_s_and_its_last_dose_may_be_cut(
+    on_s: float, times: int, last_ml: float
+) -> None:
+    ending, words = after(OPEN, read(True, True), 100.0 + on_s)
+    assert (ending.feed_times, ending.waste_times) == (times, int((on_s + 1.0) // 63))
+    assert ending.feed_last_ml == pytest.approx(last_ml)
+    assert ending.repeated_ml == pytest.approx(1.2 * max(times - 1, 0) + last_ml)
+    assert (f"repeated up to {times} times" in words) == (times > 0)
     assert REPEAT_S == PERIOD_S  # as the journal counts
 
 
 @pytest.mark.parametrize(
-    ("history", "read", "now_s", "feed_ml", "feed_times", "waste_times", "words"),
+    ("known", "seen", "now_s", "seen_s", "stopped", "most_ml", "least_ml"),
     [
-        (OPEN, found(True, True), 1000.0, 1.2, 14, 14, "repeated 14 times, 16.80 mL"),
-        (OPEN, found(True, False), 1000.0, 1.2, 14, 0, "repeated 14 times"),
-        (replace(OPEN, feed_off=True), found(True, True), 1000.0, 1.2, 14, 14, "repeated 14"),  # answered, not done
-        (replace(OPEN, feed_off=True), found(False, True), 1000.0, 1.2, 0, 14, "after its feed pump had been"),
-        (OPEN, found(False, True), 1000.0, 1.2, 0, 14, "after its feed pump had been"),  # killed in its off command
-        (replace(OPEN, fed=False), found(False, True), 1000.0, 0.0, 0, 14, "before its feed pump was switched on"),
-        (replace(OPEN, fed=False), found(False, False), 1000.0, 0.0, 0, 0, "before its feed pump was switched on"),
-        (OPEN, found(False, False), 1000.0, 1.2, 2, 2, "something else switched its pumps off"),  # until 231 s
-        (OPEN, found(False, False), 170.0, 1.2, 1, 1, "something else switched its pumps off"),
-        (replace(OPEN, seen_s=95.9), found(False, False), 1000.0, 1.2, 1, 1, "something else"),  # until 225.9 s
-        (replace(OPEN, seen_s=96.0), found(False, False), 1000.0, 1.2, 2, 2, "something else"),  # until 226 s
-        (replace(OPEN, feed_off=True), found(False, False), 1000.0, 1.2, 0, 2, "after its feed pump had been"),
-        (OPEN, found(True, True, "another"), 1000.0, 1.2, 0, 0, "restarted since"),
-        (OPEN, replace(found(False, False, " Waiting "), cycles=0), 1000.0, 1.2, 0, 0, "restarted since"),
-        (replace(OPEN, start_time=""), found(True, True, "another"), 1000.0, 1.2, 14, 14, "repeated 14 times"),
+        # still on: it goes on until it is switched off now; the period is up to .7 s longer
+        (OPEN, read(True, False), 1000.0, 101.0, {}, 18.0, 18.0),
+        # found off after the link was gone, and the agent says when it switched it off
+        (OPEN, read(False, False), 1500.0, 102.0, {"Pump1": 222.5, "Pump2": 222.6}, 2.4, 2.4),
+        (UNHEARD, read(False, False), 1500.0, 102.0, {"Pump1": 222.5}, 2.4, 2.4),
+        # an agent without a record: after its silence at most, and at least nothing
+        (OPEN, read(False, False), 1500.0, 102.0, None, 3.6, 0.0),
+        (OPEN, read(False, False), 1500.0, 95.9, None, 2.4, 0.0),  # until 225.9 s
+        # its command was not answered, and no agent can have acted yet: found off, it never went on
+        (UNHEARD, read(False, True), 219.0, 100.0, {}, 0.0, 0.0),
+        (UNHEARD, read(True, True), 130.0, 100.0, {}, 1.2, 1.2),
+        (UNHEARD, read(False, False), 219.9, 100.0, None, 0.0, 0.0),
+        (UNHEARD, read(False, False), 220.1, 100.0, None, 2.4, 0.0),
+        (UNHEARD, read(False, False), 900.0, 100.0, {}, 0.0, 0.0),
+        # heard and found off: somebody switched it off, nobody knows when; the agent would have ended both pumps
+        (OPEN, read(False, False), 130.0, 101.0, {}, 1.2, 0.0),
+        (OPEN, read(False, True), 130.0, 101.0, {}, 1.2, 1.2),
+        # asked off without an answer, and found off
+        (replace(OPEN, feed_tried=103.5, waste_tried=111.0), read(False, False), 600.0, 101.0, {}, 1.2, 1.2),
+        (replace(OPEN, feed_tried=166.0), read(False, False), 600.0, 101.0, {}, 2.4, 2.4),
+        (replace(OPEN, feed_tried=103.5), read(False, False), 600.0, 101.0, {"Pump1": 222.5}, 2.4, 2.4),
+        (replace(OPEN, feed_tried=103.5), read(False, False), 600.0, 101.0, None, 3.6, 0.0),
+        (replace(UNHEARD, feed_tried=123.3), read(False, False), 600.0, 101.0, {}, 1.2, 0.0),
+        (replace(OPEN, feed_tried=103.5), read(True, False), 240.0, 101.0, {}, 3.6, 3.6),
+        # never fed
+        (UNFED, read(False, True), 1000.0, 98.0, {}, 0.0, 0.0),
+        (UNFED, read(False, False), 1000.0, 98.0, {}, 0.0, 0.0),
+        # answered off, and found on: not done
+        (replace(OPEN, feed_off=(103.0, 103.1)), read(True, True), 240.0, 101.0, {}, 3.6, 3.6),
+        (replace(OPEN, feed_off=(103.0, 103.1)), read(False, True), 1000.0, 101.0, {}, 1.2, 1.2),
+        # a device that was restarted forgot its pumps; as a rule that is why it was silent
+        (OPEN, read(True, True, "another"), 1000.0, 101.5, {}, 1.2, 0.7),
+        (OPEN, read(False, False, " Waiting "), 1000.0, 101.5, {}, 1.2, 0.7),
+        (replace(OPEN, experiment=""), read(True, True, "another"), 1000.0, 101.0, {}, 18.0, 18.0),
     ],
 )  # fmt: skip
-def test_what_is_booked_and_said(
-    history: ReactorHistory, read: DeviceState, now_s: float, feed_ml: float, feed_times: int, waste_times: int,
-    words: str,
+def test_what_a_look_says_of_a_dose_whose_course_nobody_saw(
+    known: ReactorHistory, seen: DeviceState, now_s: float, seen_s: float, stopped: dict[str, float] | None,
+    most_ml: float, least_ml: float,
 ) -> None:  # fmt: skip
-    ending, note = conclude(history, read, now_s, 120.0)
-    assert (ending.on_s, ending.feed_ml, ending.waste_ml) == (100.0, feed_ml, 9.0)
-    assert (ending.feed_times, ending.waste_times) == (feed_times, waste_times)
-    assert note.startswith("a dose of 1.20 mL was left open")
-    assert words in note
+    ending, _ = after(known, seen, now_s, seen_s, stopped)
+    assert ending.feed_ml + ending.repeated_ml == pytest.approx(most_ml)
+    assert ending.feed_low_ml == pytest.approx(least_ml, abs=1e-6)
+    assert ending.least == pytest.approx(least_ml / most_ml if most_ml else 1.0)
+
+
+def test_a_look_says_nothing_of_a_pump_whose_end_was_answered_nor_without_an_open_dose() -> None:
+    ended = replace(OPEN, feed_off=(103.0, 103.1), waste_off=(110.0, 110.1))
+    assert found(ended, read(False, False), 1000.0, 101.0, SILENCE_S, {}) == {}
+    assert found(ReactorHistory(), read(True, True), 1000.0, 101.0, SILENCE_S, {}) == {}
+
+
+def test_a_spare_pump_s_dose_is_told_as_its_own() -> None:
+    known = replace(OPEN, feed_pump="Pump3")
+    ending, _ = after(known, replace(read(False, False), pumps_on=(False, False, True, False)), 170.0)
+    assert (ending.pump, ending.feed_times) == (3, 1)
+    assert {g.pump for g in ending.beyond(1.2)} == {3}
+
+
+def test_what_was_given_beyond_what_was_booked_comes_one_by_one_with_the_least_that_it_was() -> None:
+    ending = Ending(10.0, 1.2, 9.0, 2, 2, 0, 0.6, 9.0, 1.5)
+    assert ending.least == pytest.approx(0.5)
+    assert ending.beyond(1.2) == [
+        Given(10.0, 0.0, pytest.approx(-0.6), 0.0), Given(73.0, 1.2, pytest.approx(0.6), 9.0),
+        Given(136.0, 0.6, pytest.approx(0.3), 9.0),
+    ]  # fmt: skip
+    assert Ending(10.0, 0.0, 9.0, feed_low_ml=0.0).beyond(1.2) == [Given(10.0, -1.2, -1.2, -1.2)]
 
 
 def test_repetitions_are_told_one_by_one_and_survive_the_journal() -> None:
-    ending = Ending(10.0, 1.2, 9.0, 1, 2)
-    assert ending.repeats() == [(73.0, 1.2, 9.0), (136.0, 0.0, 9.0)]
+    ending = Ending(10.0, 1.2, 9.0, 1, 2, 4, 0.4, 3.0, 1.0)
+    assert ending.repeats() == [(73.0, 0.4, 9.0), (136.0, 0.0, 3.0)]
     assert Ending.of_row(json.loads(json.dumps(ending.row()))) == ending
-    assert ending.row()["repeated_ml"] == 1.2
+    assert ending.row()["repeated_ml"] == 0.4
+    earlier = Ending.of_row({"on_s": 10.0, "feed_ml": 1.2, "waste_ml": 9.0, "feed_times": 2, "waste_times": 2})
+    assert earlier.repeats() == [(73.0, 1.2, 9.0), (136.0, 1.2, 9.0)]  # a journal of an earlier version
+    assert earlier.least == 1.0
 
 
 def test_every_dose_of_a_journal_in_the_order_of_time() -> None:
     def intent(n: int, name: str, on_s: float) -> dict[str, object]:
         return {
-            "n": n,
-            "kind": "intent",
-            "reactor": name,
-            "on_s": on_s,
-            "feed_ml": 1.2,
-            "waste_ml": 9.0,
-            "sample": [0, 1],
-        }
+            "n": n, "kind": "intent", "reactor": name, "on_s": on_s, "feed_ml": 1.2, "waste_ml": 9.0,
+            "sample": [0, 1], "feed_duty": 0.019, "waste_duty": 0.143,
+        }  # fmt: skip
 
     rows = [
         intent(0, "M0", 10.0), {"n": 1, "kind": "feed_on", "reactor": "M0", "on_s": 11.0},

@@ -18,7 +18,7 @@ from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
 from hardware.emulator.transport import EmulatorTransport
 from hardware.errors import RecordingError
-from hardware.link.transport import Reply
+from hardware.link.transport import Reply, Transport
 from hardware.reactor import Command
 from hardware.storage.recording_reader import read_recording
 
@@ -52,7 +52,7 @@ def mutilate(body: bytes, rng: random.Random) -> bytes:
             return json.dumps(rng.choice(STRANGE)).encode()
 
 
-class Hostile:
+class Hostile(Transport):
     """A link whose answers are mutilated while `angry`; remembers what is sent then."""
 
     def __init__(self, inner: EmulatorTransport, rng: random.Random) -> None:

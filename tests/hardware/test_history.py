@@ -14,30 +14,46 @@ def row(n: int, kind: str, reactor: str = "M0", **fields: Any) -> dict[str, Any]
     return {"n": n, "kind": kind, "reactor": reactor, "time_s": 10.0 * n, **fields}
 
 
-INTENT = {"sample": [60.0, 2], "feed_ml": 0.5, "waste_ml": 6.0, "carry_ml": 0.1, "doses": 1}
+INTENT = {
+    "sample": [60.0, 2], "feed_ml": 0.5, "waste_ml": 6.0, "carry_ml": 0.1, "doses": 1, "feed_duty": 0.01,
+    "waste_duty": 0.1,
+}  # fmt: skip
 
 
 def test_nothing_is_known_of_a_reactor_without_rows_and_a_dose_may_have_given_nothing() -> None:
     known = {key: value for key, value in asdict(ReactorHistory()).items() if value == value}  # but for nan
-    assert {key: value for key, value in known.items() if value} == {}
-    assert set(asdict(Ending(10.0)).values()) == {10.0, 0}
+    spans = {known.pop(key) for key in ("feed_on", "waste_on", "feed_off", "waste_off")}
+    assert all(start != start and end != end for start, end in spans)
+    assert {key: value for key, value in known.items() if value} == {"feed_pump": "Pump1"}
+    assert {value for value in asdict(Ending(10.0)).values() if value == value} == {10.0, 0}
     assert Ending(100.0, 0.5, 6.0, 2, 0).repeats() == [(163.0, 0.5, 0.0), (226.0, 0.5, 0.0)]
 
 
 def test_what_later_rows_say_of_a_dose() -> None:
     rows = [row(1, "intent", **INTENT, on_s=75.0), row(2, "feed_on", on_s=76.0)]
     off = row(3, "command", path="/SetOutputOn/Pump1/0/M0", answer=204)
+    waste_off = {**off, "path": "/SetOutputOn/Pump2/0/M0", "took_s": 0.5}
+    never = None
     for later, expected in (
-        ([off], (True, True)),
-        ([{**off, "answer": "no answer"}], (True, False)),
-        ([{**off, "path": "/SetOutputOn/Pump2/0/M0"}], (True, False)),
-        ([row(3, "dose_end")], (False, False)),
-        ([off, row(4, "intent", **INTENT, on_s=135.0)], (True, False)),
-        ([row(3, "intent", **{**INTENT, "feed_ml": 0.0}, on_s=135.0)], (False, False)),
-        ([row(3, "regulate", setpoint=0.5)], (False, False)),
+        ([off], (True, (30.0, 30.0), never)),
+        ([off, {**off, "time_s": 50.0}], (True, (30.0, 30.0), never)),  # the first of them ended it
+        ([{**off, "answer": "no answer"}], (True, never, never)),
+        ([waste_off], (True, never, (29.5, 30.0))),
+        ([off, row(4, "found", feed_off=None, waste_off=[31.0, 32.0])], (True, never, (31.0, 32.0))),
+        ([row(3, "dose_end")], (False, never, never)),
+        ([off, row(4, "intent", **INTENT, on_s=135.0)], (True, never, never)),
+        ([row(3, "intent", **{**INTENT, "feed_ml": 0.0}, on_s=135.0)], (False, never, never)),
+        ([row(3, "regulate", setpoint=0.5)], (False, never, never)),
+        ([row(3, "sample", blank=1.0)], (True, never, never)),
     ):
         found = replay([*rows, *later])["M0"]
-        assert (found.open, found.feed_off) == expected
+        ends = [None if end[1] != end[1] else end for end in (found.feed_off, found.waste_off)]
+        assert (found.open, *ends) == expected
+        assert found.blank != 1.0
+    begun = replay([*rows, row(3, "command", path="/SetOutputOn/Pump2/1/M0", answer="no answer")])["M0"]
+    assert begun.wasted  # it may run
+    assert begun.feed_s == pytest.approx(0.63)
+    assert begun.waste_s == pytest.approx(6.3)
     assert replay([row(1, "guard")])["M0"].overflow_pump_on
     assert not ReactorHistory().overflow_pump_on
     assert replay([row(1, "regulate", setpoint=0.5)])["M0"].handed_over == 0.5

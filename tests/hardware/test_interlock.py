@@ -390,7 +390,7 @@ def test_the_saved_state_has_the_fields_that_earlier_runs_wrote() -> None:
     assert set(state) == {
         "volume_ml", "fed_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_unusable",
         "_fresh_s", "_seen", "_repeats",
-        "_od", "_at", "_since_ml", "_suspect", "_suspect_at", "_suspects", "_mu",
+        "_od", "_at", "_since_ml", "_since_low_ml", "_suspect", "_suspect_at", "_suspects", "_mu",
         "_excess", "_deficit", "_futile", "_over", "_helpless_od", "_eased",
         "_target_c", "_relief_c", "_thermo_s", "_hot", "_too_hot", "_nonsense", "_heat_off",
         "_hold_until_s", "_hold_kind", "_latched",

@@ -213,7 +213,7 @@ def test_a_start_that_fails_and_cannot_switch_it_off_again_says_so() -> None:
         return reply
 
     inner.post = dying  # type: ignore[method-assign]
-    with pytest.raises(DeviceStateError, match="reset; overflow pump not verified off: M0: .*reset"):
+    with pytest.raises(DeviceStateError, match="reset; pumps not verified off: M0: .*reset.*by hand now"):
         lab.reactors.begin()
 
 
@@ -284,6 +284,7 @@ def test_a_resumed_run_tells_that_it_was_off_meanwhile() -> None:
     for k in (1, 2, 3, 4):  # what the board agent does when nobody asks for two minutes
         lab.device.handle("POST", f"/SetOutputOn/Pump{k}/0/M0")
     resume(lab, 300.0)
+    lab.run(2)
     assert runs(lab)
     assert ["the overflow pump was found off" in row["note"] for row in lab.of("note")][-1]
 

@@ -278,6 +278,7 @@ class Culture:
     od: float = math.nan
     at: float = math.nan
     since: float = 0.0
+    least: float = 0.0  # dosed since then, where `since` is the most
     suspect: float = math.nan
     suspect_at: float = math.nan
     suspects: int = 0
@@ -318,17 +319,18 @@ class Culture:
         return self.take(od, t, ["falls+" if down else "jump"])
 
     def take(self, od: float, t: float, kinds: list[str]) -> list[str]:
-        self.od, self.at, self.since = od, t, 0.0
+        self.od, self.at, self.since, self.least = od, t, 0.0, 0.0
         return kinds
 
     def accumulate(self, od: float, t: float, setpoint: float) -> list[str]:
         if od <= 0.05 or self.od <= 0.05:
             return []
         dt, d, x = max(t - self.at, 1e-3), self.since / 20.0, math.log(od / self.od)
-        rise = x - min(0.04, self.mu + 0.01) * dt + 0.5 * d if d > 0.0 else min(x - 0.04 * dt, 0.0)
+        least = self.least / 20.0
+        rise = x - min(0.04, self.mu + 0.01) * dt + 0.5 * least if least > 0.0 else min(x - 0.04 * dt, 0.0)
         self.excess = max(self.excess + rise, 0.0)
         self.deficit = max(self.deficit - x - 1.6 * d - 0.005 * dt, 0.0)
-        full = d / dt >= 0.8 * 0.06
+        full = least / dt >= 0.8 * 0.06
         short = full and od > 1.05 * setpoint
         self.futile = max(self.futile + x + 0.004 * dt, 0.0) if full else 0.0
         self.mu += (1.0 - math.exp(-dt / 60.0)) * (min(max((x + d) / dt, 0.0), 0.04) - self.mu)
@@ -367,9 +369,10 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
             dt = float(rng.choice([0.0, 0.5, 1.0, 2.0, 7.0], p=[0.03, 0.1, 0.67, 0.1, 0.1]))
             feed = feeds * (rng.random(N) < 0.95)
             setpoint = np.where(rng.random(N) < 0.01, 2.0, setpoint)
-            change.dosed(feed)
-            for twin, ml in zip(twins, feed, strict=True):
-                twin.since += ml
+            low = feed * rng.choice([1.0, 0.5, 0.0], N, p=[0.8, 0.1, 0.1])
+            change.dosed(feed, low)
+            for twin, ml, least_ml in zip(twins, feed, low, strict=True):
+                twin.since, twin.least = twin.since + ml, twin.least + least_ml
             true = np.clip(true * np.exp(mu * dt - gain * feed / 20.0), 0.02, 3.0)
             true = np.where(rng.random(N) < 0.01, true * rng.choice([0.6, 0.93, 1.07, 1.5], N), true)
             minute += dt

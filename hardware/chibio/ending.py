@@ -1,0 +1,139 @@
+"""What became of a dose: pure functions, for a life of the program that saw its end and for one that did not.
+
+A pump that is on gives its dose again every 63 s until it is off (docs/device.md, Pumps). When it went on and off is
+known from answers, from what a read finds, and from the dead-man switch of a board agent. Where none of them says it
+exactly, it lies between two times, and what was given between two volumes.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from hardware.chibio.dosing import PumpCalibration
+from hardware.chibio.protocol import FEED, PERIOD_S, PUMPS, WASTE, DeviceState
+from hardware.chibio.resume import ReactorHistory, Span
+from hardware.storage.doses import Ending
+
+__all__ = ["conclude", "found"]
+
+SWITCH_S = 10.0  # after its silence an agent needs a moment, and the last request that it heard is not on record
+MOTOR_S = 0.7  # a motor starts at most so long after the answer, and a period is at most so much longer
+SILENT_S = 20.0  # a request without an answer was carried out within that, if at all
+
+
+@dataclass(frozen=True)
+class _Pump:
+    """One pump in an open dose. asked_s: run time at which it was asked on, inf if it never was. on, off: run times
+    between which it went on and off, nan if not known. tried_s: run time at which it was first asked off in vain, nan
+    if it never was. dose_s: on-time as planned."""
+
+    part: str
+    name: str
+    asked_s: float
+    on: Span
+    off: Span
+    tried_s: float
+    dose_s: float
+
+    def on_s(self, now_s: float) -> Span:
+        """Least and most seconds for which it was on; it is off by now."""
+        first, last = (now_s, now_s) if math.isnan(self.off[1]) else self.off
+        least = 0.0 if math.isnan(self.on[1]) else max(first - self.on[1] - MOTOR_S, 0.0)
+        return least, max(last - self.asked_s, 0.0)
+
+
+def _pumps(known: ReactorHistory) -> tuple[_Pump, _Pump]:
+    """Feed and waste of an open dose."""
+    fed_s = known.on_s if known.fed else math.inf
+    wasted_s = known.on_s if math.isnan(known.waste_on[0]) else known.waste_on[0]
+    return (
+        _Pump("feed", known.feed_pump, fed_s, known.feed_on, known.feed_off, known.feed_tried, known.feed_s),
+        _Pump(
+            "waste", WASTE, wasted_s if known.wasted else math.inf, known.waste_on, known.waste_off,
+            known.waste_tried, known.waste_s,
+        ),
+    )  # fmt: skip
+
+
+def found(
+    known: ReactorHistory, state: DeviceState, now_s: float, seen_s: float, silence_s: float,
+    stopped: Mapping[str, float] | None,
+) -> dict[str, Span | None]:  # fmt: skip
+    """What a look at the device adds to what is `known` of an open dose: when its pumps went on or off, run times.
+
+    None takes back what was answered and is not so. Nothing is added where the answers have told it. A pump that is
+    found off was switched off by whom and when, in this order: by a restart; by the agent, as it says; by a command of
+    ours whose answer was lost; else it never went on, or an agent without a record switched it off after our silence.
+
+    Args:
+      state: as read at run time now_s. seen_s: run time of the last answer before that.
+      silence_s: of this program, after which a board agent, if there is one, switches pumps off.
+      stopped: pump, run time at which an agent says that it found it on and switched it off; None: it does not say.
+    """
+    added: dict[str, Span | None] = {}
+    restarted = bool(known.experiment) and (state.start_time != known.experiment or not state.started)
+    for pump in _pumps(known) if known.open else ():
+        is_on, asked_s = state.pumps_on[PUMPS.index(pump.name)] and not restarted, min(pump.asked_s, known.on_s)
+        on_heard, off_heard = not math.isnan(pump.on[1]), not math.isnan(pump.off[1])
+        agent_s = (stopped or {}).get(pump.name, math.nan)
+        silent = stopped is None and now_s >= seen_s + silence_s
+        if (is_on or not math.isnan(agent_s)) and not on_heard:
+            added[f"{pump.part}_on"] = (asked_s, min(asked_s + SILENT_S, now_s))
+        if is_on and (off_heard or not math.isnan(pump.tried_s)):
+            added[f"{pump.part}_off"] = None
+        if is_on or off_heard:
+            continue
+        if restarted:  # as a rule that is why it was not heard any more
+            off = min(seen_s, now_s), min(now_s, max(seen_s, asked_s + PERIOD_S - 1.0))
+        elif not math.isnan(agent_s):
+            off = agent_s, agent_s
+        elif not math.isnan(pump.tried_s) and not silent:
+            off = pump.tried_s, pump.tried_s
+        elif on_heard and pump.part == "feed" and state.pumps_on[PUMPS.index(WASTE)]:  # an agent ends both
+            off = pump.on[1] + pump.dose_s + MOTOR_S, pump.on[1] + pump.dose_s + MOTOR_S
+        elif not on_heard and not silent:
+            off = asked_s, asked_s
+        else:
+            heard_s = pump.on[1] if on_heard else asked_s
+            off = heard_s, max(heard_s, min(now_s, seen_s + silence_s + SWITCH_S))
+        added[f"{pump.part}_off"] = off
+    return added
+
+
+def conclude(
+    known: ReactorHistory, now_s: float, feed: PumpCalibration, waste: PumpCalibration
+) -> tuple[Ending, str]:  # fmt: skip
+    """How the open dose in `known` ended, and in words what is not as planned, "" if nothing is.
+
+    Args: now_s: run time at which its pumps were verified off. feed, waste: the two pumps.
+    """
+    fed, wasted = _pumps(known)
+    least_s, most_s = fed.on_s(now_s)
+    low_ml, low_times, low_last_ml = _runs(least_s, fed.dose_s, PERIOD_S + MOTOR_S, feed)
+    feed_ml, feed_times, feed_last_ml = _runs(most_s, fed.dose_s, PERIOD_S, feed)
+    waste_ml, waste_times, waste_last_ml = _runs(wasted.on_s(now_s)[1], wasted.dose_s, PERIOD_S, waste)
+    number = 0 if known.feed_pump == FEED else PUMPS.index(known.feed_pump) + 1
+    ending = Ending(
+        known.on_s, feed_ml, waste_ml, feed_times, waste_times, number, feed_last_ml, waste_last_ml,
+        low_ml * max(low_times, 1) + low_last_ml,
+    )  # fmt: skip
+    return ending, _words(ending, known.feed_ml)
+
+
+def _runs(on_s: float, dose_s: float, period_s: float, pump: PumpCalibration) -> tuple[float, int, float]:
+    """What a pump gives that is on for so long: its dose, mL, how often it began again, what the last of those gave."""
+    times = int(on_s // period_s)
+    last_ml = pump.volume(min(dose_s, on_s - times * period_s)) if times else 0.0
+    return pump.volume(min(dose_s, on_s)), times, last_ml
+
+
+def _words(ending: Ending, planned_ml: float) -> str:
+    """What is not as planned."""
+    low_ml, most_ml, times = ending.feed_low_ml, ending.feed_ml + ending.repeated_ml, ending.feed_times
+    dose, volume = f"a dose of {planned_ml:.2f} mL", f"{low_ml:.2f} to {most_ml:.2f} mL"
+    if times:
+        return f"{dose} was repeated up to {times} times by the device, {volume} in all, booked at their times"
+    if most_ml < 1e-3:
+        return f"{dose} gave no medium"
+    as_planned = low_ml >= 0.95 * planned_ml - 0.1
+    return "" if as_planned else f"{dose} gave {volume}, booked as the latter"

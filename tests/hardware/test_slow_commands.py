@@ -1,0 +1,155 @@
+"""A dose whose commands are slow, lost, or cut off with the cable, the program alive: booked is what was given."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
+from hardware.errors import LinkError
+from hardware.link.transport import Reply, SwitchedOff
+from tests.hardware.driver_lab import DriverLab
+from tests.hardware.emulator_lab import BIAS_S, quiet
+
+FEED_ON, FEED_OFF, WASTE_ON = "/SetOutputOn/Pump1/1/", "/SetOutputOn/Pump1/0/", "/SetOutputOn/Pump2/1/"
+FALSE_ALARMS = {"falls", "no_dilution", "cannot_hold"}
+SHARE, SLACK_ML = 0.05, 0.1
+WEIGHED = PumpCalibration(bias_s=BIAS_S)
+
+
+def lab_of(names: tuple[str, ...] = ("M0",), rate: float = 0.01) -> DriverLab:
+    lab = DriverLab(names, options=quiet(mu=0.03))
+    lab.client([ReactorCalibration(WEIGHED, WEIGHED)] * len(names))
+    lab.law.rate = rate
+    lab.reactors.begin()
+    lab.run(4)
+    return lab
+
+
+def check_booked(lab: DriverLab) -> None:
+    """Booked against true volume, once the dose under way has ended: 5 % and .1 mL."""
+    lab.run(2)
+    lab.clock.sleep(15.0)
+    true = [lab.truth(name)["feed_ml"] for name in lab.names]
+    np.testing.assert_allclose(lab.loop.interlock.budget.fed_ml, true, rtol=SHARE, atol=SLACK_ML)
+
+
+def delayed(lab: DriverLab, seconds: float, path: str, before: bool) -> None:
+    """From now on requests of a kind are that slow on their way there, or the answer on its way back."""
+    real = lab.wire.inner.post
+
+    def post(asked: str) -> Reply:
+        late = asked.startswith(path)
+        lab.clock.sleep(seconds * late * before)
+        reply = real(asked)
+        lab.clock.sleep(seconds * late * (not before))
+        return reply
+
+    lab.wire.inner.post = post  # type: ignore[method-assign]
+
+
+def cable(lab: DriverLab, out: Callable[[], bool]) -> None:
+    """Requests reach nobody while it is out."""
+    post, get = lab.wire.inner.post, lab.wire.inner.get
+
+    def through(whole: Callable[[str], Reply], path: str) -> Reply:
+        if out():
+            lab.clock.sleep(3.0)
+            raise LinkError(f"{path}: no route to the device")
+        return whole(path)
+
+    lab.wire.inner.post = lambda path: through(post, path)  # type: ignore[method-assign]
+    lab.wire.inner.get = lambda path: through(get, path)  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("before", [True, False], ids=["there", "back"])
+@pytest.mark.parametrize("seconds", [2.65, 4.5, 9.0])
+@pytest.mark.parametrize("path", [FEED_ON, WASTE_ON, FEED_OFF])
+def test_a_slow_command_costs_no_medium_and_blames_neither_tube_nor_bottle(
+    path: str, seconds: float, before: bool
+) -> None:
+    lab = lab_of()
+    delayed(lab, seconds, path, before)
+    given = lab.truth()["feed_ml"]
+    lab.run(14)
+    check_booked(lab)
+    assert lab.truth()["feed_ml"] - given > 10.5 * 0.6
+    assert not FALSE_ALARMS & lab.kinds()
+    notes = [note for step in lab.steps for note in step.notes]
+    slow = "M0: the link is slow: the feed pump's command was answered after "
+    assert any(note.startswith(slow) for note in notes) == (path == FEED_ON)
+
+
+@pytest.mark.parametrize("minutes", [0.5, 3.0, 12.0])
+def test_a_link_lost_in_a_dose_without_an_agent_is_booked_before_the_next_sample_is_judged(minutes: float) -> None:
+    lab = lab_of(("M0", "M1"))
+    until = {"s": -math.inf}
+    cable(lab, lambda: lab.clock.now() < until["s"])
+    while not lab.device.apps["M0"].data["Pump1"]["ON"]:
+        lab.step()
+    until["s"] = lab.clock.now() + 60.0 * minutes
+    lab.run(minutes + 6)
+    check_booked(lab)
+    assert not FALSE_ALARMS & lab.kinds()
+    assert "link" in lab.kinds()
+
+
+@pytest.mark.parametrize("minutes", [1.0, 22.0])
+@pytest.mark.parametrize("deadman_s", [20.0, 120.0])
+def test_a_cable_pulled_in_a_dose_books_what_the_board_agent_let_the_pump_give(
+    minutes: float, deadman_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The agent switches off after its own silence, although the client and its pump-off attempts live on."""
+    lab = lab_of(("M0", "M1"))
+    state = {"out": -math.inf, "heard": 0.0}
+    ended: dict[str, dict[str, float]] = {}
+
+    def out() -> bool:
+        now = lab.clock.now()
+        if now >= state["out"]:
+            state["heard"] = now
+            return False
+        if now > state["heard"] + deadman_s and not ended:
+            for name in lab.names:
+                on = [p for p in ("Pump1", "Pump2") if lab.device.apps[name].data[p]["ON"]]
+                for pump in ("Pump1", "Pump2", "Pump3", "Pump4"):
+                    lab.device.handle("POST", f"/SetOutputOn/{pump}/0/{name}")
+                ended[name] = {pump: lab.clock.now() for pump in on}
+        return True
+
+    def switched_off() -> SwitchedOff:
+        return {name: {p: lab.clock.now() - at for p, at in of.items()} for name, of in ended.items()}
+
+    cable(lab, out)
+    monkeypatch.setattr(lab.wire.inner, "switched_off", switched_off)
+    while not lab.device.apps["M0"].data["Pump1"]["ON"]:
+        lab.step()
+    state["heard"], state["out"] = lab.clock.now(), lab.clock.now() + 60.0 * minutes
+    lab.run(minutes + 6)
+    check_booked(lab)
+    assert not FALSE_ALARMS & lab.kinds()
+    assert lab.samples[0] >= 4
+
+
+@pytest.mark.parametrize("lost", ["there", "back"])
+def test_a_feed_command_without_an_answer_is_looked_for_and_booked_as_found(lost: str) -> None:
+    lab = lab_of()
+    real, tried = lab.wire.inner.post, []
+
+    def post(path: str) -> Reply:
+        if path.startswith(FEED_ON) and not tried:
+            tried.append(path)
+            if lost == "back":
+                real(path)
+            lab.clock.sleep(20.0)
+            raise LinkError("no answer")
+        return real(path)
+
+    lab.wire.inner.post = post  # type: ignore[method-assign]
+    lab.run(6)
+    check_booked(lab)
+    assert not FALSE_ALARMS & lab.kinds()
+    notes = [note for step in lab.steps for note in step.notes]
+    assert any("what it did is looked for" in note for note in notes)
+    assert any("gave no medium" in note for note in notes) == (lost == "there")

@@ -1,0 +1,262 @@
+"""No wait of the driver is without an end and a word: a flag that stays, a start that fails, a link that is silent."""
+
+import json
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hardware.chibio.resume import replay
+from hardware.errors import DeviceStateError
+from hardware.link.transport import Reply
+from tests.hardware.driver_lab import DriverLab
+from tests.hardware.emulator_lab import quiet
+
+
+def until(lab: DriverLab, seconds: float, what: Any) -> bool:
+    """Let device time pass in small steps until something holds; whether it did."""
+    for _ in range(int(seconds / 0.1)):
+        lab.clock.sleep(0.1)
+        lab.device.run_until(lab.clock.now())
+        if what():
+            return True
+    return False
+
+
+def measuring(lab: DriverLab, name: str = "M0") -> bool:
+    return bool(lab.device.apps[name].data["OD"]["Measuring"])
+
+
+def left_measuring(names: tuple[str, ...] = ("M0",), **options: Any) -> DriverLab:
+    """A device whose experiment somebody stopped in the five seconds of a measurement: its flag stays 1."""
+    lab = DriverLab(names, options=quiet(mu=0.025), **options)
+    for name in names:
+        lab.device.handle("POST", f"/Experiment/1/{name}")
+    assert until(lab, 90.0, lambda: measuring(lab))
+    lab.device.handle("POST", "/Experiment/0/M0")
+    lab.clock.sleep(120.0)
+    assert measuring(lab)
+    return lab
+
+
+def test_a_flag_that_a_stopped_measurement_left_holds_no_start_up() -> None:
+    lab = left_measuring()
+    lab.reactors.begin()
+    assert lab.device.apps["M0"].data["Experiment"]["ON"] == 1
+    lab.run(5)
+    assert lab.samples[0] >= 4
+    assert not lab.kinds()
+
+
+def test_a_flag_that_a_dead_thread_left_costs_one_restart_and_neither_heat_nor_stirring(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    lab = DriverLab(("M0", "M1"), options=quiet(mu=0.025))
+    lab.law.rate = 0.008
+    lab.reactors.begin()
+    lab.run(5)
+    fed = lab.truth("M1")["feed_ml"]
+    lab.fault("internal_zero", 1.0, "M0")
+    assert until(lab, 90.0, lambda: measuring(lab))
+    lab.run(4)
+    assert {"stalled"} < lab.kinds() <= {"stalled", "stale", "lost", "stopped"}
+    assert lab.truth("M1")["feed_ml"] > fed + 1.0  # the neighbour is dosed meanwhile
+    before = lab.samples[0]
+    lab.run(6)
+    data = lab.device.apps["M0"].data
+    assert lab.samples[0] >= before + 3
+    assert data["Thermostat"]["ON"] == data["Experiment"]["ON"] == 1
+    assert lab.truth("M0")["temperature"] > 36.0
+    assert any("restarted after: stalled" in note for step in lab.steps for note in step.notes)
+
+
+def test_a_running_experiment_that_measures_for_ever_is_not_waited_for(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    lab = DriverLab(options=quiet(mu=0.025))
+    lab.device.handle("POST", "/Experiment/1/M0")
+    lab.fault("internal_zero", 1.0, "M0")
+    lab.clock.sleep(120.0)
+    began = lab.clock.now()
+    lab.reactors.begin()
+    assert 20.0 <= lab.clock.now() - began < 40.0
+    assert "M0: the device has measured for 20 s, which is too long: not waited for" in caplog.text
+
+
+def test_a_restart_that_brings_no_sample_is_said_and_tried_again() -> None:
+    lab = DriverLab(options=quiet(mu=0.025))
+    lab.reactors.begin()
+    lab.run(3)
+    lab.fault("internal_zero", 2)
+    lab.run(20)
+    notes = [note for step in lab.steps for note in step.notes]
+    assert any("the restart before brought no sample, attempt 2 follows" in note for note in notes)
+    assert lab.steps[-1].reasons[0] is None
+    assert lab.samples[0] >= 8
+
+
+def test_a_start_that_the_device_does_not_take_is_said_and_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = DriverLab(("M0", "M1"), options=quiet(mu=0.025))
+    lab.reactors.begin()
+    lab.run(3)
+    lab.fault("internal_zero", 1.0, "M0")
+    real, deaf = lab.wire.inner.post, {"on": True}
+
+    def post(path: str) -> Reply:
+        return Reply(204, b"") if deaf["on"] and path == "/Experiment/1/M0" else real(path)
+
+    monkeypatch.setattr(lab.wire.inner, "post", post)
+    lab.run(15)
+    said = [note for step in lab.steps for note in step.notes if "could not be restarted after" in note]
+    assert "the experiment does not start; look at the device's terminal" in said[0]
+    assert lab.samples[1] > lab.samples[0] + 8
+    deaf["on"] = False
+    before = lab.samples[0]
+    lab.run(10)
+    assert lab.samples[0] > before + 2
+
+
+def test_waits_at_the_start_are_on_the_screen(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    lab = DriverLab(("M0", "M1"), options=quiet(mu=0.025))
+    lab.device.handle("POST", "/Experiment/1/M0")
+    lab.clock.sleep(20.0)
+    lab.device.handle("POST", "/Experiment/0/M0")
+    lab.reactors.begin()
+    said = [record.getMessage() for record in caplog.records]
+    assert "M0: an experiment was stopped, its last cycle may still end: waits 70 s" in said
+    assert "M1: its experiment starts in 30 s, one reactor after the other" in said
+
+
+# -- one link ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 3, 8])
+@pytest.mark.parametrize("silent", ["lost_request", "lost_reply"])
+def test_a_link_that_accepts_and_never_answers_is_told_of_every_reactor_within_100_s(n: int, silent: str) -> None:
+    names = tuple(f"M{k}" for k in range(n))
+    lab = DriverLab(names, options=quiet(mu=0.025))
+    lab.law.rate = 0.006
+    lab.reactors.begin()
+    lab.run(4)
+    lab.fault(silent, -1)
+    lost_s, told = lab.clock.now(), {}
+    while len(told) < n and lab.clock.now() < lost_s + 600.0:
+        step = lab.step()
+        for name, reason in zip(names, step.reasons, strict=True):
+            if "link" in (reason or ""):
+                told.setdefault(name, lab.clock.now() - lost_s)
+    assert len(told) == n
+    assert max(told.values()) < 100.0
+    lab.fault(silent, 0)
+    before, back_s = lab.samples.copy(), lab.clock.now()
+    lab.run(4)
+    assert (lab.samples >= before + 2).all()
+    assert not {"falls", "no_dilution", "cannot_hold"} & lab.kinds()
+    assert lab.clock.now() - back_s < 300.0
+
+
+def test_what_one_reactor_waited_for_in_vain_the_others_do_not_wait_for_again() -> None:
+    lab = DriverLab(("M0", "M1", "M2", "M3"), options=quiet(mu=0.025))
+    lab.reactors.begin()
+    lab.run(3)
+    lab.fault("lost_request", -1)
+    began = lab.clock.now()
+    failed = lab.reactors.pumps_off(np.ones(4, dtype=np.bool_))
+    assert len(failed) == 4
+    assert lab.clock.now() - began < 21.0  # one time-out, not eight
+    assert "not sent, a moment ago" in failed[-1]
+    lab.fault("lost_request", 0)
+    lab.clock.sleep(3.0)
+    assert lab.reactors.pumps_off(np.ones(4, dtype=np.bool_)) == []
+
+
+# -- no reactor waits for another --------------------------------------------------------------------------------------
+
+
+def resume(lab: DriverLab) -> None:
+    rows, elapsed = json.loads(json.dumps(lab.rows)), lab.reactors.elapsed()
+    lab.client()
+    lab.reactors.begin(replay(rows), elapsed)
+
+
+def test_a_resumed_run_goes_on_with_the_others_while_one_is_absent(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    lab = DriverLab(("M0", "M1", "M2"), options=quiet(mu=0.025))
+    lab.law.rate = 0.006
+    lab.reactors.begin()
+    lab.run(3)
+    lab.device.apps["M1"].data["present"] = 0
+    lab.device.apps["M1"].data["Experiment"]["ON"] = 0  # else its own thread ends the software
+    lab.device.computer.events.remove("M1/Experiment")
+    lab.device.computer.events.remove("M1/Thermostat")
+    resume(lab)
+    assert "M1: not taken over, the others go on and this one is tried again" in caplog.text
+    before, fed = lab.samples.copy(), [lab.truth(m)["feed_ml"] for m in ("M0", "M2")]
+    lab.run(3)
+    assert (lab.samples[[0, 2]] >= before[[0, 2]] + 2).all()
+    assert all(lab.truth(m)["feed_ml"] > ml for m, ml in zip(("M0", "M2"), fed, strict=True))
+    assert "absent" in lab.kinds()
+    lab.device.apps["M1"].data["present"] = 1  # its data and its dead thread are as they were
+    lab.run(8)
+    assert lab.samples[1] > before[1]
+
+
+def test_a_resumed_run_whose_reactors_are_all_out_of_reach_ends_with_what_it_could_not_verify() -> None:
+    lab = DriverLab(("M0", "M1"), options=quiet(mu=0.025))
+    lab.reactors.begin()
+    lab.run(3)
+    lab.fault("lost_request", -1)
+    with pytest.raises(DeviceStateError, match=r"no answer.*pumps not verified off: M0: .*; M1: .*by hand now"):
+        resume(lab)
+
+
+# -- a stop at the start -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("moment", range(1, 12))
+def test_a_stop_while_a_killed_run_is_resumed_leaves_its_pump_off(
+    moment: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The program was killed in a dose, so the pump goes on; the next one is stopped at its nth request."""
+    caplog.set_level(logging.INFO)
+    lab = DriverLab(options=quiet(mu=0.025))
+    lab.law.rate = 0.01
+    lab.reactors.begin()
+    while not lab.device.apps["M0"].data["Pump1"]["ON"]:
+        lab.step()
+    lab.clock.sleep(70.0)
+    assert lab.device.apps["M0"].data["Pump1"]["ON"]
+    real, seen = lab.wire.inner.post, []
+
+    def post(path: str) -> Reply:
+        seen.append(path)
+        if len(seen) == moment:
+            raise KeyboardInterrupt
+        return real(path)
+
+    monkeypatch.setattr(lab.wire.inner, "post", post)
+    with pytest.raises(KeyboardInterrupt):
+        resume(lab)
+    assert lab.motors_off()
+    assert "pumps verified off" in caplog.text
+    lab.clock.sleep(200.0)
+    assert lab.motors_off()
+
+
+def test_a_stop_while_a_run_is_resumed_over_a_dead_link_says_that_it_could_not_verify(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    lab = DriverLab(options=quiet(mu=0.025))
+    lab.reactors.begin()
+    lab.run(2)
+
+    def stopped(path: str) -> Reply:
+        monkeypatch.undo()
+        lab.fault("lost_request", -1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(lab.wire.inner, "post", stopped)
+    with pytest.raises(DeviceStateError, match=r"stopped; pumps not verified off: M0"):
+        resume(lab)
