@@ -18,6 +18,7 @@ from experiments.reliability.rig_outcome import RigOutcome, judged
 from experiments.reliability.rig_trial import Trial
 from experiments.reporting.tables import markdown
 from hardware.errors import ReactorError
+from hardware.pioreactor.rig.build import PUBLISHED
 
 __all__ = ["RigFaultsConfig", "rig_faults"]
 
@@ -38,6 +39,7 @@ class RigFaultsConfig:
     workers: int = setting(2, "rigs at a time", within=(1, 16))
     settle: int = setting(2, "doses after the last fault before the run is ended", within=(1, 100))
     seed: int = setting(0, "of the vials", at_least=0)
+    package: str = setting(PUBLISHED, "version of the vendor's software on the package index, or a wheel's path")
 
     def __post_init__(self) -> None:
         check(self)
@@ -47,7 +49,7 @@ class RigFaultsConfig:
 def one_trial(config: RigFaultsConfig, fault: RigFault, moment: str, folder: Path, stop: threading.Event) -> RigOutcome:
     """One fault in a rig of its own. Raises: ReactorError if the rig does not start."""
     folder.mkdir(parents=True)
-    with Trial(folder, config.speed, config.seed, stop) as trial:
+    with Trial(folder, config.speed, config.seed, config.package, stop) as trial:
         times = config.kills if fault.name in KILL_NAMES else 1
         struck: list[float] = []
         trouble = ""

@@ -87,9 +87,10 @@ def _units(
     """Pioreactors that no other client on this computer has, or those of a rig. Raises: ReactorError."""
     with ExitStack() as stack:
         if isinstance(backend, RigBackendConfig):
-            rig = stack.enter_context(Rig(backend.reactors, replace(backend.rig, growth_x=backend.speed), folder))
+            vials = replace(backend.rig, growth_x=backend.speed)
+            rig = stack.enter_context(Rig(backend.reactors, vials, folder, backend.experiment))
             backend = replace(backend, broker="127.0.0.1", broker_port=rig.broker, addresses=dict(rig.web))
-            log.info("the vendor's software at %s, cultures %g times real time", rig.web, backend.speed)
+            log.info("the vendor's software %s at %s, cultures %g times real time", rig.version, rig.web, backend.speed)
         for unit in backend.reactors:
             stack.enter_context(closing(DeviceLock(f"unit {unit} of {backend.broker}:{backend.broker_port}")))
         yield stack.enter_context(closing(PioreactorReactors(backend, RealClock(backend.speed), log_row, run)))

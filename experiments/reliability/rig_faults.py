@@ -90,7 +90,8 @@ def vendors_turbidostat(target_od: float, wait_s: float = 0.0) -> Act:
     """Somebody starts the vendor's turbidostat."""
 
     def act(t: Trial) -> None:
-        t.run_job("dosing_automation", automation_name="turbidostat", target_od=target_od, exchange_volume_ml=0.5)
+        options = {t.known.target: target_od, "exchange-volume-ml": 0.5, **dict(t.known.signal)}
+        t.run_job("dosing_automation", automation_name="turbidostat", **options)
         time.sleep(wait_s)
 
     return act
@@ -104,7 +105,7 @@ def kill_waste(t: Trial) -> None:
 
 def clear_lock(pin: int) -> Act:
     """What the fault tells the operator to type."""
-    return lambda t: t.pio("cache", "clear", "pwm_locks", str(pin), "--as-int")
+    return lambda t: t.pio(*t.known.purge.split()[1:], "pwm_locks", str(pin), "--as-int")
 
 
 def left_lock(t: Trial) -> None:
@@ -214,7 +215,7 @@ OTHERS = (
         unheld="the pump that ran on diluted the culture",
     ),
     RigFault("reader_stopped", "somebody stops od_reading in the vendor's page",
-             lambda t: t.post("/jobs/stop?job_name=od_reading"), seconds=1.0,
+             lambda t: t.stop_job("od_reading"), seconds=1.0,
              by=("takes no OD readings",), within_s=30.0, blind=True),
     RigFault("all_stopped", "somebody stops every job of the unit, in a dose", lambda t: t.post("/jobs/stop/all"),
              moments=("in",), seconds=1.0, by=("takes no OD readings", "ended early"), within_s=30.0, blind=True),
@@ -225,7 +226,7 @@ OTHERS = (
     RigFault(
         "foreign_automation", "somebody starts the vendor's turbidostat",
         vendors_turbidostat(0.4),
-        lambda t: t.post("/jobs/stop?job_name=dosing_automation"), seconds=30.0, by=("a dosing automation",),
+        lambda t: t.stop_job("dosing_automation"), seconds=30.0, by=("a dosing automation",),
         within_s=20.0, foreign=30, unheld="the vendor's turbidostat dosed to 0.4",
     ),
     RigFault("second_client", "the program is started once more for the same units", second, seconds=1.0,

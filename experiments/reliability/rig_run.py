@@ -25,6 +25,7 @@ from hardware.clock import RealClock
 from hardware.errors import DeviceStateError
 from hardware.pioreactor.mailbox import Mailbox, Mqtt
 from hardware.pioreactor.rig.processes import Rig, RigConfig
+from hardware.pioreactor.versions import Facts, facts
 from hardware.pioreactor.web import Web
 
 __all__ = ["LOOK_S", "RigStudyConfig", "VendorConfig", "run_on_rig"]
@@ -93,7 +94,7 @@ class Witness(Mailbox):
             if topic.endswith("/dosing_events") and not retained:
                 row = {"wall": round(time.time(), 3), "unit": self.unit, **json.loads(payload)}
                 self._into.write(json.dumps(row) + "\n")
-            elif topic.endswith(f"/{AUTOMATION}/target_od"):
+            elif topic.endswith((f"/{AUTOMATION}/target_od", f"/{AUTOMATION}/target_biomass")):
                 self.target = float(payload)
         except (ValueError, TypeError):
             self.refused += 1
@@ -102,11 +103,14 @@ class Witness(Mailbox):
 class VendorUnit:
     """The unit that the vendor's turbidostat regulates, with the setpoints that a deployment's journal tells.
 
-    Args: web, box: of the unit. folder: of the deployment; vendor.jsonl is written there.
+    Args: web, box: of the unit. folder: of the deployment; vendor.jsonl is written there. known: of the version.
     """
 
-    def __init__(self, config: VendorConfig, web: Web, mqtt: Mqtt, box: Witness, folder: Path, leader: str) -> None:
+    def __init__(
+        self, config: VendorConfig, web: Web, mqtt: Mqtt, box: Witness, folder: Path, leader: str, known: Facts
+    ) -> None:
         self._config, self._web, self._mqtt, self._box, self._leader = config, web, mqtt, box, leader
+        self._known = known
         self._journal, self._read = folder / "journal.jsonl", 0
         self._told = folder / "vendor.jsonl"
         self._setpoint, self._phase, self._asked_s = float("nan"), -1, -float("inf")
@@ -153,10 +157,11 @@ class VendorUnit:
             return
         self._asked_s = time.monotonic()
         if self._box.live(AUTOMATION):
-            topic = f"pioreactor/{self._config.unit}/{EXPERIMENT}/{AUTOMATION}/target_od/set"
+            target = self._known.target.replace("-", "_")
+            topic = f"pioreactor/{self._config.unit}/{EXPERIMENT}/{AUTOMATION}/{target}/set"
             self._mqtt.publish(topic, str(self._setpoint))
             return
-        options = {"automation-name": "turbidostat", "target-od": self._setpoint}
+        options = {"automation-name": "turbidostat", self._known.target: self._setpoint, **dict(self._known.signal)}
         options["exchange-volume-ml"] = self._config.exchange_ml
         smoothing = [["turbidostat.config", "od_smoothing_ema", str(self._config.look_smoothing)]]
         self._run(AUTOMATION, options, smoothing)
@@ -175,9 +180,9 @@ def deployment(config: RigStudyConfig, rig: Rig, folder: Path, out: Path) -> Ite
     command = [sys.executable, "-m", "experiments.deploy", "backend=pioreactor", f"backend.reactors=[{names}]"]
     command += [f"backend.addresses.{unit}={rig.web[unit]}" for unit in config.reactors]
     command += ["backend.broker=127.0.0.1", f"backend.broker_port={rig.broker}", f"backend.speed={config.speed}"]
-    command += [f"backend.reading_s={config.reading_s}", "backend.thermostat=false", "backend.stirring=false"]
     command += [f"backend.volume_ml={config.rig.volume_ml}", f"safety.volume_ml={config.rig.volume_ml}"]
-    command += [f"scenario={config.scenario}", *config.overrides, f"hydra.run.dir={folder}"]
+    command += [f"backend.reading_s={config.reading_s}", f"scenario={config.scenario}"]
+    command += [*config.overrides, f"hydra.run.dir={folder}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with out.open("ab") as into:
         client = subprocess.Popen(command, stdout=into, stderr=into, env=environment, start_new_session=True)
@@ -211,7 +216,8 @@ def run_on_rig(config: RigStudyConfig, folder: Path) -> Path:
         who = f"rig-study-{os.getpid()}"
         mqtt = Mqtt("127.0.0.1", rig.broker, LOGIN, dict(boxes), RealClock(1.0), who)
         stack.enter_context(closing(mqtt))
-        vendor = VendorUnit(config.vendor, Web(rig.web[unit]), mqtt, boxes[unit], run, config.reactors[0])
+        web, known = Web(rig.web[unit]), facts(rig.version)
+        vendor = VendorUnit(config.vendor, web, mqtt, boxes[unit], run, config.reactors[0], known)
         vendor.read()
         client = stack.enter_context(deployment(config, rig, run, folder / "deployment.log"))
         began = told = time.monotonic()

@@ -18,6 +18,7 @@ from typing import Any
 
 from hardware.pioreactor.rig.processes import Rig, RigConfig
 from hardware.pioreactor.rig.vials import Pulse
+from hardware.pioreactor.versions import facts
 from hardware.storage.journal import read_journal
 
 __all__ = ["MEDIA_PIN", "SETPOINT", "SICK", "WASTE_PIN", "WELL", "Seen", "Trial", "log_rows"]
@@ -49,15 +50,17 @@ class Seen:
 class Trial:
     """A rig of a sick and a well unit, and the client that runs both; use as a context manager.
 
-    Args: folder: of the trial, must exist. speed: growth faster than real time. seed: of the vials. stop: nothing is
-      waited for any more.
+    Args: folder: of the trial, must exist. speed: growth faster than real time. seed: of the vials. package: of the
+      vendor's software. stop: nothing is waited for any more.
+    Attributes: known, of the software's version.
     Raises: DeviceStateError if the rig does not start.
     """
 
-    def __init__(self, folder: Path, speed: float, seed: int, stop: threading.Event) -> None:
+    def __init__(self, folder: Path, speed: float, seed: int, package: str, stop: threading.Event) -> None:
         self._stop = stop
         self.folder, self.run, self.speed = folder, folder / "run", speed
-        self.rig = Rig((SICK, WELL), RigConfig(growth_x=speed, od=SETPOINT, seed=seed), folder)
+        self.rig = Rig((SICK, WELL), RigConfig(package=package, growth_x=speed, od=SETPOINT, seed=seed), folder)
+        self.known = facts(self.rig.version)
         self.client: subprocess.Popen[bytes] | None = None
         self.lives = 0
         self.words: list[str] = []  # further ones of the command line
@@ -84,9 +87,8 @@ class Trial:
         return [
             "backend=pioreactor", f"backend.reactors=[{SICK},{WELL}]", "backend.broker=127.0.0.1",
             f"backend.broker_port={self.rig.broker}", f"backend.speed={self.speed}", "backend.reading_s=1",
-            "backend.thermostat=false", "backend.stirring=false", *addresses, "scenario=hold",
-            f"scenario.setpoints=[{SETPOINT}]", "scenario.minutes=[100000]", "safety.silent=100000",
-            f"hydra.run.dir={run}", *self.words,
+            *addresses, "scenario=hold", f"scenario.setpoints=[{SETPOINT}]", "scenario.minutes=[100000]",
+            "safety.silent=100000", f"hydra.run.dir={run}", *self.words,
         ]  # fmt: skip
 
     def _client(self, words: Sequence[str], log: str = "client") -> subprocess.Popen[bytes]:
@@ -158,6 +160,10 @@ class Trial:
         env = {"EXPERIMENT": "turbidostat", "JOB_SOURCE": "user"}
         options = {key.replace("_", "-"): value for key, value in options.items()}
         self.post(f"/jobs/run/job_name/{job}", {"options": options, "args": [], "env": env, "config_overrides": []})
+
+    def stop_job(self, job: str) -> None:
+        """A job that somebody's browser stops; a version that looks in the body looks nowhere else."""
+        self.post(f"/jobs/stop?job_name={job}", {"job_name": job})
 
     def signal_job(self, job: str, number: int) -> int:
         """A signal to every process of one of the unit's jobs; how many there were."""

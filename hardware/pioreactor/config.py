@@ -87,6 +87,4 @@ class RigBackendConfig(PioreactorConfig):
     speed: float = setting(10.0, "growth faster than real time: device seconds per real second", within=(1, 60))
     reactors: tuple[str, ...] = setting(("pio01", "pio02"), "names of the units", some=True)
     reading_s: float = setting(1.0, "real time between the vendor's readings", "s", within=(1, 30))
-    thermostat: bool = setting(False, "run the vendor's thermostat; else temperatures are not controlled")
-    stirring: bool = setting(False, "run the vendor's stirring")
-    rig: RigConfig = part(RigConfig, "the vials; growth_x is `speed`")
+    rig: RigConfig = part(RigConfig, "the software and the vials; growth_x is `speed`")

@@ -9,31 +9,39 @@ import numpy as np
 import pytest
 
 from hardware.clock import RealClock
+from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import RigBackendConfig
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay
-from hardware.pioreactor.rig.build import CACHE, missing
+from hardware.pioreactor.rig.build import PUBLISHED, environment, home, missing
 from hardware.pioreactor.rig.processes import Rig, RigConfig
+from hardware.pioreactor.versions import facts
 from hardware.reactor import Command
 from hardware.storage.journal import Journal
 
 UNIT, EACH_ML = "pio01", 0.1  # mL: a busy computer is late by 60 ms
+WHEELS = Path(__file__).resolve().parents[2] / "../shared/pioreactor_env"
+PACKAGES = {"25.11.19": PUBLISHED, "26.7.2": str(WHEELS / "26.7.2" / "pioreactor-26.7.2-py3-none-any.whl")}
 
 
-def need_the_rig() -> None:
-    """Skip the calling module where the vendor's software cannot be run, and say what would help."""
+def need_the_rig(package: str = PUBLISHED) -> None:
+    """Skip the calling test or module where this package cannot be run, and say what would help; build a wheel's."""
     pytest.importorskip("paho.mqtt.client", reason="pip install 'paho-mqtt>=2'")
-    if lack := missing():
+    if lack := missing(package):
         pytest.skip(f"the vendor's software cannot run here: {lack}", allow_module_level=True)
-    if not (CACHE / "env" / "done").exists():
+    if package == PUBLISHED and not (home(package) / "done").exists():
         pytest.skip("build it with: python -m hardware.pioreactor.rig --build-only", allow_module_level=True)
+    try:
+        environment(package)
+    except DeviceStateError as error:
+        pytest.skip(str(error), allow_module_level=True)
 
 
 class Bench:
     """One unit in the rig, and lives of the driver that end without a word and go on from the journal."""
 
-    def __init__(self, folder: Path, **values: Any) -> None:
-        self.rig = Rig((UNIT,), RigConfig(growth_x=1.0, od=0.5))
+    def __init__(self, folder: Path, package: str = PUBLISHED, **values: Any) -> None:
+        self.rig = Rig((UNIT,), RigConfig(package=package, growth_x=1.0, od=0.5))
         self.folder, self.run = folder, f"test{time.time():.0f}"
         where = {"broker": "127.0.0.1", "broker_port": self.rig.broker, "addresses": dict(self.rig.web)}
         self.config = RigBackendConfig(reactors=(UNIT,), **{"speed": 5.0, **where, **values})
@@ -121,7 +129,8 @@ class Bench:
 
     def clear_the_lock(self) -> None:
         """What the fault tells the operator to do on the unit."""
-        command = [str(self.rig.folder / UNIT / "pio"), "cache", "clear", "pwm_locks", "13", "--as-int"]
+        words = facts(self.rig.version).purge.split()[1:]
+        command = [str(self.rig.folder / UNIT / "pio"), *words, "pwm_locks", "13", "--as-int"]
         subprocess.run(command, check=True, capture_output=True)
 
     def judge(self, each_ml: float = EACH_ML) -> None:

@@ -1,5 +1,6 @@
-"""The vendor's published package in an environment of its own, and Debian's broker."""
+"""The vendor's package in an environment of its own, one for each version, and Debian's broker."""
 
+import hashlib
 import os
 import shutil
 import subprocess
@@ -7,13 +8,11 @@ from pathlib import Path
 
 from hardware.errors import DeviceStateError
 
-__all__ = ["CACHE", "VERSION", "broker", "environment", "missing"]
+__all__ = ["CACHE", "PUBLISHED", "broker", "environment", "home", "missing", "version"]
 
-VERSION = "25.11.19"
+PUBLISHED = "25.11.19"  # the newest of the package index
 CACHE = Path("~/.cache/turbidostat/pioreactor").expanduser()
-PACKAGES = (f"pioreactor[leader-worker]=={VERSION}", "PyYAML")  # the second is needed and not declared
 PYTHONS = ("python3.13", "python3.14", "python3.12")
-BROKERS = ("mosquitto", "/usr/sbin/mosquitto")
 
 
 def _python() -> str | None:
@@ -30,45 +29,62 @@ def _runs(python: str) -> bool:
 
 def broker() -> str | None:
     """The path of the MQTT broker, None if there is none."""
-    return next((path for name in BROKERS if (path := shutil.which(name))), None)
+    return shutil.which("mosquitto") or shutil.which("/usr/sbin/mosquitto")
 
 
-def missing() -> str:
+def home(package: str = PUBLISHED, folder: str = "") -> Path:
+    """Where the environment of a package is, built or not; a wheel is known by its name and content.
+
+    Args: package: version on the package index, with or without "pioreactor==", or path of a wheel. folder: of all
+      environments, "" for the one in the user's cache.
+    """
+    wheel, key = Path(package).expanduser(), package.removeprefix("pioreactor==")
+    if wheel.is_file():
+        key = f"{wheel.stem}-{hashlib.sha256(wheel.read_bytes()).hexdigest()[:8]}"
+    return (Path(folder).expanduser() if folder else CACHE) / key
+
+
+def version(env: Path) -> str:
+    """Of the vendor's package in a built environment."""
+    return next(env.glob("lib/python*/site-packages/pioreactor-*.dist-info")).stem.split("-")[1]
+
+
+def missing(package: str = PUBLISHED, folder: str = "") -> str:
     """What this computer lacks for the rig, with the remedy; "" if nothing but the environment itself."""
     if broker() is None:
         return "no MQTT broker: apt-get install mosquitto"
-    if not (CACHE / "env" / "done").exists() and _python() is None:
+    if package.endswith(".whl") and not Path(package).expanduser().is_file():
+        return f"no wheel {package}: give the path of one, or a version like {PUBLISHED}"
+    if not (home(package, folder) / "done").exists() and _python() is None:
         return "no Python 3.12 or newer for the vendor's package: pyenv install 3.13"
     return ""
 
 
-def environment(folder: Path = CACHE) -> Path:
-    """The environment with the vendor's package in `folder`, built if it is not there; returns its folder of programs.
+def environment(package: str = PUBLISHED, folder: str = "") -> Path:
+    """The environment with the vendor's package, built if it is not there. Args: as of `home`.
 
     Raises: DeviceStateError with what is missing, or pip's last line.
     """
-    env = folder / "env"
-    done = env / "done"
-    if done.exists() and done.read_text(encoding="utf-8") == VERSION:
-        return env / "bin"
-    if lack := missing():
+    if lack := missing(package, folder):
         raise DeviceStateError(f"the rig cannot be built: {lack}")
-    python = _python()
+    env = home(package, folder)
+    if (env / "done").exists():
+        return env
+    python, wheel = _python(), Path(package).expanduser()
     assert python is not None
+    ours = ("PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")  # they would point Python at our own packages
     shutil.rmtree(env, ignore_errors=True)
-    folder.mkdir(parents=True, exist_ok=True)
+    env.parent.mkdir(parents=True, exist_ok=True)
+    found = f"{wheel.resolve()}[leader-worker]" if wheel.is_file() else f"pioreactor[leader-worker]=={env.name}"
+    needed = (found, "PyYAML")  # the second is needed and not declared
     for command in (
         [python, "-m", "venv", str(env)],
-        [str(env / "bin" / "pip"), "install", "-q", "--disable-pip-version-check", *PACKAGES],
+        [str(env / "bin" / "pip"), "install", "-q", "--disable-pip-version-check", *needed],
     ):
-        ran = subprocess.run(command, capture_output=True, text=True, check=False, env=_clean())
+        variables = {k: v for k, v in os.environ.items() if k not in ours}
+        ran = subprocess.run(command, capture_output=True, text=True, check=False, env=variables)
         if ran.returncode:
             said = (ran.stderr.strip() or ran.stdout.strip() or "no word").splitlines()[-1]
             raise DeviceStateError(f"the rig cannot be built: {said}; try {' '.join(command)}")
-    done.write_text(VERSION, encoding="utf-8")
-    return env / "bin"
-
-
-def _clean() -> dict[str, str]:
-    """Our variables without those that point Python at our own packages."""
-    return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")}
+    (env / "done").touch()
+    return env

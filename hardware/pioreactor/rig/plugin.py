@@ -67,7 +67,11 @@ def install() -> None:
     mock.MockTMP1075.get_temperature = lambda self: float(ask({"ask": "temperature"}).get("temperature", 25.0))
 
     class Output(mock.MockPWMOutputDevice):  # type: ignore[misc]
-        """A pin whose duty the rig's vial feels."""
+        """A pin whose duty the rig's vial feels; as on a unit, whoever takes it switches it off first."""
+
+        def __init__(self, pin: int, *args: Any, **values: Any) -> None:
+            super().__init__(pin, *args, **values)
+            self.dc = 0.0
 
         def start(self, initial_dc: float) -> None:
             super().start(initial_dc)

@@ -12,23 +12,25 @@ import socket
 import subprocess
 import tempfile
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from urllib.request import Request, urlopen
 
 from conf.schema import check, setting
 from hardware.errors import DeviceStateError
-from hardware.pioreactor.rig.build import broker, environment
-from hardware.pioreactor.rig.files import layout, wrapper
+from hardware.pioreactor.rig.build import PUBLISHED, broker, environment, version
+from hardware.pioreactor.rig.files import FLOWS, LOGIN, database, layout, wrapper
 from hardware.pioreactor.rig.vials import VialServer, vial_preset
+from hardware.pioreactor.versions import facts
 
 __all__ = ["Rig", "RigConfig"]
 
 WEB = (
     "import os, pioreactor.web.app as web\n"
-    "web.client._client_id = ('rig-web-' + os.environ['HOSTNAME']).encode()\n"  # else each throws out the other
+    "if hasattr(web, 'client'):\n"
+    "    web.client._client_id = ('rig-web-' + os.environ['HOSTNAME']).encode()\n"  # else each throws out the other
     "web.create_app().run(host=os.environ['RIG_HOST'], port=int(os.environ['RIG_WEB_PORT']), threaded=True)\n"
 )
 BOOT_S = 40.0
@@ -38,42 +40,54 @@ CONSUMER = ("-n", "-b", "1.001", "-w", "4", "-f", "-C", "-d", "0.05")  # of the 
 
 @dataclass(frozen=True)
 class RigConfig:
-    """What the rig's vials are.
+    """Which software the rig runs, and what its vials are.
 
     Raises: ValueError naming key, value and allowed range.
     """
 
-    folder: str = setting("", "of the environment and of the units' files; empty: in the user's cache")
+    package: str = setting(PUBLISHED, "version of the vendor's software on the package index, or a wheel's path")
+    folder: str = setting("", "of the environments; empty: in the user's cache")
     growth_x: float = setting(10.0, "how much faster than real time the cultures grow", within=(1.0, 60.0))
     od: float = setting(0.7, "of the cultures at the start", "OD", within=(0.0, 4.0))
     plant: str = setting("nominal", "preset of the cultures")
-    volume_ml: float = setting(20.0, "culture up to the waste tube", "mL", within=(5.0, 30.0))
+    volume_ml: float = setting(
+        20.0, "culture up to the waste tube", "mL", within=(5, 35), note="up to 15 mL in a vial of 20 mL, else of 40"
+    )
     seed: int = setting(0, "of the vials", at_least=0)
 
     def __post_init__(self) -> None:
         check(self, "backend.rig")
 
+    @property
+    def vial_ml(self) -> int:
+        """Of the whole vial."""
+        return 20 if self.volume_ml <= 15.0 else 40
+
 
 class Rig:
     """Everything that stands on a bench, as processes of this computer; use as a context manager.
 
-    Args: units: names; unit k is at 127.0.0.k. config: of their vials. truth: folder of truth.jsonl, where
-      another than the rig's own, which is removed with it.
-    Attributes: web, address of each unit's web server; broker, port of MQTT; vials; folder; processes by name.
+    Args: units: names; unit k is at 127.0.0.k, the first leads. config: of software and vials. truth: folder of
+      truth.jsonl, where another than the rig's own, which is removed with it. experiment: that all units are in.
+    Attributes: version, of the software; web, address of each unit's web server; broker, port of MQTT; vials; folder;
+      processes by name.
     Raises: DeviceStateError with what is missing or did not start.
     """
 
-    def __init__(self, units: Sequence[str], config: RigConfig | None = None, truth: Path | None = None) -> None:
-        self.config = config or RigConfig()
-        self.units = tuple(units)
-        home = Path(self.config.folder).expanduser() if self.config.folder else None
-        self._bin = environment(home) if home else environment()
+    def __init__(
+        self, units: Sequence[str], config: RigConfig | None = None, truth: Path | None = None,
+        experiment: str = "turbidostat",
+    ) -> None:  # fmt: skip
+        self.config = c = config or RigConfig()
+        self.units, self.experiment = tuple(units), experiment
+        env = environment(c.package, c.folder)
+        self._bin, self.version = env / "bin", version(env)
         self.folder = Path(tempfile.mkdtemp(prefix="pioreactor-rig-"))
         self.broker, self.port = _free_port("127.0.0.1"), _free_port("127.0.0.1")
         self.web = {unit: f"http://127.0.0.{k}:{self.port}" for k, unit in enumerate(self.units, 1)}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        plant = vial_preset(self.config.plant, self.config.volume_ml, self.config.od)
-        self.vials = VialServer(self.units, plant, self.config.growth_x, truth or self.folder, self.config.seed)
+        plant = vial_preset(c.plant, c.volume_ml, c.od, c.vial_ml, c.growth_x)
+        self.vials = VialServer(self.units, plant, c.growth_x, truth or self.folder, c.seed)
         try:
             self._start()
         except BaseException:
@@ -81,46 +95,44 @@ class Rig:
             raise
 
     def _start(self) -> None:
-        conf = self.folder / "mosquitto.conf"
+        conf, known, secret = self.folder / "mosquitto.conf", facts(self.version), self.folder / "mosquitto.password"
+        subprocess.run(["mosquitto_passwd", "-b", "-c", secret, *LOGIN], check=True, capture_output=True)
         conf.write_text(
-            f"listener {self.broker} 127.0.0.1\nallow_anonymous true\nuser {getpass.getuser()}\n", encoding="utf-8"
+            f"listener {self.broker} 127.0.0.1\npassword_file {secret}\nuser {getpass.getuser()}\n", encoding="utf-8"
         )
         self.start("broker")
-        _wait(lambda: _listens("127.0.0.1", self.broker), "the broker")
+        _wait("127.0.0.1", self.broker, "the broker")
+        values: dict[str, Any] = {"port": self.port, "broker": self.broker, "volume_ml": self.config.volume_ml}
+        values["database"] = self.folder / "pioreactor.sqlite"
+        database(values["database"], self.units, self.experiment, self._model)
         for unit in self.units:
-            layout(self.folder / unit, unit, self.units, self.port, self.broker, self.config.volume_ml)
-            for name in ("pio", "pios"):
-                script = self.folder / unit / name
-                script.write_text(wrapper(self._bin / name, self._variables(unit)), encoding="utf-8")
-                script.chmod(0o755)
-            stand_in = self.folder / unit / "sudo"  # what a unit would shut down, reboot or restart is this computer
-            stand_in.write_text("#!/bin/sh\nexit 1\n", encoding="utf-8")
-            stand_in.chmod(0o755)
-            shutil.copy(Path(__file__).with_name("plugin.py"), self.folder / unit / "plugins" / "rig_plugin.py")
-            for name in UNIT:
-                self.start(f"{unit} {name}")
-        for unit, url in self.web.items():
-            _wait(lambda url=url: _answers(f"{url}/unit_api/health"), f"the web server of {unit}")
-            for pump in ("media_pump", "waste_pump"):
-                request = urllib.request.Request(
-                    f"{url}/unit_api/active_calibrations/{pump}/rig-{pump}", method="PATCH"
-                )
-                urllib.request.urlopen(request, timeout=10.0).close()
+            home = self.folder / unit
+            layout(home, unit, self.units, known, values)
+            scripts = {name: wrapper(self._bin / name, self._variables(unit)) for name in ("pio", "pios")}
+            scripts["sudo"] = "#!/bin/sh\nexit 1\n"  # what a unit would shut down, reboot or restart is this computer
+            for name, text in scripts.items():
+                (home / name).write_text(text, encoding="utf-8")
+                (home / name).chmod(0o755)
+            shutil.copy(Path(__file__).with_name("plugin.py"), home / "plugins" / "rig_plugin.py")
+            self.boot(unit)
+            for pump in FLOWS:
+                path = f"/unit_api/active_calibrations/{pump}/rig-{pump}"
+                urlopen(Request(self.web[unit] + path, method="PATCH"), timeout=10.0).close()
+
+    @property
+    def _model(self) -> str:
+        return f"pioreactor_{self.config.vial_ml}ml"
 
     def start(self, name: str) -> None:
         """Start, or start again, one process: "broker", "UNIT web", "UNIT tasks" or "UNIT monitor"."""
-        unit, _, what = name.partition(" ")
-        if name == "broker":
-            command = [str(broker()), "-c", str(self.folder / "mosquitto.conf")]
-            variables = dict(os.environ)
-        else:
-            python, variables = str(self._bin / "python"), self._variables(unit)
-            consumer = ["pioreactor.web.tasks.huey", *CONSUMER]
-            command = {
-                "web": [python, "-c", WEB],
-                "tasks": [str(self._bin / "huey_consumer"), *consumer],
-                "monitor": [str(self._bin / "pio"), "run", "monitor"],
-            }[what]
+        unit, _, what = name.rpartition(" ")
+        variables = self._variables(unit) if unit else dict(os.environ)
+        command = {
+            "broker": [str(broker()), "-c", str(self.folder / "mosquitto.conf")],
+            "web": [str(self._bin / "python"), "-c", WEB],
+            "tasks": [str(self._bin / "huey_consumer"), "pioreactor.web.tasks.huey", *CONSUMER],
+            "monitor": [str(self._bin / "pio"), "run", "monitor"],
+        }[what]
         with (self.folder / f"{name.replace(' ', '-')}.log").open("ab") as log:
             self.processes[name] = subprocess.Popen(
                 command, env=variables, stdout=log, stderr=log, cwd=self.folder, start_new_session=True,
@@ -135,7 +147,7 @@ class Rig:
             "DOT_PIOREACTOR": str(home), "RUN_PIOREACTOR": str(home), "GLOBAL_CONFIG": str(home / "config.ini"),
             "LOCAL_CONFIG": str(home / "unit_config.ini"), "PLUGINS_DEV": str(home / "plugins"),
             "PIO_EXECUTABLE": str(home / "pio"), "PIOS_EXECUTABLE": str(home / "pios"),
-            "HARDWARE": "1.2", "FIRMWARE": "0.5", "MODEL_NAME": "pioreactor_40ml", "MODEL_VERSION": "1.5",
+            "HARDWARE": "1.2", "FIRMWARE": "0.5", "MODEL_NAME": self._model, "MODEL_VERSION": "1.5",
             "BLINKA_FORCECHIP": "BCM2XXX", "BLINKA_FORCEBOARD": "RASPBERRY_PI_4B",
             "TURBIDOSTAT_RIG_PORT": str(self.vials.port), "RIG_HOST": f"127.0.0.{k}", "RIG_WEB_PORT": str(self.port),
             "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
@@ -151,27 +163,36 @@ class Rig:
 
         Raises: DeviceStateError if its web server does not come back.
         """
+        self.cut(unit)
+        self.boot(unit)
+
+    def cut(self, unit: str) -> None:
+        """A unit loses its power."""
         for name in UNIT:
             self.kill(f"{unit} {name}")
-        for pid in self._left(f"{self.folder / unit}\0"):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        _kill(self.jobs(unit))
         self.vials.power_cut(unit)
         shutil.rmtree(self.folder / unit / "cache")
         (self.folder / unit / "cache").mkdir()
+
+    def boot(self, unit: str) -> None:
+        """A unit that had no power gets it. Raises: DeviceStateError if its web server does not come back."""
         for name in UNIT:
             self.start(f"{unit} {name}")
-        _wait(lambda: _answers(f"{self.web[unit]}/unit_api/health"), f"the web server of {unit}")
+        _wait(f"127.0.0.{self.units.index(unit) + 1}", self.port, f"the web server of {unit}")
 
-    def jobs(self, unit: str, job: str) -> list[int]:
-        """Process ids of the vendor's jobs of this name on a unit, by what the system says of them."""
+    def jobs(self, unit: str = "", job: str = "") -> list[int]:
+        """Process ids of the vendor's jobs of this name on a unit, by what the system says of them.
+
+        They have sessions of their own, and the unit's folder in their environment. Args: unit, job: "" for all.
+        """
+        home = f"RUN_PIOREACTOR={self.folder / unit}{chr(0) if unit else '/'}".encode()
         found = []
         for path in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 words = (path / "cmdline").read_bytes().split(b"\0")
-                home = f"DOT_PIOREACTOR={self.folder / unit}\0".encode()
-                if job.encode() in words and home in (path / "environ").read_bytes():
-                    found.append(int(path.name))
+                mine = home in (path / "environ").read_bytes() and int(path.name) != os.getpid()
+                found += [int(path.name)] * (mine and (not job or job.encode() in words))
         return found
 
     def close(self) -> None:
@@ -180,19 +201,8 @@ class Rig:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             process.wait()
-        for pid in self._left(f"{self.folder}/"):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        _kill(self.jobs())
         self.vials.close()
-
-    def _left(self, place: str) -> list[int]:
-        """Jobs that the task queues started: they have sessions of their own, and our folder in their environment."""
-        found, home = [], f"RUN_PIOREACTOR={place}".encode()
-        for path in Path("/proc").glob("[0-9]*"):
-            with contextlib.suppress(OSError):
-                if home in (path / "environ").read_bytes() and int(path.name) != os.getpid():
-                    found.append(int(path.name))
-        return found
 
     def __enter__(self) -> Rig:
         return self
@@ -200,6 +210,12 @@ class Rig:
     def __exit__(self, *raised: object) -> None:
         self.close()
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _kill(pids: Sequence[int]) -> None:
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def _end_with_us() -> None:
@@ -220,17 +236,9 @@ def _listens(host: str, port: int) -> bool:
     return False
 
 
-def _answers(url: str) -> bool:
-    try:
-        urllib.request.urlopen(url, timeout=2.0).close()
-    except (OSError, urllib.error.URLError):
-        return False
-    return True
-
-
-def _wait(ready: object, what: str) -> None:
+def _wait(host: str, port: int, what: str) -> None:
     deadline = time.monotonic() + BOOT_S
-    while not ready():  # type: ignore[operator]
+    while not _listens(host, port):
         if time.monotonic() > deadline:
             raise DeviceStateError(f"{what} of the rig did not start within {BOOT_S:.0f} s; look at its log")
         time.sleep(0.1)

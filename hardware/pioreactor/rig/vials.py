@@ -21,8 +21,10 @@ from hardware.pioreactor.rig.files import FLOWS, PINS
 __all__ = ["VOLTS_PER_OD", "Pulse", "VialServer", "vial_preset"]
 
 VOLTS_PER_OD = 0.1  # of the photodiode at 90 degrees: with the reference at 0.1 V one unit of the reading is one OD
-HELD = (12, 13)  # pins that a chip drives on when the process that set them is killed
-MEDIA, WASTE = PINS["media"], PINS["waste"]
+MEDIA, WASTE = PINS["media"], PINS["waste"]  # a chip drives them on when the process that set them is killed
+HEATER = PINS["heating"]  # its process drives it
+VIAL_C, PLATE_C = 0.8, 0.48  # degC per percent of the heater's duty: vial above the room, plate above the vial
+PLATE_S = 70.0  # in which the plate follows: the vendor's estimate from its cooling is then the vial's within 0.4 degC
 
 
 @dataclass(frozen=True)
@@ -36,29 +38,36 @@ class Pulse:
     feed_ml: float
 
 
-def vial_preset(name: str, volume_ml: float, od: float) -> PlantConfig:
-    """Preset `conf/plant/NAME.yaml`, pulse dosing, in a vial of this volume. Raises: ValueError for an unknown name."""
+def vial_preset(name: str, volume_ml: float, od: float, vial_ml: float, growth_x: float) -> PlantConfig:
+    """Preset `conf/plant/NAME.yaml`, pulse dosing, in a vial of this volume. Raises: ValueError for an unknown name.
+
+    Args: volume_ml: up to the waste tube. vial_ml: of the whole vial.
+    """
     plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
-    vessel = replace(plant.vessel, volume_ml=volume_ml, capacity_ml=max(40.0, volume_ml + 4.5))
+    vessel = replace(plant.vessel, volume_ml=volume_ml, capacity_ml=vial_ml)
     pump = replace(plant.pump, dosing="pulse", gain_ml_s=FLOWS["media_pump"], waste_ml_s=FLOWS["waste_pump"])
-    return replace(plant, pump=pump, vessel=vessel, start_od=od)
+    cooling = min(plant.thermal.cooling_min * growth_x, 600.0)  # heat moves in real time
+    return replace(plant, pump=pump, vessel=vessel, start_od=od, thermal=replace(plant.thermal, cooling_min=cooling))
 
 
 class _Vial:
-    """One culture with its two pumps, in real seconds; growth alone runs `growth_x` times faster.
+    """One culture with its two pumps and its heater, in real seconds; growth alone runs `growth_x` times faster.
 
-    Attributes: offset_od, added to what the photodiode sees; held_od, what it sees for ever, nan for the culture.
+    It stays at its temperature until the heater is first driven, and then at what the heater makes of it.
+
+    Attributes: offset_od, added to what the photodiode sees; held_od, what it sees for ever, nan for the culture;
+      heat, duty of the heater, nan before that; plate_c, by how much its plate is warmer than the vial.
     """
 
     def __init__(self, unit: str, plant: Plant, growth_x: float, log: Any) -> None:
         self.unit, self.plant, self._growth_x, self._log = unit, plant, growth_x, log
         self.at = time.time()
         self.duty = {MEDIA: 0.0, WASTE: 0.0}
-        self.owner: dict[int, int] = {}
         self._since: dict[int, tuple[float, float]] = {}
         self.pulses: list[Pulse] = []
         self.peak_ml = float(plant.vessel.volume_ml[0])
         self.offset_od, self.held_od = 0.0, math.nan
+        self.heat, self.plate_c, self._heated_by = math.nan, 0.0, 0
 
     @property
     def seen_od(self) -> float:
@@ -67,20 +76,28 @@ class _Vial:
         return true + self.offset_od
 
     def sync(self, now: float) -> None:
-        """Let time pass up to now."""
+        """Let time pass up to now; a heater whose process is gone is off."""
         seconds = now - self.at
         if seconds <= 1e-4:
             return
         on = {pin: np.array([self.duty[pin] / 100.0 * seconds]) for pin in (MEDIA, WASTE)}
-        self.plant.advance(seconds * self._growth_x / 60.0, on[MEDIA], on[WASTE])
+        minutes, thermal = seconds * self._growth_x / 60.0, self.plant.thermal
+        self.plant.advance(minutes, on[MEDIA], on[WASTE])
+        if self.heat >= 0.0:
+            self.heat *= self.heat == 0.0 or _alive(self._heated_by)
+            thermal.temperature = thermal.temperature + VIAL_C * self.heat * minutes / thermal.config.cooling_min
+            self.plate_c += (PLATE_C * self.heat - self.plate_c) * -math.expm1(-seconds / PLATE_S)
         self.at = now
         self.peak_ml = max(self.peak_ml, float(self.plant.vessel.volume_ml[0]))
 
     def drive(self, pin: int, duty: float, pid: int, now: float) -> None:
         """A pin's duty changes, in percent."""
+        self.sync(now)
+        if pin == HEATER:
+            self.heat, self._heated_by = duty, pid
+            self.plant.thermal.set_target(0.0)
         if pin not in self.duty:
             return
-        self.sync(now)
         was, fed = self.duty[pin], float(self.plant.feed.delivered_ml[0])
         if duty > 0.0 and was == 0.0:
             self._since[pin] = (now, fed)
@@ -90,13 +107,7 @@ class _Vial:
             pulse = Pulse(self.unit, pump, start, now - start, fed - had if pin == MEDIA else 0.0)
             self.pulses.append(pulse)
             self._log({"unit": pulse.unit, "pump": pump, "start": start, "s": pulse.seconds, "ml": pulse.feed_ml})
-        self.duty[pin], self.owner[pin] = duty, pid
-
-    def reap(self, now: float) -> None:
-        """A pin whose process is gone falls back to 0, unless a chip drives it on."""
-        for pin, duty in self.duty.items():
-            if duty > 0.0 and pin not in HELD and not _alive(self.owner[pin]):
-                self.drive(pin, 0.0, 0, now)
+        self.duty[pin] = duty
 
     def truth(self) -> dict[str, Any]:
         """What is really in the vial and what was really moved."""
@@ -154,7 +165,6 @@ class VialServer:
             with self._lock:
                 for vial in self.vials.values():
                     vial.sync(now)
-                    vial.reap(now)
                     if now - told >= 1.0:
                         self._log({"unit": vial.unit, **vial.truth()})
             told = now if now - told >= 1.0 else told
@@ -169,15 +179,14 @@ class VialServer:
             vial.drive(int(asked["pin"]), float(asked["dc"]), int(asked["pid"]), now)
             return {"ok": True}
         if asked.get("ask") == "temperature":
-            return {"temperature": float(vial.plant.thermal.temperature[0])}
+            return {"temperature": float(vial.plant.thermal.temperature[0]) + vial.plate_c}
         return {"volts": VOLTS_PER_OD * vial.seen_od}
 
     def power_cut(self, unit: str) -> None:
         """Every pin of a unit falls to 0."""
-        vial = self.vials[unit]
         with self._lock:
-            for pin in vial.duty:
-                vial.drive(pin, 0.0, 0, time.time())
+            for pin in (MEDIA, WASTE):
+                self.vials[unit].drive(pin, 0.0, 0, time.time())
 
     def close(self) -> None:
         """End the thread. Idempotent."""

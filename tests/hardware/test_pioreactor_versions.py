@@ -1,0 +1,327 @@
+"""The table of versions against the vendor's software of each, and the rig that runs them: asked by HTTP, no driver.
+
+What a unit does is judged by the vial.
+"""
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.plant.plant import Plant
+from hardware.pioreactor.rig.files import LOGIN
+from hardware.pioreactor.rig.processes import Rig, RigConfig
+from hardware.pioreactor.rig.vials import HEATER, MEDIA, _Vial, vial_preset
+from hardware.pioreactor.versions import TESTED, Facts, facts
+from tests.hardware.pioreactor_bench import EACH_ML, PACKAGES, UNIT, need_the_rig
+
+pytestmark = [pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(300)]  # one rig at a time
+
+LONG_S = 60.0  # a deadline that a busy computer meets
+TARGETS = {"target-od", "target-biomass"}
+
+
+def until(holds: Callable[[], bool]) -> bool:
+    end = time.monotonic() + LONG_S
+    while not (held := holds()) and time.monotonic() < end:
+        time.sleep(0.05)
+    return held
+
+
+class Asked:
+    """A unit in the rig, its culture in a small vial; `known` is the table's word on it."""
+
+    def __init__(self, package: str) -> None:
+        self.rig = Rig((UNIT,), RigConfig(package=package, growth_x=1.0, od=0.5, volume_ml=14.0), experiment="e1")
+        self.known, self.vial = facts(self.rig.version), self.rig.vials.vials[UNIT]
+
+    def ask(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
+        """Status and content of an answer."""
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(f"{self.rig.web[UNIT]}{path}", data, method=method)
+        request.add_header("Content-Type", "application/json")
+        try:
+            with urllib.request.urlopen(request, timeout=20.0) as answer:
+                return answer.status, json.load(answer)
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, error.read()
+
+    def run(self, job: str, options: dict[str, Any] | None = None) -> tuple[int, Any]:
+        """Ask for a job, again as long as the unit has had too many requests for it."""
+        body, said = {"options": options or {}, "env": {"EXPERIMENT": "e1"}}, [(0, None)]
+
+        def taken() -> bool:
+            said.append(self.ask("POST", f"/unit_api/jobs/run/job_name/{job}", body))
+            return said[-1][0] != 429
+
+        assert until(taken)
+        return said[-1]
+
+    def finished(self, task: str) -> tuple[int, Any]:
+        """The answer of a task that is over."""
+        said = [(0, None)]
+
+        def over() -> bool:
+            said.append(self.ask("GET", f"/unit_api/task_results/{task}"))
+            return said[-1][0] != 202
+
+        assert until(over)
+        return said[-1]
+
+    def jobs(self) -> list[str]:
+        """Names of the jobs that the unit lists."""
+        return [job["job_name"] for job in self.ask("GET", "/unit_api/jobs/running")[1]]
+
+    def settings(self, job: str) -> dict[str, Any]:
+        """Of a running job; none of one that does not run."""
+        status, said = self.ask("GET", f"/unit_api/jobs/settings/job_name/{job}")
+        return said["settings"] if status == 200 else {}
+
+    def stop(self, job: str, in_body: bool) -> int:
+        """Status of a stop that names its job in the body, or in the query."""
+        if in_body:
+            return self.ask("POST", "/unit_api/jobs/stop", {"job_name": job})[0]
+        return self.ask("POST", f"/unit_api/jobs/stop?job_name={job}")[0]
+
+    def fed_ml(self) -> float:
+        return float(self.vial.plant.feed.delivered_ml[0])
+
+    def pumping(self) -> bool:
+        return self.vial.duty[MEDIA] > 0.0
+
+    def pio(self, command: str) -> int:
+        """Exit status of one of the vendor's commands, typed on the unit."""
+        words = [str(self.rig.folder / UNIT / "pio"), *command.split()[1:]]
+        return subprocess.run(words, capture_output=True, check=False, timeout=LONG_S).returncode
+
+
+@pytest.fixture(scope="module", params=PACKAGES)
+def unit(request: pytest.FixtureRequest) -> Iterator[Asked]:
+    need_the_rig(PACKAGES[request.param])
+    made = Asked(PACKAGES[request.param])
+    try:
+        assert made.rig.version == request.param
+        yield made
+    finally:
+        made.rig.__exit__()
+
+
+def test_the_unit_says_its_version(unit):
+    assert unit.ask("GET", "/unit_api/versions/app")[1] == {"version": unit.rig.version}
+    assert unit.rig.version in TESTED
+
+
+def test_all_that_runs_on_a_bench_runs_here(unit):
+    unit.run("od_reading", {"interval": 1.0})
+    unit.run("stirring")
+    unit.run("temperature_automation", {"automation-name": "thermostat", "target-temperature": 37.0})
+    jobs = {"monitor", "od_reading", "stirring", "temperature_automation"}
+    assert until(lambda: jobs <= set(unit.jobs()))
+    assert until(lambda: "ods" in unit.settings("od_reading"))
+    said = json.loads(unit.settings("od_reading")["ods"])["ods"]["2"]["od"]
+    assert said == pytest.approx(float(unit.vial.plant.apparent_od[0]), abs=0.05)
+    assert until(lambda: unit.vial.heat >= 0.0), "the vial feels the heater"
+    assert unit.settings("stirring")["$state"] == "ready"
+
+
+def test_a_dose_reaches_the_vial_and_its_task_says_what_the_table_says(unit):
+    before, had = unit.fed_ml(), len(unit.vial.pulses)
+    status, said = unit.run("add_media", {"ml": 0.4})
+    assert status == 202
+    assert until(lambda: len(unit.vial.pulses) > had)
+    assert unit.fed_ml() - before == pytest.approx(0.4, abs=EACH_ML)
+    status, told = unit.finished(said["task_id"])
+    assert (status, told["status"]) == (200, unit.known.succeeded)
+    again = unit.ask("GET", f"/unit_api/task_results/{said['task_id']}")
+    assert (again[0] == 200) is unit.known.kept
+
+
+def test_a_task_whose_job_cannot_start_fails_as_the_table_says(unit):
+    status, told = unit.finished(unit.run("add_media", {"no-such-option": 1})[1]["task_id"])
+    if unit.known.ends:
+        assert (status, told["status"]) == (unit.known.failure, "failed")
+    else:
+        assert (status, told["status"], told["result"]) == (200, unit.known.succeeded, False)
+    asked = unit.finished(unit.run("remove_waste", {"help": None})[1]["task_id"])[1]["result"]
+    assert asked == ({"ok": True} if unit.known.ends else False), "it ended well, at once"
+
+
+def test_a_stop_names_its_job_where_the_version_looks_for_it(unit):
+    before = unit.fed_ml()
+    unit.run("add_media", {"duration": 60.0})
+    assert until(unit.pumping)
+    assert unit.stop("add_media", in_body=not unit.known.stop_in_body) == 400
+    assert unit.pumping()
+    assert unit.stop("add_media", in_body=unit.known.stop_in_body) == 202
+    assert until(lambda: not unit.pumping())
+    assert unit.fed_ml() - before < 60.0
+    assert until(lambda: "add_media" not in unit.jobs())
+
+
+def test_a_killed_dose_pumps_on_until_its_lock_is_cleared_by_the_version_s_command(unit):
+    unit.run("add_media", {"duration": 60.0})
+    assert until(unit.pumping)
+    for pid in unit.rig.jobs(UNIT, "add_media"):
+        os.kill(pid, signal.SIGKILL)
+    had = len(unit.vial.pulses)
+    locked = unit.run("add_media", {"duration": 0.1})[1]["task_id"]
+    unit.finished(locked)
+    assert unit.pumping(), "a chip drives it on"
+    wrong = {"pio cache clear", "pio cache purge"} - {unit.known.purge}
+    assert unit.pio(f"{wrong.pop()} pwm_locks {MEDIA} --as-int") == 2, "no such command"
+    assert unit.pio(f"{unit.known.purge} pwm_locks {MEDIA} --as-int") == 0
+    unit.run("add_media", {"duration": 0.1})
+    assert until(lambda: len(unit.vial.pulses) > had)
+    assert until(lambda: not unit.pumping() and not unit.rig.jobs(UNIT, "add_media"))
+    assert unit.jobs().count("add_media") == 1, "a killed job is never taken off the list by itself"
+    forget = {"pio jobs remove", "pio jobs purge"} - {unit.known.forget}
+    assert all(unit.pio(f"{command} --job-name add_media") == 2 for command in forget)
+    if unit.known.forget:
+        assert unit.pio(f"{unit.known.forget} --job-name add_media") == 0
+        assert "add_media" not in unit.jobs()
+
+
+def test_a_turbidostat_takes_the_option_of_the_table_and_no_other(unit):
+    name = {"automation-name": "turbidostat", "exchange-volume-ml": 1.0}
+    (other,) = TARGETS - {unit.known.target}
+    unit.finished(unit.run("dosing_automation", name | {other: 9.0})[1]["task_id"])
+    assert until(lambda: "dosing_automation" not in unit.jobs())
+    unit.run("dosing_automation", name | {unit.known.target: 9.0} | dict(unit.known.signal))
+    assert until(lambda: unit.settings("dosing_automation").get("$state") == "ready")
+    said = unit.settings("dosing_automation")
+    assert float(said[unit.known.target.replace("-", "_")]) == 9.0
+    assert {option.replace("-", "_"): said.get(option.replace("-", "_")) for option, _ in unit.known.signal} == {
+        option.replace("-", "_"): value for option, value in unit.known.signal
+    }
+    assert unit.stop("dosing_automation", unit.known.stop_in_body) == 202
+    assert until(lambda: "dosing_automation" not in unit.jobs())
+
+
+def test_the_unit_keeps_a_ledger_that_can_be_set_where_the_table_says_so(unit):
+    route = "/unit_api/bioreactor/experiments/e1"
+    status, said = unit.ask("GET", route)
+    assert status == (200 if unit.known.ledger else 404)
+    if not unit.known.ledger:
+        return
+    assert said["values"][unit.known.tube] == 14.0
+    assert unit.ask("PATCH", route, {"values": {"current_volume_ml": 14.5}})[0] == 200
+    assert unit.ask("GET", route)[1]["values"]["current_volume_ml"] == 14.5
+    before = unit.fed_ml()
+    assert unit.run("add_media", {"ml": 3.5})[0] == 400, "18 mL is the most in a vial of 20"
+    assert unit.fed_ml() == before
+
+
+def test_the_leader_says_which_experiment_a_unit_is_in(unit):
+    assert unit.ask("GET", f"/api/workers/{UNIT}/experiment")[1]["experiment"] == "e1"
+    assert unit.ask("GET", "/api/workers/pio09/experiment")[0] == 404
+    assert unit.ask("GET", "/api/experiments/e2")[0] == 404
+
+
+@pytest.mark.parametrize("password", ["wrong", LOGIN[1]])
+def test_the_broker_wants_the_password(unit, password):
+    paho = importlib.import_module("paho.mqtt.client")
+    client, said = paho.Client(paho.CallbackAPIVersion.VERSION2), []
+    client.username_pw_set(LOGIN[0], password)
+    client.on_connect = lambda _c, _u, _f, reason, _p: said.append(bool(reason.is_failure))
+    client.connect("127.0.0.1", unit.rig.broker)
+    client.loop_start()
+    try:
+        assert until(lambda: bool(said))
+    finally:
+        client.disconnect()
+        client.loop_stop()
+    assert said[0] is (password == "wrong")
+
+
+# -- the heater, by itself -----------------------------------------------------------------------------------------
+
+
+def vial(growth_x: float = 1.0) -> _Vial:
+    config = vial_preset("nominal", 14.0, 0.0, 20, growth_x)
+    made = _Vial(UNIT, Plant(config, 1, [np.random.default_rng(0)]), growth_x, lambda _row: None)
+    made.at = 0.0
+    return made
+
+
+def heated(made: _Vial, duty: float, seconds: float, start: float = 0.0) -> float:
+    """The vial's temperature, degC, after its heater had a duty for so long."""
+    made.drive(HEATER, duty, os.getpid(), start)
+    for share in np.linspace(0.0, 1.0, 1 + int(seconds // 10.0))[1:]:
+        made.sync(start + seconds * float(share))
+    return float(made.plant.thermal.temperature[0])
+
+
+def test_a_culture_keeps_its_temperature_until_the_heater_is_driven():
+    made = vial()
+    made.sync(3600.0)
+    assert float(made.plant.thermal.temperature[0]) == pytest.approx(37.0)
+
+
+@pytest.mark.parametrize("growth_x", [1.0, 10.0])
+def test_heat_moves_in_real_time_whatever_the_growth(growth_x):
+    made = vial(growth_x)
+    assert heated(made, 0.0, 39.0 * 60.0) == pytest.approx(24.0 + 13.0 / np.e, abs=0.05)  # one time constant
+    assert heated(made, 16.25, 6.0 * 3600.0, 39.0 * 60.0) == pytest.approx(37.0, abs=0.1)  # 0.8 degC per percent
+
+
+def test_a_heater_falls_with_its_process():
+    made = vial()
+    heated(made, 40.0, 60.0)
+    with subprocess.Popen(["true"]) as gone:
+        gone.wait()
+    made.drive(HEATER, 40.0, gone.pid, 60.0)
+    made.sync(61.0)
+    assert made.heat == 0.0
+
+
+ESTIMATE = """import json, sys
+from pioreactor.background_jobs.temperature_automation import TemperatureAutomationJob as Job
+print(json.dumps([Job.approximate_temperature_20_2_0(one) for one in json.load(sys.stdin)]))
+"""
+
+
+def test_the_vendor_s_estimate_from_the_plate_s_cooling_is_the_vial_s_temperature(unit):
+    series = []
+    for duty in (10.0, 25.0, 35.0):
+        made, looks = vial(), 5.3 * np.arange(21)  # of the thermostat, which heats for 95 s before them
+        for start in 200.0 * np.arange(60):
+            heated(made, duty, 95.0, float(start))
+            made.drive(HEATER, 0.0, os.getpid(), float(start) + 95.0)
+            cooling = []
+            for second in start + 95.0 + looks:
+                made.sync(float(second))
+                cooling.append(float(made.plant.thermal.temperature[0]) + made.plate_c)
+        series.append({"previous_heater_dc": duty, "time_series_of_temp": cooling, "true": cooling[-1] - made.plate_c})
+    told = subprocess.run(
+        [unit.rig._bin / "python", "-c", ESTIMATE], input=json.dumps(series), text=True, capture_output=True,
+        check=False, env=unit.rig._variables(UNIT),
+    )  # fmt: skip
+    assert told.returncode == 0, told.stderr
+    assert json.loads(told.stdout.splitlines()[-1]) == pytest.approx([one["true"] for one in series], abs=0.4)
+
+
+# -- the table, by itself -------------------------------------------------------------------------------------------
+
+
+def test_the_table_is_read_from_its_first_row_to_the_version_s():
+    assert facts("25.11.19") == facts("") == Facts()
+    assert facts("25.12.10").stop_in_body
+    assert not facts("25.12.10").curve_struct
+    assert facts("26.2.3").purge == "pio cache clear"
+    assert facts("26.2.23").purge == "pio cache purge"
+    assert facts("26.10.0") == facts("27.1.0rc1") == facts("26.7.2")
+
+
+@pytest.mark.parametrize(("volume_ml", "vial_ml"), [(14.0, 20), (20.0, 40), (35.0, 40)])
+def test_a_vial_is_large_enough_for_its_culture(volume_ml, vial_ml):
+    assert RigConfig(volume_ml=volume_ml).vial_ml == vial_ml
