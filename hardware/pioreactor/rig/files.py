@@ -43,6 +43,8 @@ target_rpm_during_od_reading=0 target_rpm_outside_od_reading=500 enable_dodging_
 post_delay_duration=0.25 pre_delay_duration=0.25
 stirring.pid Kp=0.005 Ki=0 Kd=0
 temperature_automation.thermostat Kp=2.6 Ki=0 Kd=4.6
+turbidostat.config signal_channel=2 od_smoothing_ema=0.5
+dosing_automation.turbidostat biomass_signal=auto
 dosing_automation.config pause_between_subdoses_seconds=0.5 waste_removal_multiplier=2 max_subdose=1.0"""
 
 HATS: dict[str, dict[str, Any]] = {

@@ -104,7 +104,7 @@ class Rig:
         _wait("127.0.0.1", self.broker, "the broker")
         values: dict[str, Any] = {"port": self.port, "broker": self.broker, "volume_ml": self.config.volume_ml}
         values["database"] = self.folder / "pioreactor.sqlite"
-        database(values["database"], self.units, self.experiment, self._model)
+        database(values["database"], self.units, self.experiment, f"pioreactor_{self.config.vial_ml}ml")
         for unit in self.units:
             home = self.folder / unit
             layout(home, unit, self.units, known, values)
@@ -118,10 +118,6 @@ class Rig:
             for pump in FLOWS:
                 path = f"/unit_api/active_calibrations/{pump}/rig-{pump}"
                 urlopen(Request(self.web[unit] + path, method="PATCH"), timeout=10.0).close()
-
-    @property
-    def _model(self) -> str:
-        return f"pioreactor_{self.config.vial_ml}ml"
 
     def start(self, name: str) -> None:
         """Start, or start again, one process: "broker", "UNIT web", "UNIT tasks" or "UNIT monitor"."""
@@ -147,8 +143,8 @@ class Rig:
             "DOT_PIOREACTOR": str(home), "RUN_PIOREACTOR": str(home), "GLOBAL_CONFIG": str(home / "config.ini"),
             "LOCAL_CONFIG": str(home / "unit_config.ini"), "PLUGINS_DEV": str(home / "plugins"),
             "PIO_EXECUTABLE": str(home / "pio"), "PIOS_EXECUTABLE": str(home / "pios"),
-            "HARDWARE": "1.2", "FIRMWARE": "0.5", "MODEL_NAME": self._model, "MODEL_VERSION": "1.5",
-            "BLINKA_FORCECHIP": "BCM2XXX", "BLINKA_FORCEBOARD": "RASPBERRY_PI_4B",
+            "HARDWARE": "1.2", "FIRMWARE": "0.5", "MODEL_NAME": f"pioreactor_{self.config.vial_ml}ml",
+            "MODEL_VERSION": "1.5", "BLINKA_FORCECHIP": "BCM2XXX", "BLINKA_FORCEBOARD": "RASPBERRY_PI_4B",
             "TURBIDOSTAT_RIG_PORT": str(self.vials.port), "RIG_HOST": f"127.0.0.{k}", "RIG_WEB_PORT": str(self.port),
             "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
         }  # fmt: skip
