@@ -15,11 +15,12 @@ from conf.schema import check, part, require, setting
 from experiments.cli import files, frame
 from experiments.control.device import linked, one_interrupt, save_calibration
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Connection, no_log
+from hardware.chibio.connection import Connection
 from hardware.chibio.dosing import PumpFit, fit_pump
 from hardware.chibio.procedures import dose_series
 from hardware.chibio.protocol import FEED, PERIOD_S, POSITIONS, WASTE
 from hardware.errors import ReactorError
+from hardware.logbook import no_log
 
 __all__ = ["CalibratePumpConfig", "Series", "calibrate", "read_weighings"]
 

@@ -18,7 +18,7 @@ from experiments.reliability.rig_outcome import RigOutcome, judged
 from experiments.reliability.rig_trial import Trial
 from experiments.reporting.tables import markdown
 from hardware.errors import ReactorError
-from hardware.pioreactor.rig.build import PUBLISHED
+from hardware.pioreactor.config import PUBLISHED
 
 __all__ = ["RigFaultsConfig", "rig_faults"]
 

@@ -34,7 +34,7 @@ class Recorded:
 
     reactors: tuple[str, ...]
     speed: float
-    volume_ml: float
+    volume_ml: Mapping[str, float]
     journal: Sequence[Mapping[str, Any]]
     truth: Sequence[Mapping[str, Any]]
     events: Sequence[Mapping[str, Any]] | None
@@ -52,7 +52,8 @@ def recorded(folder: Path) -> Recorded:
     folder = folder / "run" if (folder / "run" / "journal.jsonl").is_file() else folder
     try:
         backend: Any = files.load_yaml(folder / "config.yaml").backend
-        reactors, speed, volume = tuple(backend.reactors), float(backend.speed), float(backend.volume_ml)
+        reactors, speed, own = tuple(backend.reactors), float(backend.speed), backend.get("units") or {}
+        volume = {u: float((own.get(u) or {}).get("volume_ml") or backend.volume_ml) for u in reactors}
         journal, _ = read_journal(folder / "journal.jsonl")
         truth = _rows(folder / "truth.jsonl")
         events, vendor = (_rows(path) if (path := folder / name).exists() else None for name in BESIDE)
@@ -140,7 +141,7 @@ def rig_study(config: RigStudyConfig, folder: Path) -> None:
     except ReactorError as error:
         raise frame.UserError(str(error)) from None
     found = found_in(run)
-    wrong = [line for u in found if u.account for line in rig_truth.trouble(u, config.limits, run.volume_ml)]
+    wrong = [line for u in found if u.account for line in rig_truth.trouble(u, config.limits, run.volume_ml[u.unit])]
     units = {u.unit: {key: value for key, value in asdict(u).items() if key != "unit"} for u in found}
     summary = {"met": not wrong, "speed": run.speed, "vendor_look_min": LOOK_S * run.speed / 60.0, "not_met": wrong}
     files.write_json(folder / "summary.json", {**summary, "units": units, "wall_s": round(time.monotonic() - began, 1)})

@@ -3,7 +3,7 @@
 import time
 from typing import Protocol
 
-__all__ = ["Clock", "RealClock", "VirtualClock"]
+__all__ = ["Clock", "RealClock", "ScaledClock", "VirtualClock"]
 
 
 class Clock(Protocol):
@@ -38,6 +38,21 @@ class RealClock:
         """Wait `seconds` device seconds."""
         if seconds > 0.0:
             time.sleep(seconds / self.speed)
+
+
+class ScaledClock:
+    """Another clock, `speed` times as fast."""
+
+    def __init__(self, clock: Clock, speed: float) -> None:
+        self._clock, self.speed = clock, speed
+
+    def now(self) -> float:
+        """Its seconds."""
+        return self._clock.now() * self.speed
+
+    def sleep(self, seconds: float) -> None:
+        """Wait `seconds` of its own."""
+        self._clock.sleep(seconds / self.speed)
 
 
 class VirtualClock:

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from conf.presets import load
 from conf.schema import build
 from dqn.policy import Policy
@@ -33,7 +35,8 @@ from experiments.control.recovery import continue_loop
 from experiments.controllers import registry
 from experiments.training.config import read_env_file
 from hardware.emulator.device import plant_preset
-from hardware.reactor import Reactor
+from hardware.pioreactor.config import PioreactorConfig
+from hardware.reactor import Array, Reactor
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedReactors
 
@@ -168,7 +171,7 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
         controller = registry.build(setup.config.controller, setup.model, setup.policy, plant, flow, setup.bounds)
     except ValueError as error:
         raise frame.UserError(str(error)) from None
-    interlock, composition = Interlock(len(reactors.names), setup.config.safety), None
+    interlock, composition = Interlock(len(reactors.names), setup.config.safety, *_levels(setup.config)), None
     if setup.keeper is not None:
         truth = None if plant is None else partial(getattr, plant.culture, "share")
         composition = Composition(setup.keeper, setup.scenarios, setup.config.share_warnings, truth)
@@ -177,6 +180,14 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     if setup.resumed:
         continue_loop(loop, record.journal, record.state_path)
     return loop
+
+
+def _levels(config: DeployConfig) -> tuple[Array, Array] | tuple[()]:
+    """Level of each waste tube, and more than which is an overflow, mL, where each reactor has its own."""
+    if not isinstance(config.backend, PioreactorConfig):
+        return ()
+    tube_ml, room_ml = np.array(config.backend.volumes_ml), config.safety.max_volume_ml - config.safety.volume_ml
+    return tube_ml, np.minimum(tube_ml + room_ml, np.array(config.backend.full_ml))
 
 
 @contextmanager

@@ -21,8 +21,8 @@ from hardware.chibio.resume import replay
 from hardware.clock import RealClock
 from hardware.errors import RecordingError
 from hardware.link.open import DeviceLock
-from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
-from hardware.pioreactor.logbook import Log, no_log
+from hardware.logbook import Log, no_log
+from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
 from hardware.pioreactor.preflight import preflight as preflight_units
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay as replay_units
@@ -87,13 +87,19 @@ def _units(
     """Pioreactors that no other client on this computer has, or those of a rig. Raises: ReactorError."""
     with ExitStack() as stack:
         if isinstance(backend, RigBackendConfig):
-            vials = replace(backend.rig, growth_x=backend.speed)
-            rig = stack.enter_context(Rig(backend.reactors, vials, folder, backend.experiment))
-            backend = replace(backend, broker="127.0.0.1", broker_port=rig.broker, addresses=dict(rig.web))
+            cultures = dict(zip(backend.reactors, backend.volumes_ml, strict=True))
+            login = backend.username, backend.password()
+            made = Rig(cultures, backend.rig, backend.speed, folder, backend.experiment, login)
+            rig = stack.enter_context(made)
+            units = {u: replace(backend.units.get(u, UnitConfig()), address=url) for u, url in rig.web.items()}
+            backend = replace(
+                backend, broker="127.0.0.1", broker_port=rig.broker, tls=False, units=units,
+                leader=rig.web[backend.reactors[0]],
+            )  # fmt: skip
             log.info("the vendor's software %s at %s, cultures %g times real time", rig.version, rig.web, backend.speed)
         for unit in backend.reactors:
             stack.enter_context(closing(DeviceLock(f"unit {unit} of {backend.broker}:{backend.broker_port}")))
-        yield stack.enter_context(closing(PioreactorReactors(backend, RealClock(backend.speed), log_row, run)))
+        yield stack.enter_context(closing(PioreactorReactors(backend, RealClock(), log_row, run)))
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from experiments.control.supply import MADE_UP_MIN
 from experiments.controllers import registry
 from hardware.chibio.config import ChiBioConfig
 from hardware.pioreactor.config import PioreactorConfig
+from hardware.safety.config import SafetyConfig
 
 __all__ = ["check_fit"]
 
@@ -45,11 +46,12 @@ def _check_units(config: DeployConfig, backend: PioreactorConfig, scenarios: lis
             f"scenario.temperatures ask for {asked[0]:g} to {asked[-1]:g} degC: {where} controls none without "
             "backend.thermostat=true"
         )
-    for key, unit in (("period_s", "s"), ("volume_ml", "mL")):
-        ours, theirs = getattr(backend, key), getattr(safety, key)
-        if abs(ours - theirs) > 1e-6:
-            given = f"backend.{key} = {ours:g} {unit}, safety.{key} = {theirs:g} {unit}"
-            raise frame.UserError(f"{where}: {given}: allowed the same; give safety.{key}={ours:g}")
+    if abs(backend.period_s - safety.period_s) > 1e-6:
+        given = f"backend.period_s = {backend.period_s:g} s, safety.period_s = {safety.period_s:g} s"
+        raise frame.UserError(f"{where}: {given}: allowed the same; give safety.period_s={backend.period_s:g}")
+    if safety.volume_ml not in (SafetyConfig().volume_ml, *backend.volumes_ml):
+        remedy = "the interlock takes backend.volume_ml or backend.units.NAME.volume_ml; drop it"
+        raise frame.UserError(f"{where}: safety.volume_ml = {safety.volume_ml:g} mL: {remedy}")
     if safety.max_rate * backend.period_s > backend.max_dose_ml + 1e-9:
         least = math.floor(1e5 * backend.max_dose_ml / backend.period_s) / 1e5
         raise frame.UserError(

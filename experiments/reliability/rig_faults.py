@@ -152,7 +152,7 @@ def plant(part: str, switch: str, value: float) -> Act:
 
 def swapped(t: Trial) -> None:
     """The address of the sick unit leads to the other."""
-    t.words.append(f"backend.addresses.{SICK}={t.rig.web[WELL]}")
+    t.words.append(f"backend.units.{SICK}.address={t.rig.web[WELL]}")
 
 
 def flood(t: Trial) -> None:

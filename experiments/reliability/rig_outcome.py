@@ -99,7 +99,7 @@ def _texts(row: Mapping[str, Any]) -> str:
     """What a row of the journal tells."""
     decided = row.get("row")
     inner = str(decided.get("interlock", "")) if isinstance(decided, Mapping) else ""
-    return " ".join((str(row.get("text", "")), str(row.get("interlock", "")), str(row.get("end", "")), inner))
+    return " ".join((str(row.get("note", "")), str(row.get("interlock", "")), str(row.get("end", "")), inner))
 
 
 def _told(

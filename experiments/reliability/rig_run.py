@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -23,8 +23,9 @@ from experiments.cli.words import UserError
 from experiments.reliability.rig_truth import Limits
 from hardware.clock import RealClock
 from hardware.errors import DeviceStateError
-from hardware.pioreactor.mailbox import Mailbox, Mqtt
-from hardware.pioreactor.rig.processes import Rig, RigConfig
+from hardware.pioreactor.config import PioreactorConfig, RigConfig
+from hardware.pioreactor.mailbox import Cluster, Mailbox
+from hardware.pioreactor.rig.processes import Rig
 from hardware.pioreactor.versions import Facts, facts
 from hardware.pioreactor.web import Web
 
@@ -32,7 +33,7 @@ __all__ = ["LOOK_S", "RigStudyConfig", "VendorConfig", "run_on_rig"]
 
 log = logging.getLogger(__name__)
 
-EXPERIMENT, LOGIN = "turbidostat", ("pioreactor", "raspberry")
+EXPERIMENT = "turbidostat"
 OD, AUTOMATION = "od_reading", "dosing_automation"
 LOOK_S = 15.0  # real time between two looks of the vendor's turbidostat, which it lets nobody change
 START_S = 60.0  # real time a job of the vendor's may take to come up
@@ -66,8 +67,11 @@ class RigStudyConfig:
     )
     scenario: str = setting("setpoint_steps", "preset of the deployment", choices=tuple(groups()["scenario"]))
     reading_s: float = setting(1.0, "real time between the readings of those units", "s", within=(1, 30))
+    volumes_ml: tuple[float, ...] = setting(
+        (20.0, 14.0, 20.0), "cultures of those units and of vendor.unit", "mL", within=(5, 38), some=True
+    )
     overrides: tuple[str, ...] = setting(("scenario.recovery_od=0.7",), "further words of the deploy command")
-    rig: RigConfig = part(RigConfig, "the vials; growth_x is `speed`")
+    rig: RigConfig = part(RigConfig, "the software and the vials")
     vendor: VendorConfig = part(VendorConfig, "the unit that the vendor's turbidostat regulates")
     limits: Limits = part(Limits, "what the deployment has to keep")
 
@@ -75,6 +79,12 @@ class RigStudyConfig:
         check(self)
         names = (*self.reactors, self.vendor.unit)
         require(len(set(names)) == len(names), "reactors and vendor.unit", names, "unique names")
+        require(len(names) == len(self.volumes_ml), "volumes_ml", self.volumes_ml, f"one for each of {names}")
+
+    @property
+    def cultures(self) -> dict[str, float]:
+        """mL of each unit, the vendor's last."""
+        return dict(zip((*self.reactors, self.vendor.unit), self.volumes_ml, strict=True))
 
 
 class Witness(Mailbox):
@@ -84,7 +94,7 @@ class Witness(Mailbox):
     """
 
     def __init__(self, unit: str, into: TextIO) -> None:
-        super().__init__(unit, EXPERIMENT, "2", RealClock(1.0))
+        super().__init__(unit, PioreactorConfig(experiment=EXPERIMENT), RealClock())
         self.unit, self._into, self.target = unit, into, float("nan")
 
     def take(self, topic: str, payload: bytes, retained: bool) -> None:
@@ -107,7 +117,7 @@ class VendorUnit:
     """
 
     def __init__(
-        self, config: VendorConfig, web: Web, mqtt: Mqtt, box: Witness, folder: Path, leader: str, known: Facts
+        self, config: VendorConfig, web: Web, mqtt: Cluster, box: Witness, folder: Path, leader: str, known: Facts
     ) -> None:
         self._config, self._web, self._mqtt, self._box, self._leader = config, web, mqtt, box, leader
         self._known = known
@@ -122,7 +132,7 @@ class VendorUnit:
         self._run(OD, {}, [[f"{OD}.config", key, value] for key, value in values.items()])
 
     def _run(self, job: str, options: dict[str, Any], overrides: list[list[str]]) -> None:
-        self._web.run(job, options, {"EXPERIMENT": EXPERIMENT, "JOB_SOURCE": "user"}, overrides)
+        self._web.run(job, options, overrides)
         deadline = time.monotonic() + START_S
         while not self._box.live(job):
             if time.monotonic() > deadline:
@@ -178,9 +188,13 @@ def deployment(config: RigStudyConfig, rig: Rig, folder: Path, out: Path) -> Ite
     """The process that controls the judged units; it is ended on leaving, its pumps verified off."""
     names = ",".join(config.reactors)
     command = [sys.executable, "-m", "experiments.deploy", "backend=pioreactor", f"backend.reactors=[{names}]"]
-    command += [f"backend.addresses.{unit}={rig.web[unit]}" for unit in config.reactors]
+    for unit in config.reactors:
+        command += [
+            f"backend.units.{unit}.address={rig.web[unit]}",
+            f"backend.units.{unit}.volume_ml={rig.units[unit]}",
+        ]
     command += ["backend.broker=127.0.0.1", f"backend.broker_port={rig.broker}", f"backend.speed={config.speed}"]
-    command += [f"backend.volume_ml={config.rig.volume_ml}", f"safety.volume_ml={config.rig.volume_ml}"]
+    command += [f"backend.leader={next(iter(rig.web.values()))}"]
     command += [f"backend.reading_s={config.reading_s}", f"scenario={config.scenario}"]
     command += [*config.overrides, f"hydra.run.dir={folder}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -208,15 +222,14 @@ def run_on_rig(config: RigStudyConfig, folder: Path) -> Path:
     run, unit = folder / "run", config.vendor.unit
     run.mkdir()
     with ExitStack() as stack:
-        rigged = replace(config.rig, growth_x=config.speed)
-        rig = stack.enter_context(Rig((*config.reactors, unit), rigged, run))
+        rig = stack.enter_context(Rig(config.cultures, config.rig, config.speed, run))
         log.info("the vendor's software at %s, cultures %g times real time", rig.web, config.speed)
         into = stack.enter_context((run / "dosing_events.jsonl").open("a", encoding="utf-8", buffering=1))
         boxes = {name: Witness(name, into) for name in rig.units}
         who = f"rig-study-{os.getpid()}"
-        mqtt = Mqtt("127.0.0.1", rig.broker, LOGIN, dict(boxes), RealClock(1.0), who)
-        stack.enter_context(closing(mqtt))
-        web, known = Web(rig.web[unit]), facts(rig.version)
+        where = PioreactorConfig(broker="127.0.0.1", broker_port=rig.broker, experiment=EXPERIMENT)
+        mqtt = stack.enter_context(closing(Cluster(where, dict(boxes), who, RealClock())))
+        web, known = Web(rig.web[unit], EXPERIMENT), facts(rig.version)
         vendor = VendorUnit(config.vendor, web, mqtt, boxes[unit], run, config.reactors[0], known)
         vendor.read()
         client = stack.enter_context(deployment(config, rig, run, folder / "deployment.log"))

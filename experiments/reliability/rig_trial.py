@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hardware.pioreactor.rig.processes import Rig, RigConfig
+from hardware.pioreactor.config import RigConfig
+from hardware.pioreactor.rig.processes import Rig
 from hardware.pioreactor.rig.vials import Pulse
 from hardware.pioreactor.versions import facts
 from hardware.storage.journal import read_journal
@@ -26,6 +27,7 @@ __all__ = ["MEDIA_PIN", "SETPOINT", "SICK", "WASTE_PIN", "WELL", "Seen", "Trial"
 SICK, WELL = "pio01", "pio02"
 MEDIA_PIN, WASTE_PIN = 13, 12
 SETPOINT = 0.5  # OD
+WELL_ML = 14.0
 NEAR_OD = 0.03
 START_S, END_S = 90.0, 60.0  # real seconds for a client to dose, and to end
 
@@ -59,7 +61,8 @@ class Trial:
     def __init__(self, folder: Path, speed: float, seed: int, package: str, stop: threading.Event) -> None:
         self._stop = stop
         self.folder, self.run, self.speed = folder, folder / "run", speed
-        self.rig = Rig((SICK, WELL), RigConfig(package=package, growth_x=speed, od=SETPOINT, seed=seed), folder)
+        vials = RigConfig(package=package, od=SETPOINT, seed=seed)
+        self.rig = Rig({SICK: 20.0, WELL: WELL_ML}, vials, speed, folder)
         self.known = facts(self.rig.version)
         self.client: subprocess.Popen[bytes] | None = None
         self.lives = 0
@@ -83,11 +86,12 @@ class Trial:
         return (self.folder / "second.log").read_text(encoding="utf-8")
 
     def _command(self, run: Path) -> list[str]:
-        addresses = [f"backend.addresses.{unit}={url}" for unit, url in self.rig.web.items()]
+        units = [f"backend.units.{unit}.address={url}" for unit, url in self.rig.web.items()]
+        units += [f"backend.units.{WELL}.volume_ml={WELL_ML}", f"backend.leader={self.rig.web[SICK]}"]
         return [
             "backend=pioreactor", f"backend.reactors=[{SICK},{WELL}]", "backend.broker=127.0.0.1",
             f"backend.broker_port={self.rig.broker}", f"backend.speed={self.speed}", "backend.reading_s=1",
-            *addresses, "scenario=hold", f"scenario.setpoints=[{SETPOINT}]", "scenario.minutes=[100000]",
+            *units, "scenario=hold", f"scenario.setpoints=[{SETPOINT}]", "scenario.minutes=[100000]",
             "safety.silent=100000", f"hydra.run.dir={run}", *self.words,
         ]  # fmt: skip
 

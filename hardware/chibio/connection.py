@@ -1,15 +1,15 @@
 """The connection to one reactor: every request verified. No schedule, no policy, no safety rules."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 from hardware.chibio.protocol import PUMPS, DeviceState, check_command, parse_state
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
 from hardware.link.transport import SharedLink, Transport
+from hardware.logbook import Log, no_log
 
-__all__ = ["Connection", "Log", "identity", "no_log"]
+__all__ = ["Connection", "identity"]
 
 SEEN_S = 1.0
 """For so long after an answer a reactor counts as present: a server that ended needs more time before it listens again.
@@ -17,13 +17,6 @@ Later the next command looks first, because a server that starts carries out wha
 reactor that is absent by then."""
 SETTLE_S = 0.3
 """A pump command is answered before its thread has written to the bus (docs/device.md, Pumps)."""
-
-Log = Callable[[str, Mapping[str, Any]], None]
-"""Takes a kind and its fields, for instance `Journal.append`."""
-
-
-def no_log(kind: str, fields: Mapping[str, Any]) -> None:
-    """Keeps nothing."""
 
 
 def identity(transport: Transport, clock: Clock) -> str:

@@ -12,10 +12,10 @@ from hardware.chibio.connection import Connection
 from hardware.chibio.diagnosis import fault_of
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, plan_dose
 from hardware.chibio.ending import conclude, found
-from hardware.chibio.logbook import Logbook
 from hardware.chibio.protocol import FEED, PUMPS, WASTE, DeviceState
 from hardware.chibio.resume import ReactorHistory
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
+from hardware.logbook import Logbook
 from hardware.storage.doses import Given
 
 __all__ = ["DoseSequence"]
@@ -136,7 +136,8 @@ class DoseSequence:
 
     def _intend(self, plan: DosePlan, rate: float) -> None:
         """Write down what is about to be done. Only then may it be done: a resumed run acts once per sample."""
-        self._book.intend(
+        self._book.write(
+            "intent",
             sample=self._acted, rate=rate, feed_duty=plan.feed_duty, waste_duty=plan.waste_duty, feed_ml=plan.feed_ml,
             waste_ml=plan.waste_ml, carry_ml=self._carry_ml, doses=self._doses, on_s=self._book.elapsed(),
             **({} if plan.pump == FEED else {"feed_pump": plan.pump}),

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from conf.schema import check, setting
 from hardware.chibio.connection import Connection
-from hardware.chibio.logbook import Logbook
 from hardware.chibio.protocol import BANDS, LEDS, SLOTS, DeviceState, Slot
+from hardware.logbook import Logbook
 
 __all__ = ["Fluorescence", "FluorescenceSlotConfig"]
 

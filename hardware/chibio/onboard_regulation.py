@@ -3,10 +3,10 @@
 import math
 
 from hardware.chibio.connection import Connection
-from hardware.chibio.logbook import Logbook
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import DeviceState
 from hardware.errors import DeviceStateError
+from hardware.logbook import Logbook
 
 __all__ = ["OnboardRegulation", "describe", "regulates"]
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 from conf.schema import check, setting
 from hardware.chibio.connection import Connection
-from hardware.chibio.logbook import Logbook
 from hardware.chibio.protocol import MAX_OVERFLOW_DUTY, PUMPS, SPARE, DeviceState
+from hardware.logbook import Logbook
 
 __all__ = ["OverflowPump", "OverflowPumpConfig"]
 

@@ -8,13 +8,14 @@ from pathlib import Path
 
 from hardware.check import Check
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Connection, no_log
+from hardware.chibio.connection import Connection
 from hardware.chibio.dosing import MAX_FEED_DUTY, ReactorCalibration
 from hardware.chibio.fluorescence import HIDDEN, FluorescenceSlotConfig
 from hardware.chibio.protocol import PERIOD_S, UNSET_BLANK, DeviceState
 from hardware.clock import Clock
 from hardware.errors import ReactorError
 from hardware.link.transport import Transport
+from hardware.logbook import no_log
 
 __all__ = ["Check", "preflight"]
 

@@ -14,21 +14,21 @@ import numpy as np
 
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Connection, Log, no_log
+from hardware.chibio.connection import Connection
 from hardware.chibio.dosing import ReactorCalibration
-from hardware.chibio.logbook import Logbook
-from hardware.chibio.protocol import FEED
 from hardware.chibio.resume import ReactorHistory, remember
 from hardware.chibio.station import Station
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, ReactorError
 from hardware.link.transport import SharedLink, Transport
-from hardware.reactor import Array, Command, Mask, Measurement, Receipt, Vitals, left_off
+from hardware.logbook import Log, Logbook, no_log
+from hardware.reactor import Array, Mask, Measurement, Vitals, left_off
+from hardware.stations import Stations
 
 __all__ = ["ChiBioReactors"]
 
 
-class ChiBioReactors:
+class ChiBioReactors(Stations[Station]):
     """One to eight Chi.Bio reactors behind one server (implements `hardware.reactor.Reactor`).
 
     Use: `begin` (or `begin(replay(rows), elapsed_s)` after a crash), then `measure` and `actuate` in turn, `stop` in
@@ -52,12 +52,11 @@ class ChiBioReactors:
         calibrations = calibrations if calibrations is not None else [ReactorCalibration()] * len(config.reactors)
         if len(calibrations) != len(config.reactors):
             raise ValueError(f"calibrations for {len(calibrations)} reactors, reactors = {list(config.reactors)}")
-        self.config, self._clock, self._log = config, clock, log
+        super().__init__(clock, log)
+        self.config = config
         self._link = SharedLink(transport, clock)
         self._past = dict.fromkeys(config.reactors, ReactorHistory())
-        self._log_error: Exception | None = None
         self._agenda = Agenda(clock)
-        self._zero = clock.now()
         self.stations = tuple(
             Station(
                 Connection(
@@ -65,7 +64,7 @@ class ChiBioReactors:
                     config.reactors,
                     self._link,
                     clock,
-                    self._note_down,
+                    self.note_down,
                     config.overflow_pump.pump,
                     config.fluorescence.command,
                     config.supply.pumps,
@@ -73,25 +72,16 @@ class ChiBioReactors:
                 calibration,
                 config,
                 self._agenda,
-                Logbook(m, self._note_down, self._write, self.elapsed),
+                Logbook(m, self.note_down, self.write, self.elapsed),
                 partial(self._past.__getitem__, m),
             )
             for m, calibration in zip(config.reactors, calibrations, strict=True)
         )
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Positions, e.g. ("M0", "M1")."""
-        return tuple(s.name for s in self.stations)
-
-    @property
     def handed_over(self) -> Mask:
         """Reactors that were handed over to the on-board regulation, shape (N,)."""
         return np.array([station.regulation.active for station in self.stations])
-
-    def elapsed(self) -> float:
-        """Run time, s: counted from `begin`, together with what had passed before."""
-        return self._clock.now() - self._zero
 
     def begin(self, histories: Mapping[str, ReactorHistory] | None = None, elapsed_s: float = 0.0) -> None:
         """Sweep the pumps off, pin identities and blanks, start what does not run yet, staggered inside the minute.
@@ -156,14 +146,12 @@ class ChiBioReactors:
         deadline = max(last + self.config.stale_s, self._clock.now() + 20.0)
         fresh = np.zeros(len(self.stations), dtype=np.bool_)
         while True:
-            self._work()
+            self._between()
             for i, station in enumerate(self.stations):
                 if self._clock.now() >= station.sampling.next_poll:
                     fresh[i] = station.poll()
-                    self._work()
-            if self._log_error is not None:
-                error, self._log_error = self._log_error, None
-                raise error
+                    self._between()
+            self.raise_late()
             now = self._clock.now()
             if fresh.any() or now >= deadline or any(station.book.news for station in self.stations):
                 return self._measurement(fresh)
@@ -182,47 +170,14 @@ class ChiBioReactors:
         light = column("fluorescence") if self.config.fluorescence.measure else None
         return Measurement(column("time_s"), column("od"), column("temperature"), fresh, vitals, light)
 
-    def _work(self) -> None:
+    def _between(self) -> None:
         """Run what is due now. A task that fails costs itself only; on a dead link others are due again by then."""
         now = self._clock.now()
         while self._agenda.next_due() <= now:
             try:
                 self._agenda.run_due(now)
             except ReactorError as error:
-                self._note_down("task_failed", {"error": str(error)})
-
-    def actuate(self, command: Command) -> Receipt:
-        """Begin one dose per row of `command.rows`, verified targets first; its end is carried out by `measure`.
-
-        Raises: what the log raises when an intent cannot be written (then nothing is dosed); ValueError for a rate
-          that is negative or not finite. Trouble with device or link becomes a note.
-        """
-        volume, waste, kept = (np.zeros(len(self.stations)) for _ in range(3))
-        for i, station in enumerate(self.stations):
-            if command.rows[i]:
-                station.set_temperature(float(command.temperature[i]))
-                before_ml = station.doses.carry_ml
-                pump = FEED if command.pump is None else f"Pump{command.pump[i]}"
-                plan = station.dose(float(command.pump_rate[i]), pump)
-                volume[i], waste[i] = plan.feed_ml, plan.waste_ml
-                kept[i] = station.doses.carry_ml - before_ml
-                self._work()
-        notes = tuple(f"{station.name}: {note}" for station in self.stations for note in station.book.notes)
-        for station in self.stations:
-            station.book.notes.clear()
-        return Receipt(volume, notes, waste, kept)
-
-    def repeated(self) -> list[tuple[float, Receipt]]:
-        """What doses gave beyond what was booked when they began, not told before: run time, s, and volumes."""
-        found = []
-        for i, station in enumerate(self.stations):
-            mine = np.arange(len(self.stations)) == i
-            extra, station.doses.extra = station.doses.extra, []
-            found += [
-                (g.at_s, Receipt(mine * g.feed_ml, (), mine * g.waste_ml, pump=g.pump, low_ml=mine * g.low_ml))
-                for g in extra
-            ]
-        return sorted(found, key=lambda one: one[0])
+                self.note_down("task_failed", {"error": str(error)})
 
     def pumps_off(self, rows: Mask) -> list[str]:
         """All pumps of `rows` off, verified, but for an overflow pump; returns what failed, one line per reactor."""
@@ -273,7 +228,7 @@ class ChiBioReactors:
         for station in pending:
             station.connection.escalate()
         pending = [s for s in pending if not self._silence(s, errors)]
-        self._note_down("stop", {"reactors": self.names, "not_verified": [s.name for s in pending]})
+        self.note_down("stop", {"reactors": self.names, "not_verified": [s.name for s in pending]})
         if pending:
             reasons = "; ".join(f"{s.name}: {errors[s.name]}" for s in pending)
             raise DeviceStateError(f"pumps not verified off: {reasons}. Switch the pump boards off by hand now")
@@ -296,26 +251,23 @@ class ChiBioReactors:
             if station.connection.read().running:
                 raise DeviceStateError(f"{station.name}: the experiment does not end; stop it in the web page")
 
-    def _write(self, kind: str, fields: Mapping[str, Any]) -> None:
+    def write(self, kind: str, fields: Mapping[str, Any]) -> None:
         """Remember and log, or neither. Raises: what the log raises."""
-        row, before = {"time_s": round(self.elapsed(), 3), **fields}, dict(self._past)
-        self._remember(kind, row)  # first: a stop may come right after it was written
+        before = dict(self._past)
+        row = self._remember(kind, fields)  # first: a stop may come right after it was written
         try:
-            self._log(kind, row)
+            super().write(kind, row)
         except (OSError, ReactorError):
             self._past.update(before)
             raise
 
-    def _note_down(self, kind: str, fields: Mapping[str, Any]) -> None:
-        """Log without ever standing in the way of a pump-off: an error is kept for `measure` to raise."""
-        row = {"time_s": round(self.elapsed(), 3), **fields}
-        self._remember(kind, row)
-        try:
-            self._log(kind, row)
-        except (OSError, ReactorError) as error:
-            self._log_error = error
+    def note_down(self, kind: str, fields: Mapping[str, Any]) -> None:
+        """Remember, and log without ever standing in the way of a pump-off."""
+        super().note_down(kind, self._remember(kind, fields))
 
-    def _remember(self, kind: str, row: Mapping[str, Any]) -> None:
-        """What a row says is what a resumed run would know."""
+    def _remember(self, kind: str, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """What a row says is what a resumed run would know; the row."""
+        row = {"time_s": round(self.elapsed(), 3), **fields}
         if (name := str(row.get("reactor"))) in self._past:
             self._past[name] = remember(self._past[name], {"kind": kind, **row})
+        return row

@@ -14,13 +14,13 @@ from hardware.chibio.diagnosis import diagnose, fault_of
 from hardware.chibio.dose_sequence import DoseSequence
 from hardware.chibio.dosing import DosePlan, ReactorCalibration
 from hardware.chibio.fluorescence import Fluorescence
-from hardware.chibio.logbook import Logbook
 from hardware.chibio.onboard_regulation import OnboardRegulation
 from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import FEED, DeviceState
 from hardware.chibio.resume import ReactorHistory
 from hardware.chibio.sampling import Sampling
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
+from hardware.logbook import Logbook
 from hardware.reactor import Fault
 
 __all__ = ["Station"]
@@ -319,9 +319,12 @@ class Station:
 
     # --------------------------------------------------------------------------------------------------- actuation
 
-    def dose(self, rate: float, pump: str = FEED) -> DosePlan:
-        """Begin the dose for the newest sample (`DoseSequence.begin`), unless the reactor may not be dosed now."""
-        refusal = ""
+    def dose(self, rate: float, number: int) -> DosePlan:
+        """Begin the dose for the newest sample (`DoseSequence.begin`), unless the reactor may not be dosed now.
+
+        Args: rate: mL/s. number: of the pump that feeds.
+        """
+        refusal, pump = "", f"Pump{number}"
         if self.regulation.active:
             refusal = "handed over to the on-board regulation"
         elif self.busy or self.book.fault is not None:

@@ -1,14 +1,13 @@
 """HTTP, straight to the device's server."""
 
 import contextlib
-import re
 import time
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
 
 from hardware.errors import LinkError, ProtocolError, ReactorError
+from hardware.link.secret import read_secret
 from hardware.link.transport import (
     MAX_BODY,
     Reply,
@@ -19,24 +18,38 @@ from hardware.link.transport import (
     switched_off,
 )
 
-__all__ = ["HttpTransport"]
+__all__ = ["HttpTransport", "fetch"]
 
 AGENT = "board_agent/"  # how the server's name begins where an agent stands before the device
 REFUSED = (401, 403, 409)  # by which the agent says that it did not carry a request out, and why
+TOKEN = "give backend.transport.token_file a copy of the board's (docs/board_agent.md, The token)"
 
 
-def read_token(path: str) -> str:
-    """The board agent's token. Raises: LinkError naming the file and the remedy; never the token."""
-    remedy = "give backend.transport.token_file a copy of the board's (docs/board_agent.md, The token)"
+def fetch(
+    client: httpx.Client, method: str, url: str, wait_s: float, body: bytes | None = None
+) -> tuple[int, bytes, httpx.Headers]:
+    """Status, body and headers of an answer that came whole within `wait_s`, so that nobody who dribbles holds a loop.
+
+    Raises: LinkError, whose cause is an `httpx.ConnectError` or `ConnectTimeout` where nobody was reached;
+      ProtocolError for what is no HTTP answer, or longer than MAX_BODY.
+    """
+    what, deadline, found = f"{method} {urlsplit(url).path}", time.monotonic() + wait_s, bytearray()
     try:
-        mode, token = Path(path).stat().st_mode, Path(path).read_bytes()[:1024].strip()
-    except OSError as error:
-        raise LinkError(f"token_file = {path}: {error.strerror}; {remedy}") from None
-    if mode & 0o077:
-        raise LinkError(f"token_file = {path}: others may use it (mode {mode & 0o777:o}); chmod 600 {path}")
-    if not re.fullmatch(rb"[!-~]{32,256}", token):
-        raise LinkError(f"token_file = {path}: not one line of 32 to 256 characters; {remedy}")
-    return token.decode("ascii")
+        with client.stream(method, url, content=body) as answer:
+            for chunk in answer.iter_raw():
+                found += chunk
+                if len(found) > MAX_BODY:
+                    raise ProtocolError(f"{what}: the answer is longer than {MAX_BODY} bytes")
+                if time.monotonic() > deadline:
+                    raise LinkError(f"{what}: the answer was not complete after {wait_s:.1f} s")
+            return answer.status_code, bytes(found), answer.headers
+    except (httpx.RemoteProtocolError, httpx.DecodingError) as error:
+        if "without sending" in str(error):  # closed before the answer was whole: a dying server, not a strange one
+            raise LinkError(f"{what}: {url} closed the connection without a whole answer") from error
+        raise ProtocolError(f"{what}: not an HTTP answer ({error})") from error
+    except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
+        reason, host = str(error) or type(error).__name__, url.removesuffix(urlsplit(url).path)
+        raise LinkError(f"{what}: no answer from {host} ({reason}); check cable and server") from error
 
 
 class HttpTransport(Transport):
@@ -65,7 +78,7 @@ class HttpTransport(Transport):
             raise ValueError(f"url = {url!r}: allowed http://host:port, for instance http://192.168.7.2:5000")
         self.url = url.rstrip("/")
         self._read_s, self._speed = config.timeout(config.read_s, speed), speed
-        self._token = read_token(config.token_file) if config.token_file else ""
+        self._token = read_secret("token_file", config.token_file, 32, TOKEN) if config.token_file else ""
         authority = {"Authorization": f"Bearer {self._token}", "X-Session": str(session or new_session())}
         self._client = httpx.Client(
             timeout=httpx.Timeout(self._read_s, connect=config.timeout(config.connect_s, speed)),
@@ -90,24 +103,8 @@ class HttpTransport(Transport):
         self._client.close()
 
     def _request(self, method: str, path: str) -> Reply:
-        deadline = time.monotonic() + self._read_s
-        body = bytearray()
-        try:
-            with self._client.stream(method, self.url + path) as answer:
-                for chunk in answer.iter_raw():
-                    body += chunk
-                    if len(body) > MAX_BODY:
-                        raise ProtocolError(f"{method} {path}: the answer is longer than {MAX_BODY} bytes")
-                    if time.monotonic() > deadline:
-                        raise LinkError(f"{method} {path}: the answer was not complete after {self._read_s:.1f} s")
-                if answer.status_code in REFUSED and answer.headers.get("server", "").startswith(AGENT):
-                    why = body[:300].decode("ascii", "replace").strip()
-                    raise LinkError(f"{method} {path}: the board agent refuses it: {why}")
-                return Reply(answer.status_code, bytes(body), answer.headers.get("date", ""))
-        except (httpx.RemoteProtocolError, httpx.DecodingError) as error:
-            if "without sending" in str(error):  # closed before the answer was whole: a dying server, not a strange one
-                raise LinkError(f"{method} {path}: {self.url} closed the connection without a whole answer") from error
-            raise ProtocolError(f"{method} {path}: not an HTTP answer ({error})") from error
-        except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
-            reason = str(error) or type(error).__name__
-            raise LinkError(f"{method} {path}: no answer from {self.url} ({reason}); check cable and server") from error
+        status, body, headers = fetch(self._client, method, self.url + path, self._read_s)
+        if status in REFUSED and headers.get("server", "").startswith(AGENT):
+            why = body[:300].decode("ascii", "replace").strip()
+            raise LinkError(f"{method} {path}: the board agent refuses it: {why}")
+        return Reply(status, body, headers.get("date", ""))

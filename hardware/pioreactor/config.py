@@ -1,13 +1,40 @@
 """How Pioreactors are reached and run: `backend=pioreactor` and `backend=pioreactor_rig`."""
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 
 from conf.schema import check, part, require, setting
-from hardware.pioreactor.rig.processes import RigConfig
+from hardware.link.secret import read_secret
 
-__all__ = ["PioreactorConfig", "RigBackendConfig"]
+__all__ = ["PASSWORD", "PUBLISHED", "PioreactorConfig", "RigBackendConfig", "RigConfig", "UnitConfig", "vial_ml"]
+
+PASSWORD = "PIOREACTOR_MQTT_PASSWORD"
+"""Variable of the environment that holds the broker's password; without it and without a file the vendor's own."""
+SHIPPED = "raspberry"  # what the vendor's installation sets, public
+PUBLISHED = "25.11.19"
+"""Version of the vendor's software, the newest of the package index."""
+FULL_ML = {20: 18.0, 40: 36.0}  # the vendor's most in each vial
 
 JOB_WAIT_S = 12.0  # real seconds in which an accepted job must have shown itself
+
+
+def vial_ml(volume_ml: float) -> int:
+    """The vendor's vial for a culture of this volume, mL."""
+    return 20 if volume_ml <= 15.0 else 40
+
+
+@dataclass(frozen=True)
+class UnitConfig:
+    """What one unit has otherwise than `backend` says. Raises: ValueError naming key, value and allowed range."""
+
+    address: str = setting("", "of its web server, e.g. http://10.42.0.2; '': http://NAME.local")
+    channel: str | None = setting(None, "as backend.channel", choices=("1", "2", "3", "4"))
+    od_zero: float | None = setting(None, "as backend.od_zero", within=(-10, 10))
+    od_scale: float | None = setting(None, "as backend.od_scale", above=0.0, at_most=1000.0)
+    volume_ml: float | None = setting(None, "as backend.volume_ml", "mL", within=(5, 38))
+
+    def __post_init__(self) -> None:
+        check(self, "backend.units.NAME")
 
 
 @dataclass(frozen=True)
@@ -19,13 +46,18 @@ class PioreactorConfig:
 
     kind: str = setting("pioreactor", "which backend")
     reactors: tuple[str, ...] = setting(("pio01",), "names of the units, as in the vendor's page", some=True)
-    addresses: dict[str, str] = setting(
-        {}, "of a unit's web server, e.g. addresses.pio01=http://10.42.0.2; one that is missing is http://NAME.local"
+    units: dict[str, UnitConfig] = setting(
+        {}, "what single units have otherwise, e.g. units.pio01.address=http://10.42.0.2 or units.pio02.volume_ml=14"
     )
     broker: str = setting("pioreactor.local", "host of the cluster's MQTT broker, its leader")
     broker_port: int = setting(1883, "of the broker", within=(1, 65535))
     username: str = setting("pioreactor", "of the broker")
-    password: str = setting("raspberry", "of the broker; the vendor ships this one")
+    password_file: str = setting(
+        "", f"file with the broker's password, mode 600; '': {PASSWORD} of the environment, else the vendor's own"
+    )
+    tls: bool = setting(False, "encrypt the way to the broker")
+    ca_file: str = setting("", "certificate of who signed the broker's; '': those of this computer", note="with tls")
+    leader: str = setting("", "address of the leader's web server; '': http://BROKER")
     experiment: str = setting("turbidostat", "name of the experiment in the vendor's pages and data")
     speed: float = setting(
         1.0, "growth faster than real time, only in the rig: device seconds per real second", within=(1, 60)
@@ -44,18 +76,23 @@ class PioreactorConfig:
     temperature: float = setting(37.0, "thermostat at the start; scenarios may change it", "degC", within=(15, 42))
     thermostat: bool = setting(True, "run the vendor's thermostat; else temperatures are not controlled")
     stirring: bool = setting(True, "run the vendor's stirring")
-    volume_ml: float = setting(20.0, "culture up to the efflux tube, as safety.volume_ml", "mL", within=(5, 38))
+    volume_ml: float = setting(
+        20.0, "culture up to the efflux tube, for the interlock too", "mL", within=(5, 38), note="14 in a 20 mL vial"
+    )
     min_dose_ml: float = setting(
         0.05, "less is put off to the next dose: the pump does not give it well", "mL", within=(0, 1)
     )
     max_dose_ml: float = setting(1.5, "the largest dose", "mL", within=(0.1, 5), note="the vendor has no limit")
     waste_factor: float = setting(2.0, "waste pump over media pump, as the vendor's automations", within=(1, 5))
+    drain_ml: float = setting(
+        100.0, "most that is drained while a media pump cannot be stopped, then a plug is all that helps", "mL",
+        within=(0, 2000),
+    )  # fmt: skip
     pump_pins: tuple[int, ...] = setting((13, 16, 12), "GPIO pins of media, alt-media and waste pump", some=True)
     start_s: float = setting(
         JOB_WAIT_S, "real time in which an accepted dose must begin; later its fate is unknown", "s", within=(2, 120)
     )
     stale_s: float = setting(100.0, "age at which a newest sample is no basis for a dose", "s", within=(35, 1200))
-    retry_s: float = setting(2.0, "real time between attempts", "s", within=(0.2, 60))
     stop_s: float = setting(30.0, "real time a stop tries to verify the pumps off", "s", within=(1, 600))
 
     def __post_init__(self) -> None:
@@ -66,17 +103,65 @@ class PioreactorConfig:
         require(self.stale_s > self.period_s, "backend.stale_s", f"{self.stale_s} s", later)
         least = f"min_dose_ml = {self.min_dose_ml} or more"
         require(self.max_dose_ml >= self.min_dose_ml, "backend.max_dose_ml", f"{self.max_dose_ml} mL", least)
-        unknown = [name for name in self.addresses if name not in self.reactors]
-        require(not unknown, "backend.addresses", tuple(unknown), f"names of {', '.join(self.reactors)}")
+        require(len(self.pump_pins) == 3, "backend.pump_pins", self.pump_pins, "three: media, alt-media, waste")
+        unknown = [name for name in self.units if name not in self.reactors]
+        require(not unknown, "backend.units", tuple(unknown), f"names of {', '.join(self.reactors)}")
+        bad = next((c for c in "#+/" if c in self.experiment or not self.experiment), "")
+        require(not bad, "backend.experiment", self.experiment, "a name without # + and /")
 
     @property
     def control_min(self) -> float:
         """Control period, min; a policy must have been trained for the same one, or for any."""
         return self.period_s / 60.0
 
+    @property
+    def volumes_ml(self) -> tuple[float, ...]:
+        """Culture of each unit up to its efflux tube, mL."""
+        return tuple(self.of(unit).volume_ml for unit in self.reactors)
+
+    @property
+    def full_ml(self) -> tuple[float, ...]:
+        """The vendor's most in each unit's vial, mL."""
+        return tuple(FULL_ML[vial_ml(volume_ml)] for volume_ml in self.volumes_ml)
+
+    def of(self, unit: str) -> "PioreactorConfig":
+        """As one unit has it: its own values in the place of those for all."""
+        own = self.units.get(unit, UnitConfig())
+        given = {key: getattr(own, key) for key in ("channel", "od_zero", "od_scale", "volume_ml")}
+        return replace(self, **{key: value for key, value in given.items() if value is not None})
+
     def address(self, unit: str) -> str:
         """Of a unit's web server."""
-        return self.addresses.get(unit, f"http://{unit}.local").rstrip("/")
+        return (self.units.get(unit, UnitConfig()).address or f"http://{unit}.local").rstrip("/")
+
+    @property
+    def leader_address(self) -> str:
+        """Of the leader's web server."""
+        return (self.leader or f"http://{self.broker}").rstrip("/")
+
+    def password(self) -> str:
+        """Of the broker, which stands in no config, file of a run or line of the screen.
+
+        Raises: LinkError naming the file and the remedy.
+        """
+        remedy = "one line with the broker's password, mode 600"
+        if not self.password_file:
+            return os.environ.get(PASSWORD, SHIPPED)
+        return read_secret("backend.password_file", self.password_file, 1, remedy, r"[^\x00-\x1f]")
+
+
+@dataclass(frozen=True)
+class RigConfig:
+    """Which software the rig runs, and what its vials are. Raises: ValueError naming key, value and allowed range."""
+
+    package: str = setting(PUBLISHED, "version of the vendor's software on the package index, or a wheel's path")
+    folder: str = setting("", "of the environments; empty: in the user's cache")
+    od: float = setting(0.7, "of the cultures at the start", "OD", within=(0.0, 4.0))
+    plant: str = setting("nominal", "preset of the cultures")
+    seed: int = setting(0, "of the vials", at_least=0)
+
+    def __post_init__(self) -> None:
+        check(self, "backend.rig")
 
 
 @dataclass(frozen=True)
@@ -87,4 +172,4 @@ class RigBackendConfig(PioreactorConfig):
     speed: float = setting(10.0, "growth faster than real time: device seconds per real second", within=(1, 60))
     reactors: tuple[str, ...] = setting(("pio01", "pio02"), "names of the units", some=True)
     reading_s: float = setting(1.0, "real time between the vendor's readings", "s", within=(1, 30))
-    rig: RigConfig = part(RigConfig, "the software and the vials; growth_x is `speed`")
+    rig: RigConfig = part(RigConfig, "the software and the vials")

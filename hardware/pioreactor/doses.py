@@ -1,40 +1,22 @@
 """One dose from intent to its end: media, then waste, each a job of the vendor's with our id; never sent twice.
 
-The vendor's 202 says only that a request was written down. A dose has begun when an event with its id arrives, and is
-over when its events add up, its job is gone and its pin is off. One whose fate is not known is never sent again and
-counted whole; nothing more is dosed until the unit's task queue has proved that it cannot run any more.
+A dose whose fate is not known is never sent again; nothing more is dosed until it is certain that it cannot run any
+more. What it gave is on record with the least and the most, and what was booked otherwise when it began is corrected.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from hardware.clock import Clock
-from hardware.errors import ReactorError
-from hardware.pioreactor.config import PioreactorConfig
-from hardware.pioreactor.logbook import Logbook
-from hardware.pioreactor.mailbox import DOSING_JOBS, Event, Mailbox, Mqtt
-from hardware.pioreactor.pump_jobs import (
-    ASK_S,
-    LATE_ML,
-    MEDIA,
-    OURS,
-    UNSTARTED_S,
-    WASTE,
-    Course,
-    Given,
-    PumpJobs,
-    Steps,
-)
+from hardware.pioreactor.mailbox import DOSING_JOBS, PUMPS, Event
+from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, WASTE, Moved, Pumps, Steps
 from hardware.pioreactor.resume import History
-from hardware.pioreactor.web import Web
-from hardware.storage.doses import REPEAT_S
+from hardware.storage.doses import Given
 
 __all__ = ["Doses", "Plan"]
 
-DRAINS, QUIET = 5, 1.5  # attempts to empty a vial; control periods without a stop before each
-
-CYCLED = "/off"  # ends the id of a pin that we switched on and off
-UNSEEN = "its end was not on record: counted whole, its waste as far as it was told"
+DRAINS = 5  # attempts to empty a vial
+UNSEEN = "its end was not on record: at most what was asked, unless its pump was found on"
 
 
 @dataclass(frozen=True)
@@ -46,35 +28,22 @@ class Plan:
     carry_ml: float = 0.0
 
 
-class Doses(PumpJobs):
+class Doses:
     """The doses of one unit, one at a time, at most one per sample.
 
-    Args: run: of this run, part of every id.
-    Attributes: ended_s, clock time at which the last dose was over; stopped_s, at which pumps were last asked off;
-      foreign, what was dosed without our command; extra, such volumes and corrections of booked doses: run time, feed
-      and waste, mL, until somebody books and clears them.
+    Attributes: pumps; ended_s, real time at which the last dose was over; foreign, what was dosed without our command;
+      extra, what was given beyond what was booked when doses began, until somebody books and clears it.
     """
 
-    def __init__(
-        self,
-        unit: str,
-        web: Web,
-        mqtt: Mqtt,
-        box: Mailbox,
-        config: PioreactorConfig,
-        clock: Clock,
-        book: Logbook,
-        run: str,
-    ) -> None:
-        super().__init__(unit, web, mqtt, box, config, clock, book, run)
-        self.ended_s = self.stopped_s = -math.inf
-        self.extra: list[tuple[float, float, float]] = []
+    def __init__(self, pumps: Pumps) -> None:
+        self.pumps, self._book, self._config, self._clock = pumps, pumps.book, pumps.config, pumps.clock
+        self.ended_s = self._due = -math.inf
+        self.extra: list[Given] = []
         self.foreign = ""
         self.sample: tuple[float, int] | None = None
         self.carry_ml, self._count = 0.0, 0
-        self._course: Course | None = None
-        self._due, self._waits = 0.0, False
-        self._booked: dict[tuple[str, str], float] = {}
+        self._course: Iterator[float] | None = None
+        self._booked: dict[tuple[str, str], float] = {}  # by job and source; -1 while it is under way
         self._strange: list[Event] = []
 
     @property
@@ -82,16 +51,10 @@ class Doses(PumpJobs):
         """Whether a dose is under way, or the fate of one unknown."""
         return self._course is not None
 
-    @property
-    def at_rest(self) -> bool:
-        """Whether the dose under way waits: for what is not known, or for pumps to be allowed again."""
-        return bool(self.trouble) or self._waits
-
     def restore(self, history: History) -> None:
         """Continue as an earlier life of the run left it; a dose without an end is looked for, never sent again."""
         self.sample, self.carry_ml, self._count = history.sample, history.carry_ml, history.doses
-        if history.open:
-            self._course = self._look_for(history)
+        self._course = self._look_for(history) if history.open else None
 
     def plan(self, rate: float) -> Plan:
         """What a mean rate comes to, mL. Args: rate: mL/s over a control period, >= 0. Raises: ValueError."""
@@ -109,14 +72,14 @@ class Doses(PumpJobs):
         Raises: ValueError for a rate that is negative or not finite; what the intent's log raises.
         """
         plan = self.plan(rate)
-        if reason := refusal or self._obstacle(sample, plan):
+        if reason := refusal or self._obstacle(sample):
             if plan.feed_ml > 0.0:
                 self._book.tell(f"no dose: {reason}")
             return Plan(carry_ml=self.carry_ml)
         dosing = plan.feed_ml > 0.0
         self._count += dosing
         self.sample, self.carry_ml = sample, plan.carry_ml
-        dose, on_s = f"{OURS}{self._run}/{self.unit}/{self._count}", self._book.elapsed()
+        dose, on_s = f"{OURS}{self.pumps.run}/{self.pumps.unit}/{self._count}", self._book.elapsed()
         self._book.write(
             "intent", sample=sample, rate=rate, feed_ml=plan.feed_ml, waste_ml=plan.waste_ml, carry_ml=plan.carry_ml,
             doses=self._count, on_s=on_s, id=dose,
@@ -126,160 +89,133 @@ class Doses(PumpJobs):
             self.work()
         return plan
 
-    def _obstacle(self, sample: tuple[float, int] | None, plan: Plan) -> str:
+    def _obstacle(self, sample: tuple[float, int] | None) -> str:
         if sample is None or sample == self.sample:
             return "no new sample"
         if self.running:
             return "the previous dose has not ended"
-        if self.trouble:
-            return self.trouble
-        if plan.feed_ml > 0.0 and self._strays():
+        if self.pumps.box.on() or any(self.pumps.box.live(job) for job in DOSING_JOBS):
             return "a pump or a dosing job of somebody else runs"
         return ""
 
-    def _strays(self) -> bool:
-        """Whether a pump or a dosing job of somebody else runs: asked of the unit itself, before every dose."""
-        try:
-            jobs = {job["job_name"] for job in self._web.running()} & set(DOSING_JOBS)
-        except ReactorError as error:
-            self._book.tell(f"the unit does not list its jobs: {error}")
-            return True
-        jobs = {job for job in jobs if self._box.live(job)}  # the list keeps a killed one for ever
-        return bool(jobs or self._box.running_pins(self._config.pump_pins))
-
-    # -- the course of a dose --------------------------------------------------------------------------------------
-
     def work(self) -> None:
         """Do what is due; called again and again."""
-        if self._course is None and (lost := [job for job in (MEDIA, WASTE) if self._box.lost(job)]):
-            self._course = self.prove_off(lost[0])
+        if self._course is None:
+            self._course = next((self._silence(job) for job in (MEDIA, WASTE) if self.pumps.odd(job)), None)
         if self._course is None or self._clock.now() < self._due:
             return
         try:
-            pause = next(self._course)
+            self._due = self._clock.now() + next(self._course)
         except StopIteration:
             self._course, self.ended_s = None, self._clock.now()
             self._settle_strange()
-            return
-        self._due = self._clock.now() + pause * self._config.speed
 
     def take(self, events: list[Event]) -> None:
-        """Dosing events that arrived; those of nobody's dose wait until no dose is under way."""
+        """Dosing events that arrived; those that are nobody's here are booked after the dose under way."""
         for event in events:
-            key = event.pump, event.source
-            self._told[key] = self._told.get(key, 0.0) + event.ml
-            if key not in self._booked or self._booked[key] >= 0.0:
+            self.pumps.take(event)
+            if self._booked.get((event.pump, event.source), 0.0) >= 0.0:
                 self._strange.append(event)
         if self._course is None:
             self._settle_strange()
 
-    def _dose(self, plan: Plan, dose: str, on_s: float) -> Course:
-        """Media, then as much waste as the plan says; the end on record."""
-        self._book.write("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
-        for pump in (MEDIA, WASTE):
-            self._booked[pump, dose] = -1.0  # under way: its events are expected
-        media = yield from self.pump(MEDIA, plan.feed_ml, dose)
-        waste, ran_on = Given(0.0, 0.0), media.high > plan.feed_ml + LATE_ML
-        if media.high > 0.0 and not ran_on:
-            waste = yield from self.pump(WASTE, plan.waste_ml, dose)
-        self._conclude(dose, on_s, media, waste)
-        if ran_on:  # on record before: it may wait for long
-            waste = yield from self._drain(media, dose)
-        self._correct(plan, media, waste)
+    # -- the course of a dose --------------------------------------------------------------------------------------
 
-    def _drain(self, media: Given, dose: str) -> Steps:
-        """Waste after a media pump that ran on, until the vial is back at its tube; what was taken out.
+    def _dose(self, plan: Plan, dose: str, on_s: float) -> Iterator[float]:
+        """Media, then as much waste as the plan says, then the end on record."""
+        self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
+        self._booked[MEDIA, dose] = self._booked[WASTE, dose] = -1.0
+        media, waste = (yield from self.pumps.give(MEDIA, plan.feed_ml, dose)), Moved()
+        if 0.0 < media.high <= plan.feed_ml + LATE_ML and not self.pumps.halted:
+            waste = yield from self.pumps.give(WASTE, plan.waste_ml, dose)
+        yield from self._conclude(plan, dose, on_s, media, waste)
 
-        It waits while anybody asks for pumps off, and goes on where it was stopped: a vial that is too full by the
-        ledger is given no dose, and so no waste, any more.
+    def _look_for(self, history: History) -> Iterator[float]:
+        """The dose an earlier life left open: what became of it while nobody watched, and what still may.
+
+        Waste that still runs takes only what lies above its tube.
         """
-        self._book.tell("the vial is drained of what the media pump gave while it ran on, before it is dosed again")
-        wanted, taken, k = self._config.waste_factor * min(media.high, self._config.volume_ml), 0.0, 0
-        while wanted - taken > LATE_ML and k < DRAINS:
-            self._waits = self._clock.now() < self.stopped_s + QUIET * self._config.period_s
-            if self._waits:
-                yield ASK_S
-                continue
-            k += 1
-            key = WASTE, f"{dose}/drain{k}"
-            self._booked[key] = -1.0
-            given = yield from self.pump(WASTE, wanted - taken, key[1])
-            self._booked[key] = given.low
-            taken += given.low
-        return Given(taken, wanted)
+        pumps, dose, asked_ml = self.pumps, history.id, history.feed_ml
+        media, waste = Moved(), Moved()
+        if history.fed:
+            self._booked[MEDIA, dose] = self._booked[WASTE, dose] = -1.0
+            media, waste = Moved(0.0, asked_ml, UNSEEN), Moved(0.0, history.waste_ml)
+            if history.boot == pumps.boot and not history.wasted:
+                asked = self._clock.now() - (self._book.elapsed() - history.on_s) / self._config.speed
+                ran_s = pumps.pin(MEDIA).ran_s
+                seen = yield from pumps.follow(MEDIA, asked_ml, dose, history.task, asked, ran_s)
+                media = replace(seen, low=0.0, high=max(seen.high, asked_ml), end=seen.end or UNSEEN)
+        yield from self._conclude(Plan(asked_ml, history.waste_ml), dose, history.on_s, media, waste)
 
-    def _correct(self, plan: Plan, media: Given, waste: Given) -> None:
-        """What was not as planned, for whoever booked the plan when the dose began: feed, and what the level rose."""
-        more, rise = media.high - plan.feed_ml, max(media.high - waste.low, 0.0)
-        if abs(more) > LATE_ML or rise > LATE_ML:
-            self.extra.append((self._book.elapsed(), more, more - rise))
+    def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> Iterator[float]:
+        """A dose's end on record, then the vial back at its tube, then what was booked otherwise put right.
 
-    def _conclude(self, dose: str, on_s: float, media: Given, waste: Given) -> None:
+        Whoever booked the plan when the dose began is told what more was fed, and what the level rose.
+        """
         self._booked[MEDIA, dose], self._booked[WASTE, dose] = media.high, waste.low
-        for given, pump in ((media, "media"), (waste, "waste")):
-            if given.end:
-                self._book.tell(f"{pump}: {given.end}")
-        self._book.note_down(
-            "dose_end", verified_off=True, on_s=on_s, feed_ml=media.high, waste_ml=waste.low, feed_times=0,
-            waste_times=0, repeated_ml=0.0, feed_low_ml=media.low, waste_high_ml=waste.high, id=dose,
+        for moved, pump in ((media, "media"), (waste, "waste")):
+            if moved.end:
+                self._book.tell(f"{pump}: {moved.end}")
+        taken = waste.low + media.drained
+        self._book.log(
+            "dose_end", verified_off=True, on_s=on_s, feed_ml=media.high, waste_ml=taken, feed_times=0, waste_times=0,
+            repeated_ml=0.0, feed_low_ml=media.low, waste_high_ml=waste.high + media.drained, id=dose,
             end=media.end or waste.end,
         )  # fmt: skip
+        if media.high > plan.feed_ml + LATE_ML:
+            taken += yield from self._drain(media, dose)
+        more, rise = media.high - plan.feed_ml, max(media.high - taken, 0.0)
+        if abs(more) > LATE_ML or rise > LATE_ML or media.low < plan.feed_ml - LATE_ML:
+            self.extra.append(Given(self._book.elapsed(), more, media.low - plan.feed_ml, more - rise))
 
-    def _look_for(self, history: History) -> Course:
-        """The dose an earlier life left open: how it ended cannot be had any more; it is counted whole."""
-        if not history.fed:
-            self._conclude(history.id, history.on_s, Given(0.0, 0.0), Given(0.0, 0.0))
-            return
-        for pump in (MEDIA, WASTE):
-            self._booked[pump, history.id] = -1.0
-        self.trouble = f"a dose of {history.feed_ml:.2f} mL was left open"
-        barrier, taken = self._barrier(), False
-        while (
-            not taken
-            or self._box.running_pins(self._config.pump_pins)
-            or self._box.live(MEDIA)
-            or self._box.live(WASTE)
-        ):
-            taken = taken or barrier.passed()
-            yield ASK_S
-        yield UNSTARTED_S
-        media, waste = Given(0.0, history.feed_ml), Given(0.0, history.waste_ml)
-        if self._box.lost(WASTE):
-            yield from self.prove_off(WASTE)
-        if self._box.lost(MEDIA):
-            yield from self.prove_off(MEDIA)
-            on_s = (self._book.elapsed() - history.on_s) / self._config.speed
-            media, waste = Given(0.0, max(history.feed_ml, on_s * self.flow_ml_s[MEDIA])), Given(0.0, 0.0)
-        self.trouble = ""
-        self._conclude(history.id, history.on_s, replace(media, end=UNSEEN), waste)
-        if media.high > history.feed_ml:
-            waste = yield from self._drain(media, history.id)
-        self._correct(Plan(history.feed_ml, history.waste_ml), media, waste)
+    def _drain(self, media: Moved, dose: str) -> Steps[float]:
+        """Waste after a media pump that ran on, until the vial is back at its tube; what was taken out, mL."""
+        self._book.tell("the vial is drained of what the media pump gave while it ran on, before it is dosed again")
+        wanted, taken = self._config.waste_factor * min(media.high - media.drained, self._config.volume_ml), 0.0
+        for k in range(DRAINS):
+            if wanted - taken > LATE_ML and not self.pumps.halted:
+                key = WASTE, f"{dose}/drain{k}"
+                self._booked[key] = -1.0
+                self._booked[key] = (yield from self.pumps.give(WASTE, wanted - taken, key[1])).low
+                taken += self._booked[key]
+        return taken
 
     # -- what nobody commanded -------------------------------------------------------------------------------------
+
+    def _silence(self, job: str) -> Iterator[float]:
+        """A pump that runs without a job, or whose job was killed: ended, and what it moved on record."""
+        pin, name = self.pumps.pin(job), f"{self.pumps.short}/{self._book.elapsed():.0f}"
+        since = pin.on_s if pin.on and pin.on_s > -math.inf else self._clock.now()
+        moved = yield from self.pumps.end(job, 0.0, name, since)
+        if moved.high > 0.0:
+            self._give(job, moved.low, moved.high, f"{job} ran without its job")
+        if job == MEDIA and moved.high > LATE_ML:
+            taken = moved.drained + (yield from self._drain(moved, name))
+            self.extra.append(Given(self._book.elapsed(), 0.0, 0.0, taken))
 
     def _settle_strange(self) -> None:
         """Book what was dosed without a command of this run, beyond what was counted already."""
         strange, self._strange = self._strange, []
-        for event in strange:
-            key = event.pump, event.source
-            counted = max(self._booked.get(key, 0.0), 0.0)
-            over = min(self._told[key] - counted, event.ml)
-            if over <= 1e-6 or event.pump not in (MEDIA, "add_alt_media", WASTE):
+        for job, source in dict.fromkeys((event.pump, event.source) for event in strange):
+            counted = self._booked.get((job, source), 0.0)
+            over = self.pumps.told[job, source] - counted
+            ours = source.startswith(f"{OURS}{self.pumps.run}/")  # what is booked of it may be more than was told
+            if abs(over) <= 1e-6 or (ours and over < 0.0) or job not in PUMPS:
                 continue
-            self._booked[key] = counted + over
-            ours = (
-                "by which its pin was switched off" if event.source.endswith(CYCLED) else "an earlier request ran late"
-            )
-            who = ours if event.source.startswith(OURS) else f"by {event.source}"
-            feed, waste = (0.0, over) if event.pump == WASTE else (over, 0.0)
-            at_s = self._book.elapsed()
-            self.extra.append((at_s, feed, waste))
-            said = f"{event.pump} of {over:.2f} mL without our command ({who})"
-            self.foreign = self.foreign if event.source.endswith(CYCLED) else said
-            self._book.tell(said)
-            self._book.note_down(
-                "dose_end", verified_off=True, on_s=at_s - REPEAT_S, feed_ml=feed, waste_ml=waste,
-                feed_times=int(feed > 0.0), waste_times=int(waste > 0.0), repeated_ml=feed, feed_low_ml=0.0,
-                source=event.source,
-            )  # fmt: skip
+            self._booked[job, source] = counted + over
+            if source == self.pumps.short:
+                self._give(job, over, over, f"{job} to end with its pin off")
+                continue
+            who = "an earlier request ran late" if source.startswith(OURS) else f"by {source[:60]}"
+            self.foreign = f"{job} of {over:.2f} mL without our command ({who})"
+            self._give(job, over, over, self.foreign)
+
+    def _give(self, job: str, low_ml: float, high_ml: float, why: str) -> None:
+        """What a pump moved beside our doses, as what it is: when it was noticed, how much, by whom."""
+        fed = job != WASTE
+        given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, (not fed) * high_ml)
+        self.extra.append(given)
+        self._book.tell(f"{why}: {low_ml:.2f} to {high_ml:.2f} mL")
+        self._book.log(
+            "given", at_s=given.at_s, why=why, feed_ml=given.feed_ml, feed_low_ml=given.low_ml, waste_ml=given.waste_ml
+        )

@@ -1,230 +1,254 @@
-"""MQTT of a cluster: what each unit last said, kept by one listening thread and read by the driver's."""
+"""MQTT of a cluster: what each unit last said, kept by one listening thread and read by the driver's.
 
-import contextlib
-import importlib
+Whatever arrives, the thread lives: what is not understood is left out, counted, and said once.
+"""
+
 import json
+import math
 import os
 import socket
 import threading
 from collections import deque
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from hardware.clock import Clock
-from hardware.errors import LinkError
+from hardware.link.mqtt import MqttLink
+from hardware.pioreactor.config import PioreactorConfig
 
-__all__ = ["DOSING_JOBS", "Event", "Mailbox", "Mqtt", "Reading"]
+__all__ = ["DOSING_JOBS", "PUMPS", "Cluster", "Event", "Mailbox", "Pin", "Reading", "State"]
 
-KEPT = 2000
+KEPT, LONGEST = 2000, 100_000  # readings and events; bytes of a message
 LOCKS = "turbidostat/lock/"  # who controls units of this cluster, retained, cleared by the last will
-DOSING_JOBS = (
-    "add_media", "remove_waste", "add_alt_media", "circulate_media", "circulate_alt_media", "pumps",
-    "dosing_automation",
-)  # fmt: skip
-LIVE = ("init", "ready", "sleeping")  # states of a job that is there
+PUMPS = ("add_media", "add_alt_media", "remove_waste")  # jobs, in the order of config.pump_pins
+DOSING_JOBS = (*PUMPS, "circulate_media", "circulate_alt_media", "pumps", "dosing_automation")
+LIVE, WORDS = ("init", "ready", "sleeping"), ("init", "ready", "sleeping", "disconnected", "lost")
+TWICE_S = 0.2  # two messages that are not of the same instant
 
 
 class Reading(NamedTuple):
-    """One OD reading: when it arrived by our clock, the unit's own timestamp, the value, whether it is calibrated."""
+    """One OD reading: when it arrived by our clock, the value."""
 
     at: float
-    stamp: str
     value: float
-    calibrated: bool
 
 
 class Event(NamedTuple):
-    """One dosing event: when it arrived, which pump job, mL (told before they are pumped), who asked for it."""
+    """One dosing event: which pump job, mL (told before they are pumped), who asked for it."""
 
-    at: float
     pump: str
     ml: float
     source: str
 
 
-class Mailbox:
-    """What one unit said; filled by `take`, which may be called from another thread.
+class State(NamedTuple):
+    """What a job last said of itself, and when; a retained word is of unknown age, -inf."""
 
-    Attributes: readings and events, newest last, for the driver to take out; duty, of each pin that runs, by
-      experiment; states, of each job; heard, when a job last told its state; temperature, and target of the
-      thermostat, degC; refused, messages; ran_s, how long each pin has run by the clock, s.
+    word: str = ""
+    at: float = -math.inf
+
+
+class Pin:
+    """A pump's pin by the messages about it.
+
+    Attributes: on; on_s, off_s, when it last went on and off, -inf if that is not known; ran_s, for how long it has run
+      up to off_s; run_s, ended_s, when a job of the pump last said that it is there, and that it ended; doubt_s, when
+      it was said to be on though its job had ended.
     """
 
-    def __init__(self, unit: str, experiment: str, channel: str, clock: Clock) -> None:
-        self._root, self._channel, self._clock = f"pioreactor/{unit}/", channel, clock
-        self.experiment = experiment
-        self._lock = threading.Lock()
+    def __init__(self) -> None:
+        self.on, self.ran_s = False, 0.0
+        self.on_s = self.off_s = self.run_s = self.ended_s = self.doubt_s = -math.inf
+
+    def told(self, on: bool, at: float, word: str) -> None:
+        """A message that has all pins of the unit.
+
+        Stirring reads them and says so an instant later: a pin that is on without a job is on if it is said twice.
+        Args: at: when it came, -inf if it was retained. word: state of the pin's job.
+        """
+        if not on:
+            self.ends(at)
+        elif not self.on and (word in LIVE or at == -math.inf):
+            self.on, self.on_s = True, at
+        elif not self.on and (word == "lost" or -math.inf < self.doubt_s < at - TWICE_S):
+            self.on, self.on_s = True, self.run_s if word == "lost" else self.doubt_s
+        elif not self.on:
+            self.doubt_s = max(self.doubt_s, at) if self.doubt_s == -math.inf else self.doubt_s
+
+    def ends(self, at: float) -> None:
+        """It stands still; what it ran until then counts once."""
+        if self.on:
+            self.ran_s += at - self.on_s if self.on_s > -math.inf else 0.0
+            self.off_s, self.on = at, False
+        self.doubt_s = -math.inf
+
+
+class Mailbox:
+    """What one unit said; filled by `take`, which may be called from another thread. Times are real seconds.
+
+    A retained message of another experiment is of no time that is known, and left out. A pump's job that ended has
+    switched its pin off.
+
+    Attributes: readings and events, newest last, and ignored, kinds of messages that were left out, for the driver to
+      take out; pins; states, of each job by experiment; temperature, and target of the thermostat, degC; stir_duty, of
+      the stirring job, %; heard_s, when the unit last said anything; dc_s, when it last told its pins; channels, in the
+      newest reading; refused, how many messages were left out.
+    """
+
+    def __init__(self, unit: str, config: PioreactorConfig, clock: Clock) -> None:
+        self._root, self._channel, self._clock = f"pioreactor/{unit}/", config.of(unit).channel, clock
+        self._experiment = config.experiment
+        self.lock = threading.RLock()
         self.readings: deque[Reading] = deque(maxlen=KEPT)
         self.events: deque[Event] = deque(maxlen=KEPT)
-        self.duty: dict[str, dict[int, float]] = {}
-        self.states: dict[tuple[str, str], str] = {}
-        self.heard: dict[str, float] = {}
-        self.ran_s: dict[int, float] = {}
-        self._on: dict[int, float] = {}
-        self.temperature = self.target = float("nan")
-        self.refused = 0
-        self._stamp = ""
+        self.ignored: list[str] = []
+        self.jobs = dict(zip(PUMPS, config.pump_pins, strict=True))
+        self.pins = {pin: Pin() for pin in config.pump_pins}
+        self.states: dict[tuple[str, str], State] = {}
+        self.temperature = self.target = self.stir_duty = math.nan
+        self.heard_s = self.dc_s = -math.inf
+        self.channels: tuple[str, ...] = ()
+        self.refused, self._stamp, self._said = 0, "", set[str]()
 
     def take(self, topic: str, payload: bytes, retained: bool) -> None:
-        """One message; what is not understood is left out."""
-        if not topic.startswith(self._root):
-            return
+        """One message. Raises: nothing."""
         experiment, _, rest = topic.removeprefix(self._root).partition("/")
         try:
-            with self._lock:
+            with self.lock:
+                if len(payload) > LONGEST:
+                    raise ValueError(f"{len(payload)} bytes")
+                self.heard_s = self.heard_s if retained else self._clock.now()
                 self._enter(experiment, rest, payload, retained)
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except Exception as error:  # the thread that calls must go on, whatever somebody sends
             self.refused += 1
+            kind = rest.rsplit("/", 1)[-1][:40]
+            if kind not in self._said and len(self._said) < 100:
+                self._said.add(kind)
+                why = " ".join(str(error)[:80].split()) or type(error).__name__
+                self.ignored.append(f"a message was ignored, {rest[:60]!r}: {why}")
 
     def _enter(self, experiment: str, rest: str, payload: bytes, retained: bool) -> None:
-        now, mine = self._clock.now(), experiment == self.experiment
-        if rest.endswith("/$state"):
-            job = rest.removesuffix("/$state")
-            self.states[experiment, job] = payload.decode()
-            self.heard[job] = self.heard[job] if retained and job in self.heard else now
-        elif rest == "pwms/dc":
-            self._switched({int(k): float(v) for k, v in json.loads(payload or b"{}").items()}, experiment, now)
+        now, mine = self._clock.now(), experiment == self._experiment
+        at = -math.inf if retained else now
+        if rest.endswith("/$state") and payload:
+            self._state(experiment, rest.removesuffix("/$state"), payload.decode(), at)
+        elif rest == "pwms/dc" and (mine or not retained):
+            duty = {int(pin): _number(dc) for pin, dc in json.loads(payload or b"{}").items()}
+            for job, number in self.jobs.items():
+                word = next((w for w in LIVE if self.live(job)), self.state(job).word)
+                self.pins[number].told(duty.get(number, 0.0) > 0.0, at, word)
+            self.dc_s = max(self.dc_s, at)
         elif rest == "dosing_events" and not retained:
             e = json.loads(payload)
-            self.events.append(Event(now, e["event"], float(e["volume_change"]), str(e["source_of_event"])))
-        elif rest == "od_reading/ods" and mine:
+            if not isinstance(e["event"], str):
+                raise TypeError("an event without a name")
+            self.events.append(Event(e["event"], _number(e["volume_change"]), str(e["source_of_event"])))
+        elif rest == "od_reading/ods" and mine and payload:
             self._reading(json.loads(payload), now, retained)
-        elif rest == "temperature_automation/temperature" and mine:
-            self.temperature = float(json.loads(payload)["temperature"])
-        elif rest == "temperature_automation/target_temperature" and mine:
-            self.target = float(payload or "nan")
+        elif rest == "temperature_automation/temperature" and mine and payload:
+            self.temperature = _number(json.loads(payload)["temperature"])
+        elif rest == "temperature_automation/target_temperature" and mine and payload:
+            self.target = _number(payload)
+        elif rest == "stirring/duty_cycle" and mine and payload:
+            self.stir_duty = _number(payload)
 
-    def _switched(self, duty: dict[int, float], experiment: str, now: float) -> None:
-        """The pins that run now, and for how long those ran that do no more."""
-        before, self.duty[experiment] = self.duty.get(experiment, {}), duty
-        for pin in duty.keys() - before.keys():
-            self._on[pin] = now
-        for pin in before.keys() - duty.keys():
-            self.ran_s[pin] = self.ran_s.get(pin, 0.0) + now - self._on.pop(pin, now)
+    def _state(self, experiment: str, job: str, word: str, at: float) -> None:
+        if word not in WORDS:
+            raise ValueError(f"no state: {word[:40]!r}")
+        known = self.states.get((experiment, job), State())
+        self.states[experiment, job] = State(word, max(known.at, at) if word == known.word else at)
+        if at == -math.inf or job not in self.jobs:
+            return
+        pin = self.pins[self.jobs[job]]
+        if word == "init" or (word in LIVE and known.word not in LIVE):
+            pin.run_s = at
+        elif word == "disconnected":
+            pin.ended_s = at
+            if pin.on_s >= pin.run_s:  # its own word on the pin may come a moment later, or was overtaken
+                pin.ends(at)
 
     def _reading(self, said: dict[str, Any], now: float, retained: bool) -> None:
         """A retained reading is the last one of whatever was before; one with the stamp of another is the same."""
-        stamp, one = str(said["timestamp"]), said["ods"][self._channel]
+        stamp = str(said["timestamp"])
+        self.channels = tuple(sorted(map(str, said["ods"])))
         if retained or stamp == self._stamp:
             self.refused += 1
             return
+        value = _number(said["ods"][self._channel]["od"])
         self._stamp = stamp
-        self.readings.append(Reading(now, stamp, float(one["od"]), bool(one.get("calibrated"))))
+        self.readings.append(Reading(now, value))
 
     def forget(self) -> None:
-        """After a break: what was said before it may have changed since; what is retained is said again."""
-        with self._lock:
-            self.duty.clear()
+        """What jobs said of themselves, before it is said again."""
+        with self.lock:
             self.states.clear()
 
-    def drain(self) -> tuple[list[Reading], list[Event]]:
-        """Readings and events since the last call."""
-        with self._lock:
-            found = list(self.readings), list(self.events)
+    def drain(self) -> tuple[list[Reading], list[Event], list[str]]:
+        """Readings, events, and what was ignored, since the last call."""
+        with self.lock:
+            found = list(self.readings), list(self.events), self.ignored
             self.readings.clear()
             self.events.clear()
+            self.ignored = []
         return found
 
-    def running_pins(self, pins: Sequence[int]) -> list[int]:
-        """Those of `pins` that run, by what the unit said last."""
-        with self._lock:
-            return [pin for pin in pins if any(of.get(pin, 0.0) > 0.0 for of in self.duty.values())]
+    def state(self, job: str) -> State:
+        """What a job of our experiment last said."""
+        return self.states.get((self._experiment, job), State())
 
     def live(self, job: str) -> bool:
-        """Whether a job of this name is there, in whatever experiment."""
-        with self._lock:
-            return any(name == job and state in LIVE for (_, name), state in self.states.items())
+        """Whether a job of this name is there: in our experiment, or heard of in another one since we listen."""
+        with self.lock:
+            known = [(e, s) for (e, name), s in self.states.items() if name == job]
+        return any(s.word in LIVE and (e == self._experiment or s.at > -math.inf) for e, s in known)
 
-    def been(self, job: str, since: float) -> bool:
-        """Whether a job of this name came and went since that clock time."""
-        return self.heard.get(job, float("-inf")) > since and not self.live(job)
-
-    def lost(self, job: str) -> bool:
-        """Whether a job of this name in our experiment ended without a word: its process was killed."""
-        with self._lock:
-            return self.states.get((self.experiment, job)) == "lost"
+    def on(self) -> list[int]:
+        """Pins that run by what the unit said last."""
+        return [number for number, pin in self.pins.items() if pin.on]
 
 
-class Mqtt:
-    """The connection to the broker, kept up by a thread of its own.
+def _number(said: Any) -> float:
+    """A finite number, of text too. Raises: TypeError, ValueError, OverflowError."""
+    value = float(said) if isinstance(said, int | float | str | bytes) and not isinstance(said, bool) else math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"no number: {str(said)[:40]!r}")
+    return value
 
-    Args: host, port, username, password: of the broker. boxes: of the units. name: of this client.
-    Attributes: connected; since, clock time at which it last became so; breaks, how often it was lost.
-    Raises: LinkError if the library is missing or the broker does not answer.
-    """
 
-    def __init__(
-        self, host: str, port: int, login: tuple[str, str], boxes: dict[str, Mailbox], clock: Clock, name: str
-    ) -> None:
-        try:
-            paho = importlib.import_module("paho.mqtt.client")
-        except ImportError:
-            raise LinkError("the Pioreactor needs the MQTT library: pip install 'paho-mqtt>=2'") from None
-        self._boxes, self._clock = boxes, clock
-        self.connected, self.since, self.breaks = False, float("-inf"), 0
-        self._client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id=name)
-        self._client.username_pw_set(*login)
-        self._client.reconnect_delay_set(1, 5)
-        self._lock, self._held, self._others = LOCKS + name, "", dict[str, dict[str, Any]]()
-        self._client.will_set(self._lock, b"", qos=1, retain=True)
-        self._client.on_connect, self._client.on_disconnect = self._up, self._down
-        self._client.on_message = lambda _c, _u, m: self._message(m)
-        try:
-            self._client.connect(host, port, keepalive=10)
-        except OSError as error:
-            raise LinkError(
-                f"MQTT broker {host}:{port}: {error}; check backend.broker and that the leader is on"
-            ) from None
-        self._client.loop_start()
+class Cluster(MqttLink):
+    """The connection to the broker of some units, and who else controls them. Raises: LinkError."""
 
-    def _up(self, client: Any, _user: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        if not reason.is_failure:
-            for unit, box in self._boxes.items():
-                box.forget()
-                client.subscribe(f"pioreactor/{unit}/#", qos=1)
-            self._others.clear()
-            client.subscribe(f"{LOCKS}+", qos=1)
-            if self._held:  # the last will of the connection before cleared it
-                client.publish(self._lock, self._held, qos=1, retain=True)
-            self.connected, self.since = True, self._clock.now()
+    def __init__(self, config: PioreactorConfig, boxes: dict[str, Mailbox], name: str, clock: Clock) -> None:
+        self._boxes, self._lock, self._others = boxes, LOCKS + name, dict[str, dict[str, Any]]()
+        super().__init__(
+            config.broker, config.broker_port, config.username, config.password(), name, clock, tls=config.tls,
+            ca_file=config.ca_file, topics=[*(f"pioreactor/{unit}/#" for unit in boxes), f"{LOCKS}+"],
+            take=self._message, again=self._forget, will=self._lock,
+        )  # fmt: skip
 
-    def _down(self, *_said: Any) -> None:
-        self.connected, self.breaks = False, self.breaks + 1
+    def _forget(self) -> None:
+        """After a break: what was said before it may have changed since; what is retained is said again."""
+        self._others.clear()
+        for box in self._boxes.values():
+            box.forget()
+
+    def _message(self, topic: str, payload: bytes, retained: bool) -> None:
+        if topic.startswith(LOCKS):
+            self._others.pop(topic, None)
+            said = json.loads(payload[:LONGEST] or b"null")
+            if isinstance(said, dict) and isinstance(said.get("units"), list) and topic != self._lock:
+                self._others[topic] = said
+        elif (unit := topic.split("/")[1]) in self._boxes:
+            self._boxes[unit].take(topic, payload, retained)
 
     def hold(self) -> None:
         """Tell every other client of this cluster that these units are ours, as long as we are there."""
-        self._held = json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "units": list(self._boxes)})
-        self._client.publish(self._lock, self._held, qos=1, retain=True)
+        self.keep(json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "units": list(self._boxes)}))
 
     def holder(self, unit: str) -> str:
         """Who else controls a unit, with the remedy, "" if nobody does; an earlier life of the same run is nobody."""
         for topic, said in list(self._others.items()):
-            if unit in said.get("units", ()):
-                who = f"process {said.get('pid')} on {said.get('host')} controls {unit}: one client per unit"
-                return f"{who}; if it is not there any more: mosquitto_pub -r -n -t {topic}"
+            if unit in said["units"]:
+                who = f"process {str(said.get('pid'))[:20]} on {str(said.get('host'))[:60]} controls {unit}"
+                remedy = f"if it is not there any more: mosquitto_pub -r -n -t {topic}"
+                return f"{who}: one client per unit; {remedy}"
         return ""
-
-    def _message(self, message: Any) -> None:
-        if message.topic.startswith(LOCKS):
-            self._others.pop(message.topic, None)
-            with contextlib.suppress(ValueError):
-                said = json.loads(message.payload or b"null")
-                if isinstance(said, dict) and message.topic != self._lock:
-                    self._others[message.topic] = said
-            return
-        unit = message.topic.split("/")[1]
-        if unit in self._boxes:
-            self._boxes[unit].take(message.topic, message.payload, bool(message.retain))
-
-    def publish(self, topic: str, payload: str) -> bool:
-        """Whether it was handed to the broker."""
-        return self.connected and int(self._client.publish(topic, payload, qos=1).rc) == 0
-
-    def close(self) -> None:
-        """Idempotent."""
-        if self._held and self.connected:
-            self._held = ""
-            with contextlib.suppress(RuntimeError, ValueError):
-                self._client.publish(self._lock, b"", qos=1, retain=True).wait_for_publish(1.0)
-        self._client.loop_stop()
-        self._client.disconnect()

@@ -1,54 +1,112 @@
 """Before a run: one line per check, passed or with the remedy. Changes nothing on a unit."""
 
+import time
 from collections.abc import Iterator
+from datetime import datetime
+from typing import Any
 
 from hardware.check import Check
+from hardware.clock import RealClock
 from hardware.errors import ReactorError
 from hardware.pioreactor.jobs import flow
 from hardware.pioreactor.mailbox import DOSING_JOBS
-from hardware.pioreactor.pump_jobs import MEDIA
+from hardware.pioreactor.pumps import Barrier
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.station import Station
+from hardware.pioreactor.versions import TESTED, facts
+from hardware.pioreactor.web import NotHeard, Web
 
-__all__ = ["KNOWN", "preflight"]
+__all__ = ["preflight"]
 
-KNOWN = ("25.11.19",)  # versions of the vendor's software that the tests ran against
-CLOCK_S = 30.0
+CLOCK_S, QUEUE_S = 30.0, 20.0
 
 
 def preflight(reactors: PioreactorReactors) -> list[Check]:
-    """Per unit: reached, version, clock, calibrations, nothing else that doses. Raises: nothing about a unit."""
-    checks: list[Check] = []
+    """The broker, then per unit what a run needs of it. Raises: nothing about a unit."""
+    try:
+        reactors.connect()
+        checks = [Check("broker", True, f"{reactors.config.broker} lets {reactors.config.username} in")]
+    except ReactorError as error:
+        detail, _, remedy = str(error).partition("; ")
+        checks = [Check("broker", False, detail, remedy)]
+    leader = Web(reactors.config.leader_address)
     for station in reactors.stations:
         try:
-            checks += list(_unit(station, reactors))
+            checks += list(_unit(station, reactors, leader))
         except ReactorError as error:
-            checks.append(Check(f"{station.name} link", False, str(error), "check power, network, backend.addresses"))
+            checks.append(Check(f"{station.name} link", False, str(error), "check power, network and backend.units"))
+    leader.close()
     return checks
 
 
-def _unit(station: Station, reactors: PioreactorReactors) -> Iterator[Check]:
+def _unit(station: Station, reactors: PioreactorReactors, leader: Web) -> Iterator[Check]:
     """Checks of one unit. Raises: ReactorError where it does not answer."""
-    name = station.name
-    who = str(station.web.get("/health").get("pioreactor_unit"))
-    yield Check(f"{name} identity", who == name, f"the unit at {station.web.url} is {who}", "correct backend.addresses")
-    version = str(station.web.get("/versions/app").get("version"))
-    yield Check(f"{name} version", version in KNOWN, version, f"tried with {', '.join(KNOWN)}", required=False)
-    off = f"{(error_s := station.web.clock_error_s()):+.1f} s against this computer"
+    name, web, config = station.name, station.web, reactors.config.of(station.name)
+    health = web.get("/health")
+    who = str(health.get("pioreactor_unit"))
+    yield Check(f"{name} identity", who == name, f"the unit at {web.url} is {who}", f"correct backend.units.{name}")
+    version = str(web.get("/versions/app").get("version"))
+    asked = "" if version in TESTED else "; asked of it all the same: its jobs, calibrations, settings, task queue"
+    yield Check(f"{name} version", version in TESTED, version, f"tried with {', '.join(TESTED)}{asked}", required=False)
+    said = datetime.fromisoformat(str(health.get("utc_time")).replace("Z", "+00:00")).timestamp()
+    off = f"{(error_s := said - time.time()):+.1f} s against this computer"
     yield Check(f"{name} clock", abs(error_s) < CLOCK_S, off, "only its logs suffer", required=False)
-    calibrations = station.web.get("/active_calibrations")
+    yield from _experiment(name, config.experiment, leader)
+    calibrations = web.get("/active_calibrations")
     for pump in ("media_pump", "waste_pump"):
         try:
-            yield Check(f"{name} {pump}", True, f"{flow(calibrations, pump, name):.3f} mL/s at its calibrated duty")
+            yield Check(f"{name} {pump}", True, f"{flow(calibrations, pump):.3f} mL/s at its calibrated duty")
         except ReactorError as error:
             detail, _, remedy = str(error).partition("; ")
             yield Check(f"{name} {pump}", False, detail, remedy)
-    other, _, remedy = reactors.holder(name).partition("; ")
+    settings = _settings(name, web, leader)
+    eyes = {k: v for k, v in settings.get("od_config.photodiode_channel", {}).items() if v not in ("", "REF")}
+    sees = ", ".join(f"{k} at {v} degrees" for k, v in eyes.items()) or "none"
+    remedy = f"allowed backend.channel or backend.units.{name}.channel one of these, or set it in the vendor's page"
+    yield Check(f"{name} photodiode", config.channel in eyes, f"{config.channel} of {sees}", remedy)
+    tube = str(settings.get("bioreactor", {}).get(facts(version).tube, "not set"))
+    remedy = "set both to the culture's volume at its efflux tube: the vendor refuses doses by its own"
+    same = tube == "not set" or abs(float(tube) - config.volume_ml) <= 0.5
+    yield Check(f"{name} volume", same, f"{tube} mL in its settings, {config.volume_ml:g} here", remedy, required=False)
+    other, _, remedy = reactors.mqtt.holder(name).partition("; ")
     yield Check(f"{name} client", not other, other or "no other client of ours", remedy)
-    jobs = {str(job["job_name"]) for job in station.web.running()}
-    dosing = sorted(jobs & set(DOSING_JOBS))
-    killed = f"POST /unit_api/jobs/stop?job_name={dosing[0] if dosing else MEDIA}"
-    remedy = f"stop it in the vendor's page; one that was killed stays in its list until {killed}"
+    dosing = sorted({str(job["job_name"]) for job in web.running()} & set(DOSING_JOBS))
+    forget = facts(version).forget
+    word = f"on the unit {forget} --job-name {dosing[0]}" if forget and dosing else "the unit is rebooted"
+    remedy = f"stop it in the vendor's page; one that was killed stays in its list until {word}"
     yield Check(f"{name} dosing", not dosing, ", ".join(dosing) or "nothing else doses", remedy)
-    largest = f"the vendor has no limit of one dose; ours is {reactors.config.max_dose_ml:g} mL"
+    yield _queue(name, web)
+    largest = f"the vendor has no limit of one dose; ours is {config.max_dose_ml:g} mL"
     yield Check(f"{name} dead man", True, f"{largest}, and every pump job times itself")
+
+
+def _experiment(name: str, wanted: str, leader: Web) -> Iterator[Check]:
+    """Whether the unit is in the experiment that its jobs are to run in: the vendor shows nothing of another."""
+    remedy = "give backend.experiment=NAME of the one it is in, or assign it in the vendor's page"
+    try:
+        found = str(leader.get(f"/workers/{name}/experiment", below="/api").get("experiment"))
+        yield Check(f"{name} experiment", found == wanted, f"{found}, backend.experiment = {wanted}", remedy)
+    except NotHeard as error:
+        if "status 404" in str(error):
+            yield Check(f"{name} experiment", False, "the leader knows no experiment that it is in", remedy)
+            return
+        yield Check(f"{name} experiment", False, str(error), "give backend.leader=http://HOST", required=False)
+
+
+def _settings(name: str, web: Web, leader: Web) -> dict[str, Any]:
+    """The unit's configuration by section: newer versions tell it themselves. Raises: ReactorError."""
+    try:
+        found = web.get("/config/merged")
+    except NotHeard:
+        found = leader.get(f"/workers/{name}/configuration", below="/api").get(name)
+    return found if isinstance(found, dict) else {}
+
+
+def _queue(name: str, web: Web) -> Check:
+    """Whether the task queue takes what is written down, by a request that only prints help."""
+    clock = RealClock()
+    barrier = Barrier(web, clock)
+    while not (passed := barrier.passed()) and clock.now() < QUEUE_S:
+        clock.sleep(0.1)
+    detail = "takes what is written down" if passed else f"took nothing in {QUEUE_S:.0f} s"
+    return Check(f"{name} task queue", passed, detail, "on the unit: sudo systemctl restart huey")

@@ -38,22 +38,20 @@ class Sampling:
         self._readings: deque[Reading] = deque(maxlen=1000)
         self.newest = Sample(math.nan, math.nan, math.nan, math.nan, 0)
         self.arrived_s, self.read_s, self.count = now, now, 0
-        self._due = now
+        self._due = -math.inf
 
     def take(self, readings: list[Reading]) -> None:
-        """Readings that arrived."""
-        self._readings.extend(r for r in readings if math.isfinite(r.value))
-        if readings:
-            self.read_s = readings[-1].at
+        """Readings that arrived, at clock times."""
+        self._readings.extend(readings)
+        self.read_s = readings[-1].at if readings else self.read_s
 
-    def look(self, now: float, undisturbed_s: float, dosing: bool) -> Sample | None:
+    def look(self, now: float, undisturbed_s: float) -> Sample | None:
         """The sample that is due, None if none is, or the readings for one are not there yet.
 
-        Args: undisturbed_s: clock time from which readings count. dosing: a dose is under way.
+        Args: undisturbed_s: clock time from which readings count.
         """
-        if now < self._due or dosing:
-            return None
-        used = [r for r in self._readings if r.at >= max(undisturbed_s, now - self._config.window_s)]
+        begin = max(undisturbed_s, now - self._config.window_s)
+        used = [r for r in self._readings if r.at >= begin] if now >= self._due else []
         if len(used) < FEWEST:
             return None
         values = np.array([r.value for r in used])

@@ -1,126 +1,163 @@
-"""One unit: its jobs brought up and kept, its samples, its doses, what is wrong with it."""
+"""One unit: its jobs brought up and kept, its samples, its doses, what is wrong with it.
+
+Two clocks: real time for messages and jobs, device time, the run's, for samples. What takes its time is a course: it
+yields pauses, real seconds, in which the other units go on.
+"""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
 
-from hardware.clock import Clock
+from hardware.clock import Clock, ScaledClock
 from hardware.errors import DeviceStateError, LinkError, ReactorError
+from hardware.logbook import Logbook
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.doses import Doses, Plan
-from hardware.pioreactor.jobs import AUTOMATION, HEAT, OD, STIR, flow, gone, request
-from hardware.pioreactor.logbook import Log, Logbook
-from hardware.pioreactor.mailbox import Mailbox, Mqtt
-from hardware.pioreactor.pump_jobs import MEDIA, WASTE
+from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, flow, regulates, request, target_of
+from hardware.pioreactor.mailbox import Cluster, Mailbox
+from hardware.pioreactor.pumps import MEDIA, STEP_S, WASTE, Barrier, Calls, Pumps, Steps, boot_of
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.sampling import Sampling
+from hardware.pioreactor.versions import facts
 from hardware.pioreactor.web import Web
 from hardware.reactor import Fault
 
 __all__ = ["Station"]
 
-GRACE_S = 20.0  # real seconds in which a job that was asked for may come up
-TELL_S = 3.0  # real seconds between two words on the same target
-WEB_STOP_S = 5.0  # real seconds between two stops by HTTP
+T = TypeVar("T")
+
+GRACE_S = 20.0  # in which a job that was asked for may come up; between two attempts at a unit that is in trouble
+TELL_S, TELLS = 3.0, 6  # between two words on the same target; of those before the job is started anew
+SETTLED_S = 2.0  # after which a turbidostat that is wrong has ended
+FRESH = 4.0  # periods of readings in which one that is taken has arrived
 
 
 class Station:
-    """One unit of a cluster. Args: as of `PioreactorReactors`; run: part of every dose's id."""
+    """One unit of a cluster.
 
-    def __init__(
-        self, unit: str, config: PioreactorConfig, mqtt: Mqtt, box: Mailbox, clock: Clock, log: Log,
-        elapsed: Callable[[], float], run: str,
-    ) -> None:  # fmt: skip
-        self.name, self._config, self._mqtt, self._box, self._clock = unit, config, mqtt, box, clock
-        self.web = Web(config.address(unit))
-        self.book = Logbook(unit, config.experiment, log, elapsed)
-        self.doses = Doses(unit, self.web, mqtt, box, config, clock, self.book, run)
-        self.sampling = Sampling(config, clock.now())
-        self.handed_over = math.nan
-        self.given_up, self.heat_is_off, self.news = False, False, False
-        self.fault: Fault | None = None
-        self._target = math.nan
+    Args: config: of this unit. real: clock of messages. run: of this run, part of every id.
+    Attributes: web, book, doses, sampling: its parts; handed_over, OD at which the vendor's turbidostat was started,
+      nan if it was not; up, whether it was brought up.
+    """
+
+    def __init__(self, config: PioreactorConfig, mqtt: Cluster, box: Mailbox, real: Clock, book: Logbook, run: str):
+        self.name, self.book, self._config, self._mqtt, self._box = book.name, book, config, mqtt, box
+        self._real, self._device = real, ScaledClock(real, config.speed)
+        self.web = Web(config.address(self.name), config.experiment)
+        self._pumps = Pumps(self.name, self.web, mqtt, box, config, real, book, run)
+        self.doses = Doses(self._pumps)
+        self.sampling = Sampling(config, self._device.now())
+        self.handed_over = self._target = math.nan
+        self.given_up = self.heat_is_off = self.up = False
+        self._calls = Calls(self.web, real)
+        self._course: Iterator[float] | None = None
+        self._gone, self._been, self._missing = set[str](), set[str](), list[str]()
         self._asked_s: dict[str, float] = {}
-        self._gone, self._been = set[str](), set[str]()
-        self._asked_web_s, self._told_s = -math.inf, math.inf
-        self._tried = False
-        self._web_error = ""
+        self._listed = set[str]()
+        self._told_s, self._tells, self._trouble = math.inf, 0, ""
 
     # -- bringing up -----------------------------------------------------------------------------------------------
 
-    def bring_up(self, history: History) -> None:
-        """Pumps off, calibrations read, jobs adopted or started, an open dose of an earlier life looked for.
+    def bring_up(self, history: History) -> Iterator[float]:
+        """Version and calibrations read, jobs adopted or started, an open dose of an earlier life looked for.
 
         Raises: ReactorError for what no waiting can mend.
         """
         self.handed_over = history.handed_over
-        calibrations = self.web.get("/active_calibrations")
+        self._pumps.facts = facts(str((yield from self._answer(self.web.get, "/versions/app")).get("version")))
+        calibrations = yield from self._answer(self.web.get, "/active_calibrations")
         for job, pump in ((MEDIA, "media_pump"), (WASTE, "waste_pump")):
-            self.doses.flow_ml_s[job] = flow(calibrations, pump, self.name)
-        if self._box.live(AUTOMATION) and math.isnan(self.handed_over):
-            raise DeviceStateError(f"{self.name}: {self._automation()}")
+            self._pumps.flow_ml_s[job] = flow(calibrations, pump)
+        rows = yield from self._answer(self.web.running)
+        self._pumps.boot, self._listed = boot_of(rows), {str(row["job_name"]) for row in rows}
+        if AUTOMATION in self._listed and math.isnan(self.handed_over):
+            raise DeviceStateError("a dosing automation of the vendor's runs, and would dose too; stop it in its page")
         self.doses.restore(history)
-        if not history.open and math.isnan(self.handed_over):
-            self._flush()
-        self.ask_for(OD)
-        if self._config.stirring:
-            self.ask_for(STIR)
+        barrier, deadline = Barrier(self.web, self._real), self._real.now() + GRACE_S
+        while not (history.open or math.isfinite(self.handed_over) or barrier.passed()):
+            if self._real.now() > deadline:
+                huey = "sudo systemctl restart huey"
+                raise LinkError(f"the task queue takes nothing, so a dose would run at any time; on the unit: {huey}")
+            yield STEP_S
         target = history.temperature if math.isfinite(history.temperature) else self._config.temperature
-        if self._config.thermostat:
-            self.set_temperature(target)
-        self.book.note_down("device", device_id=self.name, url=self.web.url, flows=self.doses.flow_ml_s)
+        self._target, self._told_s = target if self._config.thermostat else math.nan, -math.inf
+        for job in self._wanted():
+            if not self._there(job):
+                yield from self._start(job)
+        self.book.log(
+            "device", device_id=self.name, url=self.web.url, flows=self._pumps.flow_ml_s, boot=self._pumps.boot
+        )
+        self.book.log("temperature", temperature=self._target)
+        self.up = True
 
-    def _topic(self, job: str, setting: str) -> str:
-        return f"pioreactor/{self.name}/{self._config.experiment}/{job}/{setting}/set"
+    def lie_down(self, error: ReactorError, history: History) -> None:
+        """It could not be brought up in a run that goes on without it meanwhile: tried again after a while."""
+        self.book.report(Fault("link", str(error), "the others go on, and this one is tried again"))
+        self._course = self._rise(history)
 
-    def _flush(self) -> None:
-        """Prove that the task queue takes what is written down, and that nothing older waits in it.
+    def _rise(self, history: History) -> Iterator[float]:
+        again = self._real.now() + GRACE_S
+        while self._real.now() < again:
+            yield STEP_S
+        try:
+            yield from self.bring_up(history)
+        except ReactorError as error:
+            self.lie_down(error, history)
 
-        Raises: LinkError if it does not.
-        """
-        task, deadline = self.web.run(MEDIA, {"help": None}, self.book.env, []), self._now_in(GRACE_S)
-        while self.web.result(task) is None:
-            if self._clock.now() > deadline:
-                raise LinkError(
-                    f"{self.name}: the task queue takes nothing, so a dose would run at any later time; on the unit: "
-                    "sudo systemctl restart huey"
-                )
-            self._clock.sleep(0.2 * self._config.speed)
+    def _answer(self, what: Callable[..., T], *given: Any) -> Steps[T]:
+        """Wait for a request while the other units go on. Raises: as the request."""
+        future = self.web.ask(what, *given)
+        while not future.done():
+            yield STEP_S
+        return future.result()
 
-    def _now_in(self, real_s: float) -> float:
-        return self._clock.now() + real_s * self._config.speed
-
-    def ask_for(self, job: str) -> None:
-        """Start one of the vendor's jobs unless it is there. Raises: ReactorError."""
-        if self._box.live(job):
-            return
-        options, overrides = request(job, self._config, self._target, self.handed_over)
-        if self._box.lost(job):  # the vendor still counts a killed job as running, and would refuse another
-            self.web.post(f"/jobs/stop?job_name={job}")
-        self.web.run(job, options, self.book.env, overrides)
-        self._asked_s[job] = self._clock.now()
-        self.book.note_down("command", job=job, options=options)
+    def _start(self, job: str) -> Iterator[float]:
+        """Ask for one of the vendor's jobs. Raises: ReactorError."""
+        options, overrides = request(job, self._config, self._pumps.facts, self._target, self.handed_over)
+        yield from self._answer(self.web.run, job, options, overrides)
+        self._asked_s[job] = self._real.now()
+        self.book.log("command", job=job, options=options)
 
     # -- what happens ----------------------------------------------------------------------------------------------
 
     def go_on(self) -> None:
-        """Take in what the unit said, and go on with a dose."""
-        readings, events = self._box.drain()
-        self.sampling.take(readings)
+        """Take in what the unit said, and go on with a dose and what else is under way."""
+        course = self._course
+        if course is not None and next(course, None) is None and self._course is course:
+            self._course = None
+        if not self.up and not self._pumps.halted:
+            return
+        readings, events, ignored = self._box.drain()
+        for note in ignored:
+            self.book.tell(note)
+        self.sampling.take([r._replace(at=r.at * self._config.speed) for r in readings])
         self.doses.take(events)
         self.doses.work()
+        if not self.up:
+            return
+        if rows := self._calls.ask("rows", GRACE_S / 2.0, self.web.running):
+            self._listed = {str(row["job_name"]) for row in rows[0]}
+            if self._pumps.rebooted(rows[0]) and not self.doses.running:
+                self._pumps.boot = boot_of(rows[0])
+                self.book.log("device", device_id=self.name, url=self.web.url, boot=self._pumps.boot)
+        if any(pin.doubt_s > -math.inf for pin in self._box.pins.values()) and self._calls.due("pins", TELL_S):
+            self._pumps.ask_pins()
+        self._missing = [job for job in self._wanted() if self._is_gone(job)] if self._mqtt.connected else []
         self._steer()
 
     def poll(self) -> bool:
-        """Go on; whether there is a new sample, which whoever asked has to act on."""
+        """Go on. True if there is a new sample; the caller must act on it."""
         self.go_on()
-        undisturbed_s = self.doses.ended_s + self._config.mix_s * (self.doses.ended_s > 0.0)
-        dosing = self.doses.running and not self.doses.at_rest  # a dose in doubt may take hours to be known
-        found = self.sampling.look(self._clock.now(), undisturbed_s, dosing)
-        self._judge()
+        if not self.up:
+            return False
+        undisturbed_s = (self.doses.ended_s * self._config.speed) + self._config.mix_s
+        dosing = self.doses.running and not self._pumps.waits  # a dose in doubt may take hours to be known
+        found = None if dosing else self.sampling.look(self._device.now(), undisturbed_s)
+        self.book.report(self._wrong())
         if found is None:
             return False
-        age = self._clock.now() - found.at
-        self.book.note_down(
+        age = self._device.now() - found.at
+        self.book.log(
             "sample", sample_s=round(self.book.elapsed() - age, 3), od=found.od, spread=found.spread,
             readings=found.number, temperature=self._box.temperature,
         )  # fmt: skip
@@ -136,33 +173,26 @@ class Station:
         """Of the newest sample, None before the first."""
         return (round(self.sampling.newest.at, 3), self.sampling.count) if self.sampling.count else None
 
-    def _judge(self) -> None:
-        """What is wrong now."""
-        fault = self._wrong()
-        if (fault and fault.kind) != (self.fault and self.fault.kind):
-            self.news = True
-            self.book.note_down("fault", fault=str(fault) if fault else "none")
-        self.fault = fault
-
     def _wrong(self) -> Fault | None:
+        """What is wrong now."""
         if not self._mqtt.connected:
             return Fault("link", "no MQTT broker", "the leader is off or its network is; doses wait")
-        if self.doses.trouble:
-            return Fault("pump", self.doses.trouble, "nothing is dosed until that is known")
+        if self._pumps.trouble:
+            return Fault("pump", self._pumps.trouble, "nothing is dosed until that is known")
         if other := self._mqtt.holder(self.name):
             who, _, done = other.partition("; ")
             return Fault("mode", who, done)
         if self._box.live(AUTOMATION) and math.isnan(self.handed_over):
             return Fault("mode", "a dosing automation runs", "stop it in the vendor's page")
-        if not self.doses.running and self._box.running_pins(self._config.pump_pins) and math.isnan(self.handed_over):
-            return Fault("pump", "a pump runs without our command", self.doses.locks)
         if self.doses.foreign and math.isnan(self.handed_over):
             return Fault("mode", self.doses.foreign, "one client per unit; it is counted")
-        if missing := [job for job in self._wanted() if self._is_gone(job)]:
-            remedy = "asked for again; one that was killed bars its successor: reboot the unit"
-            return Fault("stopped", gone(missing[0]), remedy)
-        if self._web_error:
-            return Fault("link", self._web_error, "check the unit's web server")
+        if self._missing:
+            forget, job = self._pumps.facts.forget, self._missing[0]
+            word = f"{forget} --job-name {job}" if forget else "reboot it"
+            remedy = f"asked for again; a killed job blocks restarts, on the unit: {word}"
+            return Fault("stopped", f"the unit {GONE[job]}", remedy)
+        if self._trouble:
+            return Fault("link", self._trouble, "check the unit's web server")
         return None
 
     def _wanted(self) -> list[str]:
@@ -171,135 +201,145 @@ class Station:
         wanted = {OD: True, STIR: self._config.stirring, HEAT: heated, AUTOMATION: math.isfinite(self.handed_over)}
         return [job for job, it_is in wanted.items() if it_is]
 
+    def _there(self, job: str) -> bool:
+        """Whether a job is there: by its own word; readings, by what they bring; else by the unit's list.
+
+        A job that goes on over a restart of the broker may never say so again.
+        """
+        longest_s = FRESH * self._config.reading_s * self._config.speed
+        if job == OD and self.sampling.count and self._device.now() < self.sampling.read_s + longest_s:
+            return True
+        state = self._box.state(job)
+        known = state.at > -math.inf or not state.word
+        return self._box.live(job) if state.word and known else job in self._listed
+
     def _is_gone(self, job: str) -> bool:
         """Whether a job should run and does not: readings stopped in whatever way; others killed, or never there.
 
         It is asked for again, and again; until it is there it is gone. What somebody stopped in the vendor's page stays
         stopped.
         """
-        if self._box.live(job):
+        if self._there(job):
             self._gone.discard(job)
             self._been.add(job)
             return False
-        due = self._asked_s.get(job, -math.inf) + GRACE_S * self._config.speed
-        if (job == OD or job not in self._been or self._box.lost(job)) and self._clock.now() > due:
+        due = self._asked_s.get(job, -math.inf) + GRACE_S
+        stopped = self._box.state(job).word == "disconnected" and job in self._been
+        if (job == OD or not stopped) and self._real.now() > due:
             self._gone.add(job)
-            self._again(job)
+            self._asked_s[job] = self._real.now()
+            self._course = self._course or self._again(job)
         return job in self._gone
 
-    def _again(self, job: str) -> None:
+    def _again(self, job: str) -> Iterator[float]:
         try:
-            self.ask_for(job)
-            self._web_error = ""
+            yield from self._start(job)
+            self._trouble = ""
         except ReactorError as error:
-            self._web_error, self._asked_s[job] = str(error), self._clock.now()
-
-    @staticmethod
-    def _automation() -> str:
-        return "a dosing automation of the vendor's runs, which would dose beside us; stop it in the vendor's page"
+            self._trouble = str(error)
 
     # -- commands --------------------------------------------------------------------------------------------------
 
-    def dose(self, rate: float) -> Plan:
+    def dose(self, rate: float, _pump: int) -> Plan:
         """Begin the dose for the newest sample. Raises: ValueError; what the journal raises."""
         refusal = ""
         if self.given_up:
             refusal = "the unit was given up"
         elif math.isfinite(self.handed_over):
             refusal = "the unit regulates itself"
-        elif self.fault is not None:
-            refusal = str(self.fault)
-        elif self._clock.now() - self.sampling.newest.at > self._config.stale_s:
+        elif self.book.fault is not None:
+            refusal = str(self.book.fault)
+        elif self._device.now() - self.sampling.newest.at > self._config.stale_s:
             refusal = "its sample is stale"
         plan = self.doses.begin(rate, self.key, refusal)
         self.doses.foreign = ""
         return plan
 
     def set_temperature(self, target: float) -> None:
-        """Thermostat to a target, degC; nan leaves it. Trouble becomes a note."""
+        """Thermostat to a target, degC; nan leaves it."""
         if not math.isfinite(target) or not self._config.thermostat or self.heat_is_off or target == self._target:
             return
-        self._target, self._told_s = target, -math.inf
-        self.book.note_down("temperature", temperature=target)
-        try:
-            self.ask_for(HEAT)
-        except ReactorError as error:
-            self._target = math.nan
-            self.book.tell(f"thermostat: {error}")
+        self._target, self._told_s, self._tells = target, -math.inf, 0
+        self.book.log("temperature", temperature=target)
 
     def _steer(self) -> None:
-        """Tell the thermostat its target until it says it: what is told while it starts is not heard."""
-        if not self._told_s < math.inf or not self._box.live(HEAT):
+        """Tell the thermostat its target until it says it: what is told while it starts is not heard.
+
+        One that goes on over a restart of the broker may hear nothing any more: it is then started anew.
+        """
+        if not self._told_s < math.inf or not self._there(HEAT) or self.heat_is_off:
             return
         if self._box.target == self._target:
-            self._told_s = math.inf
-        elif self._clock.now() > self._told_s + TELL_S * self._config.speed:
-            self._told_s = self._clock.now()
-            self._mqtt.publish(self._topic(HEAT, "target_temperature"), str(self._target))
+            self._told_s, self._tells = math.inf, 0
+        elif self._real.now() > self._told_s + TELL_S:
+            self._told_s, self._tells = self._real.now(), self._tells + 1
+            self._pumps.say(f"{HEAT}/target_temperature/set", str(self._target))
+        if self._tells > TELLS and self._calls.ask("deaf", GRACE_S, self.web.stop, HEAT):
+            self._tells = 0
+            self._listed.discard(HEAT)
 
-    def pumps_off(self, real_s: float) -> None:
-        """Every dosing job ended and every pump off, by MQTT first, then by HTTP, verified.
+    def pumps_off(self, real_s: float, final: bool = False) -> Iterator[float]:
+        """Course: every pump off, verified; a dose under way is cut. Args: final: what empties a vial is cut, too.
 
-        A dose under way is stopped and followed to its end. Raises: DeviceStateError, LinkError.
+        Raises: DeviceStateError naming what is not verified off.
         """
-        deadline, self.doses.stopped_s = self._now_in(real_s), self._clock.now()
-        while True:
-            self.go_on()
-            if self._mqtt.connected and self.doses.off() and (self.doses.at_rest or not self.doses.running):
-                break
-            if self._clock.now() > deadline:
-                raise DeviceStateError(self._still_on())
-            if not self.doses.off() or not self._mqtt.connected:
-                self._stop()
-            self._clock.sleep(0.3 * self._config.speed)
-
-    def _stop(self) -> None:
-        """By MQTT every time; by HTTP, which costs the unit two processes, seldom."""
-        self.doses.cycle_pins()
-        if not self.doses.stop_jobs() and not self._tried:
-            self._tried, self._asked_web_s = True, self._clock.now()  # MQTT first
-        elif self._clock.now() > self._asked_web_s + WEB_STOP_S * self._config.speed:
-            self._asked_web_s = self._clock.now()
-            try:
-                self.doses.stop_by_web()
-            except ReactorError as error:
-                self.book.tell(f"stop: {error}")
-
-    def _still_on(self) -> str:
-        pins = self._box.running_pins(self._config.pump_pins)
-        seen = f"pin {pins[0]} on" if pins else ("not verified off" if self._mqtt.connected else "no broker to ask")
-        return f"pumps of {self.name}: {seen}; pull the plug of its pumps. {self.doses.locks}"
-
-    def give_up(self) -> None:
-        """No dose in this run any more, by us or by the vendor's turbidostat. Raises: as `pumps_off`."""
-        self.given_up, self.handed_over = True, math.nan
-        if self._box.live(AUTOMATION):
-            self._mqtt.publish(
-                f"pioreactor/{self.name}/{self._config.experiment}/{AUTOMATION}/$state/set", "disconnected"
-            )
-        self.pumps_off(3.0)
-
-    def heat_off(self) -> None:
-        """Thermostat ended for the rest of the run. Raises: DeviceStateError."""
-        self.heat_is_off = True
-        self._mqtt.publish(self._topic(HEAT, "$state"), "disconnected")
-        deadline = self._now_in(5.0)
-        while self._box.live(HEAT):
-            if self._clock.now() > deadline:
-                raise DeviceStateError("the thermostat does not end; stop it in the vendor's page")
-            self._clock.sleep(0.2 * self._config.speed)
-
-    def regulate(self, setpoint: float) -> None:
-        """Hand over to the vendor's turbidostat for good. Raises: ReactorError if it does not come up."""
-        self.pumps_off(self._config.stop_s)
-        self.handed_over = setpoint
+        deadline, pumps, box = self._real.now() + real_s, self._pumps, self._box
+        pumps.cut, pumps.halted = True, final
         try:
-            self.ask_for(AUTOMATION)
-            deadline = self._now_in(GRACE_S)
-            while not self._box.live(AUTOMATION):
-                if self._clock.now() > deadline:
-                    raise DeviceStateError("the vendor's turbidostat does not start; look at its log")
-                self._clock.sleep(0.2 * self._config.speed)
+            while (
+                not self._mqtt.connected or self.doses.running or box.on()
+                or any(box.live(job) or pumps.odd(job) for job in (MEDIA, WASTE))
+            ):  # fmt: skip
+                if self._real.now() > deadline or (pumps.trouble and not final):
+                    seen = f"pin {box.on()[0]} on" if box.on() else "not verified off"
+                    why = (pumps.trouble or pumps.locks) if self._mqtt.connected else "no broker to ask"
+                    raise DeviceStateError(f"pumps of {self.name}: {seen}; pull the plug of its pumps. {why}")
+                self.go_on()
+                yield STEP_S
+        finally:
+            pumps.cut = final
+
+    def give_up(self) -> Iterator[float]:
+        """Course: no dose in this run any more, by us or by the vendor's turbidostat. Raises: as `pumps_off`."""
+        self.given_up, self.handed_over = True, math.nan
+        if self._there(AUTOMATION):
+            yield from self._end_job(AUTOMATION)
+        yield from self.pumps_off(self._config.stop_s, final=True)
+
+    def heat_off(self) -> Iterator[float]:
+        """Course: thermostat ended for the rest of the run. Raises: DeviceStateError."""
+        self.heat_is_off = True
+        yield from self._end_job(HEAT)
+
+    def _end_job(self, job: str) -> Iterator[float]:
+        """One of the vendor's jobs ended, by MQTT and by HTTP. Raises: DeviceStateError if it goes on."""
+        deadline = self._real.now() + 8.0
+        while self._box.live(job):
+            if self._real.now() > deadline:
+                raise DeviceStateError(f"{job} of {self.name} does not end; stop it in the vendor's page")
+            if self._calls.due(f"end {job}", 1.0):
+                self._pumps.say(f"{job}/$state/set", "disconnected")
+            self._calls.ask(f"stop {job}", 4.0, self.web.stop, job)
+            yield STEP_S
+
+    def regulate(self, setpoint: float) -> Iterator[float]:
+        """Course: handed over to the vendor's turbidostat for good, once it says that it regulates at this setpoint.
+
+        Raises: ReactorError if it does not come up.
+        """
+        yield from self.pumps_off(self._config.stop_s)
+        self.handed_over, asked = setpoint, target_of(self._config, self._pumps.facts, setpoint)
+        try:
+            yield from self._start(AUTOMATION)
+            deadline, ready_s, settings = self._real.now() + GRACE_S, math.inf, None
+            while not (self._real.now() > ready_s + SETTLED_S and regulates(settings, asked)):
+                if self._real.now() > deadline:
+                    raise DeviceStateError("the vendor's turbidostat does not regulate; look at its log")
+                ready = self._box.state(AUTOMATION).word == "ready"
+                ready_s = min(ready_s, self._real.now()) if ready else math.inf
+                if said := self._calls.ask("settings", 0.5, self.web.get, f"/jobs/settings/job_name/{AUTOMATION}"):
+                    settings = said[0]
+                yield STEP_S
         except ReactorError:
             self.handed_over = math.nan
             raise

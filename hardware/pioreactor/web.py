@@ -1,51 +1,63 @@
-"""The vendor's HTTP interface of one unit: what was said, and whether it can have been heard."""
+"""The vendor's HTTP interface of one unit or leader: what was said, and whether it can have been heard."""
 
 import json
-import time
-import urllib.error
-import urllib.request
-from datetime import datetime
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import httpx
 
 from hardware.errors import LinkError, ProtocolError
+from hardware.link.http import fetch
 
 __all__ = ["NotHeard", "Web"]
 
+T = TypeVar("T")
+
+OVER = ("complete", "succeeded", "failed")  # states of a task that was taken and is over, in whatever version
+
 
 class NotHeard(LinkError):
-    """A request that certainly was not carried out: nobody listened, or it was turned away."""
+    """A request that certainly was not carried out: nobody was reached, or it was turned away."""
 
 
 class Web:
-    """`/unit_api` of one unit. Args: url: e.g. http://pio01.local. timeout_s: of one request."""
+    """`/unit_api` of one unit. Its requests wait on a thread of their own, one after another.
 
-    def __init__(self, url: str, timeout_s: float = 4.0) -> None:
+    Args: url: e.g. http://pio01.local. experiment: that jobs run in.
+    """
+
+    def __init__(self, url: str, experiment: str = "", timeout_s: float = 4.0) -> None:
         self.url, self._timeout_s = url, timeout_s
+        self._env = {"EXPERIMENT": experiment, "JOB_SOURCE": "turbidostat"}
+        headers = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
+        self._client = httpx.Client(trust_env=False, timeout=timeout_s, headers=headers)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix=f"web {url}")
 
-    def get(self, path: str) -> Any:
+    def ask(self, what: Callable[..., T], *given: Any) -> "Future[T]":
+        """Begin one of the calls below and wait elsewhere."""
+        return self._pool.submit(what, *given)
+
+    def get(self, path: str, below: str = "/unit_api") -> Any:
         """The answer's content. Raises: LinkError, ProtocolError."""
-        return self._request("GET", path, None)
+        return self.send("GET", path, None, below)
 
-    def post(self, path: str, body: dict[str, Any] | None = None) -> Any:
-        """The answer's content; 202 says only that it was written down.
-
-        Raises: NotHeard when it cannot have been carried out; other LinkError and ProtocolError when that is unknown.
-        """
-        return self._request("POST", path, body or {})
-
-    def run(self, job: str, options: dict[str, Any], env: dict[str, str], overrides: list[list[str]]) -> str:
-        """Ask for a job; returns the task's id. Raises: as `post`."""
-        body = {"options": options, "args": [], "env": env, "config_overrides": overrides}
-        answer = self.post(f"/jobs/run/job_name/{job}", body)
+    def run(self, job: str, options: Mapping[str, Any], overrides: Sequence[Sequence[str]] = ()) -> str:
+        """Ask for a job; returns the task's id. Raises: as `send`."""
+        body = {"options": options, "args": [], "env": self._env, "config_overrides": overrides}
+        answer = self.send("POST", f"/jobs/run/job_name/{job}", body)
         if not (isinstance(answer, dict) and isinstance(answer.get("task_id"), str)):
             raise ProtocolError(f"{self.url}: answered {str(answer)[:60]} to {job}, expected a task_id")
         return str(answer["task_id"])
 
-    def result(self, task: str) -> bool | None:
-        """Whether the process that a task began may be there; False: it was over within half a second; None: it waits.
+    def stop(self, job: str) -> None:
+        """Ask a job to end; one version reads the query, the other the body. Raises: as `send`."""
+        self.send("POST", f"/jobs/stop?job_name={job}", {"job_name": job})
 
-        An answer is given once: a second question is answered as if it still waited. A task that failed may have begun
-        its process. Raises: LinkError, ProtocolError.
+    def result(self, task: str) -> bool | None:
+        """Whether the process that a task began may be there; False: it is over and failed; None: the task waits.
+
+        Some versions give the answer once, and then as if the task still waited. Raises: LinkError, ProtocolError.
         """
         try:
             answer = self.get(f"/task_results/{task}")
@@ -53,11 +65,14 @@ class Web:
             if "status 500" in str(error):
                 return True
             raise
-        done = isinstance(answer, dict) and answer.get("status") == "complete"
-        return bool(answer["result"]) if done else None
+        if not (isinstance(answer, dict) and answer.get("status") in OVER):
+            return None
+        result = answer.get("result")
+        result = result.get("ok") if isinstance(result, dict) else result
+        return answer["status"] != "failed" and result is not False
 
     def running(self) -> list[dict[str, Any]]:
-        """The vendor's list of running jobs; one whose process was killed is in it for ever.
+        """The vendor's list of running jobs; one whose process was killed stays in it.
 
         Raises: LinkError, ProtocolError.
         """
@@ -66,29 +81,31 @@ class Web:
             raise ProtocolError(f"{self.url}: {str(jobs)[:60]} is no list of jobs")
         return jobs
 
-    def clock_error_s(self) -> float:
-        """The unit's clock minus ours, s. Raises: ReactorError."""
-        said = str(self.get("/health").get("utc_time", ""))
-        try:
-            return datetime.fromisoformat(said.replace("Z", "+00:00")).timestamp() - time.time()
-        except ValueError:
-            raise LinkError(f"{self.url}: {said!r} is no time") from None
+    def send(self, method: str, path: str, body: Mapping[str, Any] | None, below: str = "/unit_api") -> Any:
+        """The answer's content; 202 to POST or PATCH says only that it was written down.
 
-    def _request(self, method: str, path: str, body: dict[str, Any] | None) -> Any:
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(f"{self.url}/unit_api{path}", data, method=method)
-        request.add_header("Content-Type", "application/json")
+        Raises: NotHeard when it cannot have been carried out; other LinkError and ProtocolError when that is unknown.
+        """
+        url, content = f"{self.url}{below}{path}", None if body is None else json.dumps(body).encode()
         try:
-            with urllib.request.urlopen(request, timeout=self._timeout_s) as answer:
-                return json.loads(answer.read() or b"null")
-        except urllib.error.HTTPError as error:
-            error.close()
-            if 400 <= error.code < 500:
-                raise NotHeard(f"{self.url}{path}: turned away with status {error.code}") from None
-            raise ProtocolError(f"{self.url}{path}: status {error.code}") from None
-        except urllib.error.URLError as error:
-            kind = NotHeard if isinstance(error.reason, ConnectionRefusedError) else LinkError
-            raise kind(f"{self.url}: {error.reason}; check power, network and backend.addresses") from None
-        except (OSError, ValueError) as error:
-            kind_of = ProtocolError if isinstance(error, ValueError) else LinkError
-            raise kind_of(f"{self.url}{path}: {error or type(error).__name__}") from None
+            status, said, _ = fetch(self._client, method, url, self._timeout_s, content)
+        except LinkError as error:
+            if isinstance(error.__cause__, httpx.ConnectError | httpx.ConnectTimeout):
+                raise NotHeard(str(error)) from error
+            raise
+        try:
+            answer = json.loads(said or b"null")
+        except (ValueError, RecursionError):
+            answer = said[:400].decode("utf-8", "replace")
+            if status < 300:
+                raise ProtocolError(f"{url}: not JSON: {answer[:60]!r}") from None
+        if status < 300:
+            return answer
+        reason = answer.get("error", answer) if isinstance(answer, dict) else answer
+        text = f"{url}: status {status}: {' '.join(str(reason).split())[:160]}"
+        raise NotHeard(text) if 400 <= status < 500 else ProtocolError(text)
+
+    def close(self) -> None:
+        """Idempotent; a request that hangs is left to its time-out."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._client.close()

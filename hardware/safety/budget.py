@@ -15,12 +15,18 @@ __all__ = ["FeedBudget"]
 class FeedBudget:
     """Feed of N reactors over the last minute, the last hour and the run, and the volume it leaves in the vial.
 
+    Args: tube_ml, full_ml: level that the waste tube keeps, and more than which is an overflow, mL, shape (N,); None:
+      as configured for all.
     Attributes: fed_ml, since the run began; volume_ml, in the vial by this ledger; both of shape (N,).
     """
 
-    def __init__(self, n: int, config: SafetyConfig) -> None:
+    def __init__(
+        self, n: int, config: SafetyConfig, tube_ml: Array | None = None, full_ml: Array | None = None
+    ) -> None:
         self._config = config
-        self.volume_ml = np.full(n, config.volume_ml)
+        self._tube_ml = np.full(n, config.volume_ml) if tube_ml is None else tube_ml
+        self._full_ml = np.full(n, config.max_volume_ml) if full_ml is None else full_ml
+        self.volume_ml = self._tube_ml.copy()
         self.fed_ml = np.zeros(n)
         self._hour = np.zeros((n, 60))  # feed per minute of the hour
         self._minute = np.full(n, -1.0)  # minute of the newest entry of _hour
@@ -61,7 +67,7 @@ class FeedBudget:
         return {
             "budget": np.minimum.reduce(left),
             "bottle": c.bottle_ml - self.fed_ml,
-            "overflow": c.max_volume_ml - self.volume_ml,
+            "overflow": self._full_ml - self.volume_ml,
         }
 
     def _roll(self, now: float) -> None:
@@ -91,7 +97,7 @@ class FeedBudget:
         for mine, new in ((self._dose_s, np.full(len(feed), now)), (self._dose_ml, feed)):
             mine[dosed] = np.column_stack([mine[dosed, 1:], new[dosed]])
         self._owed_ml = np.where(dosed, 0.0, self._owed_ml)
-        level = np.maximum(self.volume_ml + feed - waste, self._config.volume_ml)
+        level = np.maximum(self.volume_ml + feed - waste, self._tube_ml)
         self.volume_ml = np.where(waste != 0.0, level, self.volume_ml + feed)
 
     def state(self) -> dict[str, Array]:

@@ -142,9 +142,15 @@ class SafetyConfig:
     ml_per_hour: float = setting(75.0, "feed budget", "mL", above=0.0, below=math.inf)
     ml_per_run: float = setting(10000.0, "feed budget", "mL", above=0.0, below=math.inf)
     bottle_ml: float = setting(2000.0, "fresh medium at the start, per reactor", "mL", above=0.0, below=math.inf)
-    volume_ml: float = setting(20.0, "level the waste tube keeps", "mL", within=(10, 30))
+    volume_ml: float = setting(
+        20.0, "level the waste tube keeps; of Pioreactors backend.volume_ml", "mL", within=(10, 30)
+    )
     max_volume_ml: float = setting(
-        25.0, "more than this is an overflow (the vial holds 30); volume_ml or more", "mL", at_most=30.0
+        25.0,
+        "more than this is an overflow (the vial holds 30); volume_ml or more; of Pioreactors as much more than "
+        "theirs, and at most the vendor's limit",
+        "mL",
+        at_most=30.0,
     )
     max_setpoint: float = setting(1.5, "a larger setpoint is a typing error", "OD", within=(0.05, 4))
     od_min: float = setting(-0.1, "readings below are impossible", "OD")

@@ -52,14 +52,17 @@ class Verdict:
 class Interlock:
     """Stands between controllers and pumps of N reactors: asks its five parts, then concludes.
 
+    Args: tube_ml, full_ml: of each vial, as of `FeedBudget`, where they differ from the config's.
     Attributes: budget, the ledger of feed and level.
     """
 
-    def __init__(self, n: int, config: SafetyConfig | None = None) -> None:
+    def __init__(
+        self, n: int, config: SafetyConfig | None = None, tube_ml: Array | None = None, full_ml: Array | None = None
+    ) -> None:
         self.n, self.config = n, config or SafetyConfig()
-        self.budget = FeedBudget(n, self.config)
+        self.budget = FeedBudget(n, self.config, tube_ml, full_ml)
         self._readings = Readings(n, self.config)
-        self._change = UnexplainedChange(n, self.config)
+        self._change = UnexplainedChange(n, self.config, tube_ml)
         self._heat = Heat(n, self.config)
         self._light = Light(n, self.config)
         self._parts = (self.budget, self._readings, self._change, self._heat, self._light)

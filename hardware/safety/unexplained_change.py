@@ -22,8 +22,8 @@ class UnexplainedChange:
     setpoint is reached, or OD falls after all.
     """
 
-    def __init__(self, n: int, config: SafetyConfig) -> None:
-        self._config = config
+    def __init__(self, n: int, config: SafetyConfig, tube_ml: Array | None = None) -> None:
+        self._config, self._tube_ml = config, np.full(n, config.volume_ml) if tube_ml is None else tube_ml
         self._od, self._at = np.full(n, math.nan), np.full(n, math.nan)  # newest believed reading and its minute
         self._since_ml, self._since_low_ml = np.zeros(n), np.zeros(n)  # dosed since then, at most and at least
         self._suspect, self._suspect_at = np.full(n, math.nan), np.full(n, math.nan)  # newest reading after a step
@@ -84,7 +84,7 @@ class UnexplainedChange:
         c = self._config
         tolerance = np.maximum(c.jump, c.jump_fraction * np.abs(od))
         base = np.maximum(od, 0.0)
-        low = base * np.exp(-c.gain_max * self._since_ml / c.volume_ml - c.death * minutes) - tolerance
+        low = base * np.exp(-c.gain_max * self._since_ml / self._tube_ml - c.death * minutes) - tolerance
         high = base * np.exp(np.minimum(c.mu_max * minutes, 5.0)) + tolerance
         return low, high
 
@@ -101,11 +101,11 @@ class UnexplainedChange:
             usual = usual & (od > 0.05) & (self._od > 0.05)
             dt = np.where(usual, np.maximum(t - self._at, 1e-3), 1.0)
             x = np.where(usual, np.log(np.where(usual, od / self._od, 1.0)), 0.0)
-        d, least = self._since_ml / c.volume_ml, self._since_low_ml / c.volume_ml
+        d, least = self._since_ml / self._tube_ml, self._since_low_ml / self._tube_ml
         cap = np.minimum(c.mu_max, self._mu + 0.01)
         rise = np.where(least > 0.0, x - cap * dt + c.gain_min * least, np.minimum(x - c.mu_max * dt, 0.0))
         fall = -x - c.gain_max * d - c.death * dt
-        full = least / dt >= 0.8 * c.max_rate * 60.0 / c.volume_ml
+        full = least / dt >= 0.8 * c.max_rate * 60.0 / self._tube_ml
         excess = np.where(usual, np.maximum(self._excess + rise, 0.0), self._excess)
         deficit = np.where(usual, np.maximum(self._deficit + fall, 0.0), self._deficit)
         futile = np.where(full, np.maximum(self._futile + x + 0.004 * dt, 0.0), 0.0)

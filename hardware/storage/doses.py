@@ -1,6 +1,7 @@
 """What the journal says of doses, in the rows of every family: what each gave, and what was repeated of it.
 
-`intent` before a dose, `feed_on` before its pump is switched on or asked for, `dose_end` after it.
+`intent` before a dose, `feed_on` before its pump is switched on or asked for, `dose_end` after it, `given` for what
+was dosed beside.
 """
 
 from __future__ import annotations
@@ -136,7 +137,7 @@ def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
     """
     ledger = _Ledger()
     for row in rows:
-        if row.get("kind") in ("intent", "feed_on", "dose_end"):
+        if row.get("kind") in ("intent", "feed_on", "dose_end", "given"):
             try:
                 ledger.take(row)
             except (KeyError, TypeError, ValueError) as error:
@@ -161,6 +162,9 @@ class _Ledger:
             self._begun[name] = Dosed(row["n"], name, float(row["on_s"]), *volumes, pump=number)
         elif kind == "feed_on" and name in self._begun:
             self.given[self._begun[name].n] = self._begun[name]
+        elif kind == "given":  # beside our doses
+            volumes = float(row["feed_ml"]), float(row["waste_ml"])
+            self.repeated.append(Dosed(row["n"], name, float(row["at_s"]), *volumes, again=True))
         elif kind == "dose_end" and "feed_times" in row:
             ending = Ending.of_row(row)
             dose = self._begun.pop(name, None)

@@ -10,7 +10,6 @@ from experiments.control.loop import ClosedLoop, Step
 from experiments.controllers.base import Array, Mask
 from experiments.reliability.rehearsal import SOUND
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Log
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.clock import VirtualClock
@@ -18,6 +17,7 @@ from hardware.emulator.device import ChiBioDevice, DeviceOptions
 from hardware.emulator.faults import inject
 from hardware.emulator.transport import EmulatorTransport
 from hardware.link.transport import Reply, SwitchedOff, Transport
+from hardware.logbook import Log
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
 

@@ -10,11 +10,11 @@ import pytest
 
 from hardware.clock import RealClock
 from hardware.errors import DeviceStateError
-from hardware.pioreactor.config import RigBackendConfig
+from hardware.pioreactor.config import PUBLISHED, RigBackendConfig, RigConfig, UnitConfig
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay
-from hardware.pioreactor.rig.build import PUBLISHED, environment, home, missing
-from hardware.pioreactor.rig.processes import Rig, RigConfig
+from hardware.pioreactor.rig.build import environment, home, missing
+from hardware.pioreactor.rig.processes import Rig
 from hardware.pioreactor.versions import facts
 from hardware.reactor import Command
 from hardware.storage.journal import Journal
@@ -41,9 +41,10 @@ class Bench:
     """One unit in the rig, and lives of the driver that end without a word and go on from the journal."""
 
     def __init__(self, folder: Path, package: str = PUBLISHED, **values: Any) -> None:
-        self.rig = Rig((UNIT,), RigConfig(package=package, growth_x=1.0, od=0.5))
+        self.rig = Rig({UNIT: 20.0}, RigConfig(package=package, od=0.5))
         self.folder, self.run = folder, f"test{time.time():.0f}"
-        where = {"broker": "127.0.0.1", "broker_port": self.rig.broker, "addresses": dict(self.rig.web)}
+        where: dict[str, Any] = {"broker": "127.0.0.1", "broker_port": self.rig.broker, "leader": self.rig.web[UNIT]}
+        where["units"] = {UNIT: UnitConfig(address=self.rig.web[UNIT])}
         self.config = RigBackendConfig(reactors=(UNIT,), **{"speed": 5.0, **where, **values})
         try:
             self.live()
@@ -54,7 +55,7 @@ class Bench:
     def live(self) -> None:
         """A life of the driver, the first or the next."""
         self.journal = Journal(self.folder / "journal.jsonl")
-        self.reactors = PioreactorReactors(self.config, RealClock(self.config.speed), self.journal.append, self.run)
+        self.reactors = PioreactorReactors(self.config, RealClock(), self.journal.append, self.run)
         self.reactors.begin(replay(self.journal.rows), 1e4 * self.journal.next_row)
         self.station = self.reactors.stations[0]
 
@@ -72,7 +73,7 @@ class Bench:
         until = time.monotonic() + real_s
         while time.monotonic() < until:
             if self.reactors.measure().fresh[0]:
-                if self.station.fault is None:
+                if self.station.book.fault is None:
                     return True
                 self.dose(0.0)  # as the loop does with every sample
         return False

@@ -12,11 +12,11 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.dose_sequence import DoseSequence
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration
-from hardware.chibio.logbook import Logbook
 from hardware.chibio.resume import ReactorHistory, remember
 from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 from hardware.link.transport import Reply, Transport
+from hardware.logbook import Logbook
 from tests.hardware.script import DONE, answer, state
 
 OFFS = [f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 2, 3, 4)]

@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Connection, no_log
+from hardware.chibio.connection import Connection
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.preflight import preflight
 from hardware.chibio.reactors import ChiBioReactors
@@ -28,6 +28,7 @@ from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorE
 from hardware.link.http import HttpTransport
 from hardware.link.open import open_transport
 from hardware.link.transport import Reply, TransportConfig
+from hardware.logbook import no_log
 from hardware.reactor import Command
 from tests.hardware.driver_lab import DriverLab
 from tests.hardware.script import answer, state

@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 
 from envs.plant.plant import Plant
-from hardware.pioreactor.rig.files import LOGIN
-from hardware.pioreactor.rig.processes import Rig, RigConfig
+from hardware.pioreactor.config import RigConfig, vial_ml
+from hardware.pioreactor.rig.files import LOGIN, flows
+from hardware.pioreactor.rig.processes import Rig
 from hardware.pioreactor.rig.vials import HEATER, MEDIA, _Vial, vial_preset
 from hardware.pioreactor.versions import TESTED, Facts, facts
 from tests.hardware.pioreactor_bench import EACH_ML, PACKAGES, UNIT, need_the_rig
@@ -41,7 +42,7 @@ class Asked:
     """A unit in the rig, its culture in a small vial; `known` is the table's word on it."""
 
     def __init__(self, package: str) -> None:
-        self.rig = Rig((UNIT,), RigConfig(package=package, growth_x=1.0, od=0.5, volume_ml=14.0), experiment="e1")
+        self.rig = Rig({UNIT: 14.0}, RigConfig(package=package, od=0.5), experiment="e1")
         self.known, self.vial = facts(self.rig.version), self.rig.vials.vials[UNIT]
 
     def ask(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
@@ -247,7 +248,7 @@ def test_the_broker_wants_the_password(unit, password):
 
 
 def vial(growth_x: float = 1.0) -> _Vial:
-    config = vial_preset("nominal", 14.0, 0.0, 20, growth_x)
+    config = vial_preset("nominal", 14.0, 0.0, flows(0), growth_x)
     made = _Vial(UNIT, Plant(config, 1, [np.random.default_rng(0)]), growth_x, lambda _row: None)
     made.at = 0.0
     return made
@@ -322,6 +323,6 @@ def test_the_table_is_read_from_its_first_row_to_the_version_s():
     assert facts("26.10.0") == facts("27.1.0rc1") == facts("26.7.2")
 
 
-@pytest.mark.parametrize(("volume_ml", "vial_ml"), [(14.0, 20), (20.0, 40), (35.0, 40)])
-def test_a_vial_is_large_enough_for_its_culture(volume_ml, vial_ml):
-    assert RigConfig(volume_ml=volume_ml).vial_ml == vial_ml
+@pytest.mark.parametrize(("volume_ml", "vial"), [(14.0, 20), (20.0, 40), (35.0, 40)])
+def test_a_vial_is_large_enough_for_its_culture(volume_ml, vial):
+    assert vial_ml(volume_ml) == vial

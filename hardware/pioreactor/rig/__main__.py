@@ -7,20 +7,22 @@ import time
 from dataclasses import fields
 
 from hardware.errors import ReactorError
+from hardware.pioreactor.config import RigConfig
 from hardware.pioreactor.rig.build import environment, version
-from hardware.pioreactor.rig.processes import Rig, RigConfig
+from hardware.pioreactor.rig.processes import Rig
 
 
 def main() -> int:
     """Start it, say where it is, wait."""
     parser = argparse.ArgumentParser(prog="python -m hardware.pioreactor.rig", description=__doc__)
-    parser.add_argument("--units", default="pio01,pio02", help="names, separated by commas")
+    parser.add_argument("--units", default="pio01=20,pio02=14", help="NAME=CULTURE_ML of each, separated by commas")
+    parser.add_argument("--growth-x", type=float, default=10.0, help="how much faster than real time cultures grow: 10")
     parser.add_argument("--build-only", action="store_true", help="build the environment and start nothing")
     for one in fields(RigConfig):
         name, default = f"--{one.name.replace('_', '-')}", one.default
         parser.add_argument(name, type=type(default), default=default, help=f"as backend.rig.{one.name}: {default}")
     given = vars(parser.parse_args())
-    units, build_only = given.pop("units").split(","), given.pop("build_only")
+    words, build_only, growth_x = given.pop("units").split(","), given.pop("build_only"), given.pop("growth_x")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         config = RigConfig(**given)
@@ -28,7 +30,8 @@ def main() -> int:
             env = environment(config.package, config.folder)
             print(f"the vendor's software {version(env)} is in {env}")
             return 0
-        with Rig(units, config) as rig:
+        units = {name: float(ml or 20.0) for name, _, ml in (word.partition("=") for word in words)}
+        with Rig(units, config, growth_x) as rig:
             where = " ".join(f"{unit}={url}" for unit, url in rig.web.items())
             print(f"rig ready: {where} broker=127.0.0.1:{rig.broker} truth={rig.folder}/truth.jsonl", flush=True)
             while True:

@@ -7,10 +7,10 @@ import subprocess
 from pathlib import Path
 
 from hardware.errors import DeviceStateError
+from hardware.pioreactor.config import PUBLISHED
 
-__all__ = ["CACHE", "PUBLISHED", "broker", "environment", "home", "missing", "version"]
+__all__ = ["CACHE", "broker", "environment", "home", "missing", "version"]
 
-PUBLISHED = "25.11.19"  # the newest of the package index
 CACHE = Path("~/.cache/turbidostat/pioreactor").expanduser()
 PYTHONS = ("python3.13", "python3.14", "python3.12")
 

@@ -2,13 +2,14 @@
 
 import json
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.versions import Facts
 
-__all__ = ["FLOWS", "LOGIN", "PINS", "calibration", "database", "layout", "wrapper"]
+__all__ = ["LOGIN", "PINS", "database", "flows", "layout", "model", "wrapper"]
 
 AT = "2026-01-01T00:00:00.000Z"  # when all of this was made
 
@@ -20,8 +21,6 @@ PINS = {"stirring": 17, "media": 13, "alt_media": 16, "waste": 12, "heating": 18
 CHANNELS = {"stirring": 1, "media": 2, "alt_media": 3, "waste": 4, "heating": 5}  # wiring as shipped
 
 ADC = ("pd2", "pd1", "aux", "version")  # by channel
-
-FLOWS = {"media_pump": 1.0, "waste_pump": 2.0}  # mL/s
 
 # A section and its entries a line. The tube's level stands under both of its names; the rest is the vendor's default.
 CONFIG = """cluster.topology leader_hostname={leader} leader_address=127.0.0.1
@@ -69,25 +68,43 @@ FOLDERS = (
 )  # fmt: skip
 
 
-def layout(folder: Path, unit: str, units: Sequence[str], known: Facts, values: Mapping[str, object]) -> None:
-    """Everything below a unit's folder. Args: known: of the version. values: port, broker, database and volume_ml."""
+def flows(k: int) -> dict[str, float]:
+    """mL/s of the pumps of the k-th unit: no two are alike."""
+    x = (1.0, 0.8, 1.25)[k % 3]
+    return {"media_pump": x, "waste_pump": 2.0 * x}
+
+
+def model(volume_ml: float) -> str:
+    """The vendor's name of a unit with a vial for this culture."""
+    return f"pioreactor_{vial_ml(volume_ml)}ml"
+
+
+def layout(
+    folder: Path, unit: str, hosts: Mapping[str, str], known: Facts, flow: Mapping[str, float],
+    values: Mapping[str, object],
+) -> None:  # fmt: skip
+    """Everything below a unit's folder.
+
+    Args: hosts: of all units. known: of the version. flow: of its pumps, mL/s. values: port, broker, database, login
+      and volume_ml.
+    """
     for name in FOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
-    addresses = " ".join(f"{name}=127.0.0.{k}" for k, name in enumerate(units, 1))
+    addresses = " ".join(f"{name}={host}" for name, host in hosts.items())
     channels = " ".join(f"{k}={name}" for name, k in CHANNELS.items())
-    words = {"folder": folder, "leader": units[0], "addresses": addresses, "channels": channels, "login": LOGIN}
+    words = {"folder": folder, "leader": next(iter(hosts)), "addresses": addresses, "channels": channels}
     sections = (line.split() for line in CONFIG.format(**words, **values).splitlines())
     text = "".join("\n".join([f"[{section}]", *entries, ""]) for section, *entries in sections)
     (folder / "config.ini").write_text(text, encoding="utf-8")
     (folder / "unit_config.ini").write_text("", encoding="utf-8")
     for name, content in HATS.items():
         (folder / "hardware" / "hats" / "1.2" / f"{name}.yaml").write_text(json.dumps(content), encoding="utf-8")
-    for pump, flow in FLOWS.items():
+    for pump, ml_s in flow.items():
         path = folder / "storage" / "calibrations" / pump / f"rig-{pump}.yaml"
-        path.write_text(calibration(pump, unit, flow, known), encoding="utf-8")
+        path.write_text(_calibration(pump, unit, ml_s, known), encoding="utf-8")
 
 
-def calibration(pump: str, unit: str, flow_ml_s: float, known: Facts) -> str:
+def _calibration(pump: str, unit: str, flow_ml_s: float, known: Facts) -> str:
     """A calibration of a pump in the vendor's format, which moves `flow_ml_s` at full duty."""
     points, line = [0.5, 1.0, 2.0], [flow_ml_s, 0.0]
     curve = f"{{type: poly, coefficients: {line}}}" if known.curve_struct else f"{line}\ncurve_type: poly"
@@ -98,13 +115,13 @@ def calibration(pump: str, unit: str, flow_ml_s: float, known: Facts) -> str:
     )
 
 
-def database(path: Path, units: Sequence[str], experiment: str, model: str) -> None:
+def database(path: Path, units: Mapping[str, float], experiment: str) -> None:
     """What the leader must know: its units, and the experiment that all of them are assigned to."""
     with sqlite3.connect(path) as db:
         db.executescript(TABLES)
         db.execute("INSERT INTO experiments VALUES (?, ?, '')", (experiment, AT))
-        for unit in units:
-            db.execute("INSERT INTO workers VALUES (?, ?, ?, '1.5', 1)", (unit, AT, model))
+        for unit, volume_ml in units.items():
+            db.execute("INSERT INTO workers VALUES (?, ?, ?, '1.5', 1)", (unit, AT, model(volume_ml)))
             db.execute("INSERT INTO experiment_worker_assignments VALUES (?, ?, ?)", (unit, experiment, AT))
 
 

@@ -12,20 +12,18 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 from urllib.request import Request, urlopen
 
-from conf.schema import check, setting
 from hardware.errors import DeviceStateError
-from hardware.pioreactor.rig.build import PUBLISHED, broker, environment, version
-from hardware.pioreactor.rig.files import FLOWS, LOGIN, database, layout, wrapper
+from hardware.pioreactor.config import RigConfig
+from hardware.pioreactor.rig.build import broker, environment, version
+from hardware.pioreactor.rig.files import LOGIN, database, flows, layout, model, wrapper
 from hardware.pioreactor.rig.vials import VialServer, vial_preset
 from hardware.pioreactor.versions import facts
 
-__all__ = ["Rig", "RigConfig"]
+__all__ = ["Rig"]
 
 WEB = (
     "import os, pioreactor.web.app as web\n"
@@ -38,56 +36,33 @@ UNIT = ("web", "tasks", "monitor")  # what boots with a unit; without any job th
 CONSUMER = ("-n", "-b", "1.001", "-w", "4", "-f", "-C", "-d", "0.05")  # of the task queue, as on a unit
 
 
-@dataclass(frozen=True)
-class RigConfig:
-    """Which software the rig runs, and what its vials are.
-
-    Raises: ValueError naming key, value and allowed range.
-    """
-
-    package: str = setting(PUBLISHED, "version of the vendor's software on the package index, or a wheel's path")
-    folder: str = setting("", "of the environments; empty: in the user's cache")
-    growth_x: float = setting(10.0, "how much faster than real time the cultures grow", within=(1.0, 60.0))
-    od: float = setting(0.7, "of the cultures at the start", "OD", within=(0.0, 4.0))
-    plant: str = setting("nominal", "preset of the cultures")
-    volume_ml: float = setting(
-        20.0, "culture up to the waste tube", "mL", within=(5, 35), note="up to 15 mL in a vial of 20 mL, else of 40"
-    )
-    seed: int = setting(0, "of the vials", at_least=0)
-
-    def __post_init__(self) -> None:
-        check(self, "backend.rig")
-
-    @property
-    def vial_ml(self) -> int:
-        """Of the whole vial."""
-        return 20 if self.volume_ml <= 15.0 else 40
-
-
 class Rig:
     """Everything that stands on a bench, as processes of this computer; use as a context manager.
 
-    Args: units: names; unit k is at 127.0.0.k, the first leads. config: of software and vials. truth: folder of
-      truth.jsonl, where another than the rig's own, which is removed with it. experiment: that all units are in.
+    Args: units: names, and culture of each up to its waste tube, mL; unit k is at 127.0.0.k, the first leads. config:
+      of software and vials. growth_x: how much faster than real time the cultures grow. truth: folder of truth.jsonl,
+      where another than the rig's own, which is removed with it. experiment: that all units are in. login: of
+      the broker.
     Attributes: version, of the software; web, address of each unit's web server; broker, port of MQTT; vials; folder;
       processes by name.
     Raises: DeviceStateError with what is missing or did not start.
     """
 
     def __init__(
-        self, units: Sequence[str], config: RigConfig | None = None, truth: Path | None = None,
-        experiment: str = "turbidostat",
+        self, units: Mapping[str, float], config: RigConfig | None = None, growth_x: float = 1.0,
+        truth: Path | None = None, experiment: str = "turbidostat", login: tuple[str, str] = LOGIN,
     ) -> None:  # fmt: skip
-        self.config = c = config or RigConfig()
-        self.units, self.experiment = tuple(units), experiment
+        c = config or RigConfig()
+        self.units, self.experiment, self.login = dict(units), experiment, login
         env = environment(c.package, c.folder)
         self._bin, self.version = env / "bin", version(env)
         self.folder = Path(tempfile.mkdtemp(prefix="pioreactor-rig-"))
         self.broker, self.port = _free_port("127.0.0.1"), _free_port("127.0.0.1")
-        self.web = {unit: f"http://127.0.0.{k}:{self.port}" for k, unit in enumerate(self.units, 1)}
+        self.hosts = {unit: f"127.0.0.{k}" for k, unit in enumerate(self.units, 1)}
+        self.web = {unit: f"http://{host}:{self.port}" for unit, host in self.hosts.items()}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        plant = vial_preset(c.plant, c.volume_ml, c.od, c.vial_ml, c.growth_x)
-        self.vials = VialServer(self.units, plant, c.growth_x, truth or self.folder, c.seed)
+        plants = {u: vial_preset(c.plant, ml, c.od, flows(k), growth_x) for k, (u, ml) in enumerate(self.units.items())}
+        self.vials = VialServer(plants, growth_x, truth or self.folder, c.seed)
         try:
             self._start()
         except BaseException:
@@ -96,18 +71,18 @@ class Rig:
 
     def _start(self) -> None:
         conf, known, secret = self.folder / "mosquitto.conf", facts(self.version), self.folder / "mosquitto.password"
-        subprocess.run(["mosquitto_passwd", "-b", "-c", secret, *LOGIN], check=True, capture_output=True)
+        subprocess.run(["mosquitto_passwd", "-b", "-c", secret, *self.login], check=True, capture_output=True)
         conf.write_text(
             f"listener {self.broker} 127.0.0.1\npassword_file {secret}\nuser {getpass.getuser()}\n", encoding="utf-8"
         )
         self.start("broker")
         _wait("127.0.0.1", self.broker, "the broker")
-        values: dict[str, Any] = {"port": self.port, "broker": self.broker, "volume_ml": self.config.volume_ml}
-        values["database"] = self.folder / "pioreactor.sqlite"
-        database(values["database"], self.units, self.experiment, f"pioreactor_{self.config.vial_ml}ml")
-        for unit in self.units:
+        store = self.folder / "pioreactor.sqlite"
+        where = {"port": self.port, "broker": self.broker, "database": store, "login": self.login}
+        database(store, self.units, self.experiment)
+        for k, (unit, volume_ml) in enumerate(self.units.items()):
             home = self.folder / unit
-            layout(home, unit, self.units, known, values)
+            layout(home, unit, self.hosts, known, flows(k), {**where, "volume_ml": volume_ml})
             scripts = {name: wrapper(self._bin / name, self._variables(unit)) for name in ("pio", "pios")}
             scripts["sudo"] = "#!/bin/sh\nexit 1\n"  # what a unit would shut down, reboot or restart is this computer
             for name, text in scripts.items():
@@ -115,7 +90,7 @@ class Rig:
                 (home / name).chmod(0o755)
             shutil.copy(Path(__file__).with_name("plugin.py"), home / "plugins" / "rig_plugin.py")
             self.boot(unit)
-            for pump in FLOWS:
+            for pump in flows(k):
                 path = f"/unit_api/active_calibrations/{pump}/rig-{pump}"
                 urlopen(Request(self.web[unit] + path, method="PATCH"), timeout=10.0).close()
 
@@ -136,16 +111,16 @@ class Rig:
             )  # fmt: skip
 
     def _variables(self, unit: str) -> dict[str, str]:
-        home, k = self.folder / unit, self.units.index(unit) + 1
+        home = self.folder / unit
         return {
             "PATH": f"{home}:{self._bin}:/usr/local/bin:/usr/bin:/bin",
             "HOME": str(home), "TESTING": "1", "HOSTNAME": unit, "ACTIVE": "1",
             "DOT_PIOREACTOR": str(home), "RUN_PIOREACTOR": str(home), "GLOBAL_CONFIG": str(home / "config.ini"),
             "LOCAL_CONFIG": str(home / "unit_config.ini"), "PLUGINS_DEV": str(home / "plugins"),
             "PIO_EXECUTABLE": str(home / "pio"), "PIOS_EXECUTABLE": str(home / "pios"),
-            "HARDWARE": "1.2", "FIRMWARE": "0.5", "MODEL_NAME": f"pioreactor_{self.config.vial_ml}ml",
+            "HARDWARE": "1.2", "FIRMWARE": "0.5", "MODEL_NAME": model(self.units[unit]),
             "MODEL_VERSION": "1.5", "BLINKA_FORCECHIP": "BCM2XXX", "BLINKA_FORCEBOARD": "RASPBERRY_PI_4B",
-            "TURBIDOSTAT_RIG_PORT": str(self.vials.port), "RIG_HOST": f"127.0.0.{k}", "RIG_WEB_PORT": str(self.port),
+            "TURBIDOSTAT_RIG_PORT": str(self.vials.port), "RIG_HOST": self.hosts[unit], "RIG_WEB_PORT": str(self.port),
             "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
         }  # fmt: skip
 
@@ -175,7 +150,7 @@ class Rig:
         """A unit that had no power gets it. Raises: DeviceStateError if its web server does not come back."""
         for name in UNIT:
             self.start(f"{unit} {name}")
-        _wait(f"127.0.0.{self.units.index(unit) + 1}", self.port, f"the web server of {unit}")
+        _wait(self.hosts[unit], self.port, f"the web server of {unit}")
 
     def jobs(self, unit: str = "", job: str = "") -> list[int]:
         """Process ids of the vendor's jobs of this name on a unit, by what the system says of them.

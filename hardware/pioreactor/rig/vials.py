@@ -6,7 +6,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ import numpy as np
 from conf.presets import load
 from conf.schema import build
 from envs.plant.plant import Plant, PlantConfig
-from hardware.pioreactor.rig.files import FLOWS, PINS
+from hardware.pioreactor.config import vial_ml
+from hardware.pioreactor.rig.files import PINS
 
 __all__ = ["VOLTS_PER_OD", "Pulse", "VialServer", "vial_preset"]
 
@@ -38,14 +39,14 @@ class Pulse:
     feed_ml: float
 
 
-def vial_preset(name: str, volume_ml: float, od: float, vial_ml: float, growth_x: float) -> PlantConfig:
-    """Preset `conf/plant/NAME.yaml`, pulse dosing, in a vial of this volume. Raises: ValueError for an unknown name.
+def vial_preset(name: str, volume_ml: float, od: float, flow: Mapping[str, float], growth_x: float) -> PlantConfig:
+    """Preset `conf/plant/NAME.yaml`, pulse dosing, in the vendor's vial. Raises: ValueError for an unknown name.
 
-    Args: volume_ml: up to the waste tube. vial_ml: of the whole vial.
+    Args: volume_ml: up to the waste tube. flow: of its pumps, mL/s.
     """
     plant = build(PlantConfig(), load(f"plant/{name}"), "plant")
-    vessel = replace(plant.vessel, volume_ml=volume_ml, capacity_ml=vial_ml)
-    pump = replace(plant.pump, dosing="pulse", gain_ml_s=FLOWS["media_pump"], waste_ml_s=FLOWS["waste_pump"])
+    vessel = replace(plant.vessel, volume_ml=volume_ml, capacity_ml=float(vial_ml(volume_ml)))
+    pump = replace(plant.pump, dosing="pulse", gain_ml_s=flow["media_pump"], waste_ml_s=flow["waste_pump"])
     cooling = min(plant.thermal.cooling_min * growth_x, 600.0)  # heat moves in real time
     return replace(plant, pump=pump, vessel=vessel, start_od=od, thermal=replace(plant.thermal, cooling_min=cooling))
 
@@ -126,17 +127,15 @@ class VialServer:
     """All vials behind one UDP port, on a thread of its own.
 
     Args:
-      units: their names. plant: of each vial. growth_x: how much faster than real time the culture grows.
+      plants: of each vial, by the name of its unit. growth_x: how much faster than real time the culture grows.
       folder: truth.jsonl, every run of a pump and once a second every vial, is written here.
     Attributes: port.
     """
 
-    def __init__(self, units: Sequence[str], plant: PlantConfig, growth_x: float, folder: Path, seed: int = 0) -> None:
+    def __init__(self, plants: Mapping[str, PlantConfig], growth_x: float, folder: Path, seed: int = 0) -> None:
         self._file = (folder / "truth.jsonl").open("a", encoding="utf-8", buffering=1)
-        streams = np.random.default_rng(seed).spawn(len(units))
-        self.vials = {
-            u: _Vial(u, Plant(plant, 1, [r]), growth_x, self._log) for u, r in zip(units, streams, strict=True)
-        }
+        streams = iter(np.random.default_rng(seed).spawn(len(plants)))
+        self.vials = {u: _Vial(u, Plant(plant, 1, [next(streams)]), growth_x, self._log) for u, plant in plants.items()}
         self._wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._wire.bind(("127.0.0.1", 0))
         self._wire.settimeout(0.05)

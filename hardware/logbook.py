@@ -1,42 +1,48 @@
 """What one reactor has to report: rows for the journal, notes for the next receipt, its present fault."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from hardware.chibio.connection import Log
 from hardware.reactor import Fault
 
-__all__ = ["Logbook"]
+__all__ = ["Log", "Logbook", "no_log"]
+
+Log = Callable[[str, Mapping[str, Any]], None]
+"""Takes a kind and its fields, for instance `Journal.append`."""
 
 screen = logging.getLogger(__name__)
+
+
+def no_log(kind: str, fields: Mapping[str, Any]) -> None:
+    """Keeps nothing."""
 
 
 class Logbook:
     """One reactor's journal, notes and fault.
 
     Args:
-      name: position, the `reactor` of every row.
-      log: takes a row; must never raise (see `ChiBioReactors`).
-      intend: takes the row of an intent; may raise, and then nothing is dosed.
+      name: of the reactor, the `reactor` of every row.
+      log: takes a row; must never raise (see `hardware.stations`).
+      write: takes a row that must be on the disk before what it speaks of is done, e.g. an intent; may raise.
       elapsed: run time, s.
     Attributes: fault; news, whether its kind changed since someone last looked; notes for the next receipt.
     """
 
-    def __init__(self, name: str, log: Log, intend: Log, elapsed: Callable[[], float]) -> None:
+    def __init__(self, name: str, log: Log, write: Log, elapsed: Callable[[], float]) -> None:
         self.name, self.elapsed = name, elapsed
         self.fault: Fault | None = None
         self.news = False
         self.notes: list[str] = []
-        self._log, self._intend = log, intend
+        self._log, self._write = log, write
 
     def log(self, kind: str, **fields: Any) -> None:
         """Write a row."""
         self._log(kind, {"reactor": self.name, **fields})
 
-    def intend(self, **fields: Any) -> None:
-        """Write what is about to be dosed. Raises: what the journal raises."""
-        self._intend("intent", {"reactor": self.name, **fields})
+    def write(self, kind: str, **fields: Any) -> None:
+        """Write a row first. Raises: what the journal raises; then nothing is to be done."""
+        self._write(kind, {"reactor": self.name, **fields})
 
     def tell(self, note: str) -> None:
         """Write a note, and keep it for the next receipt."""

@@ -1,0 +1,96 @@
+"""MQTT: a connection to a broker, kept up by a thread of its own."""
+
+import contextlib
+import importlib
+import math
+import ssl
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from hardware.clock import Clock
+from hardware.errors import LinkError
+
+__all__ = ["MqttLink"]
+
+
+class MqttLink:
+    """One client of a broker.
+
+    Args:
+      host, port, username, password: of the broker. name: of this client.
+      tls: encrypted; ca_file: certificate of who signed the broker's, "": those of this computer.
+      topics: filters that are subscribed to. take: called with topic, payload and whether it was retained, on the
+        connection's thread; what it raises is lost. again: called before anything arrives on a new connection.
+      will: topic of ours whose retained message the broker clears when we are gone.
+    Attributes: broke_s, when the connection was last lost, by `clock`; refusal, why the broker does not let us in, ""
+      if it did or was not reached.
+    Raises: LinkError if the library or a certificate is missing, or the broker is not there.
+    """
+
+    def __init__(
+        self, host: str, port: int, username: str, password: str, name: str, clock: Clock, *, tls: bool, ca_file: str,
+        topics: Sequence[str], take: Callable[[str, bytes, bool], None], again: Callable[[], None], will: str,
+    ) -> None:  # fmt: skip
+        try:
+            paho = importlib.import_module("paho.mqtt.client")
+        except ImportError:
+            raise LinkError("MQTT needs its library: pip install 'paho-mqtt>=2'") from None
+        self._clock, self._topics, self._again, self._will, self._said = clock, tuple(topics), again, will, ""
+        self.broke_s, self.refusal, self._is_up = -math.inf, "", False
+        self._client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id=name)
+        self._client.username_pw_set(username, password)
+        self._client.reconnect_delay_set(1, 5)
+        self._client.will_set(will, b"", qos=1, retain=True)
+        self._client.on_connect, self._client.on_disconnect = self._up, self._down
+
+        def on_message(_client: Any, _user: Any, message: Any) -> None:
+            with contextlib.suppress(Exception):  # the thread would end, and nobody hear of it
+                take(str(message.topic), bytes(message.payload), bool(message.retain))
+
+        self._client.on_message = on_message
+        try:
+            if tls:
+                self._client.tls_set_context(ssl.create_default_context(cafile=ca_file or None))
+            self._client.connect(host, port, keepalive=10)
+        except (OSError, ValueError) as error:  # also of TLS, and of a file that is not there
+            remedy = "check backend.broker, backend.tls and backend.ca_file, and that it is on"
+            raise LinkError(f"MQTT broker {host}:{port}: {error}; {remedy}") from None
+        self._client.loop_start()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the broker hears us and our thread listens."""
+        thread = getattr(self._client, "_thread", None)
+        return self._is_up and thread is not None and thread.is_alive()
+
+    def _up(self, client: Any, _user: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        self.refusal = str(reason) if reason.is_failure else ""
+        if not reason.is_failure:
+            self._again()
+            client.subscribe([(topic, 1) for topic in self._topics])
+            if self._said:  # the last will of the connection before cleared it
+                client.publish(self._will, self._said, qos=1, retain=True)
+            self._is_up = True
+
+    def _down(self, *_said: Any) -> None:
+        self.broke_s = self._clock.now() if self._is_up else self.broke_s
+        self._is_up = False
+
+    def publish(self, topic: str, payload: str) -> None:
+        """Nothing where there is no connection: what is said late may do harm."""
+        if self.connected:
+            self._client.publish(topic, payload, qos=1)
+
+    def keep(self, payload: str) -> None:
+        """The retained message on `will`, as long as we are there."""
+        self._said = payload
+        self._client.publish(self._will, payload, qos=1, retain=True)
+
+    def close(self) -> None:
+        """Idempotent."""
+        if self._said and self.connected:
+            self._said = ""
+            with contextlib.suppress(RuntimeError, ValueError):
+                self._client.publish(self._will, b"", qos=1, retain=True).wait_for_publish(1.0)
+        self._client.loop_stop()
+        self._client.disconnect()

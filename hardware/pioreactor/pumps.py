@@ -1,0 +1,362 @@
+"""The pump jobs of one unit: asked for once, followed to their end, and ended where they do not end by themselves.
+
+The vendor's 202 says only that a request was written down. A job has begun when an event with its id arrives or its pin
+goes on, and is over when it has said so and its pin is off. Every other course leads into one routine, `Pumps.end`.
+Times here are real seconds.
+"""
+
+import contextlib
+import math
+from collections.abc import Callable, Generator
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+from hardware.clock import Clock
+from hardware.errors import ReactorError
+from hardware.logbook import Logbook
+from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.mailbox import PUMPS, Cluster, Event, Mailbox, Pin
+from hardware.pioreactor.versions import Facts
+from hardware.pioreactor.web import NotHeard, Web
+
+__all__ = ["LATE_ML", "MEDIA", "OURS", "WASTE", "Moved", "Pumps", "Steps", "boot_of"]
+
+T = TypeVar("T")
+
+MEDIA, WASTE = PUMPS[0], PUMPS[2]
+OURS = "turbidostat/"
+STEP_S = 0.1
+SETTLE_S = 1.5  # between two events of a dose .5 s pass; a word on a pin that was overtaken comes within that
+OVERRUN_S = 3.0  # beyond its time a job is given to end by itself
+UNSTARTED_S = 60.0  # that a process may take from the queue to its first word, on a busy unit
+PROBE_S = 30.0  # between two harmless requests that show whether the task queue works
+QUIET_S = 10.0  # without a word a unit that lives is never: it reads OD
+LATE_ML = 0.1  # messages are late by some hundredths of a second
+ROUNDED_S = 0.5  # a dose is told in slices of so long, before each is pumped
+SHORT_S, SHORTS = 0.1, 3  # a run of a pump that ends with its pin off, whatever it was; of those at most
+AGAIN_S = 15.0  # between two of them
+DRAIN_ML = 4.0  # at a time, while a media pump cannot be stopped
+
+Steps = Generator[float, None, T]
+"""A course that yields what to wait, s, and returns T."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What a pump moved, mL: at least low, at most high. end: in words, "" for a dose that went as asked. drained: what
+    the waste pump took out meanwhile."""
+
+    low: float = 0.0
+    high: float = 0.0
+    end: str = ""
+    drained: float = 0.0
+
+
+class Calls:
+    """HTTP requests that nobody waits for: of each kind one at a time, and at most so often."""
+
+    def __init__(self, web: Web, clock: Clock) -> None:
+        self._web, self._clock = web, clock
+        self._open: dict[str, Future[Any]] = {}
+        self._next: dict[str, float] = {}
+
+    def due(self, kind: str, every_s: float) -> bool:
+        """Whether something of this kind is to be done now."""
+        now = self._clock.now()
+        due = now >= self._next.get(kind, -math.inf)
+        self._next[kind] = now + every_s if due else self._next[kind]
+        return due
+
+    def ask(self, kind: str, every_s: float, what: Callable[..., T], *given: Any) -> tuple[T] | None:
+        """The answer that came since the last call; None while there is none, and for trouble on the way."""
+        if kind not in self._open and self.due(kind, every_s):
+            self._open[kind] = self._web.ask(what, *given)
+        if kind in self._open and self._open[kind].done():
+            with contextlib.suppress(ReactorError):
+                return (self._open.pop(kind).result(),)
+        return None
+
+
+class Barrier:
+    """Whether nothing older waits in the task queue any more: a harmless request behind it was taken.
+
+    It is made anew now and then, because a unit that boots forgets what was written down. Args: wait_s: until the
+    first.
+    """
+
+    def __init__(self, web: Web, clock: Clock, wait_s: float = 0.0) -> None:
+        self._calls, self._web, self._task = Calls(web, clock), web, ""
+        self._clock, self._from_s = clock, clock.now() + wait_s
+
+    def passed(self) -> bool:
+        """Whether it was, by what was answered until now."""
+        if self._clock.now() < self._from_s:
+            return False
+        said = self._calls.ask("result", 0.5, self._web.result, self._task) if self._task else None
+        if said and said[0] is not None:
+            return True
+        if made := self._calls.ask("run", PROBE_S, self._web.run, MEDIA, {"help": None}):
+            self._task = made[0]
+        return False
+
+
+def boot_of(rows: list[dict[str, Any]]) -> str:
+    """When a unit was started, by its list of running jobs; "" where that does not say it."""
+    return next((str(row.get("started_at", "")) for row in rows if row["job_name"] == "monitor"), "")
+
+
+class Pumps:
+    """Media and waste pump of one unit.
+
+    Args: run: of this run, part of every id.
+    Attributes: flow_ml_s, of each by its active calibration; told, mL by job and source of the events; facts, of the
+      unit's version; boot, when the unit was started; proven, jobs whose pumps were ended here, and when; trouble, why
+      no dose may be given, "" if one may; cut, whether media is to end, halted, whether everything is; waits, whether
+      what is under way waits for somebody or something else.
+    """
+
+    def __init__(
+        self, unit: str, web: Web, mqtt: Cluster, box: Mailbox, config: PioreactorConfig, clock: Clock, book: Logbook,
+        run: str,
+    ) -> None:  # fmt: skip
+        self.unit, self.web, self.mqtt, self.box = unit, web, mqtt, box
+        self.config, self.clock, self.book, self.run = config, clock, book, run
+        self.flow_ml_s = {MEDIA: 1.0, WASTE: 1.0}  # about what the vendor's pumps give, until it was read
+        self.told: dict[tuple[str, str], float] = {}
+        self.facts, self.boot = Facts(), ""
+        self.trouble, self.cut, self.halted, self.waits = "", False, False, False
+        self.proven: dict[str, float] = {}
+
+    @property
+    def short(self) -> str:
+        """The id of a run of a pump that only ends with its pin off."""
+        return f"{OURS}{self.run}/{self.unit}/off"
+
+    def take(self, event: Event) -> None:
+        """A dosing event; a correction of what was told is negative."""
+        key = event.pump, event.source
+        self.told[key] = self.told.get(key, 0.0) + event.ml
+
+    def pin(self, job: str) -> Pin:
+        """That a job drives."""
+        return self.box.pins[self.box.jobs[job]]
+
+    def lost(self, job: str) -> bool:
+        """Whether a job ended without a word, or stands still: its process was killed, frozen, or lost the broker."""
+        return self.box.state(job).word == "lost"
+
+    def odd(self, job: str) -> bool:
+        """Whether a pump has to be ended: it runs without a job, or its job was lost and it is not proven off since."""
+        pin, new = self.pin(job), self.box.state(job).at > self.proven.get(job, -math.inf) or job not in self.proven
+        runs_on = pin.on and not self.box.live(job) and self.clock.now() > max(pin.on_s, pin.ended_s) + SETTLE_S
+        return runs_on or (self.lost(job) and new)
+
+    def rebooted(self, rows: list[dict[str, Any]]) -> bool:
+        """Whether the unit was started again, by its list of running jobs."""
+        return boot_of(rows) not in ("", self.boot)
+
+    @property
+    def locks(self) -> str:
+        """What to do about a lock that a killed process left."""
+        pins = ", ".join(map(str, self.config.pump_pins))
+        word = f"{self.facts.purge} pwm_locks PIN --as-int"
+        return (
+            f"look at the unit's log; a killed process leaves a lock on its pin, which ends with {word} (pins {pins})"
+        )
+
+    def say(self, topic: str, payload: str) -> None:
+        """Publish below our experiment."""
+        self.mqtt.publish(f"pioreactor/{self.unit}/{self.config.experiment}/{topic}", payload)
+
+    def ask_pins(self) -> None:
+        """Have stirring say all pins again."""
+        if not math.isnan(self.box.stir_duty):
+            self.say("stirring/duty_cycle/set", f"{self.box.stir_duty:g}")
+
+    def give(self, job: str, ml: float, dose: str) -> Steps[Moved]:
+        """Ask for one pump job and follow it; what it gave. It is never asked for again."""
+        asked, ml, task, ran_s = self.clock.now(), round(ml, 4), "", self.pin(job).ran_s
+        future = self.web.ask(self.web.run, job, {"ml": ml, "source-of-event": dose})
+        while not future.done():
+            yield STEP_S
+        try:
+            task = future.result()
+            self.book.log("task", id=dose, job=job, task=task)
+        except NotHeard as error:
+            return Moved(end=f"not given: {error}")
+        except ReactorError as error:
+            self.book.tell(f"{job}: whether it was heard is unknown: {error}")
+        return (yield from self.follow(job, ml, dose, task, asked, ran_s))
+
+    def follow(self, job: str, ml: float, dose: str, task: str, asked: float, ran_s: float) -> Steps[Moved]:
+        """A job to its end; what it gave. Args: task: that it was asked for with, "" if it is unknown; ran_s: then."""
+        if why := (yield from self._begins(job, ml, dose, task, asked)):
+            return Moved(0.0, ml if self.mqtt.broke_s >= asked else 0.0, why)
+        late = self.clock.now() + ml / self.flow_ml_s[job] + OVERRUN_S
+        while not self._is_over(job, dose, ml, asked):
+            cut = self._unwanted(job) or self.odd(job) or self.mqtt.broke_s >= asked
+            if cut or self.clock.now() > late:
+                return (yield from self.end(job, ml, dose, asked))
+            yield STEP_S
+        return self._moved(job, ml, dose, (self.pin(job).ran_s - ran_s) * self.flow_ml_s[job])
+
+    def _unwanted(self, job: str) -> bool:
+        return self.halted or (self.cut and job == MEDIA)
+
+    def _begins(self, job: str, ml: float, dose: str, task: str, asked: float) -> Steps[str]:
+        """A request until its pump begins, then ""; or until it is certain that it never will, then why.
+
+        That is where its task is over and failed; where its job came and went; where it, or one that was queued behind
+        it, was taken from the queue and no job came for long; where the unit was started again.
+        """
+        calls, barrier = Calls(self.web, self.clock), Barrier(self.web, self.clock, PROBE_S * bool(task))
+        never_s, why = math.inf, ""  # from when on it cannot begin any more
+        while not (why or self.told.get((job, dose), 0.0) > 0.0 or self.pin(job).on or self.pin(job).on_s >= asked):
+            now, state, taken = self.clock.now(), self.box.state(job), None
+            if now > asked + self.config.start_s and not (self.trouble or self.box.live(job)):
+                self.trouble = f"the fate of a dose of {ml:.2f} mL ({job}) is unknown: it was not seen to begin"
+                self.book.tell(self.trouble)
+            self.waits = bool(self.trouble)
+            if task and (said := calls.ask("task", 0.5, self.web.result, task)):
+                taken = said[0]
+            if self.trouble and taken is None and math.isinf(never_s) and barrier.passed():
+                taken = True
+            if taken is not None:
+                never_s = min(never_s, now + (UNSTARTED_S if taken else SETTLE_S))
+            if state.word == "disconnected" and state.at >= asked:
+                never_s = min(never_s, state.at + SETTLE_S)
+            if now > never_s and not self.box.live(job):
+                why = f"accepted and not carried out: {self.locks}"
+            if self.trouble and (rows := calls.ask("rows", 5.0, self.web.running)) and self.rebooted(rows[0]):
+                why = "not carried out: the unit was started again, which forgets requests"
+            if self._unwanted(job) and calls.due("stop", 1.0):  # heard only once the job listens
+                self.say(f"{job}/$state/set", "disconnected")
+            yield STEP_S
+        if self.trouble and not why:
+            self.book.tell(f"{job} of {ml:.2f} mL ran late")
+        self.trouble, self.waits = "", False
+        return why
+
+    def _is_over(self, job: str, dose: str, ml: float, asked: float) -> bool:
+        """Whether a job has said that it ended, its pin stands still, and its last event is there or will not come."""
+        state, now = self.box.state(job), self.clock.now()
+        ended = state.word == "disconnected" and state.at >= asked and not self.pin(job).on
+        return ended and (self.told.get((job, dose), 0.0) >= ml - 1e-6 or now > state.at + SETTLE_S)
+
+    def _moved(self, job: str, ml: float, dose: str, ran_ml: float) -> Moved:
+        """What a job that ended gave, by its events and by how long its pin was on."""
+        told, end = self.told.get((job, dose), 0.0), ""
+        low = high = told
+        if told < ml - 1e-6:  # a stop by HTTP tells up to half a second too much; a last event may be missing
+            slack = LATE_ML if ran_ml > 0.0 else ROUNDED_S * self.flow_ml_s[job]
+            low, high = max(min(told, ran_ml or told) - slack, 0.0), min(max(told, ran_ml) + slack, ml)
+            end = f"{told:.2f} of {ml:.2f} mL told: ended early, or its last event was not sent"
+        if ran_ml > high + LATE_ML:  # a job times itself, and on a busy unit it does that late
+            return Moved(low, ran_ml, end or f"its pin was on for {ran_ml:.2f} mL, {told:.2f} mL were told")
+        return Moved(low, high, end)
+
+    def end(self, job: str, ml: float, dose: str, since: float) -> Steps[Moved]:
+        """End a pump that has begun, or may have, until it is proven off; what it moved (docs/pioreactor.md, Ending).
+
+        While a media pump goes on, the waste pump keeps the vial from overflowing, up to `drain_ml`. What only a hand
+        can do is said; once it was done, what is tried here ends the pump.
+
+        Args: ml: as asked. since: when it was asked.
+        """
+        ending, off_s, drained = Ending(self, job, since), math.nan, 0.0
+        drain: Steps[Moved] | None = None
+        while math.isnan(off_s) or drain is not None:
+            try:
+                next(drain or iter((0.0,)))
+            except StopIteration as over:
+                drained, drain = drained + over.value.low, None
+            if math.isnan(off_s) and math.isnan(off_s := ending.off_s()):
+                ending.act()
+                late, left = self.clock.now() > ending.began + OVERRUN_S, self.config.drain_ml - drained
+                self.trouble, self.waits = (self._plug(job), True) if late else (self.trouble, self.waits)
+                if late and drain is None and job == MEDIA and self.pin(job).on and left > LATE_ML and not self.halted:
+                    drain = self.give(WASTE, min(DRAIN_ML, left), f"{dose}/beside{self.clock.now():.0f}")
+            yield STEP_S
+        self.trouble, self.waits = "", False
+        self.proven[job] = self.clock.now()
+        return replace(ending.moved(ml, self.told.get((job, dose), 0.0), off_s), drained=drained)
+
+    def _plug(self, job: str) -> str:
+        pin = self.box.jobs[job]
+        why = "whose process was killed or stands still" if self.lost(job) else "which should have ended"
+        return (
+            f"pin {pin} may run on after {job}, {why}; pull the pump's plug, or on the unit: "
+            f"{self.facts.purge} pwm_locks {pin} --as-int (it is then ended from here)"
+        )
+
+
+class Ending:
+    """One pump on its way to being proven off: what is tried, and what proves it.
+
+    The job is asked by MQTT and by HTTP. Stirring is asked to say all pins again. A short run of the same pump sets its
+    pin to 0 as it begins and as it ends, if no lock forbids that; its events are booked as those of anybody. Each is
+    tried again and again, at its own pace; of short runs at most `SHORTS` are carried out, and none is asked for while
+    an earlier one may still wait.
+
+    Args: pumps: of the unit. job, since: as of `Pumps.end`. Attributes: began, when it did.
+    """
+
+    def __init__(self, pumps: Pumps, job: str, since: float) -> None:
+        self._p, self._job, self._since = pumps, job, since
+        self.began, self._calls = pumps.clock.now(), Calls(pumps.web, pumps.clock)
+        self._listed: bool | None = None
+        self._told, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
+        self._quiet_s, self._rebooted, self._lost, self._held = math.inf, False, False, False
+
+    def _shorts(self) -> float:
+        return self._p.told.get((self._job, self._p.short), 0.0)
+
+    def act(self) -> None:
+        """Ask what is due."""
+        p, job, passed, calls = self._p, self._job, self._p.clock.now() - self.began, self._calls
+        if calls.due("mqtt", 1.0):
+            p.say(f"{job}/$state/set", "disconnected")
+        if passed > 1.0 and calls.due("pins", 5.0):
+            p.ask_pins()
+        if passed > 2.0 and self._listed is not False:
+            calls.ask("stop", 20.0, p.web.stop, job)
+        may_run = self._shorts() - self._told < (SHORTS - 0.5) * SHORT_S * p.flow_ml_s[job]
+        if passed > 5.0 and may_run and self._barrier.passed():
+            self._barrier, self._short_s = Barrier(p.web, p.clock, AGAIN_S), min(self._short_s, p.clock.now())
+            calls.ask("run", 0.0, p.web.run, job, {"duration": SHORT_S, "source-of-event": p.short})
+
+    def off_s(self) -> float:
+        """When the pump was off at the latest, nan while that is not proven."""
+        p, now, pin, state = self._p, self._p.clock.now(), self._p.pin(self._job), self._p.box.state(self._job)
+        self._lost = self._lost or state.word == "lost"
+        self._held = self._held or (bool(self._listed) and pin.on)
+        if now > p.box.heard_s + QUIET_S:
+            self._quiet_s = min(self._quiet_s, p.box.heard_s)
+        if rows := self._calls.ask("rows", 2.0, p.web.running):
+            self._listed = any(row["job_name"] == self._job for row in rows[0])
+            self._rebooted = not self._listed and p.rebooted(rows[0])
+            if self._rebooted:  # its pins are 0 since it lost its power, and that was after its last word
+                p.boot, off_s = boot_of(rows[0]), max(min(self._quiet_s, now), self._since)
+                pin.ends(off_s)
+                return off_s
+        fresh, said = p.box.dc_s > self.began, state.word == "disconnected" and state.at >= self._since
+        by_itself = said and not self._lost and (fresh or pin.off_s >= self._since)
+        by_short = said and self._shorts() > self._told and state.at >= self._short_s
+        if pin.on or not (by_itself or by_short or (self._listed is False and fresh)):
+            return math.nan
+        return pin.off_s if pin.off_s >= self._since else now
+
+    def moved(self, ml: float, told: float, off_s: float) -> Moved:
+        """What the pump moved since it was asked. Args: ml: as asked. told: by its events. off_s: as of `off_s`."""
+        p, pin, flow = self._p, self._p.pin(self._job), self._p.flow_ml_s[self._job]
+        seen = pin.on_s if pin.on_s >= self._since else self._since if self._held else math.nan
+        ran = max(off_s - seen, 0.0) * flow
+        low, end = max(told - ROUNDED_S * flow, 0.0), "ended from here"
+        if math.isnan(seen):  # its pin was never seen: a job times itself
+            return Moved(low, max(ml, told), end)
+        if self._rebooted:
+            return Moved(low, max(ran, min(ml, ran + p.config.reading_s * flow)), "the unit was started again in it")
+        if p.mqtt.broke_s >= self._since and not self._lost:  # a job that loses the broker ends; when was not heard
+            ran = min(ran, max(ml, told))
+        return Moved(low, max(ran, told), end)
