@@ -1,0 +1,217 @@
+"""The cable between a client and a device: real sockets that can be pulled, slowed, and listened to."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import socket
+import struct
+import termios
+import threading
+import time
+import tty
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+MODES = ("pass", "refuse", "hole", "mute", "reset", "dribble")
+ANSWER = b"HTTP/1.1 204 NO CONTENT\r\nConnection: close\r\n\r\n"
+
+
+@dataclass
+class Rule:
+    """What befalls requests whose "METHOD /path" matches. Times in device seconds.
+
+    before: wait before the device hears it; after: before the client hears the answer; times: how often, None for
+    always; swallow: answered 204, never heard by the device; then: called when the answer is there, `ahead` before.
+    """
+
+    pattern: str
+    before: float = 0.0
+    after: float = 0.0
+    times: int | None = None
+    swallow: bool = False
+    ahead: Callable[[], None] | None = None
+    then: Callable[[], None] | None = None
+
+
+@dataclass
+class Seen:
+    """One request: when it came and was answered (device s; None: never), and with what."""
+
+    at_s: float
+    request: str
+    answered_s: float | None = None
+    status: int | None = None
+
+
+@dataclass
+class Link:
+    """A proxy in front of `target` (http://host:port). clock: device seconds; speed: device per real second.
+
+    set("refuse") closes the port, "hole" swallows what is sent and every new connection, as a pulled cable does;
+    "mute" accepts and never answers; "reset" accepts and resets; "dribble" sends a byte each 0.2 real seconds.
+    """
+
+    target: str
+    clock: Callable[[], float]
+    speed: float
+    mode: str = "pass"
+    rules: list[Rule] = field(default_factory=list)
+    seen: list[Seen] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        host, port = self.target.removeprefix("http://").split(":")
+        self._to, self._lock = (host, int(port)), threading.Lock()
+        self._listener, self._fillers, self._epoch = self._listen(0, 64), list[socket.socket](), 0
+        self.port = self._listener.getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+        self._closed = False
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    @staticmethod
+    def _listen(port: int, backlog: int) -> socket.socket:
+        listener = socket.socket()
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(("127.0.0.1", port))
+        listener.listen(backlog)
+        return listener
+
+    def set(self, mode: str) -> None:
+        """Change what the cable does, also to requests on their way."""
+        assert mode in MODES
+        with self._lock:
+            was, self.mode = self.mode, mode
+            self._epoch += 1
+            if {was, mode} & {"refuse", "hole"} and was != mode:
+                for end in (self._listener, *self._fillers):
+                    end.close()
+                self._fillers = []
+                if mode == "hole":  # a full queue: the kernel drops every further SYN
+                    self._listener = self._listen(self.port, 0)
+                    for _ in range(2):
+                        filler = socket.socket()
+                        filler.setblocking(False)
+                        filler.connect_ex(("127.0.0.1", self.port))
+                        self._fillers.append(filler)
+                elif mode != "refuse":
+                    self._listener = self._listen(self.port, 64)
+
+    def close(self) -> None:
+        self._closed = True
+        self.set("refuse")
+
+    def _accept(self) -> None:
+        while not self._closed:
+            listener, mode = self._listener, self.mode
+            if mode in ("refuse", "hole"):
+                time.sleep(0.005)
+                continue
+            try:
+                if select.select([listener], [], [], 0.02)[0] and self.mode == mode:
+                    connection, _ = listener.accept()
+                    threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+            except (OSError, ValueError):
+                time.sleep(0.005)
+
+    def _serve(self, client: socket.socket) -> None:
+        with client:
+            try:
+                while self._one(client):
+                    pass
+            except OSError:
+                pass
+
+    def _one(self, client: socket.socket) -> bool:
+        """One request and its answer. Returns whether another may follow on this connection."""
+        head = b""
+        while b"\r\n\r\n" not in head:
+            more = client.recv(65536)
+            if not more:
+                return False
+            head += more
+        epoch = self._epoch
+        request = " ".join(head.split(b"\r\n", 1)[0].decode("latin1").split(" ")[:2])
+        seen = Seen(self.clock(), request)
+        self.seen.append(seen)
+        rules = [r for r in self.rules if r.times != 0 and re.search(r.pattern, request)]
+        for rule in rules:
+            rule.times = None if rule.times is None else rule.times - 1
+        for rule in rules:
+            if rule.ahead:
+                rule.ahead()
+            self._wait(rule.before)
+        if self._lost(client, epoch):
+            return False
+        answer = ANSWER if any(rule.swallow for rule in rules) else self._forward(head)
+        seen.status = int(answer.split(b" ")[1]) if answer else None
+        for rule in rules:
+            self._wait(rule.after)
+        if not answer or self._lost(client, epoch):
+            return False
+        seen.answered_s = self.clock()
+        for rule in rules:
+            if rule.then:
+                rule.then()
+        for piece in [answer[k : k + 1] for k in range(len(answer))] if self.mode == "dribble" else [answer]:
+            if self.mode == "dribble":
+                time.sleep(0.2)
+            client.sendall(piece)
+        return b"connection: close" not in answer.split(b"\r\n\r\n")[0].lower()
+
+    def _wait(self, seconds: float) -> None:
+        time.sleep(seconds / self.speed)
+
+    def _lost(self, client: socket.socket, epoch: int) -> bool:
+        """Whether the cable keeps this request or answer; silent cables hold the connection until they are mended."""
+        if self.mode == "reset":
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            return True
+        if epoch == self._epoch and self.mode in ("pass", "dribble"):
+            return False
+        while self.mode in ("hole", "mute") and not self._closed:
+            time.sleep(0.02)
+        return True
+
+    def _forward(self, head: bytes) -> bytes:
+        try:
+            with socket.create_connection(self._to, timeout=60.0) as device:
+                device.sendall(head)
+                answer = b""
+                while more := device.recv(65536):
+                    answer += more
+                    top, end, body = answer.partition(b"\r\n\r\n")
+                    length = re.search(rb"content-length: *(\d+)", top, re.IGNORECASE)
+                    if end and (b" 204 " in top or (length and len(body) >= int(length[1]))):
+                        break
+                return answer
+        except OSError:
+            return b""
+
+
+class SerialLine:
+    """A serial line as two ptys, `board` and `pc`, and a thread that carries bytes between them until it is cut."""
+
+    def __init__(self) -> None:
+        self._ends = [os.openpty(), os.openpty()]
+        for master, slave in self._ends:
+            tty.setraw(master, termios.TCSANOW)
+            tty.setraw(slave, termios.TCSANOW)
+        self.board, self.pc = (os.ttyname(slave) for _, slave in self._ends)
+        self.cut = self._closed = False
+        self._thread = threading.Thread(target=self._carry, daemon=True)
+        self._thread.start()
+
+    def _carry(self) -> None:
+        (left, _), (right, _) = self._ends
+        while not self._closed:
+            for end in select.select([left, right], [], [], 0.05)[0]:
+                data = os.read(end, 4096)
+                if not self.cut:
+                    os.write(right if end == left else left, data)
+
+    def close(self) -> None:
+        self._closed = True
+        self._thread.join()
+        for end in (end for pair in self._ends for end in pair):
+            os.close(end)
