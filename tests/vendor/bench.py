@@ -428,6 +428,12 @@ def client_environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 
 
+def in_foreground() -> None:
+    """A shell starts what is in its background deaf to Ctrl-C; a client must hear it."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 class Client:
     """`python -m experiments.COMMAND` as a user starts it. `lines`: what it said and when, device s."""
 
@@ -438,7 +444,7 @@ class Client:
         self.ended_s: float | None = None
         self.process = subprocess.Popen(
             [sys.executable, "-m", *arguments], cwd=ROOT, env=client_environment(), text=True, start_new_session=True,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, preexec_fn=in_foreground,
         )  # fmt: skip
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -483,17 +489,13 @@ def weigh(kind: str, folder: Path, reactors: Sequence[str], unit: int) -> Path:
     with BENCHES[kind](folder / f"weigh_{kind}_{len(reactors)}", reactors, unit) as bench:
         if isinstance(bench, Emulator):
             bench.sleep(60.0)
-        for part, (pump, duties) in WEIGHED.items():
-            for duty in duties:
-                before = {m: len(bench.runs(m)) for m in reactors}
-                for _ in range(4):
-                    threads = [threading.Thread(target=bench.dose, args=(m, pump, duty)) for m in reactors]
-                    for thread in threads:
-                        thread.start()
-                    for thread in threads:
-                        thread.join()
-                for m in reactors:
-                    doses = [run.ml for run in bench.runs(m)[before[m] :] if run.pump == pump]
+        for m in reactors:  # one after the other: motors that start together keep one another waiting on the bus
+            for part, (pump, duties) in WEIGHED.items():
+                for duty in duties:
+                    before = len(bench.runs(m))
+                    for _ in range(4 if part == "feed" else 1):
+                        bench.dose(m, pump, duty)
+                    doses = [run.ml for run in bench.runs(m)[before:] if run.pump == pump]
                     rows.setdefault((m, part), []).append((duty, len(doses), sum(doses)))
     made = folder / "weighed"
     shutil.rmtree(made, ignore_errors=True)

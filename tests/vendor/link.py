@@ -73,7 +73,14 @@ class Link:
     def _listen(port: int, backlog: int) -> socket.socket:
         listener = socket.socket()
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(("127.0.0.1", port))
+        for attempt in range(200):
+            try:
+                listener.bind(("127.0.0.1", port))
+                break
+            except OSError:  # the thread that accepts still looks at the listener before
+                if attempt == 199:
+                    raise
+                time.sleep(0.005)
         listener.listen(backlog)
         return listener
 
