@@ -181,7 +181,7 @@ class App(Bench):
 
     kind = "app"
 
-    def __init__(self, folder: Path, reactors: Sequence[str], unit: int = 0) -> None:
+    def __init__(self, folder: Path, reactors: Sequence[str], unit: int = 0, od: float = START_OD) -> None:
         super().__init__(folder, reactors, unit)
         self._began, port = time.monotonic(), free_port()
         self.url = f"http://127.0.0.1:{port}"
@@ -210,7 +210,7 @@ class App(Bench):
                 self.post(f"/MeasureOD/{m}")
                 raws.append(float(self.state(m)["OD0"]["raw"]))
             self.post(f"/CalibrateOD/OD0/{m}/{sum(raws) / 3:g}/0")
-            self.change(m, x=START_OD)
+            self.change(m, x=od)
 
     def now(self) -> float:
         return (time.monotonic() - self._began) * SPEED
@@ -310,10 +310,10 @@ class Emulator(Bench):
     kind = "emulator"
     lacks = ("glitch: a single failed reading of the four",)
 
-    def __init__(self, folder: Path, reactors: Sequence[str], unit: int = 0) -> None:
+    def __init__(self, folder: Path, reactors: Sequence[str], unit: int = 0, od: float = START_OD) -> None:
         super().__init__(folder, reactors, unit)
         command = [sys.executable, "-m", "hardware.emulator", "--port", "0", "--speed", f"{SPEED:g}"]
-        command += ["--reactors", ",".join(reactors), "--od", f"{START_OD}", "--unit", str(unit + 1)]
+        command += ["--reactors", ",".join(reactors), "--od", f"{od}", "--unit", str(unit + 1)]
         self._process = subprocess.Popen(
             command, cwd=ROOT, env=client_environment(), stdout=subprocess.PIPE, text=True, start_new_session=True
         )
@@ -493,7 +493,7 @@ def weigh(kind: str, folder: Path, reactors: Sequence[str], unit: int) -> Path:
             for part, (pump, duties) in WEIGHED.items():
                 for duty in duties:
                     before = len(bench.runs(m))
-                    for _ in range(4 if part == "feed" else 1):
+                    for _ in range(1 if part == "waste" else 16 if kind == "emulator" else 4):  # its doses scatter
                         bench.dose(m, pump, duty)
                     doses = [run.ml for run in bench.runs(m)[before:] if run.pump == pump]
                     rows.setdefault((m, part), []).append((duty, len(doses), sum(doses)))

@@ -18,13 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from tests.vendor import judge
-from tests.vendor.bench import BENCHES, SPEED, Agent, Client, weigh
+from tests.vendor.bench import BENCHES, SPEED, START_OD, Agent, Client, weigh
 from tests.vendor.link import Link, Rule, SerialLine
 
 TOLD_S = 100.0
-VOLUME_SHARE, VOLUME_ML = 0.05, 0.1
+VOLUME_SHARE, VOLUME_ML = 0.05, {"app": 0.1, "emulator": 0.3}  # the emulator's doses scatter by 5 % and .1 s each
 BAND = 0.06
-SETPOINT = 0.5
+SETPOINT, LOW = 0.5, 0.35
+LARGE_ML = 1.0  # a dose that a step down asks for
 WARM = 35.0  # degC; the device's own law holds these vials between 35.8 and 36.5
 STEADY_ROWS = 9  # of every reactor, before a fault
 ALL = ("M0", "M1", "M2")
@@ -34,11 +35,12 @@ EIGHT = tuple(f"M{k}" for k in range(8))
 class Case:
     """A bench, a cable, perhaps a board agent, and clients one after the other on the same run folder."""
 
-    def __init__(self, kind: str, folder: Path, reactors: Sequence[str] = ALL, agent: str = "", unit: int = 0) -> None:
+    def __init__(self, kind: str, folder: Path, fault: Fault, unit: int = 0) -> None:
+        reactors, agent = fault.reactors, fault.agent
         self.kind, self.folder, self.reactors = kind, folder, tuple(reactors)
         self.calibration = weigh(kind, folder.parent, self.reactors, unit)
         folder.mkdir(parents=True)
-        self.bench = BENCHES[kind](folder / "device", self.reactors, unit)
+        self.bench = BENCHES[kind](folder / "device", self.reactors, unit, START_OD if fault.runs else 0.0)
         self.serial = SerialLine() if agent == "serial" else None
         self.agent = Agent(self.bench, folder, self.serial.board if self.serial else "") if agent else None
         near = self.agent.url if self.agent and not self.serial else self.bench.url
@@ -49,6 +51,7 @@ class Case:
         self.over_s: float | None = None
         self.failures: list[str] = []
         self.facts: dict[str, Any] = {}
+        self.setpoints, self.phases = [SETPOINT], [1000.0]
 
     @property
     def client(self) -> Client:
@@ -73,7 +76,8 @@ class Case:
         return self.client
 
     def deploy(self, run: Path | None = None) -> Client:
-        schedule = ["scenario=hold", f"scenario.setpoints=[{SETPOINT}]", "scenario.minutes=[1000]"]
+        schedule = ["scenario=hold", f"scenario.setpoints={self.setpoints}", f"scenario.minutes={self.phases}"]
+        schedule.append(f"scenario.temperatures={[37] * len(self.phases)}")
         return self.command("deploy", "backend=chibio", *schedule, run=run)
 
     def resume(self) -> Client:
@@ -195,7 +199,7 @@ class Fault:
     agent: str = ""
     ise: bool = False
     volume: bool = True
-    runs: bool = True  # leaves a recording of deploy
+    runs: bool = True  # a run with a culture; False: clear medium and no recording
     after_all: Callable[[Case], None] | None = None
 
 
@@ -218,6 +222,27 @@ def pulled(mode: str, minutes: float, in_dose: bool = True) -> Callable[[Case], 
             case.serial.cut = False
         else:
             case.link.set("pass")
+        case.over()
+
+    return act
+
+
+def pulled_in_step(mode: str, minutes: float, unanswered: bool = False) -> Callable[[Case], None]:
+    """The cable, in a large dose: the second after a step down. unanswered: before the client knows that it runs."""
+
+    def act(case: Case) -> None:
+        case.setpoints, case.phases = [SETPOINT, LOW], [STEADY_ROWS + 1.0, 1000.0]
+        case.steady()
+        while [run.ml for run in case.bench.runs("M1") if run.pump == "Pump1"][-1] < LARGE_ML:
+            case.until_dose("M1")
+            case.sleep(5.0)
+        if unanswered:
+            case.upon(FEED_ON, lambda: case.link.set(mode))
+        case.until_dose("M1")
+        case.befall()
+        case.link.set(mode)
+        case.minutes(minutes)
+        case.link.set("pass")
         case.over()
 
     return act
@@ -284,8 +309,6 @@ def begins(case: Case, client: Client) -> None:
 
 def then_blank(what: str) -> Callable[[Case], None]:
     def act(case: Case) -> None:
-        for m in case.reactors if case.kind == "app" else ():
-            case.bench.change(m, x=0.0)
         in_measuring(case, what)
         begins(case, case.command("blank", f"backend.calibration={case.folder / 'blanks'}", run=case.folder / "blank"))
         status = case.client.wait(60 * 25.0)
@@ -295,6 +318,12 @@ def then_blank(what: str) -> Callable[[Case], None]:
             case.fail(f"blank: exit status {status}, {len(blanks)} of {len(case.reactors)} blanks")
 
     return act
+
+
+def somebody_starts(case: Case) -> None:
+    """As a person does it, who looks first: a start of what runs would stop it."""
+    if not case.bench.state("M0")["Experiment"]["ON"]:
+        case.bench.post("/Experiment/1/M0")
 
 
 def then_resume(case: Case) -> None:
@@ -307,7 +336,7 @@ def then_resume(case: Case) -> None:
     case.sleep(20.0)
     begins(case, case.resume())
     case.minutes(6.0)
-    case.bench.post("/Experiment/1/M0")
+    somebody_starts(case)
     case.over()
 
 
@@ -317,7 +346,7 @@ def stopped_by_somebody(case: Case) -> None:
     case.befall()
     case.bench.post("/Experiment/0/M0")
     case.minutes(6.0)
-    case.bench.post("/Experiment/1/M0")
+    somebody_starts(case)
     case.over()
 
 
@@ -500,12 +529,11 @@ def kills(case: Case) -> None:
 def compare_volumes(case: Case, when: str) -> None:
     """Booked against true so far; a fact, and a failure beyond the allowance."""
     record = judge.Record(case.run)
-    for m in case.reactors:
-        true = sum(run.ml for run in case.bench.runs(m) if run.pump == "Pump1")
-        booked = record.booked(m)
+    for m, vial in case.bench.truth().items():
+        true, booked = vial["feed"], record.booked(m)
         case.facts.setdefault(when, "")
         case.facts[when] += f"{m} {booked:.2f}/{true:.2f} "
-        if abs(booked - true) > VOLUME_SHARE * true + VOLUME_ML:
+        if abs(booked - true) > VOLUME_SHARE * true + VOLUME_ML[case.kind]:
             case.fail(f"{when}: {m} booked {booked:.2f} mL, true {true:.2f}")
 
 
@@ -558,6 +586,11 @@ FAULTS = [
     # 4: the cable is pulled in a dose, nobody switches off
     Fault("cable out 6 min in a dose", 4, pulled("hole", 6.0), LINK, after=16.0),
     Fault("cable out 12 min in a dose", 4, pulled("hole", 12.0), LINK, after=25.0),
+    Fault("cable out 12 min in a large dose", 4, pulled_in_step("hole", 12.0), LINK, after=20.0),
+    Fault("cable out 4 min in a large dose, agent", 2, pulled_in_step("hole", 4.0), LINK, after=16.0, agent="http"),
+    Fault("cable out 12 min, large dose unanswered", 4, pulled_in_step("hole", 12.0, True), LINK, after=20.0),
+    Fault("accepts, never answers 12 min, from a large dose on", 4, pulled_in_step("mute", 12.0), LINK, after=20.0),
+    Fault("refused 25 min in a large dose", 4, pulled_in_step("refuse", 25.0), LINK, after=25.0),
     Fault("connections refused 6 min in a dose", 4, pulled("refuse", 6.0), LINK, after=16.0),
     Fault("connections reset 6 min in a dose", 4, pulled("reset", 6.0), LINK, after=16.0),
     # 5: readings that are refused
@@ -599,8 +632,7 @@ def judged(case: Case, fault: Fault) -> dict[str, Any]:
         return found | {"failures": failures}
     reactors: dict[str, Any] = {}
     for m in case.reactors:
-        runs = bench.runs(m)
-        true, booked = sum(run.ml for run in runs if run.pump == "Pump1"), record.booked(m)
+        runs, true, booked = bench.runs(m), case.facts["feed"][m], record.booked(m)
         lost, doubled = record.lost_and_doubled(m)
         off = judge.worst(bench, m, SETPOINT, case.facts.get("steady_s", begin), case.facts["ended_s"])
         reactors[m] = {
@@ -608,7 +640,7 @@ def judged(case: Case, fault: Fault) -> dict[str, Any]:
             "doubled": doubled, "worst_od": round(off, 3), "false": record.false_alarms(m), "rows": len(record.rows(m)),
         }  # fmt: skip
         summary = record.summary.get("reactors", {}).get(m, {}).get("volume_ml")
-        if fault.volume and abs(booked - true) > VOLUME_SHARE * true + VOLUME_ML:
+        if fault.volume and abs(booked - true) > VOLUME_SHARE * true + VOLUME_ML[case.kind]:
             failures.append(f"{m} booked {booked:.2f} mL, true {true:.2f}")
         if summary is None or abs(summary - booked) > 0.02 + 0.001 * booked:
             failures.append(f"{m} summary says {summary} mL, the recording {booked:.2f}")
@@ -645,7 +677,7 @@ def not_back(case: Case) -> dict[str, list[str]]:
         lacks = []
         dosed = [run for run in bench.runs(m) if run.pump == "Pump1" and run.start_s > now - 300.0]
         rows = record.rows(m)
-        high = truth[m]["x"] - SETPOINT
+        high = truth[m]["x"] - case.setpoints[-1]
         if not dosed and high > -0.02:
             lacks.append("is not dosed")
         if abs(high) > BAND and not (high > 0 and sum(run.ml for run in dosed) > 2.0) and not high < -BAND:
@@ -662,7 +694,7 @@ def not_back(case: Case) -> dict[str, list[str]]:
 def play(kind: str, fault: Fault, work: Path, unit: int = 0) -> dict[str, Any]:
     """Run one fault from its begin to the verdict; writes outcome.json."""
     folder = work / re.sub(r"[^a-z0-9]+", "_", fault.name.lower())
-    case = Case(kind, folder, fault.reactors, fault.agent, unit)
+    case = Case(kind, folder, fault, unit)
     try:
         fault.act(case)
         if fault.runs:
@@ -679,9 +711,10 @@ def play(kind: str, fault: Fault, work: Path, unit: int = 0) -> dict[str, Any]:
         case.fail(f"{type(problem).__name__}: {problem}")
         case.facts = {"not_back": {}, "on_at_end": {}, "ended_s": case.bench.now(), "began_s": 0.0} | case.facts
     finally:
-        volumes = {m: case.bench.runs(m) for m in case.reactors}
+        runs = {m: case.bench.runs(m) for m in case.reactors}
+        case.facts["feed"] = {m: vial["feed"] for m, vial in case.bench.truth().items()}
         case.close()
-    case.bench.runs = volumes.__getitem__  # type: ignore[method-assign]
+    case.bench.runs = runs.__getitem__  # type: ignore[method-assign]
     outcome = judged(case, fault)
     (folder / "outcome.json").write_text(json.dumps(outcome, indent=1))
     return outcome

@@ -23,7 +23,8 @@ class Rule:
     """What befalls requests whose "METHOD /path" matches. Times in device seconds.
 
     before: wait before the device hears it; after: before the client hears the answer; times: how often, None for
-    always; swallow: answered 204, never heard by the device; then: called when the answer is there, `ahead` before.
+    always; swallow: answered 204, never heard by the device; then: called when the device has answered and the client
+    does not know yet, `ahead` before the device hears it.
     """
 
     pattern: str
@@ -154,12 +155,11 @@ class Link:
         seen.status = int(answer.split(b" ")[1]) if answer else None
         for rule in rules:
             self._wait(rule.after)
+            if rule.then:
+                rule.then()
         if not answer or self._lost(client, epoch):
             return False
         seen.answered_s = self.clock()
-        for rule in rules:
-            if rule.then:
-                rule.then()
         for piece in [answer[k : k + 1] for k in range(len(answer))] if self.mode == "dribble" else [answer]:
             if self.mode == "dribble":
                 time.sleep(0.2)
