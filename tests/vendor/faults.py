@@ -24,6 +24,7 @@ from tests.vendor.link import Link, Rule, SerialLine
 TOLD_S = 100.0
 VOLUME_SHARE, VOLUME_ML = 0.05, {"app": 0.1, "emulator": 0.3}  # the emulator's doses scatter by 5 % and .1 s each
 BAND = 0.06
+OUTLIERS = {"app": 0, "emulator": 1}  # rows: one reading in 170 of the emulator's is an outlier, which may fall
 SETPOINT, LOW = 0.5, 0.35
 LARGE_ML = 1.0  # a dose that a step down asks for
 WARM = 35.0  # degC; the device's own law holds these vials between 35.8 and 36.5
@@ -649,7 +650,7 @@ def judged(case: Case, fault: Fault) -> dict[str, Any]:
             failures.append(f"{m} {unasked} runs of the feed motor that nobody asked for or booked")
         if lost or doubled:
             failures.append(f"{m} {lost} rows lost, {doubled} doubled")
-        if reactors[m]["false"]:
+        if sum(reactors[m]["false"].values()) > OUTLIERS[case.kind]:
             failures.append(f"{m} false {reactors[m]['false']}")
         if m not in fault.befallen and off > BAND:
             failures.append(f"{m} strays {off:.3f} OD, nothing befell it")
