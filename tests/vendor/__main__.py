@@ -8,7 +8,7 @@ import json
 import os
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -70,8 +70,9 @@ def main(arguments: list[str]) -> int:
     out.mkdir(parents=True, exist_ok=True)
     outcomes = []
     with ProcessPoolExecutor(int(given.get("workers", "2"))) as pool:
-        for outcome in pool.map(one, [(kind, fault.name, str(out)) for fault in chosen(given.get("faults", ""))]):
-            outcomes.append(outcome)
+        wanted = reversed(chosen(given.get("faults", "")))  # the longest stand last
+        for done in as_completed([pool.submit(one, (kind, fault.name, str(out))) for fault in wanted]):
+            outcomes.append(outcome := done.result())
             print(row(outcome), flush=True)
             (out / "outcomes.json").write_text(json.dumps(outcomes, indent=1))
             lines = [HEADER, "|" + "---|" * 10, *map(row, outcomes)]
