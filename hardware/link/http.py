@@ -1,7 +1,11 @@
 """HTTP, straight to the device's server."""
 
 import contextlib
+import socket
+import threading
 import time
+from collections.abc import Callable, Iterator
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -22,7 +26,31 @@ __all__ = ["HttpTransport", "fetch"]
 
 AGENT = "board_agent/"  # how the server's name begins where an agent stands before the device
 REFUSED = (401, 403, 409)  # by which the agent says that it did not carry a request out, and why
+GRACE_S = 0.2  # the client's own time-out says more, and comes first where nothing comes at all
 TOKEN = "give backend.transport.token_file a copy of the board's (docs/board_agent.md, The token)"
+
+
+@contextlib.contextmanager
+def _cut_after(wait_s: float) -> Iterator[Callable[[str, dict[str, Any]], None]]:
+    """A trace for a request that is cut off after `wait_s`: a time-out of httpx begins anew with each byte."""
+    opened: list[socket.socket] = []
+
+    def trace(event: str, info: dict[str, Any]) -> None:
+        if event.endswith(("connect_tcp.complete", "start_tls.complete")):
+            opened[:] = [info["return_value"].get_extra_info("socket")]
+
+    def cut() -> None:
+        for one in opened:
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+
+    late = threading.Timer(wait_s, cut)
+    late.daemon = True
+    late.start()
+    try:
+        yield trace
+    finally:
+        late.cancel()
 
 
 def fetch(
@@ -35,7 +63,10 @@ def fetch(
     """
     what, deadline, found = f"{method} {urlsplit(url).path}", time.monotonic() + wait_s, bytearray()
     try:
-        with client.stream(method, url, content=body) as answer:
+        with (
+            _cut_after(wait_s + GRACE_S) as trace,
+            client.stream(method, url, content=body, extensions={"trace": trace}) as answer,
+        ):
             for chunk in answer.iter_raw():
                 found += chunk
                 if len(found) > MAX_BODY:
@@ -44,6 +75,8 @@ def fetch(
                     raise LinkError(f"{what}: the answer was not complete after {wait_s:.1f} s")
             return answer.status_code, bytes(found), answer.headers
     except (httpx.RemoteProtocolError, httpx.DecodingError) as error:
+        if time.monotonic() > deadline:
+            raise LinkError(f"{what}: the answer was not complete after {wait_s:.1f} s") from error
         if "without sending" in str(error):  # closed before the answer was whole: a dying server, not a strange one
             raise LinkError(f"{what}: {url} closed the connection without a whole answer") from error
         raise ProtocolError(f"{what}: not an HTTP answer ({error})") from error

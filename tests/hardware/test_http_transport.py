@@ -111,11 +111,17 @@ def dribble(c: socket.socket, _: bytes) -> None:
         time.sleep(0.05)
 
 
+def dribble_head(c: socket.socket, _: bytes) -> None:
+    for byte in OK:
+        c.sendall(bytes([byte]))
+        time.sleep(0.05)
+
+
 def reset(c: socket.socket, _: bytes) -> None:
     c.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
 
 
-@pytest.mark.parametrize("behave", [silent, dribble, reset, lambda c, _: None])
+@pytest.mark.parametrize("behave", [silent, dribble, dribble_head, reset, lambda c, _: None])
 def test_no_answer_is_a_link_error_within_the_time_out(server: Server, behave: Callable[..., None]) -> None:
     server.behave = behave
     with link(server.url) as transport:
