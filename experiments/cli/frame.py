@@ -28,6 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from conf.schema import build
 from experiments.cli import extensions, files, help_page, latest, search, stop, sweep, words
+from experiments.cli.start import stopped
 from experiments.cli.words import UserError, normalise
 
 __all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config", "swept"]
@@ -170,7 +171,7 @@ class Command(Generic[T]):
         except BrokenPipeError:  # `--help | head`: whoever reads has seen enough
             _silence(sys.stdout)
         except KeyboardInterrupt:
-            print("stopped before anything began", file=sys.stderr)
+            print(stopped(), file=sys.stderr)
             sys.exit(stop.STATUS)
         except Exception as error:
             line = _refusal(error)

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 
-__all__ = ["begin"]
+__all__ = ["begin", "stopped"]
 
 PACKAGES = ("conf", "dqn", "envs", "hardware")
 HOME = Path(__file__).parents[2]  # where all packages of ours stand side by side
@@ -34,9 +34,15 @@ def _other_package() -> str | None:
     return None
 
 
+def stopped() -> str:
+    """What a stop says before anything began; a run that was to be resumed may have left a pump on."""
+    resumed = any(word.lstrip("+").startswith("resume=") for word in sys.argv)
+    return "stopped before anything began" + "; pumps not verified off: resume the run" * resumed
+
+
 def _shown(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """Ctrl-C while a command is imported; a traceback through other people's modules tells nobody anything."""
     if issubclass(kind, KeyboardInterrupt):
-        print("stopped before anything began", file=sys.stderr)
+        print(stopped(), file=sys.stderr)
     else:
         sys.__excepthook__(kind, error, trace)

@@ -64,16 +64,29 @@ def _simulated(opening: Opening) -> Iterator[Reactor]:
 
 
 @contextmanager
+def _not_looked_at() -> Iterator[None]:
+    """Who stops it in here is told that nobody has looked at the pumps: an earlier life may have left one on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        log.warning("stopped before the pumps were looked at: pumps not verified off")
+        raise
+
+
+@contextmanager
 def _chibio(opening: Opening) -> Iterator[Reactor]:
     """A Chi.Bio or its emulator, checked before a run begins. Raises: ReactorError, UserError."""
     backend, earlier = opening.backend, opening.journal.rows
-    with linked(backend) as (transport, clock):
-        calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
-        if opening.resumed and not earlier:
-            raise RecordingError(f"journal {opening.journal.path}: missing or empty; put it back, or start a new run")
-        if not earlier:
-            check(backend, transport, clock, calibrations, opening.folder)
-        reactors = ChiBioReactors(transport, clock, backend, calibrations, opening.journal.append)
+    with ExitStack() as stack:
+        with _not_looked_at():
+            transport, clock = stack.enter_context(linked(backend))
+            calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
+            if opening.resumed and not earlier:
+                where = opening.journal.path
+                raise RecordingError(f"journal {where}: missing or empty; put it back, or start a new run")
+            if not earlier:
+                check(backend, transport, clock, calibrations, opening.folder)
+            reactors = ChiBioReactors(transport, clock, backend, calibrations, opening.journal.append)
         elapsed_s = (time.time() - float(earlier[0]["wall"])) * backend.speed if earlier else 0.0
         reactors.begin(replay(earlier), elapsed_s)
         with left_off(reactors):

@@ -129,3 +129,19 @@ def test_the_paper_s_rival_on_an_emulated_device_behind_a_real_socket(tmp_path: 
     assert done.returncode == 0, done.stderr + done.stdout
     assert done.stderr == ""
     check(tmp_path, "mpc")
+
+
+def test_a_stop_before_the_pumps_were_looked_at_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Ctrl-C at the first request, by which the device is found: what an earlier life left on may run on."""
+
+    @contextmanager
+    def stopped(backend: EmulatorConfig) -> Iterator[None]:
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(families, "linked", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run.deploy(config("inverse", "emulator", tmp_path), tmp_path)
+    assert "pumps not verified off" in caplog.text

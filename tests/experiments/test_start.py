@@ -62,15 +62,18 @@ def test_a_mere_folder_of_that_name_beside_an_editable_install(tmp_path: Path) -
     assert not list((tmp_path / "work").glob("runs"))
 
 
-def test_ctrl_c_while_a_command_is_imported(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("more", "also"), [([], ""), (["resume=runs/deploy/x"], "; pumps not verified off: resume the run")]
+)
+def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, more: list[str], also: str) -> None:
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "experiments.deploy"]
+    command = [sys.executable, "-m", "experiments.deploy", *more]
     process = subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
     while "_multiarray_umath" not in Path(f"/proc/{process.pid}/maps").read_text():
         assert process.poll() is None
         time.sleep(0.001)
     process.send_signal(signal.SIGINT)
     said = process.communicate()[1]
-    assert said == "stopped before anything began\n"
+    assert said == f"stopped before anything began{also}\n"
     assert process.returncode in (130, -signal.SIGINT)
     assert not list(tmp_path.iterdir())
