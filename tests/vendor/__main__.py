@@ -1,7 +1,8 @@
 """`python -m tests.vendor [bench=app|emulator] [faults=[NAME,...]] [workers=2] [out=FOLDER]`: run faults, judge them.
 
-`python -m tests.vendor side_by_side` compares sysdata. A name stands for every fault that contains it; `planted` are
-those that the judge must find. Writes table.md and outcomes.json.
+A name stands for every fault that contains it; `planted` are those that the judge must find. Writes outcomes.json.
+`python -m tests.vendor table=[FOLDER,...]` writes the newest outcome of each fault below these folders, app beside
+emulator, into docs/faults.md. `python -m tests.vendor side_by_side` compares sysdata.
 """
 
 import json
@@ -13,72 +14,90 @@ from pathlib import Path
 from typing import Any
 
 from tests.vendor import test_side_by_side
-from tests.vendor.bench import missing
+from tests.vendor.bench import BENCHES, ROOT, missing
 from tests.vendor.faults import FAULTS, PLANTED, Fault, play
 
-COLUMNS = ("item", "fault", "told after, s", "words", "booked/true, mL", "motor runs/doses/repeats", "worst OD")
-HEADER = "| " + " | ".join((*COLUMNS, "lost, doubled", "false", "verdict")) + " |"
+PAGE = ROOT / "docs" / "faults.md"
+BEGIN, END = "<!-- vendor's app -->\n", "<!-- end -->"
+HEADER = """\
+| fault | told after, s | in the words | booked of true volume, mL, app | emulator | app | emulator |
+|---|---|---|---|---|---|---|
+"""
 
 
-def row(outcome: dict[str, Any]) -> str:
-    """One line of the table."""
-    reactors = outcome.get("reactors", {})
-
-    def each(text: Any) -> str:
-        return ", ".join(text(one) for one in reactors.values())
-
-    told = "–" if outcome["told_s"] is None else f"{outcome['told_s']:.0f}"
-    cells = [
-        str(outcome["item"]), outcome["name"], told, outcome["words"][:120].replace("|", "/"),
-        each(lambda one: f"{one['booked']:.1f}/{one['true']:.1f}"),
-        each(lambda one: "/".join(str(n) for n in one["motor"].values())),
-        each(lambda one: f"{one['worst_od']:.2f}"),
-        each(lambda one: f"{one['lost']} {one['doubled']}"),
-        each(lambda one: " ".join(f"{kind} {n}" for kind, n in one["false"].items()) or "–"),
-        "; ".join(outcome["failures"])[:600].replace("|", "/") or "holds",
-    ]  # fmt: skip
-    return f"| {' | '.join(cells)} |"
+def listed(words: str) -> list[str]:
+    return [word.strip() for word in words.strip("[]").split(",") if word.strip()]
 
 
 def chosen(names: str) -> list[Fault]:
-    wanted = [name.strip() for name in names.strip("[]").split(",") if name.strip()]
-    every = FAULTS + PLANTED
-    return [f for f in every if any(name in f.name for name in wanted)] if wanted else FAULTS
-
-
-def work_of(base: Path, kind: str) -> Path:
-    """A folder for each worker: its boards have identities of their own."""
-    return base / f"{kind}_{os.getpid()}"
+    wanted = listed(names)
+    return [f for f in FAULTS + PLANTED if any(name in f.name for name in wanted)] if wanted else FAULTS
 
 
 def one(arguments: tuple[str, str, str]) -> dict[str, Any]:
+    """One fault, in a folder of this worker: its boards have identities of their own."""
     kind, name, base = arguments
     fault = next(f for f in FAULTS + PLANTED if f.name == name)
-    return play(kind, fault, work_of(Path(base), kind), unit=os.getpid() % 900)
+    return play(kind, fault, Path(base) / f"{kind}_{os.getpid()}", unit=os.getpid() % 900)
+
+
+def verdict(outcome: dict[str, Any] | None) -> str:
+    return "not run" if outcome is None else "; ".join(outcome["failures"]).replace("|", "/")[:300] or "holds"
+
+
+def told(outcome: dict[str, Any] | None) -> str:
+    return "–" if outcome is None or outcome["told_s"] is None else f"{outcome['told_s']:.0f}"
+
+
+def volumes(outcome: dict[str, Any] | None) -> str:
+    each = (outcome or {}).get("reactors", {}).values()
+    return ", ".join(f"{m['booked']:.1f} of {m['true']:.1f}" for m in each) or "–"
+
+
+def row(name: str, app: dict[str, Any] | None, emulator: dict[str, Any] | None) -> str:
+    """One line of the table."""
+    said = next((o["words"] for o in (app, emulator) if o and o["words"]), "")
+    words = f"`{said.partition(': ')[2].replace('|', '/')[:60]}`" if said else "–"
+    after = told(app) if told(app) == told(emulator) else f"{told(app)}, {told(emulator)}"
+    cells = [name, after, words, volumes(app), volumes(emulator), verdict(app), verdict(emulator)]
+    return f"| {' | '.join(cells)} |"
+
+
+def table(folders: list[str]) -> str:
+    """Every fault's newest outcome on each bench, Markdown."""
+    newest: dict[tuple[str, str], dict[str, Any]] = {}
+    paths = [path for folder in folders for path in Path(folder).rglob("outcome.json")]
+    for path in sorted(paths, key=lambda path: path.stat().st_mtime):
+        outcome = json.loads(path.read_text())
+        newest[outcome["name"], outcome["bench"]] = outcome
+    rows = [row(f.name, *(newest.get((f.name, kind)) for kind in BENCHES)) for f in FAULTS + PLANTED]
+    return HEADER + "\n".join(rows) + "\n"
 
 
 def main(arguments: list[str]) -> int:
     given = dict(argument.partition("=")[::2] for argument in arguments)
     out = Path(given.get("out", f"runs/vendor/{time.strftime('%Y-%m-%d_%H-%M-%S')}")).resolve()
-    if "side_by_side" in given:
-        print(test_side_by_side.table(out, list(test_side_by_side.SEQUENCES)))
-        return 0
     kind = given.get("bench", "app")
+    if "table" in given:
+        before, _, rest = PAGE.read_text().partition(BEGIN)
+        PAGE.write_text(before + BEGIN + "\n" + table(listed(given["table"])) + "\n" + END + rest.partition(END)[2])
+        return 0
     if kind == "app" and (reason := missing()):
         print(reason)
         return 2
+    if "side_by_side" in given:
+        print(test_side_by_side.table(out, list(test_side_by_side.SEQUENCES)))
+        return 0
     out.mkdir(parents=True, exist_ok=True)
     outcomes = []
     with ProcessPoolExecutor(int(given.get("workers", "2"))) as pool:
         wanted = reversed(chosen(given.get("faults", "")))  # the longest stand last
         for done in as_completed([pool.submit(one, (kind, fault.name, str(out))) for fault in wanted]):
             outcomes.append(outcome := done.result())
-            print(row(outcome), flush=True)
+            print(f"{outcome['name']}: told {told(outcome)} s; {volumes(outcome)}; {verdict(outcome)}", flush=True)
             (out / "outcomes.json").write_text(json.dumps(outcomes, indent=1))
-            lines = [HEADER, "|" + "---|" * 10, *map(row, outcomes)]
-            (out / "table.md").write_text("\n".join(lines) + "\n")
     held = sum(not outcome["failures"] for outcome in outcomes)
-    print(f"{held} of {len(outcomes)} hold; {out / 'table.md'}")
+    print(f"{held} of {len(outcomes)} hold; {out}")
     return int(held < len(outcomes))
 
 
