@@ -8,7 +8,7 @@ what befalls them and by when it must be told and over, `judge.py` reads what a 
 truth.
 
 CHIBIO_APP is the folder of the vendor's app.py, static/ and templates/ (HarrisonSteel/ChiBio; it has no licence and is
-stored nowhere). CHIBIO_PYTHON is a Python with what it imports; without it one is made once in the user's cache folder.
+stored nowhere). CHIBIO_PYTHON is a Python with what it imports: gunicorn<21, flask, numpy, pyserial, simplejson.
 The stand-ins are in ../shared/chibio_env beside the project, or in CHIBIO_STANDINS. Nothing here reads the code that
 it judges.
 """

@@ -2,7 +2,7 @@
 
 A name stands for every fault that contains it; `planted` are those that the judge must find. Writes outcomes.json.
 `python -m tests.vendor table=[FOLDER,...]` writes the newest outcome of each fault below these folders, app beside
-emulator, into docs/faults.md. `python -m tests.vendor side_by_side` compares sysdata.
+emulator, into docs/faults.md.
 """
 
 import json
@@ -13,7 +13,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from tests.vendor import test_side_by_side
 from tests.vendor.bench import BENCHES, ROOT, missing
 from tests.vendor.faults import FAULTS, PLANTED, Fault, play
 
@@ -85,9 +84,6 @@ def main(arguments: list[str]) -> int:
     if kind == "app" and (reason := missing()):
         print(reason)
         return 2
-    if "side_by_side" in given:
-        print(test_side_by_side.table(out, list(test_side_by_side.SEQUENCES)))
-        return 0
     out.mkdir(parents=True, exist_ok=True)
     outcomes = []
     with ProcessPoolExecutor(int(given.get("workers", "2"))) as pool:

@@ -44,11 +44,11 @@ class Case:
         self.serial = SerialLine() if agent == "serial" else None
         self.agent = Agent(self.bench, folder, self.serial.board if self.serial else "") if agent else None
         near = self.agent.url if self.agent and not self.serial else self.bench.url
-        self.link = Link(near, self.bench.now, SPEED)
+        self.link = Link(near, SPEED)
+        self.cable = self.serial or self.link
         self.run = folder / "run"
         self.clients: list[Client] = []
         self.fault_s: float | None = None
-        self.over_s: float | None = None
         self.failures: list[str] = []
         self.facts: dict[str, Any] = {}
         self.setpoints, self.phases = [SETPOINT], [1000.0]
@@ -118,9 +118,12 @@ class Case:
         """The fault begins now."""
         self.fault_s = self.bench.now()
 
-    def over(self) -> None:
-        """It is over now; what has to come back by itself has its time from here."""
-        self.over_s = self.bench.now()
+    def without_cable(self, mode: str, minutes: float) -> None:
+        """The fault begins now, and is over after so long."""
+        self.befall()
+        self.cable.set(mode)
+        self.minutes(minutes)
+        self.cable.set("pass")
 
     def until_dose(self, m: str, pump: str = "Pump1") -> None:
         """Wait until this motor has begun to turn."""
@@ -200,7 +203,6 @@ class Fault:
     ise: bool = False
     volume: bool = True
     runs: bool = True  # a run with a culture; False: clear medium and no recording
-    after_all: Callable[[Case], None] | None = None
 
 
 def pulled(mode: str, minutes: float, in_dose: bool = True) -> Callable[[Case], None]:
@@ -212,17 +214,7 @@ def pulled(mode: str, minutes: float, in_dose: bool = True) -> Callable[[Case], 
             case.until_dose("M1")
         else:
             case.until_quiet()
-        case.befall()
-        if case.serial:
-            case.serial.cut = True
-        else:
-            case.link.set(mode)
-        case.minutes(minutes)
-        if case.serial:
-            case.serial.cut = False
-        else:
-            case.link.set("pass")
-        case.over()
+        case.without_cable(mode, minutes)
 
     return act
 
@@ -239,11 +231,7 @@ def pulled_in_step(mode: str, minutes: float, unanswered: bool = False) -> Calla
         if unanswered:
             case.upon(FEED_ON, lambda: case.link.set(mode))
         case.until_dose("M1")
-        case.befall()
-        case.link.set(mode)
-        case.minutes(minutes)
-        case.link.set("pass")
-        case.over()
+        case.without_cable(mode, minutes)
 
     return act
 
@@ -258,7 +246,6 @@ def ruled(minutes: float, *rules: Rule) -> Callable[[Case], None]:
         case.befall()
         case.minutes(minutes)
         case.link.rules.clear()
-        case.over()
 
     return act
 
@@ -274,7 +261,6 @@ def changed(minutes: float = 0.0, **changes: float) -> Callable[[Case], None]:
         case.minutes(minutes)
         for key in changes if minutes else ():
             case.bench.change("M0", **{key: 0})
-        case.over()
 
     return act
 
@@ -296,7 +282,6 @@ def then_deploy(what: str) -> Callable[[Case], None]:
         in_measuring(case, what)
         begins(case, case.deploy())
         case.until_rows(1, 360.0)
-        case.over()
 
     return act
 
@@ -337,7 +322,6 @@ def then_resume(case: Case) -> None:
     begins(case, case.resume())
     case.minutes(6.0)
     somebody_starts(case)
-    case.over()
 
 
 def stopped_by_somebody(case: Case) -> None:
@@ -347,7 +331,6 @@ def stopped_by_somebody(case: Case) -> None:
     case.bench.post("/Experiment/0/M0")
     case.minutes(6.0)
     somebody_starts(case)
-    case.over()
 
 
 def worker_killed(case: Case) -> None:
@@ -355,7 +338,6 @@ def worker_killed(case: Case) -> None:
     case.bench.until_measuring("M0")
     case.befall()
     case.bench.kill_worker()
-    case.over()
 
 
 def software_killed(case: Case) -> None:
@@ -365,7 +347,6 @@ def software_killed(case: Case) -> None:
     case.kill_software()
     case.minutes(3.0)
     case.restart_software()
-    case.over()
 
 
 def restart_ignored(times: int) -> Callable[[Case], None]:
@@ -375,7 +356,6 @@ def restart_ignored(times: int) -> Callable[[Case], None]:
         case.befall()
         case.bench.change("M0", internal_zero=1)
         case.minutes(4.0 + 3.0 * times)
-        case.over()
 
     return act
 
@@ -412,13 +392,9 @@ def strike(case: Case, what: tuple[str, bool, int], number: int, patience: float
     case.upon(pattern, act, ahead, nth)
     end = case.bench.now() + patience
     while not struck and case.bench.now() < end and case.client.running():
-        self_paced(case)
+        case.sleep(0.5)
     case.link.rules.clear()
     return bool(struck)
-
-
-def self_paced(case: Case) -> None:
-    case.sleep(0.5)
 
 
 def ended_well(case: Case, moment: str, since: int) -> None:
@@ -494,7 +470,6 @@ def signals(case: Case) -> None:
         ended_well(case, f"{name} of a resume after a kill in a dose, SIGINT", since)
     case.resume()
     case.befall()
-    case.over()
 
 
 def kills(case: Case) -> None:
@@ -523,7 +498,6 @@ def kills(case: Case) -> None:
         case.sleep(5.0)
         compare_volumes(case, f"killed {name}")
     case.befall()
-    case.over()
 
 
 def compare_volumes(case: Case, when: str) -> None:
@@ -540,7 +514,6 @@ def compare_volumes(case: Case, when: str) -> None:
 def nothing(case: Case) -> None:
     case.steady()
     case.befall()
-    case.over()
 
 
 def hand_dosed(case: Case) -> None:
@@ -549,7 +522,6 @@ def hand_dosed(case: Case) -> None:
     case.until_quiet()
     case.befall()
     case.bench.dose("M1", "Pump1", 0.05)
-    case.over()
 
 
 LATE = r"POST /SetOutputOn/Pump1/1/"
@@ -634,7 +606,7 @@ def judged(case: Case, fault: Fault) -> dict[str, Any]:
     for m in case.reactors:
         runs, true, booked = bench.runs(m), case.facts["feed"][m], record.booked(m)
         lost, doubled = record.lost_and_doubled(m)
-        off = judge.worst(bench, m, SETPOINT, case.facts.get("steady_s", begin), case.facts["ended_s"])
+        off = judge.worst(bench, m, SETPOINT, begin, case.facts["ended_s"])
         reactors[m] = {
             "booked": round(booked, 2), "true": round(true, 2), "motor": record.motor(m, runs), "lost": lost,
             "doubled": doubled, "worst_od": round(off, 3), "false": record.false_alarms(m), "rows": len(record.rows(m)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import select
@@ -37,29 +38,17 @@ class Rule:
 
 
 @dataclass
-class Seen:
-    """One request: when it came and was answered (device s; None: never), and with what."""
-
-    at_s: float
-    request: str
-    answered_s: float | None = None
-    status: int | None = None
-
-
-@dataclass
 class Link:
-    """A proxy in front of `target` (http://host:port). clock: device seconds; speed: device per real second.
+    """A proxy in front of `target` (http://host:port). speed: device per real second.
 
     set("refuse") closes the port, "hole" swallows what is sent and every new connection, as a pulled cable does;
     "mute" accepts and never answers; "reset" accepts and resets; "dribble" sends a byte each 0.2 real seconds.
     """
 
     target: str
-    clock: Callable[[], float]
     speed: float
     mode: str = "pass"
     rules: list[Rule] = field(default_factory=list)
-    seen: list[Seen] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         host, port = self.target.removeprefix("http://").split(":")
@@ -123,11 +112,8 @@ class Link:
                 time.sleep(0.005)
 
     def _serve(self, client: socket.socket) -> None:
-        with client:
-            try:
-                while self._one(client):
-                    pass
-            except OSError:
+        with client, contextlib.suppress(OSError):
+            while self._one(client):
                 pass
 
     def _one(self, client: socket.socket) -> bool:
@@ -140,26 +126,21 @@ class Link:
             head += more
         epoch = self._epoch
         request = " ".join(head.split(b"\r\n", 1)[0].decode("latin1").split(" ")[:2])
-        seen = Seen(self.clock(), request)
-        self.seen.append(seen)
         rules = [r for r in self.rules if r.times != 0 and re.search(r.pattern, request)]
         for rule in rules:
             rule.times = None if rule.times is None else rule.times - 1
-        for rule in rules:
             if rule.ahead:
                 rule.ahead()
             self._wait(rule.before)
         if self._lost(client, epoch):
             return False
         answer = ANSWER if any(rule.swallow for rule in rules) else self._forward(head)
-        seen.status = int(answer.split(b" ")[1]) if answer else None
         for rule in rules:
             self._wait(rule.after)
             if rule.then:
                 rule.then()
         if not answer or self._lost(client, epoch):
             return False
-        seen.answered_s = self.clock()
         for piece in [answer[k : k + 1] for k in range(len(answer))] if self.mode == "dribble" else [answer]:
             if self.mode == "dribble":
                 time.sleep(0.2)
@@ -197,7 +178,7 @@ class Link:
 
 
 class SerialLine:
-    """A serial line as two ptys, `board` and `pc`, and a thread that carries bytes between them until it is cut."""
+    """A serial line as two ptys, `board` and `pc`, and a thread that carries bytes between them while it may `pass`."""
 
     def __init__(self) -> None:
         self._ends = [os.openpty(), os.openpty()]
@@ -205,16 +186,19 @@ class SerialLine:
             tty.setraw(master, termios.TCSANOW)
             tty.setraw(slave, termios.TCSANOW)
         self.board, self.pc = (os.ttyname(slave) for _, slave in self._ends)
-        self.cut = self._closed = False
+        self._cut = self._closed = False
         self._thread = threading.Thread(target=self._carry, daemon=True)
         self._thread.start()
+
+    def set(self, mode: str) -> None:
+        self._cut = mode != "pass"
 
     def _carry(self) -> None:
         (left, _), (right, _) = self._ends
         while not self._closed:
             for end in select.select([left, right], [], [], 0.05)[0]:
                 data = os.read(end, 4096)
-                if not self.cut:
+                if not self._cut:
                     os.write(right if end == left else left, data)
 
     def close(self) -> None:

