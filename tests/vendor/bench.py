@@ -344,8 +344,11 @@ class Emulator(Bench):
                 self.fault(name, m, value / unit)
             elif key == "as7341":
                 self.fault("spectrometer_dead", m, value)
-            elif key == "glitch":
-                self.fault("spectrometer_glitch", m, 1.0 if value else 0.0)
+            elif key == "glitch":  # for about one of the four readings, which take five seconds
+                self.until_measuring(m)
+                self.fault("spectrometer_glitch", m)
+                self.sleep(1.2)
+                self.fault("spectrometer_glitch", m, 0.0)
             else:
                 self.fault(key, m, value)
 

@@ -349,13 +349,16 @@ def software_killed(case: Case) -> None:
     case.restart_software()
 
 
-def restart_ignored(times: int) -> Callable[[Case], None]:
+def thread_dies(restarts_ignored: int = 0) -> Callable[[Case], None]:
+    """M0's thread dies at once, in the measurement; so many starts are then answered and not carried out."""
+
     def act(case: Case) -> None:
         case.steady()
-        case.link.rules.append(Rule(r"POST /Experiment/1/M0", times=times, swallow=True))
+        case.link.rules.append(Rule(r"POST /Experiment/1/M0", times=restarts_ignored, swallow=True))
+        case.bench.until_measuring("M0")
         case.befall()
         case.bench.change("M0", internal_zero=1)
-        case.minutes(4.0 + 3.0 * times)
+        case.minutes(4.0 + 3.0 * restarts_ignored)
 
     return act
 
@@ -537,11 +540,11 @@ FAULTS = [
     Fault("thread dead in measuring, then blank", 1, then_blank("dead"), None, runs=False),
     Fault("stopped in measuring, then resume", 1, then_resume, REACTOR, NEIGHBOURS),
     Fault("stopped in measuring, in a run", 1, stopped_by_somebody, REACTOR, NEIGHBOURS),
-    Fault("thread dead in measuring, in a run", 1, changed(internal_zero=1), REACTOR, NEIGHBOURS, 14.0),
+    Fault("thread dead in measuring, in a run", 1, thread_dies(), REACTOR, NEIGHBOURS, 10.0),
     Fault("worker killed in measuring", 1, worker_killed),
     Fault("software dead for 3 min, killed in measuring", 1, software_killed),
-    Fault("thread dead, restart ignored twice", 1, restart_ignored(2), REACTOR, NEIGHBOURS, 14.0),
-    Fault("thread dead, restart ignored six times", 1, restart_ignored(6), REACTOR, NEIGHBOURS, 14.0),
+    Fault("thread dead, restart ignored twice", 1, thread_dies(2), REACTOR, NEIGHBOURS, 14.0),
+    Fault("thread dead, restart ignored six times", 1, thread_dies(6), REACTOR, NEIGHBOURS, 14.0),
     Fault("requests about M0 take 15 s", 1, ruled(10.0, Rule(ABOUT_M0, before=15.0)), REACTOR, NEIGHBOURS),
     Fault("requests about M0 are not answered", 1, ruled(10.0, Rule(ABOUT_M0, before=900.0)), REACTOR, NEIGHBOURS),
     # 2: the cable is pulled in a dose, the client lives, the board agent switches off
