@@ -13,7 +13,7 @@ from hardware.chibio.diagnosis import fault_of
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, plan_dose
 from hardware.chibio.ending import conclude, found
 from hardware.chibio.protocol import FEED, PUMPS, WASTE, DeviceState
-from hardware.chibio.resume import ReactorHistory
+from hardware.chibio.resume import NEVER, ReactorHistory
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 from hardware.logbook import Logbook
 from hardware.storage.doses import Given
@@ -22,6 +22,7 @@ __all__ = ["DoseSequence"]
 
 DOSE_OFF_S = 2.0  # the device ends a dose by itself; the off command comes after it, whatever link and bus take
 WASTE_FIRST_S = 1.0  # a motor starts 0.2 to 0.7 s after the answer: the waste motor must already turn when feed arrives
+LATE_S = 300.0  # a command that was given up may wait so long in a queue or on the way, and is carried out then
 SLOW_S = 1.0  # an answer to a pump command that takes longer is told
 
 
@@ -55,6 +56,8 @@ class DoseSequence:
         self._acted: tuple[float, int] | None = None  # newest sample a dose was decided for
         self._carry_ml, self._doses = 0.0, 0
         self._due_s = math.inf  # clock time at which the dose under way should be over
+        self._given_up: ReactorHistory | None = None  # a dose whose feed command brought no answer and no feed yet
+        self._late, self._off_s = False, 0.0  # whether it is now; run time at which the pumps were last verified off
         self._doubt_s = math.nan  # run time of the last answer before one was missing in a dose, nan if none was
 
     def restore(self) -> None:
@@ -73,6 +76,12 @@ class DoseSequence:
     def unsettled(self) -> bool:
         """Whether a dose is past its end and what it gave is not known yet: a sample waits for that a little."""
         return self.running and not self.stuck and self._clock.now() > self._due_s and not math.isnan(self._doubt_s)
+
+    @property
+    def late(self) -> str:
+        """The pump whose command was given up and may still be carried out, "" if there is none."""
+        lost = self._given_up
+        return lost.feed_pump if lost is not None and self._book.elapsed() < lost.on_s + LATE_S else ""
 
     def forget_sample(self) -> None:
         """The device's records begin anew: no dose was decided for any sample in them."""
@@ -230,6 +239,8 @@ class DoseSequence:
         connection = self._connection
         try:
             self._look_first()
+            if self.late and not (self._past().open and self._past().fed):
+                self._late = self._late or self.late in connection.read().running_pumps
             connection.pumps_off(tries, PUMPS if overflow_pump else self._config.overflow_pump.others)
         except ReactorError as error:
             if isinstance(error, DeviceStateError) and connection.state is not None:
@@ -237,8 +248,11 @@ class DoseSequence:
             self._in_doubt()
             raise
         self.running, self.stuck, self._due_s, self._doubt_s = False, "", math.inf, math.nan
+        if self._late and self._given_up is not None:
+            self._book_late(self._given_up)
         if (known := self._past()).open:
             self._conclude(known)
+        self._off_s = self._book.elapsed()
 
     def _in_doubt(self) -> None:
         """A request of a dose was not answered: from the last answer on the device may have done otherwise."""
@@ -281,3 +295,17 @@ class DoseSequence:
         self._book.log("dose_end", **ending.row())
         booked_ml = known.feed_ml if known.fed else 0.0
         self.extra += ending.beyond(booked_ml)
+        if known.fed:
+            self._given_up = known if math.isnan(known.feed_on[1]) else None
+
+    def _book_late(self, lost: ReactorHistory) -> None:
+        """A feed command that was given up was carried out once the pumps were verified off: on record, and booked."""
+        again = replace(lost, open=True, on_s=self._off_s, wasted=False, feed_on=NEVER, feed_off=NEVER)
+        ending, _ = conclude(again, self._book.elapsed(), self._calibrated(lost.feed_pump), self._calibration.waste)
+        given = ending.beyond(0.0)
+        total_ml = sum(one.feed_ml for one in given)
+        for one in given:
+            self._book.log("given", at_s=one.at_s, feed_ml=one.feed_ml, waste_ml=one.waste_ml, why="heard late")
+        self._book.tell(f"a feed command that was given up was heard late: {total_ml:.2f} mL, booked")
+        self.extra += given
+        self._given_up, self._late = None, False

@@ -108,6 +108,10 @@ class Station:
         try:
             yield from self._let_measure()
             state = self.connection.read()
+            if state.running and state.measuring:  # still: nobody measures there any more
+                self.book.say(f"the device has measured for {MEASURING_S:.0f} s, which is too long: started anew")
+                self.connection.post(f"/Experiment/0/{self.name}")
+                state = self.connection.read()
             if not state.running and state.cycles > 0 and not waited and not state.ended:
                 self.book.say(f"an experiment was stopped, its last cycle may still end: waits {OLD_CYCLE_S:.0f} s")
                 yield OLD_CYCLE_S
@@ -135,6 +139,8 @@ class Station:
     def take_over(self) -> Task:
         """Task: `bring_up` in a run that goes on meanwhile; what does not succeed is said and tried again."""
         try:
+            if not self.connection.read().running:
+                self.book.say("its experiment was stopped meanwhile and is started again")
             yield from self.bring_up()
         except ReactorError as error:
             self.restored = False
@@ -143,7 +149,7 @@ class Station:
             )
 
     def _let_measure(self) -> Task:
-        """Task: a measurement under way is over, because a blank changed in the middle of one would spoil it.
+        """Task: a measurement under way is over, or has taken too long; a blank changed in one would spoil it.
 
         The device's flag says it only while an experiment runs: one that is stopped or dies in a measurement leaves it
         for good, until the next start (docs/device.md, Cycle).
@@ -151,7 +157,6 @@ class Station:
         since = self.connection.clock.now()
         while (state := self.connection.read()).running and state.measuring:
             if self.connection.clock.now() - since > MEASURING_S:
-                self.book.say(f"the device has measured for {MEASURING_S:.0f} s, which is too long: not waited for")
                 return
             yield 2.0
 
@@ -253,7 +258,7 @@ class Station:
         fault = diagnose(
             state, self._config, age_s=age, start_time=self._start_time, blank=self._blank,
             setpoint=self.regulation.setpoint, dosing=self.doses.running, stuck=self.doses.stuck,
-            ended=self._why_ended(), overflow_trouble=self.overflow_pump.trouble,
+            ended=self._why_ended(), overflow_trouble=self.overflow_pump.trouble, late=self.doses.late,
         )  # fmt: skip
         self.book.report(fault)
         if state.running and not self.doses.running:

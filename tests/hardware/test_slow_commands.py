@@ -153,3 +153,38 @@ def test_a_feed_command_without_an_answer_is_looked_for_and_booked_as_found(lost
     notes = [note for step in lab.steps for note in step.notes]
     assert any("what it did is looked for" in note for note in notes)
     assert any("gave no medium" in note for note in notes) == (lost == "there")
+
+
+@pytest.mark.parametrize("late_s", [24.0, 40.0])
+def test_a_feed_command_that_is_heard_after_it_was_given_up_is_booked_and_the_link_is_blamed(late_s: float) -> None:
+    """A request in a busy server's queue, or in a cable that is back: its sender has gone, its dose is given."""
+    lab = lab_of()
+    real, due = lab.wire.inner.post, [math.inf]
+
+    def post(path: str) -> Reply:
+        if path.startswith(FEED_ON) and math.isinf(due[0]):
+            due[0] = lab.clock.now() + late_s
+            lab.clock.sleep(20.0)
+            raise LinkError("no answer")
+        return real(path)
+
+    lab.wire.inner.post = post  # type: ignore[method-assign]
+    get = lab.wire.inner.get
+
+    def arrives(path: str) -> Reply:
+        if lab.clock.now() > due[0] > 0.0:
+            due[0] = 0.0
+            real(FEED_ON + "M0")
+            lab.clock.sleep(1.0)
+        return get(path)
+
+    lab.wire.inner.get = arrives  # type: ignore[method-assign]
+    given = lab.truth()["feed_ml"]
+    lab.run(6)
+    assert due[0] == 0.0
+    assert lab.truth()["feed_ml"] > given + 2.0
+    check_booked(lab)
+    assert not FALSE_ALARMS & lab.kinds()
+    said = [note for step in lab.steps for note in step.notes]
+    assert any("was given up was heard late" in note for note in said)
+    assert not any("not by this program" in (reason or "") for step in lab.steps for reason in step.reasons)

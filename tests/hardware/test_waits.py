@@ -72,7 +72,7 @@ def test_a_flag_that_a_dead_thread_left_costs_one_restart_and_neither_heat_nor_s
     assert any("restarted after: stalled" in note for step in lab.steps for note in step.notes)
 
 
-def test_a_running_experiment_that_measures_for_ever_is_not_waited_for(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_running_experiment_that_measures_for_ever_is_started_anew(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     lab = DriverLab(options=quiet(mu=0.025))
     lab.device.handle("POST", "/Experiment/1/M0")
@@ -80,8 +80,11 @@ def test_a_running_experiment_that_measures_for_ever_is_not_waited_for(caplog: p
     lab.clock.sleep(120.0)
     began = lab.clock.now()
     lab.reactors.begin()
-    assert 20.0 <= lab.clock.now() - began < 40.0
-    assert "M0: the device has measured for 20 s, which is too long: not waited for" in caplog.text
+    assert 90.0 <= lab.clock.now() - began < 120.0
+    assert "M0: the device has measured for 20 s, which is too long: started anew" in caplog.text
+    lab.run(3)
+    assert lab.samples[0] >= 2
+    assert "stalled" not in lab.kinds()
 
 
 def test_a_restart_that_brings_no_sample_is_said_and_tried_again() -> None:
