@@ -313,12 +313,10 @@ def somebody_starts(case: Case) -> None:
 
 def then_resume(case: Case) -> None:
     case.steady()
-    case.until_quiet()
-    case.client.process.kill()
-    case.client.wait(60.0)
     case.bench.until_measuring("M0")
     case.bench.post("/Experiment/0/M0")
-    case.sleep(20.0)
+    case.client.process.kill()
+    case.client.wait(60.0)
     begins(case, case.resume())
     case.minutes(6.0)
     somebody_starts(case)
