@@ -56,7 +56,10 @@ class DoseSequence:
         self._acted: tuple[float, int] | None = None  # newest sample a dose was decided for
         self._carry_ml, self._doses = 0.0, 0
         self._due_s = math.inf  # clock time at which the dose under way should be over
-        self._given_up: ReactorHistory | None = None  # a dose whose feed command brought no answer and no feed yet
+        self._given_up: list[
+            ReactorHistory
+        ] = []  # doses whose feed command brought no answer and may yet be carried out
+        self._unanswered = False  # of the dose under way
         self._late, self._off_s = False, 0.0  # whether it is now; run time at which the pumps were last verified off
         self._doubt_s = math.nan  # run time of the last answer before one was missing in a dose, nan if none was
 
@@ -80,8 +83,8 @@ class DoseSequence:
     @property
     def late(self) -> str:
         """The pump whose command was given up and may still be carried out, "" if there is none."""
-        lost = self._given_up
-        return lost.feed_pump if lost is not None and self._book.elapsed() < lost.on_s + LATE_S else ""
+        self._given_up = [lost for lost in self._given_up if self._book.elapsed() < lost.on_s + LATE_S]
+        return self._given_up[0].feed_pump if self._given_up else ""
 
     def forget_sample(self) -> None:
         """The device's records begin anew: no dose was decided for any sample in them."""
@@ -141,6 +144,8 @@ class DoseSequence:
             return "its sample is of unknown age, the next one is waited for"
         if past + waste_s > self._config.window_s:
             return f"{past:.0f} s after its sample appeared it would not end before the next measurement"
+        if past + 2.0 * self._connection.took_s + waste_s > self._config.window_s:  # what `_set_targets` will take
+            return f"the device answers too slowly ({past:.0f} s after the sample)"
         return ""
 
     def _intend(self, plan: DosePlan, rate: float) -> None:
@@ -168,6 +173,7 @@ class DoseSequence:
                 self._book.tell(f"the link is slow: the feed pump's command was answered after {took_s:.1f} s")
         except ReactorError as error:  # never repeated: whether it runs is unknown, that it ends is certain
             self._in_doubt()
+            self._unanswered = fed
             self._book.tell(
                 f"the answer to the feed pump's command was lost, what it did is looked for: {error}" if fed
                 else f"no dose: {error}"
@@ -248,8 +254,8 @@ class DoseSequence:
             self._in_doubt()
             raise
         self.running, self.stuck, self._due_s, self._doubt_s = False, "", math.inf, math.nan
-        if self._late and self._given_up is not None:
-            self._book_late(self._given_up)
+        if self._late and self._given_up:
+            self._book_late(self._given_up.pop(0))
         if (known := self._past()).open:
             self._conclude(known)
         self._off_s = self._book.elapsed()
@@ -295,8 +301,9 @@ class DoseSequence:
         self._book.log("dose_end", **ending.row())
         booked_ml = known.feed_ml if known.fed else 0.0
         self.extra += ending.beyond(booked_ml)
-        if known.fed:
-            self._given_up = known if math.isnan(known.feed_on[1]) else None
+        if known.fed and (self._unanswered or math.isnan(known.feed_on[1])):
+            self._given_up.append(known)
+        self._unanswered = False
 
     def _book_late(self, lost: ReactorHistory) -> None:
         """A feed command that was given up was carried out once the pumps were verified off: on record, and booked."""
@@ -308,4 +315,4 @@ class DoseSequence:
             self._book.log("given", at_s=one.at_s, feed_ml=one.feed_ml, waste_ml=one.waste_ml, why="heard late")
         self._book.tell(f"a feed command that was given up was heard late: {total_ml:.2f} mL, booked")
         self.extra += given
-        self._given_up, self._late = None, False
+        self._late = False

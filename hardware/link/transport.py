@@ -78,29 +78,36 @@ class SharedLink(Transport):
 
     After a request that took longer than `SILENT_S` and brought no answer, every request within the next `PAUSE_S`
     fails at once. So a silent server costs all reactors together one time-out, and they are told of it within that.
+    Where others are answered between two time-outs of one reactor, requests about that one alone fail at once, for
+    `REST_S`: it must not take its neighbours' time.
 
     Args: link: carries the requests. clock: device time.
     Attributes: heard_s, clock time of the newest answer, -inf before the first.
     """
 
-    SILENT_S, PAUSE_S = 1.0, 2.0
+    SILENT_S, PAUSE_S, REST_S = 1.0, 2.0, 40.0
 
     def __init__(self, link: Transport, clock: Clock) -> None:
         self._link, self._clock = link, clock
         self.heard_s, self._again_s, self._silence = -math.inf, -math.inf, ""
+        self._silent: dict[str, tuple[float, float]] = {}  # reactor: its last time-out, and until when it rests
 
     def _request(self, method: str, path: str) -> Reply:
-        asked_s = self._clock.now()
-        if asked_s < self._again_s:
+        asked_s, about = self._clock.now(), path.rpartition("/")[2]
+        silent_s, rests_s = self._silent.get(about, (math.inf, -math.inf))
+        if asked_s < max(self._again_s, rests_s):
             raise LinkError(f"{method} {path}: not sent, a moment ago: {self._silence}")
         try:
             reply = self._link.get(path) if method == "GET" else self._link.post(path)
         except LinkError as error:
             now = self._clock.now()
             if now - asked_s > self.SILENT_S:
-                self._again_s, self._silence = now + self.PAUSE_S, str(error)
+                alone = bool(about) and self.heard_s > silent_s
+                self._silent[about] = now, now + self.REST_S * alone
+                self._again_s, self._silence = now + self.PAUSE_S * (not alone), str(error)
             raise
         self.heard_s = self._clock.now()
+        self._silent.pop(about, None)
         return reply
 
     def switched_off(self) -> SwitchedOff | None:

@@ -188,3 +188,28 @@ def test_a_feed_command_that_is_heard_after_it_was_given_up_is_booked_and_the_li
     said = [note for step in lab.steps for note in step.notes]
     assert any("was given up was heard late" in note for note in said)
     assert not any("not by this program" in (reason or "") for step in lab.steps for reason in step.reasons)
+
+
+@pytest.mark.parametrize(("seconds", "fails"), [(15.0, False), (20.0, True)], ids=["slow", "silent"])
+def test_one_reactor_that_is_slow_or_silent_does_not_take_its_neighbours_time(seconds: float, fails: bool) -> None:
+    lab = DriverLab(("M0", "M1", "M2"), options=quiet(mu=0.03))
+    lab.client([ReactorCalibration(WEIGHED, WEIGHED)] * 3)
+    lab.law.rate = 0.012
+    lab.reactors.begin()
+    lab.run(4)
+    real = lab.wire.inner.post
+
+    def post(path: str) -> Reply:
+        if path.endswith("/M0"):
+            lab.clock.sleep(seconds)
+            if fails:
+                raise LinkError(f"{path}: no answer")
+        return real(path)
+
+    lab.wire.inner.post = post  # type: ignore[method-assign]
+    began, given = lab.clock.now(), [lab.truth(name)["feed_ml"] for name in ("M1", "M2")]
+    lab.run(12)
+    minutes = (lab.clock.now() - began) / 60.0
+    more = [lab.truth(name)["feed_ml"] - before for name, before in zip(("M1", "M2"), given, strict=True)]
+    assert min(more) > 0.6 * 0.72 * minutes  # 0.72 mL a minute are asked for; two minutes go by until it is found out
+    assert "link" in lab.kinds() if fails else any("too slowly" in note for step in lab.steps for note in step.notes)

@@ -70,7 +70,7 @@ class Record:
         return {
             "runs": sum(run.pump == "Pump1" and run.seconds > 0.05 for run in runs),
             "doses": len({round(row["on_s"], 3) for row in self.of("feed_on", m)}),
-            "repeats": sum(times(row.get("feed_times")) for row in ends.values()),
+            "repeats": sum(times(row.get("feed_times")) for row in ends.values()) + len(self.of("given", m)),
         }
 
 
