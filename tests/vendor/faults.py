@@ -387,8 +387,8 @@ def strike(case: Case, what: tuple[str, bool, int], number: int, patience: float
     struck: list[float] = []
 
     def act() -> None:
+        struck.append(case.bench.now())  # first: a killed client ends the wait
         case.client.signal(number)
-        struck.append(case.bench.now())
 
     case.upon(pattern, act, ahead, nth)
     end = case.bench.now() + patience
