@@ -84,7 +84,7 @@ class DoseSequence:
     def late(self) -> str:
         """The pump whose command was given up and may still be carried out, "" if there is none."""
         self._given_up = [lost for lost in self._given_up if self._book.elapsed() < lost.on_s + LATE_S]
-        return self._given_up[0].feed_pump if self._given_up else ""
+        return self._given_up[-1].feed_pump if self._given_up else ""
 
     def forget_sample(self) -> None:
         """The device's records begin anew: no dose was decided for any sample in them."""
@@ -255,7 +255,7 @@ class DoseSequence:
             raise
         self.running, self.stuck, self._due_s, self._doubt_s = False, "", math.inf, math.nan
         if self._late and self._given_up:
-            self._book_late(self._given_up.pop(0))
+            self._book_late(self._given_up.pop())  # the newest: its duty is the one that is set
         if (known := self._past()).open:
             self._conclude(known)
         self._off_s = self._book.elapsed()
