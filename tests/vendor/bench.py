@@ -448,7 +448,7 @@ class Client:
 
 
 def weigh(kind: str, folder: Path, reactors: Sequence[str], unit: int) -> Path:
-    """Weigh every pump on a bench of its own, as device_guide.md asks, and return the folder of calibrations."""
+    """Weigh every pump on a bench of its own, as docs/device_guide.md asks, and return the folder of calibrations."""
     calibration = folder / f"calibration_{kind}_{len(reactors)}"
     if calibration.exists():
         return calibration
