@@ -127,7 +127,8 @@ def draw(run: Recorded, folder: Path) -> None:
             edges = [(at - zero) * run.speed / 60.0 for at in (span.start, span.end)]
             style: dict[str, Any] = {"color": "black", "linewidth": 0.9, "linestyle": "--", "zorder": 4}
             top.plot(edges, [span.setpoint] * 2, label=None if n else "setpoint", **style)
-    top.set_ylabel("true OD")
+    held = [row["od"] for unit in run.reactors for row in rig_truth.of_unit(run.truth, unit) if "od" in row]
+    top.set(ylabel="true OD", ylim=(0.0, 1.3 * max(held, default=1.0)))  # a vendor's unit that escapes leaves the axes
     top.legend(handles=sorted(top.get_legend_handles_labels()[0], key=lambda line: line.get_label() == "setpoint"))
     bottom.set(ylabel="dose, mL", xlabel="time, min of the culture", ylim=(0.0, None))
     save(figure, folder / "figures", "rig_study")

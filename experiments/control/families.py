@@ -26,8 +26,8 @@ from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitC
 from hardware.pioreactor.preflight import preflight as preflight_units
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay as replay_units
-from hardware.pioreactor.rig.processes import Rig
 from hardware.reactor import Reactor, left_off
+from hardware.rig.processes import Rig
 from hardware.simulated import SimulatedReactors
 from hardware.storage.journal import Journal
 

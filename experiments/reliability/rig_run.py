@@ -25,9 +25,9 @@ from hardware.clock import RealClock
 from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import PioreactorConfig, RigConfig
 from hardware.pioreactor.mailbox import Cluster, Mailbox
-from hardware.pioreactor.rig.processes import Rig
 from hardware.pioreactor.versions import Facts, facts
 from hardware.pioreactor.web import Web
+from hardware.rig.processes import Rig
 
 __all__ = ["LOOK_S", "RigStudyConfig", "VendorConfig", "run_on_rig"]
 

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from hardware.pioreactor.config import RigConfig
-from hardware.pioreactor.rig.processes import Rig
-from hardware.pioreactor.rig.vials import Pulse
 from hardware.pioreactor.versions import facts
+from hardware.rig.processes import Rig
+from hardware.rig.vials import Pulse
 from hardware.storage.journal import read_journal
 
 __all__ = ["MEDIA_PIN", "SETPOINT", "SICK", "WASTE_PIN", "WELL", "Seen", "Trial", "log_rows"]

@@ -84,9 +84,9 @@ class PioreactorConfig:
     )
     max_dose_ml: float = setting(1.5, "the largest dose", "mL", within=(0.1, 5), note="the vendor has no limit")
     waste_factor: float = setting(2.0, "waste pump over media pump, as the vendor's automations", within=(1, 5))
-    drain_ml: float = setting(
-        100.0, "most that is drained while a media pump cannot be stopped, then a plug is all that helps", "mL",
-        within=(0, 2000),
+    bottle_ml: float = setting(
+        2000.0, "medium of one unit: while a media pump cannot be stopped, until so much may have flowed, the waste "
+        "pump keeps its vial from overflowing", "mL", within=(1, 20_000),
     )  # fmt: skip
     pump_pins: tuple[int, ...] = setting((13, 16, 12), "GPIO pins of media, alt-media and waste pump", some=True)
     start_s: float = setting(

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.mailbox import DOSING_JOBS, PUMPS, Event
 from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, WASTE, Moved, Pumps, Steps
 from hardware.pioreactor.resume import History
@@ -42,8 +43,8 @@ class Doses:
         self.foreign = ""
         self.sample: tuple[float, int] | None = None
         self.carry_ml, self._count = 0.0, 0
+        self._room_ml = vial_ml(self._config.volume_ml) - self._config.volume_ml  # above the tube; the rest runs over
         self._course: Iterator[float] | None = None
-        self._booked: dict[tuple[str, str], float] = {}  # by job and source; -1 while it is under way
         self._strange: list[Event] = []
 
     @property
@@ -114,7 +115,7 @@ class Doses:
         """Dosing events that arrived; those that are nobody's here are booked after the dose under way."""
         for event in events:
             self.pumps.take(event)
-            if self._booked.get((event.pump, event.source), 0.0) >= 0.0:
+            if math.isfinite(self.pumps.counted.get((event.pump, event.source), 0.0)):
                 self._strange.append(event)
         if self._course is None:
             self._settle_strange()
@@ -124,7 +125,6 @@ class Doses:
     def _dose(self, plan: Plan, dose: str, on_s: float) -> Iterator[float]:
         """Media, then as much waste as the plan says, then the end on record."""
         self._book.log("feed_on", on_s=on_s, id=dose)  # before it is done: it may have been done
-        self._booked[MEDIA, dose] = self._booked[WASTE, dose] = -1.0
         media, waste = (yield from self.pumps.give(MEDIA, plan.feed_ml, dose)), Moved()
         if 0.0 < media.high <= plan.feed_ml + LATE_ML and not self.pumps.halted:
             waste = yield from self.pumps.give(WASTE, plan.waste_ml, dose)
@@ -138,13 +138,14 @@ class Doses:
         pumps, dose, asked_ml = self.pumps, history.id, history.feed_ml
         media, waste = Moved(), Moved()
         if history.fed:
-            self._booked[MEDIA, dose] = self._booked[WASTE, dose] = -1.0
+            pumps.counted[MEDIA, dose] = pumps.counted[WASTE, dose] = math.inf
             media, waste = Moved(0.0, asked_ml, UNSEEN), Moved(0.0, history.waste_ml)
             if history.boot == pumps.boot and not history.wasted:
                 asked = self._clock.now() - (self._book.elapsed() - history.on_s) / self._config.speed
                 ran_s = pumps.pin(MEDIA).ran_s
                 seen = yield from pumps.follow(MEDIA, asked_ml, dose, history.task, asked, ran_s)
-                media = replace(seen, low=0.0, high=max(seen.high, asked_ml), end=seen.end or UNSEEN)
+                end = seen.end if seen.high > 0.0 else ""  # or it was over before: that it is not seen says nothing
+                media = replace(seen, low=0.0, high=max(seen.high, asked_ml), end=end or UNSEEN)
         yield from self._conclude(Plan(asked_ml, history.waste_ml), dose, history.on_s, media, waste)
 
     def _conclude(self, plan: Plan, dose: str, on_s: float, media: Moved, waste: Moved) -> Iterator[float]:
@@ -152,7 +153,7 @@ class Doses:
 
         Whoever booked the plan when the dose began is told what more was fed, and what the level rose.
         """
-        self._booked[MEDIA, dose], self._booked[WASTE, dose] = media.high, waste.low
+        self.pumps.counted[MEDIA, dose], self.pumps.counted[WASTE, dose] = media.high, waste.low
         for moved, pump in ((media, "media"), (waste, "waste")):
             if moved.end:
                 self._book.tell(f"{pump}: {moved.end}")
@@ -164,20 +165,17 @@ class Doses:
         )  # fmt: skip
         if media.high > plan.feed_ml + LATE_ML:
             taken += yield from self._drain(media, dose)
-        more, rise = media.high - plan.feed_ml, max(media.high - taken, 0.0)
+        more, rise = media.high - plan.feed_ml, max(min(media.high, self._room_ml) - taken, 0.0)
         if abs(more) > LATE_ML or rise > LATE_ML or media.low < plan.feed_ml - LATE_ML:
             self.extra.append(Given(self._book.elapsed(), more, media.low - plan.feed_ml, more - rise))
 
     def _drain(self, media: Moved, dose: str) -> Steps[float]:
         """Waste after a media pump that ran on, until the vial is back at its tube; what was taken out, mL."""
         self._book.tell("the vial is drained of what the media pump gave while it ran on, before it is dosed again")
-        wanted, taken = self._config.waste_factor * min(media.high - media.drained, self._config.volume_ml), 0.0
+        wanted, taken = self._config.waste_factor * min(media.high - media.drained, self._room_ml), 0.0
         for k in range(DRAINS):
             if wanted - taken > LATE_ML and not self.pumps.halted:
-                key = WASTE, f"{dose}/drain{k}"
-                self._booked[key] = -1.0
-                self._booked[key] = (yield from self.pumps.give(WASTE, wanted - taken, key[1])).low
-                taken += self._booked[key]
+                taken += (yield from self.pumps.give(WASTE, wanted - taken, f"{dose}/drain{k}")).low
         return taken
 
     # -- what nobody commanded -------------------------------------------------------------------------------------
@@ -186,7 +184,7 @@ class Doses:
         """A pump that runs without a job, or whose job was killed: ended, and what it moved on record."""
         pin, name = self.pumps.pin(job), f"{self.pumps.short}/{self._book.elapsed():.0f}"
         since = pin.on_s if pin.on and pin.on_s > -math.inf else self._clock.now()
-        moved = yield from self.pumps.end(job, 0.0, name, since)
+        moved = yield from self.pumps.end(job, 0.0, name, since, pin.ran_s)
         if moved.high > 0.0:
             self._give(job, moved.low, moved.high, f"{job} ran without its job")
         if job == MEDIA and moved.high > LATE_ML:
@@ -197,12 +195,12 @@ class Doses:
         """Book what was dosed without a command of this run, beyond what was counted already."""
         strange, self._strange = self._strange, []
         for job, source in dict.fromkeys((event.pump, event.source) for event in strange):
-            counted = self._booked.get((job, source), 0.0)
+            counted = self.pumps.counted.get((job, source), 0.0)
             over = self.pumps.told[job, source] - counted
             ours = source.startswith(f"{OURS}{self.pumps.run}/")  # what is booked of it may be more than was told
             if abs(over) <= 1e-6 or (ours and over < 0.0) or job not in PUMPS:
                 continue
-            self._booked[job, source] = counted + over
+            self.pumps.counted[job, source] = counted + over
             if source == self.pumps.short:
                 self._give(job, over, over, f"{job} to end with its pin off")
                 continue

@@ -18,10 +18,12 @@ from hardware.pioreactor.config import PioreactorConfig
 __all__ = ["DOSING_JOBS", "PUMPS", "Cluster", "Event", "Mailbox", "Pin", "Reading", "State"]
 
 KEPT, LONGEST = 2000, 100_000  # readings and events; bytes of a message
+MOST_ML = 10.0  # an event tells half a second of a pump
 LOCKS = "turbidostat/lock/"  # who controls units of this cluster, retained, cleared by the last will
 PUMPS = ("add_media", "add_alt_media", "remove_waste")  # jobs, in the order of config.pump_pins
 DOSING_JOBS = (*PUMPS, "circulate_media", "circulate_alt_media", "pumps", "dosing_automation")
 LIVE, WORDS = ("init", "ready", "sleeping"), ("init", "ready", "sleeping", "disconnected", "lost")
+ECHOES = ("stirring", "temperature_automation")  # jobs that say all pins of the unit now and then
 TWICE_S = 0.2  # two messages that are not of the same instant
 
 
@@ -51,35 +53,42 @@ class Pin:
     """A pump's pin by the messages about it.
 
     Attributes: on; on_s, off_s, when it last went on and off, -inf if that is not known; ran_s, for how long it has run
-      up to off_s; run_s, ended_s, when a job of the pump last said that it is there, and that it ended; doubt_s, when
-      it was said to be on though its job had ended.
+      up to off_s; run_s, ended_s, when a job of the pump last said that it is there, and that it ended; event_s, when
+      it first told what it is about to give, inf if it did not; doubt_s, when it was said to be on though its job had
+      ended.
     """
 
     def __init__(self) -> None:
         self.on, self.ran_s = False, 0.0
         self.on_s = self.off_s = self.run_s = self.ended_s = self.doubt_s = -math.inf
+        self.event_s = math.inf
 
-    def told(self, on: bool, at: float, word: str) -> None:
+    def told(self, on: bool, at: float, word: str, echoes: bool) -> None:
         """A message that has all pins of the unit.
 
-        Stirring reads them and says so an instant later: a pin that is on without a job is on if it is said twice.
-        Args: at: when it came, -inf if it was retained. word: state of the pin's job.
+        Other jobs read them and say so an instant later: a pin that is on without a job is on if it is said twice.
+        Args: at: when it came, -inf if it was retained and on. word: state of the pin's job. echoes: whether others say
+          pins.
         """
         if not on:
             self.ends(at)
-        elif not self.on and (word in LIVE or at == -math.inf):
-            self.on, self.on_s = True, at
-        elif not self.on and (word == "lost" or -math.inf < self.doubt_s < at - TWICE_S):
-            self.on, self.on_s = True, self.run_s if word == "lost" else self.doubt_s
         elif not self.on:
-            self.doubt_s = max(self.doubt_s, at) if self.doubt_s == -math.inf else self.doubt_s
+            if word in LIVE or at == -math.inf or not echoes:
+                on_s = at
+            elif word == "lost" or -math.inf < self.doubt_s < at - TWICE_S:
+                on_s = self.run_s if word == "lost" else self.doubt_s
+            else:
+                self.doubt_s = at if self.doubt_s == -math.inf else self.doubt_s
+                return
+            self.on, self.on_s = True, min(on_s, self.event_s)  # a job that stands still says its pin late
 
     def ends(self, at: float) -> None:
         """It stands still; what it ran until then counts once."""
-        if self.on:
-            self.ran_s += at - self.on_s if self.on_s > -math.inf else 0.0
+        began = self.on_s if self.on else self.event_s
+        self.ran_s += at - began if math.isfinite(began) else 0.0
+        if self.on or began < math.inf:
             self.off_s, self.on = at, False
-        self.doubt_s = -math.inf
+        self.doubt_s, self.event_s = -math.inf, math.inf
 
 
 class Mailbox:
@@ -116,7 +125,8 @@ class Mailbox:
             with self.lock:
                 if len(payload) > LONGEST:
                     raise ValueError(f"{len(payload)} bytes")
-                self.heard_s = self.heard_s if retained else self._clock.now()
+                if not (retained or rest.endswith("/set") or payload == b"lost"):  # what others say, or the broker
+                    self.heard_s = self._clock.now()
                 self._enter(experiment, rest, payload, retained)
         except Exception as error:  # the thread that calls must go on, whatever somebody sends
             self.refused += 1
@@ -133,15 +143,23 @@ class Mailbox:
             self._state(experiment, rest.removesuffix("/$state"), payload.decode(), at)
         elif rest == "pwms/dc" and (mine or not retained):
             duty = {int(pin): _number(dc) for pin, dc in json.loads(payload or b"{}").items()}
+            echoes = not mine or any(map(self.live, ECHOES))
             for job, number in self.jobs.items():
                 word = next((w for w in LIVE if self.live(job)), self.state(job).word)
-                self.pins[number].told(duty.get(number, 0.0) > 0.0, at, word)
+                on = duty.get(number, 0.0) > 0.0
+                self.pins[number].told(on, at if on else now, word, echoes)  # off by now, whenever that was said
             self.dc_s = max(self.dc_s, at)
         elif rest == "dosing_events" and not retained:
             e = json.loads(payload)
             if not isinstance(e["event"], str):
                 raise TypeError("an event without a name")
-            self.events.append(Event(e["event"], _number(e["volume_change"]), str(e["source_of_event"])))
+            event = Event(e["event"], _number(e["volume_change"]), str(e["source_of_event"]))
+            if abs(event.ml) > MOST_ML:
+                raise ValueError(f"{event.ml:g} mL")
+            self.events.append(event)
+            if event.pump in self.jobs and event.ml > 0.0 and self.live(event.pump):
+                pin = self.pins[self.jobs[event.pump]]
+                pin.event_s = min(pin.event_s, now)
         elif rest == "od_reading/ods" and mine and payload:
             self._reading(json.loads(payload), now, retained)
         elif rest == "temperature_automation/temperature" and mine and payload:
@@ -163,7 +181,9 @@ class Mailbox:
             pin.run_s = at
         elif word == "disconnected":
             pin.ended_s = at
-            if pin.on_s >= pin.run_s:  # its own word on the pin may come a moment later, or was overtaken
+            if (
+                pin.on_s >= pin.run_s or pin.run_s <= pin.event_s < math.inf
+            ):  # its own word on the pin may come a moment later, or was overtaken
                 pin.ends(at)
 
     def _reading(self, said: dict[str, Any], now: float, retained: bool) -> None:
@@ -178,9 +198,11 @@ class Mailbox:
         self.readings.append(Reading(now, value))
 
     def forget(self) -> None:
-        """What jobs said of themselves, before it is said again."""
+        """What jobs said of themselves, before it is said again; a pump's job ends with the broker."""
         with self.lock:
             self.states.clear()
+            for pin in self.pins.values():
+                pin.event_s = math.inf
 
     def drain(self) -> tuple[list[Reading], list[Event], list[str]]:
         """Readings, events, and what was ignored, since the last call."""

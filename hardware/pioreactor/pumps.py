@@ -30,7 +30,7 @@ STEP_S = 0.1
 SETTLE_S = 1.5  # between two events of a dose .5 s pass; a word on a pin that was overtaken comes within that
 OVERRUN_S = 3.0  # beyond its time a job is given to end by itself
 UNSTARTED_S = 60.0  # that a process may take from the queue to its first word, on a busy unit
-PROBE_S = 30.0  # between two harmless requests that show whether the task queue works
+PROBE, PROBE_S = "circulate_media", 30.0  # asked for its help only; a second request for one job within 1 s is refused
 QUIET_S = 10.0  # without a word a unit that lives is never: it reads OD
 LATE_ML = 0.1  # messages are late by some hundredths of a second
 ROUNDED_S = 0.5  # a dose is told in slices of so long, before each is pumped
@@ -87,18 +87,17 @@ class Barrier:
 
     def __init__(self, web: Web, clock: Clock, wait_s: float = 0.0) -> None:
         self._calls, self._web, self._task = Calls(web, clock), web, ""
-        self._clock, self._from_s = clock, clock.now() + wait_s
+        self._clock, self._from_s, self._passed = clock, clock.now() + wait_s, False
 
     def passed(self) -> bool:
         """Whether it was, by what was answered until now."""
-        if self._clock.now() < self._from_s:
-            return False
+        if self._clock.now() < self._from_s or self._passed:
+            return self._passed
         said = self._calls.ask("result", 0.5, self._web.result, self._task) if self._task else None
-        if said and said[0] is not None:
-            return True
-        if made := self._calls.ask("run", PROBE_S, self._web.run, MEDIA, {"help": None}):
+        self._passed = bool(said and said[0] is not None)
+        if made := self._calls.ask("run", PROBE_S, self._web.run, PROBE, {"help": None}):
             self._task = made[0]
-        return False
+        return self._passed
 
 
 def boot_of(rows: list[dict[str, Any]]) -> str:
@@ -110,10 +109,11 @@ class Pumps:
     """Media and waste pump of one unit.
 
     Args: run: of this run, part of every id.
-    Attributes: flow_ml_s, of each by its active calibration; told, mL by job and source of the events; facts, of the
-      unit's version; boot, when the unit was started; proven, jobs whose pumps were ended here, and when; trouble, why
-      no dose may be given, "" if one may; cut, whether media is to end, halted, whether everything is; waits, whether
-      what is under way waits for somebody or something else.
+    Attributes: flow_ml_s, of each by its active calibration; told, mL by job and source of the events; counted, mL of
+      them that whoever asked for them books, inf while they are under way; facts, of the unit's version; boot, when the
+      unit was started; proven, jobs whose pumps were ended here, and when; trouble, why no dose may be given, "" if one
+      may; cut, whether media is to end, halted, whether everything is; waits, whether what is under way waits for
+      somebody or something else.
     """
 
     def __init__(
@@ -124,6 +124,7 @@ class Pumps:
         self.config, self.clock, self.book, self.run = config, clock, book, run
         self.flow_ml_s = {MEDIA: 1.0, WASTE: 1.0}  # about what the vendor's pumps give, until it was read
         self.told: dict[tuple[str, str], float] = {}
+        self.counted: dict[tuple[str, str], float] = {}
         self.facts, self.boot = Facts(), ""
         self.trouble, self.cut, self.halted, self.waits = "", False, False, False
         self.proven: dict[str, float] = {}
@@ -134,9 +135,9 @@ class Pumps:
         return f"{OURS}{self.run}/{self.unit}/off"
 
     def take(self, event: Event) -> None:
-        """A dosing event; a correction of what was told is negative."""
+        """A dosing event; a correction is negative, and of what was told."""
         key = event.pump, event.source
-        self.told[key] = self.told.get(key, 0.0) + event.ml
+        self.told[key] = max(self.told.get(key, 0.0) + event.ml, 0.0)
 
     def pin(self, job: str) -> Pin:
         """That a job drives."""
@@ -177,6 +178,7 @@ class Pumps:
     def give(self, job: str, ml: float, dose: str) -> Steps[Moved]:
         """Ask for one pump job and follow it; what it gave. It is never asked for again."""
         asked, ml, task, ran_s = self.clock.now(), round(ml, 4), "", self.pin(job).ran_s
+        self.counted[job, dose] = math.inf
         future = self.web.ask(self.web.run, job, {"ml": ml, "source-of-event": dose})
         while not future.done():
             yield STEP_S
@@ -184,10 +186,13 @@ class Pumps:
             task = future.result()
             self.book.log("task", id=dose, job=job, task=task)
         except NotHeard as error:
+            self.counted[job, dose] = 0.0
             return Moved(end=f"not given: {error}")
         except ReactorError as error:
             self.book.tell(f"{job}: whether it was heard is unknown: {error}")
-        return (yield from self.follow(job, ml, dose, task, asked, ran_s))
+        moved = yield from self.follow(job, ml, dose, task, asked, ran_s)
+        self.counted[job, dose] = moved.high if job == MEDIA else moved.low
+        return moved
 
     def follow(self, job: str, ml: float, dose: str, task: str, asked: float, ran_s: float) -> Steps[Moved]:
         """A job to its end; what it gave. Args: task: that it was asked for with, "" if it is unknown; ran_s: then."""
@@ -197,7 +202,7 @@ class Pumps:
         while not self._is_over(job, dose, ml, asked):
             cut = self._unwanted(job) or self.odd(job) or self.mqtt.broke_s >= asked
             if cut or self.clock.now() > late:
-                return (yield from self.end(job, ml, dose, asked))
+                return (yield from self.end(job, ml, dose, asked, ran_s))
             yield STEP_S
         return self._moved(job, ml, dose, (self.pin(job).ran_s - ran_s) * self.flow_ml_s[job])
 
@@ -211,16 +216,20 @@ class Pumps:
         it, was taken from the queue and no job came for long; where the unit was started again.
         """
         calls, barrier = Calls(self.web, self.clock), Barrier(self.web, self.clock, PROBE_S * bool(task))
-        never_s, why = math.inf, ""  # from when on it cannot begin any more
-        while not (why or self.told.get((job, dose), 0.0) > 0.0 or self.pin(job).on or self.pin(job).on_s >= asked):
+        never_s, why, late = math.inf, "", False  # from when on it cannot begin any more; whether it should have begun
+        while not (
+            why or self.told.get((job, dose), 0.0) > 0.0 or self.pin(job).on or self.pin(job).on_s >= asked
+            or (self.lost(job) and self.box.state(job).at >= asked)
+        ):  # fmt: skip
             now, state, taken = self.clock.now(), self.box.state(job), None
-            if now > asked + self.config.start_s and not (self.trouble or self.box.live(job)):
+            if now > asked + self.config.start_s and not (late or self.trouble or self.box.live(job)):
+                late = True
                 self.trouble = f"the fate of a dose of {ml:.2f} mL ({job}) is unknown: it was not seen to begin"
                 self.book.tell(self.trouble)
-            self.waits = bool(self.trouble)
+            self.waits = self.waits or late
             if task and (said := calls.ask("task", 0.5, self.web.result, task)):
                 taken = said[0]
-            if self.trouble and taken is None and math.isinf(never_s) and barrier.passed():
+            if late and taken is None and math.isinf(never_s) and barrier.passed():
                 taken = True
             if taken is not None:
                 never_s = min(never_s, now + (UNSTARTED_S if taken else SETTLE_S))
@@ -228,14 +237,15 @@ class Pumps:
                 never_s = min(never_s, state.at + SETTLE_S)
             if now > never_s and not self.box.live(job):
                 why = f"accepted and not carried out: {self.locks}"
-            if self.trouble and (rows := calls.ask("rows", 5.0, self.web.running)) and self.rebooted(rows[0]):
+            if late and (rows := calls.ask("rows", 5.0, self.web.running)) and self.rebooted(rows[0]):
                 why = "not carried out: the unit was started again, which forgets requests"
             if self._unwanted(job) and calls.due("stop", 1.0):  # heard only once the job listens
                 self.say(f"{job}/$state/set", "disconnected")
             yield STEP_S
-        if self.trouble and not why:
+        if late and not why:
             self.book.tell(f"{job} of {ml:.2f} mL ran late")
-        self.trouble, self.waits = "", False
+        if late:
+            self.trouble, self.waits = "", False
         return why
 
     def _is_over(self, job: str, dose: str, ml: float, asked: float) -> bool:
@@ -252,19 +262,19 @@ class Pumps:
             slack = LATE_ML if ran_ml > 0.0 else ROUNDED_S * self.flow_ml_s[job]
             low, high = max(min(told, ran_ml or told) - slack, 0.0), min(max(told, ran_ml) + slack, ml)
             end = f"{told:.2f} of {ml:.2f} mL told: ended early, or its last event was not sent"
-        if ran_ml > high + LATE_ML:  # a job times itself, and on a busy unit it does that late
-            return Moved(low, ran_ml, end or f"its pin was on for {ran_ml:.2f} mL, {told:.2f} mL were told")
-        return Moved(low, high, end)
+        if ran_ml > high + LATE_ML:
+            end = end or f"its pin was on for {ran_ml:.2f} mL, {told:.2f} mL were told"
+        return Moved(low, max(high, round(ran_ml, 4)), end)  # a job times itself, and on a busy unit it does that late
 
-    def end(self, job: str, ml: float, dose: str, since: float) -> Steps[Moved]:
+    def end(self, job: str, ml: float, dose: str, since: float, ran_s: float) -> Steps[Moved]:
         """End a pump that has begun, or may have, until it is proven off; what it moved (docs/pioreactor.md, Ending).
 
-        While a media pump goes on, the waste pump keeps the vial from overflowing, up to `drain_ml`. What only a hand
-        can do is said; once it was done, what is tried here ends the pump.
+        While a media pump goes on, the waste pump keeps the vial from overflowing, until `bottle_ml` may have flowed.
+        What only a hand can do is said; once it was done, what is tried here ends the pump.
 
-        Args: ml: as asked. since: when it was asked.
+        Args: ml: as asked. since, ran_s: when it was asked, and for how long its pin had run then.
         """
-        ending, off_s, drained = Ending(self, job, since), math.nan, 0.0
+        ending, off_s, drained = Ending(self, job, since, ran_s), math.nan, 0.0
         drain: Steps[Moved] | None = None
         while math.isnan(off_s) or drain is not None:
             try:
@@ -273,10 +283,12 @@ class Pumps:
                 drained, drain = drained + over.value.low, None
             if math.isnan(off_s) and math.isnan(off_s := ending.off_s()):
                 ending.act()
-                late, left = self.clock.now() > ending.began + OVERRUN_S, self.config.drain_ml - drained
-                self.trouble, self.waits = (self._plug(job), True) if late else (self.trouble, self.waits)
-                if late and drain is None and job == MEDIA and self.pin(job).on and left > LATE_ML and not self.halted:
-                    drain = self.give(WASTE, min(DRAIN_ML, left), f"{dose}/beside{self.clock.now():.0f}")
+                late, flowed = self.clock.now() > ending.began + OVERRUN_S, ending.flowed()
+                self.trouble = self._plug(job) if late else self.trouble
+                self.waits = late or self.waits
+                wanted = self.config.waste_factor * flowed - drained
+                if late and drain is None and job == MEDIA and not self.halted and wanted > DRAIN_ML:
+                    drain = self.give(WASTE, DRAIN_ML, f"{dose}/beside{self.clock.now():.0f}")
             yield STEP_S
         self.trouble, self.waits = "", False
         self.proven[job] = self.clock.now()
@@ -284,9 +296,9 @@ class Pumps:
 
     def _plug(self, job: str) -> str:
         pin = self.box.jobs[job]
-        why = "whose process was killed or stands still" if self.lost(job) else "which should have ended"
+        how = "whose process was killed or stands still" if self.lost(job) else "which should have ended"
         return (
-            f"pin {pin} may run on after {job}, {why}; pull the pump's plug, or on the unit: "
+            f"pin {pin} may run on after {job}, {how}; pull the pump's plug, or on the unit: "
             f"{self.facts.purge} pwm_locks {pin} --as-int (it is then ended from here)"
         )
 
@@ -299,15 +311,17 @@ class Ending:
     tried again and again, at its own pace; of short runs at most `SHORTS` are carried out, and none is asked for while
     an earlier one may still wait.
 
-    Args: pumps: of the unit. job, since: as of `Pumps.end`. Attributes: began, when it did.
+    Args: pumps: of the unit. others as of `Pumps.end`. Attributes: began, when it did.
     """
 
-    def __init__(self, pumps: Pumps, job: str, since: float) -> None:
-        self._p, self._job, self._since = pumps, job, since
+    def __init__(self, pumps: Pumps, job: str, since: float, ran_s: float) -> None:
+        self._p, self._job, self._since, self._ran_s = pumps, job, since, ran_s
         self.began, self._calls = pumps.clock.now(), Calls(pumps.web, pumps.clock)
         self._listed: bool | None = None
         self._told, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
-        self._quiet_s, self._rebooted, self._lost, self._held = math.inf, False, False, False
+        self._quiet_s, self._still_s, self._rows_s = math.inf, math.inf, -math.inf
+        self._short: Future[str] | None = None
+        self._rebooted = self._lost = self._held = False
 
     def _shorts(self) -> float:
         return self._p.told.get((self._job, self._p.short), 0.0)
@@ -322,38 +336,64 @@ class Ending:
         if passed > 2.0 and self._listed is not False:
             calls.ask("stop", 20.0, p.web.stop, job)
         may_run = self._shorts() - self._told < (SHORTS - 0.5) * SHORT_S * p.flow_ml_s[job]
-        if passed > 5.0 and may_run and self._barrier.passed():
-            self._barrier, self._short_s = Barrier(p.web, p.clock, AGAIN_S), min(self._short_s, p.clock.now())
-            calls.ask("run", 0.0, p.web.run, job, {"duration": SHORT_S, "source-of-event": p.short})
+        if self._short is not None and self._short.done():
+            if not isinstance(self._short.exception(), NotHeard):
+                self._barrier = Barrier(p.web, p.clock, AGAIN_S)
+            self._short = None
+        heard = p.mqtt.connected  # what it tells, else it runs unseen
+        if (
+            self._short is None
+            and passed > 5.0
+            and may_run
+            and heard
+            and self._barrier.passed()
+            and calls.due("short", 2.0)
+        ):
+            self._short_s = min(self._short_s, p.clock.now())
+            self._short = p.web.ask(p.web.run, job, {"duration": SHORT_S, "source-of-event": p.short})
 
     def off_s(self) -> float:
         """When the pump was off at the latest, nan while that is not proven."""
         p, now, pin, state = self._p, self._p.clock.now(), self._p.pin(self._job), self._p.box.state(self._job)
-        self._lost = self._lost or state.word == "lost"
-        self._held = self._held or (bool(self._listed) and pin.on)
+        broke = p.mqtt.broke_s >= self._since  # a broker that stood still takes jobs that live for lost
+        self._lost = self._lost or (state.word == "lost" and not broke)
+        self._held = self._held or (bool(self._listed) and pin.on and pin.on_s == -math.inf)
         if now > p.box.heard_s + QUIET_S:
             self._quiet_s = min(self._quiet_s, p.box.heard_s)
+        fresh, said = p.box.dc_s > self.began, state.word == "disconnected" and state.at >= self._since
+        if fresh and not pin.on and pin.doubt_s == -math.inf:
+            self._still_s = min(self._still_s, p.box.dc_s)
         if rows := self._calls.ask("rows", 2.0, p.web.running):
+            self._rows_s = now
             self._listed = any(row["job_name"] == self._job for row in rows[0])
             self._rebooted = not self._listed and p.rebooted(rows[0])
             if self._rebooted:  # its pins are 0 since it lost its power, and that was after its last word
                 p.boot, off_s = boot_of(rows[0]), max(min(self._quiet_s, now), self._since)
                 pin.ends(off_s)
                 return off_s
-        fresh, said = p.box.dc_s > self.began, state.word == "disconnected" and state.at >= self._since
         by_itself = said and not self._lost and (fresh or pin.off_s >= self._since)
         by_short = said and self._shorts() > self._told and state.at >= self._short_s
         if pin.on or not (by_itself or by_short or (self._listed is False and fresh)):
             return math.nan
         return pin.off_s if pin.off_s >= self._since else now
 
+    def flowed(self) -> float:
+        """What a pump that runs on, or told that it is about to and no end, moved up to now, mL; 0 for one of a silent
+        unit, and for one whose bottle is empty by now."""
+        p, pin, now = self._p, self._p.pin(self._job), self._p.clock.now()
+        silent, broke = now > self._rows_s + QUIET_S, p.mqtt.broke_s >= self._since and not self._lost
+        flowed = max(now - max(self._since, pin.on_s if pin.on else pin.event_s), 0.0) * p.flow_ml_s[self._job]
+        return flowed if not (silent or broke) and flowed < p.config.bottle_ml else 0.0
+
     def moved(self, ml: float, told: float, off_s: float) -> Moved:
         """What the pump moved since it was asked. Args: ml: as asked. told: by its events. off_s: as of `off_s`."""
         p, pin, flow = self._p, self._p.pin(self._job), self._p.flow_ml_s[self._job]
-        seen = pin.on_s if pin.on_s >= self._since else self._since if self._held else math.nan
-        ran = max(off_s - seen, 0.0) * flow
+        longest = max(min(off_s, self._still_s) - self._since, 0.0) * flow
+        ran = min((pin.ran_s - self._ran_s) * flow - (self._shorts() - self._told), longest)
+        if self._held or (ran <= 0.0 and self._lost):  # since when it runs was never heard
+            ran = longest
         low, end = max(told - ROUNDED_S * flow, 0.0), "ended from here"
-        if math.isnan(seen):  # its pin was never seen: a job times itself
+        if ran <= 0.0:  # its pin was never seen: a job times itself
             return Moved(low, max(ml, told), end)
         if self._rebooted:
             return Moved(low, max(ran, min(ml, ran + p.config.reading_s * flow)), "the unit was started again in it")

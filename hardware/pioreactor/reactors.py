@@ -141,6 +141,10 @@ class PioreactorReactors(Stations[Station]):
         """The thermostat of `rows` off for the rest of the run."""
         return self._each(rows, Station.heat_off)
 
+    def set_level(self, n: int, level_ml: float) -> None:
+        """Put the unit's own ledger, where it keeps one, to a volume, as soon as it answers."""
+        self.stations[n].level_ml = level_ml
+
     def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
         """Hand `rows` over to the vendor's turbidostat at `setpoint` (OD, (N,)); returns what failed."""
         targets = dict(zip(self.names, setpoint, strict=True))

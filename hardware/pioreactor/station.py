@@ -29,6 +29,7 @@ T = TypeVar("T")
 GRACE_S = 20.0  # in which a job that was asked for may come up; between two attempts at a unit that is in trouble
 TELL_S, TELLS = 3.0, 6  # between two words on the same target; of those before the job is started anew
 SETTLED_S = 2.0  # after which a turbidostat that is wrong has ended
+SILENT_S = 45.0  # without a reading, after which a reader that says it is there is none
 FRESH = 4.0  # periods of readings in which one that is taken has arrived
 
 
@@ -37,7 +38,8 @@ class Station:
 
     Args: config: of this unit. real: clock of messages. run: of this run, part of every id.
     Attributes: web, book, doses, sampling: its parts; handed_over, OD at which the vendor's turbidostat was started,
-      nan if it was not; up, whether it was brought up.
+      nan if it was not; level_ml, that the unit's own ledger is to be put to, nan if it is not; up, whether it was
+      brought up.
     """
 
     def __init__(self, config: PioreactorConfig, mqtt: Cluster, box: Mailbox, real: Clock, book: Logbook, run: str):
@@ -47,7 +49,7 @@ class Station:
         self._pumps = Pumps(self.name, self.web, mqtt, box, config, real, book, run)
         self.doses = Doses(self._pumps)
         self.sampling = Sampling(config, self._device.now())
-        self.handed_over = self._target = math.nan
+        self.handed_over = self._target = self.level_ml = math.nan
         self.given_up = self.heat_is_off = self.up = False
         self._calls = Calls(self.web, real)
         self._course: Iterator[float] | None = None
@@ -140,6 +142,10 @@ class Station:
             if self._pumps.rebooted(rows[0]) and not self.doses.running:
                 self._pumps.boot = boot_of(rows[0])
                 self.book.log("device", device_id=self.name, url=self.web.url, boot=self._pumps.boot)
+        told = math.isnan(self.level_ml) or not self._pumps.facts.ledger
+        if not told and (said := self._calls.ask("level", TELL_S, self.web.set_level, self.level_ml)):
+            self.book.tell(f"its own ledger: {said[0] or f'{self.level_ml:g} mL'}")
+            self.level_ml = math.nan
         if any(pin.doubt_s > -math.inf for pin in self._box.pins.values()) and self._calls.due("pins", TELL_S):
             self._pumps.ask_pins()
         self._missing = [job for job in self._wanted() if self._is_gone(job)] if self._mqtt.connected else []
@@ -188,7 +194,7 @@ class Station:
             return Fault("mode", self.doses.foreign, "one client per unit; it is counted")
         if self._missing:
             forget, job = self._pumps.facts.forget, self._missing[0]
-            word = f"{forget} --job-name {job}" if forget else "reboot it"
+            word = f"{forget} --job-name {job}, else reboot it" if forget else "reboot it"
             remedy = f"asked for again; a killed job blocks restarts, on the unit: {word}"
             return Fault("stopped", f"the unit {GONE[job]}", remedy)
         if self._trouble:
@@ -207,8 +213,10 @@ class Station:
         A job that goes on over a restart of the broker may never say so again.
         """
         longest_s = FRESH * self._config.reading_s * self._config.speed
-        if job == OD and self.sampling.count and self._device.now() < self.sampling.read_s + longest_s:
-            return True
+        if job == OD and self.sampling.count:
+            silent_s = self._device.now() - self.sampling.read_s
+            if silent_s < longest_s or silent_s > SILENT_S * self._config.speed:
+                return silent_s < longest_s
         state = self._box.state(job)
         known = state.at > -math.inf or not state.word
         return self._box.live(job) if state.word and known else job in self._listed
@@ -232,8 +240,9 @@ class Station:
         return job in self._gone
 
     def _again(self, job: str) -> Iterator[float]:
+        """Start a job anew; one that is there and does nothing is first ended."""
         try:
-            yield from self._start(job)
+            yield from self._answer(self.web.stop, job) if self._box.live(job) else self._start(job)
             self._trouble = ""
         except ReactorError as error:
             self._trouble = str(error)

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
+from urllib.parse import quote
 
 import httpx
 
@@ -28,7 +29,7 @@ class Web:
     """
 
     def __init__(self, url: str, experiment: str = "", timeout_s: float = 4.0) -> None:
-        self.url, self._timeout_s = url, timeout_s
+        self.url, self._timeout_s, self._experiment = url, timeout_s, experiment
         self._env = {"EXPERIMENT": experiment, "JOB_SOURCE": "turbidostat"}
         headers = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
         self._client = httpx.Client(trust_env=False, timeout=timeout_s, headers=headers)
@@ -53,6 +54,20 @@ class Web:
     def stop(self, job: str) -> None:
         """Ask a job to end; one version reads the query, the other the body. Raises: as `send`."""
         self.send("POST", f"/jobs/stop?job_name={job}", {"job_name": job})
+
+    def set_level(self, level_ml: float) -> str:
+        """Put the unit's own ledger of the vial to a volume; why it refuses that, "" if it does not. Raises: as `send`.
+
+        Newer versions refuse doses by it.
+        """
+        path = f"/bioreactor/experiments/{quote(self._experiment, safe='')}"
+        try:
+            self.send("PATCH", path, {"values": {"current_volume_ml": level_ml}})
+        except NotHeard as error:
+            if "status" not in str(error):
+                raise
+            return str(error)
+        return ""
 
     def result(self, task: str) -> bool | None:
         """Whether the process that a task began may be there; False: it is over and failed; None: the task waits.

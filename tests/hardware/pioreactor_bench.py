@@ -13,10 +13,10 @@ from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import PUBLISHED, RigBackendConfig, RigConfig, UnitConfig
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import replay
-from hardware.pioreactor.rig.build import environment, home, missing
-from hardware.pioreactor.rig.processes import Rig
 from hardware.pioreactor.versions import facts
 from hardware.reactor import Command
+from hardware.rig.build import environment, home, missing
+from hardware.rig.processes import Rig
 from hardware.storage.journal import Journal
 
 UNIT, EACH_ML = "pio01", 0.1  # mL: a busy computer is late by 60 ms
@@ -30,7 +30,7 @@ def need_the_rig(package: str = PUBLISHED) -> None:
     if lack := missing(package):
         pytest.skip(f"the vendor's software cannot run here: {lack}", allow_module_level=True)
     if package == PUBLISHED and not (home(package) / "done").exists():
-        pytest.skip("build it with: python -m hardware.pioreactor.rig --build-only", allow_module_level=True)
+        pytest.skip("build it with: python -m hardware.rig --build-only", allow_module_level=True)
     try:
         environment(package)
     except DeviceStateError as error:
@@ -130,9 +130,11 @@ class Bench:
 
     def clear_the_lock(self) -> None:
         """What the fault tells the operator to do on the unit."""
-        words = facts(self.rig.version).purge.split()[1:]
-        command = [str(self.rig.folder / UNIT / "pio"), *words, "pwm_locks", "13", "--as-int"]
-        subprocess.run(command, check=True, capture_output=True)
+        self.pio(*facts(self.rig.version).purge.split()[1:], "pwm_locks", "13", "--as-int")
+
+    def pio(self, *words: str) -> None:
+        """A command of the vendor's on the unit."""
+        subprocess.run([str(self.rig.folder / UNIT / "pio"), *words], check=True, capture_output=True)
 
     def judge(self, each_ml: float = EACH_ML) -> None:
         """Nothing twice, every dose with an end, the truth within the driver's own bounds.

@@ -1,21 +1,22 @@
-"""Two doubles of the vendor's side in virtual time: a unit's web server and the broker, answering as recorded.
+"""A unit and its broker in virtual time, as the vendor's software behaves in the rig: what days of faults need.
 
-The order and spacing of what a job says (init, ready, event, duty, event, duty off, disconnected) and every odd answer
-are those of version 25.11.19 around `add_media` of 0.7 mL, as the rig recorded them;
-docs/pioreactor.md, What is odd in the vendor's software.
+What a job says and when (init, ready, duty, event, duty off, disconnected), who says all pins again, what a lock, a
+kill -9, a freeze, a power cut and a lost broker leave behind are those of versions 25.11.19 and 26.7.2 as measured in
+the rig; docs/pioreactor.md, What is odd in the vendor's software. Written from those measurements, not from the driver.
 """
 
 import heapq
 import itertools
 import json
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
 import pytest
 
 from hardware.clock import VirtualClock
-from hardware.errors import LinkError, ProtocolError
+from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.pioreactor import reactors, station
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Mailbox
@@ -26,228 +27,432 @@ from hardware.reactor import Command, Measurement
 
 UNIT, EXPERIMENT, MEDIA_PIN, WASTE_PIN = "pio01", "turbidostat", 13, 12
 PINS = {"add_media": MEDIA_PIN, "remove_waste": WASTE_PIN}
-BEGIN_S = 0.4  # from the answer 202 to the first event
+FLOW = {"add_media": 0.7, "remove_waste": 1.6}  # mL/s
+BEGIN_S = 0.25  # from the answer 202 to the pin
+STIR_S, OD_S = 26.0, 5.0
 
 
 class World(VirtualClock):
-    """Time, the unit's processes and its vial; `sleep` lets happen what is due.
+    """Time, the unit's processes and its pumps; `sleep` lets happen what is due.
 
-    Switches: web, queue, broker (up or not), lock (a pin lock left behind), heard (how a POST of a dose is answered),
-    kill_after_s (a dose's process is killed so long after its pump began), late_s (a job ends its pump so much late),
-    mute (a pin that goes on is not told), dies (a job is over at once), barred (jobs beside the readings do not start).
+    Switches: web, queue, broker (up or not); stirs (stirring runs, and says all pins); locks, of pins; heard (how a
+    POST of a dose is answered); kill_after_s, freeze_after_s (after its pump began; frozen for frozen_s), stop_after_s
+    (somebody stops it); late_s (a job ends its pump so much late); mute (a pin that goes on is not told by its job);
+    dies (a job is over at once); barred (jobs beside the readings do not start); begin_s.
+
+    Attributes: truth, mL by job; asked, what was asked for; waste, when the waste pump ran.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, version: str = "26.7.2") -> None:
         super().__init__(1000.0)
+        self.version, self.boot = version, "boot1"
         self.box: Mailbox | None = None
+        self.mqtt: Any = None
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._order = itertools.count()
-        self.web = self.queue = self.broker = True
-        self.lock = self.od_alive = False
-        self.heard = "yes"
-        self.kill_after_s = self.stop_after_s = np.inf
-        self.reading, self.od_every_s, self.clock_jump_s = 0.5, 5.0, 0.0
-        self.late_s = 0.0
-        self.dies = False
-        self.mute = self.barred = False
-        self.holder = ""
+        self.web = self.queue = self.broker = self.stirs = True
+        self.dies = self.mute = self.barred = self.deaf = self.stands = False
+        self.locks: set[int] = set()
+        self.heard, self.holder, self.begin_s = "yes", "", BEGIN_S
+        self.kill_after_s = self.freeze_after_s = self.stop_after_s = np.inf
+        self.frozen_s = self.late_s = 0.0
+        self.reading, self.od_alive, self.od_s = 0.5, False, OD_S
+        self.cache: dict[int, float] = {}  # what every message about pins says
+        self.since: dict[int, float] = {}  # when a pin really went on
+        self.truth = dict.fromkeys(PINS, 0.0)
+        self.rows: dict[str, int] = {"monitor": 1}  # listed jobs
+        self.run_now: dict[str, list[Any]] = {}  # running pump jobs by name: [stopped, options]
+        self.before: list[str] = []
+        self.asked: list[tuple[str, Mapping[str, Any]]] = []
+        self.accepted: dict[str, float] = {}
         self.waiting: list[Callable[[], None]] = []
-        self.duty: dict[int, float] = {}
-        self.since: dict[int, float] = {}
-        self.moved = {"add_media": 0.0, "remove_waste": 0.0}
-        self.runs: list[tuple[str, Mapping[str, Any]]] = []
-        self.stops: list[str] = []
         self.results: dict[str, bool] = {}
-        self.jobs: dict[str, bool] = {}
-        self.mqtt: Any = None
+        self.retained: dict[str, str] = {}
+        self.life = 0  # of the unit's power: what belongs to an earlier one does not happen any more
 
     def later(self, seconds: float, what: Callable[[], None]) -> None:
-        heapq.heappush(self._queue, (self.now() + seconds, next(self._order), what))
+        life = self.life
+        heapq.heappush(
+            self._queue, (self.now() + seconds, next(self._order), lambda: what() if life == self.life else None)
+        )
 
     def sleep(self, seconds: float) -> None:
         until = self.now() + seconds
         while self._queue and self._queue[0][0] <= until:
             at, _, what = heapq.heappop(self._queue)
-            super().sleep(at - self.now())
+            super().sleep(max(at - self.now(), 0.0))
             what()
-        super().sleep(until - self.now())
+        super().sleep(max(until - self.now(), 0.0))
+
+    # -- messages --------------------------------------------------------------------------------------------------
 
     def say(self, rest: str, payload: str, retained: bool = False, experiment: str = EXPERIMENT) -> None:
+        """A message; `retained`: it comes because somebody subscribes, not because it is said now."""
+        topic = f"pioreactor/{UNIT}/{experiment}/{rest}"
+        if rest.endswith(("$state", "dc", "target_temperature", "duty_cycle")) and (self.broker or self.stands):
+            self.retained[topic] = payload
         if self.broker and self.box is not None:
-            self.box.take(f"pioreactor/{UNIT}/{experiment}/{rest}", payload.encode(), retained)
+            self.box.take(topic, payload.encode(), retained)
 
-    def od_job(self) -> None:
-        self.od_alive = True
-        self.say("od_reading/$state", "ready")
-        self.later(self.od_every_s, self._read)
+    def state(self, job: str, word: str) -> None:
+        self.say(f"{job}/$state", word)
 
-    def _read(self) -> None:
-        if self.od_alive:
-            self.say("od_reading/ods", self.od(self.reading, f"t{self.now() + self.clock_jump_s:.3f}"))
-            self.later(self.od_every_s, self._read)
+    def pins(self) -> None:
+        """All pins of the unit, by whichever process."""
+        self.say("pwms/dc", json.dumps({**self.cache, **({17: 30.0} if self.stirs else {})}))
 
-    @staticmethod
-    def od(value: float, stamp: str) -> str:
-        return json.dumps({"timestamp": stamp, "ods": {"2": {"od": value, "channel": "2", "calibrated": 0}}})
+    def stir(self) -> None:
+        if self.stirs:
+            self.pins()
+            self.later(STIR_S, self.stir)
 
     def event(self, job: str, ml: float, source: str) -> None:
         body = {"volume_change": ml, "event": job, "source_of_event": source, "timestamp": "t"}
         self.say("dosing_events", json.dumps(body))
 
-    def pin(self, job: str, on: bool) -> None:
-        pin = PINS[job]
+    @staticmethod
+    def od(value: float, stamp: str) -> str:
+        return json.dumps({"timestamp": stamp, "ods": {"2": {"od": value, "channel": "2", "calibrated": 0}}})
+
+    def _read(self) -> None:
+        if self.od_alive:
+            self.say("od_reading/ods", self.od(self.reading, f"t{self.now():.3f}"))
+            self.later(self.od_s, self._read)
+
+    # -- a pump and its job ----------------------------------------------------------------------------------------
+
+    def pin(self, job: str, on: bool, told: bool = True) -> None:
+        """A pin really goes on or off."""
+        number = PINS[job]
         if on:
-            self.duty[pin] = 100.0
-            self.since.setdefault(pin, self.now())
-        elif pin in self.duty:
-            del self.duty[pin]
-            self.moved[job] += self.now() - self.since.pop(pin)
-        if not (on and self.mute):
-            self.say("pwms/dc", json.dumps(self.duty), retained=True)
+            self.cache[number] = 100.0
+            self.since.setdefault(number, self.now())
+        else:
+            self.cache.pop(number, None)
+            if number in self.since:
+                self.truth[job] += (self.now() - self.since.pop(number)) * FLOW[job]
+        if told:
+            self.pins()
 
     def dose(self, job: str, options: Mapping[str, Any]) -> None:
-        """What one pump job does, 1 mL/s."""
-        ml, source = float(options["ml"]), str(options["source-of-event"])
-        self.jobs[job] = True
-        self.say(f"{job}/$state", "ready")
-        if self.lock:  # refused with nothing but a line in a log
-            self.later(0.1, lambda: self.end(job))
+        """What a pump job does from its process's start on."""
+        self.rows[job] = self.rows.get(job, 0) + 1
+        self.state(job, "init")
+        self.later(0.04, lambda: self.state(job, "ready"))
+        if PINS[job] in self.locks:  # refused with nothing but a line in a log
+            self.later(0.1, lambda: self.over(job))
             return
-        cut = min(self.kill_after_s, self.stop_after_s, ml)
-        for k in range(int(np.ceil(cut / 0.5 - 1e-9))):
-            part = min(0.5, ml - 0.5 * k)
-            self.later(0.5 * k, lambda part=part: self.event(job, part, source))  # type: ignore[misc]
-        self.later(0.03, lambda: self.pin(job, True))
-        if self.kill_after_s < ml:
-            self.later(0.03 + self.kill_after_s, lambda: self.killed(job))
-        else:
-            self.later(0.03 + cut + self.late_s, lambda: self.pin(job, False))
-            self.later(0.05 + cut + self.late_s, lambda: self.end(job))
+        me: list[Any] = [False, options]
+        self.run_now[job] = me
+        seconds = float(options["duration"]) if "duration" in options else float(options["ml"]) / FLOW[job]
+        self.pin(job, False, told=False)  # whoever takes a pin switches it off first
+        self.later(0.05, lambda: self._pumps(job, me, seconds))
+
+    def _pumps(self, job: str, me: list[Any], seconds: float) -> None:
+        source, flow, began, told = str(me[1].get("source-of-event", "CLI")), FLOW[job], self.now(), [0.0]
+        short = "duration" in me[1]
+        self.locks.add(PINS[job])
+        self.pin(job, True, told=False)
+        thawed = [-np.inf]
+
+        def tell() -> None:
+            if not self.mute and self.run_now.get(job) is me:
+                late = thawed[0] - self.now() - 1e-3
+                self.pins() if late <= 0.0 else self.later(late, tell)
+
+        kill = np.inf if short or job != "add_media" else self.kill_after_s
+        freeze = np.inf if short or job != "add_media" else self.freeze_after_s
+
+        def slice_() -> None:
+            nonlocal freeze
+            if self.run_now.get(job) is not me:
+                return
+            passed = self.now() - began
+            if passed >= freeze:
+                freeze, thawed[0] = np.inf, self.now() + self.frozen_s
+                self.later(15.0 + 1.0, lambda: self._lost(job, me))
+                ends = passed + self.frozen_s > seconds
+                self.later(self.frozen_s, (lambda: self._thaws(job, me)) if ends else slice_)
+                return
+            if me[0] or passed >= seconds + self.late_s - 1e-9 or passed >= self.stop_after_s - 1e-9:
+                self._ends(job, me, flow * min(passed, seconds) if me[0] or self.stop_after_s < seconds else None, told)
+                return
+            if passed >= kill:
+                self.killed(job)
+                return
+            if passed >= 0.5 * len(told[1:]) - 1e-9 and told[0] < flow * seconds - 1e-9:
+                part = min(0.5 * flow, flow * seconds - told[0])
+                told[0] += part
+                told.append(part)
+                self.event(job, part, source)
+            stops = (
+                x for x in (seconds + self.late_s, kill, freeze, self.stop_after_s, 0.5 * len(told[1:])) if x > passed
+            )
+            self.later(max(min(min(stops) - passed, 0.1), 1e-3), slice_)
+
+        slice_()
+        self.later(0.015, tell)
+
+    def _ends(self, job: str, me: list[Any], really: float | None, told: list[float]) -> None:
+        """A job ends by itself or by MQTT: pin off, then the correction of what was told."""
+        del self.run_now[job]
+        self.locks.discard(PINS[job])
+        self.pin(job, False)
+        if really is not None and abs(really - told[0]) > 1e-9:
+            self.event(job, really - told[0], str(me[1].get("source-of-event", "CLI")))
+        self.later(0.03, lambda: self.over(job))
+
+    def over(self, job: str) -> None:
+        self._unlist(job)
+        self.state(job, "disconnected")
+
+    def _unlist(self, job: str) -> None:
+        self.rows[job] = self.rows.get(job, 1) - 1
+        if self.rows[job] <= 0:
+            self.rows.pop(job)
 
     def killed(self, job: str) -> None:
-        """kill -9 of a pump job: its lock stays, and its pin as it was."""
-        self.lock = True
-        self.jobs.pop(job, None)
-        self.say(f"{job}/$state", "lost")
+        """kill -9 of a pump job: its lock and its row stay, and its pin as it was."""
+        self.run_now.pop(job, None)
+        self.state(job, "lost")
 
-    def cycle(self, job: str, options: Mapping[str, Any]) -> None:
-        """A short run of a pump, which leaves its pin off whatever it was; a lock refuses it."""
-        self.jobs[job] = True
-        self.say(f"{job}/$state", "ready")
-        seconds = float(options["duration"])
-        if not self.lock:
-            self.event(job, seconds, str(options["source-of-event"]))
-            self.pin(job, True)
-            self.later(seconds, lambda: self.pin(job, False))
-        self.later(seconds + 0.1, lambda: self.end(job))
+    def _lost(self, job: str, me: list[Any]) -> None:
+        if self.run_now.get(job) is me:
+            me.append("lost")
+            self.state(job, "lost")
 
-    def end(self, job: str) -> None:
-        self.jobs.pop(job, None)
-        self.say(f"{job}/$state", "disconnected")
+    def _thaws(self, job: str, me: list[Any]) -> None:
+        """A job that was frozen goes on: it has missed its end. One that the broker gave up says nothing any more."""
+        del self.run_now[job]
+        self.locks.discard(PINS[job])
+        self.pin(job, False, told=len(me) < 3)
+        self._unlist(job)
+        if len(me) < 3:
+            self.state(job, "disconnected")
+
+    def heard_set(self, topic: str, payload: str) -> None:
+        """What a client says to jobs."""
+        _, _, _, job, *rest = topic.split("/")
+        if job in self.run_now and rest == ["$state", "set"] and self.freeze_after_s == np.inf:
+            self.run_now[job][0] = True
+        elif job in ("temperature_automation", "dosing_automation") and rest == ["$state", "set"]:
+            self.later(0.2, lambda: self.over(job))
+        elif (job, rest) == ("stirring", ["duty_cycle", "set"]) and self.stirs and not self.deaf:
+            self.later(0.3, self.pins)
+        ready = self.retained.get(f"pioreactor/{UNIT}/{EXPERIMENT}/{job}/$state") == "ready"
+        if rest == ["target_temperature", "set"] and ready and not self.deaf:
+            self.say(f"{job}/target_temperature", payload)
+
+    # -- task queue, power, broker ---------------------------------------------------------------------------------
 
     def take(self, task: str, job: str, options: Mapping[str, Any]) -> None:
         """The task queue takes a request."""
-        if self.dies and "help" not in options:
+        if (self.dies and "help" not in options) or ("help" in options and self.version < "26"):
             self.results[task] = False
             return
-        self.results[task] = "help" not in options
-        if job in PINS and "ml" in options:
-            self.later(BEGIN_S, lambda: self.dose(job, options))
-        if job in PINS and "duration" in options:
-            self.later(BEGIN_S, lambda: self.cycle(job, options))
-        if job == "od_reading":
-            self.later(1.0, self.od_job)
-        if job in ("dosing_automation", "stirring", "temperature_automation") and not self.barred:
-            self.later(1.0, lambda: self.say(f"{job}/$state", "init"))
-            self.later(2.0, lambda: self.say(f"{job}/$state", "ready"))
-        if job == "temperature_automation":
-            self.later(2.0, lambda: self.target(str(options["target-temperature"])))
+        self.results[task] = True
+        if job in PINS and "help" not in options:
+            self.later(self.begin_s - 0.05, lambda: self.dose(job, options))
+        elif job == "od_reading":
+            self.od_alive = True
+            self.rows[job] = 1
+            self.state(job, "ready")
+            self.later(self.od_s, self._read)
+        elif "help" not in options and not self.barred:
+            self.rows[job] = 1
+            self.later(1.0, lambda: self.state(job, "init"))
+            self.later(2.0, lambda: self.ready(job, options))
 
-    def target(self, payload: str) -> None:
-        """What a thermostat says once it is ready; it does not hear before."""
-        self.say("temperature_automation/target_temperature", payload, retained=True)
+    def ready(self, job: str, options: Mapping[str, Any]) -> None:
+        self.state(job, "ready")
+        if job == "temperature_automation":
+            self.say(f"{job}/target_temperature", str(options["target-temperature"]))
+        if job == "stirring":
+            self.stirs = True
+            self.say("stirring/duty_cycle", "30")
+            self.stir()
 
     def revive(self) -> None:
         """The task queue comes back and runs what waits in it."""
-        self.queue = True
-        waiting, self.waiting = self.waiting, []
+        self.queue, waiting, self.waiting = True, self.waiting, []
         for what in waiting:
             what()
 
+    def cut(self) -> None:
+        """The unit loses its power: everything ends, and nobody says so."""
+        for job in PINS:
+            self.pin(job, False, told=False)
+        self.life += 1
+        self.cache, self.rows, self.run_now, self.waiting, self.results = {}, {}, {}, [], {}
+        self.locks.clear()
+        self.od_alive = self.stirs = self.web = False
+        self.later(60.0, self._given_up)
+
+    def _given_up(self) -> None:
+        """The broker gives up clients that it has not heard for long."""
+        for job in ("od_reading", "stirring", "temperature_automation", *PINS):
+            if self.retained.get(f"pioreactor/{UNIT}/{EXPERIMENT}/{job}/$state") in ("init", "ready"):
+                self.state(job, "lost")
+
+    def power(self) -> None:
+        """The unit boots; its jobs are lost since the broker noticed."""
+        self.boot, self.rows, self.web, self.queue = f"boot{self.now():.0f}", {"monitor": 1}, True, True
+        self._given_up()
+
+    def lose_broker(self, back_s: float) -> None:
+        """The broker dies: pump jobs end with it, what it retained is gone; it is back after a while."""
+        self.broker = False
+        self.mqtt.broke_s = self.now()
+        self.retained.clear()
+        for job, me in list(self.run_now.items()):
+            del self.run_now[job]
+            self.locks.discard(PINS[job])
+            self.pin(job, False)
+            self._unlist(job)
+            del me
+        self.later(back_s, self._broker_back)
+
+    def freeze_broker(self, for_s: float) -> None:
+        """The broker stands still: who asks it often leaves it, what is said meanwhile is there when it goes on."""
+        self.broker, self.stands = False, True
+        ours = (f"pioreactor/{UNIT}/{EXPERIMENT}/{job}/$state" for job in PINS)
+        self.before = [topic for topic in ours if self.retained.get(topic) in ("init", "ready")]
+        self.mqtt.broke_s = self.now()
+        self.later(for_s, self._broker_goes_on)
+
+    def _broker_goes_on(self) -> None:
+        self.broker, self.stands = True, False
+        assert self.box is not None
+        self.box.forget()
+        for topic in self.before:  # who left it meanwhile is taken for lost
+            self.retained[topic] = "lost"
+        for topic, payload in self.retained.items():
+            self.box.take(topic, payload.encode(), True)
+
+    def _broker_back(self) -> None:
+        self.broker = True
+        assert self.box is not None
+        self.box.forget()
+        if self.version < "26":  # the newer one says nothing any more
+            for job in ("od_reading", "stirring", "temperature_automation"):
+                if job in self.rows:
+                    self.state(job, "ready")
+        else:
+            self.deaf = True
+
 
 class FakeWeb:
-    """`hardware.pioreactor.web.Web` of the unit."""
+    """`hardware.pioreactor.web.Web` of the unit; what is asked for is answered a moment later."""
 
     def __init__(self, world: World) -> None:
-        self.world, self.url = world, "http://pio01.local"
-        self.active = {pump: {"curve_data_": [1.0, 0.0]} for pump in ("media_pump", "waste_pump")}
+        self.world, self.url, self._count = world, "http://pio01.local", itertools.count()
+        poly: Any = {"type": "poly", "coefficients": [0.0, 0.0]}
+        self.active: dict[str, Any] = {}
+        for job, pump in (("add_media", "media_pump"), ("remove_waste", "waste_pump")):
+            line = [FLOW[job], 0.0]
+            curve = line if world.version < "26" else {**poly, "coefficients": line}
+            self.active[pump] = {"curve_data_": curve}
+        self.settings: dict[str, Any] = {}
+        self.levels: list[float] = []
+
+    def ask(self, what: Callable[..., Any], *given: Any) -> "Future[Any]":
+        future: Future[Any] = Future()
+
+        def answer() -> None:
+            try:
+                future.set_result(what(*given))
+            except ReactorError as error:
+                future.set_exception(error)
+
+        heapq.heappush(self.world._queue, (self.world.now() + 0.01, next(self.world._order), answer))
+        return future
 
     def _up(self) -> None:
         if not self.world.web:
             raise NotHeard("http://pio01.local: refused")
 
-    def get(self, path: str) -> Any:
+    def get(self, path: str, below: str = "/unit_api") -> Any:
         self._up()
-        answers = {
-            "/active_calibrations": self.active,
+        if path == "/active_calibrations":
+            return self.active
+        if path.startswith("/jobs/settings"):
+            if "dosing_automation" not in self.world.rows:
+                raise NotHeard("status 404")
+            return {"settings": self.settings}
+        return {
             "/health": {"pioreactor_unit": UNIT, "utc_time": "2026-11-21T00:00:00Z"},
-            "/versions/app": {"version": "25.11.19"},
-        }
-        return answers[path]
+            "/versions/app": {"version": self.world.version},
+        }[path]
 
-    def post(self, path: str, body: Any = None) -> Any:
+    def run(self, job: str, options: Mapping[str, Any], overrides: Any = ()) -> str:
         self._up()
-        self.world.stops.append(path)
-        return {"task_id": "stop"}
-
-    def run(self, job: str, options: Mapping[str, Any], env: Any, overrides: Any) -> str:
-        world = self.world
-        self._up()
-        task = f"task{len(world.runs)}"
-        dose = job in PINS and "ml" in options
-        if dose and world.heard == "429":
-            raise NotHeard("turned away with status 429")
-        world.runs.append((job, dict(options)))
-        if world.queue:
-            world.take(task, job, options)
-        else:
-            world.waiting.append(lambda: world.take(task, job, options))
-        if dose and world.heard == "lost answer":
+        w, task = self.world, f"task{next(self._count)}"
+        dose = "ml" in options
+        if dose and w.heard == "429":
+            raise NotHeard("status 429")
+        if dose and w.heard == "500":
+            raise ProtocolError("status 500")
+        if w.now() < w.accepted.get(job, -np.inf) + 1.0:  # one request a second for each job
+            raise NotHeard("status 429")
+        w.accepted[job] = w.now()
+        w.asked.append((job, options))
+        if job == "dosing_automation":
+            self.settings = {key.replace("-", "_"): value for key, value in options.items()}
+        if not (dose and w.heard == "nobody"):
+            if w.queue:
+                w.take(task, job, options)
+            else:
+                w.waiting.append(lambda: w.take(task, job, options))
+        if dose and w.heard in ("lost answer", "nobody"):
             raise LinkError("timed out")
         return task
 
+    def set_level(self, level_ml: float) -> str:
+        self._up()
+        self.levels.append(level_ml)
+        return ""
+
+    def stop(self, job: str) -> None:
+        self._up()
+        if job == "od_reading" and job in self.world.rows:
+            self.world.later(0.5, lambda: self.world.over(job))
+        if job in self.world.run_now and self.world.freeze_after_s == np.inf:
+            self.world.later(0.1, lambda: self.world.run_now.get(job, [False]).__setitem__(0, True))
+
     def result(self, task: str) -> bool | None:
         self._up()
-        return self.world.results.pop(task, None)
+        results = self.world.results
+        return results.pop(task, None) if self.world.version < "26" else results.get(task)
 
     def running(self) -> list[dict[str, Any]]:
         self._up()
-        if self.world.heard == "500":
-            raise ProtocolError("status 500")
-        return [{"job_name": job} for job in self.world.jobs]
+        return [
+            {"job_name": job, "started_at": self.world.boot} for job, n in self.world.rows.items() for _ in range(n)
+        ]
+
+    def close(self) -> None:
+        pass
 
 
-class FakeMqtt:
-    """`hardware.pioreactor.mailbox.Mqtt`."""
+class FakeCluster:
+    """`hardware.pioreactor.mailbox.Cluster`."""
 
-    def __init__(self, *args: Any) -> None:
-        self.boxes: dict[str, Mailbox] = args[3]
-        self.breaks, self.said = 0, []  # type: ignore[var-annotated]
-        self.world: World = args[4]
-        self.world.mqtt, self.world.box = self, self.boxes[UNIT]
+    def __init__(self, config: PioreactorConfig, boxes: dict[str, Mailbox], name: str, clock: World) -> None:
+        self.boxes, self.world, self.broke_s, self.refusal = boxes, clock, -np.inf, ""
+        self.said: list[tuple[str, str]] = []
+        clock.mqtt, clock.box = self, boxes[UNIT]
+        for topic, payload in clock.retained.items():
+            boxes[UNIT].take(topic, payload.encode(), True)
 
     @property
     def connected(self) -> bool:
         return self.world.broker
 
-    def publish(self, topic: str, payload: str) -> bool:
+    def publish(self, topic: str, payload: str) -> None:
         self.said.append((topic, payload))
-        heard = (
-            self.world.box is not None and self.world.box.states.get((EXPERIMENT, "temperature_automation")) == "ready"
-        )
-        if topic.endswith("/target_temperature/set") and heard:
-            self.world.target(payload)
-        return self.world.broker
+        if self.world.broker:
+            self.boxes[UNIT].take(topic, payload.encode(), False)  # we hear ourselves
+            self.world.heard_set(topic, payload)
 
     def hold(self) -> None:
         self.held = True
@@ -260,23 +465,27 @@ class FakeMqtt:
 
 
 class Lab:
-    """The driver around the doubles. Attributes: world, reactors, rows of the journal."""
+    """The driver around the unit. Attributes: world, reactors, rows of the journal."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, world: World | None = None, **values: Any) -> None:
         self.world = world or World()
         self.web = FakeWeb(self.world)
-        monkeypatch.setattr(station, "Web", lambda url: self.web)
-        monkeypatch.setattr(reactors, "Mqtt", FakeMqtt)
+        monkeypatch.setattr(station, "Web", lambda *_given: self.web)
+        monkeypatch.setattr(reactors, "Cluster", FakeCluster)
         self.rows: list[dict[str, Any]] = []
-        config = PioreactorConfig(**{"stirring": False, "thermostat": False, **values})
+        config = PioreactorConfig(**{"thermostat": False, **values})
         self.reactors = PioreactorReactors(config, self.world, self._log, "run")
         self.station = self.reactors.stations[0]
+
+    @property
+    def fault(self) -> Any:
+        return self.station.book.fault
 
     def _log(self, kind: str, fields: Mapping[str, Any]) -> None:
         self.rows.append({"n": len(self.rows), "wall": 0.0, "kind": kind, **fields})
 
-    def begin(self, history: History | None = None) -> None:
-        self.reactors.begin({UNIT: history} if history else None)
+    def begin(self, history: History | None = None, elapsed_s: float = 0.0) -> None:
+        self.reactors.begin({UNIT: history} if history else None, elapsed_s)
 
     def sample(self, tries: int = 20) -> Measurement:
         """The next fresh sample."""
@@ -299,9 +508,22 @@ class Lab:
             self.world.sleep(0.1)
             self.station.poll()
 
+    def until(self, holds: Callable[[], bool], limit_s: float) -> float:
+        """Wait until something holds; how long that took."""
+        began = self.world.now()
+        while not holds():
+            assert self.world.now() < began + limit_s, (self.fault, self.rows[-5:])
+            self.wait(0.1)
+        return self.world.now() - began
+
     def of(self, kind: str) -> list[dict[str, Any]]:
         return [row for row in self.rows if row["kind"] == kind]
 
     def asked(self, job: str) -> list[Mapping[str, Any]]:
         """Real requests for a pump job."""
-        return [options for name, options in self.world.runs if name == job and "ml" in options]
+        return [options for name, options in self.world.asked if name == job and "ml" in options]
+
+    def given(self) -> tuple[float, float]:
+        """Least and most medium by the journal, mL."""
+        rows = [row for row in self.rows if row["kind"] in ("dose_end", "given")]
+        return sum(row["feed_low_ml"] for row in rows), sum(row["feed_ml"] for row in rows)

@@ -13,9 +13,10 @@ import pytest
 
 from hardware.clock import RealClock
 from hardware.errors import DeviceStateError
-from hardware.pioreactor.mailbox import Mailbox, Mqtt
-from hardware.pioreactor.rig.build import broker
-from hardware.pioreactor.rig.processes import _free_port, _listens
+from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.mailbox import Cluster, Mailbox
+from hardware.rig.build import broker
+from hardware.rig.processes import _free_port, _listens
 from tests.hardware.pioreactor_lab import UNIT, Lab
 
 HELD = "process 7 on elsewhere controls pio01: one client per unit; remedy"
@@ -48,10 +49,10 @@ def port(tmp_path: Path) -> Iterator[int]:
             p.kill()
 
 
-def client(port: int, name: str, *units: str) -> Mqtt:
+def client(port: int, name: str, *units: str) -> Cluster:
     clock = RealClock(1.0)
-    boxes = {unit: Mailbox(unit, "e", "2", clock) for unit in units}
-    made = Mqtt("127.0.0.1", port, ("", ""), boxes, clock, name)
+    config = PioreactorConfig(reactors=units, broker="127.0.0.1", broker_port=port)
+    made = Cluster(config, {unit: Mailbox(unit, config, clock) for unit in units}, name, clock)
     assert holds(lambda: made.connected)
     return made
 
@@ -104,7 +105,7 @@ def test_a_connection_that_was_lost_holds_its_units_again(port: int) -> None:
     first.hold()
     assert holds(lambda: other.holder("pio01") != "")
     first._client.socket().shutdown(2)  # the broker sends the last will
-    assert holds(lambda: first.breaks == 1 and first.connected)
+    assert holds(lambda: first.broke_s > 0.0 and first.connected)
     assert holds(lambda: other.holder("pio01") != "")
     first.close()
     other.close()
@@ -115,7 +116,7 @@ def test_a_unit_of_another_client_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     lab.world.holder = HELD
     with pytest.raises(DeviceStateError, match="process 7 on elsewhere controls pio01"):
         lab.begin()
-    assert not lab.world.runs
+    assert not lab.world.asked
 
 
 def test_a_second_client_in_the_run_holds_our_doses(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,8 +126,8 @@ def test_a_second_client_in_the_run_holds_our_doses(monkeypatch: pytest.MonkeyPa
     lab.sample()
     lab.world.holder = HELD
     lab.wait(1.0)
-    assert lab.station.fault is not None
-    assert lab.station.fault.kind == "mode"
+    assert lab.fault is not None
+    assert lab.fault.kind == "mode"
     assert lab.dose(0.5) == 0.0
     assert not lab.asked("add_media")
-    assert UNIT in str(lab.station.fault)
+    assert UNIT in str(lab.fault)

@@ -8,22 +8,28 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 
+from hardware.clock import RealClock
 from hardware.pioreactor.preflight import preflight
-from tests.hardware.pioreactor_bench import UNIT, Bench, need_the_rig
+from hardware.pioreactor.reactors import PioreactorReactors
+from hardware.pioreactor.versions import facts
+from tests.hardware.pioreactor_bench import PACKAGES, UNIT, Bench, need_the_rig
 
-need_the_rig()
 pytestmark = [pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(300)]  # one rig
 
 LATE_ML = 0.3  # messages on a computer whose cores are all taken
 LONG_S = 120.0
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    made = Bench(tmp_path_factory.mktemp("unit"), speed=10.0, period_s=30.0, start_s=60.0, max_dose_ml=3.0)
+@pytest.fixture(scope="module", params=PACKAGES)
+def bench(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    package = PACKAGES[request.param]
+    need_the_rig(package)
+    folder, values = tmp_path_factory.mktemp("unit"), {"speed": 10.0, "period_s": 30.0, "start_s": 60.0}
+    made = Bench(folder, package, max_dose_ml=3.0, **values)
     try:
         assert made.sample(LONG_S)
         yield made
@@ -36,9 +42,9 @@ def asked_for(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     jobs: list[str] = []
     run = bench.station.web.run
 
-    def noted(job, options, env, overrides):
+    def noted(job, options, overrides=()):
         jobs.extend([job] * ("ml" in options))
-        return run(job, options, env, overrides)
+        return run(job, options, overrides)
 
     monkeypatch.setattr(bench.station.web, "run", noted)
     return jobs
@@ -46,6 +52,23 @@ def asked_for(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def test_preflight_passes(bench):
     assert not [str(check) for check in preflight(bench.reactors) if not check.ok]
+
+
+def test_what_a_run_would_lack_is_named_with_what_helps(bench):
+    config = replace(bench.config, experiment="other", channel="4", volume_ml=14.0)
+    reactors = PioreactorReactors(config, RealClock())
+    try:
+        checks = {check.name.removeprefix(f"{UNIT} "): check for check in preflight(reactors)}
+    finally:
+        reactors.close()
+    assert not checks["experiment"].ok
+    assert "turbidostat, backend.experiment = other" in str(checks["experiment"])
+    assert not checks["photodiode"].ok
+    assert "4 of 2 at 90 degrees" in str(checks["photodiode"])
+    assert not checks["client"].ok, "the program of this test controls the unit"
+    assert "20.0 mL in its settings, 14 here" in str(checks["volume"])
+    assert checks["version"].ok
+    assert checks["task queue"].ok
 
 
 def test_a_unit_of_the_rig_cannot_shut_this_computer_down(bench):
@@ -76,7 +99,8 @@ def test_a_dose_whose_process_is_killed_is_an_alarm_and_nothing_is_sent_until_it
     assert bench.go_on(LONG_S, bench.pumping)
     for pid in bench.rig.jobs(UNIT, "add_media"):
         os.kill(pid, 9)
-    assert bench.go_on(LONG_S, lambda: "pio cache clear pwm_locks 13 --as-int" in str(bench.station.fault))
+    purge = facts(bench.rig.version).purge
+    assert bench.go_on(LONG_S, lambda: f"{purge} pwm_locks 13 --as-int" in str(bench.station.book.fault))
     jobs = asked_for(bench, monkeypatch)
     assert bench.pumping(), "a chip drives it on"
     assert bench.dose(0.5) == 0.0

@@ -1,4 +1,4 @@
-"""`python -m hardware.pioreactor.rig`: the vendor's software around our vials, until Ctrl-C."""
+"""`python -m hardware.rig`: the vendor's software around our vials, until Ctrl-C."""
 
 import argparse
 import signal
@@ -8,13 +8,13 @@ from dataclasses import fields
 
 from hardware.errors import ReactorError
 from hardware.pioreactor.config import RigConfig
-from hardware.pioreactor.rig.build import environment, version
-from hardware.pioreactor.rig.processes import Rig
+from hardware.rig.build import environment, version
+from hardware.rig.processes import Rig
 
 
 def main() -> int:
     """Start it, say where it is, wait."""
-    parser = argparse.ArgumentParser(prog="python -m hardware.pioreactor.rig", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m hardware.rig", description=__doc__)
     parser.add_argument("--units", default="pio01=20,pio02=14", help="NAME=CULTURE_ML of each, separated by commas")
     parser.add_argument("--growth-x", type=float, default=10.0, help="how much faster than real time cultures grow: 10")
     parser.add_argument("--build-only", action="store_true", help="build the environment and start nothing")

@@ -17,7 +17,7 @@ from conf.presets import load
 from conf.schema import build
 from envs.plant.plant import Plant, PlantConfig
 from hardware.pioreactor.config import vial_ml
-from hardware.pioreactor.rig.files import PINS
+from hardware.rig.files import PINS
 
 __all__ = ["VOLTS_PER_OD", "Pulse", "VialServer", "vial_preset"]
 

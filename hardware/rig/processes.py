@@ -18,10 +18,10 @@ from urllib.request import Request, urlopen
 
 from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import RigConfig
-from hardware.pioreactor.rig.build import broker, environment, version
-from hardware.pioreactor.rig.files import LOGIN, database, flows, layout, model, wrapper
-from hardware.pioreactor.rig.vials import VialServer, vial_preset
 from hardware.pioreactor.versions import facts
+from hardware.rig.build import broker, environment, version
+from hardware.rig.files import LOGIN, database, flows, layout, model, wrapper
+from hardware.rig.vials import VialServer, vial_preset
 
 __all__ = ["Rig"]
 
