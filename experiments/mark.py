@@ -1,4 +1,7 @@
-"""Note in a run's folder what was done at the bench: `python -m experiments.mark run=RUN text=inoculated`."""
+"""Note in a run's folder what was done at the bench: `python -m experiments.mark run=RUN text=inoculated`.
+
+A level that was read off a vial is more: the run under way sets its ledger to it.
+"""
 
 import time
 from dataclasses import dataclass
@@ -23,6 +26,10 @@ class MarkConfig:
     run: str = setting("", "folder of a deployment, running or over")
     reactor: str = setting("", "which one; empty: all of them")
     text: str = setting("inoculated", "what happened, in one line of at most 80 characters")
+    level_ml: float | None = setting(
+        None, "volume read off the vial: the ledger of a run under way is set to it, and the unit's own", "mL",
+        within=(0, 40),
+    )  # fmt: skip
     minute: float | None = setting(
         None, "of the run at which it happened; null: now", "min", within=(-1440.0, 1_000_000.0)
     )
@@ -35,6 +42,9 @@ class MarkConfig:
             repr(self.text),
             "1 to 80 characters, one line",
         )
+        if self.level_ml is not None:
+            require(bool(self.reactor), "reactor", repr(self.reactor), "the one whose level_ml was read")
+            require(self.minute is None, "minute", self.minute, "null with level_ml: a level is of now")
 
 
 def _minute_now(folder: Path, stored: Any) -> float:
@@ -64,10 +74,12 @@ def mark(config: MarkConfig) -> str:
         minute = config.minute
         if minute is None:
             minute = _minute_now(folder, files.load_yaml(folder / "config.yaml"))
-        path = add_mark(folder, Mark(minute, config.reactor, config.text))
+        text = config.text if config.level_ml is None else f"level {config.level_ml:g} mL"
+        path = add_mark(folder, Mark(minute, config.reactor, text, config.level_ml))
     except (OSError, RecordingError) as error:
         raise frame.UserError(f"run={folder}: {error}") from None
-    return f"{config.reactor or 'all reactors'}: {config.text} at minute {minute:.1f}, in {path}"
+    taken = "" if config.level_ml is None else "; the run takes it over with its next sample, and says so"
+    return f"{config.reactor or 'all reactors'}: {text} at minute {minute:.1f}, in {path}{taken}"
 
 
 def _body(config: MarkConfig, folder: Path) -> None:

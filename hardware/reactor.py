@@ -8,14 +8,14 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hardware.errors import DeviceStateError, ReactorError
 
-__all__ = ["Command", "Fault", "Measurement", "Reactor", "Receipt", "Vitals", "left_off"]
+__all__ = ["Command", "Fault", "KeepsLevels", "Measurement", "Reactor", "Receipt", "Vitals", "left_off"]
 
 log = logging.getLogger(__name__)
 
@@ -167,6 +167,15 @@ class Reactor(Protocol):
 
     def stop(self) -> None:
         """All pumps off, verified. Idempotent. Raises: ReactorError if they could not be verified off."""
+        ...
+
+
+@runtime_checkable
+class KeepsLevels(Protocol):
+    """Reactors that keep a ledger of their own, by which they refuse doses."""
+
+    def set_level(self, n: int, level_ml: float) -> None:
+        """Put the ledger of reactor n to a volume, as soon as it answers."""
         ...
 
 

@@ -15,7 +15,7 @@ from experiments.control.composition import Composition
 from experiments.control.progress import Progress
 from experiments.control.supply import Supply
 from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Remembers, Watches
-from hardware.reactor import Command, Reactor, Receipt
+from hardware.reactor import Command, KeepsLevels, Reactor, Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock, Verdict
 
@@ -191,6 +191,14 @@ class ClosedLoop:
             self.controller.dosed(receipt.volume_ml + (0.0 if receipt.kept_ml is None else receipt.kept_ml))
         if self.composition is not None:
             self.composition.dosed(receipt.volume_ml)
+
+    def set_level(self, name: str, level_ml: float) -> float:
+        """The ledger of a vial, and the device's own where it keeps one, set to what was read; what it was, mL."""
+        n, ledger = self.reactors.names.index(name), self.interlock.budget.volume_ml
+        before, ledger[n] = float(ledger[n]), level_ml
+        if isinstance(self.reactors, KeepsLevels):
+            self.reactors.set_level(n, level_ml)
+        return before
 
     def _respond(self, verdict: Verdict, left: Mask) -> list[str]:
         """Carry out what the interlock demands beyond not dosing; returns what failed, to be tried again.

@@ -251,7 +251,14 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
         )
     loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
     decided = {row["reactor"]: row["n"] for row in journal.rows if row["kind"] == "decision"}
-    for dose in doses:
+    levels = [row for row in journal.rows if row["kind"] == "level" and row["n"] >= state["journal_row"]]
+    for dose in [*doses, None]:
+        while levels and (dose is None or levels[0]["n"] < dose.n):
+            level = levels.pop(0)
+            if level["reactor"] in loop.reactors.names:
+                loop.set_level(level["reactor"], float(level["level_ml"]))
+        if dose is None:
+            break
         mine = np.array([name == dose.reactor for name in loop.reactors.names])
         loop.book(Receipt(mine * dose.feed_ml, (), mine * dose.waste_ml), dose.at_s)
         if dose.n > decided.get(dose.reactor, -1):  # what came before the newest decision is in its position already

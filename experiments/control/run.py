@@ -16,6 +16,7 @@ from experiments.control import assemble, notify
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
 from experiments.control.device import one_interrupt
+from experiments.control.levels import Levels
 from experiments.control.loop import ClosedLoop
 from experiments.control.notify import Notifier
 from experiments.control.record import Record
@@ -40,7 +41,7 @@ log = logging.getLogger(__name__)
 
 def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
     """The loop until its end or trouble; returns the outcome. Pumps are verified off, whatever happens."""
-    log_changes, reactors = ChangeLog(loop, tell), loop.reactors
+    log_changes, levels, reactors = ChangeLog(loop, tell), Levels(record), loop.reactors
     outcome = "failed: see the log"
     record.journal.append("start", {"time_s": round(reactors.elapsed(), 3), "pid": os.getpid()})
     try:
@@ -48,6 +49,7 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
             for step in loop.run():
                 record.done(step, loop.state())
                 log_changes(step)
+                levels.take(loop)
                 bar.update(int(step.rows.sum()))
         given_up = [name for name, s in zip(reactors.names, loop.stopped, strict=True) if s]
         outcome = f"stopped by the interlock: {', '.join(given_up)}" if given_up else "completed"

@@ -70,8 +70,11 @@ def title_of(config: DeployConfig, folder: Path, outcome: str) -> str:
     return f"{_title(config, folder)}: {outcome}"
 
 
+AGAIN_S = 3600.0
+
+
 class ChangeLog:
-    """Logs what changes, once: phases, who decides, words of the interlock, notes of the reactors.
+    """Logs what changes, once: phases, who decides, words of the interlock; and notes of the reactors, once an hour.
 
     Args: loop: that is watched. tell: is told of alarms and hand-overs, too: event, text, reactor.
     """
@@ -83,7 +86,7 @@ class ChangeLog:
         self._phase = [-2] * len(self._names)
         self._reason: list[str | None] = [None] * len(self._names)
         self._supervised = [False] * len(self._names)
-        self._noted: set[str] = set()
+        self._noted: dict[str, float] = {}  # run time at which a kind of note was last said
         self._error, self._samples = np.zeros(len(self._names)), np.zeros(len(self._names))  # of the window so far
 
     def __call__(self, step: Step) -> None:
@@ -119,9 +122,9 @@ class ChangeLog:
         self._handed_over = self._reactors.handed_over.copy()
         for note in step.notes:
             kind = re.sub(r"[\d.]+", "#", note)
-            if kind not in self._noted:  # the journal has every one of them
-                self._noted.add(kind)
-                log.info("%s (noted once here, every time in the journal)", note)
+            if step.now_s >= self._noted.get(kind, -np.inf) + AGAIN_S:
+                self._noted[kind] = step.now_s
+                log.info("%s (noted here once an hour, every time in the journal)", note)
 
     def _ended(self, step: Step, n: int) -> str:
         """Which step of reactor n's schedule this sample ended, and why."""
@@ -264,7 +267,7 @@ def figure_of(record: Record, scenarios: Sequence[Scenario], title: str) -> Figu
 def _marks(record: Record) -> list[Mark]:
     """What somebody did at the bench; a damaged file of it is said and costs the figure nothing else."""
     try:
-        return read_marks(record.folder)
+        return sorted(read_marks(record.folder), key=lambda mark: mark.time_min)
     except RecordingError as error:
         log.warning("%s", error)
         return []

@@ -11,39 +11,51 @@ from hardware.storage.recorder import Recorder
 __all__ = ["NAME", "Mark", "add_mark", "read_marks"]
 
 NAME = "marks.csv"
-COLUMNS = ("time_min", "reactor", "text", "written")
+COLUMNS = ("time_min", "reactor", "text", "written", "level_ml")
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What happened at minute `time_min` of a run to `reactor`; "" is all of them."""
+    """What happened at minute `time_min` of a run to `reactor`; "" is all of them. level_ml: volume in its vial then,
+    None if nobody read it."""
 
     time_min: float
     reactor: str
     text: str
+    level_ml: float | None = None
 
 
 def add_mark(folder: Path, mark: Mark) -> Path:
-    """Append a mark to a run folder, on the disk when this returns; the running program takes no notice.
+    """Append a mark to a run folder, on the disk when this returns; of the running program a level is taken over.
 
     Raises: RecordingError if the disk refuses or the file is another one.
     """
     written = datetime.now().astimezone().isoformat(timespec="seconds")
     with Recorder(folder / NAME, COLUMNS) as file:
         file.write(
-            {"time_min": round(mark.time_min, 3), "reactor": mark.reactor, "text": mark.text, "written": written}
-        )
+            {
+                "time_min": round(mark.time_min, 3), "reactor": mark.reactor, "text": mark.text, "written": written,
+                "level_ml": "" if mark.level_ml is None else mark.level_ml,
+            }
+        )  # fmt: skip
     return folder / NAME
 
 
 def read_marks(folder: Path) -> list[Mark]:
-    """The marks of a run folder, in the order of time; none where there is no file. Raises: RecordingError."""
+    """The marks of a run folder, as they were written; none where there is no file. Raises: RecordingError."""
     path = folder / NAME
     if not path.is_file():
         return []
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            found = [Mark(float(row["time_min"]), row["reactor"], row["text"]) for row in csv.DictReader(file)]
+            return [
+                Mark(
+                    float(row["time_min"]),
+                    row["reactor"],
+                    row["text"],
+                    float(level) if (level := row.get("level_ml")) else None,
+                )
+                for row in csv.DictReader(file)
+            ]
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise RecordingError(f"{path}: damaged ({type(error).__name__}: {error}); mend it or move it away") from None
-    return sorted(found, key=lambda mark: mark.time_min)

@@ -12,6 +12,7 @@ from experiments.control import assemble
 from experiments.control.config import DeployConfig
 from experiments.controllers import registry
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
+from hardware.safety.config import SafetyConfig
 
 CALM = Scenario((0.5, 0.6), (10.0, 10.0), (37.0, 37.0))
 WARMER = replace(CALM, temperatures=(30.0, 37.0))
@@ -54,7 +55,6 @@ def test_a_controller_that_knows_the_plant_needs_a_simulated_one(tmp_path: Path)
     ("values", "words"),
     [
         ({"period_s": 120.0, "stale_s": 200.0}, "give safety.period_s=120$"),
-        ({"volume_ml": 15.0}, "safety.volume_ml = 20 mL: allowed the same; give safety.volume_ml=15$"),
         ({"max_dose_ml": 0.9}, "interlock allows 1.2 mL in a period of 60 s; give safety.max_rate=0.015 or a larger"),
     ],
 )
@@ -62,3 +62,13 @@ def test_the_interlock_counts_with_the_units_own_period_volume_and_dose(
     tmp_path: Path, values: dict[str, float], words: str
 ) -> None:
     refused(tmp_path, words, backend=PioreactorConfig(**values))
+
+
+def test_a_volume_is_said_once_and_by_the_backend(tmp_path: Path) -> None:
+    backend = PioreactorConfig(volume_ml=12.0)
+    refused(
+        tmp_path,
+        "safety.volume_ml = 28 mL: the interlock takes backend.volume_ml",
+        backend=backend,
+        safety=SafetyConfig(volume_ml=28.0, max_volume_ml=29.0),
+    )

@@ -14,6 +14,7 @@ import pytest
 from envs.plant.sensor import counts_from_od, od_from_counts
 from envs.scenario import Scenario
 from experiments.cli import frame
+from experiments.control.levels import Levels
 from experiments.control.record import Record
 from experiments.control.recovery import COLUMNS
 from experiments.control.summary import figure_of, summarise
@@ -129,7 +130,7 @@ def test_a_mark_stands_in_the_figure_and_in_the_summary(run: Rehearsal) -> None:
     (run.folder / "marks.csv").unlink(missing_ok=True)
     add_mark(run.folder, Mark(9.0, "", "new bottle"))
     add_mark(run.folder, Mark(3.5, "M0", "inoculated, twice"))
-    assert read_marks(run.folder) == [Mark(3.5, "M0", "inoculated, twice"), Mark(9.0, "", "new bottle")]
+    assert read_marks(run.folder) == [Mark(9.0, "", "new bottle"), Mark(3.5, "M0", "inoculated, twice")]
     axes = figure_of(run.record, [SCHEDULE], "").axes
     assert [text.get_text() for text in axes[0].texts] == ["M0 inoculated, twice", "new bottle"]
     for ax in axes:
@@ -146,6 +147,78 @@ def test_a_damaged_file_of_marks_costs_no_summary(run: Rehearsal, caplog: pytest
     with pytest.raises(RecordingError, match="mend it or move it away"):
         read_marks(run.folder)
     (run.folder / "marks.csv").unlink()
+
+
+def test_a_level_that_was_read_off_a_vial_is_the_ledger_from_then_on_also_after_a_kill(tmp_path: Path) -> None:
+    """Killed after the level was journalled and before the state was saved; a damaged file stops nothing."""
+    config = replace(rehearsed(("M0", "M1"), Scenario((0.4,), (12.0,), (37.0,))), fsync=False)
+    made = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.5)
+    made.begin()
+    steps, levels = made.run(), Levels(made.record)
+    next(steps)
+    ledger = made.loop.interlock.budget
+    add_mark(tmp_path, Mark(1.0, "M0", "inoculated"))
+    add_mark(tmp_path, Mark(1.0, "M1", "level", 23.5))
+    levels.take(made.loop)
+    assert ledger.volume_ml.tolist() == [20.0, 23.5]
+    levels.take(made.loop)
+    assert [row["level_ml"] for row in made.record.journal.reread() if row["kind"] == "level"] == [23.5]
+    with pytest.raises(Killed):
+        made.kill()
+    made.close()
+    made.begin()
+    levels = Levels(made.record)
+    levels.take(made.loop)
+    assert made.loop.interlock.budget.volume_ml[1] == 23.5
+    (tmp_path / "marks.csv").write_text("damaged\n")
+    levels.take(made.loop)
+    for _ in made.run():  # a dose whose waste is carried out brings the level back to its tube
+        pass
+    assert made.loop.interlock.budget.volume_ml[1] == 20.0
+    made.close()
+    (tmp_path / "marks.csv").unlink()
+    add_mark(tmp_path, Mark(1.0, "M1", "level", 23.5))
+    made.begin()  # once more: the level was taken over in a life before
+    Levels(made.record).take(made.loop)
+    assert made.loop.interlock.budget.volume_ml[1] == 20.0
+    made.close()
+
+
+def test_a_level_and_the_doses_after_it_are_replayed_in_their_order(tmp_path: Path) -> None:
+    """The state on the disk is of before the level."""
+    config = replace(rehearsed(("M0",), Scenario((0.4,), (20.0,), (37.0,))), fsync=False)
+    made = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.5)
+    made.begin()
+    steps, levels = made.run(), Levels(made.record)
+    next(steps)
+    before = (tmp_path / "state.json").read_bytes()
+    add_mark(tmp_path, Mark(1.0, "M0", "level", 23.5))
+    levels.take(made.loop)
+    given = 0
+    while given < 3:
+        given += float(np.nansum(next(steps).volume_ml)) > 0.0
+    expected = made.loop.interlock.budget.volume_ml.copy()
+    with pytest.raises(Killed):
+        made.kill()
+    made.close()
+    (tmp_path / "state.json").write_bytes(before)
+    made.begin()
+    np.testing.assert_allclose(made.loop.interlock.budget.volume_ml, expected)
+    assert expected[0] < 23.5
+    made.close()
+
+
+def test_a_level_is_of_one_reactor_and_of_now(tmp_path: Path) -> None:
+    folder = _under_way(tmp_path / "run")
+    said = mark(MarkConfig(str(folder), "M0", level_ml=18.5))
+    assert said.startswith("M0: level 18.5 mL at minute ")
+    (found,) = read_marks(folder)
+    assert (found.reactor, found.level_ml) == ("M0", 18.5)
+    for wrong, message in (({}, "reactor = ''"), ({"reactor": "M0", "minute": 3.0}, "minute = 3.0")):
+        with pytest.raises(ValueError, match=message):
+            MarkConfig(str(folder), level_ml=18.5, **wrong)
+    with pytest.raises(ValueError, match="level_ml = 41"):
+        MarkConfig(str(folder), "M0", level_ml=41.0)
 
 
 def _under_way(folder: Path, kind: str = "emulator") -> Path:
@@ -184,7 +257,7 @@ def test_now_is_the_minute_of_the_run(tmp_path: Path) -> None:
     folder = _under_way(tmp_path / "run")
     mark(MarkConfig(str(folder), "M0", "inoculated"))
     mark(MarkConfig(str(folder), "", "bottle", minute=1.25))
-    (first, second) = read_marks(folder)
+    (second, first) = read_marks(folder)
     assert first == Mark(1.25, "", "bottle")
     assert second.time_min == pytest.approx(20.0, abs=2.0)
 

@@ -8,7 +8,7 @@ import pytest
 from experiments.reliability.rig_faults import MOMENTS, RIG_FAULTS, RigFault, rig_faults_named
 from experiments.reliability.rig_outcome import judged
 from experiments.reliability.rig_trial import SICK, WELL, Seen
-from hardware.pioreactor.rig.vials import Pulse
+from hardware.rig.vials import Pulse
 
 STRUCK = 30.0
 FAULT = RigFault("made_up", "", lambda t: None, by=("a word",))
@@ -24,7 +24,7 @@ def sound() -> Seen:
             journal.append({"kind": "sample", "reactor": unit, "wall": wall, "sample_s": 60.0 * k})
             rows[unit].append((float(k), 0.5))
         if k == 3:
-            journal.append({"kind": "note", "reactor": SICK, "wall": wall, "text": "a word on it"})
+            journal.append({"kind": "note", "reactor": SICK, "wall": wall, "note": "a word on it"})
         journal.append({"kind": "feed_on", "reactor": SICK, "wall": wall + 0.1, "id": f"r/{k}"})
         pulses.append(Pulse(SICK, "media", wall + 0.5, 0.5, 0.5))
         end = {"kind": "dose_end", "reactor": SICK, "wall": wall + 2.0, "id": f"r/{k}", "feed_ml": 0.5}
@@ -95,7 +95,7 @@ def test_a_lost_row_and_a_row_too_many_are_seen() -> None:
 
 
 def test_silence_is_seen() -> None:
-    assert "not told" in wrong(changed(sound(), "note", 0, text="something else"))
+    assert "not told" in wrong(changed(sound(), "note", 0, note="something else"))
     assert "told after" in wrong(sound(), replace(FAULT, within_s=-7.0))
     assert "min without a row" in wrong(
         replace(sound(), rows={unit: [(0.0, 0.5), (60.0, 0.5)] for unit in (SICK, WELL)}), replace(FAULT, seconds=1.0)
