@@ -31,4 +31,6 @@ REMOVED: dict[str, str] = {  # old dotted key -> why, and what to use instead
     "agent.learning_rate_decay": "the rate is constant",
     "agent.relabel_margin": "new goals lie between the task's lowest and highest setpoint",
     "agent.target_blend": "the target network is always a copy",
+    "backend.addresses": "give backend.units.NAME.address=http://HOST",
+    "backend.password": "it would stand in the files of a run; give PIOREACTOR_MQTT_PASSWORD or backend.password_file",
 }

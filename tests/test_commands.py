@@ -17,7 +17,7 @@ import pytest
 from tests.documented import PAGES, ROOT, commands, needs_hardware
 
 OTHERS = (
-    "experiments", "experiments.demo", "experiments.cli.reference", "hardware.emulator", "hardware.pioreactor.rig",
+    "experiments", "experiments.demo", "experiments.cli.reference", "hardware.emulator", "hardware.rig",
     "turbidostat",
 )  # fmt: skip
 SHOWN = {

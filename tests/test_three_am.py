@@ -169,8 +169,8 @@ SAID: dict[str, dict[str, Reader]] = {  # which call says something, in which fi
         "station",
     )},
     "hardware/chibio/protocol.py": ERRORS,
-    **{f"hardware/pioreactor/{name}.py": TELLS for name in (
-        "doses", "jobs", "mailbox", "pump_jobs", "reactors", "station", "web",
+    **{f"hardware/pioreactor/{name}.py": {k: v for k, v in TELLS.items() if k != "say"} for name in (
+        "doses", "jobs", "mailbox", "pumps", "reactors", "station", "web",
     )},
     "hardware/link/*.py": ERRORS,
     "hardware/reactor.py": ERRORS,
@@ -192,8 +192,9 @@ NAMED = {  # names whose values are said elsewhere
     "experiments/control/summary.py": ("who",),
     "hardware/chibio/fluorescence.py": ("trouble",),
     "hardware/chibio/overflow_pump.py": ("trouble",),
-    "hardware/pioreactor/doses.py": ("trouble", "said"),
-    "hardware/pioreactor/pump_jobs.py": ("trouble",),
+    "hardware/pioreactor/doses.py": ("foreign",),
+    "hardware/pioreactor/pumps.py": ("trouble", "end", "why"),
+    "hardware/pioreactor/station.py": ("refusal",),
     "hardware/safety/interlock.py": ("texts",),
     "hardware/storage/recorder.py": ("repaired",),
 }

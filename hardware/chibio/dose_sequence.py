@@ -56,9 +56,7 @@ class DoseSequence:
         self._acted: tuple[float, int] | None = None  # newest sample a dose was decided for
         self._carry_ml, self._doses = 0.0, 0
         self._due_s = math.inf  # clock time at which the dose under way should be over
-        self._given_up: list[
-            ReactorHistory
-        ] = []  # doses whose feed command brought no answer and may yet be carried out
+        self._given_up: list[ReactorHistory] = []  # their feed command brought no answer and may yet be carried out
         self._unanswered = False  # of the dose under way
         self._late, self._off_s = False, 0.0  # whether it is now; run time at which the pumps were last verified off
         self._doubt_s = math.nan  # run time of the last answer before one was missing in a dose, nan if none was

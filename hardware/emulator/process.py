@@ -5,11 +5,15 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 
 from hardware.errors import LinkError
 
 __all__ = ["EmulatorProcess"]
+
+
+START_S = 60.0
 
 
 class EmulatorProcess:
@@ -27,7 +31,10 @@ class EmulatorProcess:
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
         self.pid = self._process.pid
         assert self._process.stdout is not None
+        late = threading.Timer(START_S, self._process.kill)
+        late.start()
         line = self._process.stdout.readline()
+        late.cancel()
         ready = re.match(r"emulator ready: (http://\S+) .* control (http://\S+)", line)
         if ready is None:
             self.close()
