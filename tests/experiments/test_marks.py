@@ -208,6 +208,27 @@ def test_a_level_and_the_doses_after_it_are_replayed_in_their_order(tmp_path: Pa
     made.close()
 
 
+def test_a_level_that_the_saved_state_knows_is_not_restored_again_and_0_ml_is_one(tmp_path: Path) -> None:
+    config = replace(rehearsed(("M0", "M1"), Scenario((0.4,), (12.0,), (37.0,))), fsync=False)
+    made = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.5)
+    made.begin()
+    steps, levels = made.run(), Levels(made.record)
+    next(steps)
+    add_mark(tmp_path, Mark(1.0, "M1", "level", 23.5))
+    levels.take(made.loop)
+    while made.loop.interlock.budget.volume_ml[1] > 20.0:  # a dose brings it back to its tube
+        next(steps)
+    with pytest.raises(Killed):
+        made.kill()
+    made.close()
+    made.begin()
+    assert made.loop.interlock.budget.volume_ml.tolist() == [20.0, 20.0]
+    add_mark(tmp_path, Mark(2.0, "M0", "level", 0.0))
+    Levels(made.record).take(made.loop)
+    assert made.loop.interlock.budget.volume_ml.tolist() == [0.0, 20.0]
+    made.close()
+
+
 def test_a_level_is_of_one_reactor_and_of_now(tmp_path: Path) -> None:
     folder = _under_way(tmp_path / "run")
     said = mark(MarkConfig(str(folder), "M0", level_ml=18.5))

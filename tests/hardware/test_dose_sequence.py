@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.dose_sequence import DoseSequence
-from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration
+from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, SupplyConfig
 from hardware.chibio.resume import ReactorHistory, remember
 from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
@@ -384,3 +385,30 @@ def test_after_targets_that_could_not_be_set_no_dose_begins_before_the_pumps_are
     bench.run()
     assert (ended(bench)["feed_ml"], ended(bench)["waste_ml"]) == (0.0, 0.0)
     assert bench.begin(key=(120.0, 3)).feed_ml > 0.0
+
+
+@pytest.fixture
+def supplied() -> Bench:
+    """With a supply pump of another flow."""
+    bench = Bench()
+    bench.doses._config = replace(ChiBioConfig(), supply=SupplyConfig(pump3_ml_s=0.7))
+    bench.connection._supply_pumps = ("Pump3",)
+    return bench
+
+
+def test_what_the_feed_put_off_is_not_given_by_a_supply_pump(supplied):
+    assert supplied.begin(0.2 / 60.0).feed_ml == 0.0
+    supplied.clock.sleep(60.0)
+    plan = supplied.doses.begin(0.5 / 60.0, (120.0, 3), supplied.clock.now(), "", "Pump3")
+    assert plan.feed_ml == pytest.approx(0.5, abs=1e-3)
+    assert supplied.doses.carry_ml == pytest.approx(0.2)
+
+
+def test_of_two_commands_that_were_given_up_the_newer_is_looked_for(supplied):
+    supplied.line.lost = {"/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump3/1/M0"}
+    supplied.begin(0.5 / 60.0)
+    supplied.run(60.0)
+    supplied.clock.sleep(60.0)
+    supplied.doses.begin(0.5 / 60.0, (120.0, 3), supplied.clock.now(), "", "Pump3")
+    supplied.run(60.0)
+    assert supplied.doses.late == "Pump3"

@@ -463,3 +463,29 @@ def test_each_unit_is_handed_over_at_its_own_setpoint_and_has_its_own_level(lab)
     assert [unit.asked for unit in units] == [[0.4], [0.7]]
     lab.reactors.set_level(1, 14.5)
     assert [unit.level_ml for unit in units] == [0.0, 14.5]
+
+
+def test_after_a_crash_medium_that_still_waits_in_the_queue_is_waited_for(monkeypatch):
+    lab = Lab(monkeypatch)
+    lab.begin()
+    lab.sample()
+    lab.world.queue = False
+    lab.dose(0.8)
+    lab.wait(0.6)
+    rows, world = list(lab.rows), lab.world
+    again = Lab(monkeypatch, world)
+    again.rows = rows
+    again.begin(replay(rows)[UNIT], 60.0)
+    again.wait(30.0)
+    assert not again.of("dose_end")
+    world.revive()
+    again.until(lambda: bool(again.of("dose_end")), 120.0)
+    assert world.truth["add_media"] == pytest.approx(0.8, abs=0.02)
+
+
+def test_what_is_put_off_is_told_once_and_taken_back_when_it_is_given(lab):
+    assert lab.dose(0.03) == 0.0
+    assert lab.receipt.kept_ml[0] == pytest.approx(0.03)
+    lab.sample()
+    assert lab.dose(0.04) == pytest.approx(0.07)
+    assert lab.receipt.kept_ml[0] == pytest.approx(-0.03)

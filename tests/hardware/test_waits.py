@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from hardware.chibio.resume import replay
-from hardware.errors import DeviceStateError
-from hardware.link.transport import Reply
+from hardware.clock import VirtualClock
+from hardware.errors import DeviceStateError, LinkError
+from hardware.link.transport import Reply, SharedLink, Transport
 from tests.hardware.driver_lab import DriverLab
 from tests.hardware.emulator_lab import quiet
 
@@ -263,3 +264,27 @@ def test_a_stop_while_a_run_is_resumed_over_a_dead_link_says_that_it_could_not_v
     monkeypatch.setattr(lab.wire.inner, "post", stopped)
     with pytest.raises(DeviceStateError, match=r"stopped; pumps not verified off: M0"):
         resume(lab)
+
+
+def test_one_time_out_now_and_then_rests_no_reactor():
+    """Two, an hour apart, each with an answer soon after."""
+    clock, asked, dead = VirtualClock(0.0), [], [False]
+
+    class One(Transport):
+        def get(self, path):
+            asked.append(path)
+            if dead[0]:
+                clock.sleep(20.0)
+                raise LinkError("time-out")
+            return Reply(200, b"")
+
+    link = SharedLink(One(), clock)
+    for _ in range(2):
+        dead[0] = True
+        with pytest.raises(LinkError):
+            link.get("/x/M0")
+        dead[0] = False
+        clock.sleep(link.PAUSE_S + 0.1)
+        link.get("/x/M0")
+        clock.sleep(3600.0)
+    assert len(asked) == 4
