@@ -31,7 +31,7 @@ WEB = (
     "    web.client._client_id = ('rig-web-' + os.environ['HOSTNAME']).encode()\n"  # else each throws out the other
     "web.create_app().run(host=os.environ['RIG_HOST'], port=int(os.environ['RIG_WEB_PORT']), threaded=True)\n"
 )
-BOOT_S = 40.0
+BOOT_S = 90.0  # a busy computer
 UNIT = ("web", "tasks", "monitor")  # what boots with a unit; without any job the list of jobs is an error
 CONSUMER = ("-n", "-b", "1.001", "-w", "4", "-f", "-C", "-d", "0.05")  # of the task queue, as on a unit
 

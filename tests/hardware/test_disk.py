@@ -176,4 +176,6 @@ def test_a_long_journal_keeps_what_a_naive_reader_keeps(tmp_path: Path, monkeypa
         reader.close()
         assert [row["k"] for row in reader.rows] == kept
         assert (reader.cut, reader.next_row) == (0, 12)
-    assert all(json.loads(b"{" + mark + b"}")["kind"] in ("device", "temperature", "regulate") for mark in LANDMARKS)
+    assert all(
+        json.loads(b"{" + mark + b"}")["kind"] in ("device", "temperature", "regulate", "level") for mark in LANDMARKS
+    )
