@@ -56,6 +56,10 @@ class Run:
         """Wait for a file with something in it."""
         self._until(lambda: any(path.stat().st_size for path in self.folder.glob(pattern)))
 
+    def until_rows(self, pattern: str) -> None:
+        """Wait for a table with a row below its head: what writes it is under way."""
+        self._until(lambda: any(path.read_text().count("\n") > 1 for path in self.folder.glob(pattern)))
+
     def until_processes(self, count: int) -> None:
         self._until(lambda: len(self.processes()) >= count)
 
@@ -96,7 +100,7 @@ def go_on(run: Run, line: str) -> None:
 
 def test_a_stopped_training_goes_on_to_the_bit_with_the_command_it_names(tmp_path: Path) -> None:
     run = Run(tmp_path, "experiments.train", *SHORT, "hydra.run.dir=a folder")  # one that needs quotes
-    run.until_there("a folder/progress.csv")
+    run.until_rows("a folder/progress.csv")
     run.process.terminate()
     line = run.end()
     assert "keeps checkpoint.pt, progress.csv; go on" in line
@@ -126,7 +130,7 @@ def test_an_impatient_user_gets_out_at_once_and_keeps_what_was_saved(tmp_path: P
 def test_a_stopped_benchmark_ends_its_workers(tmp_path: Path) -> None:
     words = ["+experiment=comparison", "workers=2", "replicates=200", "train_seeds=1", "hydra.run.dir=run"]
     run = Run(tmp_path, "experiments.benchmark", *words)
-    run.until_there("run/training/dqn/progress.csv")
+    run.until_rows("run/training/dqn/progress.csv")
     os.killpg(run.process.pid, signal.SIGTERM)  # its workers get it too
     assert run.end() == "stopped; run keeps training/; to try again, start anew"
     assert (tmp_path / "run/training/dqn/checkpoint.pt").is_file()
