@@ -64,19 +64,19 @@ def power(lab: Lab) -> None:
     lab.world.power()
 
 
-def killed_and_queue_dead(lab: Lab) -> None:
-    killed(0.2)(lab)
-    in_the_dose(lambda lab: setattr(lab.world, "queue", False))(lab)
+def killed_and_dead(what: str) -> Callable[[Lab], None]:
+    """Its job is killed, and then the queue or the web server of its unit."""
+
+    def act(lab: Lab) -> None:
+        killed(0.2)(lab)
+        in_the_dose(lambda lab: setattr(lab.world, what, False))(lab)
+
+    return act
 
 
 def revived(lab: Lab) -> None:
     unlock(lab)
     lab.world.revive()
-
-
-def web_down(lab: Lab) -> None:
-    killed(0.2)(lab)
-    in_the_dose(lambda lab: setattr(lab.world, "web", False))(lab)
 
 
 def web_up(lab: Lab) -> None:
@@ -89,8 +89,8 @@ WRONG = {
     "killed at once": Wrong(killed(0.0), 40.0, unlock, "pwm_locks 13"),
     "killed before it told its pin": Wrong(killed(0.01, mute=True), 70.0, unlock, "pwm_locks 13"),
     "killed, and rebooted": Wrong(killed(0.2), 40.0, lambda lab: (lab.world.cut(), power(lab))[0], "pwm_locks 13"),
-    "killed, queue dead": Wrong(killed_and_queue_dead, 60.0, revived, "pwm_locks 13"),
-    "killed, web server dead": Wrong(web_down, 60.0, web_up, "pwm_locks 13"),
+    "killed, queue dead": Wrong(killed_and_dead("queue"), 60.0, revived, "pwm_locks 13"),
+    "killed, web server dead": Wrong(killed_and_dead("web"), 60.0, web_up, "pwm_locks 13"),
     **{f"frozen {s:g} s": Wrong(frozen(0.01, s), s, told="pin 13" if s > 8.0 else "") for s in (0.01, 1.0, 7.0, 14.0)},
     **{f"frozen {s:g} s in it": Wrong(frozen(0.6, s), s, told="pin 13") for s in (20.0, 60.0)},
     "broker lost": Wrong(in_the_dose(lambda lab: lab.world.lose_broker(3.0)), 3.0),

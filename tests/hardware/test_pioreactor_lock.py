@@ -29,24 +29,26 @@ def holds(what: Callable[[], bool]) -> bool:
     return what()
 
 
-@pytest.fixture
-def port(tmp_path: Path) -> Iterator[int]:
+@contextmanager
+def real_broker(folder: Path, settings: str) -> Iterator[int]:
+    """A broker of one's own with these lines of mosquitto.conf; its port."""
     pytest.importorskip("paho.mqtt.client", reason="pip install 'paho-mqtt>=2'")
-    program = broker()
-    if program is None:
+    if (program := broker()) is None:
         pytest.skip("no MQTT broker: apt-get install mosquitto")
-    number = _free_port("127.0.0.1")
-    conf = tmp_path / "mosquitto.conf"
-    conf.write_text(f"listener {number} 127.0.0.1\nallow_anonymous true\n", encoding="utf-8")
-    with (
-        (tmp_path / "log").open("wb") as log,
-        subprocess.Popen([program, "-c", str(conf)], stdout=log, stderr=log) as p,
-    ):
+    number, conf = _free_port("127.0.0.1"), folder / "mosquitto.conf"
+    conf.write_text(f"listener {number} 127.0.0.1\n{settings}\n", encoding="utf-8")
+    with (folder / "log").open("wb") as log, subprocess.Popen([program, "-c", str(conf)], stdout=log, stderr=log) as p:
         try:
             assert holds(lambda: _listens("127.0.0.1", number))
             yield number
         finally:
             p.kill()
+
+
+@pytest.fixture
+def port(tmp_path: Path) -> Iterator[int]:
+    with real_broker(tmp_path, "allow_anonymous true") as number:
+        yield number
 
 
 def client(port: int, name: str, *units: str) -> Cluster:

@@ -1,5 +1,6 @@
 """Doors of the Pioreactor driver: HTTP as it comes, a broker that refuses, a password that nobody sees."""
 
+import getpass
 import json
 import os
 import subprocess
@@ -17,8 +18,8 @@ from hardware.pioreactor.config import PASSWORD, PioreactorConfig
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.web import NotHeard, Web
 from hardware.rig.build import broker
-from hardware.rig.processes import _free_port, _listens
-from tests.hardware.test_pioreactor_lock import holds
+from hardware.rig.processes import _free_port
+from tests.hardware.test_pioreactor_lock import real_broker
 
 ROOT = Path(__file__).parents[2]
 
@@ -132,21 +133,12 @@ def test_a_unit_that_hangs_does_not_make_another_wait(server):
 @pytest.fixture
 def port(tmp_path: Path) -> Iterator[int]:
     """Of a broker that wants ada's password."""
-    pytest.importorskip("paho.mqtt.client", reason="pip install 'paho-mqtt>=2'")
-    if (program := broker()) is None:
+    if broker() is None:
         pytest.skip("no MQTT broker: apt-get install mosquitto")
-    number, secret, conf = _free_port("127.0.0.1"), tmp_path / "secret", tmp_path / "mosquitto.conf"
+    secret = tmp_path / "secret"
     subprocess.run(["mosquitto_passwd", "-b", "-c", secret, "ada", "zebra-77"], check=True, capture_output=True)
-    conf.write_text(f"listener {number} 127.0.0.1\npassword_file {secret}\nuser root\n", encoding="utf-8")
-    with (
-        (tmp_path / "log").open("wb") as log,
-        subprocess.Popen([program, "-c", str(conf)], stdout=log, stderr=log) as process,
-    ):
-        try:
-            assert holds(lambda: _listens("127.0.0.1", number))
-            yield number
-        finally:
-            process.kill()
+    with real_broker(tmp_path, f"password_file {secret}\nuser {getpass.getuser()}") as number:
+        yield number
 
 
 def connected(port: int, **values: str) -> bool:
