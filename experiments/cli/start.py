@@ -36,7 +36,9 @@ def _other_package() -> str | None:
 
 def stopped() -> str:
     """What a stop says before anything began; a run that was to be resumed may have left a pump on."""
-    resumed = any(word.lstrip("+").startswith("resume=") for word in sys.argv)
+    words = sys.orig_argv
+    deploys = any(Path(word).name in ("deploy", "deploy.py", "experiments.deploy") for word in words)
+    resumed = deploys and any(word.lstrip("+").startswith("resume=") for word in words)
     return "stopped before anything began" + "; pumps not verified off: resume the run" * resumed
 
 

@@ -123,9 +123,11 @@ def _pioreactor(opening: Opening) -> Iterator[Reactor]:
         raise RecordingError(f"journal {opening.journal.path}: missing or empty; put it back, or start a new run")
     began = float(earlier[0]["wall"]) if earlier else time.time()
     run = format(int(began), "x")
-    with _units(opening.backend, opening.folder, opening.journal.append, run) as reactors:
-        if not earlier:
-            report(preflight_units(reactors))
+    with ExitStack() as stack:
+        with _not_looked_at():
+            reactors = stack.enter_context(_units(opening.backend, opening.folder, opening.journal.append, run))
+            if not earlier:
+                report(preflight_units(reactors))
         elapsed_s = (time.time() - began) * opening.backend.speed if earlier else 0.0
         with left_off(reactors):
             reactors.begin(replay_units(earlier), elapsed_s)

@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dqn import policy
+from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.control import families, run
@@ -29,7 +30,8 @@ from hardware.chibio.config import EmulatorConfig
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
 from hardware.emulator.transport import EmulatorTransport
-from hardware.storage.journal import read_journal
+from hardware.pioreactor.config import PioreactorConfig
+from hardware.storage.journal import Journal, read_journal
 from tests.experiments.test_deploy import inverse_policy
 
 ROOT = Path(__file__).parents[2]
@@ -144,4 +146,20 @@ def test_a_stop_before_the_pumps_were_looked_at_says_so(
     monkeypatch.setattr(families, "linked", stopped)
     with pytest.raises(KeyboardInterrupt):
         run.deploy(config("inverse", "emulator", tmp_path), tmp_path)
+    assert "pumps not verified off" in caplog.text
+
+
+def test_a_stop_before_the_units_were_looked_at_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    @contextmanager
+    def stopped(*_given: object) -> Iterator[None]:
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(families, "_units", stopped)
+    with closing(Journal(tmp_path / "journal.jsonl", fsync=False)) as journal:
+        opening = families.Opening(PioreactorConfig(), PlantConfig(), journal, tmp_path, resumed=False)
+        with pytest.raises(KeyboardInterrupt), families.OPENERS["pioreactor"](opening):
+            pass
     assert "pumps not verified off" in caplog.text

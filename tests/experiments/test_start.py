@@ -63,11 +63,15 @@ def test_a_mere_folder_of_that_name_beside_an_editable_install(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("more", "also"), [([], ""), (["resume=runs/deploy/x"], "; pumps not verified off: resume the run")]
-)
-def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, more: list[str], also: str) -> None:
+    ("name", "more", "also"),
+    [
+        ("deploy", [], ""), ("deploy", ["resume=runs/deploy/x"], "; pumps not verified off: resume the run"),
+        ("train", ["resume=runs/train/x"], ""),
+    ],
+)  # fmt: skip
+def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, name: str, more: list[str], also: str) -> None:
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "experiments.deploy", *more]
+    command = [sys.executable, "-m", f"experiments.{name}", *more]
     process = subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
     while "_multiarray_umath" not in Path(f"/proc/{process.pid}/maps").read_text():
         assert process.poll() is None
