@@ -19,7 +19,7 @@ class Scenario:
     """Phases one after another, counted from the end of the recovery.
 
     Where `until` gives a phase a condition, its minutes are the longest it may take, and `edges`, `phase` and `at` are
-    those of a schedule in which no condition is met (`experiments/control/progress.py` has them as they came).
+    those of a schedule in which no condition is met (`experiments/loop/progress.py` has them as they came).
     The share of a second species may be asked for, phase by phase or as mean - amplitude sin(2 pi t / period), t since
     the recovery ended. Where it is, whoever controls the composition decides on the temperature, elsewhere
     `temperatures` holds. Raises: ValueError naming key, value and allowed range.

@@ -48,7 +48,7 @@ def write(folder: Path) -> Path:
     one) a section for each. Raises: frame.UserError where there is nothing to report on.
     """
     from experiments.comparison import page as comparison
-    from experiments.control import aftermath
+    from experiments.record import aftermath
     from experiments.reporting import page
 
     runs = [folder] if (folder / "summary.json").is_file() else sorted(p.parent for p in folder.glob("*/summary.json"))

@@ -182,14 +182,14 @@ SAID: dict[str, dict[str, Reader]] = {  # which call says something, in which fi
 RETURNED = {  # functions whose result is said elsewhere
     "hardware/chibio/ending.py": "_words",
     "hardware/chibio/sampling.py": "_measure_lateness",
-    "experiments/control/recovery.py": "complete",
+    "experiments/record/recovery.py": "complete",
 }
 NAMED = {  # names whose values are said elsewhere
-    "experiments/control/composition.py": ("said",),
-    "experiments/control/record.py": ("repairs",),
-    "experiments/control/recovery.py": ("repairs",),
+    "experiments/loop/composition.py": ("said",),
+    "experiments/record/record.py": ("repairs",),
+    "experiments/record/recovery.py": ("repairs",),
     "experiments/control/run.py": ("outcome",),
-    "experiments/control/summary.py": ("who",),
+    "experiments/record/summary.py": ("who",),
     "hardware/chibio/fluorescence.py": ("trouble",),
     "hardware/chibio/overflow_pump.py": ("trouble",),
     "hardware/pioreactor/doses.py": ("foreign",),

@@ -23,10 +23,10 @@ from experiments.comparison.config import BenchmarkConfig
 from experiments.composition import registry as laws
 from experiments.composition.controller import CompositionController
 from experiments.composition.program import Program
-from experiments.control.composition import program_of
 from experiments.control.policies import composition_policy, load_policy
 from experiments.controllers import registry
 from experiments.controllers.base import Accounts, Controller, Watches
+from experiments.loop.composition import program_of
 
 __all__ = ["CompositionCell", "CompositionTrial", "composition_cells", "policies_of", "run_cells", "run_composition"]
 

@@ -25,10 +25,10 @@ from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli.stop import Workers
 from experiments.comparison.config import BenchmarkConfig
-from experiments.control.loop import ClosedLoop
-from experiments.control.metrics import WindowMetrics, window_metrics
 from experiments.controllers import registry
 from experiments.controllers.base import Controller
+from experiments.loop.loop import ClosedLoop
+from experiments.loop.metrics import WindowMetrics, window_metrics
 from hardware.safety.config import Response, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors

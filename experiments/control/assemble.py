@@ -23,16 +23,16 @@ from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
 from experiments.composition import registry as compositions
 from experiments.control import families
-from experiments.control.composition import Composition, Keeper, program_of
 from experiments.control.config import DeployConfig
 from experiments.control.families import Opening
 from experiments.control.fit import check_fit
-from experiments.control.loop import ClosedLoop
 from experiments.control.plant_file import read_plant_file
 from experiments.control.policies import admit, composition_policy, policy_check, run_policy
-from experiments.control.record import Record
-from experiments.control.recovery import continue_loop
 from experiments.controllers import registry
+from experiments.loop.composition import Composition, Keeper, program_of
+from experiments.loop.loop import ClosedLoop
+from experiments.record.record import Record
+from experiments.record.recovery import continue_loop
 from experiments.training.config import read_env_file
 from hardware.emulator.device import plant_preset
 from hardware.pioreactor.config import PioreactorConfig

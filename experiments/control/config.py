@@ -7,10 +7,10 @@ from conf.schema import check, part, require, setting
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.composition import registry as compositions
-from experiments.control.composition import ShareWarnings, columns
-from experiments.control.recovery import COLUMNS
 from experiments.controllers import registry
 from experiments.controllers.learned import LearnedConfig
+from experiments.loop.composition import ShareWarnings, columns
+from experiments.record.recovery import COLUMNS
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
 from hardware.safety.config import SafetyConfig

@@ -6,8 +6,8 @@ from envs.outputs import DOSE_ML
 from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.control.config import DeployConfig
-from experiments.control.supply import MADE_UP_MIN
 from experiments.controllers import registry
+from experiments.loop.supply import MADE_UP_MIN
 from hardware.chibio.config import ChiBioConfig
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.safety.config import SafetyConfig

@@ -2,8 +2,8 @@
 
 import logging
 
-from experiments.control.loop import ClosedLoop
-from experiments.control.record import Record
+from experiments.loop.loop import ClosedLoop
+from experiments.record.record import Record
 from hardware.errors import RecordingError
 from hardware.storage.marks import NAME, read_marks
 

@@ -11,25 +11,25 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from experiments.cli import files, frame
+from experiments.cli.choices import choices
 from experiments.cli.frame import swept
 from experiments.control import assemble, notify
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
 from experiments.control.device import one_interrupt
 from experiments.control.levels import Levels
-from experiments.control.loop import ClosedLoop
 from experiments.control.notify import Notifier
-from experiments.control.record import Record
-from experiments.control.summary import (
+from experiments.loop.loop import ClosedLoop
+from experiments.record.curves import controlled
+from experiments.record.record import Record
+from experiments.record.summary import (
     ChangeLog,
-    began,
     composition_figure_of,
     figure_of,
     metrics_table,
     reasons_line,
     shares_table,
     summarise,
-    title_of,
 )
 from experiments.reporting import charts
 from hardware.errors import ReactorError, RecordingError
@@ -37,6 +37,20 @@ from hardware.errors import ReactorError, RecordingError
 __all__ = ["deploy"]
 
 log = logging.getLogger(__name__)
+
+
+def _began(setup: Setup, folder: Path) -> None:
+    """Log what is run, for how long, and where to watch it."""
+    longest = max(s.total_min for s in setup.scenarios)
+    title = f"{_title(setup.config, folder)}, {', '.join(setup.config.backend.reactors)}"
+    log.info("%s: %g min (%.1f h) of schedule once the culture has grown", title, longest, longest / 60.0)
+    log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
+
+
+def _title(config: DeployConfig, folder: Path) -> str:
+    """Of the figures: who controls what."""
+    law = "" if config.composition is None else f" and {config.composition.kind}"
+    return f"{config.controller.kind}{law} on {controlled(choices(folder), asdict(config))}"
 
 
 def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
@@ -77,7 +91,7 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
         with suppress(RecordingError):  # a signal or an error in a dose ends the loop before its row is written
             record.complete()
     try:
-        title = title_of(config, folder, outcome)
+        title = f"{_title(config, folder)}: {outcome}"
         figures = {"closed_loop": figure_of(record, setup.scenarios, title)}
         if setup.keeper is not None:
             figures["composition"] = composition_figure_of(record, title)
@@ -138,7 +152,7 @@ def _recorded(setup: Setup, folder: Path, tell: Notifier) -> str:
     with one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync, config.columns)) as record:
         for repair in record.repairs:
             log.warning("%s", repair)
-        began(config, setup.scenarios, folder)
+        _began(setup, folder)
         with assemble.opened(setup, record) as loop:
             tell("start", f"{'resumed' if setup.resumed else 'started'}: {', '.join(loop.reactors.names)}")
             outcome = _run(loop, record, tell)

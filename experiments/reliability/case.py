@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from experiments.control.config import DeployConfig
-from experiments.control.loop import Step
 from experiments.controllers.base import Array
+from experiments.loop.loop import Step
 from experiments.reliability.audit import audit_doses, audit_rows
 from experiments.reliability.faults import FAULTY, INF, Fault
 from experiments.reliability.outcome import Outcome, allowed, judge

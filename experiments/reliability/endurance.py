@@ -14,9 +14,9 @@ import numpy as np
 
 from conf.schema import check, part, setting
 from envs.scenario import Scenario
-from experiments.control.loop import Step
 from experiments.controllers.base import Mask
 from experiments.controllers.registry import on_device
+from experiments.loop.loop import Step
 from experiments.reliability.audit import Served, audit_doses, audit_rows
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from experiments.reliability.tracking import BAND_OD, Tracking

@@ -16,9 +16,9 @@ import numpy as np
 from envs.scenario import Scenario
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
-from experiments.control.loop import ClosedLoop, Step
-from experiments.control.record import Record
 from experiments.controllers import registry
+from experiments.loop.loop import ClosedLoop, Step
+from experiments.record.record import Record
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration, SupplyConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig

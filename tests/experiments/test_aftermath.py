@@ -14,7 +14,7 @@ from dqn import policy as policies
 from experiments import deploy, report
 from experiments.cli import frame
 from experiments.control import run
-from experiments.control.aftermath import believed, told
+from experiments.record.aftermath import believed, told
 from tests.experiments.test_deploy import inverse_policy
 
 pytestmark = pytest.mark.xdist_group("aftermath")  # its tests share runs, made once

@@ -11,10 +11,10 @@ import yaml
 from experiments import report
 from experiments.cli import frame
 from experiments.control import policies, run
-from experiments.control.composition import COLUMNS
-from experiments.control.metrics import mean_errors
-from experiments.control.recovery import COLUMNS as USUAL
 from experiments.deploy import main
+from experiments.loop.composition import COLUMNS
+from experiments.loop.metrics import mean_errors
+from experiments.record.recovery import COLUMNS as USUAL
 from hardware.storage.recording_reader import read_recording
 
 pytestmark = pytest.mark.xdist_group("composition")  # its tests share a run, made once

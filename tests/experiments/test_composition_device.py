@@ -19,7 +19,7 @@ from conf.schema import build
 from envs.scenario import Scenario
 from experiments.composition import registry as compositions
 from experiments.control.device import save_calibration
-from experiments.control.recovery import COLUMNS as USUAL
+from experiments.record.recovery import COLUMNS as USUAL
 from experiments.reliability.audit import audit_doses, audit_rows
 from experiments.reliability.kills import KillConfig, killed_run
 from experiments.reliability.rehearsal import SOUND, Killed, Rehearsal, rehearsed

@@ -12,9 +12,9 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.composition import registry as compositions
 from experiments.composition.base import Array, Mask, Wanted
-from experiments.control.composition import COLUMNS, Composition, ShareWarnings, program_of
-from experiments.control.loop import ClosedLoop, Step
 from experiments.controllers import registry
+from experiments.loop.composition import COLUMNS, Composition, ShareWarnings, program_of
+from experiments.loop.loop import ClosedLoop, Step
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Measurement
 from hardware.safety.config import SafetyConfig

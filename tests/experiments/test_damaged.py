@@ -17,8 +17,8 @@ from experiments.cli import frame
 from experiments.cli.frame import UserError, save_config
 from experiments.control.config import DeployConfig
 from experiments.control.policies import load_policy
-from experiments.control.record import Record
 from experiments.deploy import _schema
+from experiments.record.record import Record
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import RecordingError

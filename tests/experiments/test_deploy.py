@@ -19,11 +19,11 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
 from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
-from experiments.control.loop import ClosedLoop
-from experiments.control.record import Record
-from experiments.control.summary import ChangeLog
 from experiments.controllers import registry
 from experiments.controllers.learned import LearnedController
+from experiments.loop.loop import ClosedLoop
+from experiments.record.record import Record
+from experiments.record.summary import ChangeLog
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from envs.scenario import Scenario
-from experiments.control.summary import ChangeLog, reasons_line, summarise
+from experiments.record.summary import ChangeLog, reasons_line, summarise
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.emulator.faults import inject
 from hardware.storage.journal import read_journal

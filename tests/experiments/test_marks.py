@@ -15,11 +15,11 @@ from envs.plant.sensor import counts_from_od, od_from_counts
 from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.control.levels import Levels
-from experiments.control.record import Record
-from experiments.control.recovery import COLUMNS
-from experiments.control.summary import figure_of, summarise
 from experiments.mark import MarkConfig, mark
 from experiments.mark import main as command
+from experiments.record.record import Record
+from experiments.record.recovery import COLUMNS
+from experiments.record.summary import figure_of, summarise
 from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.emulator.faults import inject
 from hardware.emulator.vial import DARK_COUNTS

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.control.metrics import window_metrics
+from experiments.loop.metrics import window_metrics
 
 
 def test_decaying_error_has_ise_one_half_and_itae_one():

@@ -19,7 +19,7 @@ from experiments.cli import frame
 from experiments.control import notify
 from experiments.control.config import DeployConfig
 from experiments.control.notify import Hook, Notifier, hidden
-from experiments.control.summary import ChangeLog
+from experiments.record.summary import ChangeLog
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.emulator.faults import inject
 from tests.experiments.test_deploy import ROOT

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
-from experiments.control.loop import Step
-from experiments.control.record import Record
 from experiments.controllers.base import Array, Mask
+from experiments.loop.loop import Step
+from experiments.record.record import Record
 from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.emulator.faults import inject
 from hardware.emulator.transport import EmulatorTransport

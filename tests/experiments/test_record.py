@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.control.record import Record
-from experiments.control.recovery import COLUMNS, load_state
+from experiments.record.record import Record
+from experiments.record.recovery import COLUMNS, load_state
 from hardware.errors import RecordingError
 
 

@@ -16,11 +16,11 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.cli import files
-from experiments.control.loop import ClosedLoop, Step
 from experiments.control.policies import find_policy, load_policy
-from experiments.control.recovery import load_state
 from experiments.controllers import registry
 from experiments.controllers.base import Array, Controller, Mask, Remembers
+from experiments.loop.loop import ClosedLoop, Step
+from experiments.record.recovery import load_state
 from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors

@@ -14,8 +14,8 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.control import assemble
-from experiments.control.loop import ClosedLoop
-from experiments.control.supply import Supply
+from experiments.loop.loop import ClosedLoop
+from experiments.loop.supply import Supply
 from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import SupplyConfig

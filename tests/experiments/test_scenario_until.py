@@ -10,8 +10,8 @@ import pytest
 
 from envs.scenario import Scenario
 from experiments.comparison.config import BenchmarkConfig
-from experiments.control.progress import Progress
-from experiments.control.summary import summarise
+from experiments.loop.progress import Progress
+from experiments.record.summary import summarise
 from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 

@@ -10,9 +10,9 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.control.policies import find_policy, load_policy
-from experiments.control.summary import ChangeLog
 from experiments.controllers.estimator import LOG_OD, EstimatorConfig
 from experiments.controllers.learned import RelativeController
+from experiments.record.summary import ChangeLog
 from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.storage.journal import read_journal

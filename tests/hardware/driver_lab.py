@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from envs.scenario import Scenario
-from experiments.control.loop import ClosedLoop, Step
 from experiments.controllers.base import Array, Mask
+from experiments.loop.loop import ClosedLoop, Step
 from experiments.reliability.rehearsal import SOUND
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration

@@ -47,7 +47,7 @@ TABLE = {
         )] + ["experiments/test_open_dose.py", "test_settings.py"],
     ),
     "figures": (
-        ["experiments/control/metrics.py", "experiments/comparison/statistics.py"],
+        ["experiments/loop/metrics.py", "experiments/comparison/statistics.py"],
         ["experiments/test_metrics.py", "experiments/test_statistics.py"],
     ),
 }  # fmt: skip

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.scenario import Scenario
-from experiments.control.composition import Composition
-from experiments.control.progress import Progress
-from experiments.control.supply import Supply
 from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Remembers, Watches
+from experiments.loop.composition import Composition
+from experiments.loop.progress import Progress
+from experiments.loop.supply import Supply
 from hardware.reactor import Command, KeepsLevels, Reactor, Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock, Verdict

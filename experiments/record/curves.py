@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.cli.choices import choices
-from experiments.control.loop import Step
+from experiments.loop.loop import Step
 from experiments.reporting import tables
 from experiments.reporting.curves import BAND, DEPLOYMENT, SHARES
 from experiments.reporting.tensorboard import Events

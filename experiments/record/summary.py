@@ -2,25 +2,20 @@
 
 import logging
 import re
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from envs.scenario import Scenario
-from experiments.cli.choices import choices
-from experiments.control.composition import TRUE
-from experiments.control.config import DeployConfig
-from experiments.control.curves import controlled
-from experiments.control.loop import ClosedLoop, Step
-from experiments.control.metrics import mean_errors, window_metrics
-from experiments.control.progress import Progress
-from experiments.control.record import Record
-from experiments.control.recovery import Rows
+from experiments.loop.composition import TRUE
+from experiments.loop.loop import ClosedLoop, Step
+from experiments.loop.metrics import mean_errors, window_metrics
+from experiments.loop.progress import Progress
+from experiments.record.record import Record
+from experiments.record.recovery import Rows
 from experiments.reporting import charts
 from experiments.reporting.composition_chart import composition_figure
 from hardware.errors import RecordingError
@@ -29,14 +24,12 @@ from hardware.storage.marks import Mark, read_marks
 
 __all__ = [
     "ChangeLog",
-    "began",
     "composition_figure_of",
     "figure_of",
     "metrics_table",
     "reasons_line",
     "shares_table",
     "summarise",
-    "title_of",
 ]
 
 log = logging.getLogger(__name__)
@@ -49,25 +42,6 @@ FORMATS = {  # of the metrics of a window
     "settling_min": "8.1f",
     "steady_abs_error": "8.4f",
 }
-
-
-def began(config: DeployConfig, scenarios: Sequence[Scenario], folder: Path) -> None:
-    """Log what is run, for how long, and where to watch it."""
-    longest = max(s.total_min for s in scenarios)
-    title = f"{_title(config, folder)}, {', '.join(config.backend.reactors)}"
-    log.info("%s: %g min (%.1f h) of schedule once the culture has grown", title, longest, longest / 60.0)
-    log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
-
-
-def _title(config: DeployConfig, folder: Path) -> str:
-    values = asdict(config)
-    law = "" if config.composition is None else f" and {config.composition.kind}"
-    return f"{config.controller.kind}{law} on {controlled(choices(folder), values)}"
-
-
-def title_of(config: DeployConfig, folder: Path, outcome: str) -> str:
-    """Of the figures: who controlled what, and how it ended."""
-    return f"{_title(config, folder)}: {outcome}"
 
 
 AGAIN_S = 3600.0

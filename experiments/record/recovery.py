@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.control.loop import ClosedLoop, Step
 from experiments.controllers.base import Accounts, Remembers
+from experiments.loop.loop import ClosedLoop, Step
 from hardware.errors import RecordingError
 from hardware.reactor import Receipt
 from hardware.safety.config import Response

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from experiments.cli import files
-from experiments.control.curves import Curves
-from experiments.control.loop import Step
-from experiments.control.recovery import COLUMNS, REBUILD, Array, Row, complete, cut_short, read_rows, row_of
+from experiments.loop.loop import Step
+from experiments.record.curves import Curves
+from experiments.record.recovery import COLUMNS, REBUILD, Array, Row, complete, cut_short, read_rows, row_of
 from hardware.errors import RecordingError
 from hardware.storage.journal import Journal
 from hardware.storage.recorder import Recorder

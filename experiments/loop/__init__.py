@@ -1,0 +1,1 @@
+"""The closed loop: sample, schedule, law, interlock, dose; and how well it held."""
