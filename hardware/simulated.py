@@ -21,7 +21,6 @@ class SimulatedConfig:
 
     kind: str = setting("sim", "which backend")
     reactors: tuple[str, ...] = setting(("M0",), "one simulated vial each", some=True)
-    control_min: float = setting(1.0, "between samples", "min", above=0.0, at_most=60.0)
     pump_ml_s: float = setting(1.0, "believed flow of the feed pump at full power", "mL/s", above=0.0, at_most=10.0)
     seed: int = setting(0, "of everything the plant draws", at_least=0)
 
@@ -36,15 +35,17 @@ class SimulatedReactors:
 
     Args:
       plant: N vials, reset to the state the run starts from.
-      config: names, period and what the pump is believed to deliver.
+      config: names and what the pump is believed to deliver. control_min: between samples, min.
       clock: virtual, or a scaled one to watch a run.
     """
 
-    def __init__(self, plant: Plant, config: SimulatedConfig, clock: Clock | None = None) -> None:
+    def __init__(
+        self, plant: Plant, config: SimulatedConfig, control_min: float = 1.0, clock: Clock | None = None
+    ) -> None:
         if plant.n != len(config.reactors):
             raise ValueError(f"plant has {plant.n} vials: allowed {len(config.reactors)}, one per reactor")
         self.plant = plant
-        self.config = config
+        self.config, self.control_min = config, control_min
         self._clock = clock or VirtualClock()
         self._started = self._clock.now()
         self._sampled = False
@@ -59,8 +60,8 @@ class SimulatedReactors:
     def measure(self) -> Measurement:
         """Let the control period pass (with the dose of the last command) and read every sensor. Raises: nothing."""
         if self._sampled:
-            self.plant.advance(self.config.control_min, self._feed_s, temperature_target=self._target)
-            self._clock.sleep(60.0 * self.config.control_min)
+            self.plant.advance(self.control_min, self._feed_s, temperature_target=self._target)
+            self._clock.sleep(60.0 * self.control_min)
             self._feed_s = np.zeros(self.plant.n)
         self._sampled = True
         return Measurement(
@@ -73,7 +74,7 @@ class SimulatedReactors:
 
     def actuate(self, command: Command) -> Receipt:
         """Dose once within the coming control period. Raises: nothing."""
-        volume = np.where(command.rows, command.pump_rate, 0.0) * 60.0 * self.config.control_min
+        volume = np.where(command.rows, command.pump_rate, 0.0) * 60.0 * self.control_min
         self._feed_s = volume / self.config.pump_ml_s
         self._target = np.where(command.rows, command.temperature, np.nan)
         return Receipt(volume_ml=volume)

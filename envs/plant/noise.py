@@ -23,7 +23,7 @@ def streams(rng: np.random.Generator | Streams, n: int) -> list[np.random.Genera
     return list(rng)
 
 
-def spread(rngs: Streams, mean: float, cv: float) -> Array:
+def spread(rngs: Streams, mean: Array | float, cv: Array | float) -> Array:
     """mean (1 + cv z) with z standard normal cut at three sigma, one draw per stream, shape (N,)."""
     z = np.clip([rng.standard_normal() for rng in rngs], -3.0, 3.0)
     return np.asarray(mean * (1.0 + cv * z), dtype=np.float64)

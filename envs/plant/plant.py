@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, part, setting
+from envs.bench import Bench
 from envs.integrators import INTEGRATORS
 from envs.plant.culture import Culture, GrowthConfig
 from envs.plant.disturbance import named
@@ -78,13 +79,20 @@ class Plant:
       config: what is real about it.
       n: number of vials.
       rng: a generator, from which one stream per vial is spawned, or a sequence of n generators.
+      volume_ml: what the bench says of each culture, mL, (N,) or one for all; the config may differ from it.
     Raises: ValueError for n < 1 or a sequence of another length.
 
     State and fault switches are arrays of shape (N,) in the parts. A switch may be set at any time and stays until it
     is set again. `minutes` is the time since reset.
     """
 
-    def __init__(self, config: PlantConfig, n: int, rng: np.random.Generator | Streams) -> None:
+    def __init__(
+        self,
+        config: PlantConfig,
+        n: int,
+        rng: np.random.Generator | Streams,
+        volume_ml: Array | float = Bench.volume_ml,
+    ) -> None:
         if n < 1:
             raise ValueError(f"number of vials = {n}: allowed >= 1")
         self.config, self.n = config, n
@@ -93,7 +101,7 @@ class Plant:
         # The parts draw from the same streams: their order belongs to what a seed means.
         integrate = INTEGRATORS[config.integrator]
         self.culture = Culture(config.growth, once, integrate, config.substep_min, config.second, second)
-        self.vessel = Vessel(config.vessel, config.pump, once)
+        self.vessel = Vessel(config.vessel, config.pump, once, np.full(n, volume_ml, dtype=np.float64))
         self.feed = FeedPump(config.pump, once)
         self.sensor = OdSensor(config.sensor, once, reading)
         self.thermal = Thermal(config.thermal, n)

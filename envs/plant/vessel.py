@@ -22,7 +22,9 @@ MIN_VOLUME_ML = 1.0  # mL, what no pump can take out of a vial; keeps concentrat
 class VesselConfig:
     """The vial and its bottle."""
 
-    volume_ml: float = setting(20.0, "mean culture up to the waste tube (Steel 2020)", "mL", within=(5, 50))
+    volume_ml: float | None = setting(
+        None, "mean culture up to the waste tube, where it differs from the bench's on purpose", "mL", within=(5, 50)
+    )
     volume_sd_ml: float = setting(0.0, "spread of the tube's height between vials", "mL", within=(0, 1.5))
     overflow_above_ml: float = setting(
         2.0, "the overflow pump's tube ends so far above the waste tube", "mL", within=(0, 10)
@@ -35,8 +37,21 @@ class VesselConfig:
 
     def __post_init__(self) -> None:
         check(self, "plant.vessel")
-        lowest = self.volume_ml + 4.5
+        if self.volume_ml is not None:
+            self._holds(self.volume_ml)
+
+    def _holds(self, volume_ml: float) -> None:
+        lowest = volume_ml + 4.5
         require(self.capacity_ml >= lowest, "plant.vessel.capacity_ml", f"{self.capacity_ml} mL", f"{lowest:g} to 200")
+
+    def of(self, bench_ml: Array) -> Array:
+        """Mean culture of each vial, mL, (N,); `bench_ml` unless the config differs.
+
+        Raises: ValueError for more than the vial holds.
+        """
+        mean = bench_ml if self.volume_ml is None else np.full(len(bench_ml), self.volume_ml)
+        self._holds(float(mean.max()))
+        return mean
 
 
 class Vessel:
@@ -47,14 +62,15 @@ class Vessel:
 
     Args:
       config: heights and evaporation; pump: flows of the waste pump and of the overflow pump.
-      rngs: one stream per vial, for the height of its tube.
+      rngs: one stream per vial, for the height of its tube. bench_ml: what the bench says of the volume, mL, (N,).
     State, shape (N,): `volume_ml`, `overflowed`. Fault switches, shape (N,): `waste_gain_factor` and
     `overflow_gain_factor`, 0 blocked, 1 sound.
     """
 
-    def __init__(self, config: VesselConfig, pump: PumpConfig, rngs: Streams) -> None:
+    def __init__(self, config: VesselConfig, pump: PumpConfig, rngs: Streams, bench_ml: Array) -> None:
         self.config, self._pump = config, pump
-        self._tube_ml = spread(rngs, config.volume_ml, config.volume_sd_ml / config.volume_ml)
+        mean = config.of(bench_ml)
+        self._tube_ml = spread(rngs, mean, config.volume_sd_ml / mean)
         self.draws: dict[str, Array] = {"volume_ml": self._tube_ml}
         self.waste_gain_factor, self.overflow_gain_factor = np.ones(len(rngs)), np.ones(len(rngs))
         self.reset()

@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import Entry, entries
+from envs.bench import Bench
 from envs.identification.twin import Course, Twin
 from envs.plant.culture import GrowthConfig
 from envs.plant.plant import PlantConfig
 from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
+from envs.plant.vessel import VesselConfig
 
 __all__ = ["plant_of", "twin_yaml"]
 
@@ -27,7 +29,7 @@ LEFT = (
 
 def plant_of(found: Twin) -> PlantConfig:
     """The twin as a plant. Raises: ValueError naming the value that no plant may have."""
-    volume = PlantConfig().vessel.volume_ml
+    volume = Bench.volume_ml  # flow and volume are one number to a recording: both stand in the file
     flow, knots = volume / (60.0 * found.tau.value), _numbers(found.knot_min)
     growth = GrowthConfig(mu=_mean(found.mu.value), knots_min=knots, knots_mu=_numbers(found.mu.value))
     pump = PumpConfig(dosing="pulse", gain_ml_s=_mean(flow), pulse_cv=_rounded(found.noise.dose_cv))
@@ -40,7 +42,7 @@ def plant_of(found: Twin) -> PlantConfig:
         lag1=_rounded(noise.lag1),
         outlier_rate=_rounded(noise.outlier_rate),
     )
-    return PlantConfig(growth, pump, sensor, start_od=_rounded(found.start_od), integrator="rk4")
+    return PlantConfig(growth, pump, sensor, VesselConfig(volume), start_od=_rounded(found.start_od), integrator="rk4")
 
 
 def twin_yaml(found: Twin, source: str) -> str:
@@ -64,7 +66,7 @@ def twin_yaml(found: Twin, source: str) -> str:
     for own, usual in zip(entries(plant), entries(nominal), strict=True):
         if own.value == usual.value:
             continue
-        if own.name in ("growth", "pump", "sensor"):
+        if own.name in ("growth", "pump", "sensor", "vessel"):
             lines.append(f"{own.name}:")
             changed = zip(entries(own.value), entries(usual.value), strict=True)
             lines += [f"  {_line(e)}" for e, was in changed if e.value != was.value]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from conf.schema import check, part, require, setting
+from envs.bench import Bench
 from envs.task import EnvConfig
 
 __all__ = ["CertifyConfig", "Limits"]
@@ -47,7 +48,10 @@ class CertifyConfig:
     """`python -m experiments.certify`. Raises: ValueError naming key, value and allowed range."""
 
     policy: str = setting("latest", "a policy.npz, a run folder, or `latest`: what train or demo wrote last")
-    env: EnvConfig | None = setting(None, "the nominal model: its mu and tau; null: the one the policy was trained on")
+    bench: Bench = part(Bench, "where it is to run: full pump is max_rate period / tau with tau = volume / 60")
+    env: EnvConfig | None = setting(
+        None, "the nominal model: its mu and tau; null: the one the policy was trained on, or that of the bench"
+    )
     env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: what calibrate wrote last; replaces env")
     uncertainty: float = setting(
         0.3, "mu and tau are anywhere within +- this share of the nominal ones, in every period anew", within=(0, 0.9)

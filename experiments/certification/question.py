@@ -57,13 +57,15 @@ def actions(policy: Policy) -> Array:
 def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
     """The nominal model: the one that is asked for, else the one the policy was trained on.
 
-    A policy of (error, growth share) serves any; the nominal one turns OD into e where bounds depend on the OD.
+    A policy of (error, growth share) serves any; that of the bench turns OD into e where bounds depend on the OD.
     Raises: CertificationError where the policy does not say it, or has another control period.
     """
     said = policy.metadata.get("model", {})
     model = config.env
     if policy.observation == RELATIVE:
-        return model or EnvConfig()
+        bench = config.bench
+        own = EnvConfig(tau=bench.tau, control_min=bench.control_min, max_pump_rate=bench.max_rate)
+        return model or own
     if model is None:
         if not {"mu", "tau"} <= set(said):
             raise CertificationError("it does not say which model it was trained on; give env.mu=MU env.tau=TAU")

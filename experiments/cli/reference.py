@@ -31,7 +31,7 @@ them. After a change:
 A value is set by `key=value` and a preset is chosen by `group=preset`, in any order, after
 `python -m experiments.NAME`. `--help` prints a command's keys with the values that the rest of its line gives.
 `--cfg job` prints the resolved config, which every run keeps as `config.yaml` in its folder. A key that belongs to a
-part is written with the part's name before it: `safety.max_rate=0.01`.
+part is written with the part's name before it: `bench.max_rate=0.01`.
 """
 
 

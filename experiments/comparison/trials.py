@@ -19,6 +19,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from dqn.policy import Policy
+from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
@@ -29,7 +30,7 @@ from experiments.controllers import registry
 from experiments.controllers.base import Controller
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.metrics import WindowMetrics, window_metrics
-from hardware.safety.config import Response, SafetyConfig
+from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 
@@ -134,10 +135,12 @@ def run_trial(
     """
     if plant_config.sensor.noise_floor == 0.0:  # the interlock takes a sensor that repeats itself exactly for dead
         plant_config = replace(plant_config, sensor=replace(plant_config.sensor, noise_floor=LEAST_NOISE))
-    plant = Plant(plant_config, replicates, np.random.default_rng(seed))
-    backend = SimulatedConfig(reactors=tuple(f"M{i}" for i in range(replicates)), control_min=model.control_min)
-    interlock = Interlock(replicates, SafetyConfig(max_rate=model.max_pump_rate))
-    loop = ClosedLoop(SimulatedReactors(plant, backend), make(plant), interlock, schedule)
+    bench = Bench(period_s=60.0 * model.control_min, max_rate=model.max_pump_rate)
+    plant = Plant(plant_config, replicates, np.random.default_rng(seed), bench.volume_ml)
+    reactors = SimulatedReactors(
+        plant, SimulatedConfig(reactors=tuple(f"M{i}" for i in range(replicates))), bench.control_min
+    )
+    loop = ClosedLoop(reactors, make(plant), Interlock(replicates, bench=bench), schedule)
     minute = np.arange(0.0, schedule.total_min + 1e-6, model.control_min)
     fields = ("od", "clean", "rate", "temperature", "media_ml")
     stored: dict[str, Any] = {key: np.full((replicates, minute.size), np.nan) for key in fields}

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
+from envs.bench import Bench
 from envs.coculture.rates import EQUAL_RATES_C, LAG_E_MIN, LAG_P_MIN, e_coli_rate, p_putida_rate
 from envs.plant.fluorescence import DELAY_MIN, FOLLOW_PER_H, LEAST, steady_production
 from experiments.composition.base import Array, Estimate, Mask
@@ -45,7 +46,6 @@ class CompositionEstimatorConfig:
     pigment_first_sd: float = setting(0.5, "sd of the first guess of ln (pigment over its balance)", within=(0.01, 5))
     gain_sd: float = setting(0.05, "sd of the pump's true flow over the calibrated one", within=(0, 1))
     dose_cv: float = setting(0.1, "spread of a dose", within=(0, 1))
-    volume_ml: float = setting(20.0, "of the culture", "mL", within=(5, 100))
     od_sd: float = setting(0.005, "of an OD reading", "OD", within=(1e-4, 0.1))
     fluorescence_sd: float = setting(30.0, "of a fluorescence reading", "counts", within=(0.1, 10_000))
     od_term: float = setting(150.0, "light that cells of any kind scatter into the band", "counts/OD", within=(0, 5000))
@@ -81,11 +81,11 @@ class CompositionEstimator:
     A reading further off than `gate_sigma` is left out, and with an OD the light beside it. Where it stays, the density
     with the pigment, or the pigment alone, is set anew, and the share learns nothing from it. Doses must be told.
 
-    State: mean (N, 8), cov (N, 8, 8). Args: config: first guesses and noise.
+    State: mean (N, 8), cov (N, 8, 8). Args: config: first guesses and noise. volume_ml: V, (N,) or one for all.
     """
 
-    def __init__(self, config: CompositionEstimatorConfig) -> None:
-        self.config = config
+    def __init__(self, config: CompositionEstimatorConfig, volume_ml: Array | float = Bench.volume_ml) -> None:
+        self.config, self._volume_ml = config, volume_ml
         self.reset(1)
 
     def reset(self, n: int) -> None:
@@ -156,7 +156,7 @@ class CompositionEstimator:
         before = self._temperature[idx]
         after = np.where(np.isfinite(temperature), temperature, before)
         steps = np.maximum(np.ceil(minutes / LONGEST_STEP_MIN - 1e-6), 1.0)
-        dose = self._given_ml[idx] / self.config.volume_ml
+        dose = self._given_ml[idx] / np.broadcast_to(self._volume_ml, self._given_ml.shape)[idx]
         for k in range(int(steps.max())):
             on = k < steps
             length, slope = (minutes / steps)[on], ((after - before) / steps)[on]

@@ -4,7 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 from dqn.policy import Policy
-from experiments.composition.base import Law
+from envs.bench import Bench
+from experiments.composition.base import Array, Law
 from experiments.composition.controller import CompositionController
 from experiments.composition.estimator import CompositionEstimator
 from experiments.composition.laws import (
@@ -55,12 +56,18 @@ def config(kind: str) -> Any:
     return KINDS[kind][0]()
 
 
-def build(config: Any, policy: Policy | None = None, program: Program | None = None) -> CompositionController:
+def build(
+    config: Any,
+    policy: Policy | None = None,
+    program: Program | None = None,
+    volume_ml: Array | float = Bench.volume_ml,
+) -> CompositionController:
     """The controller that a config describes.
 
     Args:
       config: as `config` gives it; `kind` names the law.
       policy: what `dqn` and `dqn_preview` follow. program: what `optimum` plans.
+      volume_ml: of the cultures, as the bench says, (N,) or one for all.
     Raises: ValueError naming what is missing for this kind of law.
     """
     if config.kind not in KINDS:
@@ -70,4 +77,5 @@ def build(config: Any, policy: Policy | None = None, program: Program | None = N
     for part in parts:
         if given[part] is None:
             raise ValueError(f"composition = {config.kind}: {MISSING[part]}")
-    return CompositionController(CompositionEstimator(config.estimator), make(**{part: given[part] for part in parts}))
+    law = make(**{part: given[part] for part in parts})
+    return CompositionController(CompositionEstimator(config.estimator, volume_ml), law)

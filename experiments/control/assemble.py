@@ -37,7 +37,7 @@ from experiments.training.config import read_env_file
 from hardware.emulator.device import plant_preset
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.reactor import Array, Reactor
-from hardware.safety.interlock import Interlock
+from hardware.safety.interlock import VIAL_ML, Interlock
 from hardware.simulated import SimulatedReactors
 
 __all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack"]
@@ -109,24 +109,28 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         raise frame.UserError(str(error)) from None
     if resumed and backend.kind == "sim":
         raise frame.UserError(f"resume={config.resume}: a simulated run takes a second; run it again")
-    plant, model = config.plant, EnvConfig()
+    bench, plant = config.bench, config.plant
+    model = EnvConfig(tau=bench.tau)
     if config.plant_file is not None:
         plant = read_plant_file(config.plant_file)
     if config.env_file is not None:
         model = read_env_file(config.env_file)
-        gain = plant.vessel.volume_ml / (60.0 * model.tau)  # tau = V / (60 g)
+        gain = (plant.vessel.volume_ml or bench.volume_ml) / (60.0 * model.tau)  # tau = V / (60 g)
         growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
         plant = replace(plant, growth=growth, pump=pump)
+    if backend.kind == "sim" and (plant.vessel.volume_ml or bench.volume_ml) != bench.volume_ml:
+        of_bench = f"bench.volume_ml = {bench.volume_ml:g} mL, which everything else goes by"
+        log.warning("plant.vessel.volume_ml = %g mL differs from %s: on purpose?", plant.vessel.volume_ml, of_bench)
     check_fit(config, scenarios)
     keeper = _keeper(config, plant, folder, scenarios)
     if keeper is not None and hasattr(backend, "fluorescence"):  # the device has to measure what the estimate needs
         backend = replace(backend, fluorescence=replace(backend.fluorescence, measure=True))
         config = replace(config, backend=backend)
-    fastest = min(model.max_pump_rate, config.safety.max_rate)
-    model = replace(model, control_min=backend.control_min, max_pump_rate=fastest)
+    fastest = min(model.max_pump_rate, bench.max_rate)
+    model = replace(model, control_min=bench.control_min, max_pump_rate=fastest)
     policy = bounds = None
     if config.controller.kind == "dqn" and not config.preflight_only:
-        policy = run_policy(config.policy, folder, resumed, backend.control_min, config.safety.max_rate)
+        policy = run_policy(config.policy, folder, resumed, bench.control_min, bench.max_rate)
         admit(policy, folder / "policy.npz", config, scenarios)
         bounds = certificate.bounds(policy, folder / "policy.npz")
     return Setup(config, scenarios, plant, model, policy, bounds, resumed, keeper)
@@ -152,7 +156,9 @@ def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: l
         raise frame.UserError("composition=optimum plans one program: give all reactors the same shares and minutes")
     policy = composition_policy(kind, config.composition_policy, folder, config.resume is not None)
     try:
-        keeper: Keeper = compositions.build(config.composition, policy, program_of(one))
+        keeper: Keeper = compositions.build(
+            config.composition, policy, program_of(one), config.bench.volumes(config.backend.reactors)
+        )
     except ValueError as error:
         raise frame.UserError(str(error)) from None
     return keeper
@@ -164,14 +170,20 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     Raises: UserError naming what the controller needs and does not have here; RecordingError for a state that is
       damaged or does not fit.
     """
-    plant, flow = None, 1.0
+    plant, flow, bench = None, 1.0, setup.config.bench
+    volumes_ml = bench.volumes(reactors.names)
     if isinstance(reactors, SimulatedReactors):
         plant, flow = reactors.plant, reactors.config.pump_ml_s
     try:
-        controller = registry.build(setup.config.controller, setup.model, setup.policy, plant, flow, setup.bounds)
+        controller = registry.build(
+            setup.config.controller, setup.model, setup.policy, plant, flow, setup.bounds, volumes_ml
+        )
     except ValueError as error:
         raise frame.UserError(str(error)) from None
-    interlock, composition = Interlock(len(reactors.names), setup.config.safety, *_levels(setup.config)), None
+    interlock, composition = (
+        Interlock(len(volumes_ml), setup.config.safety, bench, volumes_ml, _rim(setup.config)),
+        None,
+    )
     if setup.keeper is not None:
         truth = None if plant is None else partial(getattr, plant.culture, "share")
         composition = Composition(setup.keeper, setup.scenarios, setup.config.share_warnings, truth)
@@ -182,18 +194,17 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     return loop
 
 
-def _levels(config: DeployConfig) -> tuple[Array, Array] | tuple[()]:
-    """Level of each waste tube, and more than which is an overflow, mL, where each reactor has its own."""
-    if not isinstance(config.backend, PioreactorConfig):
-        return ()
-    tube_ml, room_ml = np.array(config.backend.volumes_ml), config.safety.max_volume_ml - config.safety.volume_ml
-    return tube_ml, np.minimum(tube_ml + room_ml, np.array(config.backend.full_ml))
+def _rim(config: DeployConfig) -> Array | float:
+    """What each vial holds, mL."""
+    return np.array(config.backend.full_ml) if isinstance(config.backend, PioreactorConfig) else VIAL_ML
 
 
 @contextmanager
 def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
     """The loop around the configured reactors, which are released afterwards. Raises: ReactorError, UserError."""
-    opening = Opening(setup.config.backend, setup.plant, record.journal, record.folder, setup.resumed)
+    opening = Opening(
+        setup.config.backend, setup.config.bench, setup.plant, record.journal, record.folder, setup.resumed
+    )
     with families.opened(opening) as reactors:
         try:
             yield close_loop(setup, reactors, record)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from conf.schema import check, part, require, setting
+from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.composition import registry as compositions
@@ -36,6 +37,7 @@ class DeployConfig:
 
     backend: Any = part(SimulatedConfig, "what is controlled")
     plant: PlantConfig = part(PlantConfig, "what the vials of a simulated backend are")
+    bench: Bench = part(Bench, "volume, control period and pump: what everybody has to know alike")
     safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
     scenario: Scenario = part(Scenario, "what the culture is asked to do")
     at_end: str = setting(
@@ -86,6 +88,10 @@ class DeployConfig:
 
     def __post_init__(self) -> None:
         check(self)
+        self.safety.ages_s(self.bench)
+        self.plant.vessel.of(self.bench.volumes(self.backend.reactors))
+        unknown = [name for name in self.bench.volumes_ml if name not in self.backend.reactors]
+        require(not unknown, "bench.volumes_ml", tuple(unknown), f"names of {', '.join(self.backend.reactors)}")
         if "://" in self.notify.split(" ")[0]:
             raise ValueError("notify: an address is a secret and not kept in files; allowed env:NAME, a variable of it")
         if self.plant_file is not None:

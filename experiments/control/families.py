@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from conf import presets
+from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
 from experiments.control.config import BACKENDS
 from experiments.control.device import check, linked, load_calibrations, report
@@ -40,12 +41,13 @@ log = logging.getLogger(__name__)
 class Opening:
     """What a family is given to open its reactors.
 
-    backend: its config. plant: of simulated vials. journal: of the run, into which a driver writes every command before
-    it is carried out; `journal.rows` is what an earlier life of the run wrote. folder: of the run. resumed: there was
-    such a life.
+    backend: its config. bench: volume, period and pump. plant: of simulated vials. journal: of the run, into which a
+    driver writes every command before it is carried out; `journal.rows` is what an earlier life of the run wrote.
+    folder: of the run. resumed: there was such a life.
     """
 
     backend: Any
+    bench: Bench
     plant: PlantConfig
     journal: Journal
     folder: Path
@@ -59,8 +61,9 @@ Opener = Callable[[Opening], AbstractContextManager[Reactor]]
 def _simulated(opening: Opening) -> Iterator[Reactor]:
     """Vials in this process."""
     backend = opening.backend
-    vials = Plant(opening.plant, len(backend.reactors), np.random.default_rng(backend.seed))
-    yield SimulatedReactors(vials, backend)
+    volumes_ml = opening.bench.volumes(backend.reactors)
+    vials = Plant(opening.plant, len(backend.reactors), np.random.default_rng(backend.seed), volumes_ml)
+    yield SimulatedReactors(vials, backend, opening.bench.control_min)
 
 
 @contextmanager

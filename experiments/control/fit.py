@@ -10,7 +10,6 @@ from experiments.controllers import registry
 from experiments.loop.supply import MADE_UP_MIN
 from hardware.chibio.config import ChiBioConfig
 from hardware.pioreactor.config import PioreactorConfig
-from hardware.safety.config import SafetyConfig
 
 __all__ = ["check_fit"]
 
@@ -19,6 +18,9 @@ def check_fit(config: DeployConfig, scenarios: list[Scenario]) -> None:
     """Raises: UserError naming the backend, what it lacks or what differs, and the remedy."""
     if isinstance(config.backend, ChiBioConfig | PioreactorConfig):
         _check_controller(config)
+    if isinstance(config.backend, ChiBioConfig) and config.bench.period_s != 60.0:
+        given = f"bench.period_s = {config.bench.period_s:g} s"
+        raise frame.UserError(f"{given}: allowed 60 with backend={config.backend.kind}, which measures so often")
     if isinstance(config.backend, PioreactorConfig):
         _check_units(config, config.backend, scenarios)
     _check_supply(config, scenarios)
@@ -35,7 +37,7 @@ def _check_controller(config: DeployConfig) -> None:
 
 def _check_units(config: DeployConfig, backend: PioreactorConfig, scenarios: list[Scenario]) -> None:
     """What a Pioreactor does not measure or control, and whether its doses are what the interlock counts with."""
-    where, safety = f"backend={backend.kind}", config.safety
+    where, bench = f"backend={backend.kind}", config.bench
     if any(s.composed for s in scenarios):
         raise frame.UserError(
             f"scenario.ratios: {where} measures no fluorescence, by which a share is known; drop them or use a Chi.Bio"
@@ -46,18 +48,12 @@ def _check_units(config: DeployConfig, backend: PioreactorConfig, scenarios: lis
             f"scenario.temperatures ask for {asked[0]:g} to {asked[-1]:g} degC: {where} controls none without "
             "backend.thermostat=true"
         )
-    if abs(backend.period_s - safety.period_s) > 1e-6:
-        given = f"backend.period_s = {backend.period_s:g} s, safety.period_s = {safety.period_s:g} s"
-        raise frame.UserError(f"{where}: {given}: allowed the same; give safety.period_s={backend.period_s:g}")
-    if safety.volume_ml not in (SafetyConfig().volume_ml, *backend.volumes_ml):
-        remedy = "the interlock takes backend.volume_ml or backend.units.NAME.volume_ml; drop it"
-        raise frame.UserError(f"{where}: safety.volume_ml = {safety.volume_ml:g} mL: {remedy}")
-    if safety.max_rate * backend.period_s > backend.max_dose_ml + 1e-9:
-        least = math.floor(1e5 * backend.max_dose_ml / backend.period_s) / 1e5
+    if bench.max_rate * bench.period_s > backend.max_dose_ml + 1e-9:
+        least = math.floor(1e5 * backend.max_dose_ml / bench.period_s) / 1e5
         raise frame.UserError(
             f"{where}: backend.max_dose_ml = {backend.max_dose_ml:g} mL, the interlock allows "
-            f"{safety.max_rate * backend.period_s:.3g} mL in a period of {backend.period_s:g} s; "
-            f"give safety.max_rate={least:g} or a larger backend.max_dose_ml"
+            f"{bench.max_rate * bench.period_s:.3g} mL in a period of {bench.period_s:g} s; "
+            f"give bench.max_rate={least:g} or a larger backend.max_dose_ml"
         )
 
 
@@ -65,15 +61,14 @@ def _check_supply(config: DeployConfig, scenarios: list[Scenario]) -> None:
     """Whether pumps that a scenario gives by have a tube, and doses may be large enough. Raises: UserError."""
     if not any(s.supplied for s in scenarios):
         return
-    backend, safety = config.backend, config.safety
-    most_ml, needed, period_s = safety.max_rate * safety.period_s, 2.0 * DOSE_ML, 60.0 * backend.control_min
+    backend, bench = config.backend, config.bench
+    most_ml, needed = bench.max_rate * bench.period_s, 2.0 * DOSE_ML
     if most_ml < needed:
-        remedy = f"allowed {needed / safety.period_s:.4f} mL/s or more beside scenario.outputs"
-        raise frame.UserError(f"safety.max_rate = {safety.max_rate:g} mL/s: {remedy}")
-    if abs(period_s - safety.period_s) > 1e-6 or backend.control_min > MADE_UP_MIN:
-        remedy = f"allowed the same, and at most {MADE_UP_MIN:g} min, beside scenario.outputs"
-        given = f"safety.period_s = {safety.period_s:g} s, backend.control_min = {backend.control_min:g} min"
-        raise frame.UserError(f"{given}: {remedy}")
+        remedy = f"allowed {needed / bench.period_s:.4f} mL/s or more beside scenario.outputs"
+        raise frame.UserError(f"bench.max_rate = {bench.max_rate:g} mL/s: {remedy}")
+    if bench.control_min > MADE_UP_MIN:
+        remedy = f"allowed at most {60.0 * MADE_UP_MIN:g} s beside scenario.outputs"
+        raise frame.UserError(f"bench.period_s = {bench.period_s:g} s: {remedy}")
     if backend.kind == "sim":
         return
     if not hasattr(backend, "supply"):
@@ -86,5 +81,5 @@ def _check_supply(config: DeployConfig, scenarios: list[Scenario]) -> None:
                 raise frame.UserError(f"scenario.outputs of {name}: Pump{number} has no tube; {remedy}")
             can = backend.supply.most_ml(f"Pump{number}")
             if can < most_ml - 1e-9:
-                remedy = f"allowed {most_ml:.2f} mL a dose; take a wider tube or a smaller safety.max_rate"
+                remedy = f"allowed {most_ml:.2f} mL a dose; take a wider tube or a smaller bench.max_rate"
                 raise frame.UserError(f"{key}: Pump{number} gives at most {can:.2f} mL a dose: {remedy}")

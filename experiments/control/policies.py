@@ -137,7 +137,7 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     if not fastest <= max_rate + 1e-12:
         raise frame.UserError(
             f"policy {path} pumps up to {fastest} mL/s, the interlock allows {max_rate} mL/s; "
-            "train with a smaller env.max_pump_rate or raise safety.max_rate"
+            "train with a smaller env.max_pump_rate or raise bench.max_rate"
         )
     log.info("policy %s: %s", path, training)
     return policy
@@ -171,7 +171,7 @@ def _refuses(config: DeployConfig) -> bool:
 def policy_check(config: DeployConfig, scenarios: Sequence[Scenario]) -> Check:
     """The policy's line of a preflight; that none has been trained yet does not stop a look at the device."""
     try:
-        policy = load_policy(config.policy, config.backend.control_min, config.safety.max_rate)
+        policy = load_policy(config.policy, config.bench.control_min, config.bench.max_rate)
     except NoPolicyError as error:
         return Check("policy", False, str(error), "python -m experiments.train", required=False)
     except frame.UserError as error:

@@ -124,8 +124,8 @@ def _start_od(setup: Setup, scenario: Scenario) -> float:
 
 def _reactor(setup: Setup, name: str, scenario: Scenario, now: datetime) -> Iterator[str]:
     """The steps of one reactor, each in a line, and whether its medium lasts."""
-    safety, growth = setup.config.safety, setup.model.mu
-    dilution = setup.model.max_pump_rate / setup.model.tau
+    growth, volume_ml = setup.model.mu, setup.config.bench.volume_of(name)
+    dilution = setup.model.max_pump_rate / setup.model.tau * (setup.config.bench.volume_ml / volume_ml)
     od, at, ml, most = max(_start_od(setup, scenario), 1e-3), 0.0, 0.0, 0.0
     yield f"{name} ({setup.config.role(name)}), from OD {od:g}, growth {growth:g} 1/min"
     yield HEAD
@@ -135,7 +135,7 @@ def _reactor(setup: Setup, name: str, scenario: Scenario, now: datetime) -> Iter
     for k, (setpoint, most_min, degc) in enumerate(
         zip(scenario.setpoints, scenario.minutes, scenario.temperatures, strict=True)
     ):
-        step = expected(scenario, k, od, growth, dilution, safety.volume_ml)
+        step = expected(scenario, k, od, growth, dilution, volume_ml)
         until = (scenario.until[k] if scenario.until else None) or "its time"
         share = scenario.ratios[k] if scenario.ratios else None
         said = f"{until}{'' if share is None else f'; share {share:g}, which decides the temperature'}"
@@ -168,13 +168,12 @@ def _spare(scenario: Scenario, k: int, minutes: float) -> float:
 
 def _lasts(setup: Setup, ml: float, most: float) -> str:
     """Whether bottle and budget last."""
-    safety = setup.config.safety
-    key = "bottle_ml" if safety.bottle_ml <= safety.ml_per_run else "ml_per_run"
-    limit = getattr(safety, key)
+    bench, safety = setup.config.bench, setup.config.safety
+    limit, key = min((bench.bottle_ml, "bench.bottle_ml"), (safety.ml_per_run, "safety.ml_per_run"))
     if most <= limit:
-        return f"safety.{key}={limit:g} lasts"
+        return f"{key}={limit:g} lasts"
     word = "does NOT last" if ml > limit else "may not last"
-    return f"safety.{key}={limit:g} {word}: the interlock stops feeding there; give the run more"
+    return f"{key}={limit:g} {word}: the interlock stops feeding there; give the run more"
 
 
 def _clock(now: datetime, minutes: float) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from conf.schema import check, setting
+from envs.bench import Bench
 from envs.task import MAX_PUMP_RATE, EnvConfig
 from experiments.controllers.base import Array, Mask, put_back, saved, usable
 
@@ -20,7 +21,6 @@ class ChiBioPIConfig:
     """What the device's law is told; its gains are constants of the device's code."""
 
     kind: str = setting("pi", "which controller")
-    volume_ml: float = setting(20.0, "what the device is told the vial holds; scales the gain", "mL", within=(5, 50))
     max_pump_rate: float = setting(MAX_PUMP_RATE, "the device's clamp", "mL/s", above=0.0, at_most=0.05)
 
     def __post_init__(self) -> None:
@@ -38,12 +38,14 @@ class ChiBioPI:
            (for a gasket that makes the pump deliver too little)
       I2 = 0 if |e| > 0.1 and |x - x'| < 0.05; else I2 + 0.01 e if |x - x'| < 0.1; else I2
       u  = clip(P + I1 + I2, 0, 0.02); 0 if x - x' > 0.04 (noise guard); 0 in the first two cycles
+
+    Args: volume_ml: V, what the device is told of the culture, mL, (N,) or one for all.
     """
 
     _memory = ("_cycles", "_before", "_times", "_p", "_i1", "_i2", "_rate")
 
-    def __init__(self, config: ChiBioPIConfig) -> None:
-        self.config = config
+    def __init__(self, config: ChiBioPIConfig, volume_ml: Array | float = Bench.volume_ml) -> None:
+        self.config, self._volume_ml = config, volume_ml
         self.reset(1)
 
     def reset(self, n: int) -> None:
@@ -70,7 +72,7 @@ class ChiBioPI:
         error, change = x - r, np.abs(x - self._before)
         interval = self._times[1] - self._times[0]
         interval = np.where(interval > 0.0, interval, 1.0)  # before two records exist; u is 0 then
-        gain = self.config.volume_ml / (60.0 * ASSUMED_FLOW_ML_S) / interval
+        gain = self._volume_ml / (60.0 * ASSUMED_FLOW_ML_S) / interval
         p = np.where(x > 0.0, np.log(np.maximum(x, LOWEST_OD) / r) * gain, 0.0)
         i1 = self._i1 + np.where((change < 0.05) & (error > 0.025), 0.1 * error, 0.0)
         i1 = np.where(error < 0.01, 0.0, i1)

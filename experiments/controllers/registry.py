@@ -6,10 +6,11 @@ from typing import Any
 from conf import presets
 from conf.schema import old_name
 from dqn.policy import Policy
+from envs.bench import Bench
 from envs.plant.plant import Plant
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
-from experiments.controllers.base import Controller
+from experiments.controllers.base import Array, Controller
 from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
 from experiments.controllers.inverse import Inverse, InverseConfig
 from experiments.controllers.learned import LearnedConfig, learned
@@ -21,7 +22,7 @@ __all__ = ["add", "build", "config", "on_device"]
 
 KINDS: dict[str, tuple[type[Any], Callable[..., Controller], tuple[str, ...]]] = {
     "dqn": (LearnedConfig, learned, ("config", "policy", "model", "bounds")),
-    "pi": (ChiBioPIConfig, ChiBioPI, ("config",)),
+    "pi": (ChiBioPIConfig, ChiBioPI, ("config", "volume_ml")),
     "pi_tuned": (TunedPIConfig, TunedPI, ("config", "model")),
     "mpc": (MpcConfig, Mpc, ("config", "model")),
     "inverse": (InverseConfig, Inverse, ("config", "model")),
@@ -29,7 +30,7 @@ KINDS: dict[str, tuple[type[Any], Callable[..., Controller], tuple[str, ...]]] =
     "hold": (HoldConfig, Hold, ("config", "model")),
     "oracle": (OracleConfig, Oracle, ("config", "plant", "model", "flow_ml_s")),
 }
-PARTS = ("model", "policy", "plant", "bounds", "flow_ml_s")
+PARTS = ("model", "policy", "plant", "bounds", "flow_ml_s", "volume_ml")
 MISSING = {
     "policy": "needs a policy; give policy=RUN/policy.npz",
     "plant": "knows a simulated plant; allowed with backend=sim only",
@@ -47,10 +48,8 @@ def add(kind: str, config: type[Any], make: Callable[..., Controller], what: str
       parts: what else it is built from, arguments of `build`.
     Raises: ValueError for a kind that exists, or a part that nobody has.
     """
-    if wrong := set(parts) - {"model", "policy", "plant", "bounds", "flow_ml_s"}:
-        raise ValueError(
-            f"controller {kind}: no part {sorted(wrong)[0]}; allowed model, policy, plant, bounds, flow_ml_s"
-        )
+    if wrong := set(parts) - set(PARTS):
+        raise ValueError(f"controller {kind}: no part {sorted(wrong)[0]}; allowed {', '.join(PARTS)}")
     presets.add(f"controller/{kind}", {"kind": kind}, what)
     KINDS[kind] = (config, make, ("config", *parts))
 
@@ -77,6 +76,7 @@ def build(
     plant: Plant | None = None,
     flow_ml_s: float = 1.0,
     bounds: EstimateBounds | None = None,
+    volume_ml: Array | float = Bench.volume_ml,
 ) -> Controller:
     """The controller that a config describes.
 
@@ -86,13 +86,14 @@ def build(
       policy: what `dqn` follows. plant: the vials that `oracle` knows; only a simulation has it.
       bounds: within which the certificate of `policy` lets it act; None where it has none, and nobody supervises.
       flow_ml_s: what the backend believes its pumps deliver (the oracle must know what a rate becomes).
+      volume_ml: of the cultures, as the bench says, (N,) or one for all.
     Raises: ValueError naming what is missing for this kind of controller.
     """
     if config.kind not in KINDS:
         raise ValueError(f"controller.kind = {config.kind}: no such controller")
     _, make, parts = KINDS[config.kind]
     given = {"config": config, "model": model, "policy": policy, "plant": plant, "flow_ml_s": flow_ml_s}
-    given["bounds"] = bounds
+    given |= {"bounds": bounds, "volume_ml": volume_ml}
     for part in parts:
         if given[part] is None and part in MISSING:
             raise ValueError(f"controller = {config.kind}: {MISSING[part]}")

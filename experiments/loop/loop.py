@@ -102,7 +102,7 @@ class ClosedLoop:
         self._recovery_od = np.array([s.recovery_od for s in self.schedules])
         self._recovery_limit = np.array([s.recovery_limit_min for s in self.schedules])
         self.progress = Progress(self.schedules)
-        self.supply = Supply(self.schedules, interlock.config.max_rate * interlock.config.period_s)
+        self.supply = Supply(self.schedules, interlock.bench.max_rate * interlock.bench.period_s)
         self.began = np.full(n, np.nan)  # minute at which each reactor's schedule began
         self.done = np.zeros(n, dtype=np.bool_)
         self.stopped = np.zeros(n, dtype=np.bool_)  # given up by the interlock, pumps verified off
@@ -145,7 +145,7 @@ class ClosedLoop:
         decided = self.controller.act(np.where(rows & ~believed, np.nan, m.od), setpoint, minute, steered)
         proposed = np.where(steered & ~(self.done & (self._at_end != "hold")), decided, 0.0)
         pump, extra_ml = self.supply.due(elapsed, phase, steered & ~self.done)
-        proposed = np.where(pump == 1, proposed, extra_ml / self.interlock.config.period_s)
+        proposed = np.where(pump == 1, proposed, extra_ml / self.interlock.bench.period_s)
         verdict = self.interlock.check(m, proposed, setpoint, temperature, now)
         sound = rows & (verdict.response == Response.PASS)  # the device will dose by the same sensor
         left = self.done & (self._at_end == "regulate") & sound

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
+from conf.schema import build
 from dqn import policy as policies
+from envs.bench import Bench
 from envs.identification.agreement import Agreement, Compared, agreement
 from envs.identification.model import Parameter
 from envs.identification.screening import Series
@@ -44,7 +46,8 @@ class Believed:
 
 def believed(run: Path) -> Believed:
     """The model of the policy, else of the `env_file`, else the nominal one, in a deployment's folder."""
-    config, nominal = _config(run), EnvConfig()
+    config = _config(run)
+    nominal = EnvConfig(tau=_bench(config).tau)
     controller = config.get("controller")
     learned = isinstance(controller, Mapping) and controller.get("kind") == "dqn"
     if learned and (run / "policy.npz").is_file():
@@ -60,6 +63,14 @@ def believed(run: Path) -> Believed:
         except frame.UserError:
             return Believed(nominal.mu, nominal.tau, f"nominal, since env_file {path} cannot be read any more")
     return Believed(nominal.mu, nominal.tau, "nominal")
+
+
+def _bench(config: Mapping[str, Any]) -> Bench:
+    """Of the run; the nominal one of a run of an earlier version, which did not say it in one place."""
+    try:
+        return build(Bench(), config.get("bench") or {}, "bench")
+    except ValueError:
+        return Bench()
 
 
 def _config(run: Path) -> Mapping[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from conf.schema import check, part, setting
+from envs.bench import Bench
 from envs.scenario import Scenario
 from experiments.controllers.base import Mask
 from experiments.controllers.registry import on_device
@@ -43,9 +44,7 @@ class SoakConfig:
     setpoints: tuple[float, ...] = setting((0.5, 0.4, 0.6), "in turn", "OD", some=True)
     phase_min: float = setting(240.0, "each", "min", within=(10, 1e5))
     controller_kind: str = setting("dqn", "a controller that can run a device; dqn is the policy that ships")
-    safety: SafetyConfig = part(
-        lambda: SafetyConfig(bottle_ml=1e6, ml_per_run=1e6), "limits of the interlock; somebody fills the bottles"
-    )
+    safety: SafetyConfig = part(lambda: SafetyConfig(ml_per_run=1e6), "limits of the interlock")
     seed: int = setting(0, "of all noise", at_least=0)
 
     def __post_init__(self) -> None:
@@ -142,7 +141,8 @@ class _Meter:
 def soak_run(config: SoakConfig, folder: Path, days: list[Day]) -> dict[str, Any]:
     """The run; appends to `days` as they pass; returns what the audit found. Raises: ReactorError."""
     names = POSITIONS[: config.reactors]
-    run = rehearsed(names, config.schedule(), config.safety, config.controller_kind)
+    filled = Bench(bottle_ml=1e6)  # by somebody
+    run = rehearsed(names, config.schedule(), config.safety, config.controller_kind, bench=filled)
     r = Rehearsal(folder, run, seed=config.seed)
     doses, served = {name: array("d") for name in names}, {name: Served() for name in names}
     r.begin()

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from envs.bench import Bench
 from envs.scenario import Scenario
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
@@ -77,11 +78,12 @@ def rehearsed(
     safety: SafetyConfig | None = None,
     controller: str = "dqn",
     overflow_pump: OverflowPumpConfig | None = None,
+    bench: Bench | None = None,
 ) -> DeployConfig:
     """The config of a run that is to be rehearsed: reactors at `names`, all with one scenario."""
     backend = ChiBioConfig(reactors=tuple(names), overflow_pump=overflow_pump or OverflowPumpConfig())
-    law = registry.config(controller)
-    return DeployConfig(backend, safety=safety or SafetyConfig(), scenario=scenario, controller=law, fsync=False)
+    law, limits = registry.config(controller), safety or SafetyConfig()
+    return DeployConfig(backend, bench=bench or Bench(), safety=limits, scenario=scenario, controller=law, fsync=False)
 
 
 class Rehearsal:
@@ -102,7 +104,10 @@ class Rehearsal:
         self.clock = ScriptedClock()
         rng = np.random.default_rng(seed)
         plumbed = _plumbed(options or DeviceOptions(), config.backend.overflow_pump, config.backend.supply)
-        self.device = ChiBioDevice(self.names, self.clock, rng, plumbed, od=od, temperature=37.0, blanked=True)
+        volumes_ml = config.bench.volumes(self.names).tolist()
+        self.device = ChiBioDevice(
+            self.names, self.clock, rng, plumbed, od=od, temperature=37.0, blanked=True, volumes_ml=volumes_ml
+        )
         self.spans: list[list[float]] = []
         self.lives = 0
         self._dead = False

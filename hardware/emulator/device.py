@@ -14,6 +14,7 @@ import numpy as np
 
 from conf.presets import load
 from conf.schema import build, check, part, setting
+from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
 from hardware.clock import Clock
 from hardware.emulator.computer import HARDWARE, AppError, BusStuck, Computer, Event, ProcessDied, Steps
@@ -54,6 +55,14 @@ class DeviceOptions:
             raise ValueError("emulator.plant.pump.dosing = continuous: allowed pulse, as the device's pumps work")
 
 
+def _each(what: str, given: float | Sequence[float], n: int) -> list[float]:
+    """One value per reactor. Raises: ValueError for another number of them."""
+    values = [float(given)] * n if isinstance(given, (int, float)) else [float(x) for x in given]
+    if len(values) != n:
+        raise ValueError(f"{what} has {len(values)} values: allowed 1 or {n}, one per reactor")
+    return values
+
+
 class ChiBioDevice:
     """A Chi.Bio control computer with reactors.
 
@@ -63,6 +72,7 @@ class ChiBioDevice:
       rng: noise of everything, one stream per reactor.
       options: see `DeviceOptions`.
       od: initial optical density, one for all or one per reactor; temperature: of the vials, degC.
+      volumes_ml: culture up to the waste tube, one for all or one per reactor.
       blanked: start with the zeros an operator has set with clear medium; False = 65000, as after power-on.
     Raises: ValueError for an unknown or repeated position or a wrong number of ODs.
     """
@@ -76,21 +86,20 @@ class ChiBioDevice:
         od: float | Sequence[float] = 0.3,
         temperature: float = 24.0,
         blanked: bool = False,
+        volumes_ml: float | Sequence[float] = Bench.volume_ml,
     ) -> None:
         if not reactors or len(set(reactors)) != len(reactors) or not set(reactors) <= set(ALL_REACTORS):
             raise ValueError(f"reactors = {','.join(reactors)}: allowed a list of different names from M0 to M7")
-        ods = [float(od)] * len(reactors) if isinstance(od, (int, float)) else [float(x) for x in od]
-        if len(ods) != len(reactors):
-            raise ValueError(f"od has {len(ods)} values: allowed 1 or {len(reactors)}, one per reactor")
+        ods, tubes_ml = _each("od", od, len(reactors)), _each("volume", volumes_ml, len(reactors))
         self.clock, self.options = clock, options or DeviceOptions()
         o = self.options
         noise, *streams = rng.spawn(1 + len(reactors))
         self.computer = Computer(clock.now(), noise, o.unit)
         self.faults, self._events = self.computer.faults, self.computer.events
         self.vials: dict[str, Vial] = {}
-        for name, stream, start_od in zip(reactors, streams, ods, strict=True):
+        for name, stream, start_od, tube_ml in zip(reactors, streams, ods, tubes_ml, strict=True):
             plant_stream, vial_stream = stream.spawn(2)
-            plant = Plant(o.plant, 1, [plant_stream])
+            plant = Plant(o.plant, 1, [plant_stream], tube_ml)
             plant.reset(start_od, temperature)
             self.vials[name] = Vial(plant, o.vial, vial_stream, clock.now())
         self.supervisor = Supervisor(self.computer, self.vials, o.boot_s, o.request_s, o.worker_timeout_s)

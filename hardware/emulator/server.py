@@ -252,6 +252,7 @@ def parser() -> argparse.ArgumentParser:
     add("--speed", type=float, default=1.0, help="device seconds per real second (default %(default)s)")
     add("--seed", type=int, default=0, help="of all noise (default %(default)s)")
     add("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
+    add("--volume", default="20", help="culture, mL, one for all or one per reactor (default %(default)s)")
     add("--temperature", type=float, help="initial, degC (default: the preset's, 37 as a rule)")
     plants = groups()["plant"]
     add("--plant", choices=plants, default="healthy", help="preset of cultures and pumps (default %(default)s)")
@@ -277,12 +278,18 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+def _numbers(what: str, given: str) -> float | list[float]:
+    """One number, or one per reactor. Raises: ValueError."""
+    try:
+        numbers = [float(x) for x in given.split(",")]
+    except ValueError:
+        raise ValueError(f"{what} = {given}: allowed a number, or one per reactor, e.g. 0.3,0.4") from None
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
 def build(arguments: argparse.Namespace) -> ChiBioDevice:
     """The device the arguments describe. Raises: ValueError."""
-    try:
-        ods = [float(x) for x in arguments.od.split(",")]
-    except ValueError:
-        raise ValueError(f"od = {arguments.od}: allowed a number, or one per reactor, e.g. 0.3,0.4") from None
+    ods, volumes_ml = _numbers("od", arguments.od), _numbers("volume", arguments.volume)
     low, high = arguments.pump_start
     vial = VialConfig(
         overflow_pump=arguments.overflow_pump, pump_start_low_s=low, pump_start_high_s=high,
@@ -295,7 +302,8 @@ def build(arguments: argparse.Namespace) -> ChiBioDevice:
         RealClock(arguments.speed),
         np.random.default_rng(arguments.seed),
         DeviceOptions(unit=arguments.unit, vial=vial, plant=plant),
-        od=ods[0] if len(ods) == 1 else ods,
+        od=ods,
+        volumes_ml=volumes_ml,
         temperature=plant.start_temperature if arguments.temperature is None else arguments.temperature,
         blanked=not arguments.unblanked,
     )

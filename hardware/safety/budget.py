@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from envs.bench import Bench
 from hardware.reactor import Array, Mask
 from hardware.safety.config import SafetyConfig
 from hardware.safety.readings import Finding
@@ -15,17 +16,14 @@ __all__ = ["FeedBudget"]
 class FeedBudget:
     """Feed of N reactors over the last minute, the last hour and the run, and the volume it leaves in the vial.
 
-    Args: tube_ml, full_ml: level that the waste tube keeps, and more than which is an overflow, mL, shape (N,); None:
-      as configured for all.
+    Args: bench: period and largest rate. tube_ml, full_ml: level that the waste tube keeps, and more than which is an
+      overflow, mL, shape (N,).
     Attributes: fed_ml, since the run began; volume_ml, in the vial by this ledger; both of shape (N,).
     """
 
-    def __init__(
-        self, n: int, config: SafetyConfig, tube_ml: Array | None = None, full_ml: Array | None = None
-    ) -> None:
-        self._config = config
-        self._tube_ml = np.full(n, config.volume_ml) if tube_ml is None else tube_ml
-        self._full_ml = np.full(n, config.max_volume_ml) if full_ml is None else full_ml
+    def __init__(self, config: SafetyConfig, bench: Bench, tube_ml: Array, full_ml: Array) -> None:
+        self._config, self._bench, n = config, bench, len(tube_ml)
+        self._tube_ml, self._full_ml = tube_ml, full_ml
         self.volume_ml = self._tube_ml.copy()
         self.fed_ml = np.zeros(n)
         self._hour = np.zeros((n, 60))  # feed per minute of the hour
@@ -36,22 +34,22 @@ class FeedBudget:
 
     def check(self, rate: Array, fresh: Mask, now: float) -> tuple[Array, list[Finding]]:
         """What of the proposed feed rates passes, mL/s, shape (N,), and what is wrong with them."""
-        c = self._config
+        c, bench = self._config, self._bench
         unusable = fresh & ~(np.isfinite(rate) & (rate >= 0.0))
         self._unusable = np.where(fresh, np.where(unusable, self._unusable + 1, 0), self._unusable)
         lost = unusable & (self._unusable >= c.controller_patience)
         wanted = np.where(fresh & ~unusable, rate, 0.0)
-        undosed = fresh & (self._owed_ml > 2.0 * c.max_rate * c.period_s)
-        in_a_row, owed = self._unusable, self._owed_ml
+        undosed = fresh & (self._owed_ml > 2.0 * bench.max_rate * bench.period_s)
+        in_a_row, owed, most = self._unusable, self._owed_ml, bench.max_rate
         findings = [
             Finding("controller", unusable & ~lost, lambda i: f"proposed {rate[i]:g} mL/s"),
             Finding("controller_lost", lost, lambda i: f"{in_a_row[i]:.0f} unusable proposals in a row"),
-            Finding("limit", wanted > c.max_rate * (1.0 + 1e-9), lambda i: f"{wanted[i]:g} mL/s cut to {c.max_rate:g}"),
+            Finding("limit", wanted > most * (1.0 + 1e-9), lambda i: f"{wanted[i]:g} mL/s cut to {most:g}"),
             Finding("undosed", undosed, lambda i: f"{owed[i]:.2f} mL were allowed, nothing was dosed"),
         ]
-        allowed = np.minimum(wanted, c.max_rate)
+        allowed = np.minimum(wanted, most)
         for kind, room in self._room(now).items():
-            asked = allowed * c.period_s
+            asked = allowed * bench.period_s
             over = asked > room + 1e-9
             texts = [f"{max(r, 0.0):.2f} mL left, {a:.2f} asked" for r, a in zip(room, asked, strict=True)]
             findings.append(Finding(kind, over, texts.__getitem__))
@@ -66,7 +64,7 @@ class FeedBudget:
         left = [c.ml_per_minute - recent, c.ml_per_hour - self._hour.sum(axis=1), c.ml_per_run - self.fed_ml]
         return {
             "budget": np.minimum.reduce(left),
-            "bottle": c.bottle_ml - self.fed_ml,
+            "bottle": self._bench.bottle_ml - self.fed_ml,
             "overflow": self._full_ml - self.volume_ml,
         }
 
@@ -80,7 +78,7 @@ class FeedBudget:
 
     def grant(self, rate: Array) -> None:
         """Remember what is allowed now, mL/s, shape (N,), until it is dosed."""
-        self._owed_ml = self._owed_ml + rate * self._config.period_s
+        self._owed_ml = self._owed_ml + rate * self._bench.period_s
 
     def book(self, feed: Array, waste: Array, now: float) -> None:
         """Book what was dosed at `now`, mL, shape (N,): V <- max(V_tube, V + feed - waste), V + feed where waste is 0.

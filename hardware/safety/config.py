@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from enum import IntEnum
 
 from conf.schema import check, part, require, setting
+from envs.bench import Bench
 
 __all__ = ["DONE", "REMEDIES", "WORDS", "Response", "Responses", "SafetyConfig"]
 
@@ -31,7 +32,7 @@ REMEDIES = {
     "setpoint": "correct the schedule: setpoints are OD over 0 and at most the configured maximum",
     "controller": "look at the policy's input and output in the journal",
     "controller_lost": "replace the policy, then start a new run",
-    "limit": "nothing if the controller asked too much; else raise safety.max_rate",
+    "limit": "nothing if the controller asked too much; else raise bench.max_rate",
     "budget": "check for a leak or wash-out; if the flow is right, raise safety.ml_per_hour or ml_per_run",
     "bottle": "fill the bottle and start a new run with its content",
     "overflow": "check waste pump and tube",
@@ -132,25 +133,15 @@ class Responses:
 
 @dataclass(frozen=True)
 class SafetyConfig:
-    """Limits of the interlock between every controller and every pump; volumes by its own ledger."""
+    """Limits of the interlock between every controller and every pump, beside what the bench says; its own ledger."""
 
-    max_rate: float = setting(0.02, "largest feed rate that passes, the device's own cap", "mL/s", within=(0, 0.05))
-    period_s: float = setting(60.0, "control period a rate stands for", "s", within=(10, 600))
     ml_per_minute: float = setting(
         3.0, "feed budget; two doses may fall into 60 s when a sample is late", "mL", above=0.0, below=math.inf
     )
     ml_per_hour: float = setting(75.0, "feed budget", "mL", above=0.0, below=math.inf)
     ml_per_run: float = setting(10000.0, "feed budget", "mL", above=0.0, below=math.inf)
-    bottle_ml: float = setting(2000.0, "fresh medium at the start, per reactor", "mL", above=0.0, below=math.inf)
-    volume_ml: float = setting(
-        20.0, "level the waste tube keeps; of Pioreactors backend.volume_ml", "mL", within=(10, 30)
-    )
-    max_volume_ml: float = setting(
-        25.0,
-        "more than this is an overflow (the vial holds 30); volume_ml or more; of Pioreactors as much more than "
-        "theirs, and at most the vendor's limit",
-        "mL",
-        at_most=30.0,
+    overflow_ml: float = setting(
+        5.0, "so much above the waste tube is an overflow, and whatever a vial cannot hold", "mL", within=(0, 10)
     )
     max_setpoint: float = setting(1.5, "a larger setpoint is a typing error", "OD", within=(0.05, 4))
     od_min: float = setting(-0.1, "readings below are impossible", "OD")
@@ -179,8 +170,10 @@ class SafetyConfig:
     noise_od: float = setting(0.005, "sd of the sensor", "OD")
     noise_fraction: float = setting(0.005, "its part that is proportional to OD")
     cooldown: float = setting(5.0, "without a dose after no_dilution or falls", "min", above=0.0, below=math.inf)
-    stale_s: float = setting(100.0, "age of a newest sample that is stale; 1.1 periods or more", "s", at_most=3600.0)
-    lost_s: float = setting(180.0, "and that is lost; stale_s or more", "s", at_most=7200.0)
+    stale_s: float | None = setting(
+        None, "age of a newest sample that is stale; null: 40 s more than a control period", "s", at_most=7200.0
+    )
+    lost_s: float | None = setting(None, "and that is lost; null: three control periods", "s", at_most=14400.0)
     silent: float = setting(120.0, "after which a reactor is given up", "min", above=0.0, below=math.inf)
     hot_excess: float = setting(2.0, "above the thermostat's target, in 3 samples", "degC")
     max_temperature: float = setting(42.0, "absolute limit, in 2 samples", "degC", within=(20, 45))
@@ -201,12 +194,20 @@ class SafetyConfig:
 
     def __post_init__(self) -> None:
         check(self, "safety")
-        for key, low, high in (
-            ("max_volume_ml", self.volume_ml, 30.0),
-            ("od_max", self.max_setpoint, 10.0),
-            ("stale_s", self.period_s * 1.1, 3600.0),
-            ("lost_s", self.stale_s, 7200.0),
-            ("composition_high", self.composition_low, 42.0),
-        ):
-            given = getattr(self, key)
-            require(low <= given, f"safety.{key}", given, f"{low:g} to {high:g}")
+        self._reaches("od_max", self.max_setpoint, 10.0)
+        self._reaches("composition_high", self.composition_low, 42.0)
+
+    def _reaches(self, key: str, low: float, high: float) -> None:
+        given = getattr(self, key)
+        require(low <= given, f"safety.{key}", given, f"{low:g} to {high:g}")
+
+    def ages_s(self, bench: Bench) -> tuple[float, float]:
+        """Ages of a newest sample that is stale and that is lost, s.
+
+        Raises: ValueError for an age that is over before the next sample comes.
+        """
+        stale_s = bench.period_s + 40.0 if self.stale_s is None else self.stale_s
+        lost_s = max(3.0 * bench.period_s, stale_s) if self.lost_s is None else self.lost_s
+        require(stale_s >= 1.1 * bench.period_s, "safety.stale_s", stale_s, f"{1.1 * bench.period_s:g} to 7200")
+        require(lost_s >= stale_s, "safety.lost_s", lost_s, f"{stale_s:g} to 14400")
+        return stale_s, lost_s

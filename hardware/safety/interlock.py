@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.bench import Bench
 from hardware.reactor import Array, Mask, Measurement, Receipt
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import DONE, REMEDIES, WORDS, Response, SafetyConfig
@@ -22,8 +23,9 @@ from hardware.safety.fluorescence import Light
 from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
-__all__ = ["Interlock", "Verdict", "kinds_of"]
+__all__ = ["VIAL_ML", "Interlock", "Verdict", "kinds_of"]
 
+VIAL_ML = 30.0  # what the vial of a Chi.Bio holds
 ADDED = (  # to the saved state of earlier versions
     "_helpless_od", "_eased", "_light", "_light_repeats", "_light_s", "_since_low_ml",
 )  # fmt: skip
@@ -52,17 +54,25 @@ class Verdict:
 class Interlock:
     """Stands between controllers and pumps of N reactors: asks its five parts, then concludes.
 
-    Args: tube_ml, full_ml: of each vial, as of `FeedBudget`, where they differ from the config's.
+    Args: bench: volume, period and largest rate. tube_ml: level of each waste tube, where they differ, (N,). rim_ml:
+      what a vial holds, one for all or (N,).
     Attributes: budget, the ledger of feed and level.
     """
 
     def __init__(
-        self, n: int, config: SafetyConfig | None = None, tube_ml: Array | None = None, full_ml: Array | None = None
+        self,
+        n: int,
+        config: SafetyConfig | None = None,
+        bench: Bench | None = None,
+        tube_ml: Array | None = None,
+        rim_ml: Array | float = VIAL_ML,
     ) -> None:
+        self.bench = bench or Bench()
         self.n, self.config = n, config or SafetyConfig()
-        self.budget = FeedBudget(n, self.config, tube_ml, full_ml)
-        self._readings = Readings(n, self.config)
-        self._change = UnexplainedChange(n, self.config, tube_ml)
+        tube = np.full(n, self.bench.volume_ml) if tube_ml is None else tube_ml
+        self.budget = FeedBudget(self.config, self.bench, tube, np.minimum(tube + self.config.overflow_ml, rim_ml))
+        self._readings = Readings(n, self.config, *self.config.ages_s(self.bench))
+        self._change = UnexplainedChange(self.config, self.bench.max_rate, tube)
         self._heat = Heat(n, self.config)
         self._light = Light(n, self.config)
         self._parts = (self.budget, self._readings, self._change, self._heat, self._light)

@@ -30,10 +30,13 @@ class Finding:
 
 
 class Readings:
-    """Age and plausibility of the newest sample of N reactors, each by itself."""
+    """Age and plausibility of the newest sample of N reactors, each by itself.
 
-    def __init__(self, n: int, config: SafetyConfig) -> None:
-        self._config = config
+    Args: stale_s, lost_s: ages of a newest sample from which it is stale, and lost.
+    """
+
+    def __init__(self, n: int, config: SafetyConfig, stale_s: float, lost_s: float) -> None:
+        self._config, self._stale_s, self._lost_s = config, stale_s, lost_s
         self._fresh_s = np.full(n, math.nan)  # when the newest sample came
         self._seen = np.full(n, math.nan)  # its reading, believed or not
         self._repeats = np.zeros(n)  # samples in a row that were equal to the one before
@@ -72,14 +75,13 @@ class Readings:
 
     def _ages(self, m: Measurement, fresh: Mask, now: float) -> list[Finding]:
         """How old the newest sample is, on this computer's clock or by what the driver says, whichever is more."""
-        c = self._config
         self._fresh_s = np.where(fresh | np.isnan(self._fresh_s), now, self._fresh_s)
         age = now - self._fresh_s
         if m.vitals is not None:
             age = np.maximum(age, np.where(fresh, 0.0, m.vitals.age_s))
-        silent = age > 60.0 * c.silent
-        lost = (age > c.lost_s) & ~silent
-        stale = (age > c.stale_s) & ~lost & ~silent
+        silent = age > 60.0 * self._config.silent
+        lost = (age > self._lost_s) & ~silent
+        stale = (age > self._stale_s) & ~lost & ~silent
         rows = {"stale": stale, "lost": lost, "silent": silent}
         return [Finding(kind, mask, lambda i: f"no new sample for {age[i]:.0f} s") for kind, mask in rows.items()]
 

@@ -22,8 +22,8 @@ class UnexplainedChange:
     setpoint is reached, or OD falls after all.
     """
 
-    def __init__(self, n: int, config: SafetyConfig, tube_ml: Array | None = None) -> None:
-        self._config, self._tube_ml = config, np.full(n, config.volume_ml) if tube_ml is None else tube_ml
+    def __init__(self, config: SafetyConfig, max_rate: float, tube_ml: Array) -> None:
+        self._config, self._max_rate, self._tube_ml, n = config, max_rate, tube_ml, len(tube_ml)
         self._od, self._at = np.full(n, math.nan), np.full(n, math.nan)  # newest believed reading and its minute
         self._since_ml, self._since_low_ml = np.zeros(n), np.zeros(n)  # dosed since then, at most and at least
         self._suspect, self._suspect_at = np.full(n, math.nan), np.full(n, math.nan)  # newest reading after a step
@@ -105,7 +105,7 @@ class UnexplainedChange:
         cap = np.minimum(c.mu_max, self._mu + 0.01)
         rise = np.where(least > 0.0, x - cap * dt + c.gain_min * least, np.minimum(x - c.mu_max * dt, 0.0))
         fall = -x - c.gain_max * d - c.death * dt
-        full = least / dt >= 0.8 * c.max_rate * 60.0 / self._tube_ml
+        full = least / dt >= 0.8 * self._max_rate * 60.0 / self._tube_ml
         excess = np.where(usual, np.maximum(self._excess + rise, 0.0), self._excess)
         deficit = np.where(usual, np.maximum(self._deficit + fall, 0.0), self._deficit)
         futile = np.where(full, np.maximum(self._futile + x + 0.004 * dt, 0.0), 0.0)

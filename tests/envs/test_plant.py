@@ -26,6 +26,9 @@ PRESETS = sorted(p.stem for p in (Path(str(resources.files("conf"))) / "plant").
 PULSE = PumpConfig(dosing="pulse")
 
 
+SMALL = PlantConfig(vessel=VesselConfig(capacity_ml=20.0))
+
+
 def preset(name: str) -> PlantConfig:
     return build(PlantConfig(), presets.load(f"plant/{name}"))
 
@@ -361,7 +364,8 @@ def test_reset_starts_a_new_culture_in_the_same_reactor() -> None:
         (lambda: PumpConfig(dead_time_s=0.05), r"set dosing=pulse"),
         (lambda: PumpConfig(dosing="pulse", prime_low=0.9, prime_high=0.5), r"prime_low = 0.9"),
         (lambda: SensorConfig(outlier_rate=1.5), r"plant.sensor.outlier_rate = 1.5"),
-        (lambda: VesselConfig(capacity_ml=20.0), r"plant.vessel.capacity_ml = 20.0 mL: allowed 24.5"),
+        (lambda: VesselConfig(20.0, capacity_ml=20.0), r"plant.vessel.capacity_ml = 20.0 mL: allowed 24.5"),
+        (lambda: Plant(SMALL, 1, np.random.default_rng(0)), r"plant.vessel.capacity_ml = 20.0 mL: allowed 24.5"),
         (lambda: ThermalConfig(cooling_min=0.0), r"plant.thermal.cooling_min = 0.0 min"),
         (lambda: PlantConfig(integrator="heun"), r"plant.integrator = heun: allowed euler, rk4"),
         (lambda: Plant(PlantConfig(), 0, np.random.default_rng(0)), r"number of vials = 0"),

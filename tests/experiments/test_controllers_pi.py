@@ -69,7 +69,7 @@ def test_the_interval_is_that_of_the_last_two_records() -> None:
 
 
 def test_gain_scales_with_volume_and_odd_readings_do_not_pump() -> None:
-    pi = ChiBioPI(ChiBioPIConfig(volume_ml=10.0))
+    pi = ChiBioPI(ChiBioPIConfig(), 10.0)
     play(pi, [0.52, 0.52, 0.52], 0.5)
     assert pi.explain()["p"][0] == pytest.approx(0.7 * np.log(1.04) / 24.0)
     assert play(pi, [0.0, 0.0, 0.0, -0.1], 0.5)[-1] == 0.0
@@ -119,7 +119,6 @@ def test_tuned_pi_does_not_wind_up() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ChiBioPIConfig(volume_ml=0.0), "controller.volume_ml = 0.0 mL: allowed 5 to 50"),
         (lambda: ChiBioPIConfig(max_pump_rate=1.0), "controller.max_pump_rate = 1.0 mL/s"),
         (lambda: TunedPIConfig(delay_min=0.0), "controller.delay_min = 0.0 min: allowed 0.5 to 60"),
     ],

@@ -20,6 +20,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dqn import policy
+from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.cli import frame
@@ -159,7 +160,7 @@ def test_a_stop_before_the_units_were_looked_at_says_so(
 
     monkeypatch.setattr(families, "_units", stopped)
     with closing(Journal(tmp_path / "journal.jsonl", fsync=False)) as journal:
-        opening = families.Opening(PioreactorConfig(), PlantConfig(), journal, tmp_path, resumed=False)
+        opening = families.Opening(PioreactorConfig(), Bench(), PlantConfig(), journal, tmp_path, resumed=False)
         with pytest.raises(KeyboardInterrupt), families.OPENERS["pioreactor"](opening):
             pass
     assert "pumps not verified off" in caplog.text

@@ -41,16 +41,16 @@ def told(*overrides: str) -> str:
 
 
 def test_steps_clock_and_bottle_are_told() -> None:
-    text = told("scenario=hold", "scenario.minutes=[1500]", "safety.bottle_ml=500", "backend.reactors=[M0,M1]")
+    text = told("scenario=hold", "scenario.minutes=[1500]", "bench.bottle_ml=500", "backend.reactors=[M0,M1]")
     assert text.count("Mon 02 12:00 Tue 03 13:00    1500     1500") == 2
     assert text.count("900 mL of medium expected") == 2  # 1500 min x 0.03 1/min x 20 mL
-    assert text.count("safety.bottle_ml=500 does NOT last") == 2
+    assert text.count("bench.bottle_ml=500 does NOT last") == 2
     assert "controller dqn, policy shipped" in text
     assert "would record in HERE" in text
-    assert "safety.bottle_ml=2000 lasts" in told("scenario=hold")
+    assert "bench.bottle_ml=2000 lasts" in told("scenario=hold")
     both = told("scenario=hold", "scenario.minutes=[90]", "scenario.outputs=['pump3 2 mL/h, pump4 1.5 mL']")
     assert "at most 3.0 mL by Pump3, at most 1.5 mL by Pump4" in both
-    longer = told("scenario=hold", "scenario.minutes=[1500]", "scenario.until=[settled]", "safety.bottle_ml=500")
+    longer = told("scenario=hold", "scenario.minutes=[1500]", "scenario.until=[settled]", "bench.bottle_ml=500")
     assert "may not last" in longer
 
 

@@ -11,8 +11,8 @@ from experiments.cli import frame
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
 from experiments.controllers import registry
+from experiments.deploy import main
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
-from hardware.safety.config import SafetyConfig
 
 CALM = Scenario((0.5, 0.6), (10.0, 10.0), (37.0, 37.0))
 WARMER = replace(CALM, temperatures=(30.0, 37.0))
@@ -54,8 +54,7 @@ def test_a_controller_that_knows_the_plant_needs_a_simulated_one(tmp_path: Path)
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"period_s": 120.0, "stale_s": 200.0}, "give safety.period_s=120$"),
-        ({"max_dose_ml": 0.9}, "interlock allows 1.2 mL in a period of 60 s; give safety.max_rate=0.015 or a larger"),
+        ({"max_dose_ml": 0.9}, "interlock allows 1.2 mL in a period of 60 s; give bench.max_rate=0.015 or a larger"),
     ],
 )
 def test_the_interlock_counts_with_the_units_own_period_volume_and_dose(
@@ -64,11 +63,8 @@ def test_the_interlock_counts_with_the_units_own_period_volume_and_dose(
     refused(tmp_path, words, backend=PioreactorConfig(**values))
 
 
-def test_a_volume_is_said_once_and_by_the_backend(tmp_path: Path) -> None:
-    backend = PioreactorConfig(volume_ml=12.0)
-    refused(
-        tmp_path,
-        "safety.volume_ml = 28 mL: the interlock takes backend.volume_ml",
-        backend=backend,
-        safety=SafetyConfig(volume_ml=28.0, max_volume_ml=29.0),
-    )
+@pytest.mark.parametrize("key", ["safety.volume_ml", "backend.volume_ml", "controller.volume_ml", "backend.period_s"])
+def test_a_volume_and_a_period_are_said_once_and_by_the_bench(key: str) -> None:
+    for backend in ("sim", "chibio", "pioreactor"):
+        with pytest.raises(frame.UserError, match=f"(?i){key.rpartition('.')[2]}"):
+            main.config([f"backend={backend}", "controller=pi", f"+{key}=28"])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs.bench import Bench
 from envs.outputs import Output, outputs_of
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
@@ -251,12 +252,13 @@ def test_a_pump_without_a_tube_is_refused_before_anything_begins(tmp_path: Path)
     with pytest.raises(frame.UserError, match="Pump4 has no tube; .*backend.supply.pump4_ml_s"):
         assemble.unpack(config(pump4_ml_s=0.0), tmp_path)
     weak = config()
-    with pytest.raises(frame.UserError, match=r"safety.max_rate = 0.005 mL/s: allowed 0.0167 mL/s or more"):
-        assemble.unpack(replace(weak, safety=replace(weak.safety, max_rate=0.005)), tmp_path)
-    for backend in (weak.backend, SimulatedConfig(control_min=5.0)):  # a dose is a rate over the same period everywhere
-        other = replace(weak, backend=backend, safety=replace(weak.safety, period_s=75.0))
-        with pytest.raises(frame.UserError, match=r"safety.period_s = 75 s, .*: allowed the same"):
-            assemble.unpack(other, tmp_path)
+    with pytest.raises(frame.UserError, match=r"bench.max_rate = 0.005 mL/s: allowed 0.0167 mL/s or more"):
+        assemble.unpack(replace(weak, bench=Bench(max_rate=0.005)), tmp_path)
+    with pytest.raises(frame.UserError, match=r"bench.period_s = 75 s: allowed 60"):
+        assemble.unpack(replace(weak, bench=Bench(period_s=75.0)), tmp_path)
+    slow = replace(weak, backend=SimulatedConfig(), bench=Bench(period_s=900.0))
+    with pytest.raises(frame.UserError, match=r"bench.period_s = 900 s: allowed at most"):
+        assemble.unpack(slow, tmp_path)
     with pytest.raises(frame.UserError, match=r"pump4_ml_s: Pump4 gives at most 0.63 mL a dose"):
         assemble.unpack(config(pump4_ml_s=0.2), tmp_path)
     with pytest.raises(ValueError, match="backend.supply = Pump3: allowed another pump"):

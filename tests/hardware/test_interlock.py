@@ -9,6 +9,7 @@ import pytest
 
 from conf import presets
 from conf.schema import build
+from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
 from hardware.emulator.device import plant_preset
@@ -20,8 +21,8 @@ from hardware.safety.interlock import Interlock, Verdict, kinds_of
 class Drive:
     """One reactor told minute by minute what it reads and what is proposed."""
 
-    def __init__(self, config: SafetyConfig | None = None) -> None:
-        self.interlock = Interlock(1, config)
+    def __init__(self, config: SafetyConfig | None = None, bench: Bench | None = None) -> None:
+        self.interlock = Interlock(1, config, bench)
         self.minute = 0
 
     def __call__(
@@ -100,7 +101,7 @@ def test_budgets() -> None:
     hour = Drive(SafetyConfig(ml_per_hour=6.0))
     fed = sum(60.0 * hour(od=0.5 + 0.001 * (k % 7), rate=0.02).rate[0] for k in range(20))
     assert fed == pytest.approx(6.0)
-    bottle = Drive(SafetyConfig(bottle_ml=2.5))
+    bottle = Drive(bench=Bench(bottle_ml=2.5))
     kinds = [only(bottle(od=0.5 + 0.001 * (k % 7), rate=0.02)) for k in range(4)]
     assert kinds == [(), (), ("bottle",), ("bottle",)]
     minute = Drive(SafetyConfig(ml_per_minute=2.0))
@@ -275,7 +276,7 @@ def cultivate(
     """N vials under an inverse law on 17 levels, setpoints 0.8, 0.65, 0.5, 0.3 for an hour each (or one for ever)."""
     vials = Plant(plant, n, np.random.default_rng(0))
     vials.reset(0.5, 37.0)
-    interlock = Interlock(n, SafetyConfig(bottle_ml=1e6))
+    interlock = Interlock(n, bench=Bench(bottle_ml=1e6))
     verdicts = []
     for k in range(minutes):
         if spoil is not None and k == spoil[0]:
@@ -339,8 +340,8 @@ def test_a_pump_at_a_third_is_found_when_the_culture_outgrows_it() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    n, c = 8, SafetyConfig(ml_per_hour=30.0, bottle_ml=150.0, silent=1e5)
-    interlock = Interlock(n, c)
+    n, c, bench = 8, SafetyConfig(ml_per_hour=30.0, silent=1e5), Bench(bottle_ml=150.0)
+    interlock = Interlock(n, c, bench)
     now, fed = 0.0, np.zeros(n)
     doses: list[tuple[float, np.ndarray]] = []
     level = np.full(n, 20.0)
@@ -357,7 +358,7 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> N
         vitals = Vitals(rng.uniform(0.0, 130.0, n), strange(4000.0, 12000.0), faults)
         m = Measurement(np.full(n, now), od, strange(36.0, 38.0), fresh, vitals)
         v = interlock.check(m, rate, setpoint, strange(36.0, 38.0), now)
-        assert np.all((v.rate >= 0.0) & (v.rate <= c.max_rate))
+        assert np.all((v.rate >= 0.0) & (v.rate <= bench.max_rate))
         assert np.all(v.rate[~fresh] == 0.0)
         assert np.all(v.rate[v.response > 0] == 0.0)
         with np.errstate(invalid="ignore"):
@@ -374,13 +375,13 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> N
         level = np.where(waste > 0.0, np.maximum(level + feed - waste, 20.0), level + feed)
         doses.append((now, feed))
         fed += feed
-        assert np.all(level <= c.max_volume_ml + 1e-9)
-        assert np.all(fed <= c.bottle_ml + 1e-9)
+        assert np.all(level <= 25.0 + 1e-9)
+        assert np.all(fed <= bench.bottle_ml + 1e-9)
         assert np.all(sum(f for t, f in doses if now - t < 60.0) <= c.ml_per_minute + 1e-9)
         assert np.all(sum(f for t, f in doses[-200:] if now - t < 3540.0) <= c.ml_per_hour + 1e-9)
         if rng.random() < 0.01:  # the program dies and comes back
             state = json.loads(json.dumps(interlock.state()).replace("-Infinity", "null").replace("NaN", "null"))
-            interlock = Interlock(n, c)
+            interlock = Interlock(n, c, bench)
             interlock.restore(state)
     assert fed.sum() > 10.0
 
@@ -461,14 +462,17 @@ def test_words_and_ranges_are_checked() -> None:
     with pytest.raises(ValueError, match="at least hold"):
         Responses(frozen="report")
     for key, value in (
-        ("max_rate", 0.5),
-        ("max_volume_ml", 10.0),
-        ("stale_s", 10.0),
+        ("overflow_ml", 11.0),
+        ("lost_s", 1e5),
         ("drift", 0.0),
-        ("bottle_ml", 0.0),
     ):
         with pytest.raises(ValueError, match=rf"safety\.{key} = .*: allowed"):
             SafetyConfig(**{key: value})
+    for key, value in (("max_rate", 0.5), ("volume_ml", 4.0), ("bottle_ml", 0.0), ("period_s", 0.0)):
+        with pytest.raises(ValueError, match=rf"bench\.{key} = .*: allowed"):
+            Bench(**{key: value})
+    with pytest.raises(ValueError, match=r"bench\.volumes_ml\.M1 = 40.0 mL: allowed 5 to 38"):
+        Bench(volumes_ml={"M1": 40.0})
 
 
 def test_a_reason_that_is_only_reported_lets_the_dose_pass() -> None:

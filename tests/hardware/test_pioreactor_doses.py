@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from envs.bench import Bench
 from hardware.errors import DeviceStateError, LinkError, RecordingError
 from hardware.pioreactor.resume import History, replay
 from hardware.safety.budget import FeedBudget
@@ -358,7 +359,7 @@ def test_an_intent_whose_request_was_never_sent_gave_nothing(monkeypatch):
 @pytest.mark.parametrize(("given", "level"), [("nothing", 20.0), ("all but its waste", 20.6), ("as planned", 20.0)])
 def test_the_ledger_of_the_interlock_ends_where_the_vial_does(lab, given, level):
     """A dose is booked when it begins; what became of it is booked as a correction."""
-    budget = FeedBudget(1, SafetyConfig(volume_ml=20.0))
+    budget = FeedBudget(SafetyConfig(), Bench(), np.full(1, 20.0), np.full(1, 25.0))
     lab.world.locks |= {MEDIA_PIN} if given == "nothing" else set()
     planned = lab.dose(0.6)
     budget.book(np.array([planned]), np.array([2.0 * planned]), 0.0)

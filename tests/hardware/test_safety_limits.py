@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs.bench import Bench
 from hardware.reactor import Fault, Measurement, Receipt, Vitals
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import REMEDIES, Response, Responses, SafetyConfig
@@ -44,6 +45,7 @@ class Ledger:
     """Feed of one reactor as a list of doses (time, mL)."""
 
     c: SafetyConfig
+    bench: Bench
     doses: list[tuple[float, float]] = field(default_factory=list)
     level: float = 20.0
     owed: float = 0.0
@@ -54,7 +56,7 @@ class Ledger:
         return sum(ml for _, ml in self.doses)
 
     def judge(self, rate: float, fresh: bool, now: float) -> tuple[float, list[str]]:
-        c, kinds = self.c, []
+        c, bench, kinds = self.c, self.bench, []
         if not fresh:
             return 0.0, []
         usable = math.isfinite(rate) and rate >= 0.0
@@ -62,16 +64,17 @@ class Ledger:
         wanted = rate if usable else 0.0
         if not usable:
             kinds.append("controller_lost" if self.unusable >= c.controller_patience else "controller")
-        if wanted > c.max_rate:
+        if wanted > bench.max_rate:
             kinds.append("limit")
-        if self.owed > 2.0 * c.max_rate * c.period_s:
+        if self.owed > 2.0 * bench.max_rate * bench.period_s:
             kinds.append("undosed")
-        wanted = min(wanted, c.max_rate)
+        wanted = min(wanted, bench.max_rate)
         minute = sum(ml for t, ml in self.doses[-4:] if now - t < 60.0)
         hour = sum(ml for t, ml in self.doses if now // 60.0 - t // 60.0 < 60.0)
         budget = min(c.ml_per_minute - minute, c.ml_per_hour - hour, c.ml_per_run - self.fed)
-        for kind, room in (("budget", budget), ("bottle", c.bottle_ml - self.fed), ("overflow", 25.0 - self.level)):
-            if wanted * c.period_s > room + 1e-9:
+        bottle = bench.bottle_ml - self.fed
+        for kind, room in (("budget", budget), ("bottle", bottle), ("overflow", 25.0 - self.level)):
+            if wanted * bench.period_s > room + 1e-9:
                 kinds.append(kind)
                 wanted = 0.0
         return wanted, kinds
@@ -95,9 +98,11 @@ class Ledger:
 )
 def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> None:
     rng = np.random.default_rng(0)
-    tight = {"ml_per_minute": 1.9, "ml_per_hour": 14.0, "ml_per_run": 30.0, "bottle_ml": 30.0, "controller_patience": 2}
-    c = SafetyConfig(period_s=period_s, stale_s=100.0, **{limit: tight[limit]})
-    budget, twins, now = FeedBudget(N, c), [Ledger(c) for _ in range(N)], 0.0
+    tight = {"ml_per_minute": 1.9, "ml_per_hour": 14.0, "ml_per_run": 30.0, "controller_patience": 2}
+    c = SafetyConfig(**{limit: tight[limit]} if limit in tight else {})
+    bench = Bench(period_s=period_s, bottle_ml=30.0 if limit == "bottle_ml" else 2000.0)
+    given = (c, bench, np.full(N, 20.0), np.full(N, 25.0))
+    budget, twins, now = FeedBudget(*given), [Ledger(c, bench) for _ in range(N)], 0.0
     order = {"controller": 0, "controller_lost": 1, "limit": 2, "undosed": 3, "budget": 4, "bottle": 5, "overflow": 6}
     for _ in range(200):
         now += float(
@@ -110,17 +115,17 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
         np.testing.assert_allclose(allowed, [e[0] for e in expected], rtol=1e-12)
         assert [sorted(kinds, key=order.get) for kinds in told(findings)] == [e[1] for e in expected]
         budget.grant(allowed)
-        feed = allowed * c.period_s * (rng.random(N) < 0.7)
+        feed = allowed * bench.period_s * (rng.random(N) < 0.7)
         waste = rng.choice([0.0, 0.5, 9.0], N)
         at = now + float(rng.choice([0.0, 40.0, -70.0, -3000.0, -3600.0, -4000.0], p=[0.5, 0.4, *[0.025] * 4]))
         budget.book(feed, waste, at)  # when it ends, or a repeat that is told of late
         now = max(now, at)
         for twin, a, f, w in zip(twins, allowed, feed, waste, strict=True):
-            twin.owed += a * c.period_s
+            twin.owed += a * bench.period_s
             twin.book(f, w, at)
         same(budget.state(), twins, volume_ml="level", fed_ml="fed", _owed_ml="owed", _unusable="unusable")
         if rng.random() < 0.3:
-            saved, budget = budget.state(), FeedBudget(N, c)
+            saved, budget = budget.state(), FeedBudget(*given)
             budget.restore({k: np.where(np.isinf(v), np.nan, v) for k, v in saved.items()})
 
 
@@ -138,17 +143,17 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
 def test_what_a_sensor_can_read(od: float, raw: float, kind: str) -> None:
     vitals = Vitals(np.zeros(2), np.array([raw, 9000.0]), (None, None))
     m = Measurement(np.zeros(2), np.array([od, 0.4]), np.full(2, 37.0), np.array([True, True]), vitals)
-    assert Readings(2, C).believed(m, np.array([True, True])).tolist() == [kind == "", True]
-    believed, findings = Readings(2, C).check(m, np.array([True, True]), 0.0)
+    assert Readings(2, C, 100.0, 180.0).believed(m, np.array([True, True])).tolist() == [kind == "", True]
+    believed, findings = Readings(2, C, 100.0, 180.0).check(m, np.array([True, True]), 0.0)
     assert told(findings, 2) == [[kind] if kind else [], []]
     assert believed.tolist() == [kind == "", True]
-    believed, findings = Readings(2, C).check(m, np.array([False, True]), 0.0)
+    believed, findings = Readings(2, C, 100.0, 180.0).check(m, np.array([False, True]), 0.0)
     assert told(findings, 2) == [[], []]
     assert believed.tolist() == [False, True]
 
 
 def test_equal_readings_are_counted_over_samples_that_are_new() -> None:
-    readings, new = Readings(1, C), np.array([True])
+    readings, new = Readings(1, C, 100.0, 180.0), np.array([True])
     kinds = []
     for od, fresh in (
         (0.5, 1),
@@ -169,7 +174,7 @@ def test_equal_readings_are_counted_over_samples_that_are_new() -> None:
         kinds += told(findings, 1)
         assert believed[0] == (bool(fresh) and kinds[-1] == [])
         if len(kinds) == 3:
-            saved, readings = readings.state(), Readings(1, C)
+            saved, readings = readings.state(), Readings(1, C, 100.0, 180.0)
             readings.restore(saved)
     assert kinds == [[], [], [], ["frozen"], [], ["frozen"], [], [], [], []]
 
@@ -183,7 +188,7 @@ def test_equal_readings_are_counted_over_samples_that_are_new() -> None:
 )  # fmt: skip
 def test_the_age_of_the_newest_sample(after_s: float, driver_s: float, kind: str) -> None:
     """By this computer's clock, or by what the driver says; a sample that is new has no age."""
-    readings = Readings(2, C)
+    readings = Readings(2, C, 100.0, 180.0)
     m = Measurement(np.zeros(2), np.array([0.5, 0.4]), np.zeros(2), np.ones(2, bool))
     readings.check(m, np.array([True, True]), 1000.0)
     vitals = Vitals(np.full(2, driver_s), np.full(2, 9000.0), (None, None))
@@ -361,7 +366,7 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
     rng = np.random.default_rng(2)
     seen: set[str] = set()
     for _ in range(10):
-        change, twins, minute = UnexplainedChange(N, C), [Culture() for _ in range(N)], 0.0
+        change, twins, minute = UnexplainedChange(C, 0.02, np.full(N, 20.0)), [Culture() for _ in range(N)], 0.0
         true = rng.choice([0.04, 0.055, 0.3, 0.5, 1.2], N)
         mu, gain = rng.choice([-0.03, -0.008, 0.0, 0.02, 0.035, 0.05], N), rng.choice([0.0, 0.4, 0.6, 1.0, 1.5, 1.8], N)
         feeds, setpoint = rng.choice([0.0, 0.5, 0.96, 1.2], N), rng.choice([0.04, 0.3, 0.5, 2.0], N)
@@ -393,14 +398,14 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
                 _futile="futile", _over="over", _helpless_od="helpless", _eased="eased",
             )  # fmt: skip
             if rng.random() < 0.05:
-                saved, change = change.state(), UnexplainedChange(N, C)
+                saved, change = change.state(), UnexplainedChange(C, 0.02, np.full(N, 20.0))
                 change.restore(saved)
     assert seen == {"jump", "falls", "falls+", "no_dilution+", "cannot_hold"}
 
 
 @pytest.mark.parametrize(("reading", "kinds"), [(0.18, []), (0.2, ["jump"])])
 def test_after_a_night_growth_explains_a_factor_of_150_and_no_more(reading: float, kinds: list[str]) -> None:
-    change, one = UnexplainedChange(1, C), np.ones(1)
+    change, one = UnexplainedChange(C, 0.02, np.full(1, 20.0)), np.ones(1)
     change.check(0.001 * one, 0.0 * one, one > 0.0, one)  # exp(5) = 148, and 0.04 of noise
     assert told(change.check(reading * one, 6e4 * one, one > 0.0, one), 1) == [kinds]
 
@@ -408,18 +413,38 @@ def test_after_a_night_growth_explains_a_factor_of_150_and_no_more(reading: floa
 @pytest.mark.parametrize(
     ("key", "least", "less", "allowed"),
     [
-        ("max_volume_ml", 20.0, 19.9, "20 to 30"),
         ("od_max", 1.5, 1.49, "1.5 to 10"),
-        ("stale_s", 66.0, 65.9, "66 to 3600"),
-        ("lost_s", 100.0, 99.9, "100 to 7200"),
+        ("stale_s", 66.0, 65.9, "66 to 7200"),
+        ("lost_s", 100.0, 99.9, "100 to 14400"),
     ],
 )
 def test_limits_that_rest_on_one_another(key: str, least: float, less: float, allowed: str) -> None:
-    SafetyConfig(**{key: least + 1e-9})
+    SafetyConfig(**{key: least + 1e-9}).ages_s(Bench())
     if key != "stale_s":  # 1.1 periods are not 66 to the last bit
-        SafetyConfig(**{key: least})
+        SafetyConfig(**{key: least}).ages_s(Bench())
     with pytest.raises(ValueError, match=rf"safety\.{key} = {less}: allowed {allowed}"):
-        SafetyConfig(**{key: less})
+        SafetyConfig(**{key: less}).ages_s(Bench())
+
+
+def test_ages_follow_the_period_of_the_bench() -> None:
+    assert SafetyConfig().ages_s(Bench()) == (100.0, 180.0)
+    assert SafetyConfig().ages_s(Bench(period_s=150.0)) == (190.0, 450.0)
+    assert SafetyConfig(stale_s=500.0).ages_s(Bench()) == (500.0, 500.0)
+    with pytest.raises(ValueError, match=r"safety\.stale_s = 100.0: allowed 165 to 7200"):
+        Interlock(1, SafetyConfig(stale_s=100.0), Bench(period_s=150.0))
+
+
+def test_each_vial_has_its_own_level() -> None:
+    """The ledger is full 5 mL above each tube, and at what a vial holds where that is less."""
+    tubes = np.array([12.0, 20.0, 28.0])
+    interlock, fed = Interlock(3, SafetyConfig(ml_per_minute=1e3), Bench(volume_ml=12.0), tubes), np.zeros(3)
+    for k in range(40):
+        now = np.full(3, 60.0 * k)
+        m = Measurement(now, np.full(3, 0.5 + 0.001 * (k % 7)), np.full(3, 37.0), np.full(3, True), None)
+        rate = interlock.check(m, np.full(3, 0.01), np.full(3, 0.5), np.full(3, np.nan), now[0]).rate
+        interlock.confirm(Receipt(60.0 * rate, (), np.zeros(3)), now[0])
+        fed += 60.0 * rate
+    assert fed.tolist() == pytest.approx([4.8, 4.8, 1.8])
 
 
 # -- conclusions -----------------------------------------------------------------------------------------------------

@@ -1,0 +1,59 @@
+"""What everybody has to know alike of a bench: the culture's volume, the period of its doses, the pump's cap."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from conf.schema import check, require, setting
+
+__all__ = ["Bench"]
+
+WITHIN_ML = (5.0, 38.0)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Said once and read by interlock, driver, estimators, laws, certificate, timetable and simulated vials.
+
+    How fast a reactor is fed is asked in mL/s over a control period; what flows at once is the driver's matter.
+
+    Raises: ValueError naming key, value and allowed range.
+    """
+
+    volume_ml: float = setting(20.0, "culture up to the waste tube", "mL", within=WITHIN_ML)
+    volumes_ml: dict[str, float] = setting(
+        {}, "of single reactors whose tube ends elsewhere, e.g. bench.volumes_ml.M1=14", "mL"
+    )
+    period_s: float = setting(60.0, "control period: from a sample and its dose to the next", "s", within=(1, 3600))
+    max_rate: float = setting(
+        0.02, "largest feed rate; the Chi.Bio's own regulator has this cap", "mL/s", above=0.0, at_most=0.05
+    )
+
+    bottle_ml: float = setting(2000.0, "fresh medium at the start, per reactor", "mL", above=0.0, below=math.inf)
+
+    def __post_init__(self) -> None:
+        check(self, "bench")
+        for name, ml in self.volumes_ml.items():
+            low, high = WITHIN_ML
+            require(low <= ml <= high, f"bench.volumes_ml.{name}", f"{ml} mL", f"{low:g} to {high:g}")
+
+    @property
+    def control_min(self) -> float:
+        """The control period, min."""
+        return self.period_s / 60.0
+
+    @property
+    def tau(self) -> float:
+        """V/60: u/tau is the dilution rate in 1/min of a calibrated pump rate u in mL/s."""
+        return self.volume_ml / 60.0
+
+    def volume_of(self, reactor: str) -> float:
+        """Culture of one reactor, mL."""
+        return self.volumes_ml.get(reactor, self.volume_ml)
+
+    def volumes(self, reactors: Sequence[str]) -> NDArray[np.float64]:
+        """Culture of each reactor, mL, (N,)."""
+        return np.array([self.volume_of(name) for name in reactors])
