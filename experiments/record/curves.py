@@ -114,7 +114,7 @@ def _parameters(chosen: Mapping[str, str], config: Mapping[str, Any]) -> dict[st
     }
     if config["backend"]["kind"] == "sim" and not (config["plant_file"] or config["env_file"]):
         plant = config["plant"]
-        tau = plant["vessel"]["volume_ml"] / (60.0 * plant["pump"]["gain_ml_s"])
+        tau = (plant["vessel"]["volume_ml"] or config["bench"]["volume_ml"]) / (60.0 * plant["pump"]["gain_ml_s"])
         values |= {"seed": config["backend"]["seed"], "mu": plant["growth"]["mu"], "tau": tau}
     return values
 
