@@ -13,14 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from conf.renamed import REMOVED, RENAMED
-
-__all__ = ["Entry", "build", "check", "entries", "old_name", "part", "require", "setting"]
+__all__ = ["Entry", "build", "check", "entries", "part", "require", "setting"]
 
 T = TypeVar("T")
 
-GROUPED = ("agents", "plants", "scenarios", "controllers")  # name -> part of the same kind
-VARIANTS = ("ablations", "trained", "fitted")  # name -> values of the agent
 TRUE, FALSE = ("true", "yes", "on", "1", "y", "t"), ("false", "no", "off", "0", "n", "f")
 
 
@@ -143,28 +139,8 @@ def check(config: Any, prefix: str = "") -> None:
     """
     for entry in (e for e in entries(config) if not e.said.holds(e.value)):
         key = f"{prefix}.{entry.name}" if prefix else entry.name
-        if now := old_name(f"{key}={entry.value}"):
-            raise ValueError(now)
         shown = entry.value if isinstance(entry.value, list | tuple) else f"{entry.value} {entry.said.unit}".rstrip()
         require(False, key, shown, entry.allowed)
-
-
-def old_name(key: str) -> str | None:
-    """The line about an old name, None for a name that never was one.
-
-    Args:
-      key: dotted key, or group=option, or key=choice. A part that stands under a name of the user's
-        (plants.NAME.pump, ablations.NAME.gamma) is known by what it is (plant.pump, agent.gamma).
-    """
-    first, *rest = key.split(".")
-    known = key.replace(".kind=", "=")  # a stored kind is the option it was chosen by
-    if rest and (first in GROUPED or first in VARIANTS):
-        known = ".".join([first[:-1] if first in GROUPED else "agent", *known.split(".")[2:]])
-    if known in RENAMED:
-        return f"{key}: renamed, now {RENAMED[known]}"
-    if known in REMOVED:
-        return f"{key}: removed; {REMOVED[known]}"
-    return None
 
 
 def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
@@ -175,7 +151,7 @@ def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
     Args:
       default: an instance; what `values` leaves out stays as it is there.
       prefix: where the config stands, for messages.
-    Raises: ValueError naming a key that does not exist (or its new name), or key, value and what is allowed.
+    Raises: ValueError naming a key that does not exist, or key, value and what is allowed.
     """
     of = {f.name: f for f in fields(cast(Any, default))}
     hints = get_type_hints(type(default))
@@ -184,7 +160,7 @@ def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
         key = f"{prefix}.{name}" if prefix else str(name)
         if name not in of:
             where = f"under {prefix}" if prefix else "here"
-            raise ValueError(old_name(key) or f"{key}: no such key; allowed {where}: {', '.join(of)}")
+            raise ValueError(f"{key}: no such key; allowed {where}: {', '.join(of)}")
         given[name] = _converted(entry, hints[name], getattr(default, name), key)
     return replace(cast(Any, default), **given)  # type: ignore[no-any-return]
 

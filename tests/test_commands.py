@@ -34,7 +34,6 @@ LESS = {
     "ablate": ["agent.total_steps=300", "n_agents=2"],
     "degradation": ["agent.total_steps=600", "n_agents=2"],
     "benchmark": ["replicates=1", "train_seeds=1"],
-    "dual_chamber": ["replicates=1"],
     "fault_matrix": ["controls=0", "moments=[dose]", "faults=[feed weak]"],
     "kill_campaign": ["kills=2", "runs=1"],
     "soak": ["days=0.05"],

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from conf import presets, renamed, schema
+from conf import presets
 from conf.schema import build, check, part, setting
 from envs.plant.plant import PlantConfig
 from experiments.cli import frame
@@ -105,21 +105,6 @@ def test_plain_values_become_the_types_of_their_fields():
         "a": Inner(rate=0.1, law="cubic"),
         "b": Inner(),
     }
-
-
-def test_an_old_name_gives_the_new_one(monkeypatch):
-    monkeypatch.setitem(renamed.RENAMED, "agent.relabel", "agent.hindsight_share")
-    monkeypatch.setitem(renamed.RENAMED, "inner.flow", "inner.rate")
-    monkeypatch.setitem(renamed.RENAMED, "outer.inner.law=square", "cubic")
-    monkeypatch.setitem(renamed.REMOVED, "inner.noise", "the sensor has it: use plant.sensor")
-    for key in ("agent.relabel", "agents.dqn.relabel", "ablations.mine.relabel"):
-        assert schema.old_name(key) == f"{key}: renamed, now agent.hindsight_share"
-    with pytest.raises(ValueError, match=r"^inner\.flow: renamed, now inner\.rate$"):
-        build(Outer(), {"inner": {"flow": 1}})
-    with pytest.raises(ValueError, match=r"^inner\.noise: removed; the sensor has it: use plant\.sensor$"):
-        build(Outer(), {"inner": {"noise": 1}})
-    with pytest.raises(ValueError, match=r"^outer\.inner\.law=square: renamed, now cubic$"):
-        Inner(law="square")
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -6,7 +6,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from conf import presets
-from conf.schema import old_name
 from experiments.cli import extensions, latest
 
 __all__ = ["EXTRA", "RUN", "UserError", "normalise", "resumed"]
@@ -33,7 +32,7 @@ def _choose(command: str, group: str, option: str) -> None:
         raise UserError(f"{given}: {command} takes {takes}; {group}= is for {', '.join(others)}")
     if re.fullmatch(r"[\w./-]+", option) and option not in (*known, "null"):
         allowed = ", ".join(presets.options(command, group))
-        raise UserError(old_name(given) or f"{given}: no such option; allowed: {allowed}")
+        raise UserError(f"{given}: no such option; allowed: {allowed}")
 
 
 def normalise(argv: Sequence[str], command: str) -> list[str]:

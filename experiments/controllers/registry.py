@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from conf import presets
-from conf.schema import old_name
 from dqn.policy import Policy
 from envs.bench import Bench
 from envs.plant.plant import Plant
@@ -65,7 +64,7 @@ def on_device(kind: str) -> str:
 def config(kind: str) -> Any:
     """The default config of this kind of controller. Raises: ValueError naming the kinds there are."""
     if kind not in KINDS:
-        raise ValueError(old_name(f"controller.kind={kind}") or f"controller.kind = {kind}: allowed {', '.join(KINDS)}")
+        raise ValueError(f"controller.kind = {kind}: allowed {', '.join(KINDS)}")
     return KINDS[kind][0]()
 
 

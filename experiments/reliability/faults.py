@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from conf.schema import old_name
 from envs.scenario import Scenario
 from experiments.controllers.base import Array, Mask
 from experiments.reliability.rehearsal import Rehearsal
@@ -397,7 +396,5 @@ def by_name(names: tuple[str, ...]) -> tuple[Fault, ...]:
     known = {f.name: f for f in FAULTS}
     for name in names:
         if name not in known:
-            raise ValueError(
-                old_name(f"faults={name}") or f"faults = {name}: no such fault; allowed {', '.join(known)}"
-            )
+            raise ValueError(f"faults = {name}: no such fault; allowed {', '.join(known)}")
     return tuple(known[name] for name in names) or FAULTS
