@@ -11,8 +11,8 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 __all__ = [
-    "Added", "add", "added", "chosen", "commands", "groups", "load", "opening", "options", "owner",
-    "sentence",
+    "Added", "add", "added", "chosen", "commands", "groups", "load", "opening", "options", "owner", "place",
+    "program", "sentence",
 ]  # fmt: skip
 
 ROOT = Path(str(resources.files("conf")))
@@ -27,6 +27,7 @@ class Added:
 
 
 _added: dict[str, Added] = {}
+_placed: dict[str, Path] = {}  # command -> its file, where that is not in conf/
 
 
 def add(name: str, values: Mapping[str, Any], what: str) -> None:
@@ -69,7 +70,7 @@ def _files() -> dict[str, list[str]]:
 
 def opening(name: str) -> list[str]:
     """The comment at the top of a file of conf/, line by line."""
-    lines = (ROOT / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
+    lines = _file(name).read_text(encoding="utf-8").splitlines()
     first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     return [line[1:].removeprefix(" ") for line in lines[:first] if not line.startswith("# @")]
 
@@ -82,6 +83,22 @@ def sentence(name: str) -> str:
     return re.split(r"(?<=\.)\s(?=[A-Z`])", first)[0]
 
 
+def place(path: Path) -> None:
+    """Make the command known that a file beside its module tells. Args: path: NAME.yaml of this source tree."""
+    _placed[path.stem] = path
+
+
+def _file(name: str) -> Path:
+    return _placed.get(name, ROOT / f"{name}.yaml")
+
+
+def program(command: str) -> str:
+    """The module that `python -m` runs."""
+    path = _placed.get(command)
+    parts = ("experiments", command) if path is None else path.relative_to(ROOT.parent).with_suffix("").parts
+    return ".".join(parts)
+
+
 def commands() -> list[str]:
     """Every command that is told by a file of conf/."""
     return [path.stem for path in sorted(ROOT.glob("*.yaml")) if path.stem != "base"]
@@ -89,7 +106,7 @@ def commands() -> list[str]:
 
 def chosen(command: str) -> dict[str, str | None]:
     """The groups that a command composes, in the place they have by themselves, and the option each starts with."""
-    root = yaml.safe_load((ROOT / f"{command}.yaml").read_text(encoding="utf-8")) or {}
+    root = yaml.safe_load(_file(command).read_text(encoding="utf-8")) or {}
     entries = [entry for entry in root.get("defaults", []) if isinstance(entry, dict)]
     found = {group: option for entry in entries for group, option in entry.items() if "@" not in group}
     return found | {inner: None for group in found for inner in groups() if inner.startswith(f"{group}/")}

@@ -12,8 +12,7 @@ from experiments.cli import completion
 KINDS = {
     "From a recording to a reactor": ("demo", "calibrate", "train", "certify", "deploy", "report"),
     "At the device": ("calibrate_pump", "blank", "mark"),
-    "Comparisons and studies": ("benchmark", "ablate", "degradation", "speed", "rig_study"),
-    "Rehearsing what goes wrong": ("fault_matrix", "kill_campaign", "soak", "rig_faults"),
+    "Side by side": ("benchmark",),
 }
 DEMO = "The whole way in one command: calibrate, train, deploy, report."
 USAGE = """\

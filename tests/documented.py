@@ -7,7 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-PYTHON = r"(?:python3?|\.venv/bin/python) -m (?:experiments|hardware)[\w.]*"
+PYTHON = r"(?:python3?|\.venv/bin/python) -m (?:experiments|hardware|tests\.(?:campaigns|studies))[\w.]*"
 SHELL = rf"(?:^|[`\s])(?={PYTHON})|`|^    "  # the word turbidostat alone may be a reactor
 PROGRAM = re.compile(rf"(?:{SHELL})({PYTHON}|turbidostat)(?![\w.])((?: [^`\n]*)?)", re.MULTILINE)
 OPEN = re.compile(r"\.\.\.|NAME|COMMAND|KEY|GROUP|PRESET|\bFILE\b(?!\.)| \| ")  # a pattern, not a command

@@ -21,7 +21,6 @@ FORBIDDEN = {
     "dqn": {"hydra", "omegaconf", "gymnasium", "tensorboard", "matplotlib", "stable_baselines3"},
     "experiments": {"stable_baselines3"},
 }
-RIVAL = "experiments.timing.rivals"  # what speed is compared with, an extra
 
 
 def architecture() -> str:
@@ -115,6 +114,11 @@ def test_nobody_imports_a_command():
         assert not wrong, f"{module} imports {sorted(wrong)}"
 
 
+def test_the_program_does_without_its_tests():
+    for module in modules():
+        assert not {name for name in imported(module) if name.split(".")[0] == "tests"}, module
+
+
 def test_every_command_can_be_run():
     for module in filter(is_command, modules()):
         text = modules()[module].read_text(encoding="utf-8")
@@ -138,7 +142,7 @@ def test_a_package_says_what_it_is_for_and_does_nothing():
 @pytest.mark.parametrize("package", PACKAGES)
 def test_third_parties_stay_where_they_belong(package):
     for module in modules():
-        if module.split(".")[0] == package and module != RIVAL:
+        if module.split(".")[0] == package:
             wrong = {name.split(".")[0] for name in imported(module)} & FORBIDDEN[package]
             assert not wrong, f"{module} imports {sorted(wrong)}"
 

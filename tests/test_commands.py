@@ -28,16 +28,15 @@ SHOWN = {
 }
 SHIPPED = "+experiment=shipped"  # a minute; to its end it gives the policy that ships, which is put in its place
 LESS = {
-    "rig_study": ['overrides=[scenario.recovery_od=0.7,"scenario.minutes=[3,3,3]"]'],
-    "rig_faults": ["faults=[no_broker]"],
-    "train": ["agent.total_steps=300", "n_agents=2"],
-    "ablate": ["agent.total_steps=300", "n_agents=2"],
-    "degradation": ["agent.total_steps=600", "n_agents=2"],
-    "benchmark": ["replicates=1", "train_seeds=1"],
-    "fault_matrix": ["controls=0", "moments=[dose]", "faults=[feed weak]"],
-    "kill_campaign": ["kills=2", "runs=1"],
-    "soak": ["days=0.05"],
-    "speed": ["runs=1", "groups=[start_up]"],
+    "tests.campaigns.rig_study": ['overrides=[scenario.recovery_od=0.7,"scenario.minutes=[3,3,3]"]'],
+    "experiments.train": ["agent.total_steps=300", "n_agents=2"],
+    "tests.studies.ablate": ["agent.total_steps=300", "n_agents=2"],
+    "tests.studies.degradation": ["agent.total_steps=600", "n_agents=2"],
+    "experiments.benchmark": ["replicates=1", "train_seeds=1"],
+    "tests.campaigns.faults": ["controls=0", "moments=[dose]", "faults=[feed weak]"],
+    "tests.campaigns.kills": ["kills=2", "runs=1"],
+    "tests.campaigns.soak": ["days=0.05"],
+    "tests.studies.speed": ["runs=1", "groups=[start_up]"],
 }
 """Command -> what makes it shorter here without leaving out a part of it."""
 
@@ -73,7 +72,7 @@ def test_a_command_of_the_pages_is_one_that_the_program_takes(
     given = [w for w in words if w not in ("-m", "--help")]
     if swept:  # one of its jobs
         given = [re.sub(r",.*$", "", w.replace("=range(", "=")) for w in given]
-    assert (ROOT / "experiments" / f"{program.removeprefix('experiments.')}.py").is_file()
+    assert (ROOT / f"{program.replace('.', '/')}.py").is_file()
     importlib.import_module(program).main.config(given)
 
 
@@ -93,7 +92,7 @@ def run(words: list[str], folder: Path, seconds: float = 280.0) -> None:
 
 def shorter(words: list[str]) -> list[str]:
     """The same command with less to do; an emulated device runs as fast as this machine can follow."""
-    less = LESS.get(words[0].removeprefix("experiments."), [])
+    less = LESS.get(words[0], [])
     if any(word.startswith("resume=") for word in words):
         return words
     if "backend=emulator" in words:

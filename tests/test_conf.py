@@ -19,11 +19,12 @@ from envs.task import EnvConfig
 from experiments.cli import frame, reference
 from experiments.control.config import deploy_schema
 from experiments.train import main
-from experiments.training.config import ENVS, TrainConfig, read_env_file, variant
+from experiments.training.config import ENVS, TrainConfig, read_env_file
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.link.transport import TransportConfig
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
+from tests.studies.variants import variant
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -351,11 +352,11 @@ def test_help_lists_what_the_command_takes_and_every_option_of_it_composes(name,
             "plant=bench: train takes env, agent, experiment, hparams_search; plant= is for deploy",
         ),
         ("benchmark", "plant=bench", "plant=bench: benchmark takes env, experiment; plant= is for deploy"),
-        ("speed", "agent=tuned", "agent=tuned: speed takes no group; agent= is for ablate, degradation, train"),
+        ("report", "agent=tuned", "agent=tuned: report takes no group; agent= is for train"),
         (
-            "kill_campaign",
+            "mark",
             "+safety=default",
-            "safety=default: kill_campaign takes no group; safety= is for deploy, fault",
+            "safety=default: mark takes no group; safety= is for deploy",
         ),
     ],
 )

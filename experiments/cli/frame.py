@@ -26,6 +26,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from conf.presets import program
 from conf.schema import build
 from experiments.cli import extensions, files, help_page, latest, search, stop, sweep, words
 from experiments.cli.start import stopped
@@ -340,5 +341,5 @@ class Command(Generic[T]):
         names = sorted(p.name + "/" * p.is_dir() for p in folder.glob("*") if not own.match(p.name))
         kept = f"{folder} keeps {', '.join(names)}" if names else f"{folder} keeps no result"
         if self.resumes and (folder / self.resumes).is_file():
-            return f"{kept}; go on with: python -m experiments.{self.name} resume={shlex.quote(str(folder))}"
+            return f"{kept}; go on with: python -m {program(self.name)} resume={shlex.quote(str(folder))}"
         return f"{kept}; to try again, start anew"

@@ -3,7 +3,7 @@
 Each function takes arrays and returns a matplotlib Figure; `save` writes it as SVG and PNG.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "COLOURS", "closed_loop", "learning", "new_figure", "policy_map", "relative_map", "relative_trajectories", "save",
-    "scaling", "seeds", "trajectories",
+    "trajectories",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -82,20 +82,6 @@ def _population(ax: Axes, x: Array, curves: Array, colour: str, label: str) -> N
     ax.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0, label=f"range of {n} seeds")
     ax.fill_between(x, q1, q3, color=colour, alpha=0.35, linewidth=0, label="middle half")
     ax.plot(x, middle, color=colour, linewidth=1.4, label=f"{label}, median")
-
-
-def seeds(ax: Axes, values: Mapping[str, Array], label: str) -> None:
-    """A row per name on a logarithmic axis called `label`: one dot per seed, a bar at their median.
-
-    Args: values: name -> (S,), the first one on top.
-    """
-    jitter = np.random.default_rng(0)
-    for row, each in enumerate(values.values()):
-        height = row + jitter.uniform(-0.22, 0.22, each.size)
-        ax.plot(np.maximum(each, 1e-4), height, ".", color=COLOURS[0], alpha=0.45, markersize=5)
-        ax.plot([np.median(each)] * 2, [row - 0.34, row + 0.34], color=COLOURS[1], linewidth=2)
-    ax.set(xscale="log", xlabel=label, ylim=(len(values) - 0.5, -0.5))
-    ax.set_yticks(range(len(values)), list(values), fontsize=8)
 
 
 def learning(episode_return: Array, eval_step: Array, regret_pct: Array, best_step: Array) -> Figure:
@@ -260,22 +246,4 @@ def closed_loop(
     if temperature is not None:
         axes[2].set_ylabel("temperature, °C")
     axes[-1].set_xlabel("time, min")
-    return figure
-
-
-def scaling(costs: Mapping[str, tuple[NDArray[np.int64], Array]]) -> Figure:
-    """Cost over one size at a time, with the line of proportional growth through the largest.
-
-    Args: costs: title -> (sizes (K,), seconds (K,)).
-    """
-    figure, axes = new_figure(10.0, 2.9, 1, len(costs))
-    for ax, (title, (sizes, seconds)) in zip(axes, costs.items(), strict=True):
-        ax.loglog(sizes, seconds, marker="o", markersize=3.5, color=COLOURS[0], linewidth=1.2, label="measured")
-        ax.loglog(
-            sizes, seconds[-1] * sizes / sizes[-1], color="black", linewidth=0.8, linestyle=":", label="proportional"
-        )
-        ax.set_title(title, fontsize=9)
-        ax.set_xlabel(title.split(",")[0])
-    axes[0].set_ylabel("time, s")
-    axes[0].legend()
     return figure

@@ -1,5 +1,4 @@
 """One training run: agents, evaluation against the optimum, checkpoints, the exported policy.
 
-Entered by commands that train (train, benchmark, ablate, degradation, speed), which load torch with it, and by control
-for `config` alone, which is free of torch.
+Entered by train and benchmark, which load torch with it, and by control for `config` alone, which is free of torch.
 """

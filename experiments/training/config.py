@@ -1,18 +1,18 @@
-"""What a training run is told: its config, a variant of its agent, a calibrated model. Free of torch."""
+"""What a training run is told: its config, a calibrated model. Free of torch."""
 
 from dataclasses import dataclass
 from typing import Any
 
 from omegaconf import DictConfig
 
-from conf.schema import build, check, part, setting
+from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.coculture.task import CocultureConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
 from experiments.cli import files, frame
 
-__all__ = ["ENVS", "TrainConfig", "env_schema", "read_env_file", "variant"]
+__all__ = ["ENVS", "TrainConfig", "env_schema", "read_env_file"]
 
 
 ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, "coculture": CocultureConfig}
@@ -67,15 +67,3 @@ def read_env_file(path: str) -> EnvConfig:
         return frame.load(content, EnvConfig(), "env")
     except frame.UserError as error:
         raise frame.UserError(f"env_file={path}: {error}") from None
-
-
-def variant(agent: DQNConfig, name: str, values: dict[str, Any]) -> DQNConfig:
-    """`agent` with some values replaced.
-
-    Raises: ValueError naming the variant and the key that does not exist or is out of range.
-    """
-    where = f"ablations.{name}"
-    try:
-        return build(agent, values, where)
-    except ValueError as error:
-        raise ValueError(str(error) if str(error).startswith(where) else f"{where}: {error}") from None

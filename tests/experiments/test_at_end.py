@@ -7,8 +7,8 @@ import pytest
 
 from envs.scenario import Scenario
 from experiments.control.config import DeployConfig
-from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.emulator.faults import inject
+from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
 

@@ -20,12 +20,12 @@ from envs.scenario import Scenario
 from experiments.composition import registry as compositions
 from experiments.control.device import save_calibration
 from experiments.record.recovery import COLUMNS as USUAL
-from experiments.reliability.audit import audit_doses, audit_rows
-from experiments.reliability.kills import KillConfig, killed_run
-from experiments.reliability.rehearsal import SOUND, Killed, Rehearsal, rehearsed
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.vial import VialConfig
 from hardware.storage.journal import read_journal
+from tests.campaigns.audit import audit_doses, audit_rows
+from tests.campaigns.killed_run import KillConfig, killed_run
+from tests.campaigns.rehearsal import SOUND, Killed, Rehearsal, rehearsed
 from tests.experiments.composition_keeper import Reckoning
 from tests.experiments.test_composition_deploy import column, rows
 from tests.hardware.test_serial_transport import Cable, wired

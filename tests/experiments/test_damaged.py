@@ -19,9 +19,9 @@ from experiments.control.config import DeployConfig
 from experiments.control.policies import load_policy
 from experiments.deploy import _schema
 from experiments.record.record import Record
-from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import RecordingError
+from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.experiments.test_deploy import ENVIRONMENT, inverse_policy
 
 Change = Callable[[Any], object]

@@ -11,11 +11,11 @@ import pytest
 
 from envs.scenario import Scenario
 from experiments.controllers.base import Array, Controller, Mask
-from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.emulator.faults import inject
 from hardware.emulator.process import EmulatorProcess
 from hardware.safety.interlock import Response
 from hardware.storage.journal import read_journal
+from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.experiments.test_exits import SPEED, Bench
 
 LOST = """

@@ -6,9 +6,9 @@ import pytest
 
 from envs.scenario import Scenario
 from experiments.record.summary import ChangeLog, reasons_line, summarise
-from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.emulator.faults import inject
 from hardware.storage.journal import read_journal
+from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
 

@@ -20,12 +20,12 @@ from experiments.mark import main as command
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS
 from experiments.record.summary import figure_of, summarise
-from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.emulator.faults import inject
 from hardware.emulator.vial import DARK_COUNTS
 from hardware.errors import RecordingError
 from hardware.storage.marks import Mark, add_mark, read_marks
 from hardware.storage.recording_reader import read_recording
+from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.experiments.test_deploy import ROOT
 from tests.hardware.emulator_lab import BLANK, quiet
 

@@ -20,8 +20,8 @@ from experiments.control import notify
 from experiments.control.config import DeployConfig
 from experiments.control.notify import Hook, Notifier, hidden
 from experiments.record.summary import ChangeLog
-from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.emulator.faults import inject
+from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.experiments.test_deploy import ROOT
 from tests.hardware.emulator_lab import quiet
 

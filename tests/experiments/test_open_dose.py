@@ -10,11 +10,11 @@ from envs.scenario import Scenario
 from experiments.controllers.base import Array, Mask
 from experiments.loop.loop import Step
 from experiments.record.record import Record
-from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.emulator.faults import inject
 from hardware.emulator.transport import EmulatorTransport
 from hardware.link.transport import SwitchedOff
 from hardware.storage.journal import read_journal
+from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
 FEED_ON, FEED_OFF, WASTE_ON = "/SetOutputOn/Pump1/1/M0", "/SetOutputOn/Pump1/0/M0", "/SetOutputOn/Pump2/1/M0"

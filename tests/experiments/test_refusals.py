@@ -49,7 +49,7 @@ def test_a_sweep_that_cannot_be_composed_is_one_line(words: list[str], tmp_path:
         (100, ["experiments.train", *SHORT]),  # what is refused first: the config
         (12_000, ["experiments.train", *SHORT]),  # the checkpoint, which torch writes
         (12_000, ["experiments.calibrate"]),  # a figure
-        (3_000, ["experiments.ablate", "only=[tuned]", "n_agents=1", "agent.total_steps=200"]),  # the events
+        (3_000, ["tests.studies.ablate", "only=[tuned]", "n_agents=1", "agent.total_steps=200"]),  # the events
     ],
 )
 def test_a_full_disk_is_one_line(limit: int, words: list[str], tmp_path: Path) -> None:

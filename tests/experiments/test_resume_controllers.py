@@ -21,10 +21,10 @@ from experiments.controllers import registry
 from experiments.controllers.base import Array, Controller, Mask, Remembers
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.record.recovery import load_state
-from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
+from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
 NAMES = ("M0", "M1", "M2")

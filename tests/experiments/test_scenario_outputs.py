@@ -17,7 +17,6 @@ from experiments.cli import frame
 from experiments.control import assemble
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.supply import Supply
-from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import SupplyConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
@@ -27,6 +26,7 @@ from hardware.errors import DeviceStateError
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
+from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.hardware.emulator_lab import BIAS_S, quiet
 
 STEPS = Scenario((0.4, 0.4), (60.0, 20.0), (37.0, 37.0), outputs=("pump3 3 mL/h, pump4 1.5 mL", None))

@@ -12,7 +12,7 @@ from envs.scenario import Scenario
 from experiments.comparison.config import BenchmarkConfig
 from experiments.loop.progress import Progress
 from experiments.record.summary import summarise
-from experiments.reliability.rehearsal import Killed, Rehearsal, rehearsed
+from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
 ALL = np.array([True, True])

@@ -15,10 +15,10 @@ from uuid import uuid4
 import pytest
 
 from dqn import checkpoint
-from experiments.ablate import AblateConfig, _read
 from experiments.cli import frame, stop
 from experiments.training.config import TrainConfig
 from experiments.training.session import Session
+from tests.studies.ablate import AblateConfig, _read
 
 ROOT = Path(__file__).parents[2]
 SHORT = ["agent=paper", "agent.total_steps=1000", "agent.learn_start=100", "eval_every=200"]
@@ -90,7 +90,7 @@ class Run:
 
 def go_on(run: Run, line: str) -> None:
     """Run the command that the line names, as it stands there."""
-    told = re.search(r"go on with: python (-m experiments\.\w+ resume=.+)$", line)
+    told = re.search(r"go on with: python (-m [\w.]+ resume=.+)$", line)
     assert told, line
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, *shlex.split(told[1])]
@@ -166,7 +166,7 @@ def test_a_stop_while_an_extension_module_loads_is_a_stop() -> None:
 
 
 def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
-    run = Run(tmp_path, "experiments.fault_matrix", "workers=2")
+    run = Run(tmp_path, "tests.campaigns.faults", "workers=2")
     run.until_processes(4)  # the command, two workers, and what tracks their semaphores
     run.process.kill()
     run.process.wait()
@@ -177,7 +177,7 @@ def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
 
 
 def test_a_stopped_ablation_goes_on_in_the_middle_of_a_variant(tmp_path: Path) -> None:
-    run = Run(tmp_path, "experiments.ablate", *SHORT, "only=[tuned]", "n_agents=2", "hydra.run.dir=study")
+    run = Run(tmp_path, "tests.studies.ablate", *SHORT, "only=[tuned]", "n_agents=2", "hydra.run.dir=study")
     run.until_there("study/tuned/progress.csv")
     run.ctrl_c()
     line = run.end()
@@ -196,22 +196,26 @@ def test_a_stopped_ablation_goes_on_in_the_middle_of_a_variant(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("words", "there", "kept"),
     [
-        (["degradation", "n_agents=1", "agent.total_steps=100"], "curves.csv", "curves.csv"),
-        (["soak"], "state.json", "certificate.json, journal.jsonl, policy.npz, recordings/, state.json"),
-        (["speed"], "config.yaml", "no result"),
-        (["calibrate", "coverage=1000"], "config.yaml", "no result"),
-        (["fault_matrix", "workers=2"], "fault_matrix.log", "cases.csv"),  # the first case is logged
+        (["tests.studies.degradation", "n_agents=1", "agent.total_steps=100"], "curves.csv", "curves.csv"),
+        (
+            ["tests.campaigns.soak"],
+            "state.json",
+            "certificate.json, journal.jsonl, policy.npz, recordings/, state.json",
+        ),
+        (["tests.studies.speed"], "config.yaml", "no result"),
+        (["experiments.calibrate", "coverage=1000"], "config.yaml", "no result"),
+        (["tests.campaigns.faults", "workers=2"], "faults.log", "cases.csv"),  # the first case is logged
     ],
 )
 def test_a_stopped_command_says_what_it_keeps(words: list[str], there: str, kept: str, tmp_path: Path) -> None:
-    run = Run(tmp_path, f"experiments.{words[0]}", *words[1:], "hydra.run.dir=run")
+    run = Run(tmp_path, *words, "hydra.run.dir=run")
     run.until_there(f"run/{there}")
     run.ctrl_c()
     assert run.end() == f"stopped; run keeps {kept}; to try again, start anew"
 
 
 def test_a_stopped_kill_campaign_leaves_neither_clients_nor_emulators(tmp_path: Path) -> None:
-    run = Run(tmp_path, "experiments.kill_campaign", "kills=4", "runs=2", "longest_s=60", "hydra.run.dir=run")
+    run = Run(tmp_path, "tests.campaigns.kills", "kills=4", "runs=2", "longest_s=60", "hydra.run.dir=run")
     run.until_there("run/run0/journal.jsonl")
     run.ctrl_c()
     assert "run keeps calibration/, ended_runs.json, run0.log, run0/" in run.end()

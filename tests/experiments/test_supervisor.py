@@ -13,9 +13,9 @@ from experiments.control.policies import find_policy, load_policy
 from experiments.controllers.estimator import LOG_OD, EstimatorConfig
 from experiments.controllers.learned import RelativeController
 from experiments.record.summary import ChangeLog
-from experiments.reliability.rehearsal import Rehearsal, rehearsed
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.storage.journal import read_journal
+from tests.campaigns.rehearsal import Rehearsal, rehearsed
 
 MODEL = EnvConfig(mu=0.025, tau=1 / 3)
 SHIPPED = find_policy("shipped")

@@ -8,7 +8,6 @@ import numpy as np
 from envs.scenario import Scenario
 from experiments.controllers.base import Array, Mask
 from experiments.loop.loop import ClosedLoop, Step
-from experiments.reliability.rehearsal import SOUND
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.reactors import ChiBioReactors
@@ -20,6 +19,7 @@ from hardware.link.transport import Reply, SwitchedOff, Transport
 from hardware.logbook import Log
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
+from tests.campaigns.rehearsal import SOUND
 
 
 class Spy(Transport):

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments.reliability.rehearsal import SOUND
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.preflight import Check, preflight
+from tests.campaigns.rehearsal import SOUND
 from tests.hardware.driver_lab import DriverLab
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
-from experiments.reliability.rehearsal import SOUND
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError, RecordingError
 from hardware.reactor import Command
+from tests.campaigns.rehearsal import SOUND
 from tests.hardware.driver_lab import DriverLab
 from tests.hardware.emulator_lab import BIAS_S, START_S, quiet
 

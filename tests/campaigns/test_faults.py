@@ -1,0 +1,214 @@
+"""The fault matrix on a few faults, and that its judge would notice what it looks for."""
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from envs.scenario import Scenario
+from experiments.cli import frame
+from hardware.chibio.overflow_pump import OverflowPumpConfig
+from hardware.emulator.vial import Dose
+from hardware.safety.config import SafetyConfig
+from tests.campaigns.audit import audit_doses
+from tests.campaigns.chibio_case import FaultCase
+from tests.campaigns.chibio_faults import FAULTS, Fault, both, by_name, post, run_device, set_
+from tests.campaigns.faults import FaultMatrixConfig, all_cases
+from tests.campaigns.outcome import Outcome, declared, table, totals
+from tests.campaigns.rehearsal import Rehearsal, rehearsed
+
+ROOT = Path(__file__).parents[2]
+SCHEDULE = Scenario((0.6, 0.5), (20.0, 20.0), (37.0, 37.0), 0.6)
+
+
+def run(
+    fault: Fault | None,
+    moment: str = "steady",
+    safety: SafetyConfig | None = None,
+    pump: OverflowPumpConfig | None = None,
+) -> Outcome:
+    return FaultCase(fault, moment, rehearsed(("M0", "M1"), SCHEDULE, safety, overflow_pump=pump), 3).run()
+
+
+def test_a_healthy_run_says_nothing_and_holds_the_setpoints() -> None:
+    outcome = run(None)
+    assert outcome.ok, outcome
+    assert outcome.kinds == {}
+    assert outcome.outcome == "completed"
+    assert outcome.peak_error < 0.06
+    assert outcome.pumps_off
+
+
+@pytest.mark.parametrize(
+    ("name", "moment", "reason"),
+    [
+        ("spectrometer dead", "steady", "spectrometer"),
+        ("link down 5 min", "dose", "link"),
+        ("request hangs 45 s", "dose", "restarted"),
+        ("reactor unplugged", "step", "link"),
+        ("started without a reactor", "dose", "absent"),
+        ("started without it in 3 s", "dose", "absent"),
+        ("foreign blank", "recovery", "blank"),
+        ("program killed 2 min", "dose", "end:killed"),
+        ("computer loses power", "dose", "repair:torn"),
+        ("disk full", "dose", "end:journal"),
+    ],
+)
+def test_what_the_table_declares_happens(name: str, moment: str, reason: str) -> None:
+    outcome = run(by_name((name,))[0], moment)
+    assert outcome.ok, outcome
+    assert outcome.reason == reason
+    assert outcome.rows_lost == outcome.doses_doubled == 0
+    assert not outcome.overflowed
+
+
+def test_a_fault_that_nobody_tells_of_is_found() -> None:
+    mute = Fault("mute", "a weak pump that must be told", set_("pump_gain_factor", 0.6), ("no_dilution",))
+    assert "not detected" in run(mute).wrong
+
+
+@pytest.mark.parametrize("after_s", [0.0, 2.0, 7.0, 12.0])
+def test_a_device_back_without_a_reactor_before_anybody_misses_it_is_not_ended_by_the_end_of_a_dose(
+    after_s: float,
+) -> None:
+    def begin(r: Rehearsal) -> None:
+        back = both(run_device, set_("unplugged"), set_("crash"), set_("restart"))
+        r.clock.at(r.clock.now() + after_s, lambda: back(r))
+
+    outcome = run(Fault("back at once", "", begin, ("absent",), wide=True, blind=True, gone=True), "dose")
+    assert outcome.exits == 1, outcome  # the one of the fault itself
+    assert outcome.wrong == ["device ended"]
+    assert outcome.reason == "absent"
+
+
+def test_a_program_that_ends_the_device_or_leaves_a_neighbour_is_found() -> None:
+    careless = Fault("careless", "", both(set_("unplugged"), set_("crash"), set_("restart")), ("absent",), gone=True,
+                     end=post("/MeasureTemp/IR/M0"), minutes=2.0, wide=True, blind=True)  # fmt: skip
+    assert {"device ended", "neighbour lost"} <= set(run(careless).wrong)
+
+
+def test_an_overflow_is_found_unless_it_is_declared() -> None:
+    blocked = by_name(("waste blocked",))[0]
+    assert run(blocked).overflowed
+    assert run(replace(blocked, overflow="")).wrong == ["overflow"]
+
+
+@pytest.mark.parametrize("name", ["feed stuck open", "waste blocked"])
+def test_what_overflows_on_the_standard_rig_does_not_with_an_overflow_pump(name: str) -> None:
+    fault = by_name((name,))[0]
+    without = run(fault)
+    assert without.ok, without
+    assert (without.overflowed, without.label) == (True, f"{name}, no overflow pump")
+    guarded = run(fault, pump=FaultMatrixConfig().overflow_pump)
+    assert guarded.ok, guarded
+    assert (guarded.overflowed, guarded.label) == (False, name)
+    assert guarded.peak_ml < 27.0
+
+
+def test_an_overflow_beside_an_overflow_pump_is_never_as_declared() -> None:
+    too_weak = OverflowPumpConfig("Pump3", 0.95, 0.9)
+    assert run(by_name(("feed stuck open",))[0], pump=too_weak).wrong == ["overflow"]
+
+
+@pytest.mark.parametrize("name", ["overflow pump blocked", "foreign overflow pump off"])
+def test_faults_of_the_overflow_pump_itself(name: str) -> None:
+    outcome = run(by_name((name,))[0], pump=FaultMatrixConfig().overflow_pump)
+    assert outcome.ok, outcome
+
+
+@pytest.mark.parametrize("minutes", [3.0, 30.0])
+def test_a_resumed_run_does_not_speak_of_lost_reactors_before_they_had_their_chance(
+    tmp_path: Path, minutes: float
+) -> None:
+    r = Rehearsal(tmp_path, rehearsed(("M0", "M1", "M2"), SCHEDULE))
+    r.begin()
+    for _ in r.run(600.0):
+        pass
+    r.close()
+    r.wait(60.0 * minutes)
+    r.begin()
+    words = [reason for step in r.run(r.clock.now() + 600.0) for reason in step.reasons if reason]
+    assert [word for word in words if word.startswith(("stale", "lost", "silent"))] == []
+    r.reactors.stop()
+    r.close()
+
+
+def test_rigs_with_and_without_overflow_pump_are_counted_apart() -> None:
+    names = ("waste blocked", "overflow pump blocked", "feed blocked")
+    config = FaultMatrixConfig(faults=names, moments=("dose",), controls=1)
+    assert [(name, guarded) for name, _, _, guarded in all_cases(config)] == [
+        ("", True), ("waste blocked", True), ("overflow pump blocked", True), ("feed blocked", True),
+        ("waste blocked", False),
+    ]  # fmt: skip
+    bare = replace(config, overflow_pump=OverflowPumpConfig())
+    assert [(name, guarded) for name, _, _, guarded in all_cases(bare)] == [
+        ("", False), ("waste blocked", False), ("feed blocked", False),
+    ]  # fmt: skip
+    found = [Outcome("a", "dose", guarded, overflowed=over) for guarded, over in ((True, True), (True, False))]
+    found += [Outcome("a", "dose", False, overflowed=True)] * 3
+    total = totals(found)
+    assert (total["overflows"], total["cases_without_guard"], total["overflows_without_guard"]) == (1, 3, 3)
+    assert "| a, no overflow pump |" in table(found)
+
+
+def test_a_word_in_a_healthy_run_is_a_false_alarm() -> None:
+    nervous = SafetyConfig(jump=1e-4, jump_fraction=1e-4)
+    assert "false alarm" in run(None, safety=nervous).wrong
+
+
+def test_doses_are_audited_by_intent_and_sample() -> None:
+    def intent(at: float, cycle: int) -> dict[str, object]:
+        return {"kind": "intent", "reactor": "M0", "on_s": at, "sample": [60.0 * cycle, cycle], "feed_ml": 0.5}
+
+    journal = [{"kind": "device", "reactor": "M0", "start_time": "a"}, intent(20.0, 1), intent(80.0, 2)]
+
+    def dose(at: float, pump: str = "Pump1") -> Dose:
+        return Dose(pump, 100.0 + at, 0.5, 1, 0.5)
+
+    assert audit_doses(journal, [dose(21.0), dose(21.0, "Pump2"), dose(81.0)], "M0", 100.0) == (0, 0)
+    assert audit_doses(journal, [dose(21.0), dose(30.0), dose(81.0)], "M0", 100.0) == (1, 0)
+    assert audit_doses(journal, [dose(5.0), dose(21.0)], "M0", 100.0) == (1, 0)
+    assert audit_doses(journal, [dose(81.0), dose(144.0), dose(207.0)], "M0", 100.0) == (0, 2)
+    assert audit_doses([*journal, intent(85.0, 2)], [], "M0", 100.0) == (1, 0)
+    assert audit_doses([*journal, journal[0] | {"start_time": "b"}, intent(200.0, 2)], [], "M0", 100.0) == (0, 0)
+
+
+def test_every_fault_declares_what_is_expected_and_has_a_name_of_its_own() -> None:
+    assert len(FAULTS) >= 40
+    assert len({f.name for f in FAULTS}) == len(FAULTS)
+    with pytest.raises(ValueError, match="needs either"):
+        Fault("x", "y", set_("bus_stuck"))
+    with pytest.raises(ValueError, match="no such fault; allowed feed blocked"):
+        by_name(("nonsense",))
+
+
+def test_table_and_totals() -> None:
+    good = Outcome("feed blocked", "steady", detected_s=600.0, reason="no_dilution", response="hold", pumps_off=True)
+    bad = Outcome("feed blocked", "step", pumps_off=True, wrong=["not detected"], rows_lost=2)
+    text = table([good, bad])
+    assert "| feed blocked | 10.0 (1 of 2) | no_dilution | hold |" in text
+    assert "**no**: not detected" in text
+    assert "1 mL/s fills the headroom" in declared(by_name(("feed stuck open", "feed blocked")))
+    assert (totals([good, bad])["rows_lost"], totals([good, bad])["not_as_declared"]) == (2, 1)
+
+
+def test_the_command(tmp_path: Path) -> None:
+    faults = "faults=[OD frozen,disk full]"
+    command = [sys.executable, "-m", "tests.campaigns.faults", faults, "moments=[dose]", "controls=1", "workers=1"]
+    done = subprocess.run([*command, f"hydra.run.dir={tmp_path}"], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["cases"], summary["undetected"], summary["not_as_declared"]) == (3, 0, 0)
+    with open(tmp_path / "cases.csv", newline="") as f:
+        assert [row["reason"] for row in csv.DictReader(f)] == ["", "frozen", "end:journal"]
+    assert (tmp_path / "figures" / "fault_matrix.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("override", ["moments=[noon]", "reactors=[M1]", "controller_kind=oracle", "faults=[nonsense]"])
+def test_bad_values_are_named(override: str) -> None:
+    with pytest.raises(frame.UserError, match="allowed|nonsense"):
+        frame.load(frame.compose("fault_matrix", [override]), FaultMatrixConfig())

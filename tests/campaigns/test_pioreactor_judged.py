@@ -1,0 +1,131 @@
+"""The judge of faults at the Pioreactor rig: a sound trial by hand passes, and every planted fault of it does not."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from hardware.rig.vials import Pulse
+from tests.campaigns.pioreactor_case import SICK, WELL, Seen
+from tests.campaigns.pioreactor_faults import MOMENTS, RIG_FAULTS, RigFault, rig_faults_named
+from tests.campaigns.pioreactor_judged import judged
+
+STRUCK = 30.0
+FAULT = RigFault("made_up", "", lambda t: None, by=("a word",))
+
+
+def sound() -> Seen:
+    """Ten samples of two units, 12 s apart, a dose of 0.5 mL for each of the sick one's; a word at the third."""
+    journal: list[dict[str, Any]] = []
+    pulses, rows, vials = [], {SICK: [], WELL: []}, {SICK: [], WELL: []}  # type: ignore[var-annotated]
+    for k in range(10):
+        wall = 12.0 * k
+        for unit in (SICK, WELL):
+            journal.append({"kind": "sample", "reactor": unit, "wall": wall, "sample_s": 60.0 * k})
+            rows[unit].append((float(k), 0.5))
+        if k == 3:
+            journal.append({"kind": "note", "reactor": SICK, "wall": wall, "note": "a word on it"})
+        journal.append({"kind": "feed_on", "reactor": SICK, "wall": wall + 0.1, "id": f"r/{k}"})
+        pulses.append(Pulse(SICK, "media", wall + 0.5, 0.5, 0.5))
+        end = {"kind": "dose_end", "reactor": SICK, "wall": wall + 2.0, "id": f"r/{k}", "feed_ml": 0.5}
+        journal.append({**end, "feed_low_ml": 0.5})
+    for second in range(120):
+        for unit in (SICK, WELL):
+            fed = 0.5 * min((second + 11) // 12, 10)
+            vials[unit].append(
+                {"wall": float(second), "od": 0.5, "fed_ml": fed, "peak_ml": 20.5, "duty": {"12": 0.0, "13": 0.0}}
+            )
+    return Seen(tuple(journal), rows, tuple(pulses), vials, "", 0, 5.0)
+
+
+def wrong(seen: Seen, fault: RigFault = FAULT) -> str:
+    return "; ".join(judged(fault, "between", [STRUCK], seen).wrong)
+
+
+def changed(seen: Seen, kind: str, number: int, **values: Any) -> Seen:
+    """The same with other values in the n-th row of a kind of the sick unit's journal."""
+    at = [i for i, row in enumerate(seen.journal) if row["kind"] == kind and row["reactor"] == SICK][number]
+    rows = [{**row, **values} if i == at else row for i, row in enumerate(seen.journal)]
+    return replace(seen, journal=rows)
+
+
+def vial(seen: Seen, unit: str, first: int, **values: Any) -> Seen:
+    """The same with other values of a vial from a second on."""
+    rows = [{**row, **values} if i >= first else row for i, row in enumerate(seen.vials[unit])]
+    return replace(seen, vials={**seen.vials, unit: rows})
+
+
+def test_a_sound_trial_passes_and_is_counted() -> None:
+    found = judged(FAULT, "between", [STRUCK], sound())
+    assert found.ok, found.wrong
+    assert (found.doses, found.doubled, found.rows, found.rows_lost) == (10, 0, 10, 0)
+    assert found.told_s == pytest.approx(6.0)  # from second 30 to the sample at 36
+    assert (found.low_ml, found.high_ml, found.true_ml) == pytest.approx((5.0, 5.0, 5.0))
+
+
+def test_a_run_of_the_pump_without_a_request_is_seen() -> None:
+    seen = sound()
+    twice = replace(seen, pulses=(*seen.pulses, Pulse(SICK, "media", 26.0, 0.5, 0.5)))
+    assert "without a request" in wrong(twice)
+    assert not wrong(twice, replace(FAULT, foreign=1))
+    cycled = replace(seen, pulses=(*seen.pulses, Pulse(SICK, "media", 26.0, 0.1, 0.1)))
+    assert not wrong(cycled)
+
+
+def test_a_request_while_another_is_open_is_seen() -> None:
+    assert "fate of another" in wrong(changed(sound(), "dose_end", 4, id="other"))
+    assert "no end on record" in wrong(changed(sound(), "dose_end", 9, id="other"))
+    assert "given twice" in wrong(changed(changed(sound(), "feed_on", 5, id="r/4"), "dose_end", 5, id="r/4"))
+
+
+def test_the_truth_outside_the_record_is_seen() -> None:
+    assert "on record" in wrong(vial(sound(), SICK, 100, fed_ml=6.0))
+    assert "on record" in wrong(vial(sound(), SICK, 100, fed_ml=3.5))
+    bounded = changed(sound(), "dose_end", 3, feed_ml=1.5)  # what is not known is counted whole
+    assert not wrong(vial(bounded, SICK, 100, fed_ml=6.0))
+    assert not wrong(vial(sound(), SICK, 100, fed_ml=6.0), replace(FAULT, flow=True))
+
+
+def test_a_lost_row_and_a_row_too_many_are_seen() -> None:
+    seen = sound()
+    without = replace(seen, rows={**seen.rows, SICK: seen.rows[SICK][:4] + seen.rows[SICK][5:]})
+    assert "in no row" in wrong(without)
+    more = replace(seen, rows={**seen.rows, WELL: [*seen.rows[WELL], (9.5, 0.5)]})
+    assert "without a sample" in wrong(more)
+
+
+def test_silence_is_seen() -> None:
+    assert "not told" in wrong(changed(sound(), "note", 0, note="something else"))
+    assert "told after" in wrong(sound(), replace(FAULT, within_s=-7.0))
+    assert "min without a row" in wrong(
+        replace(sound(), rows={unit: [(0.0, 0.5), (60.0, 0.5)] for unit in (SICK, WELL)}), replace(FAULT, seconds=1.0)
+    )
+
+
+def test_cultures_and_pumps_are_judged_by_the_vials() -> None:
+    assert "from its setpoint" in wrong(vial(sound(), SICK, 100, od=0.6))
+    assert "other culture" in wrong(vial(vial(sound(), WELL, 50, od=0.6), WELL, 60, od=0.5))
+    assert "pump runs at the end" in wrong(vial(sound(), WELL, 119, duty={"12": 100.0, "13": 0.0}))
+    assert "rose to" in wrong(vial(sound(), SICK, 50, peak_ml=25.0))
+    assert "ended with" in wrong(replace(sound(), status=1))
+    assert "nothing is on record" in wrong(replace(sound(), journal=()))
+
+
+def test_what_must_not_start_is_refused_with_one_line() -> None:
+    fault = replace(FAULT, refused=True)
+    refused = replace(sound(), status=1, told="INFO pass\nerror: a word; remedy\n", journal=())
+    assert not wrong(refused, fault)
+    assert "does not name it" in wrong(replace(refused, told="error: something\n"), fault)
+    assert "not refused" in wrong(replace(refused, status=0), fault)
+    assert "not refused" in wrong(replace(refused, told="Traceback\nerror: a word\n"), fault)
+    assert "dosed" in wrong(replace(refused, journal=sound().journal), fault)
+
+
+def test_every_fault_says_what_is_expected_and_when_it_comes() -> None:
+    names = [fault.name for fault in RIG_FAULTS]
+    assert len(names) == len(set(names)) >= 26
+    assert all(set(fault.moments) <= set(MOMENTS) for fault in RIG_FAULTS)
+    with pytest.raises(ValueError, match="faults = nothing: allowed client_killed"):
+        rig_faults_named(["nothing"])
+    with pytest.raises(ValueError, match="either"):
+        replace(FAULT, why_not="and a reason")
