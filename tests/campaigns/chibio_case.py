@@ -15,14 +15,14 @@ from hardware.errors import ReactorError
 from hardware.safety.config import Response
 from hardware.storage.journal import read_journal
 from tests.campaigns.audit import audit_doses, audit_rows
-from tests.campaigns.chibio_faults import FAULTY, INF, Fault
-from tests.campaigns.outcome import Outcome, allowed, judge
+from tests.campaigns.chibio_faults import FAULTY, INF
+from tests.campaigns.fault import Fault
+from tests.campaigns.outcome import Outcome, allowed, judged
 from tests.campaigns.rehearsal import Killed, Rehearsal
 from tests.campaigns.tracking import BAND_OD, Tracking
 
-__all__ = ["MOMENTS", "FaultCase"]
+__all__ = ["ChiBioCase"]
 
-MOMENTS = ("recovery", "steady", "step", "dose")
 QUIET = DeviceOptions(vial=VialConfig(outlier_rate=0.0))
 """No reading jumps for no reason, which could be taken for the fault."""
 STOPPED_S = 120.0  # after its detection, within which dosing has to end where no dose is right
@@ -121,7 +121,7 @@ def _bands(fault: Fault | None, n: int) -> Array:
 
 
 def _is_time(moment: str, r: Rehearsal) -> bool:
-    """Whether a rehearsal is at one of `MOMENTS`."""
+    """Whether a rehearsal is at one of `fault.VIRTUAL`."""
     minutes = r.clock.now() / 60.0
     elapsed = (r.clock.now() - r.spans[0][0]) / 60.0 - float(r.loop.began[0])
     first = r.loop.schedules[0].minutes[0]
@@ -135,11 +135,11 @@ def _is_time(moment: str, r: Rehearsal) -> bool:
     return r.device.vials[FAULTY].motor("Pump1") != 0
 
 
-class FaultCase:
+class ChiBioCase:
     """A fault at a moment: `run` gives its `Outcome`.
 
     Args:
-      fault: None for a healthy control run. moment: of `MOMENTS`.
+      fault: None for a healthy control run. moment: of `fault.VIRTUAL`.
       config: of the run, as `rehearsed` gives it, with `FAULTY` the first reactor; its overflow pump is the rig's,
         and an overflow may be declared only where there is none.
       seed: of all noise.
@@ -159,8 +159,7 @@ class FaultCase:
             self.r.clock.at(1.0, self._wait_for_it)
             self._run_and_resume()
             self._audit()
-        self.result.wrong = judge(self.result, self.fault)
-        return self.result
+        return judged(self.result, self.fault)
 
     def _wait_for_it(self) -> None:
         """Every quarter of a second: is it time for the fault?"""

@@ -1,82 +1,24 @@
-"""What can go wrong in an unattended run, how it is brought about, and what is expected of the system then.
-
-The table `FAULTS` is the declaration: for every fault either the reasons of which one must be given (`by`), or why no
-detection is needed or possible (`why_not`). Sources: docs/device.md, Failures; docs/biology.md, Faults.
-"""
+"""What can go wrong in an unattended run of an emulated Chi.Bio, and how it is brought about: the table `FAULTS`."""
 
 import os
 import resource
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from envs.scenario import Scenario
 from experiments.controllers.base import Array, Mask
 from hardware.emulator.faults import inject
+from tests.campaigns.fault import Fault
 from tests.campaigns.rehearsal import Rehearsal
 from tests.campaigns.tracking import BAND_OD, STEP_OD, TOP_OD, outage, undosed
 
-__all__ = ["FAULTS", "FAULTY", "Fault", "by_name"]
+__all__ = ["FAULTS", "FAULTY"]
 
 FAULTY = "M0"
 """The reactor that a fault of one reactor strikes; the others are its healthy neighbours."""
 
 Act = Callable[[Rehearsal], None]
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One fault and what is declared about it.
-
-    name, what: for tables. begin, end: bring it about and mend it. minutes: until it is mended; inf = never.
-    by: it must be told by one of these: a reason of the interlock, or `note:TEXT`, `end:TEXT`, `repair:TEXT` for words
-      in a note of the driver, in the run's outcome or among the repairs of a resumed run.
-    why_not: why it need not, or cannot, be detected; empty if it must be.
-    wide: it strikes the whole board or program, not only the reactor `FAULTY`.
-    blind: samples made meanwhile cannot be read, or none are made.
-    program: the program ends; it is resumed after `minutes`.
-    rogue: something else than this program moves the feed pump, so its runs say nothing about doubled doses.
-    error: largest distance, OD, of the faulty culture from what the schedule asks and the pump can do; by default it
-      gets no dose for three minutes. recovery_min: within so many minutes after the end of the fault (of a lasting one:
-      after its begin) it is back, and stays, within `band`, OD, of what growth and full dilution can reach from where
-      it was at the first dose after the fault (`tracking.FIRST_DOSE_MIN`). Neighbours are held to all three if the
-      fault is `wide`, else to those of a healthy run. Of a reactor that is `gone` none is judged.
-    unheld: why the culture does not come back; only `error` is judged then.
-    stops: why no dose is right from its detection on; neither is judged then, but that nothing is dosed.
-    stuck: a motor that runs whatever it is told cannot be at rest at the end.
-    gone: the reactor is absent at the end: its pumps rest without power, which cannot be verified and must be told.
-    overflow: why it overflows on a rig without an overflow pump, on which it is run as well; empty if there must be no
-      overflow on either.
-    of_overflow_pump: it is a fault of that pump, run only where there is one.
-    """
-
-    name: str
-    what: str
-    begin: Act
-    by: tuple[str, ...] = ()
-    end: Act | None = None
-    minutes: float = np.inf
-    why_not: str = ""
-    wide: bool = False
-    blind: bool = False
-    program: bool = False
-    rogue: bool = False
-    error: float = undosed(3.0)
-    recovery_min: float = 10.0
-    band: float = BAND_OD
-    unheld: str = ""
-    stops: str = ""
-    stuck: bool = False
-    gone: bool = False
-    overflow: str = ""
-    of_overflow_pump: bool = False
-
-    def __post_init__(self) -> None:
-        if bool(self.by) == bool(self.why_not):
-            raise ValueError(f"fault {self.name}: needs either `by` or `why_not`")
-        if self.unheld and self.stops:
-            raise ValueError(f"fault {self.name}: `stops` says already that the culture is not held")
 
 
 def set_(name: str, value: float = 1.0) -> Act:
@@ -389,12 +331,3 @@ FAULTS: tuple[Fault, ...] = (
           why_not="without a level sensor it looks like faster growth; an overflow pump keeps the level at its tube",
           overflow="10 mL of headroom fill in 15 to 25 min of feed", error=0.15, band=0.12),
 )  # fmt: skip
-
-
-def by_name(names: tuple[str, ...]) -> tuple[Fault, ...]:
-    """The named faults, or all for (). Raises: ValueError naming one that does not exist and those that do."""
-    known = {f.name: f for f in FAULTS}
-    for name in names:
-        if name not in known:
-            raise ValueError(f"faults = {name}: no such fault; allowed {', '.join(known)}")
-    return tuple(known[name] for name in names) or FAULTS

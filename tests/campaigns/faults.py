@@ -1,4 +1,8 @@
-"""Every fault at every moment of a run, in virtual time: `python -m tests.campaigns.faults`."""
+"""Every fault at every moment of a run, of both families: `python -m tests.campaigns.faults`.
+
+The emulated Chi.Bio is rehearsed in virtual time. At the Pioreactor rig real client processes control simulated vials
+through the vendor's web server, task queue, jobs and broker, in real time.
+"""
 
 import logging
 import math
@@ -13,42 +17,53 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from conf.schema import check, part, require, setting
 from envs.scenario import Scenario
-from experiments.cli import files, frame
-from experiments.cli.stop import Workers
+from experiments.cli import files, frame, stop
 from experiments.controllers.registry import on_device
 from hardware.chibio.overflow_pump import OverflowPumpConfig
+from hardware.pioreactor.config import PUBLISHED
 from hardware.safety.config import SafetyConfig
-from tests.campaigns.chibio_case import MOMENTS, FaultCase
-from tests.campaigns.chibio_faults import FAULTY, by_name
+from tests.campaigns.chibio_case import ChiBioCase
+from tests.campaigns.chibio_faults import FAULTY
+from tests.campaigns.fault import FAMILIES, MOMENTS, VIRTUAL, Fault
+from tests.campaigns.fault_table import FAULTS, by_name
 from tests.campaigns.outcome import Outcome, declared, table, totals, write_cases
+from tests.campaigns.pioreactor_case import PioreactorCase
 from tests.campaigns.rehearsal import rehearsed
 from tests.entry import command
 
-__all__ = ["FaultMatrixConfig", "fault_matrix"]
+__all__ = ["Case", "FaultsConfig", "faults"]
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class FaultMatrixConfig:
+class FaultsConfig:
     """Which faults to try, and when. Raises: ValueError naming key, value and allowed range.
 
     Faults that overflow without an overflow pump are run on a rig without as well. Without a pump everything is run on
     that rig, and its own faults are left out. Healthy runs have no sensor outliers.
     """
 
+    families: tuple[str, ...] = setting(("chibio",), "all faults of these, where none is named", choices=FAMILIES)
+    faults: tuple[str, ...] = setting((), "names, as in docs/faults.md and docs/pioreactor.md; empty: all of families")
+    moments: tuple[str, ...] = setting(
+        MOMENTS,
+        "of a Chi.Bio: recovery; steady at the first setpoint; after the step; feed pump running. Of a Pioreactor: "
+        "before the start; between doses; in one",
+        choices=MOMENTS, some=True,
+    )  # fmt: skip
     reactors: tuple[str, ...] = setting(("M0", "M1"), "the first falls sick, the others are its neighbours", some=True)
     scenario: Scenario = part(
-        lambda: Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8), "of every run"
+        lambda: Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 37.0), 0.8), "of every run of a Chi.Bio"
     )
     safety: SafetyConfig = part(SafetyConfig, "limits of the interlock")
     controller_kind: str = setting("dqn", "a controller that can run a device; dqn is the policy that ships")
-    overflow_pump: OverflowPumpConfig = part(lambda: OverflowPumpConfig("Pump3", 0.95, 1.2), "of the rig")
-    faults: tuple[str, ...] = setting((), "names, as in docs/faults.md; empty: all")
-    moments: tuple[str, ...] = setting(
-        MOMENTS, "recovery; steady at the first setpoint; after the step; feed pump running", choices=MOMENTS, some=True
-    )
+    overflow_pump: OverflowPumpConfig = part(lambda: OverflowPumpConfig("Pump3", 0.95, 1.2), "of the Chi.Bio's rig")
     controls: int = setting(10, "healthy runs: whatever the interlock says there is a false alarm", within=(0, 1000))
+    kills: int = setting(5, "times that each kill at the Pioreactor rig is repeated in its run", within=(1, 100))
+    speed: float = setting(5.0, "of that rig: growth faster than real time", within=(1, 30))
+    settle: int = setting(2, "doses there after the last fault before the run is ended", within=(1, 100))
+    package: str = setting(PUBLISHED, "version of the vendor's software on the package index, or a wheel's path")
     seed: int = setting(0, "of all noise", at_least=0)
     workers: int = setting(0, "processes; 0: one per core", within=(0, 64))
 
@@ -61,44 +76,70 @@ class FaultMatrixConfig:
         setpoints = self.scenario.setpoints
         require(len(setpoints) >= 2, "scenario.setpoints", setpoints, "two phases or more")
 
-
-def run_case(config: FaultMatrixConfig, name: str, moment: str, seed: int, guarded: bool) -> Outcome:
-    """One case, in whatever process. Args: name: of the fault, "" for a healthy run. guarded: with an overflow pump."""
-    fault = by_name((name,))[0] if name else None
-    pump = config.overflow_pump if guarded else OverflowPumpConfig()
-    run = rehearsed(config.reactors, config.scenario, config.safety, config.controller_kind, pump)
-    return FaultCase(fault, moment, run, seed).run()
+    @property
+    def wanted(self) -> tuple[Fault, ...]:
+        """The faults to try; those of an overflow pump only where there is one."""
+        named = by_name(self.faults) or tuple(f for f in FAULTS if f.family in self.families)
+        return tuple(f for f in named if self.overflow_pump.pump or not f.of_overflow_pump)
 
 
-def all_cases(config: FaultMatrixConfig) -> list[tuple[str, str, int, bool]]:
-    """(fault, moment, seed, rig with overflow pump) of every case; controls first, the rig without one last."""
-    there = bool(config.overflow_pump.pump)
-    faults = by_name(config.faults)
-    rigs = [(f.name, there) for f in faults if there or not f.of_overflow_pump]
-    rigs += [(f.name, False) for f in faults if there and f.overflow]
-    controls = [("", "steady", config.seed + k, there) for k in range(config.controls)]
-    return controls + [(name, moment, config.seed, guarded) for name, guarded in rigs for moment in config.moments]
+@dataclass(frozen=True)
+class Case:
+    """A fault, "" for a healthy run, at a moment. guarded: on a rig with an overflow pump."""
+
+    fault: str
+    moment: str
+    seed: int
+    guarded: bool = False
+
+    def run(self, config: FaultsConfig, folder: Path) -> Outcome:
+        """In whatever process. Args: folder: of the command."""
+        fault = by_name((self.fault,))[0] if self.fault else None
+        if fault is not None and fault.family == "pioreactor":
+            times = config.kills if fault.often else 1
+            place = folder / f"{self.fault}-{self.moment}"
+            with stop.pausing("once pumps and rig are off") as stopping:
+                return PioreactorCase(
+                    fault, self.moment, place, config.speed, self.seed, config.package, times, config.settle, stopping
+                ).run()
+        pump = config.overflow_pump if self.guarded else OverflowPumpConfig()
+        run = rehearsed(config.reactors, config.scenario, config.safety, config.controller_kind, pump)
+        return ChiBioCase(fault, self.moment, run, self.seed).run()
 
 
-def run_all(config: FaultMatrixConfig, folder: Path) -> list[Outcome]:
-    """Every case, in order; a bar on a terminal, the first and every 50th case in a log.
+def all_cases(config: FaultsConfig) -> list[Case]:
+    """Every case; controls first, the Chi.Bio's rig without an overflow pump last."""
+    there, found = bool(config.overflow_pump.pump), config.wanted
+    rigs = [(f, there and f.family == "chibio") for f in found]
+    rigs += [(f, False) for f in found if there and f.overflow and f.family == "chibio"]
+    virtual = not found or any(f.family == "chibio" for f in found)
+    controls = [Case("", "steady", config.seed + k, there) for k in range(config.controls if virtual else 0)]
+    return controls + [
+        Case(f.name, m, config.seed, guarded) for f, guarded in rigs for m in f.moments if m in config.moments
+    ]
+
+
+def run_all(config: FaultsConfig, folder: Path) -> list[Outcome]:
+    """Every case, in order; a bar on a terminal, in a log the first, every 50th and each at the Pioreactor rig.
 
     Stopped, it leaves those that are done in cases.csv. Each worker is a fresh process, because a limit on file size,
     which one fault sets, is the process's.
     """
     cases = all_cases(config)
     with (
-        Workers(config.workers) as workers,
+        stop.Workers(config.workers) as workers,
         logging_redirect_tqdm(),
         tqdm(total=len(cases), disable=None, unit="case") as bar,
     ):
-        futures = [workers.submit(run_case, config, *case) for case in cases]
+        futures = [workers.submit(case.run, config, folder) for case in cases]
         try:
             for done, future in enumerate(as_completed(futures), 1):
-                future.result()
+                o = future.result()
                 bar.update()
                 if bar.disable and (done == 1 or done % 50 == 0):
                     log.info("%d of %d cases", done, len(cases))
+                if o.family == "pioreactor":
+                    log.info("%s, %s: %s", o.label, o.moment, ", ".join(o.wrong) or "ok")
         except KeyboardInterrupt:
             if ended := [f.result() for f in futures if f.done() and f.exception() is None]:
                 write_cases(folder / "cases.csv", ended)
@@ -139,21 +180,26 @@ def draw(outcomes: list[Outcome], moments: tuple[str, ...], folder: Path) -> Non
     save(figure, folder / "figures", "fault_matrix")
 
 
-def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
-    """Run the matrix, write cases.csv, table.md, summary.json and the figure. Raises: UserError if it fails."""
+def faults(config: FaultsConfig, folder: Path) -> None:
+    """Try all, write cases.csv, table.md, summary.json and the figure. Raises: UserError if one fails."""
     began = time.monotonic()
-    faults = [f for f in by_name(config.faults) if config.overflow_pump.pump or not f.of_overflow_pump]
     outcomes = run_all(config, folder)
     if not outcomes:
-        raise frame.UserError("nothing to run: give faults or controls")
+        raise frame.UserError("nothing to run: give faults that have such moments, or controls")
     write_cases(folder / "cases.csv", outcomes)
-    rigs = [[o for o in outcomes if o.guarded], [o for o in outcomes if not o.guarded]]
-    heads = (f"With an overflow pump ({config.overflow_pump.pump} at {config.overflow_pump.duty:g})", "Without")
-    parts = [f"## {head}\n\n{table(rig)}" for head, rig in zip(heads, rigs, strict=True) if rig]
-    (folder / "table.md").write_text("\n".join([*parts, declared(faults)]), encoding="utf-8")
-    struck = [o for o in outcomes if o.fault != "none"]
+    virtual = [o for o in outcomes if o.family == "chibio"]
+    rigs = {
+        f"With an overflow pump ({config.overflow_pump.pump} at {config.overflow_pump.duty:g})": [
+            o for o in virtual if o.guarded
+        ],
+        "Without": [o for o in virtual if not o.guarded],
+        "At the Pioreactor rig": [o for o in outcomes if o.family == "pioreactor"],
+    }
+    parts = [f"## {head}\n\n{table(rig)}" for head, rig in rigs.items() if rig]
+    (folder / "table.md").write_text("\n".join([*parts, declared(config.wanted)]), encoding="utf-8")
+    struck = [o for o in virtual if o.fault != "none"]
     if struck:
-        draw(struck, config.moments, folder)
+        draw(struck, tuple(m for m in VIRTUAL if m in config.moments), folder)
     total = totals(outcomes)
     seconds = {"wall_s": round(time.monotonic() - began, 1)}
     files.write_json(folder / "summary.json", {**total, **seconds, "cases_list": [o.as_dict() for o in outcomes]})
@@ -168,7 +214,7 @@ def fault_matrix(config: FaultMatrixConfig, folder: Path) -> None:
         )
 
 
-main = command(__file__, FaultMatrixConfig(), fault_matrix)
+main = command(__file__, FaultsConfig(), faults)
 
 
 if __name__ == "__main__":

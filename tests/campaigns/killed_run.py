@@ -3,10 +3,7 @@
 import csv
 import json
 import math
-import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 import urllib.request
@@ -24,6 +21,7 @@ from hardware.emulator.process import EmulatorProcess
 from hardware.emulator.vial import Dose, Sample
 from hardware.storage.journal import read_journal
 from tests.campaigns.audit import Served, audit_doses, fed_by, rows_per_sample
+from tests.campaigns.client import Client
 from tests.campaigns.tracking import reachable
 
 __all__ = ["Findings", "KillConfig", "Stopped", "killed_run"]
@@ -161,9 +159,8 @@ class _Clients:
         self.config, self.device, self.folder, self.findings = config, device, folder, findings
         self._rng, self._stop = rng, stop
 
-    def _client(self, first: bool) -> subprocess.Popen[bytes]:
-        c = self.config
-        command = [sys.executable, "-m", "experiments.deploy"]
+    def _client(self, first: bool) -> Client:
+        c, command = self.config, []
         if first:
             scenario = ["scenario=hold", f"scenario.setpoints=[{SETPOINT}]", "scenario.minutes=[100000]"]
             backend = ["backend=chibio", f"backend.url={self.device.url}", f"backend.speed={c.speed}"]
@@ -174,20 +171,18 @@ class _Clients:
         else:
             command.append(f"resume={self.folder}")
         self.findings.lives += 1
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        with open(self.folder.parent / f"{self.folder.name}.log", "ab") as out:
-            return subprocess.Popen(command, stdout=out, stderr=out, env=environment, start_new_session=True)
+        return Client(command, self.folder.parent / f"{self.folder.name}.log")
 
     def _size(self) -> int:
         path = self.folder / "journal.jsonl"
         return path.stat().st_size if path.exists() else 0
 
-    def _until_it_writes(self, client: subprocess.Popen[bytes], before: int) -> bool:
+    def _until_it_writes(self, client: Client, before: int) -> bool:
         deadline = time.monotonic() + PATIENCE_S
-        while self._size() <= before and client.poll() is None and time.monotonic() < deadline:
+        while self._size() <= before and client.status is None and time.monotonic() < deadline:
             if self._stop.wait(0.01):
                 break
-        return client.poll() is None and self._size() > before
+        return client.status is None and self._size() > before
 
     def start_and_kill(self, k: int) -> float:
         """Start or resume, and kill at a random moment: after the first row, or already during the start.
@@ -201,13 +196,12 @@ class _Clients:
             self._stop.wait(float(self._rng.uniform(0.5, 3.0)))
         elif self._until_it_writes(client, self._size()):
             self._stop.wait(float(self._rng.uniform(0.0, self.config.longest_s)))
-            while not ((self.folder / "state.json").exists() or self._stop.wait(0.05)) and client.poll() is None:
+            while not ((self.folder / "state.json").exists() or self._stop.wait(0.05)) and client.status is None:
                 pass
-        if client.poll() is not None:
-            self.findings.trouble.append(f"client {k} ended by itself with status {client.returncode}")
+        if client.status is not None:
+            self.findings.trouble.append(f"client {k} ended by itself with status {client.status}")
         killed = time.time()
         client.kill()
-        client.wait()
         if self._stop.is_set():
             raise Stopped
         return killed
@@ -218,12 +212,7 @@ class _Clients:
         if self._until_it_writes(client, self._size()):
             self._stop.wait(LAST_S / self.config.speed)
         ended = time.time()
-        client.send_signal(signal.SIGINT)
-        try:
-            client.wait(30.0)
-        except subprocess.TimeoutExpired:
-            client.kill()
-            client.wait()
+        if client.end(30.0, signal.SIGINT) is None:
             self.findings.trouble.append("the last client did not end on SIGINT")
         return ended
 

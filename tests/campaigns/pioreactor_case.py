@@ -1,213 +1,209 @@
-"""A deployment at the rig that something happens to: real client processes, the vendor's own software, our vials."""
+"""One fault at one moment of a deployment at the Pioreactor rig, and its record against the truth of the vials."""
 
-from __future__ import annotations
-
-import csv
-import json
+import bisect
+import itertools
 import math
-import os
-import subprocess
-import sys
-import threading
 import time
-import urllib.request
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hardware.pioreactor.config import RigConfig
-from hardware.pioreactor.versions import facts
-from hardware.rig.processes import Rig
-from hardware.rig.vials import Pulse
-from hardware.storage.journal import read_journal
+from hardware.errors import ReactorError
+from tests.campaigns.fault import Fault
+from tests.campaigns.outcome import Outcome, judged
+from tests.campaigns.pioreactor_trial import SETPOINT, SICK, WELL, Seen, Trial
 
-__all__ = ["MEDIA_PIN", "SETPOINT", "SICK", "WASTE_PIN", "WELL", "Seen", "Trial", "log_rows"]
+__all__ = ["PioreactorCase", "found_in"]
 
-SICK, WELL = "pio01", "pio02"
-MEDIA_PIN, WASTE_PIN = 13, 12
-SETPOINT = 0.5  # OD
-WELL_ML = 14.0
-NEAR_OD = 0.03
-START_S, END_S = 90.0, 60.0  # real seconds for a client to dose, and to end
+LATE_S = 240.0  # real seconds in which a run must dose again after a fault
+PULSE_S = 0.15  # a shorter run of a pump is a pin that is switched on and off
+SAME_S = 0.5  # device s by which a row's time and its sample's are apart
+LAST_MIN = 3.0  # device minutes at the end
+FULL_ML = 24.0  # of a vial of 20 mL after one dose whose waste is still to come, and a doubled one
+GAP_MIN = 2.5
 
 
-@dataclass(frozen=True)
-class Seen:
-    """What is left of a trial.
+class PioreactorCase:
+    """A fault at a moment, in a rig of its own: `run` gives its `Outcome`.
 
-    journal: its rows. rows: of each recording, as (minute, OD). pulses: runs of pumps. vials: of each unit, what was
-    in it once a second. told: the clients' output. status: of the last client. speed: device seconds per real second.
+    Args:
+      fault, moment: `start` is before the client, `between` and `in` are of its doses. folder: of the case.
+      speed, seed, package: as of `Trial`. times: that the fault is brought about. settle: doses after the last of them.
+      stopping: whether the case is to end early.
     """
 
-    journal: Sequence[Mapping[str, Any]]
-    rows: Mapping[str, Sequence[tuple[float, float]]]
-    pulses: Sequence[Pulse]
-    vials: Mapping[str, Sequence[Mapping[str, Any]]]
-    told: str
-    status: int | None
-    speed: float
+    def __init__(
+        self, fault: Fault, moment: str, folder: Path, speed: float, seed: int, package: str, times: int, settle: int,
+        stopping: Callable[[], bool],
+    ) -> None:  # fmt: skip
+        self.fault, self.moment, self.folder, self.times, self.settle = fault, moment, folder, times, settle
+        self._trial = partial(Trial, folder, speed, seed, package, stopping)
+        self.struck: list[float] = []  # wall times
 
-
-class Trial:
-    """A rig of a sick and a well unit, and the client that runs both; use as a context manager.
-
-    Args: folder: of the trial, must exist. speed: growth faster than real time. seed: of the vials. package: of the
-      vendor's software. stop: nothing is waited for any more.
-    Attributes: known, of the software's version.
-    Raises: DeviceStateError if the rig does not start.
-    """
-
-    def __init__(self, folder: Path, speed: float, seed: int, package: str, stop: threading.Event) -> None:
-        self._stop = stop
-        self.folder, self.run, self.speed = folder, folder / "run", speed
-        vials = RigConfig(package=package, od=SETPOINT, seed=seed)
-        self.rig = Rig({SICK: 20.0, WELL: WELL_ML}, vials, speed, folder)
-        self.known = facts(self.rig.version)
-        self.client: subprocess.Popen[bytes] | None = None
-        self.lives = 0
-        self.words: list[str] = []  # further ones of the command line
-
-    # -- the program -----------------------------------------------------------------------------------------------
-
-    def start(self) -> None:
-        """The client, the first or, by `resume=`, the next."""
-        self.client = self._client([f"resume={self.run}"] if self.lives else self._command(self.run))
-        self.lives += 1
-
-    def second(self) -> str:
-        """Another client for the same units beside the first; what it said when it ended."""
-        other = self._client(self._command(self.folder / "second"), "second")
+    def run(self) -> Outcome:
+        """Bring it about, judge. Raises: nothing of what a rig that does not start brings about."""
+        self.folder.mkdir(parents=True)
+        trouble = ""
         try:
-            other.wait(END_S)
-        except subprocess.TimeoutExpired:
-            other.terminate()
-            other.wait(END_S)
-        return (self.folder / "second.log").read_text(encoding="utf-8")
+            with self._trial() as trial:
+                status, trouble = self._tried(trial)
+                time.sleep(1.2)  # the truth of the last second
+                out = found_in(trial.seen(status), self.fault, self.moment, self.struck)
+        except (ReactorError, OSError, RuntimeError) as error:
+            out, trouble = Outcome(self.fault.name, self.moment), f"{type(error).__name__}: {error}"
+        out.trouble = trouble or out.trouble
+        return judged(out, self.fault)
 
-    def _command(self, run: Path) -> list[str]:
-        units = [f"backend.units.{unit}.address={url}" for unit, url in self.rig.web.items()]
-        units += [f"backend.units.{WELL}.volume_ml={WELL_ML}", f"backend.leader={self.rig.web[SICK]}"]
-        return [
-            "backend=pioreactor", f"backend.reactors=[{SICK},{WELL}]", "backend.broker=127.0.0.1",
-            f"backend.broker_port={self.rig.broker}", f"backend.speed={self.speed}", "backend.reading_s=1",
-            *units, "scenario=hold", f"scenario.setpoints=[{SETPOINT}]", "scenario.minutes=[100000]",
-            "safety.silent=100000", f"hydra.run.dir={run}", *self.words,
-        ]  # fmt: skip
+    def _tried(self, trial: Trial) -> tuple[int | None, str]:
+        """Status of the client, and what kept the fault from being brought about."""
+        if self.moment == "start":
+            self._begin(trial)
+            trial.start()
+            if self.fault.refused:
+                return _ended(trial), ""
+            trouble, times = "", 1
+        else:
+            trial.start()
+            trouble, times = "" if trial.doses(2) else "no dose within the first minutes", self.times
+        for _ in range(times):
+            trouble = trouble or self._strike(trial)
+        if not (trouble or trial.doses(self.settle, LATE_S)) and not trial.stopping():
+            trouble = "no dose any more after it"
+        return trial.end(), trouble
 
-    def _client(self, words: Sequence[str], log: str = "client") -> subprocess.Popen[bytes]:
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        with (self.folder / f"{log}.log").open("ab") as out:
-            command = [sys.executable, "-m", "experiments.deploy", *words]
-            return subprocess.Popen(command, stdout=out, stderr=out, env=environment, start_new_session=True)
+    def _begin(self, trial: Trial) -> None:
+        self.struck.append(time.time())
+        self.fault.begin(trial)
 
-    def kill(self) -> None:
-        """kill -9 of the client."""
-        if self.client is not None:
-            self.client.kill()
-            self.client.wait()
-
-    def end(self) -> int | None:
-        """SIGTERM, and the status with which the client ended; None if it did not."""
-        assert self.client is not None
-        self.client.terminate()  # a shell may have told us to ignore Ctrl-C
-        try:
-            return self.client.wait(END_S)
-        except subprocess.TimeoutExpired:
-            self.kill()
-            return None
-
-    # -- waiting ---------------------------------------------------------------------------------------------------
-
-    def until(self, there: Callable[[], bool], real_s: float = START_S) -> bool:
-        """Wait for something, at most so long; whether it came. A client that ended is waited for no longer."""
-        deadline = time.monotonic() + real_s
-        while not there():
-            gone = self.client is not None and self.client.poll() is not None
-            if time.monotonic() > deadline or gone or self._stop.wait(0.02):
-                return there()
-        return True
-
-    def pumping(self, pin: int = MEDIA_PIN) -> bool:
-        """Whether a pump of the sick unit runs."""
-        return self.rig.vials.vials[SICK].duty[pin] > 0.0
-
-    def near(self) -> bool:
-        """Whether the sick culture is at its setpoint, in truth."""
-        return abs(float(self.rig.vials.vials[SICK].plant.apparent_od[0]) - SETPOINT) < NEAR_OD
-
-    def journal(self) -> list[dict[str, Any]]:
-        """The journal up to now."""
-        path = self.run / "journal.jsonl"
-        return read_journal(path)[0] if path.exists() else []
-
-    def ended(self) -> int:
-        """How many of the sick unit's doses have an end."""
-        return sum(r["kind"] == "dose_end" and bool(r.get("id")) and r["reactor"] == SICK for r in self.journal())
-
-    def doses(self, more: int, real_s: float = START_S) -> bool:
-        """Wait for so many more doses of the sick unit to end."""
-        wanted = self.ended() + more
-        return self.until(lambda: self.ended() >= wanted, real_s)
-
-    # -- what can be done to the sick unit -------------------------------------------------------------------------
-
-    def post(self, path: str, body: Mapping[str, Any] | None = None, method: str = "POST") -> None:
-        """What somebody's browser asks of the unit."""
-        data = json.dumps(body or {}).encode()
-        request = urllib.request.Request(f"{self.rig.web[SICK]}/unit_api{path}", data, method=method)
-        request.add_header("Content-Type", "application/json")
-        urllib.request.urlopen(request, timeout=10.0).close()
-
-    def run_job(self, job: str, **options: Any) -> None:
-        """A job that somebody's browser asks for."""
-        env = {"EXPERIMENT": "turbidostat", "JOB_SOURCE": "user"}
-        options = {key.replace("_", "-"): value for key, value in options.items()}
-        self.post(f"/jobs/run/job_name/{job}", {"options": options, "args": [], "env": env, "config_overrides": []})
-
-    def stop_job(self, job: str) -> None:
-        """A job that somebody's browser stops; a version that looks in the body looks nowhere else."""
-        self.post(f"/jobs/stop?job_name={job}", {"job_name": job})
-
-    def signal_job(self, job: str, number: int) -> int:
-        """A signal to every process of one of the unit's jobs; how many there were."""
-        found = self.rig.jobs(SICK, job)
-        for pid in found:
-            os.kill(pid, number)
-        return len(found)
-
-    def pio(self, *words: str) -> None:
-        """A command that the operator types at the unit."""
-        subprocess.run([str(self.rig.folder / SICK / "pio"), *words], check=True, capture_output=True, timeout=60.0)
-
-    # -- what is left ----------------------------------------------------------------------------------------------
-
-    def seen(self, status: int | None) -> Seen:
-        """Everything that it left behind."""
-        vials: dict[str, list[Mapping[str, Any]]] = {SICK: [], WELL: []}
-        for row in log_rows(self.folder / "truth.jsonl"):
-            if "od" in row:
-                vials[row["unit"]].append(row)
-        rows = {unit: _recorded(self.run / "recordings" / f"{unit}.csv") for unit in (SICK, WELL)}
-        pulses = [pulse for vial in self.rig.vials.vials.values() for pulse in vial.pulses]
-        told = (self.folder / "client.log").read_text(encoding="utf-8")
-        return Seen(self.journal(), rows, pulses, vials, told, status, self.speed)
-
-    def __enter__(self) -> Trial:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self.kill()
-        self.rig.__exit__(*raised)
+    def _strike(self, trial: Trial) -> str:
+        """Bring the fault about at its moment and mend it; what kept it from being done."""
+        if self.moment == "in" and not trial.until(trial.pumping):
+            return "no dose to strike"
+        if self.moment == "between" and not trial.until(lambda: not trial.pumping()):
+            return "a dose without an end"
+        if self.moment != "start":
+            self._begin(trial)
+        mended = time.monotonic() + 60.0 * self.fault.minutes
+        while time.monotonic() < mended:
+            if trial.stopping():
+                return "stopped"
+            time.sleep(0.02)
+        if self.fault.end is not None:
+            self.fault.end(trial)
+        if not trial.doses(2, LATE_S):
+            return "no dose any more after it"
+        trial.until(trial.near, LATE_S)
+        return ""
 
 
-def log_rows(path: Path) -> list[dict[str, Any]]:
-    """Whole rows of a file of one JSON object a line."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
+def _ended(trial: Trial) -> int | None:
+    client = trial.client
+    assert client is not None
+    trial.until(lambda: False, 90.0)  # until it has ended
+    return client.status if client.status is not None else trial.end()
 
 
-def _recorded(path: Path) -> list[tuple[float, float]]:
-    if not path.exists():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return [(float(row["time_min"]), float(row["od"] or math.nan)) for row in csv.DictReader(file)]
+def found_in(seen: Seen, fault: Fault, moment: str, struck: Sequence[float]) -> Outcome:
+    """What a trial left, measured and not judged. Args: struck: wall time of every time the fault was brought about."""
+    out = Outcome(fault.name, moment, False, "pioreactor", len(struck), status=seen.status)
+    out.allowed_s = 60.0 / seen.speed + fault.within_s
+    if fault.refused:
+        return _refused(fault, seen, out)
+    mine = [row for row in seen.journal if row.get("reactor") == SICK]
+    if not mine:
+        out.trouble = "nothing is on record"
+        return out
+    _told(fault, struck, seen, mine, out)
+    _doses(mine, seen, out)
+    _volumes(mine, seen, out)
+    _rows(fault, seen, out)
+    _cultures(seen, out)
+    out.pumps_off = not any(seen.vials[unit][-1]["duty"][pin] for unit in (SICK, WELL) for pin in ("12", "13"))
+    return out
+
+
+def _refused(fault: Fault, seen: Seen, out: Outcome) -> Outcome:
+    """A program that must not start: one line that says why, and nothing dosed."""
+    lines = [line for line in seen.told.splitlines() if line.startswith("error: ")]
+    out.outcome, out.refusals = "; ".join(lines), 0 if "Traceback" in seen.told else len(lines)
+    out.reason = next((word for word in fault.by if word in seen.told), "")
+    out.doses = sum(row["kind"] == "feed_on" for row in seen.journal)
+    out.pumps_off = True  # nothing of this client's moved
+    return out
+
+
+def _texts(row: Mapping[str, Any]) -> str:
+    """What a row of the journal tells."""
+    decided = row.get("row")
+    inner = str(decided.get("interlock", "")) if isinstance(decided, Mapping) else ""
+    return " ".join((str(row.get("note", "")), str(row.get("interlock", "")), str(row.get("end", "")), inner))
+
+
+def _told(fault: Fault, struck: Sequence[float], seen: Seen, mine: Sequence[Mapping[str, Any]], out: Outcome) -> None:
+    """Whether, by what word and how soon after each time it was told."""
+    if not fault.by:
+        return
+    words = [(row["wall"], word) for row in mine for word in fault.by if word in _texts(row)]
+    words += [(row["wall"], "started") for row in seen.journal if row["kind"] == "start" and "resumed" in fault.by[0]]
+    waits: list[float] = []
+    for at, following in zip(struck, [*struck[1:], math.inf], strict=True):
+        after = [(wall - at, word) for wall, word in words if at <= wall < following]
+        out.untold += not after
+        waits += [after[0][0]] if after else []
+        out.reason = out.reason or (after[0][1] if after else "")
+    out.detected_s = max(waits, default=math.nan)
+
+
+def _doses(mine: Sequence[Mapping[str, Any]], seen: Seen, out: Outcome) -> None:
+    """Every run of the media pump has its request; none was sent while the fate of another was open."""
+    pulses = [p for p in seen.pulses if p.unit == SICK and p.pump == "media" and p.seconds > PULSE_S]
+    asked = [row for row in mine if row["kind"] == "feed_on"]
+    at = [row["wall"] - 0.2 for row in asked]
+    runs = [0] * (len(at) + 1)
+    for pulse in pulses:
+        runs[bisect.bisect(at, pulse.start)] += 1
+    out.doses = len(pulses)
+    out.doses_doubled = runs[0] + sum(max(0, n - 1) for n in runs[1:])
+    out.ids_doubled = len(asked) - len({row["id"] for row in asked})
+    open_id = ""
+    for row in mine:
+        if row["kind"] == "feed_on":
+            out.in_doubt += bool(open_id)
+            open_id = row["id"]
+        elif row["kind"] == "dose_end" and row.get("id") == open_id:
+            open_id = ""
+    out.unended = int(bool(open_id))
+
+
+def _volumes(mine: Sequence[Mapping[str, Any]], seen: Seen, out: Outcome) -> None:
+    """What was fed by the journal, at least and at most, and in truth; how full the vial was."""
+    ends = [row for row in mine if row["kind"] == "dose_end"]
+    out.low_ml = sum(row.get("feed_low_ml", row["feed_ml"]) for row in ends)
+    out.high_ml = sum(row["feed_ml"] for row in ends)
+    vials = seen.vials[SICK]
+    began = seen.journal[0]["wall"]
+    before = max((row["fed_ml"] for row in vials if row["wall"] <= began), default=0.0)
+    out.fed_ml, out.peak_ml = vials[-1]["fed_ml"] - before, vials[-1]["peak_ml"]
+    out.overflowed = out.peak_ml > FULL_ML
+
+
+def _rows(fault: Fault, seen: Seen, out: Outcome) -> None:
+    """Every sample of both units is in one row."""
+    for unit in (SICK, WELL):
+        samples = [r["sample_s"] for r in seen.journal if r["kind"] == "sample" and r["reactor"] == unit]
+        rows = [minute * 60.0 for minute, _ in seen.rows[unit]]
+        out.rows_lost += sum(not any(abs(s - row) <= SAME_S for row in rows) for s in samples)
+        out.rows_doubled += max(len(rows) - len(samples), 0)
+    minutes = [minute for minute, _ in seen.rows[SICK]]
+    out.rows = len(minutes)
+    out.gap_min = max((b - a for a, b in itertools.pairwise(minutes)), default=math.inf)
+    out.allowed_gap_min = GAP_MIN + fault.minutes * seen.speed
+
+
+def _cultures(seen: Seen, out: Outcome) -> None:
+    """Where the sick culture is at the end, and how far the well one ever was."""
+    last = seen.vials[SICK][-1]["wall"] - LAST_MIN * 60.0 / seen.speed
+    errors = [abs(row["od"] - SETPOINT) for row in seen.vials[SICK] if row["wall"] >= last]
+    out.end_error = sum(errors) / len(errors)
+    out.neighbour_error = max(abs(row["od"] - SETPOINT) for row in seen.vials[WELL])

@@ -7,9 +7,6 @@ same setpoints at the same moments. What is left behind is the deployment's fold
 import json
 import logging
 import os
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -27,6 +24,7 @@ from hardware.pioreactor.mailbox import Cluster, Mailbox
 from hardware.pioreactor.versions import Facts, facts
 from hardware.pioreactor.web import Web
 from hardware.rig.processes import Rig
+from tests.campaigns.client import Client
 from tests.campaigns.rig_truth import Limits
 
 __all__ = ["LOOK_S", "RigStudyConfig", "VendorConfig", "run_on_rig"]
@@ -184,10 +182,10 @@ class VendorUnit:
 
 
 @contextmanager
-def deployment(config: RigStudyConfig, rig: Rig, folder: Path, out: Path) -> Iterator[subprocess.Popen[bytes]]:
+def deployment(config: RigStudyConfig, rig: Rig, folder: Path, out: Path) -> Iterator[Client]:
     """The process that controls the judged units; it is ended on leaving, its pumps verified off."""
     names = ",".join(config.reactors)
-    command = [sys.executable, "-m", "experiments.deploy", "backend=pioreactor", f"backend.reactors=[{names}]"]
+    command = ["backend=pioreactor", f"backend.reactors=[{names}]"]
     for unit in config.reactors:
         command += [
             f"backend.units.{unit}.address={rig.web[unit]}",
@@ -197,21 +195,12 @@ def deployment(config: RigStudyConfig, rig: Rig, folder: Path, out: Path) -> Ite
     command += [f"backend.leader={next(iter(rig.web.values()))}"]
     command += [f"backend.reading_s={config.reading_s}", f"scenario={config.scenario}"]
     command += [*config.overrides, f"hydra.run.dir={folder}"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    with out.open("ab") as into:
-        client = subprocess.Popen(command, stdout=into, stderr=into, env=environment, start_new_session=True)
+    client = Client(command, out)
     try:
         yield client
     finally:
-        if client.poll() is None:
-            client.send_signal(signal.SIGTERM)
-        try:
-            client.wait(LEAVE_S)
-        except subprocess.TimeoutExpired:
+        if client.end(LEAVE_S) is None:
             log.warning("the deployment did not end within %.0f s; it was killed", LEAVE_S)
-        finally:
-            client.kill()
-            client.wait()
 
 
 def run_on_rig(config: RigStudyConfig, folder: Path) -> Path:
@@ -234,15 +223,15 @@ def run_on_rig(config: RigStudyConfig, folder: Path) -> Path:
         vendor.read()
         client = stack.enter_context(deployment(config, rig, run, folder / "deployment.log"))
         began = told = time.monotonic()
-        while client.poll() is None:
+        while client.status is None:
             vendor.follow()
             if time.monotonic() > told + TOLD_S:
                 told += TOLD_S
                 log.info("minute %.0f: %s", (told - began) * config.speed / 60.0, _now(rig))
             time.sleep(0.2)
         vendor.note(None)
-    if client.returncode:
-        raise UserError(f"the deployment ended with status {client.returncode}: {_last_line(folder)}")
+    if client.status:
+        raise UserError(f"the deployment ended with status {client.status}: {_last_line(folder)}")
     return run
 
 

@@ -13,12 +13,14 @@ from envs.scenario import Scenario
 from experiments.cli import frame
 from hardware.reactor import Command, Receipt
 from hardware.safety.config import SafetyConfig
-from tests.campaigns.chibio_case import FaultCase
-from tests.campaigns.chibio_faults import FAULTS, Act, Fault, both, by_name, set_
+from tests.campaigns.chibio_case import ChiBioCase
+from tests.campaigns.chibio_faults import FAULTS, Act, both, set_
 from tests.campaigns.endurance import SoakConfig
+from tests.campaigns.fault import Fault
+from tests.campaigns.fault_table import by_name
 from tests.campaigns.killed_run import KillConfig, errors_in_lives, longest_out_min
 from tests.campaigns.kills import kill_campaign
-from tests.campaigns.outcome import Outcome, allowed, judge, table, totals
+from tests.campaigns.outcome import Outcome, allowed, judged, table, totals
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.campaigns.soak import soak
 from tests.campaigns.tracking import Tracking, reachable, undosed
@@ -32,7 +34,7 @@ NERVOUS = replace(STUCK, mu_max=0.001, drift=0.01, noise_od=0.0, noise_fraction=
 def run(
     fault: Fault | None, safety: SafetyConfig | None = None, controller: str = "inverse", moment: str = "dose"
 ) -> Outcome:
-    return FaultCase(fault, moment, rehearsed(("M0", "M1"), SCHEDULE, safety, controller), 3).run()
+    return ChiBioCase(fault, moment, rehearsed(("M0", "M1"), SCHEDULE, safety, controller), 3).run()
 
 
 def mute(*silent: int) -> Act:
@@ -65,13 +67,13 @@ def test_a_cooldown_that_never_ends_is_not_back_after_the_fault() -> None:
 def test_a_constant_rate_strays_without_any_fault() -> None:
     constant = rehearsed(("M0", "M1"), SCHEDULE, controller="hold")
     constant = replace(constant, controller=replace(constant.controller, rate=0.004))
-    assert {"strayed", "neighbour strayed"} <= set(FaultCase(None, "dose", constant, 3).run().wrong)
+    assert {"strayed", "neighbour strayed"} <= set(ChiBioCase(None, "dose", constant, 3).run().wrong)
 
 
 def test_a_controller_that_does_nothing_strays_from_the_recovery_on() -> None:
     idle = replace(rehearsed(("M0", "M1"), SCHEDULE, controller="hold"))
     idle = replace(idle, controller=replace(idle.controller, rate=0.0))
-    outcome = FaultCase(by_name(("a request is lost",))[0], "recovery", idle, 3).run()
+    outcome = ChiBioCase(by_name(("a request is lost",))[0], "recovery", idle, 3).run()
     assert {"strayed", "not back", "neighbour strayed", "neighbour not back"} <= set(outcome.wrong)
 
 
@@ -106,17 +108,17 @@ def test_every_fault_declares_where_the_culture_may_go() -> None:
 def test_judge_compares_with_the_declaration() -> None:
     fault = Fault("x", "y", set_("bus_stuck"), ("link",), error=0.2, recovery_min=5.0)
     good = Outcome("x", "dose", reason="link", pumps_off=True, peak_error=0.19, recovery_min=5.0, watched_min=30.0)
-    assert judge(good, fault) == []
-    assert judge(replace(good, peak_error=0.21), fault) == ["strayed"]
-    assert judge(replace(good, recovery_min=math.inf), fault) == ["not back"]
-    assert judge(replace(good, recovery_min=math.inf, watched_min=4.0), fault) == []  # not due yet
-    assert judge(replace(good, recovery_min=math.inf), replace(fault, unheld="so")) == []
-    assert judge(replace(good, peak_error=0.21), replace(fault, unheld="so")) == ["strayed"]
-    assert judge(replace(good, peak_error=4.0, recovery_min=math.inf), replace(fault, stops="so")) == []
-    assert judge(replace(good, fed_after_ml=0.5), replace(fault, stops="so")) == ["dosed"]
-    assert judge(replace(good, neighbour_error=0.1), fault) == ["neighbour strayed"]
-    assert judge(replace(good, neighbour_error=0.1), replace(fault, wide=True)) == []
-    assert judge(replace(good, neighbour_recovery_min=6.0), replace(fault, wide=True)) == ["neighbour not back"]
+    assert judged(good, fault).wrong == []
+    assert judged(replace(good, peak_error=0.21), fault).wrong == ["strayed"]
+    assert judged(replace(good, recovery_min=math.inf), fault).wrong == ["not back"]
+    assert judged(replace(good, recovery_min=math.inf, watched_min=4.0), fault).wrong == []  # not due yet
+    assert judged(replace(good, recovery_min=math.inf), replace(fault, unheld="so")).wrong == []
+    assert judged(replace(good, peak_error=0.21), replace(fault, unheld="so")).wrong == ["strayed"]
+    assert judged(replace(good, peak_error=4.0, recovery_min=math.inf), replace(fault, stops="so")).wrong == []
+    assert judged(replace(good, fed_after_ml=0.5), replace(fault, stops="so")).wrong == ["dosed"]
+    assert judged(replace(good, neighbour_error=0.1), fault).wrong == ["neighbour strayed"]
+    assert judged(replace(good, neighbour_error=0.1), replace(fault, wide=True)).wrong == []
+    assert judged(replace(good, neighbour_recovery_min=6.0), replace(fault, wide=True)).wrong == ["neighbour not back"]
 
 
 def test_the_sums_of_a_matrix_that_fails_everywhere() -> None:

@@ -15,9 +15,11 @@ from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.emulator.vial import Dose
 from hardware.safety.config import SafetyConfig
 from tests.campaigns.audit import audit_doses
-from tests.campaigns.chibio_case import FaultCase
-from tests.campaigns.chibio_faults import FAULTS, Fault, both, by_name, post, run_device, set_
-from tests.campaigns.faults import FaultMatrixConfig, all_cases
+from tests.campaigns.chibio_case import ChiBioCase
+from tests.campaigns.chibio_faults import FAULTS, both, post, run_device, set_
+from tests.campaigns.fault import Fault
+from tests.campaigns.fault_table import by_name
+from tests.campaigns.faults import FaultsConfig, all_cases
 from tests.campaigns.outcome import Outcome, declared, table, totals
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
 
@@ -31,7 +33,7 @@ def run(
     safety: SafetyConfig | None = None,
     pump: OverflowPumpConfig | None = None,
 ) -> Outcome:
-    return FaultCase(fault, moment, rehearsed(("M0", "M1"), SCHEDULE, safety, overflow_pump=pump), 3).run()
+    return ChiBioCase(fault, moment, rehearsed(("M0", "M1"), SCHEDULE, safety, overflow_pump=pump), 3).run()
 
 
 def test_a_healthy_run_says_nothing_and_holds_the_setpoints() -> None:
@@ -103,7 +105,7 @@ def test_what_overflows_on_the_standard_rig_does_not_with_an_overflow_pump(name:
     without = run(fault)
     assert without.ok, without
     assert (without.overflowed, without.label) == (True, f"{name}, no overflow pump")
-    guarded = run(fault, pump=FaultMatrixConfig().overflow_pump)
+    guarded = run(fault, pump=FaultsConfig().overflow_pump)
     assert guarded.ok, guarded
     assert (guarded.overflowed, guarded.label) == (False, name)
     assert guarded.peak_ml < 27.0
@@ -116,7 +118,7 @@ def test_an_overflow_beside_an_overflow_pump_is_never_as_declared() -> None:
 
 @pytest.mark.parametrize("name", ["overflow pump blocked", "foreign overflow pump off"])
 def test_faults_of_the_overflow_pump_itself(name: str) -> None:
-    outcome = run(by_name((name,))[0], pump=FaultMatrixConfig().overflow_pump)
+    outcome = run(by_name((name,))[0], pump=FaultsConfig().overflow_pump)
     assert outcome.ok, outcome
 
 
@@ -139,13 +141,13 @@ def test_a_resumed_run_does_not_speak_of_lost_reactors_before_they_had_their_cha
 
 def test_rigs_with_and_without_overflow_pump_are_counted_apart() -> None:
     names = ("waste blocked", "overflow pump blocked", "feed blocked")
-    config = FaultMatrixConfig(faults=names, moments=("dose",), controls=1)
-    assert [(name, guarded) for name, _, _, guarded in all_cases(config)] == [
+    config = FaultsConfig(faults=names, moments=("dose",), controls=1)
+    assert [(case.fault, case.guarded) for case in all_cases(config)] == [
         ("", True), ("waste blocked", True), ("overflow pump blocked", True), ("feed blocked", True),
         ("waste blocked", False),
     ]  # fmt: skip
     bare = replace(config, overflow_pump=OverflowPumpConfig())
-    assert [(name, guarded) for name, _, _, guarded in all_cases(bare)] == [
+    assert [(case.fault, case.guarded) for case in all_cases(bare)] == [
         ("", False), ("waste blocked", False), ("feed blocked", False),
     ]  # fmt: skip
     found = [Outcome("a", "dose", guarded, overflowed=over) for guarded, over in ((True, True), (True, False))]
@@ -211,4 +213,4 @@ def test_the_command(tmp_path: Path) -> None:
 @pytest.mark.parametrize("override", ["moments=[noon]", "reactors=[M1]", "controller_kind=oracle", "faults=[nonsense]"])
 def test_bad_values_are_named(override: str) -> None:
     with pytest.raises(frame.UserError, match="allowed|nonsense"):
-        frame.load(frame.compose("fault_matrix", [override]), FaultMatrixConfig())
+        frame.load(frame.compose("fault_matrix", [override]), FaultsConfig())

@@ -15,7 +15,7 @@ import numpy as np
 from hardware.emulator.process import EmulatorProcess
 from hardware.emulator.vial import Dose
 from hardware.storage.journal import read_journal
-from tests.campaigns.chibio_case import audit_doses
+from tests.campaigns.audit import audit_doses
 from tests.hardware.test_serial_transport import Cable, cable  # noqa: F401  (a fixture)
 
 ROOT = Path(__file__).parents[2]
