@@ -9,7 +9,10 @@ from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
 
-__all__ = ["Bench"]
+__all__ = ["VIAL_ML", "Bench"]
+
+VIAL_ML = 30.0
+"""What the vial of a Chi.Bio holds up to its rim, mL (docs/biology.md, Volume)."""
 
 WITHIN_ML = (5.0, 38.0)
 

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 from conf.schema import require
 
-__all__ = ["DOSE_ML", "PUMPS", "Output", "outputs_of"]
+__all__ = ["DOSE_ML", "MADE_UP_MIN", "PUMPS", "Output", "outputs_of"]
 
 PUMPS = (3, 4)
 DOSE_ML = (
     0.5  # smallest dose: more than any pump of up to 1.5 mL/s delivers dependably in 0.3 s (docs/device.md, Pumps)
 )
+MADE_UP_MIN = 5.0  # of a pause of the program or of the samples; what was owed in a longer one is left out
 MOST_ML_H, MOST_ML = 20.0, 20.0
 GIVEN = re.compile(r"pump([34])\s+(\d*\.?\d+)\s*(mL/h|mL)", re.IGNORECASE)
 WORDS = "'pump3 2 mL/h', 'pump4 1.5 mL' (at its start), both with a comma between, or null"

@@ -7,8 +7,10 @@ from pathlib import Path
 
 from conf.schema import check, part, setting
 from experiments.cli import files, frame
-from experiments.control.device import linked, one_interrupt, save_calibration
+from experiments.cli.stop import one_interrupt
+from hardware.chibio.calibrations import save_calibration
 from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.family import linked
 from hardware.chibio.procedures import measure_blanks, warm_up
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.errors import ReactorError
@@ -51,15 +53,15 @@ def blank(config: BlankConfig, folder: Path) -> None:
             except BaseException:
                 reactors.stop()
                 raise
+        rows = {}
+        for name, identity, raw, sd in zip(reactors.names, stored, mean, spread, strict=True):
+            when = {"date": date.today().isoformat(), "device_id": identity}
+            values = {"blank": float(raw), "sd": float(sd), "samples": config.samples, **when}
+            path = save_calibration(Path(backend.calibration), name, "blank", values)
+            rows[name] = {**values, "file": str(path)}
+            log.info("%s: blank %.0f +- %.0f counts, stored in %s", name, raw, sd, path)
     except ReactorError as error:
         raise frame.UserError(str(error)) from None
-    rows = {}
-    for name, identity, raw, sd in zip(reactors.names, stored, mean, spread, strict=True):
-        when = {"date": date.today().isoformat(), "device_id": identity}
-        values = {"blank": float(raw), "sd": float(sd), "samples": config.samples, **when}
-        path = save_calibration(Path(backend.calibration), name, "blank", values)
-        rows[name] = {**values, "file": str(path)}
-        log.info("%s: blank %.0f +- %.0f counts, stored in %s", name, raw, sd, path)
     files.write_json(folder / "summary.json", rows)
 
 

@@ -13,10 +13,12 @@ import numpy as np
 
 from conf.schema import check, part, require, setting
 from experiments.cli import files, frame
-from experiments.control.device import linked, one_interrupt, save_calibration
+from experiments.cli.stop import one_interrupt
+from hardware.chibio.calibrations import save_calibration
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.dosing import PumpFit, fit_pump
+from hardware.chibio.family import linked
 from hardware.chibio.procedures import dose_series
 from hardware.chibio.protocol import FEED, PERIOD_S, POSITIONS, WASTE
 from hardware.errors import ReactorError
@@ -150,12 +152,12 @@ def calibrate(config: CalibratePumpConfig, folder: Path) -> None:
             raise frame.UserError("no terminal to ask for the weights; give csv=FILE with columns duty,doses,grams")
         on_s, doses, grams = np.array([[PERIOD_S * s.duty, s.doses, s.grams] for s in found]).reshape(-1, 3).T
         fit = fit_pump(on_s, doses, grams, date.today().isoformat(), identity)
+        weighings = [{"duty": s.duty, "doses": s.doses, "grams": s.grams} for s in found]
+        uncertainty = {"flow_se": fit.flow_se, "bias_se": fit.bias_se}
+        values = {**fit.calibration.as_dict(), **uncertainty, "weighings": weighings}
+        path = save_calibration(Path(config.backend.calibration), config.reactor, config.pump, values)
     except (ReactorError, ValueError) as error:
         raise frame.UserError(str(error)) from None
-    weighings = [{"duty": s.duty, "doses": s.doses, "grams": s.grams} for s in found]
-    uncertainty = {"flow_se": fit.flow_se, "bias_se": fit.bias_se}
-    values = {**fit.calibration.as_dict(), **uncertainty, "weighings": weighings}
-    path = save_calibration(Path(config.backend.calibration), config.reactor, config.pump, values)
     files.write_json(folder / "summary.json", {**values, "file": str(path)})
     log.info("%s %s pump\n%s\nstored in %s", config.reactor, config.pump, report(fit, found), path)
 

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from conf.schema import check, require, setting
 from experiments.cli import files, frame
 from hardware.errors import RecordingError
+from hardware.family import family, known
 from hardware.storage.journal import read_journal
 from hardware.storage.marks import Mark, add_mark
 
@@ -51,7 +52,7 @@ def _minute_now(folder: Path, stored: Any) -> float:
     """The minute of a run that is under way. Raises: UserError for one that is over, or has not begun."""
     kind = str(OmegaConf.select(stored, "backend.kind"))
     over = frame.UserError(f"run={folder}: not under way; give minute=MINUTE of the run")
-    if kind == "sim":
+    if kind in known() and family(kind).simulated:
         raise over
     rows, _ = read_journal(folder / "journal.jsonl")
     if [row["kind"] for row in rows if row["kind"] in ("start", "stop")][-1:] == ["stop"]:

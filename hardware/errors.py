@@ -11,6 +11,7 @@ __all__ = [
     "ReactorError",
     "RecordingError",
     "SensorError",
+    "UnfitError",
 ]
 
 
@@ -40,3 +41,7 @@ class SensorError(ReactorError):
 
 class RecordingError(ReactorError):
     """A recording cannot be read or written."""
+
+
+class UnfitError(ReactorError):
+    """What a config asks for does not fit this kind of reactor, or a file of its calibration is damaged."""

@@ -1,15 +1,19 @@
 """Reactors in this process: N vials of a `Plant`, sampled and dosed once per control period, in virtual time."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 
 from conf.schema import check, require, setting
-from envs.plant.plant import Plant
+from envs.bench import VIAL_ML
+from envs.plant.plant import Plant, PlantConfig
 from hardware.clock import Clock, VirtualClock
-from hardware.reactor import Array, Command, Mask, Measurement, Receipt
+from hardware.family import Can, Family, Opening
+from hardware.reactor import Array, Command, Mask, Measurement, Reactor, Receipt
 
-__all__ = ["SimulatedConfig", "SimulatedReactors"]
+__all__ = ["FAMILY", "SimulatedConfig", "SimulatedFamily", "SimulatedReactors"]
 
 
 @dataclass(frozen=True)
@@ -118,3 +122,45 @@ class SimulatedReactors:
     def stop(self) -> None:
         """No dose is pending any more."""
         self._feed_s = np.zeros(self.plant.n)
+
+
+class SimulatedFamily(Family):
+    """Vials in this process."""
+
+    config = SimulatedConfig
+    can = Can(fluorescence=True, spare_pumps=True, thermostat=True)
+    at_stake = False
+    simulated = True
+
+    @contextmanager
+    def open(self, opening: Opening) -> Iterator[Reactor]:
+        """Vials of `opening.plant`."""
+        backend, bench = opening.backend, opening.bench
+        volumes_ml = bench.volumes(backend.reactors)
+        vials = Plant(opening.plant, len(backend.reactors), np.random.default_rng(backend.seed), volumes_ml)
+        yield SimulatedReactors(vials, backend, bench.control_min)
+
+    def rim_ml(self, volumes_ml: Array) -> float:
+        """As a Chi.Bio's."""
+        return VIAL_ML
+
+    def vials(self, backend: SimulatedConfig, plant: PlantConfig) -> tuple[str, PlantConfig]:
+        """Those of deploy's `plant`."""
+        return "plant", plant
+
+    def truth(self, reactors: Reactor) -> tuple[Plant | None, float]:
+        """The vials themselves, and `pump_ml_s`."""
+        if not isinstance(reactors, SimulatedReactors):
+            return None, 1.0
+        return reactors.plant, reactors.config.pump_ml_s
+
+    def address(self, backend: SimulatedConfig) -> str:
+        """In this process."""
+        return "in this computer"
+
+    def start_od(self, backend: SimulatedConfig, plant: PlantConfig) -> float:
+        """That of the vials."""
+        return plant.start_od
+
+
+FAMILY = SimulatedFamily()

@@ -8,14 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml  # type: ignore[import-untyped]
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hardware.storage import atomic
+from hardware.storage.yaml_text import read_text
 
 __all__ = ["load_yaml", "plain", "write_csv", "write_json"]
-
-LARGEST, DEEPEST = 200_000, 30  # bytes and levels of a YAML file; those of ours have a tenth and a third of it
 
 
 def load_yaml(path: Path | str) -> DictConfig | ListConfig:
@@ -23,22 +21,9 @@ def load_yaml(path: Path | str) -> DictConfig | ListConfig:
 
     Raises: OSError; ValueError, in one line, also for a file that is too large or too deep.
     """
-    with open(path, "rb") as f:
-        data = f.read(LARGEST + 1)
-    if len(data) > LARGEST:
-        raise ValueError(f"longer than {LARGEST} bytes")
+    text = read_text(path)
     try:
-        depth, text = 0, data.decode("utf-8")
-        for event in yaml.parse(text, yaml.SafeLoader):
-            where = f"in line {event.start_mark.line + 1}"
-            if isinstance(event, yaml.AliasEvent) or "${" in getattr(event, "value", ""):
-                raise ValueError(f"an alias or interpolation {where}: write the value out")
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > DEEPEST:
-                raise ValueError(f"deeper than {DEEPEST} levels {where}")
         return OmegaConf.load(io.StringIO(text))
-    except UnicodeDecodeError:
-        raise ValueError("no UTF-8 text") from None
     except ValueError:
         raise
     except Exception as error:  # whatever PyYAML and OmegaConf meet

@@ -1,5 +1,6 @@
 """How a command stops: Ctrl-C, SIGTERM and SIGHUP alike; and worker processes that never outlive it."""
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -13,10 +14,13 @@ from typing import ParamSpec, TypeVar
 
 from experiments.cli import extensions
 
-__all__ = ["SIGNALS", "STATUS", "Pause", "Workers", "handled", "interrupts", "pausing", "unmasked"]
+__all__ = [
+    "SIGNALS", "STATUS", "Pause", "Workers", "handled", "interrupts", "one_interrupt", "pausing", "unmasked",
+]  # fmt: skip
 
 P = ParamSpec("P")
 T = TypeVar("T")
+log = logging.getLogger(__name__)
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CLUSTER = (signal.SIGUSR1, signal.SIGUSR2)  # how a batch system says that a job's time is nearly over
@@ -44,6 +48,24 @@ def interrupts() -> Iterator[None]:
         raise KeyboardInterrupt
 
     with handled(interrupt, signal.SIGTERM, signal.SIGHUP):
+        yield
+
+
+@contextmanager
+def one_interrupt() -> Iterator[None]:
+    """Ctrl-C, SIGTERM (a service manager, a shutting-down PC) or SIGHUP (a closed terminal) raise KeyboardInterrupt.
+
+    Only the first of them: what comes after it does not cut short the switching off of the pumps, nor the summary.
+    """
+    came: list[int] = []
+
+    def answer(number: int, stack: FrameType | None) -> None:
+        came.append(number)
+        if len(came) == 1:
+            raise KeyboardInterrupt
+        log.warning("the pumps are being switched off and verified; this takes up to a minute")
+
+    with handled(answer, *SIGNALS):
         yield
 
 

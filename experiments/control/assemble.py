@@ -9,36 +9,35 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from conf.presets import load
 from conf.schema import build
 from dqn.policy import Policy
+from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
+from experiments.cli.choices import choices
 from experiments.composition import registry as compositions
-from experiments.control import families
 from experiments.control.config import DeployConfig
-from experiments.control.families import Opening
-from experiments.control.fit import check_fit
 from experiments.control.plant_file import read_plant_file
-from experiments.control.policies import admit, composition_policy, policy_check, run_policy
+from experiments.control.policies import Wanted, admit, composition_policy, policy_check, run_policy
 from experiments.controllers import registry
-from experiments.loop.composition import Composition, Keeper, program_of
+from experiments.loop.composition import Composition, Keeper, ShareWarnings, columns, program_of
 from experiments.loop.loop import ClosedLoop
 from experiments.record.record import Record
-from experiments.record.recovery import continue_loop
+from experiments.record.recovery import COLUMNS, continue_loop
 from experiments.training.config import read_env_file
-from hardware.emulator.device import plant_preset
-from hardware.pioreactor.config import PioreactorConfig
-from hardware.reactor import Array, Reactor
-from hardware.safety.interlock import VIAL_ML, Interlock
-from hardware.simulated import SimulatedReactors
+from hardware.check import report
+from hardware.errors import ReactorError
+from hardware.family import Family, Opening, family_of
+from hardware.reactor import Reactor
+from hardware.safety.config import SafetyConfig
+from hardware.safety.interlock import Interlock
 
 __all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack"]
 
@@ -49,23 +48,39 @@ COMPOSITION, VIALS, USUAL_VIALS = "dqn_preview", "coculture", "nominal_noise"  #
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What a deploy config comes to.
+    """What a deploy config comes to, part by part; nobody below holds the config itself.
 
-    scenarios: one per reactor. plant: of the simulated vials, that of a `plant_file` where there is one; with an
-      `env_file` it grows and is fed as calibrated.
+    family, backend, bench: of the reactors. scenarios, ends, roles: one per reactor.
+    plant: of the simulated vials, that of a `plant_file` where there is one; with an `env_file` it grows and is fed as
+      calibrated.
     model: growth model that model-based controllers are given: the calibrated one, else the nominal one.
-    policy: of controller=dqn, None for a preflight. bounds: of its certificate. resumed: an earlier life of the run is
-      continued. keeper: of the composition, None where none is controlled.
+    law: config of what decides the pump rate. wanted: the policy that controller=dqn asks for, None for another.
+    policy: as read, None for a preflight. bounds: of its certificate. keeper: of the composition, None where none is
+      controlled; warnings: when a share is said to be out of control.
+    columns, fsync: of the record. title: who controls what. row: of the run in TensorBoard's table, but its results.
+    resumed: an earlier life of the run is continued.
     """
 
-    config: DeployConfig
+    family: Family
+    backend: Any
+    bench: Bench
+    safety: SafetyConfig
     scenarios: list[Scenario]
+    ends: list[str]
+    roles: list[str]
     plant: PlantConfig
     model: EnvConfig
+    law: Any
+    wanted: Wanted | None
     policy: Policy | None
     bounds: EstimateBounds | None
+    keeper: Keeper | None
+    warnings: ShareWarnings
+    columns: tuple[str, ...]
+    fsync: bool
+    title: str
+    row: dict[str, float | str]
     resumed: bool
-    keeper: Keeper | None = None
 
 
 def completed(config: DeployConfig) -> DeployConfig:
@@ -84,11 +99,11 @@ def completed(config: DeployConfig) -> DeployConfig:
         law = build(compositions.config(COMPOSITION), load(f"composition/{COMPOSITION}"), "composition")
         config = replace(config, composition=law)
         chosen.append(f"composition={COMPOSITION}")
-    if backend.kind == "emulator" and backend.plant == type(backend)().plant:
-        config = replace(config, backend=replace(backend, plant=VIALS))
-        chosen.append(f"backend.plant={VIALS}")
+    if (two := family_of(backend).coculture(backend)) != backend:
+        config = replace(config, backend=two)
+        chosen.append(f"backend.plant={two.plant}")
     usual = build(PlantConfig(), load(f"plant/{USUAL_VIALS}"), "plant")
-    if backend.kind == "sim" and config.plant == usual and not (config.plant_file or config.env_file):
+    if family_of(backend).simulated and config.plant == usual and not (config.plant_file or config.env_file):
         config = replace(config, plant=build(PlantConfig(), load(f"plant/{VIALS}"), "plant"))
         chosen.append(f"plant={VIALS}")
     if chosen:
@@ -101,15 +116,44 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
 
     Raises: UserError naming what cannot be read or does not fit.
     """
-    backend, resumed = config.backend, config.resume is not None
+    family, backend, safety = family_of(config.backend), config.backend, config.safety
+    resumed = config.resume is not None
     try:
-        scenarios = config.schedules()
-        config.ends()
+        scenarios, ends = config.schedules(), config.ends()
     except ValueError as error:
         raise frame.UserError(str(error)) from None
-    if resumed and backend.kind == "sim":
-        raise frame.UserError(f"resume={config.resume}: a simulated run takes a second; run it again")
-    bench, plant = config.bench, config.plant
+    if resumed and not family.can.resume:
+        why = "a simulated run takes a second; run it again" if family.simulated else "its reactors cannot; start anew"
+        raise frame.UserError(f"resume={config.resume}: {why}")
+    bench, (plant, model) = config.bench, _models(config)
+    if family.simulated and (other_ml := plant.vessel.volume_ml or bench.volume_ml) != bench.volume_ml:
+        of_bench = f"bench.volume_ml = {bench.volume_ml:g} mL, which everything else goes by"
+        log.warning("plant.vessel.volume_ml = %g mL differs from %s: on purpose?", other_ml, of_bench)
+    _check_fit(config, family, scenarios, ends)
+    keeper = _keeper(config, plant, folder, scenarios)
+    if keeper is not None:  # the device has to measure what the estimate needs
+        backend = family.seeing_fluorescence(backend)
+    fastest = min(model.max_pump_rate, bench.max_rate)
+    model = replace(model, control_min=bench.control_min, max_pump_rate=fastest)
+    wanted = policy = bounds = None
+    if config.controller.kind == "dqn":
+        asked = tuple(setpoint for scenario in scenarios for setpoint in scenario.setpoints)
+        limits = bench.control_min, bench.max_rate, asked, config.poor_regret_pct
+        wanted = Wanted(config.policy, *limits, family.at_stake, config.force_policy)
+    if wanted is not None and not config.preflight_only:
+        policy = run_policy(wanted, folder, resumed)
+        admit(policy, folder / "policy.npz", wanted, resumed)
+        bounds = certificate.bounds(policy, folder / "policy.npz")
+    recorded = COLUMNS if config.composition is None else (*COLUMNS, *columns(true=family.simulated))
+    return Setup(
+        family, backend, bench, safety, scenarios, ends, config.roles(), plant, model, config.controller, wanted,
+        policy, bounds, keeper, config.share_warnings, recorded, config.fsync, *_named(config, family, folder), resumed,
+    )  # fmt: skip
+
+
+def _models(config: DeployConfig) -> tuple[PlantConfig, EnvConfig]:
+    """Of the simulated vials, and the growth model that model-based controllers are given. Raises: UserError."""
+    plant, bench = config.plant, config.bench
     model = EnvConfig(tau=bench.tau)
     if config.plant_file is not None:
         plant = read_plant_file(config.plant_file)
@@ -118,22 +162,37 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         gain = (plant.vessel.volume_ml or bench.volume_ml) / (60.0 * model.tau)  # tau = V / (60 g)
         growth, pump = replace(plant.growth, mu=model.mu), replace(plant.pump, gain_ml_s=gain)
         plant = replace(plant, growth=growth, pump=pump)
-    if backend.kind == "sim" and (plant.vessel.volume_ml or bench.volume_ml) != bench.volume_ml:
-        of_bench = f"bench.volume_ml = {bench.volume_ml:g} mL, which everything else goes by"
-        log.warning("plant.vessel.volume_ml = %g mL differs from %s: on purpose?", plant.vessel.volume_ml, of_bench)
-    check_fit(config, scenarios)
-    keeper = _keeper(config, plant, folder, scenarios)
-    if keeper is not None and hasattr(backend, "fluorescence"):  # the device has to measure what the estimate needs
-        backend = replace(backend, fluorescence=replace(backend.fluorescence, measure=True))
-        config = replace(config, backend=backend)
-    fastest = min(model.max_pump_rate, bench.max_rate)
-    model = replace(model, control_min=bench.control_min, max_pump_rate=fastest)
-    policy = bounds = None
-    if config.controller.kind == "dqn" and not config.preflight_only:
-        policy = run_policy(config.policy, folder, resumed, bench.control_min, bench.max_rate)
-        admit(policy, folder / "policy.npz", config, scenarios)
-        bounds = certificate.bounds(policy, folder / "policy.npz")
-    return Setup(config, scenarios, plant, model, policy, bounds, resumed, keeper)
+    return plant, model
+
+
+def _check_fit(config: DeployConfig, family: Family, scenarios: list[Scenario], ends: list[str]) -> None:
+    """Whether family, scenario, controller and interlock fit, before a device is asked. Raises: UserError."""
+    law, kind = config.controller.kind, config.backend.kind
+    if not family.simulated:
+        try:
+            registry.on_device(law)
+        except ValueError:
+            remedy = f"allowed with backend=sim only, not backend={kind}"
+            raise frame.UserError(f"controller = {law}: knows a simulated plant; {remedy}") from None
+    try:
+        family.fits(config.backend, config.bench, scenarios, ends)
+    except ReactorError as error:
+        raise frame.UserError(str(error)) from None
+
+
+def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dict[str, float | str]]:
+    """Who controls what, in a title and as a row of TensorBoard's table; growth and pump of a simulated vial."""
+    chosen, decides, controlled = choices(folder), str(config.controller.kind), str(config.backend.kind)
+    if family.simulated:
+        controlled = "plant_file" if config.plant_file else chosen.get("plant", "given")
+    law = "" if config.composition is None else f" and {config.composition.kind}"
+    row: dict[str, float | str] = {"command": "deploy", "decides": decides, "on": controlled}
+    row["scenario"] = chosen.get("scenario", "given")
+    if family.simulated and not (config.plant_file or config.env_file):
+        volume_ml = config.plant.vessel.volume_ml or config.bench.volume_ml
+        tau = volume_ml / (60.0 * config.plant.pump.gain_ml_s)
+        row |= {"seed": config.backend.seed, "mu": config.plant.growth.mu, "tau": tau}
+    return f"{decides}{law} on {controlled}", row
 
 
 def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Keeper | None:
@@ -145,12 +204,10 @@ def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: l
     if not asked:
         remedy = "give scenario=ratio_steps or scenario.ratios, or drop it"
         raise frame.UserError(f"composition={kind}: no scenario asks for a share; {remedy}")
-    emulated = config.backend.kind == "emulator"
-    if config.backend.kind == "sim" or emulated:
-        vials = plant_preset(config.backend.plant) if emulated else plant
-        if not vials.second.present:
-            key = f"{'backend.' if emulated else ''}plant=coculture"
-            raise frame.UserError(f"composition={kind}: the vials hold one species that does not fluoresce; give {key}")
+    vials = family_of(config.backend).vials(config.backend, plant)
+    if vials is not None and not vials[1].second.present:
+        key = f"{vials[0]}={VIALS}"
+        raise frame.UserError(f"composition={kind}: the vials hold one species that does not fluoresce; give {key}")
     one = next(s for s in scenarios if s.composed)
     if kind == "optimum" and any(program_of(s) != program_of(one) for s in scenarios):
         raise frame.UserError("composition=optimum plans one program: give all reactors the same shares and minutes")
@@ -170,42 +227,27 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     Raises: UserError naming what the controller needs and does not have here; RecordingError for a state that is
       damaged or does not fit.
     """
-    plant, flow, bench = None, 1.0, setup.config.bench
-    volumes_ml = bench.volumes(reactors.names)
-    if isinstance(reactors, SimulatedReactors):
-        plant, flow = reactors.plant, reactors.config.pump_ml_s
+    (plant, flow), volumes_ml = setup.family.truth(reactors), setup.bench.volumes(reactors.names)
     try:
-        controller = registry.build(
-            setup.config.controller, setup.model, setup.policy, plant, flow, setup.bounds, volumes_ml
-        )
+        controller = registry.build(setup.law, setup.model, setup.policy, plant, flow, setup.bounds, volumes_ml)
     except ValueError as error:
         raise frame.UserError(str(error)) from None
-    interlock, composition = (
-        Interlock(len(volumes_ml), setup.config.safety, bench, volumes_ml, _rim(setup.config)),
-        None,
-    )
+    rim_ml, composition = setup.family.rim_ml(volumes_ml), None
+    interlock = Interlock(len(volumes_ml), setup.safety, setup.bench, volumes_ml, rim_ml)
     if setup.keeper is not None:
         truth = None if plant is None else partial(getattr, plant.culture, "share")
-        composition = Composition(setup.keeper, setup.scenarios, setup.config.share_warnings, truth)
-    ends = setup.config.ends()
-    loop = ClosedLoop(reactors, controller, interlock, setup.scenarios, record.decided, ends, composition)
+        composition = Composition(setup.keeper, setup.scenarios, setup.warnings, truth)
+    loop = ClosedLoop(reactors, controller, interlock, setup.scenarios, record.decided, setup.ends, composition)
     if setup.resumed:
         continue_loop(loop, record.journal, record.state_path)
     return loop
 
 
-def _rim(config: DeployConfig) -> Array | float:
-    """What each vial holds, mL."""
-    return np.array(config.backend.full_ml) if isinstance(config.backend, PioreactorConfig) else VIAL_ML
-
-
 @contextmanager
 def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
     """The loop around the configured reactors, which are released afterwards. Raises: ReactorError, UserError."""
-    opening = Opening(
-        setup.config.backend, setup.config.bench, setup.plant, record.journal, record.folder, setup.resumed
-    )
-    with families.opened(opening) as reactors:
+    opening = Opening(setup.backend, setup.bench, setup.plant, record.journal, record.folder, setup.resumed)
+    with setup.family.open(opening) as reactors:
         try:
             yield close_loop(setup, reactors, record)
         except BaseException:  # before the loop, which ends with the same by itself: an overflow pump runs already
@@ -215,8 +257,10 @@ def opened(setup: Setup, record: Record) -> Iterator[ClosedLoop]:
 
 def run_preflight(setup: Setup, folder: Path) -> None:
     """`preflight_only=true`: every check a line with pass or the remedy. Raises: UserError if one failed."""
-    config, backend = setup.config, setup.config.backend
-    if backend.kind == "sim":
+    if setup.family.simulated:
         raise frame.UserError("preflight_only=true: a simulated reactor needs no preflight; use backend=chibio")
-    policy = [policy_check(config, setup.scenarios)] if config.controller.kind == "dqn" else []
-    families.preflight(backend, folder, policy)
+    policy = [] if setup.wanted is None else [policy_check(setup.wanted)]
+    try:
+        report([*setup.family.preflight(setup.backend, setup.bench, folder), *policy])
+    except ReactorError as error:
+        raise frame.UserError(str(error)) from None

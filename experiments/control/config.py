@@ -10,25 +10,16 @@ from envs.scenario import Scenario
 from experiments.composition import registry as compositions
 from experiments.controllers import registry
 from experiments.controllers.learned import LearnedConfig
-from experiments.loop.composition import ShareWarnings, columns
-from experiments.record.recovery import COLUMNS
-from hardware.chibio.config import ChiBioConfig, EmulatorConfig
-from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
+from experiments.loop.composition import ShareWarnings
+from hardware.family import family, family_of
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
 
-__all__ = ["BACKENDS", "DeployConfig", "deploy_schema"]
+__all__ = ["DeployConfig", "deploy_schema"]
 
 
 AT_END = ("hold", "stop", "regulate")
 OF_RUN = ("role", "at_end")  # keys of `each` that are not of its scenario
-BACKENDS: dict[str, type[Any]] = {
-    "sim": SimulatedConfig,
-    "chibio": ChiBioConfig,
-    "emulator": EmulatorConfig,
-    "pioreactor": PioreactorConfig,
-    "pioreactor_rig": RigBackendConfig,
-}
 
 
 @dataclass(frozen=True)
@@ -98,7 +89,7 @@ class DeployConfig:
             require(
                 self.env_file is None, "env_file", self.env_file, "null beside plant_file, which has a model already"
             )
-            require(self.backend.kind == "sim", "backend.kind", self.backend.kind, "sim with plant_file")
+            require(family_of(self.backend).simulated, "backend.kind", self.backend.kind, "sim with plant_file")
 
     def schedules(self) -> list[Scenario]:
         """One schedule per reactor. Raises: ValueError naming reactor, key and what is allowed."""
@@ -128,19 +119,12 @@ class DeployConfig:
             require(end in AT_END, f"each.{name}.at_end", end, ", ".join(AT_END))
         return ends
 
-    def role(self, reactor: str) -> str:
-        """What a reactor is for, in words of the user."""
-        return str(self.each.get(reactor, {}).get("role", "replicate"))
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Of the recordings."""
-        return COLUMNS if self.composition is None else (*COLUMNS, *columns(true=self.backend.kind == "sim"))
+    def roles(self) -> list[str]:
+        """What each reactor is for, in words of the user."""
+        return [str(self.each.get(name, {}).get("role", "replicate")) for name in self.backend.reactors]
 
 
 def deploy_schema(kind: str, controller: str = "dqn", composition: str | None = None) -> DeployConfig:
     """The schema for the backend and controllers of these kinds. Raises: ValueError naming the kinds there are."""
-    if kind not in BACKENDS:
-        raise ValueError(f"backend.kind = {kind}: allowed {', '.join(BACKENDS)}")
     law = None if composition is None else compositions.config(composition)
-    return DeployConfig(backend=BACKENDS[kind](), controller=registry.config(controller), composition=law)
+    return DeployConfig(backend=family(kind).config(), controller=registry.config(controller), composition=law)

@@ -10,26 +10,19 @@ import numpy as np
 
 from dqn import policy as policies
 from dqn.policy import Policy
-from envs.scenario import Scenario
 from experiments.certification import certificate
 from experiments.cli import frame
 from experiments.cli.latest import newest
-from experiments.control.config import DeployConfig
 from hardware.check import Check
 from hardware.storage import atomic
 
 __all__ = [
-    "SHIPPED_COMPOSITION", "Training", "admit", "composition_policy", "find_policy", "load_policy", "policy_check",
-    "run_policy",
+    "SHIPPED_COMPOSITION", "Training", "Wanted", "admit", "composition_policy", "find_policy", "load_policy",
+    "policy_check", "run_policy",
 ]  # fmt: skip
 
 log = logging.getLogger(__name__)
 
-REHEARSED = (
-    "sim",
-    "emulator",
-    "pioreactor_rig",
-)  # backends without a culture; on any other a doubtful policy is refused
 SHIPPED = Path(str(resources.files("dqn"))) / "shipped" / "policy.npz"
 SHIPPED_COMPOSITION = {
     "dqn": SHIPPED.with_name("coculture.npz"),
@@ -42,6 +35,29 @@ FORCE = "force_policy=true runs it all the same"
 
 class NoPolicyError(frame.UserError):
     """`policy=latest` without a training run."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The policy that a run is to have, and what that run asks of it.
+
+    name: as of `find_policy`. control_min: control period, min. max_rate: largest pump rate that the interlock allows,
+    mL/s. setpoints: OD. poor_regret_pct: more regret than this is poor, per cent. at_stake: a culture is: a policy that
+    is doubtful or not certified is refused. forced: it is not refused.
+    """
+
+    name: str
+    control_min: float
+    max_rate: float
+    setpoints: tuple[float, ...]
+    poor_regret_pct: float
+    at_stake: bool
+    forced: bool
+
+    @property
+    def refuses(self) -> bool:
+        """Whether a doubtful one may not run."""
+        return self.at_stake and not self.forced
 
 
 @dataclass(frozen=True)
@@ -143,45 +159,38 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     return policy
 
 
-def admit(policy: Policy, file: Path, config: DeployConfig, scenarios: Sequence[Scenario]) -> None:
-    """Warn of a policy that is doubtful for these scenarios, on a device also of one that is not certified.
+def admit(policy: Policy, file: Path, wanted: Wanted, resumed: bool) -> None:
+    """Warn of a policy that is doubtful for these setpoints, on a device also of one that is not certified.
 
     Args: file: of the policy, beside which its certificate lies.
     Raises: UserError where a culture is at stake, unless it is forced or an earlier life of the run began with it.
     """
-    doubts = _doubts(policy, file, config, scenarios)
-    if doubts and config.resume is None and _refuses(config):
+    doubts = _doubts(policy, file, wanted)
+    if doubts and not resumed and wanted.refuses:
         raise frame.UserError(f"policy refused: {'; '.join(doubts)}; {FORCE}")
     for doubt in doubts:
         log.warning("policy: %s", doubt)
 
 
-def _doubts(policy: Policy, file: Path, config: DeployConfig, scenarios: Sequence[Scenario]) -> list[str]:
-    asked = [setpoint for scenario in scenarios for setpoint in scenario.setpoints]
-    doubts = Training.of(policy).doubts(asked, config.poor_regret_pct)
-    if config.backend.kind not in REHEARSED:
-        doubts += certificate.doubts(policy, file, asked, config.policy)
-    return doubts
+def _doubts(policy: Policy, file: Path, wanted: Wanted) -> list[str]:
+    doubts = Training.of(policy).doubts(wanted.setpoints, wanted.poor_regret_pct)
+    return doubts + (certificate.doubts(policy, file, wanted.setpoints, wanted.name) if wanted.at_stake else [])
 
 
-def _refuses(config: DeployConfig) -> bool:
-    return config.backend.kind not in REHEARSED and not config.force_policy
-
-
-def policy_check(config: DeployConfig, scenarios: Sequence[Scenario]) -> Check:
+def policy_check(wanted: Wanted) -> Check:
     """The policy's line of a preflight; that none has been trained yet does not stop a look at the device."""
     try:
-        policy = load_policy(config.policy, config.bench.control_min, config.bench.max_rate)
+        policy = load_policy(wanted.name, wanted.control_min, wanted.max_rate)
     except NoPolicyError as error:
         return Check("policy", False, str(error), "python -m experiments.train", required=False)
     except frame.UserError as error:
         return Check("policy", False, str(error), "give another policy=PATH")
-    doubts, refused = _doubts(policy, find_policy(config.policy), config, scenarios), _refuses(config)
-    remedy = FORCE if refused else "a device refuses it without force_policy=true"
-    return Check("policy", not doubts, "; ".join(doubts) or str(Training.of(policy)), remedy, refused)
+    doubts = _doubts(policy, find_policy(wanted.name), wanted)
+    remedy = FORCE if wanted.refuses else "a device refuses it without force_policy=true"
+    return Check("policy", not doubts, "; ".join(doubts) or str(Training.of(policy)), remedy, wanted.refuses)
 
 
-def run_policy(name: str, folder: Path, resumed: bool, control_min: float, max_rate: float) -> Policy:
+def run_policy(wanted: Wanted, folder: Path, resumed: bool) -> Policy:
     """The policy of a run, of which the run folder keeps a copy with its certificate; a resumed run goes on with it.
 
     The copy is written from the policy as it was read: whatever has been trained meanwhile, both are the same.
@@ -189,9 +198,9 @@ def run_policy(name: str, folder: Path, resumed: bool, control_min: float, max_r
     """
     kept = folder / "policy.npz"
     if resumed and kept.is_file():
-        return load_policy(str(kept), control_min, max_rate)
-    source = find_policy(name)
-    policy = load_policy(str(source), control_min, max_rate)
+        return load_policy(str(kept), wanted.control_min, wanted.max_rate)
+    source = find_policy(wanted.name)
+    policy = load_policy(str(source), wanted.control_min, wanted.max_rate)
     _keep(policy, kept)
     try:
         if certificate.beside(source).is_file():

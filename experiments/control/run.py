@@ -4,23 +4,20 @@ import logging
 import os
 import shlex
 from contextlib import closing, suppress
-from dataclasses import asdict
 from pathlib import Path
 
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from experiments.cli import files, frame
-from experiments.cli.choices import choices
 from experiments.cli.frame import swept
+from experiments.cli.stop import one_interrupt
 from experiments.control import assemble, notify
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
-from experiments.control.device import one_interrupt
 from experiments.control.levels import Levels
 from experiments.control.notify import Notifier
 from experiments.loop.loop import ClosedLoop
-from experiments.record.curves import controlled
 from experiments.record.record import Record
 from experiments.record.summary import (
     ChangeLog,
@@ -42,15 +39,9 @@ log = logging.getLogger(__name__)
 def _began(setup: Setup, folder: Path) -> None:
     """Log what is run, for how long, and where to watch it."""
     longest = max(s.total_min for s in setup.scenarios)
-    title = f"{_title(setup.config, folder)}, {', '.join(setup.config.backend.reactors)}"
+    title = f"{setup.title}, {', '.join(setup.backend.reactors)}"
     log.info("%s: %g min (%.1f h) of schedule once the culture has grown", title, longest, longest / 60.0)
     log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
-
-
-def _title(config: DeployConfig, folder: Path) -> str:
-    """Of the figures: who controls what."""
-    law = "" if config.composition is None else f" and {config.composition.kind}"
-    return f"{config.controller.kind}{law} on {controlled(choices(folder), asdict(config))}"
 
 
 def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
@@ -86,23 +77,22 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
 
 def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str:
     """Figure and summary.json, whatever the outcome; returns the outcome, failed if they could not be written."""
-    config, folder = setup.config, record.folder
+    folder = record.folder
     if not outcome.startswith(("completed", "stopped by the interlock")):
         with suppress(RecordingError):  # a signal or an error in a dose ends the loop before its row is written
             record.complete()
     try:
-        title = f"{_title(config, folder)}: {outcome}"
+        title = f"{setup.title}: {outcome}"
         figures = {"closed_loop": figure_of(record, setup.scenarios, title)}
         if setup.keeper is not None:
             figures["composition"] = composition_figure_of(record, title)
         pictures = {name: charts.save(figure, folder / "figures", name) for name, figure in figures.items()}
-        roles = [config.role(name) for name in record.names]
         summary = {
-            **summarise(record, setup.scenarios, roles, outcome, loop.progress),
+            **summarise(record, setup.scenarios, setup.roles, outcome, loop.progress),
             "figure": str(folder / "figures" / "closed_loop.png"),
         }
         files.write_json(folder / "summary.json", summary)
-        record.curves.end(summary, asdict(config), pictures)
+        record.curves.end(summary, setup.row, pictures)
     except OSError as error:
         why = f"figure and summary not written ({error.strerror or error})"
         return f"failed: {outcome.removeprefix('failed: ')}; {why}"
@@ -126,10 +116,7 @@ def deploy(config: DeployConfig, folder: Path) -> None:
         frame.save_config(config, folder)
     setup = assemble.unpack(config, folder)
     if config.preflight_only:
-        try:
-            assemble.run_preflight(setup, folder)
-        except ReactorError as error:
-            raise frame.UserError(str(error)) from None
+        assemble.run_preflight(setup, folder)
         return
     tell, outcome = notify.opened(config.notify, folder, setup.resumed), "ended before its summary: see the log"
     try:
@@ -148,8 +135,8 @@ def deploy(config: DeployConfig, folder: Path) -> None:
 
 def _recorded(setup: Setup, folder: Path, tell: Notifier) -> str:
     """The loop with everything that it leaves behind; returns the outcome. Raises: ReactorError, UserError."""
-    config = setup.config
-    with one_interrupt(), closing(Record(folder, config.backend.reactors, config.fsync, config.columns)) as record:
+    kept = setup.backend.reactors, setup.fsync, setup.columns
+    with one_interrupt(), closing(Record(folder, *kept)) as record:
         for repair in record.repairs:
             log.warning("%s", repair)
         _began(setup, folder)

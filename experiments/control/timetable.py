@@ -14,7 +14,7 @@ from experiments.cli import frame
 from experiments.control import assemble
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
-from experiments.control.device import load_calibrations
+from hardware.errors import ReactorError
 
 __all__ = ["Expected", "expected", "timetable"]
 
@@ -88,46 +88,43 @@ def timetable(config: DeployConfig, place: str, now: datetime) -> str:
     if config.resume is not None:
         raise frame.UserError("dry_run=true: a resumed run goes on where it was; drop dry_run or resume")
     with tempfile.TemporaryDirectory() as scratch:
-        setup = assemble.unpack(assemble.completed(config), Path(scratch))
-    lines = [*_deciders(setup), *_device(setup)]
-    for name, scenario in zip(setup.config.backend.reactors, setup.scenarios, strict=True):
-        lines += _reactor(setup, name, scenario, now)
+        setup = assemble.unpack(whole := assemble.completed(config), Path(scratch))
+    lines = [_deciders(whole, setup), *_device(setup)]
+    for name, role, scenario in zip(setup.backend.reactors, setup.roles, setup.scenarios, strict=True):
+        lines += _reactor(setup, name, role, scenario, now)
     return "\n".join([*lines, f"would record in {place}; nothing was asked of a device and nothing was written"])
 
 
-def _deciders(setup: Setup) -> Iterator[str]:
-    c = setup.config
+def _deciders(c: DeployConfig, setup: Setup) -> str:
     policy = ""
     if setup.policy is not None:
         policy = f", policy {c.policy} (regret {float(setup.policy.metadata.get('regret_pct', math.nan)):.2g} %)"
     share = "" if c.composition is None else f"; share: {c.composition.kind}"
-    yield f"controller {c.controller.kind}{policy}{share}; at_end {c.at_end}"
+    return f"controller {c.controller.kind}{policy}{share}; at_end {c.at_end}"
 
 
 def _device(setup: Setup) -> Iterator[str]:
-    backend = setup.config.backend
-    where = getattr(backend, "url", "") if backend.kind == "chibio" else "in this computer"
-    yield f"backend {backend.kind} ({where}), reactors {', '.join(backend.reactors)}"
-    if not hasattr(backend, "calibration"):
-        return
-    found = load_calibrations(Path(backend.calibration), backend.reactors)
-    if nominal := [name for name, c in zip(backend.reactors, found, strict=True) if not c.calibrated]:
-        yield f"pumps not weighed, taken as 1 mL/s: {', '.join(nominal)}"
+    family, backend = setup.family, setup.backend
+    yield f"backend {backend.kind} ({family.address(backend)}), reactors {', '.join(backend.reactors)}"
+    try:
+        if line := family.unmeasured(backend):
+            yield line
+    except ReactorError as error:
+        raise frame.UserError(str(error)) from None
 
 
 def _start_od(setup: Setup, scenario: Scenario) -> float:
     """The OD a reactor starts from, as far as that is known; else the one its first step asks for."""
-    backend = setup.config.backend
-    known = {"sim": setup.plant.start_od, "emulator": getattr(backend, "od", 0.0)}
-    return max(known.get(backend.kind, 0.0), scenario.recovery_od) or scenario.setpoints[0]
+    known = setup.family.start_od(setup.backend, setup.plant)
+    return max(known, scenario.recovery_od) or scenario.setpoints[0]
 
 
-def _reactor(setup: Setup, name: str, scenario: Scenario, now: datetime) -> Iterator[str]:
+def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: datetime) -> Iterator[str]:
     """The steps of one reactor, each in a line, and whether its medium lasts."""
-    growth, volume_ml = setup.model.mu, setup.config.bench.volume_of(name)
-    dilution = setup.model.max_pump_rate / setup.model.tau * (setup.config.bench.volume_ml / volume_ml)
+    growth, volume_ml = setup.model.mu, setup.bench.volume_of(name)
+    dilution = setup.model.max_pump_rate / setup.model.tau * (setup.bench.volume_ml / volume_ml)
     od, at, ml, most = max(_start_od(setup, scenario), 1e-3), 0.0, 0.0, 0.0
-    yield f"{name} ({setup.config.role(name)}), from OD {od:g}, growth {growth:g} 1/min"
+    yield f"{name} ({role}), from OD {od:g}, growth {growth:g} 1/min"
     yield HEAD
     if scenario.recovery_od:
         longest = f"at most {scenario.recovery_limit_min:g} min; the times below count from its end"
@@ -168,8 +165,7 @@ def _spare(scenario: Scenario, k: int, minutes: float) -> float:
 
 def _lasts(setup: Setup, ml: float, most: float) -> str:
     """Whether bottle and budget last."""
-    bench, safety = setup.config.bench, setup.config.safety
-    limit, key = min((bench.bottle_ml, "bench.bottle_ml"), (safety.ml_per_run, "safety.ml_per_run"))
+    limit, key = min((setup.bench.bottle_ml, "bench.bottle_ml"), (setup.safety.ml_per_run, "safety.ml_per_run"))
     if most <= limit:
         return f"{key}={limit:g} lasts"
     word = "does NOT last" if ml > limit else "may not last"

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.outputs import DOSE_ML, PUMPS, outputs_of
+from envs.outputs import DOSE_ML, MADE_UP_MIN, PUMPS, outputs_of
 from envs.scenario import Scenario
 from experiments.controllers.base import Array, Mask
 
-__all__ = ["MADE_UP_MIN", "Supply"]
+__all__ = ["Supply"]
 
-MADE_UP_MIN = 5.0  # of a pause of the program or of the samples; what was owed in a longer one is left out
 FEED_PUMP = 1
 
 

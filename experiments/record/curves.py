@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.cli.choices import choices
 from experiments.loop.loop import Step
 from experiments.reporting import tables
 from experiments.reporting.curves import BAND, DEPLOYMENT, SHARES
 from experiments.reporting.tensorboard import Events
 
-__all__ = ["Curves", "controlled"]
+__all__ = ["Curves"]
 
 Array = NDArray[np.float64]
 
@@ -80,10 +79,10 @@ class Curves:
             self._each[n].scalars(values, minute, self._began + 60.0 * minute)
             self._last = minute
 
-    def end(self, summary: Mapping[str, Any], config: Mapping[str, Any], pictures: Mapping[str, Path]) -> None:
+    def end(self, summary: Mapping[str, Any], row: Mapping[str, float | str], pictures: Mapping[str, Path]) -> None:
         """What came out: figures, the windows as a table, and a row of the HPARAMS table.
 
-        Args: summary: content of summary.json. config: that of the run, as plain values. pictures: name -> PNG.
+        Args: summary: content of summary.json. row: that row but its results. pictures: name -> PNG.
         """
         when = self._began + 60.0 * self._last
         for name, path in pictures.items():
@@ -91,7 +90,7 @@ class Curves:
         windows = summary["windows"]
         self.run.text("run/summary", f"{summary['outcome']}\n\n{_table(windows)}", self._last)
         self.run.scalars({tag: v for tag, v in _results(summary).items() if np.isfinite(v)}, self._last, when)
-        self.run.hyper_parameters(_parameters(choices(self._folder), config), self._folder)
+        self.run.hyper_parameters(row, self._folder)
 
     def flush(self) -> None:
         """Make everything so far visible to a reader. Raises: OSError of a full disk."""
@@ -102,29 +101,6 @@ class Curves:
         """Flush and close. Idempotent."""
         for events in {self.run, *self._each}:
             events.close()
-
-
-def _parameters(chosen: Mapping[str, str], config: Mapping[str, Any]) -> dict[str, float | str]:
-    """The row of a deployment but its results; growth and pump of a simulated vial."""
-    values: dict[str, float | str] = {
-        "command": "deploy",
-        "decides": str(config["controller"]["kind"]),
-        "on": controlled(chosen, config),
-        "scenario": chosen.get("scenario", "given"),
-    }
-    if config["backend"]["kind"] == "sim" and not (config["plant_file"] or config["env_file"]):
-        plant = config["plant"]
-        tau = (plant["vessel"]["volume_ml"] or config["bench"]["volume_ml"]) / (60.0 * plant["pump"]["gain_ml_s"])
-        values |= {"seed": config["backend"]["seed"], "mu": plant["growth"]["mu"], "tau": tau}
-    return values
-
-
-def controlled(chosen: Mapping[str, str], config: Mapping[str, Any]) -> str:
-    """What a run controls, from its presets and config: a simulated vial by its preset, else the backend."""
-    kind = str(config["backend"]["kind"])
-    if kind != "sim":
-        return kind
-    return "plant_file" if config.get("plant_file") else chosen.get("plant", "given")
 
 
 def _results(summary: Mapping[str, Any]) -> dict[str, float]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from email.utils import parsedate_to_datetime
 from pathlib import Path
 
+from envs.bench import VIAL_ML
 from hardware.check import Check
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
@@ -20,7 +21,6 @@ from hardware.logbook import no_log
 __all__ = ["Check", "preflight"]
 
 MARGIN = 1.1  # over the feed pump's flow: pumps differ from their calibration
-VIAL_ML = 30.0  # up to its rim (docs/biology.md, Volume)
 FULL_SCALE = 65535.0  # counts of the spectrometer
 FREE_MB = 1000.0  # a week of eight reactors writes about 240 MB (docs/faults.md)
 

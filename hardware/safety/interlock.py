@@ -23,9 +23,8 @@ from hardware.safety.fluorescence import Light
 from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
-__all__ = ["VIAL_ML", "Interlock", "Verdict", "kinds_of"]
+__all__ = ["Interlock", "Verdict", "kinds_of"]
 
-VIAL_ML = 30.0  # what the vial of a Chi.Bio holds
 ADDED = (  # to the saved state of earlier versions
     "_helpless_od", "_eased", "_light", "_light_repeats", "_light_s", "_since_low_ml",
 )  # fmt: skip
@@ -65,7 +64,7 @@ class Interlock:
         config: SafetyConfig | None = None,
         bench: Bench | None = None,
         tube_ml: Array | None = None,
-        rim_ml: Array | float = VIAL_ML,
+        rim_ml: Array | float = math.inf,
     ) -> None:
         self.bench = bench or Bench()
         self.n, self.config = n, config or SafetyConfig()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.cli import files, frame
-from experiments.control.device import save_calibration
+from hardware.chibio.calibrations import save_calibration
 from tests.campaigns.killed_run import Findings, KillConfig, killed_run
 from tests.campaigns.rehearsal import SOUND
 from tests.entry import command

@@ -126,10 +126,10 @@ class Rehearsal:
         self.lives += 1
         resume = str(self.folder) if self.lives > 1 else None
         setup = assemble.unpack(replace(self.config, resume=resume), self.folder)
-        self.record = Record(self.folder, self.names, setup.config.fsync, setup.config.columns)
+        self.record = Record(self.folder, self.names, setup.fsync, setup.columns)
         self.spans.append([self.clock.now(), np.inf])
         transport, calibrations = EmulatorTransport(self.device), [SOUND] * len(self.names)
-        self.reactors = ChiBioReactors(transport, self.clock, setup.config.backend, calibrations, self._log)
+        self.reactors = ChiBioReactors(transport, self.clock, setup.backend, calibrations, self._log)
         self.reactors.begin(replay(self.record.journal.rows), self.clock.now() - self.spans[0][0])
         self.loop = assemble.close_loop(setup, self.reactors, self.record)
 

@@ -13,11 +13,12 @@ import pytest
 from experiments.blank import BlankConfig, blank
 from experiments.calibrate_pump import CalibratePumpConfig, Series, calibrate, report, weigh
 from experiments.cli import frame
-from experiments.control.device import load_calibrations, save_calibration
+from hardware.chibio.calibrations import load_calibrations, save_calibration
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import fit_pump
 from hardware.chibio.protocol import PERIOD_S
 from hardware.emulator.process import EmulatorProcess
+from hardware.errors import UnfitError
 
 ROOT = Path(__file__).parents[2]
 
@@ -187,7 +188,7 @@ def test_a_culture_is_no_blank(tmp_path: Path) -> None:
 )
 def test_a_broken_calibration_file_is_named(tmp_path: Path, content: str, words: str) -> None:
     (tmp_path / "M0_feed.yaml").write_text(content)
-    with pytest.raises(frame.UserError, match=words):
+    with pytest.raises(UnfitError, match=words):
         load_calibrations(tmp_path, ["M0"])
 
 
@@ -195,7 +196,7 @@ def test_what_was_stored_is_loaded(tmp_path: Path) -> None:
     save_calibration(tmp_path, "M3", "blank", {"blank": 13000.0})
     assert load_calibrations(tmp_path, ["M3"])[0].blank == 13000.0
     save_calibration(tmp_path, "M3", "blank", {"blank": 13.0})
-    with pytest.raises(frame.UserError, match="blank = 13"):
+    with pytest.raises(UnfitError, match="blank = 13"):
         load_calibrations(tmp_path, ["M3"])
 
 

@@ -18,8 +18,8 @@ from conf import presets
 from conf.schema import build
 from envs.scenario import Scenario
 from experiments.composition import registry as compositions
-from experiments.control.device import save_calibration
 from experiments.record.recovery import COLUMNS as USUAL
+from hardware.chibio.calibrations import save_calibration
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.vial import VialConfig
 from hardware.storage.journal import read_journal

@@ -288,10 +288,11 @@ def test_a_training_that_ends_while_the_latest_policy_is_taken_swaps_nothing(tmp
         return found
 
     monkeypatch.setattr(policy, "load", read_while_a_training_ends)
-    flown = policies.run_policy("latest", tmp_path, False, 1.0, 0.02)
+    wanted = policies.Wanted("latest", 1.0, 0.02, (), 10.0, at_stake=False, forced=False)
+    flown = policies.run_policy(wanted, tmp_path, resumed=False)
     monkeypatch.setattr(policy, "load", read)
     assert policies.find_policy("latest") == Path("runs/train/new/policy.npz")
-    resumed = policies.run_policy("latest", tmp_path, True, 1.0, 0.02)
+    resumed = policies.run_policy(wanted, tmp_path, resumed=True)
     for own in (flown, resumed):
         np.testing.assert_array_equal(own.biases[0], older.biases[0])
 

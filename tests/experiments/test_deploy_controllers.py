@@ -24,14 +24,17 @@ from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from experiments.cli import frame
-from experiments.control import families, run
+from experiments.control import run
 from experiments.control.config import DeployConfig, deploy_schema
 from experiments.controllers.registry import KINDS
 from hardware.chibio.config import EmulatorConfig
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
+from hardware.emulator.family import EmulatorFamily
 from hardware.emulator.transport import EmulatorTransport
+from hardware.family import Opening
 from hardware.pioreactor.config import PioreactorConfig
+from hardware.pioreactor.family import PioreactorFamily
 from hardware.storage.journal import Journal, read_journal
 from tests.experiments.test_deploy import inverse_policy
 
@@ -61,13 +64,13 @@ def emulated(monkeypatch: pytest.MonkeyPatch) -> list[ChiBioDevice]:
     devices = []
 
     @contextmanager
-    def linked(backend: EmulatorConfig) -> Iterator[tuple[EmulatorTransport, VirtualClock]]:
+    def linked(_: EmulatorFamily, backend: EmulatorConfig) -> Iterator[tuple[EmulatorTransport, VirtualClock]]:
         clock = VirtualClock()
         rng = np.random.default_rng(1)
         devices.append(ChiBioDevice(backend.reactors, clock, rng, od=0.5, temperature=37.0, blanked=True))
         yield EmulatorTransport(devices[-1]), clock
 
-    monkeypatch.setattr(families, "linked", linked)
+    monkeypatch.setattr(EmulatorFamily, "linked", linked)
     return devices
 
 
@@ -140,11 +143,11 @@ def test_a_stop_before_the_pumps_were_looked_at_says_so(
     """Ctrl-C at the first request, by which the device is found: what an earlier life left on may run on."""
 
     @contextmanager
-    def stopped(backend: EmulatorConfig) -> Iterator[None]:
+    def stopped(_: EmulatorFamily, backend: EmulatorConfig) -> Iterator[None]:
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr(families, "linked", stopped)
+    monkeypatch.setattr(EmulatorFamily, "linked", stopped)
     with pytest.raises(KeyboardInterrupt):
         run.deploy(config("inverse", "emulator", tmp_path), tmp_path)
     assert "pumps not verified off" in caplog.text
@@ -158,9 +161,9 @@ def test_a_stop_before_the_units_were_looked_at_says_so(
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr(families, "_units", stopped)
+    monkeypatch.setattr(PioreactorFamily, "units", stopped)
     with closing(Journal(tmp_path / "journal.jsonl", fsync=False)) as journal:
-        opening = families.Opening(PioreactorConfig(), Bench(), PlantConfig(), journal, tmp_path, resumed=False)
-        with pytest.raises(KeyboardInterrupt), families.OPENERS["pioreactor"](opening):
+        opening = Opening(PioreactorConfig(), Bench(), PlantConfig(), journal, tmp_path, resumed=False)
+        with pytest.raises(KeyboardInterrupt), PioreactorFamily().open(opening):
             pass
     assert "pumps not verified off" in caplog.text

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.control.device import linked
 from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.family import linked
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import DeviceStateError
 

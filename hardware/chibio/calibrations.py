@@ -1,0 +1,64 @@
+"""What was measured of each reactor on the bench, as files: one of YAML per reactor and part, REACTOR_PART.yaml."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
+from hardware.errors import UnfitError
+from hardware.storage import atomic
+from hardware.storage.yaml_text import read_text
+
+__all__ = ["load_calibrations", "save_calibration"]
+
+PARTS = ("feed", "waste", "blank")
+
+
+def save_calibration(folder: Path, reactor: str, part: str, values: Mapping[str, Any]) -> Path:
+    """Write FOLDER/REACTOR_PART.yaml, whole or not at all; returns its path.
+
+    Args: part: feed, waste or blank. Raises: UnfitError if the folder cannot be written.
+    """
+    path = folder / f"{reactor}_{part}.yaml"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        atomic.write(path, yaml.safe_dump(dict(values), allow_unicode=True, sort_keys=False), fsync=False)
+    except OSError as error:
+        raise UnfitError(f"calibration {path}: {error.strerror or error}; give another folder") from None
+    return path
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        content = yaml.safe_load(read_text(path))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise UnfitError(f"calibration {path}: not readable ({str(error).splitlines()[0]}); measure again") from None
+    if content is None:  # an empty file
+        return {}
+    if not isinstance(content, dict):
+        raise UnfitError(f"calibration {path}: no keys and values; measure again")
+    return {str(k): v for k, v in content.items()}
+
+
+def load_calibrations(folder: Path, reactors: Sequence[str]) -> list[ReactorCalibration]:
+    """Pumps and blanks of `reactors`; what was never measured is nominal, and its blank is nan (the device's own).
+
+    Raises: UnfitError naming the file and what is wrong with it.
+    """
+    calibrations = []
+    for name in reactors:
+        feed, waste, blank = (_read(folder / f"{name}_{part}.yaml") for part in PARTS)
+        try:
+            pumps = [PumpCalibration.from_dict(values) for values in (feed, waste)]
+            counts = float(blank.get("blank", math.nan))
+            if not math.isnan(counts) and not 3000.0 <= counts <= 60000.0:
+                raise ValueError(f"blank = {counts}: allowed 3000 to 60000 counts")
+        except (TypeError, ValueError) as error:
+            raise UnfitError(f"calibration of {name} in {folder}: {error}") from None
+        calibrations.append(ReactorCalibration(pumps[0], pumps[1], counts))
+    return calibrations

@@ -1,0 +1,121 @@
+"""Chi.Bio reactors as a family: the link to the device, its preflight, its calibrations, its spare pumps."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from envs.bench import VIAL_ML, Bench
+from envs.scenario import Scenario
+from hardware.check import Check, report
+from hardware.chibio.calibrations import load_calibrations
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.connection import identity
+from hardware.chibio.preflight import preflight
+from hardware.chibio.protocol import CYCLE_S
+from hardware.chibio.reactors import ChiBioReactors
+from hardware.chibio.resume import replay
+from hardware.clock import RealClock
+from hardware.errors import UnfitError
+from hardware.family import Can, Family, Opening, not_looked_at
+from hardware.link.open import DeviceLock, open_transport
+from hardware.link.transport import Transport
+from hardware.reactor import Array, Reactor, left_off
+
+__all__ = ["FAMILY", "ChiBioFamily", "linked"]
+
+Link = tuple[Transport, RealClock]
+
+
+@contextmanager
+def linked(backend: ChiBioConfig, own_url: str = "") -> Iterator[Link]:
+    """The open link to a device that no other client has, and the device's clock.
+
+    Args: own_url: of a device that was started for this run alone, in the place of the config's.
+    Raises: ReactorError if nothing answers, or another client on this computer has the device, by whatever name.
+    """
+    with ExitStack() as stack:
+        url = own_url or backend.url
+        transport = stack.enter_context(closing(open_transport(backend.transport, url, backend.speed)))
+        clock = RealClock(backend.speed)
+        if not own_url:
+            stack.enter_context(closing(DeviceLock(f"the device with reactor {identity(transport, clock)}")))
+        yield transport, clock
+
+
+class ChiBioFamily(Family):
+    """One device with up to eight reactors."""
+
+    config = ChiBioConfig
+    can = Can(fluorescence=True, spare_pumps=True, thermostat=True, regulation=True, resume=True)
+
+    def linked(self, backend: ChiBioConfig, bench: Bench) -> AbstractContextManager[Link]:
+        """The device of a config: its link and its clock. Raises: ReactorError."""
+        return linked(backend)
+
+    @contextmanager
+    def open(self, opening: Opening) -> Iterator[Reactor]:
+        """As the family says, and a new run is checked first. Raises: ReactorError."""
+        backend, earlier = opening.backend, opening.earlier()
+        with ExitStack() as stack:
+            with not_looked_at():
+                transport, clock = stack.enter_context(self.linked(backend, opening.bench))
+                calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
+                if not earlier:
+                    report(preflight(transport, clock, backend, calibrations, opening.folder))
+                reactors = ChiBioReactors(transport, clock, backend, calibrations, opening.journal.append)
+            elapsed_s = opening.elapsed_s(backend.speed)
+            reactors.begin(replay(earlier), elapsed_s)
+            with left_off(reactors):
+                yield reactors
+
+    def preflight(self, backend: ChiBioConfig, bench: Bench, folder: Path) -> list[Check]:
+        """As `hardware.chibio.preflight`. Raises: ReactorError."""
+        calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
+        with self.linked(backend, bench) as (transport, clock):
+            return preflight(transport, clock, backend, calibrations, folder)
+
+    def tubes(self, backend: ChiBioConfig, scenarios: Sequence[Scenario], most_ml: float) -> None:
+        """By `backend.supply`. Raises: UnfitError."""
+        for name, scenario in zip(backend.reactors, scenarios, strict=True):
+            for number in sorted(scenario.supplied):
+                key = f"backend.supply.pump{number}_ml_s"
+                if f"Pump{number}" not in backend.supply.pumps:
+                    remedy = (
+                        f"weigh what it gives in a second at full power (docs/scenarios.md) and give its flow, {key}"
+                    )
+                    raise UnfitError(f"scenario.outputs of {name}: Pump{number} has no tube; {remedy}")
+                can = backend.supply.most_ml(f"Pump{number}")
+                if can < most_ml - 1e-9:
+                    remedy = f"allowed {most_ml:.2f} mL a dose; take a wider tube or a smaller bench.max_rate"
+                    raise UnfitError(f"{key}: Pump{number} gives at most {can:.2f} mL a dose: {remedy}")
+
+    def doses(self, backend: ChiBioConfig, bench: Bench) -> None:
+        """Whether the period is the device's, and the vials hold the cultures. Raises: UnfitError."""
+        if bench.period_s != CYCLE_S:
+            where = f"allowed {CYCLE_S:g} with backend={backend.kind}, which measures so often"
+            raise UnfitError(f"bench.period_s = {bench.period_s:g} s: {where}")
+        for name in backend.reactors:
+            if (ml := bench.volume_of(name)) >= VIAL_ML:
+                raise UnfitError(f"bench.volume_ml = {ml:g} mL of {name}: the vial holds {VIAL_ML:g}; allowed less")
+
+    def rim_ml(self, volumes_ml: Array) -> float:
+        """Of the glass vial."""
+        return VIAL_ML
+
+    def seeing_fluorescence(self, backend: ChiBioConfig) -> ChiBioConfig:
+        """With its slot on."""
+        return replace(backend, fluorescence=replace(backend.fluorescence, measure=True))
+
+    def address(self, backend: ChiBioConfig) -> str:
+        """Of the device's server."""
+        return backend.url
+
+    def unmeasured(self, backend: ChiBioConfig) -> str:
+        """Pumps without a calibration. Raises: UnfitError."""
+        found = load_calibrations(Path(backend.calibration), backend.reactors)
+        nominal = [name for name, c in zip(backend.reactors, found, strict=True) if not c.calibrated]
+        return f"pumps not weighed, taken as 1 mL/s: {', '.join(nominal)}" if nominal else ""
+
+
+FAMILY = ChiBioFamily()

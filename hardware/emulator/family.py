@@ -1,0 +1,65 @@
+"""A Chi.Bio in software as a family: the same driver before a device that the run starts for itself."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+from envs.bench import Bench
+from envs.plant.plant import PlantConfig
+from hardware.chibio.config import ChiBioConfig, EmulatorConfig
+from hardware.chibio.family import ChiBioFamily, Link, linked
+from hardware.emulator.device import plant_preset
+from hardware.emulator.process import EmulatorProcess
+
+__all__ = ["FAMILY", "EmulatorFamily"]
+
+log = logging.getLogger(__name__)
+EMULATED = ("speed", "seed", "od", "plant")  # values of backend=emulator that its process is started with
+TWO = "coculture"  # preset of vials with two species
+
+
+def _words(backend: EmulatorConfig, bench: Bench) -> list[str]:
+    """The command line of the device's process."""
+    arguments = {"reactors": ",".join(backend.reactors), **{k: getattr(backend, k) for k in EMULATED}}
+    arguments["volume"] = ",".join(f"{ml:g}" for ml in bench.volumes(backend.reactors))
+    if (overflow := backend.overflow_pump).pump:
+        arguments |= {"overflow-pump": overflow.pump, "overflow-flow": overflow.flow_ml_s}
+    arguments |= {f"{pump.lower()}-flow": backend.supply.flow_ml_s(pump) for pump in backend.supply.pumps}
+    return [word for k, v in arguments.items() for word in (f"--{k}", str(v))]
+
+
+class EmulatorFamily(ChiBioFamily):
+    """A device of the run's own, which ends with it."""
+
+    config = EmulatorConfig
+    at_stake = False
+
+    @contextmanager
+    def linked(self, backend: ChiBioConfig, bench: Bench) -> Iterator[Link]:
+        """A device started for as long as the run lasts. Raises: ReactorError."""
+        assert isinstance(backend, EmulatorConfig)
+        with EmulatorProcess(_words(backend, bench)) as device:
+            url, control = device.url, device.control
+            log.info("emulated device at %s, %g times real time; faults at %s", url, backend.speed, control)
+            with linked(backend, url) as link:
+                yield link
+
+    def coculture(self, backend: EmulatorConfig) -> EmulatorConfig:
+        """Of the preset with two species, where another was not chosen."""
+        return replace(backend, plant=TWO) if backend.plant == EmulatorConfig().plant else backend
+
+    def vials(self, backend: EmulatorConfig, plant: PlantConfig) -> tuple[str, PlantConfig]:
+        """Of the preset `backend.plant`."""
+        return "backend.plant", plant_preset(backend.plant)
+
+    def address(self, backend: ChiBioConfig) -> str:
+        """In a process of this computer."""
+        return "in this computer"
+
+    def start_od(self, backend: EmulatorConfig, plant: PlantConfig) -> float:
+        """As configured."""
+        return backend.od
+
+
+FAMILY = EmulatorFamily()

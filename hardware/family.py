@@ -1,0 +1,272 @@
+"""A kind of reactor as one object: its config, how it is opened and checked, what it can do, what a run may ask of it.
+
+The kinds that come with the program are loaded when they are asked for; `add` makes a further one known.
+"""
+
+import logging
+import math
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from conf import presets
+from envs.bench import Bench
+from envs.outputs import DOSE_ML, MADE_UP_MIN
+from envs.plant.plant import Plant, PlantConfig
+from envs.scenario import Scenario
+from hardware.check import Check
+from hardware.errors import ReactorError, RecordingError, UnfitError
+from hardware.reactor import Array, Reactor
+from hardware.storage.journal import Journal
+
+__all__ = ["Can", "Family", "Opening", "add", "family", "family_of", "known", "not_looked_at"]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Can:
+    """What the reactors of a family can do.
+
+    fluorescence: measure it, by which a share is known. spare_pumps: give by pumps 3 and 4. thermostat: hold the
+    temperature that a step asks for. regulation: hold an OD by themselves. resume: go on after the program was killed.
+    """
+
+    fluorescence: bool = False
+    spare_pumps: bool = False
+    thermostat: bool = False
+    regulation: bool = False
+    resume: bool = False
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What a family is given to open its reactors.
+
+    backend: its config. bench: volume, period and pump. plant: of simulated vials. journal: of the run, into which a
+    driver writes every command before it is carried out; `journal.rows` is what an earlier life of the run wrote.
+    folder: of the run. resumed: there was such a life.
+    """
+
+    backend: Any
+    bench: Bench
+    plant: PlantConfig
+    journal: Journal
+    folder: Path
+    resumed: bool
+
+    def earlier(self) -> list[dict[str, Any]]:
+        """The rows of the run's earlier lives, none in a new run. Raises: RecordingError where they are gone."""
+        if self.resumed and not self.journal.rows:
+            raise RecordingError(f"journal {self.journal.path}: missing or empty; put it back, or start a new run")
+        return self.journal.rows
+
+    @property
+    def began(self) -> float:
+        """When the run began, s since 1970."""
+        return float(self.journal.rows[0]["wall"]) if self.journal.rows else time.time()
+
+    def elapsed_s(self, speed: float = 1.0) -> float:
+        """Run time that has passed, s; 0 in a new run. Args: speed: device seconds per real second."""
+        return (time.time() - self.began) * speed if self.journal.rows else 0.0
+
+
+class Family:
+    """One kind of reactor. What a kind of one's own must give is `config` and `open`; the rest has defaults.
+
+    Attributes:
+      config: dataclass of its values, whose fields are made by `conf.schema.setting`. It needs `kind`, the name of the
+        family, and `reactors`, their names.
+      can: what its reactors can do.
+      at_stake: a culture is: a policy that is doubtful or not certified is refused.
+      simulated: its vials are of `plant`, in this process and in virtual time, and the program knows their truth.
+    """
+
+    config: type[Any]
+    can = Can()
+    at_stake = True
+    simulated = False
+
+    def open(self, opening: Opening) -> AbstractContextManager[Reactor]:
+        """The reactors of a run: ready inside the context, released on leaving it. Raises, on entering: ReactorError.
+
+        What is dosed must be in the journal before it is done, and `Reactor.pumps_off` must say what it could not
+        verify. A new run is checked first, a resumed one goes on from `opening.earlier()`.
+        """
+        raise NotImplementedError
+
+    def preflight(self, backend: Any, bench: Bench, folder: Path) -> list[Check]:
+        """What a run needs, a line for each thing; opens what it needs for that and closes it. Raises: ReactorError.
+
+        A family that does not say how is opened as for a run; each reactor is sampled once, and its pumps are verified
+        off.
+
+        Args: folder: where the run will write.
+        """
+        checks: list[Check] = []
+        with tempfile.TemporaryDirectory() as name, closing(Journal(Path(name) / "journal.jsonl", fsync=False)) as rows:
+            try:
+                with self.open(Opening(backend, bench, PlantConfig(), rows, Path(name), resumed=False)) as reactors:
+                    checks += _looked_at(reactors)
+            except ReactorError as error:
+                checks.append(Check("reactors", False, str(error), "check power, cable and address"))
+        return checks
+
+    def fits(self, backend: Any, bench: Bench, scenarios: Sequence[Scenario], ends: Sequence[str]) -> None:
+        """Whether a run may ask this of the reactors; refused before a device is asked.
+
+        Args: scenarios, ends: one per reactor; ends as of deploy's `at_end`.
+        Raises: UnfitError naming the backend, what it lacks or what differs, and the remedy.
+        """
+        where = f"backend={backend.kind}"
+        if any(s.composed for s in scenarios) and not self.can.fluorescence:
+            raise UnfitError(
+                f"scenario.ratios: {where} measures no fluorescence, by which a share is known; drop them or use a "
+                "Chi.Bio"
+            )
+        asked = sorted({t for s in scenarios for t in s.temperatures if math.isfinite(t)})
+        if len(asked) > 1 and (lack := self.no_thermostat(backend)) is not None:
+            degrees = f"{asked[0]:g} to {asked[-1]:g} degC"
+            raise UnfitError(f"scenario.temperatures ask for {degrees}: {where} controls none{lack}")
+        if "regulate" in ends and not (self.can.regulation or self.simulated):
+            raise UnfitError(f"at_end = regulate: {where} has no regulation of its own; allowed hold, stop")
+        self.doses(backend, bench)
+        if any(s.supplied for s in scenarios):
+            self._gives(backend, bench, scenarios)
+
+    def no_thermostat(self, backend: Any) -> str | None:
+        """None if the temperature is controlled; else what is missing for that, behind "controls none"."""
+        return None if self.can.thermostat else ""
+
+    def doses(self, backend: Any, bench: Bench) -> None:
+        """Whether the reactors can be dosed with the bench's period, volumes and largest rate. Raises: UnfitError."""
+
+    def _gives(self, backend: Any, bench: Bench, scenarios: Sequence[Scenario]) -> None:
+        """Whether doses of spare pumps may be large enough, and there are such pumps. Raises: UnfitError."""
+        most_ml, needed = bench.max_rate * bench.period_s, 2.0 * DOSE_ML
+        if most_ml < needed:
+            remedy = f"allowed {needed / bench.period_s:.4f} mL/s or more beside scenario.outputs"
+            raise UnfitError(f"bench.max_rate = {bench.max_rate:g} mL/s: {remedy}")
+        if bench.control_min > MADE_UP_MIN:
+            remedy = f"allowed at most {60.0 * MADE_UP_MIN:g} s beside scenario.outputs"
+            raise UnfitError(f"bench.period_s = {bench.period_s:g} s: {remedy}")
+        if not self.can.spare_pumps:
+            raise UnfitError(f"scenario.outputs: backend={backend.kind} has no spare pumps; drop them")
+        self.tubes(backend, scenarios, most_ml)
+
+    def tubes(self, backend: Any, scenarios: Sequence[Scenario], most_ml: float) -> None:
+        """Whether each spare pump that a scenario gives by has a tube, and can give `most_ml`. Raises: UnfitError."""
+
+    def coculture(self, backend: Any) -> Any:
+        """The config with vials of two species, where it simulates vials that were left as they are."""
+        return backend
+
+    def vials(self, backend: Any, plant: PlantConfig) -> tuple[str, PlantConfig] | None:
+        """Of cultures in software the config key that chooses them, and what they are. Args: plant: deploy's own."""
+        return None
+
+    def seeing_fluorescence(self, backend: Any) -> Any:
+        """The config by which fluorescence is measured."""
+        return backend
+
+    def rim_ml(self, volumes_ml: Array) -> Array | float:
+        """What a vial holds, mL, inf where that is not known. Args: volumes_ml: of the cultures, (N,)."""
+        return math.inf
+
+    def truth(self, reactors: Reactor) -> tuple[Plant | None, float]:
+        """The vials themselves, where the program knows them, and the flow that their pump is believed to have, mL/s.
+
+        Args: reactors: as opened.
+        """
+        return None, 1.0
+
+    def address(self, backend: Any) -> str:
+        """Where the reactors are, for a reader."""
+        return str(getattr(backend, "url", "")) or "address not said"
+
+    def start_od(self, backend: Any, plant: PlantConfig) -> float:
+        """The OD that cultures start from, as far as it is known beforehand; else 0."""
+        return 0.0
+
+    def unmeasured(self, backend: Any) -> str:
+        """What was not measured on the bench and is assumed, in a line; "" for nothing. Raises: UnfitError."""
+        return ""
+
+
+def _looked_at(reactors: Reactor) -> Iterator[Check]:
+    """A sample of each reactor, and its pumps off. Raises: ReactorError."""
+    n = len(reactors.names)
+    yield Check("reactors", True, f"{', '.join(reactors.names)} opened")
+    try:
+        od, seen = np.full(n, np.nan), np.zeros(n, dtype=np.bool_)
+        for _ in range(2 * n):  # one sample may come for each reactor alone
+            if not seen.all():
+                m = reactors.measure()
+                od, seen = np.where(m.fresh, m.od, od), seen | m.fresh
+        for name, value, here in zip(reactors.names, od, seen, strict=True):
+            word = f"OD {value:.3f}" if here else "none came"
+            yield Check(f"{name} sample", bool(here and np.isfinite(value)), word, "check the reactor and its sensor")
+        failed = reactors.pumps_off(np.ones(n, dtype=np.bool_))
+        for name in reactors.names:
+            said = "; ".join(line for line in failed if line.startswith(f"{name}:"))
+            yield Check(f"{name} pumps", not said, said or "verified off", "switch them off by hand")
+    finally:
+        reactors.stop()
+
+
+@contextmanager
+def not_looked_at() -> Iterator[None]:
+    """Who stops it in here is told that nobody has looked at the pumps: an earlier life may have left one on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        log.warning("stopped before the pumps were looked at: pumps not verified off")
+        raise
+
+
+SHIPPED: Mapping[str, str] = {
+    "sim": "hardware.simulated",
+    "chibio": "hardware.chibio.family",
+    "emulator": "hardware.emulator.family",
+    "pioreactor": "hardware.pioreactor.family",
+    "pioreactor_rig": "hardware.rig.family",
+}
+"""The module of each kind that comes with the program; its FAMILY is the object."""
+_loaded: dict[str, Family] = {}
+
+
+def known() -> list[str]:
+    """The name of every kind."""
+    return list(dict.fromkeys([*SHIPPED, *_loaded]))
+
+
+def family(kind: str) -> Family:
+    """The family of this name. Raises: ValueError naming those there are."""
+    if kind not in known():
+        raise ValueError(f"backend.kind = {kind}: allowed {', '.join(known())}")
+    if kind not in _loaded:
+        _loaded[kind] = import_module(SHIPPED[kind]).FAMILY
+    return _loaded[kind]
+
+
+def family_of(backend: Any) -> Family:
+    """The family that a backend's config is of."""
+    return family(backend.kind)
+
+
+def add(one: Family, what: str) -> None:
+    """Make a family known as `backend=KIND`.
+
+    Args: one: its KIND is the default of the field `kind` of its config. what: the sentence that the help shows.
+    Raises: ValueError for a kind that exists.
+    """
+    kind = one.config().kind
+    presets.add(f"backend/{kind}", {"kind": kind}, what)
+    _loaded[kind] = one

@@ -1,0 +1,93 @@
+"""Pioreactors as a family: the units that no other client has, their preflight, and what the interlock counts with."""
+
+import math
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
+from pathlib import Path
+
+import numpy as np
+
+from envs.bench import Bench
+from hardware.check import Check, report
+from hardware.clock import RealClock
+from hardware.errors import UnfitError
+from hardware.family import Can, Family, Opening, not_looked_at
+from hardware.link.open import DeviceLock
+from hardware.logbook import Log, no_log
+from hardware.pioreactor.config import FULL_ML, PioreactorConfig, vial_ml
+from hardware.pioreactor.preflight import preflight
+from hardware.pioreactor.reactors import PioreactorReactors
+from hardware.pioreactor.resume import replay
+from hardware.reactor import Array, Reactor, left_off
+
+__all__ = ["FAMILY", "PioreactorFamily"]
+
+
+class PioreactorFamily(Family):
+    """Units of one cluster."""
+
+    config = PioreactorConfig
+    can = Can(thermostat=True, regulation=True, resume=True)
+
+    def reached(
+        self, backend: PioreactorConfig, bench: Bench, folder: Path
+    ) -> AbstractContextManager[PioreactorConfig]:
+        """The config by which the units are reached for as long as the run lasts. Raises: ReactorError."""
+        return nullcontext(backend)
+
+    @contextmanager
+    def units(
+        self, backend: PioreactorConfig, bench: Bench, folder: Path, log_row: Log = no_log, run: str = ""
+    ) -> Iterator[PioreactorReactors]:
+        """Units that no other client on this computer has. Raises: ReactorError."""
+        with ExitStack() as stack:
+            backend = stack.enter_context(self.reached(backend, bench, folder))
+            for unit in backend.reactors:
+                stack.enter_context(closing(DeviceLock(f"unit {unit} of {backend.broker}:{backend.broker_port}")))
+            yield stack.enter_context(closing(PioreactorReactors(backend, RealClock(), log_row, run)))
+
+    @contextmanager
+    def open(self, opening: Opening) -> Iterator[Reactor]:
+        """As the family says, and a new run is checked first. Raises: ReactorError."""
+        earlier, began = opening.earlier(), opening.began
+        with ExitStack() as stack:
+            with not_looked_at():
+                run = format(int(began), "x")
+                units = self.units(opening.backend, opening.bench, opening.folder, opening.journal.append, run)
+                reactors = stack.enter_context(units)
+                if not earlier:
+                    report(preflight(reactors))
+            elapsed_s = opening.elapsed_s(opening.backend.speed)
+            with left_off(reactors):
+                reactors.begin(replay(earlier), elapsed_s)
+                yield reactors
+
+    def preflight(self, backend: PioreactorConfig, bench: Bench, folder: Path) -> list[Check]:
+        """As `hardware.pioreactor.preflight`. Raises: ReactorError."""
+        with self.units(backend, bench, folder) as reactors:
+            return preflight(reactors)
+
+    def no_thermostat(self, backend: PioreactorConfig) -> str | None:
+        """The vendor's may be left off."""
+        return None if backend.thermostat else " without backend.thermostat=true"
+
+    def doses(self, backend: PioreactorConfig, bench: Bench) -> None:
+        """Whether the largest dose is one that a unit may be given. Raises: UnfitError."""
+        if bench.max_rate * bench.period_s > backend.max_dose_ml + 1e-9:
+            least = math.floor(1e5 * backend.max_dose_ml / bench.period_s) / 1e5
+            raise UnfitError(
+                f"backend={backend.kind}: backend.max_dose_ml = {backend.max_dose_ml:g} mL, the interlock allows "
+                f"{bench.max_rate * bench.period_s:.3g} mL in a period of {bench.period_s:g} s; "
+                f"give bench.max_rate={least:g} or a larger backend.max_dose_ml"
+            )
+
+    def rim_ml(self, volumes_ml: Array) -> Array:
+        """The vendor's limit of each vial."""
+        return np.array([FULL_ML[vial_ml(ml)] for ml in volumes_ml])
+
+    def address(self, backend: PioreactorConfig) -> str:
+        """Of the cluster's broker."""
+        return f"{backend.broker}:{backend.broker_port}"
+
+
+FAMILY = PioreactorFamily()

@@ -1,0 +1,36 @@
+"""YAML of a file that a person may have written: of limited size and depth, and without aliases."""
+
+from pathlib import Path
+
+import yaml  # type: ignore[import-untyped]
+
+__all__ = ["read_text"]
+
+LARGEST, DEEPEST = 200_000, 30  # bytes and levels of a YAML file; those of ours have a tenth and a third of it
+
+
+def read_text(path: Path | str) -> str:
+    """The text of a YAML file without aliases and interpolations: a few lines of those can stand for gigabytes.
+
+    Raises: OSError; ValueError, in one line, also for a file that is too large or too deep.
+    """
+    with open(path, "rb") as f:
+        data = f.read(LARGEST + 1)
+    if len(data) > LARGEST:
+        raise ValueError(f"longer than {LARGEST} bytes")
+    try:
+        depth, text = 0, data.decode("utf-8")
+        for event in yaml.parse(text, yaml.SafeLoader):
+            where = f"in line {event.start_mark.line + 1}"
+            if isinstance(event, yaml.AliasEvent) or "${" in getattr(event, "value", ""):
+                raise ValueError(f"an alias or interpolation {where}: write the value out")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST:
+                raise ValueError(f"deeper than {DEEPEST} levels {where}")
+    except UnicodeDecodeError:
+        raise ValueError("no UTF-8 text") from None
+    except ValueError:
+        raise
+    except Exception as error:  # whatever PyYAML meets
+        raise ValueError(f"not YAML ({str(error).splitlines()[0]})") from None
+    return text
