@@ -12,7 +12,7 @@ from hardware.chibio.calibrations import load_calibrations
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import identity
 from hardware.chibio.preflight import preflight
-from hardware.chibio.protocol import CYCLE_S
+from hardware.chibio.protocol import CONTROL_S
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
 from hardware.clock import RealClock
@@ -92,8 +92,8 @@ class ChiBioFamily(Family):
 
     def doses(self, backend: ChiBioConfig, bench: Bench) -> None:
         """Whether the period is the device's, and the vials hold the cultures. Raises: UnfitError."""
-        if bench.period_s != CYCLE_S:
-            where = f"allowed {CYCLE_S:g} with backend={backend.kind}, which measures so often"
+        if bench.period_s != CONTROL_S:
+            where = f"allowed {CONTROL_S:g} with backend={backend.kind}, which measures so often"
             raise UnfitError(f"bench.period_s = {bench.period_s:g} s: {where}")
         for name in backend.reactors:
             if (ml := bench.volume_of(name)) >= VIAL_ML:

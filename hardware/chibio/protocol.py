@@ -14,7 +14,7 @@ from hardware.errors import DeviceStateError, ProtocolError
 
 __all__ = [
     "BANDS",
-    "CYCLE_S",
+    "CONTROL_S",
     "FEED",
     "LEDS",
     "MAX_OVERFLOW_DUTY",
@@ -40,8 +40,8 @@ MAX_OVERFLOW_DUTY = 0.95
 """Never 1: the device does not switch such a pump off between its periods (docs/device.md, Pumps)."""
 PERIOD_S = 63.0
 """A pump that is ON runs at full power for PERIOD_S * target seconds of every PERIOD_S (docs/device.md, Pumps)."""
-CYCLE_S = 60.0
-"""The device measures once in so long (docs/device.md, Measurement)."""
+CONTROL_S = 60.0
+"""One dose per cycle of the device: the control period, s."""
 MAX_TEXT = 160
 """Characters of a text of the device that are taken; the longest line of its log that matters has 80."""
 UNSET_BLANK = 65000.0
