@@ -20,7 +20,7 @@ from hardware.chibio.connection import Connection
 from hardware.chibio.dosing import PumpFit, fit_pump
 from hardware.chibio.family import linked
 from hardware.chibio.procedures import dose_series
-from hardware.chibio.protocol import FEED, PERIOD_S, POSITIONS, WASTE
+from hardware.chibio.protocol import FEED, PERIOD_S, POSITIONS, WASTE, Permitted
 from hardware.errors import ReactorError
 from hardware.logbook import no_log
 
@@ -103,7 +103,7 @@ def weigh(config: CalibratePumpConfig, ask: Callable[[str], str] = input) -> tup
     """
     found = []
     with one_interrupt(), linked(config.backend) as (transport, clock):
-        connection = Connection(config.reactor, [config.reactor], transport, clock, no_log)
+        connection = Connection(config.reactor, Permitted([config.reactor]), transport, clock, no_log)
         identity = connection.read().device_id
         print(
             f"{config.reactor} {config.pump} pump, unit {identity}. Put its inlet into water, prime the tube, and let"

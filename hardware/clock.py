@@ -1,9 +1,9 @@
-"""Time as an argument: the real monotonic clock, a scaled one, and one that only moves when told to."""
+"""Time as an argument: real time, device time, and a clock that moves only when somebody sleeps."""
 
 import time
 from typing import Protocol
 
-__all__ = ["Clock", "RealClock", "ScaledClock", "VirtualClock"]
+__all__ = ["Clock", "DeviceClock", "RealClock", "VirtualClock"]
 
 
 class Clock(Protocol):
@@ -19,40 +19,50 @@ class Clock(Protocol):
 
 
 class RealClock:
-    """The machine's monotonic clock; `speed` device seconds pass in one real second (1 on the bench).
+    """Real time, for sockets, messages and processes: the machine's monotonic clock, 0 when this object was made."""
 
-    Raises: ValueError if speed is not positive.
-    """
-
-    def __init__(self, speed: float = 1.0) -> None:
-        if not speed > 0.0:
-            raise ValueError(f"clock speed = {speed}: allowed > 0 (1 = real time)")
-        self.speed = speed
+    def __init__(self) -> None:
         self._start = time.monotonic()
 
     def now(self) -> float:
-        """Device seconds since this clock was made."""
-        return (time.monotonic() - self._start) * self.speed
+        """Real seconds."""
+        return time.monotonic() - self._start
 
     def sleep(self, seconds: float) -> None:
-        """Wait `seconds` device seconds."""
+        """Wait real seconds."""
         if seconds > 0.0:
-            time.sleep(seconds / self.speed)
+            time.sleep(seconds)
 
 
-class ScaledClock:
-    """Another clock, `speed` times as fast."""
+class DeviceClock:
+    """Device time, for samples, doses and the run: `speed` device seconds pass in one real second.
 
-    def __init__(self, clock: Clock, speed: float) -> None:
-        self._clock, self.speed = clock, speed
+    No other module converts between the two.
+
+    Args: speed: 1 on the bench. real: clock that it runs on; None: the machine's.
+    Raises: ValueError if speed is not positive.
+    """
+
+    def __init__(self, speed: float = 1.0, real: Clock | None = None) -> None:
+        if not speed > 0.0:
+            raise ValueError(f"clock speed = {speed}: allowed > 0 (1 = real time)")
+        self.real, self._speed = real or RealClock(), speed
 
     def now(self) -> float:
-        """Its seconds."""
-        return self._clock.now() * self.speed
+        """Device seconds."""
+        return self.of_real(self.real.now())
 
     def sleep(self, seconds: float) -> None:
-        """Wait `seconds` of its own."""
-        self._clock.sleep(seconds / self.speed)
+        """Wait device seconds."""
+        self.real.sleep(self.to_real(seconds))
+
+    def of_real(self, real_s: float) -> float:
+        """Device seconds that pass in `real_s` real seconds; device time at a real time."""
+        return real_s * self._speed
+
+    def to_real(self, device_s: float) -> float:
+        """Real seconds in which `device_s` device seconds pass."""
+        return device_s / self._speed
 
 
 class VirtualClock:

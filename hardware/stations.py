@@ -1,17 +1,41 @@
-"""Reactors that are commanded one by one: what every such family does alike with rows, doses and receipts."""
+"""Reactors that are commanded one by one: measure, dose, switch off, with rows and receipts, for every family.
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Generic, Protocol, TypeVar
+A family gives a `Station` per reactor and says in a subclass what it does between two of them and while it waits.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from hardware.clock import Clock
-from hardware.errors import ReactorError
+from hardware.errors import DeviceStateError, ReactorError
 from hardware.logbook import Log, Logbook
-from hardware.reactor import Command, Receipt
+from hardware.reactor import Array, Command, Mask, Measurement, Receipt, Vitals, left_off
 from hardware.storage.doses import Given
+from hardware.storage.history import History
 
-__all__ = ["Stations"]
+__all__ = ["Newest", "Stations"]
+
+AGAIN_S = 20.0  # from one `measure` without a sample to the next, while there is none
+
+
+@dataclass(frozen=True)
+class Newest:
+    """The newest sample of one reactor; nan where there is none.
+
+    at: when it was taken, clock time, s. temperature: degC. raw, blank: counts; blank None where the device has none.
+    fluorescence: counts; None where it is not measured. arrived_s: clock time at which it was seen.
+    """
+
+    at: float
+    od: float
+    temperature: float
+    raw: float
+    arrived_s: float
+    blank: float | None = None
+    fluorescence: float | None = None
 
 
 class Plan(Protocol):
@@ -33,7 +57,11 @@ class Doses(Protocol):
 
 
 class Station(Protocol):
-    """One reactor."""
+    """One reactor.
+
+    newest: its newest sample. next_look: clock time at which it is to be looked at again. handed_over: the device
+    regulates it for good. What switches something off or over may return a course, which the family goes through.
+    """
 
     book: Logbook
 
@@ -41,26 +69,49 @@ class Station(Protocol):
     def name(self) -> str: ...
     @property
     def doses(self) -> Doses: ...
+    @property
+    def newest(self) -> Newest: ...
+    @property
+    def next_look(self) -> float: ...
+    @property
+    def handed_over(self) -> bool: ...
+
+    def poll(self) -> bool: ...
 
     def set_temperature(self, target_c: float, /) -> None: ...
 
     def dose(self, rate: float, number: int, /) -> Plan: ...
 
+    def pumps_off(self) -> Any: ...
+
+    def give_up(self) -> Any: ...
+
+    def heat_off(self) -> Any: ...
+
+    def regulate(self, setpoint: float, /) -> Any: ...
+
 
 S = TypeVar("S", bound=Station)
+H = TypeVar("H", bound=History)
 
 
-class Stations(Generic[S]):
-    """N reactors, each at its station.
+class Stations(Generic[S, H]):
+    """N reactors, each at its station (implements `hardware.reactor.Reactor`).
 
-    Args: clock: of the run. log: takes rows, e.g. `Journal.append`. What must be on the disk before it is done is
-      written first, so a log that raises there prevents it; elsewhere its error is kept, and raised by `raise_late`.
+    Use: `begin` (or `begin(replay(rows), elapsed_s)` after a crash), then `measure` and `actuate` in turn, `stop` in
+    any case.
+
+    Args: clock: of the run. stale_s: after which without a sample `measure` returns. log: takes samples, intents,
+      doses, commands, faults and notes, e.g. `Journal.append`. What must be on the disk before it is done is written
+      first, so a log that raises there prevents it; elsewhere its error is kept, and raised by `raise_late`.
     """
 
     stations: Sequence[S]
+    NOT_OFF: ClassVar[str] = "{}"
+    """What `stop` raises of reactors whose pumps could not be verified off, a format for a line on each."""
 
-    def __init__(self, clock: Clock, log: Log) -> None:
-        self._clock, self._log, self._zero = clock, log, clock.now()
+    def __init__(self, clock: Clock, stale_s: float, log: Log) -> None:
+        self._clock, self._stale_s, self._log, self._zero = clock, stale_s, log, clock.now()
         self._log_error: Exception | None = None
 
     @property
@@ -68,9 +119,79 @@ class Stations(Generic[S]):
         """One per reactor, e.g. ("M0", "M1")."""
         return tuple(station.name for station in self.stations)
 
+    @property
+    def handed_over(self) -> Mask:
+        """Reactors that the device's own regulation has been given for good, shape (N,)."""
+        return np.array([station.handed_over for station in self.stations])
+
     def elapsed(self) -> float:
         """Run time, s: counted from `begin`, together with what had passed before."""
         return self._clock.now() - self._zero
+
+    def begin(self, histories: Mapping[str, H] | None = None, elapsed_s: float = 0.0) -> None:
+        """Every reactor into its running state; a begin that fails or is stopped leaves all pumps off, or says so.
+
+        Args: histories: `replay` of the journal of the run that is resumed. elapsed_s: run time that has passed since
+          that run began.
+        Raises: ReactorError for a reactor that cannot be brought there; of a run that is resumed only if none can: the
+          others do not wait for one in trouble, which is told and tried again.
+        """
+        self._zero = self._clock.now() - elapsed_s
+        with left_off(self):
+            self._take_over(histories or {})
+
+    def _take_over(self, histories: Mapping[str, H]) -> None:
+        """Every reactor as an earlier life left it, then into its running state. Raises: as `begin`."""
+        raise NotImplementedError
+
+    # ------------------------------------------------------------------------------------------------- measurement
+
+    def measure(self) -> Measurement:
+        """The newest samples; waits for one, doing what is due meanwhile.
+
+        Returns with none fresh when a fault appears or disappears, and when no reactor has had a sample for `stale_s`
+        (again every 20 s while that lasts): `vitals` then says what is wrong.
+        Raises: what the log raised; nothing for trouble with device or link.
+        """
+        last = max(station.newest.arrived_s for station in self.stations)
+        deadline = max(last + self._stale_s, self._clock.now() + AGAIN_S)
+        fresh = np.zeros(len(self.stations), dtype=np.bool_)
+        while True:
+            self._between()
+            for i, station in enumerate(self.stations):
+                if self._clock.now() >= station.next_look:
+                    fresh[i] = station.poll()
+                    self._between()
+            self.raise_late()
+            now = self._clock.now()
+            if fresh.any() or now >= deadline or any(station.book.news for station in self.stations):
+                return self._measurement(fresh)
+            self._wait(min([deadline, *(station.next_look for station in self.stations)]) - now)
+
+    def _between(self) -> None:
+        """What is due between two reactors."""
+
+    def _wait(self, longest_s: float) -> None:
+        """Wait a little, not longer than `longest_s`."""
+        raise NotImplementedError
+
+    def _measurement(self, fresh: Mask) -> Measurement:
+        newest = [station.newest for station in self.stations]
+
+        def column(key: str) -> Array:
+            return np.array([getattr(one, key) for one in newest], dtype=np.float64)
+
+        def column_or_none(key: str) -> Array | None:
+            return None if any(getattr(one, key) is None for one in newest) else column(key)
+
+        for station in self.stations:
+            station.book.news = False
+        faults = tuple(station.book.fault for station in self.stations)
+        vitals = Vitals(self._clock.now() - column("arrived_s"), column("raw"), faults, column_or_none("blank"))
+        time_s, light = column("at") - self._zero, column_or_none("fluorescence")
+        return Measurement(time_s, column("od"), column("temperature"), fresh, vitals, light)
+
+    # --------------------------------------------------------------------------------------------------- actuation
 
     def actuate(self, command: Command) -> Receipt:
         """Begin one dose per row of `command.rows`, targets first; its end is carried out by `measure`.
@@ -92,9 +213,6 @@ class Stations(Generic[S]):
             station.book.notes.clear()
         return Receipt(volume, notes, waste, kept)
 
-    def _between(self) -> None:
-        """What is due between two reactors."""
-
     def repeated(self) -> list[tuple[float, Receipt]]:
         """What was given beyond what was booked when doses began, not told before: run time, s, and volumes."""
         found = []
@@ -106,6 +224,60 @@ class Stations(Generic[S]):
                 for g in extra
             ]
         return sorted(found, key=lambda one: one[0])
+
+    def pumps_off(self, rows: Mask) -> list[str]:
+        """All pumps of `rows` that a run switches, off, verified; returns what failed, one line per reactor."""
+        return self._each(rows, lambda station: station.pumps_off())
+
+    def give_up(self, rows: Mask) -> list[str]:
+        """`pumps_off` for the rest of the run, the device's own regulation too; returns what failed."""
+        return self._each(rows, lambda station: station.give_up())
+
+    def heat_off(self, rows: Mask) -> list[str]:
+        """Heating of `rows` off for the rest of the run; returns what failed."""
+        return self._each(rows, lambda station: station.heat_off())
+
+    def regulate(self, rows: Mask, setpoint: Array) -> list[str]:
+        """Hand `rows` over to the device's own regulation at `setpoint` (OD, shape (N,)); returns what failed.
+
+        The reactor then feeds itself; commands for it are refused from here on.
+        """
+        targets = dict(zip(self.names, setpoint, strict=True))
+        return self._each(rows, lambda station: station.regulate(float(targets[station.name])))
+
+    def _each(self, rows: Mask, action: Callable[[S], Any]) -> list[str]:
+        chosen = [station for station, wanted in zip(self.stations, rows, strict=True) if wanted]
+        return self._lines(self._all(chosen, action))
+
+    def _lines(self, failed: Mapping[S, ReactorError]) -> list[str]:
+        """What failed, in the order of the reactors."""
+        return [f"{station.name}: {failed[station]}" for station in self.stations if station in failed]
+
+    def _all(self, stations: Sequence[S], action: Callable[[S], Any]) -> dict[S, ReactorError]:
+        """Carry `action` out at each station; what failed."""
+        failed: dict[S, ReactorError] = {}
+        for station in stations:
+            try:
+                action(station)
+            except ReactorError as error:
+                failed[station] = error
+        return failed
+
+    def stop(self) -> None:
+        """All pumps off, verified, but those of a reactor that was handed over; the rest goes on. Idempotent.
+
+        Raises: DeviceStateError naming every reactor whose pumps could not be verified off, and what to do.
+        """
+        failed = self._lines(self._silence([station for station in self.stations if not station.handed_over]))
+        self.note_down("stop", {"reactors": self.names, "not_verified": failed})
+        if failed:
+            raise DeviceStateError(self.NOT_OFF.format("; ".join(failed)))
+
+    def _silence(self, stations: Sequence[S]) -> dict[S, ReactorError]:
+        """All pumps of these off for good; what could not be verified."""
+        raise NotImplementedError
+
+    # ----------------------------------------------------------------------------------------------------- journal
 
     def raise_late(self) -> None:
         """Raises: what the log raised where it must not stand in the way of a pump-off; once."""

@@ -7,7 +7,7 @@ from conf.schema import check, part, require, setting
 from hardware.chibio.dosing import DosingConfig, SupplyConfig
 from hardware.chibio.fluorescence import FluorescenceSlotConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
-from hardware.chibio.protocol import POSITIONS
+from hardware.chibio.protocol import POSITIONS, Permitted
 from hardware.link.transport import TransportConfig
 
 __all__ = ["ChiBioConfig", "EmulatorConfig"]
@@ -69,6 +69,11 @@ class ChiBioConfig:
         require(not both, "backend.supply", self.overflow_pump.pump, "another pump than the overflow pump")
         later = f"more than stale_s = {self.stale_s} s"
         require(self.lost_s > self.stale_s, "backend.lost_s", f"{self.lost_s} s", later)
+
+    @property
+    def permitted(self) -> Permitted:
+        """What a client of this config may send."""
+        return Permitted(self.reactors, self.overflow_pump.pump, self.fluorescence.command, self.supply.pumps)
 
     @property
     def control_min(self) -> float:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from hardware.chibio.protocol import PUMPS, DeviceState, check_command, parse_state
+from hardware.chibio.protocol import PUMPS, DeviceState, Permitted, check_command, parse_state
 from hardware.clock import Clock
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
 from hardware.link.transport import SharedLink, Transport
@@ -30,7 +30,7 @@ def identity(transport: Transport, clock: Clock) -> str:
     present = parse_state(reply.body).present
     if not present:
         raise DeviceStateError("the device has no reactor; plug one in with the server stopped")
-    return Connection(present[0], present[:1], transport, clock, no_log).read().device_id
+    return Connection(present[0], Permitted(present[:1]), transport, clock, no_log).read().device_id
 
 
 class Connection:
@@ -43,24 +43,11 @@ class Connection:
     have been started again without this reactor. Then the next command looks first.
 
     Args:
-      name: position, M0 to M7; reactors: all positions this client owns.
+      name: position, M0 to M7. permitted: what this client may send.
       log: takes every command and its answer.
-      overflow_pump: spare pump that may be switched on; "" if there is none.
-      slot_command: the one toggle that may be sent, that of the fluorescence slot; "" if none may be.
-      supply_pumps: spare pumps that may give doses.
     """
 
-    def __init__(
-        self,
-        name: str,
-        reactors: Sequence[str],
-        transport: Transport,
-        clock: Clock,
-        log: Log,
-        overflow_pump: str = "",
-        slot_command: str = "",
-        supply_pumps: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, name: str, permitted: Permitted, transport: Transport, clock: Clock, log: Log) -> None:
         self.name = name
         self.device_id = ""  # pinned at the first read
         self.state: DeviceState | None = None  # the last verified one
@@ -69,8 +56,7 @@ class Connection:
         self._seen_s = -math.inf  # clock time at which this reactor was last known to be present
         self.clock, self._log = clock, log
         self._transport = transport if isinstance(transport, SharedLink) else SharedLink(transport, clock)
-        self._reactors, self._overflow_pump, self._slot_command = tuple(reactors), overflow_pump, slot_command
-        self._supply_pumps = tuple(supply_pumps)
+        self._permitted = permitted
 
     @property
     def heard_s(self) -> float:
@@ -154,7 +140,7 @@ class Connection:
         return self.read()
 
     def _post(self, path: str, quiet: bool = False) -> None:
-        check_command(path, self._reactors, self._overflow_pump, self._slot_command, self._supply_pumps)
+        check_command(path, self._permitted)
         start = self.clock.now()
         answer: int | str = ""
         before, self._unsure = self._unsure, True

@@ -1,21 +1,18 @@
 """One dose from intent to verified off, what is carried to the next, and what the device may have repeated."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from hardware.chibio.agenda import Agenda, Task
-from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Connection
+from hardware.chibio.agenda import Task
+from hardware.chibio.context import Context
 from hardware.chibio.diagnosis import fault_of
-from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, plan_dose
+from hardware.chibio.dosing import DosePlan, PumpCalibration, plan_dose
 from hardware.chibio.ending import conclude, found
 from hardware.chibio.protocol import FEED, PUMPS, WASTE, DeviceState
 from hardware.chibio.resume import NEVER, ReactorHistory
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
-from hardware.logbook import Logbook
 from hardware.storage.doses import Given
 
 __all__ = ["DoseSequence"]
@@ -32,23 +29,15 @@ class DoseSequence:
     A dose is planned, written down, set, read back and switched on; its ends are tasks on the agenda. A pump that is ON
     repeats its dose every 63 s until it is switched off, so a late end means that more was dosed than planned.
 
-    Args: past: what this run knows of the reactor by the rows that it wrote, those of earlier lives too.
     Attributes: running, whether a dose is under way: its pumps are on, or not yet verified off; stuck, why they could
       not be verified off; escalated, whether the experiment was ended for that, and not started again since; extra,
       what doses gave beyond what was booked when they began, until somebody books and clears it.
     """
 
-    def __init__(
-        self,
-        connection: Connection,
-        calibration: ReactorCalibration,
-        config: ChiBioConfig,
-        agenda: Agenda,
-        book: Logbook,
-        past: Callable[[], ReactorHistory],
-    ) -> None:
-        self._connection, self._calibration, self._config = connection, calibration, config
-        self._agenda, self._clock, self._book, self._past = agenda, connection.clock, book, past
+    def __init__(self, context: Context) -> None:
+        self._connection, self._calibration, self._config = context.connection, context.calibration, context.config
+        self._agenda, self._book, self._past = context.agenda, context.book, context.past
+        self._clock = context.connection.clock
         self.running = False
         self.stuck = ""
         self.escalated = False
@@ -310,7 +299,7 @@ class DoseSequence:
         given = ending.beyond(0.0)
         total_ml = sum(one.feed_ml for one in given)
         for one in given:
-            self._book.log("given", at_s=one.at_s, feed_ml=one.feed_ml, waste_ml=one.waste_ml, why="heard late")
+            self._book.log("given", **one.row("heard late"))
         self._book.tell(f"a feed command that was given up was heard late: {total_ml:.2f} mL, booked")
         self.extra += given
         self._late = False

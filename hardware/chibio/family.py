@@ -15,7 +15,7 @@ from hardware.chibio.preflight import preflight
 from hardware.chibio.protocol import CONTROL_S
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
-from hardware.clock import RealClock
+from hardware.clock import DeviceClock
 from hardware.errors import UnfitError
 from hardware.family import Can, Family, Opening, not_looked_at
 from hardware.link.open import DeviceLock, open_transport
@@ -24,7 +24,7 @@ from hardware.reactor import Array, Reactor, left_off
 
 __all__ = ["FAMILY", "ChiBioFamily", "linked"]
 
-Link = tuple[Transport, RealClock]
+Link = tuple[Transport, DeviceClock]
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def linked(backend: ChiBioConfig, own_url: str = "") -> Iterator[Link]:
     with ExitStack() as stack:
         url = own_url or backend.url
         transport = stack.enter_context(closing(open_transport(backend.transport, url, backend.speed)))
-        clock = RealClock(backend.speed)
+        clock = DeviceClock(backend.speed)
         if not own_url:
             stack.enter_context(closing(DeviceLock(f"the device with reactor {identity(transport, clock)}")))
         yield transport, clock

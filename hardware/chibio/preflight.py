@@ -12,8 +12,8 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.dosing import MAX_FEED_DUTY, ReactorCalibration
 from hardware.chibio.fluorescence import HIDDEN, FluorescenceSlotConfig
-from hardware.chibio.protocol import PERIOD_S, UNSET_BLANK, DeviceState
-from hardware.clock import Clock
+from hardware.chibio.protocol import PERIOD_S, UNSET_BLANK, DeviceState, Permitted
+from hardware.clock import Clock, DeviceClock
 from hardware.errors import ReactorError
 from hardware.link.transport import Transport
 from hardware.logbook import no_log
@@ -46,7 +46,7 @@ def preflight(
     except ReactorError as error:
         return [*checks, Check("connection", False, str(error), "check cable, address and that the server runs")]
     for name, calibration in zip(config.reactors, calibrations, strict=True):
-        connection = Connection(name, config.reactors, transport, clock, no_log)
+        connection = Connection(name, Permitted(config.reactors), transport, clock, no_log)
         try:
             state = connection.read()
             if not state.running:
@@ -87,7 +87,7 @@ def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Ch
         except ValueError:
             return Check("board clock", True, "not visible over this link", required=False)
         clock.sleep(pause)
-    drift = (dates[1] - dates[0]) - (times[1] - times[0]) / config.speed
+    drift = (dates[1] - dates[0]) - DeviceClock(config.speed).to_real(times[1] - times[0])
     seen = f"{drift:+.1f} s against this computer"
     return Check("board clock", abs(drift) < 2.5, seen, "stop clock corrections on the board")
 

@@ -273,17 +273,23 @@ def parse_state(body: bytes) -> DeviceState:
     )
 
 
-def check_command(
-    path: str,
-    reactors: Sequence[str],
-    overflow_pump: str = "",
-    slot_command: str = "",
-    supply_pumps: Sequence[str] = (),
-) -> None:
-    """The last gate before the wire: only these POSTs, only for these reactors, only within these limits.
+@dataclass(frozen=True)
+class Permitted:
+    """What a client may command beside the standard hardware.
 
-    Args: overflow_pump: which of the spare pumps is one; "" if none is. slot_command: the one that toggles the
-      fluorescence slot of the selected reactor; "" if none may be. supply_pumps: spare pumps that may give doses.
+    reactors: positions that it owns. overflow_pump: spare pump that may be switched on; "" if there is none.
+    slot_command: the one toggle that may be sent, that of the fluorescence slot of the selected reactor; "" if none may
+    be. supply_pumps: spare pumps that may give doses.
+    """
+
+    reactors: Sequence[str]
+    overflow_pump: str = ""
+    slot_command: str = ""
+    supply_pumps: Sequence[str] = ()
+
+
+def check_command(path: str, permitted: Permitted) -> None:
+    """The last gate before the wire: only these POSTs, only for these reactors, only within these limits.
 
     Allowed are changeDevice; SetOutputTarget of feed (at most 0.05), waste (0.5), Stir, Thermostat (42 degC), OD,
     Volume; SetOutputOn with 0 or 1, where only pumps 1 and 2, OD, Stir and Thermostat may go on; both for the overflow
@@ -292,10 +298,11 @@ def check_command(
 
     Raises: DeviceStateError if the command is not one of them.
     """
-    if slot_command and path == slot_command:
+    reactors, supply_pumps = permitted.reactors, permitted.supply_pumps
+    if permitted.slot_command and path == permitted.slot_command:
         return
     verb, *args = path.removeprefix("/").split("/")
-    spare = overflow_pump if overflow_pump in SPARE else None
+    spare = permitted.overflow_pump if permitted.overflow_pump in SPARE else None
     match verb, args:
         case "changeDevice", [_]:
             allowed = True

@@ -21,14 +21,14 @@ class Sampling:
     shows how late any other one was seen.
 
     Attributes: key, (record time, cycles) of the newest sample, None before the first; od, temperature, raw, blank,
-      fluorescence, time_s (run time) of it, nan before the first; arrived_s, the clock time at which it was seen;
-      late_s, how long after it appeared that was; next_poll, the clock time of the next look.
+      fluorescence of it, and at, when it was seen, nan before the first; arrived_s, the clock time from which its age
+      counts; late_s, how long after it appeared it was seen; next_poll, the clock time of the next look.
     """
 
     def __init__(self, config: ChiBioConfig, clock: Clock) -> None:
         self._config, self._clock = config, clock
         self.key: tuple[float, int] | None = None
-        self.od = self.temperature = self.raw = self.blank = self.fluorescence = self.time_s = math.nan
+        self.od = self.temperature = self.raw = self.blank = self.fluorescence = self.at = math.nan
         self.arrived_s = self.next_poll = clock.now()
         self.late_s = 0.0
         self._offsets: deque[float] = deque(maxlen=3)  # arrival minus the device's own time, samples seen at once
@@ -71,13 +71,13 @@ class Sampling:
         """A look ended without a sample to act on: there was none, or a new one that a fault forbids to use."""
         self._looked = not is_new
 
-    def take(self, state: DeviceState, now: float, time_s: float) -> str:
+    def take(self, state: DeviceState, now: float) -> str:
         """Make a new sample the newest one; returns what it shows of the board's clock, "" if nothing.
 
-        Args: now: clock time at which it was seen. time_s: run time then.
+        Args: now: clock time at which it was seen.
         """
         self.key = (state.sample_s, state.cycles)
-        self.arrived_s, self.time_s = now, time_s
+        self.arrived_s = self.at = now
         self.od, self.temperature = state.sample_od, state.sample_temperature
         self.raw, self.blank = state.raw, state.blank
         note = self._measure_lateness(now - state.sample_s)

@@ -7,21 +7,19 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from hardware.chibio.agenda import Agenda, Task
-from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.connection import Connection
+from hardware.chibio.agenda import Task
+from hardware.chibio.context import Context
 from hardware.chibio.diagnosis import diagnose, fault_of
 from hardware.chibio.dose_sequence import DoseSequence
-from hardware.chibio.dosing import DosePlan, ReactorCalibration
+from hardware.chibio.dosing import DosePlan
 from hardware.chibio.fluorescence import Fluorescence
 from hardware.chibio.onboard_regulation import OnboardRegulation
 from hardware.chibio.overflow_pump import OverflowPump
 from hardware.chibio.protocol import FEED, DeviceState
-from hardware.chibio.resume import ReactorHistory
 from hardware.chibio.sampling import Sampling
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
-from hardware.logbook import Logbook
 from hardware.reactor import Fault
+from hardware.stations import Newest
 
 __all__ = ["Station"]
 
@@ -35,34 +33,22 @@ AGAIN_S = 60.0  # from a restart that failed to the next one
 class Station:
     """One reactor under control.
 
-    Args:
-      connection: its verified conversation. calibration: of its pumps and its zero. book: what it reports.
-      config, agenda: shared; what must happen later is put on the agenda. past: what this run knows of the reactor.
-
     Attributes: sampling, doses, regulation, overflow_pump, fluorescence: its parts; busy, while the reactor is being
       started or recovered; restored, whether it goes on from what an earlier life left.
     """
 
-    def __init__(
-        self,
-        connection: Connection,
-        calibration: ReactorCalibration,
-        config: ChiBioConfig,
-        agenda: Agenda,
-        book: Logbook,
-        past: Callable[[], ReactorHistory],
-    ) -> None:
-        self.connection, self.book = connection, book
-        self.sampling = Sampling(config, connection.clock)
-        self.doses = DoseSequence(connection, calibration, config, agenda, book, past)
+    def __init__(self, context: Context) -> None:
+        self.connection, self.book = connection, book = context.connection, context.book
+        self._calibration, self._config, self._agenda = context.calibration, context.config, context.agenda
+        self._past, self._clock, config = context.past, connection.clock, context.config
+        self.sampling = Sampling(config, self._clock)
+        self.doses = DoseSequence(context)
         self.regulation = OnboardRegulation(connection, config.overflow_pump, book)
         self.overflow_pump = OverflowPump(connection, config.overflow_pump, book)
         self.fluorescence = Fluorescence(connection, config.fluorescence, book)
-        self.busy = False
-        self._past, self.restored = past, False
+        self.busy = self.restored = False
         self._held_s, self._restarts, self._again_s = math.nan, 0, -math.inf
         self._ended = ""  # why this program ended the experiment, "" once it runs again
-        self._calibration, self._config, self._agenda, self._clock = calibration, config, agenda, connection.clock
         self._target_c = config.temperature
         self._heat = True
         self._blank = math.nan
@@ -72,6 +58,23 @@ class Station:
     def name(self) -> str:
         """Position, M0 to M7."""
         return self.connection.name
+
+    @property
+    def newest(self) -> Newest:
+        """Its newest sample."""
+        s = self.sampling
+        light = s.fluorescence if self._config.fluorescence.measure else None
+        return Newest(s.at, s.od, s.temperature, s.raw, s.arrived_s, s.blank, light)
+
+    @property
+    def next_look(self) -> float:
+        """Clock time of the next look."""
+        return self.sampling.next_poll
+
+    @property
+    def handed_over(self) -> bool:
+        """Whether the on-board regulation has it."""
+        return self.regulation.active
 
     # ------------------------------------------------------------------------------------------- start and recovery
 
@@ -92,7 +95,7 @@ class Station:
         if not self.regulation.as_handed_over(state):
             if state.regulating:
                 self.regulation.switch_off()
-            self.pumps_off()
+            self.doses.settle(tries=3)
             if on := self._config.overflow_pump.others_on(state):
                 self.book.tell(f"pumps were found on and switched off: {on}")
         self.restored = True
@@ -207,7 +210,7 @@ class Station:
         if self._restarts > 1:
             self.book.tell(f"the restart before brought no sample, attempt {self._restarts} follows")
         try:
-            self.pumps_off()
+            self.doses.settle(tries=3)
             if kind == "stalled":
                 self._ended = "it brought no sample any more"
                 self.connection.post(f"/Experiment/0/{self.name}")
@@ -252,7 +255,7 @@ class Station:
 
     def _judge(self, state: DeviceState) -> bool:
         """What a verified state means; True if it brings a new sample."""
-        now, elapsed = self._clock.now(), self.book.elapsed()
+        now = self._clock.now()
         is_new = self.sampling.look(state, now)
         age = 0.0 if is_new else now - self.sampling.arrived_s
         fault = diagnose(
@@ -267,7 +270,7 @@ class Station:
             self.busy = True
             self._agenda.add(self._recover(fault.kind))
         if is_new and (fault is None or fault.kind in ("mode", "pump", "overflow_pump")) and not self._held(now):
-            self._take(state, now, elapsed)
+            self._take(state, now)
             return True
         self.sampling.not_taken(is_new)
         return False
@@ -289,10 +292,10 @@ class Station:
         """Why this program ended the experiment, "" if it did not, or if it runs again."""
         return (self.doses.stuck or "its pumps could not be verified off") if self.doses.escalated else self._ended
 
-    def _take(self, state: DeviceState, now: float, elapsed: float) -> None:
+    def _take(self, state: DeviceState, now: float) -> None:
         """Deliver a new sample, write it down, and put heater and stirrer right."""
         sampling, self._restarts = self.sampling, 0
-        if note := sampling.take(state, now, elapsed):
+        if note := sampling.take(state, now):
             self.book.tell(note)
         sampling.fluorescence = self.fluorescence.reading(state)
         light = {"fluorescence": sampling.fluorescence} if self._config.fluorescence.measure else {}
@@ -338,14 +341,18 @@ class Station:
             refusal = f"{pump} has no tube; weigh it and give backend.supply.{pump.lower()}_ml_s"
         return self.doses.begin(rate, self.sampling.key, self.sampling.appeared_s, refusal, pump)
 
-    def pumps_off(self, tries: int = 3) -> None:
+    def pumps_off(self) -> None:
         """All pumps but the overflow pump off, verified; a dose is over then. Raises: as `Connection.pumps_off`."""
-        self.doses.settle(tries)
+        self.doses.settle()
 
     def give_up(self) -> None:
         """All pumps off for good, verified; on-board regulation too, or it would dose again. Raises: ReactorError."""
         self.regulation.take_back()
-        self.pumps_off(tries=1)
+        self.pumps_off()
+
+    def regulate(self, setpoint: float) -> None:
+        """Hand over to the on-board regulation at an OD; it feeds at most 0.02 of full power. Raises: ReactorError."""
+        self.regulation.hand_over(setpoint)
 
     def set_temperature(self, target_c: float) -> None:
         """Thermostat target, degC; nan leaves it. A failure becomes a note, and the next call tries again."""

@@ -26,7 +26,7 @@ from types import FrameType
 import numpy as np
 
 from conf.presets import groups
-from hardware.clock import RealClock
+from hardware.clock import DeviceClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions, plant_preset
 from hardware.emulator.faults import FAULTS, inject
 from hardware.emulator.routes import Exchange
@@ -42,7 +42,7 @@ CLIENT_PATIENCE_S = 5.0  # real seconds for a client to send its request
 class EmulatorServer:
     """Serves `device` on two ports until `stop`.
 
-    Args: device: on a RealClock; host; port, control_port: 0 picks a free one.
+    Args: device: on a DeviceClock; host; port, control_port: 0 picks a free one.
     Raises: OSError if a port cannot be had.
     """
 
@@ -299,7 +299,7 @@ def build(arguments: argparse.Namespace) -> ChiBioDevice:
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=arguments.overflow_flow))
     return ChiBioDevice(
         tuple(arguments.reactors.split(",")),
-        RealClock(arguments.speed),
+        DeviceClock(arguments.speed),
         np.random.default_rng(arguments.seed),
         DeviceOptions(unit=arguments.unit, vial=vial, plant=plant),
         od=ods,

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
+from hardware.clock import DeviceClock
 from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.link.secret import read_secret
 from hardware.link.transport import (
@@ -110,11 +111,12 @@ class HttpTransport(Transport):
         if not valid:
             raise ValueError(f"url = {url!r}: allowed http://host:port, for instance http://192.168.7.2:5000")
         self.url = url.rstrip("/")
-        self._read_s, self._speed = config.timeout(config.read_s, speed), speed
+        self._clock = DeviceClock(speed)
+        self._read_s = config.timeout(config.read_s, self._clock)
         self._token = read_secret("token_file", config.token_file, 32, TOKEN) if config.token_file else ""
         authority = {"Authorization": f"Bearer {self._token}", "X-Session": str(session or new_session())}
         self._client = httpx.Client(
-            timeout=httpx.Timeout(self._read_s, connect=config.timeout(config.connect_s, speed)),
+            timeout=httpx.Timeout(self._read_s, connect=config.timeout(config.connect_s, self._clock)),
             limits=httpx.Limits(max_connections=1, max_keepalive_connections=0),
             headers={"X-Requested-With": "XMLHttpRequest", "Accept-Encoding": "identity", "Connection": "close"}
             | (authority if self._token else {}),
@@ -129,7 +131,7 @@ class HttpTransport(Transport):
 
     def switched_off(self) -> SwitchedOff | None:
         """What the agent, if there is one, has switched off. Raises: LinkError, ProtocolError."""
-        return switched_off(self.get("/_agent/status").body, self._speed) if self._token else {}
+        return switched_off(self.get("/_agent/status").body, self._clock) if self._token else {}
 
     def close(self) -> None:
         """Close the client. Idempotent."""

@@ -14,6 +14,7 @@ import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from hardware.clock import DeviceClock
 from hardware.errors import LinkError, ProtocolError
 from hardware.link.transport import (
     MAX_BODY,
@@ -88,7 +89,7 @@ class SerialTransport(Transport):
         attempts: int = 5,
         session: int | None = None,
     ) -> None:
-        self.port, self._speed, self._attempts = port, speed, attempts
+        self.port, self._clock, self._attempts = port, DeviceClock(speed), attempts
         self._config = config or TransportConfig(kind="serial")
         self._line: serial.Serial | None = None
         self._session = session or new_session()
@@ -106,7 +107,7 @@ class SerialTransport(Transport):
         """What the agent has switched off. Raises: LinkError, ProtocolError."""
         if self._line is None:
             self._open()
-        return switched_off(self._exchange("PING", "/").body, self._speed)
+        return switched_off(self._exchange("PING", "/").body, self._clock)
 
     def close(self) -> None:
         """Release the port; the agent's switch stays as it is. Idempotent."""
@@ -115,7 +116,7 @@ class SerialTransport(Transport):
     def _open(self) -> None:
         import serial  # only users of the serial link need pyserial
 
-        connect_s = self._config.timeout(self._config.connect_s, self._speed)
+        connect_s = self._config.timeout(self._config.connect_s, self._clock)
         try:
             self._line = serial.serial_for_url(
                 self.port, baudrate=self._config.baud, timeout=connect_s, write_timeout=connect_s, exclusive=True
@@ -167,7 +168,7 @@ class SerialTransport(Transport):
         if len(frame) > MAX_REQUEST:
             raise ProtocolError(f"{method} {path[:40]}...: request of {len(frame)} bytes, allowed {MAX_REQUEST}")
         wait_s = self._config.read_s if method in ("GET", "POST") else self._config.connect_s
-        seconds = self._config.timeout(wait_s, self._speed)
+        seconds = self._config.timeout(wait_s, self._clock)
         garbage = 0
         last_try = time.monotonic() + 1.5 * seconds  # however many replies are damaged, no third full time-out
         try:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from conf.schema import check, setting
-from hardware.clock import Clock
+from hardware.clock import Clock, DeviceClock
 from hardware.errors import LinkError, ProtocolError
 
 __all__ = [
@@ -120,21 +120,23 @@ class SharedLink(Transport):
         self._link.close()
 
 
-def switched_off(status: bytes, speed: float) -> SwitchedOff | None:
+def switched_off(status: bytes, clock: DeviceClock) -> SwitchedOff | None:
     """What the status of a board agent says that it has switched off; None from an agent older than that.
 
-    Args: speed: device seconds per real second. Raises: ProtocolError for a status that is not an agent's.
+    Args: clock: of the device. Raises: ProtocolError for a status that is not an agent's.
     """
     try:
         found = json.loads(status).get("switched_off")
-        return found and {m: {pump: float(ago) * speed for pump, ago in pumps.items()} for m, pumps in found.items()}
+        return found and {
+            m: {pump: clock.of_real(float(ago)) for pump, ago in pumps.items()} for m, pumps in found.items()
+        }
     except (ValueError, RecursionError, TypeError, AttributeError) as error:
         raise ProtocolError(f"the board agent's status is not readable: {status[:80]!r}") from error
 
 
 @dataclass(frozen=True)
 class TransportConfig:
-    """The link to a device. Times are device seconds and are divided by the backend's `speed`.
+    """The link to a device. Times are device seconds.
 
     The device's server kills a worker that takes 30 s. Prefer a port /dev/serial/by-id/..., which survives replugging.
     """
@@ -160,6 +162,6 @@ class TransportConfig:
     def __post_init__(self) -> None:
         check(self, "transport")
 
-    def timeout(self, seconds: float, speed: float) -> float:
-        """Real seconds to wait for what takes `seconds` on a device that runs `speed` times faster."""
-        return max(seconds / speed, self.floor_s)
+    def timeout(self, seconds: float, clock: DeviceClock) -> float:
+        """Real seconds to wait for what takes `seconds` by the device's clock."""
+        return max(clock.to_real(seconds), self.floor_s)

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 from hardware.pioreactor.config import vial_ml
 from hardware.pioreactor.mailbox import DOSING_JOBS, PUMPS, Event
-from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, WASTE, Moved, Pumps, Steps
+from hardware.pioreactor.pumps import LATE_ML, MEDIA, OURS, WASTE, Moved, Pumps, Request, Steps
 from hardware.pioreactor.resume import History
-from hardware.storage.doses import Given
+from hardware.storage.doses import Ending, Given
 
 __all__ = ["Doses", "Plan"]
 
@@ -80,7 +80,7 @@ class Doses:
         dosing = plan.feed_ml > 0.0
         self._count += dosing
         self.sample, self.carry_ml = sample, plan.carry_ml
-        dose, on_s = f"{OURS}{self.pumps.run}/{self.pumps.unit}/{self._count}", self._book.elapsed()
+        dose, on_s = f"{self.pumps.ours}{self.pumps.unit.name}/{self._count}", self._book.elapsed()
         self._book.write(
             "intent", sample=sample, rate=rate, feed_ml=plan.feed_ml, waste_ml=plan.waste_ml, carry_ml=plan.carry_ml,
             doses=self._count, on_s=on_s, id=dose,
@@ -141,9 +141,9 @@ class Doses:
             pumps.counted[MEDIA, dose] = pumps.counted[WASTE, dose] = math.inf
             media, waste = Moved(0.0, asked_ml, UNSEEN), Moved(0.0, history.waste_ml)
             if history.boot == pumps.boot and not history.wasted:
-                asked = self._clock.now() - (self._book.elapsed() - history.on_s) / self._config.speed
-                ran_s = pumps.pin(MEDIA).ran_s
-                seen = yield from pumps.follow(MEDIA, asked_ml, dose, history.task, asked, ran_s)
+                ago_s = pumps.unit.clock.to_real(self._book.elapsed() - history.on_s)
+                asked_s, ran_s = self._clock.now() - ago_s, pumps.pin(MEDIA).ran_s
+                seen = yield from pumps.follow(Request(MEDIA, asked_ml, dose, asked_s, ran_s, history.task))
                 end = seen.end if seen.high > 0.0 else ""  # or it was over before: that it is not seen says nothing
                 media = replace(seen, low=0.0, high=max(seen.high, asked_ml), end=end or UNSEEN)
         yield from self._conclude(Plan(asked_ml, history.waste_ml), dose, history.on_s, media, waste)
@@ -158,11 +158,9 @@ class Doses:
             if moved.end:
                 self._book.tell(f"{pump}: {moved.end}")
         taken = waste.low + media.drained
-        self._book.log(
-            "dose_end", verified_off=True, on_s=on_s, feed_ml=media.high, waste_ml=taken, feed_times=0, waste_times=0,
-            repeated_ml=0.0, feed_low_ml=media.low, waste_high_ml=waste.high + media.drained, id=dose,
-            end=media.end or waste.end,
-        )  # fmt: skip
+        row = Ending(on_s, media.high, taken, feed_low_ml=media.low).row()
+        high_ml, end = waste.high + media.drained, media.end or waste.end
+        self._book.log("dose_end", **row, waste_high_ml=high_ml, id=dose, end=end)
         if media.high > plan.feed_ml + LATE_ML:
             taken += yield from self._drain(media, dose)
         more, rise = media.high - plan.feed_ml, max(min(media.high, self._room_ml) - taken, 0.0)
@@ -184,7 +182,7 @@ class Doses:
         """A pump that runs without a job, or whose job was killed: ended, and what it moved on record."""
         pin, name = self.pumps.pin(job), f"{self.pumps.short}/{self._book.elapsed():.0f}"
         since = pin.on_s if pin.on and pin.on_s > -math.inf else self._clock.now()
-        moved = yield from self.pumps.end(job, 0.0, name, since, pin.ran_s)
+        moved = yield from self.pumps.end(Request(job, 0.0, name, since, pin.ran_s))
         if moved.high > 0.0:
             self._give(job, moved.low, moved.high, f"{job} ran without its job")
         if job == MEDIA and moved.high > LATE_ML:
@@ -196,8 +194,8 @@ class Doses:
         strange, self._strange = self._strange, []
         for job, source in dict.fromkeys((event.pump, event.source) for event in strange):
             counted = self.pumps.counted.get((job, source), 0.0)
-            over = self.pumps.told[job, source] - counted
-            ours = source.startswith(f"{OURS}{self.pumps.run}/")  # what is booked of it may be more than was told
+            over = self.pumps.reported[job, source] - counted
+            ours = source.startswith(self.pumps.ours)  # what is booked of it may be more than was reported
             if abs(over) <= 1e-6 or (ours and over < 0.0) or job not in PUMPS:
                 continue
             self.pumps.counted[job, source] = counted + over
@@ -214,6 +212,4 @@ class Doses:
         given = Given(self._book.elapsed(), fed * high_ml, fed * low_ml, (not fed) * high_ml)
         self.extra.append(given)
         self._book.tell(f"{why}: {low_ml:.2f} to {high_ml:.2f} mL")
-        self._book.log(
-            "given", at_s=given.at_s, why=why, feed_ml=given.feed_ml, feed_low_ml=given.low_ml, waste_ml=given.waste_ml
-        )
+        self._book.log("given", **given.row(why))

@@ -9,7 +9,7 @@ import numpy as np
 
 from envs.bench import Bench
 from hardware.check import Check, report
-from hardware.clock import RealClock
+from hardware.clock import DeviceClock
 from hardware.errors import UnfitError
 from hardware.family import Can, Family, Opening, not_looked_at
 from hardware.link.open import DeviceLock
@@ -44,7 +44,7 @@ class PioreactorFamily(Family):
             backend = stack.enter_context(self.reached(backend, bench, folder))
             for unit in backend.reactors:
                 stack.enter_context(closing(DeviceLock(f"unit {unit} of {backend.broker}:{backend.broker_port}")))
-            yield stack.enter_context(closing(PioreactorReactors(backend, RealClock(), log_row, run)))
+            yield stack.enter_context(closing(PioreactorReactors(backend, DeviceClock(), log_row, run)))
 
     @contextmanager
     def open(self, opening: Opening) -> Iterator[Reactor]:

@@ -41,7 +41,7 @@ def preflight(reactors: PioreactorReactors) -> list[Check]:
 
 def _unit(station: Station, reactors: PioreactorReactors, leader: Web) -> Iterator[Check]:
     """Checks of one unit. Raises: ReactorError where it does not answer."""
-    name, web, config = station.name, station.web, reactors.config.of(station.name)
+    name, web, config = station.name, station.unit.web, reactors.config.of(station.name)
     health = web.get("/health")
     who = str(health.get("pioreactor_unit"))
     yield Check(f"{name} identity", who == name, f"the unit at {web.url} is {who}", f"correct backend.units.{name}")

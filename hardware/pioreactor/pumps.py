@@ -14,13 +14,12 @@ from typing import Any, TypeVar
 
 from hardware.clock import Clock
 from hardware.errors import ReactorError
-from hardware.logbook import Logbook
-from hardware.pioreactor.config import PioreactorConfig
-from hardware.pioreactor.mailbox import PUMPS, Cluster, Event, Mailbox, Pin
+from hardware.pioreactor.mailbox import PUMPS, Event, Pin
+from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import Facts
 from hardware.pioreactor.web import NotHeard, Web
 
-__all__ = ["LATE_ML", "MEDIA", "OURS", "WASTE", "Moved", "Pumps", "Steps", "boot_of"]
+__all__ = ["LATE_ML", "MEDIA", "OURS", "WASTE", "Moved", "Pumps", "Request", "Steps", "boot_of"]
 
 T = TypeVar("T")
 
@@ -51,6 +50,22 @@ class Moved:
     high: float = 0.0
     end: str = ""
     drained: float = 0.0
+
+
+@dataclass(frozen=True)
+class Request:
+    """A run of a pump that was asked for, or was found.
+
+    ml: as asked. dose: its id, the source of its events. asked_s, ran_s: when it was asked for, and for how long its
+    pin had run then. task: what the unit answered, "" if that is unknown.
+    """
+
+    job: str
+    ml: float
+    dose: str
+    asked_s: float
+    ran_s: float
+    task: str = ""
 
 
 class Calls:
@@ -108,22 +123,18 @@ def boot_of(rows: list[dict[str, Any]]) -> str:
 class Pumps:
     """Media and waste pump of one unit.
 
-    Args: run: of this run, part of every id.
-    Attributes: flow_ml_s, of each by its active calibration; told, mL by job and source of the events; counted, mL of
-      them that whoever asked for them books, inf while they are under way; facts, of the unit's version; boot, when the
-      unit was started; proven, jobs whose pumps were ended here, and when; trouble, why no dose may be given, "" if one
-      may; cut, whether media is to end, halted, whether everything is; waits, whether what is under way waits for
+    Attributes: flow_ml_s, of each by its active calibration; reported, mL by job and source of the events; counted, mL
+      of them that whoever asked for them books, inf while they are under way; facts, of the unit's version; boot, when
+      the unit was started; proven, jobs whose pumps were ended here, and when; trouble, why no dose may be given, "" if
+      one may; cut, whether media is to end, halted, whether everything is; waits, whether what is under way waits for
       somebody or something else.
     """
 
-    def __init__(
-        self, unit: str, web: Web, mqtt: Cluster, box: Mailbox, config: PioreactorConfig, clock: Clock, book: Logbook,
-        run: str,
-    ) -> None:  # fmt: skip
-        self.unit, self.web, self.mqtt, self.box = unit, web, mqtt, box
-        self.config, self.clock, self.book, self.run = config, clock, book, run
+    def __init__(self, unit: Unit) -> None:
+        self.unit, self.web, self.mqtt, self.box = unit, unit.web, unit.mqtt, unit.box
+        self.config, self.clock, self.book = unit.config, unit.real, unit.book
         self.flow_ml_s = {MEDIA: 1.0, WASTE: 1.0}  # about what the vendor's pumps give, until it was read
-        self.told: dict[tuple[str, str], float] = {}
+        self.reported: dict[tuple[str, str], float] = {}
         self.counted: dict[tuple[str, str], float] = {}
         self.facts, self.boot = Facts(), ""
         self.trouble, self.cut, self.halted, self.waits = "", False, False, False
@@ -132,12 +143,17 @@ class Pumps:
     @property
     def short(self) -> str:
         """The id of a run of a pump that only ends with its pin off."""
-        return f"{OURS}{self.run}/{self.unit}/off"
+        return f"{self.ours}{self.unit.name}/off"
+
+    @property
+    def ours(self) -> str:
+        """How every id of this run begins."""
+        return f"{OURS}{self.unit.run}/"
 
     def take(self, event: Event) -> None:
-        """A dosing event; a correction is negative, and of what was told."""
+        """A dosing event; a correction is negative, and of what was reported."""
         key = event.pump, event.source
-        self.told[key] = max(self.told.get(key, 0.0) + event.ml, 0.0)
+        self.reported[key] = max(self.reported.get(key, 0.0) + event.ml, 0.0)
 
     def pin(self, job: str) -> Pin:
         """That a job drives."""
@@ -166,115 +182,119 @@ class Pumps:
             f"look at the unit's log; a killed process leaves a lock on its pin, which ends with {word} (pins {pins})"
         )
 
-    def say(self, topic: str, payload: str) -> None:
-        """Publish below our experiment."""
-        self.mqtt.publish(f"pioreactor/{self.unit}/{self.config.experiment}/{topic}", payload)
-
     def ask_pins(self) -> None:
         """Have stirring say all pins again."""
         if not math.isnan(self.box.stir_duty):
-            self.say("stirring/duty_cycle/set", f"{self.box.stir_duty:g}")
+            self.unit.say("stirring/duty_cycle/set", f"{self.box.stir_duty:g}")
+
+    def said(self, request: Request) -> float:
+        """What the events of a run reported so far, mL."""
+        return self.reported.get((request.job, request.dose), 0.0)
 
     def give(self, job: str, ml: float, dose: str) -> Steps[Moved]:
         """Ask for one pump job and follow it; what it gave. It is never asked for again."""
-        asked, ml, task, ran_s = self.clock.now(), round(ml, 4), "", self.pin(job).ran_s
+        request = Request(job, round(ml, 4), dose, self.clock.now(), self.pin(job).ran_s)
         self.counted[job, dose] = math.inf
-        future = self.web.ask(self.web.run, job, {"ml": ml, "source-of-event": dose})
+        future = self.web.ask(self.web.run, job, {"ml": request.ml, "source-of-event": dose})
         while not future.done():
             yield STEP_S
         try:
-            task = future.result()
-            self.book.log("task", id=dose, job=job, task=task)
+            request = replace(request, task=future.result())
+            self.book.log("task", id=dose, job=job, task=request.task)
         except NotHeard as error:
             self.counted[job, dose] = 0.0
             return Moved(end=f"not given: {error}")
         except ReactorError as error:
             self.book.tell(f"{job}: whether it was heard is unknown: {error}")
-        moved = yield from self.follow(job, ml, dose, task, asked, ran_s)
+        moved = yield from self.follow(request)
         self.counted[job, dose] = moved.high if job == MEDIA else moved.low
         return moved
 
-    def follow(self, job: str, ml: float, dose: str, task: str, asked: float, ran_s: float) -> Steps[Moved]:
-        """A job to its end; what it gave. Args: task: that it was asked for with, "" if it is unknown; ran_s: then."""
-        if why := (yield from self._begins(job, ml, dose, task, asked)):
-            return Moved(0.0, ml if self.mqtt.broke_s >= asked else 0.0, why)
-        late = self.clock.now() + ml / self.flow_ml_s[job] + OVERRUN_S
-        while not self._is_over(job, dose, ml, asked):
-            cut = self._unwanted(job) or self.odd(job) or self.mqtt.broke_s >= asked
-            if cut or self.clock.now() > late:
-                return (yield from self.end(job, ml, dose, asked, ran_s))
+    def follow(self, request: Request) -> Steps[Moved]:
+        """A job to its end; what it gave."""
+        job = request.job
+        if why := (yield from self._begins(request)):
+            return Moved(0.0, request.ml if self.broke(request) else 0.0, why)
+        late = self.clock.now() + request.ml / self.flow_ml_s[job] + OVERRUN_S
+        while not self._is_over(request):
+            if self._unwanted(job) or self.odd(job) or self.broke(request) or self.clock.now() > late:
+                return (yield from self.end(request))
             yield STEP_S
-        return self._moved(job, ml, dose, (self.pin(job).ran_s - ran_s) * self.flow_ml_s[job])
+        return self._moved(request)
+
+    def broke(self, request: Request) -> bool:
+        """Whether the connection to the broker was lost since a run was asked for."""
+        return self.mqtt.broke_s >= request.asked_s
 
     def _unwanted(self, job: str) -> bool:
         return self.halted or (self.cut and job == MEDIA)
 
-    def _begins(self, job: str, ml: float, dose: str, task: str, asked: float) -> Steps[str]:
+    def _begins(self, request: Request) -> Steps[str]:
         """A request until its pump begins, then ""; or until it is certain that it never will, then why.
 
         That is where its task is over and failed; where its job came and went; where it, or one that was queued behind
         it, was taken from the queue and no job came for long; where the unit was started again.
         """
-        calls, barrier = Calls(self.web, self.clock), Barrier(self.web, self.clock, PROBE_S * bool(task))
+        job, asked_s, what = request.job, request.asked_s, f"{request.ml:.2f} mL"
+        calls, barrier = Calls(self.web, self.clock), Barrier(self.web, self.clock, PROBE_S * bool(request.task))
         never_s, why, late = math.inf, "", False  # from when on it cannot begin any more; whether it should have begun
         while not (
-            why or self.told.get((job, dose), 0.0) > 0.0 or self.pin(job).on or self.pin(job).on_s >= asked
-            or (self.lost(job) and self.box.state(job).at >= asked)
+            why or self.said(request) > 0.0 or self.pin(job).on or self.pin(job).on_s >= asked_s
+            or (self.lost(job) and self.box.state(job).at >= asked_s)
         ):  # fmt: skip
             now, state, taken = self.clock.now(), self.box.state(job), None
-            if now > asked + self.config.start_s and not (late or self.trouble or self.box.live(job)):
+            if now > asked_s + self.config.start_s and not (late or self.trouble or self.box.live(job)):
                 late = True
-                self.trouble = f"the fate of a dose of {ml:.2f} mL ({job}) is unknown: it was not seen to begin"
+                self.trouble = f"the fate of a dose of {what} ({job}) is unknown: it was not seen to begin"
                 self.book.tell(self.trouble)
             self.waits = self.waits or late
-            if task and (said := calls.ask("task", 0.5, self.web.result, task)):
-                taken = said[0]
+            if request.task and (answer := calls.ask("task", 0.5, self.web.result, request.task)):
+                taken = answer[0]
             if late and taken is None and math.isinf(never_s) and barrier.passed():
                 taken = True
             if taken is not None:
                 never_s = min(never_s, now + (UNSTARTED_S if taken else SETTLE_S))
-            if state.word == "disconnected" and state.at >= asked:
+            if state.word == "disconnected" and state.at >= asked_s:
                 never_s = min(never_s, state.at + SETTLE_S)
             if now > never_s and not self.box.live(job):
                 why = f"accepted and not carried out: {self.locks}"
             if late and (rows := calls.ask("rows", 5.0, self.web.running)) and self.rebooted(rows[0]):
                 why = "not carried out: the unit was started again, which forgets requests"
             if self._unwanted(job) and calls.due("stop", 1.0):  # heard only once the job listens
-                self.say(f"{job}/$state/set", "disconnected")
+                self.unit.say(f"{job}/$state/set", "disconnected")
             yield STEP_S
         if late and not why:
-            self.book.tell(f"{job} of {ml:.2f} mL ran late")
+            self.book.tell(f"{job} of {what} ran late")
         if late:
             self.trouble, self.waits = "", False
         return why
 
-    def _is_over(self, job: str, dose: str, ml: float, asked: float) -> bool:
+    def _is_over(self, request: Request) -> bool:
         """Whether a job has said that it ended, its pin stands still, and its last event is there or will not come."""
-        state, now = self.box.state(job), self.clock.now()
-        ended = state.word == "disconnected" and state.at >= asked and not self.pin(job).on
-        return ended and (self.told.get((job, dose), 0.0) >= ml - 1e-6 or now > state.at + SETTLE_S)
+        state, now = self.box.state(request.job), self.clock.now()
+        ended = state.word == "disconnected" and state.at >= request.asked_s and not self.pin(request.job).on
+        return ended and (self.said(request) >= request.ml - 1e-6 or now > state.at + SETTLE_S)
 
-    def _moved(self, job: str, ml: float, dose: str, ran_ml: float) -> Moved:
-        """What a job that ended gave, by its events and by how long its pin was on."""
-        told, end = self.told.get((job, dose), 0.0), ""
-        low = high = told
-        if told < ml - 1e-6:  # a stop by HTTP tells up to half a second too much; a last event may be missing
-            slack = LATE_ML if ran_ml > 0.0 else ROUNDED_S * self.flow_ml_s[job]
-            low, high = max(min(told, ran_ml or told) - slack, 0.0), min(max(told, ran_ml) + slack, ml)
-            end = f"{told:.2f} of {ml:.2f} mL told: ended early, or its last event was not sent"
+    def _moved(self, request: Request) -> Moved:
+        """What a job that ended by itself gave, by its events and by how long its pin was on."""
+        flow, ml, said_ml, end = self.flow_ml_s[request.job], request.ml, self.said(request), ""
+        low = high = said_ml
+        ran_ml = (self.pin(request.job).ran_s - request.ran_s) * flow
+        if said_ml < ml - 1e-6:  # a stop by HTTP tells up to half a second too much; a last event may be missing
+            slack = LATE_ML if ran_ml > 0.0 else ROUNDED_S * flow
+            low, high = max(min(said_ml, ran_ml or said_ml) - slack, 0.0), min(max(said_ml, ran_ml) + slack, ml)
+            end = f"{said_ml:.2f} of {ml:.2f} mL told: ended early, or its last event was not sent"
         if ran_ml > high + LATE_ML:
-            end = end or f"its pin was on for {ran_ml:.2f} mL, {told:.2f} mL were told"
+            end = end or f"its pin was on for {ran_ml:.2f} mL, {said_ml:.2f} mL were told"
         return Moved(low, max(high, round(ran_ml, 4)), end)  # a job times itself, and on a busy unit it does that late
 
-    def end(self, job: str, ml: float, dose: str, since: float, ran_s: float) -> Steps[Moved]:
+    def end(self, request: Request) -> Steps[Moved]:
         """End a pump that has begun, or may have, until it is proven off; what it moved (docs/pioreactor.md, Ending).
 
         While a media pump goes on, the waste pump keeps the vial from overflowing, until `bottle_ml` may have flowed.
         What only a hand can do is said; once it was done, what is tried here ends the pump.
-
-        Args: ml: as asked. since, ran_s: when it was asked, and for how long its pin had run then.
         """
-        ending, off_s, drained = Ending(self, job, since, ran_s), math.nan, 0.0
+        job, ending, off_s, drained = request.job, Ending(self, request), math.nan, 0.0
         drain: Steps[Moved] | None = None
         while math.isnan(off_s) or drain is not None:
             try:
@@ -288,11 +308,11 @@ class Pumps:
                 self.waits = late or self.waits
                 wanted = self.config.waste_factor * flowed - drained
                 if late and drain is None and job == MEDIA and not self.halted and wanted > DRAIN_ML:
-                    drain = self.give(WASTE, DRAIN_ML, f"{dose}/beside{self.clock.now():.0f}")
+                    drain = self.give(WASTE, DRAIN_ML, f"{request.dose}/beside{self.clock.now():.0f}")
             yield STEP_S
         self.trouble, self.waits = "", False
         self.proven[job] = self.clock.now()
-        return replace(ending.moved(ml, self.told.get((job, dose), 0.0), off_s), drained=drained)
+        return replace(ending.moved(off_s), drained=drained)
 
     def _plug(self, job: str) -> str:
         pin = self.box.jobs[job]
@@ -311,31 +331,32 @@ class Ending:
     tried again and again, at its own pace; of short runs at most `SHORTS` are carried out, and none is asked for while
     an earlier one may still wait.
 
-    Args: pumps: of the unit. others as of `Pumps.end`. Attributes: began, when it did.
+    Args: pumps: of the unit. request: whose pump is ended. Attributes: began, when it did.
     """
 
-    def __init__(self, pumps: Pumps, job: str, since: float, ran_s: float) -> None:
-        self._p, self._job, self._since, self._ran_s = pumps, job, since, ran_s
+    def __init__(self, pumps: Pumps, request: Request) -> None:
+        self._p, self._request, self._job, self._since = pumps, request, request.job, request.asked_s
         self.began, self._calls = pumps.clock.now(), Calls(pumps.web, pumps.clock)
         self._listed: bool | None = None
-        self._told, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
+        self._shorts_before, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
         self._quiet_s, self._still_s, self._rows_s = math.inf, math.inf, -math.inf
         self._short: Future[str] | None = None
         self._rebooted = self._lost = self._held = False
 
     def _shorts(self) -> float:
-        return self._p.told.get((self._job, self._p.short), 0.0)
+        """What short runs of the pump reported, mL."""
+        return self._p.reported.get((self._job, self._p.short), 0.0)
 
     def act(self) -> None:
         """Ask what is due."""
         p, job, passed, calls = self._p, self._job, self._p.clock.now() - self.began, self._calls
         if calls.due("mqtt", 1.0):
-            p.say(f"{job}/$state/set", "disconnected")
+            p.unit.say(f"{job}/$state/set", "disconnected")
         if passed > 1.0 and calls.due("pins", 5.0):
             p.ask_pins()
         if passed > 2.0 and self._listed is not False:
             calls.ask("stop", 20.0, p.web.stop, job)
-        may_run = self._shorts() - self._told < (SHORTS - 0.5) * SHORT_S * p.flow_ml_s[job]
+        may_run = self._shorts() - self._shorts_before < (SHORTS - 0.5) * SHORT_S * p.flow_ml_s[job]
         if self._short is not None and self._short.done():
             if not isinstance(self._short.exception(), NotHeard):
                 self._barrier = Barrier(p.web, p.clock, AGAIN_S)
@@ -355,7 +376,7 @@ class Ending:
     def off_s(self) -> float:
         """When the pump was off at the latest, nan while that is not proven."""
         p, now, pin, state = self._p, self._p.clock.now(), self._p.pin(self._job), self._p.box.state(self._job)
-        broke = p.mqtt.broke_s >= self._since  # a broker that stood still takes jobs that live for lost
+        broke = p.broke(self._request)  # a broker that stood still takes jobs that live for lost
         self._lost = self._lost or (state.word == "lost" and not broke)
         self._held = self._held or (bool(self._listed) and pin.on and pin.on_s == -math.inf)
         if now > p.box.heard_s + QUIET_S:
@@ -372,7 +393,7 @@ class Ending:
                 pin.ends(off_s)
                 return off_s
         by_itself = said and not self._lost and (fresh or pin.off_s >= self._since)
-        by_short = said and self._shorts() > self._told and state.at >= self._short_s
+        by_short = said and self._shorts() > self._shorts_before and state.at >= self._short_s
         if pin.on or not (by_itself or by_short or (self._listed is False and fresh)):
             return math.nan
         return pin.off_s if pin.off_s >= self._since else now
@@ -381,22 +402,23 @@ class Ending:
         """What a pump that runs on, or told that it is about to and no end, moved up to now, mL; 0 for one of a silent
         unit, and for one whose bottle is empty by now."""
         p, pin, now = self._p, self._p.pin(self._job), self._p.clock.now()
-        silent, broke = now > self._rows_s + QUIET_S, p.mqtt.broke_s >= self._since and not self._lost
+        silent, broke = now > self._rows_s + QUIET_S, p.broke(self._request) and not self._lost
         flowed = max(now - max(self._since, pin.on_s if pin.on else pin.event_s), 0.0) * p.flow_ml_s[self._job]
         return flowed if not (silent or broke) and flowed < p.config.bottle_ml else 0.0
 
-    def moved(self, ml: float, told: float, off_s: float) -> Moved:
-        """What the pump moved since it was asked. Args: ml: as asked. told: by its events. off_s: as of `off_s`."""
+    def moved(self, off_s: float) -> Moved:
+        """What the pump moved since it was asked. Args: off_s: as of `off_s`."""
         p, pin, flow = self._p, self._p.pin(self._job), self._p.flow_ml_s[self._job]
+        ml, said_ml = self._request.ml, p.said(self._request)
         longest = max(min(off_s, self._still_s) - self._since, 0.0) * flow
-        ran = min((pin.ran_s - self._ran_s) * flow - (self._shorts() - self._told), longest)
+        ran = min((pin.ran_s - self._request.ran_s) * flow - (self._shorts() - self._shorts_before), longest)
         if self._held or (ran <= 0.0 and self._lost):  # since when it runs was never heard
             ran = longest
-        low, end = max(told - ROUNDED_S * flow, 0.0), "ended from here"
+        low, end = max(said_ml - ROUNDED_S * flow, 0.0), "ended from here"
         if ran <= 0.0:  # its pin was never seen: a job times itself
-            return Moved(low, max(ml, told), end)
+            return Moved(low, max(ml, said_ml), end)
         if self._rebooted:
             return Moved(low, max(ran, min(ml, ran + p.config.reading_s * flow)), "the unit was started again in it")
-        if p.mqtt.broke_s >= self._since and not self._lost:  # a job that loses the broker ends; when was not heard
-            ran = min(ran, max(ml, told))
-        return Moved(low, max(ran, told), end)
+        if p.broke(self._request) and not self._lost:  # a job that loses the broker ends; when was not heard
+            ran = min(ran, max(ml, said_ml))
+        return Moved(low, max(ran, said_ml), end)

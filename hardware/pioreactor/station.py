@@ -1,26 +1,23 @@
 """One unit: its jobs brought up and kept, its samples, its doses, what is wrong with it.
 
-Two clocks: real time for messages and jobs, device time, the run's, for samples. What takes its time is a course: it
-yields pauses, real seconds, in which the other units go on.
+Messages and jobs have real time, samples that of the device, the run's. What takes its time is a course: it yields
+pauses, real seconds, in which the other units go on.
 """
 
 import math
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
-from hardware.clock import Clock, ScaledClock
 from hardware.errors import DeviceStateError, LinkError, ReactorError
-from hardware.logbook import Logbook
-from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.doses import Doses, Plan
 from hardware.pioreactor.jobs import AUTOMATION, GONE, HEAT, OD, STIR, flow, regulates, request, target_of
-from hardware.pioreactor.mailbox import Cluster, Mailbox
 from hardware.pioreactor.pumps import MEDIA, STEP_S, WASTE, Barrier, Calls, Pumps, Steps, boot_of
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.sampling import Sampling
+from hardware.pioreactor.unit import Unit
 from hardware.pioreactor.versions import facts
-from hardware.pioreactor.web import Web
 from hardware.reactor import Fault
+from hardware.stations import Newest
 
 __all__ = ["Station"]
 
@@ -30,28 +27,30 @@ GRACE_S = 20.0  # in which a job that was asked for may come up; between two att
 TELL_S, TELLS = 3.0, 6  # between two words on the same target; of those before the job is started anew
 SETTLED_S = 2.0  # after which a turbidostat that is wrong has ended
 SILENT_S = 45.0  # without a reading, after which a reader that says it is there is none
+PUMPS_S = 10.0  # in which pumps are verified off while a run goes on
 FRESH = 4.0  # periods of readings in which one that is taken has arrived
 
 
 class Station:
     """One unit of a cluster.
 
-    Args: config: of this unit. real: clock of messages. run: of this run, part of every id.
-    Attributes: web, book, doses, sampling: its parts; handed_over, OD at which the vendor's turbidostat was started,
-      nan if it was not; level_ml, that the unit's own ledger is to be put to, nan if it is not; up, whether it was
-      brought up.
+    Attributes: unit, its surroundings; book, doses, sampling: its parts; regulated_od, OD at which the vendor's
+      turbidostat was started, nan if it was not; level_ml, that the unit's own ledger is to be put to, nan if it is
+      not; up, whether it was brought up; next_look, which is always.
     """
 
-    def __init__(self, config: PioreactorConfig, mqtt: Cluster, box: Mailbox, real: Clock, book: Logbook, run: str):
-        self.name, self.book, self._config, self._mqtt, self._box = book.name, book, config, mqtt, box
-        self._real, self._device = real, ScaledClock(real, config.speed)
-        self.web = Web(config.address(self.name), config.experiment)
-        self._pumps = Pumps(self.name, self.web, mqtt, box, config, real, book, run)
+    next_look = -math.inf
+
+    def __init__(self, unit: Unit) -> None:
+        self.unit, self.name, self.book, self._web = unit, unit.name, unit.book, unit.web
+        self._config, self._mqtt, self._box = unit.config, unit.mqtt, unit.box
+        self._clock, self._real = unit.clock, unit.real
+        self._pumps = Pumps(unit)
         self.doses = Doses(self._pumps)
-        self.sampling = Sampling(config, self._device.now())
-        self.handed_over = self._target = self.level_ml = math.nan
+        self.sampling = Sampling(unit.config, self._clock.now())
+        self.regulated_od = self._target = self.level_ml = math.nan
         self.given_up = self.heat_is_off = self.up = False
-        self._calls = Calls(self.web, real)
+        self._calls = Calls(self._web, self._real)
         self._course: Iterator[float] | None = None
         self._gone, self._been, self._missing = set[str](), set[str](), list[str]()
         self._asked_s: dict[str, float] = {}
@@ -65,18 +64,18 @@ class Station:
 
         Raises: ReactorError for what no waiting can mend.
         """
-        self.handed_over = history.handed_over
-        self._pumps.facts = facts(str((yield from self._answer(self.web.get, "/versions/app")).get("version")))
-        calibrations = yield from self._answer(self.web.get, "/active_calibrations")
+        self.regulated_od = history.handed_over
+        self._pumps.facts = facts(str((yield from self._answer(self._web.get, "/versions/app")).get("version")))
+        calibrations = yield from self._answer(self._web.get, "/active_calibrations")
         for job, pump in ((MEDIA, "media_pump"), (WASTE, "waste_pump")):
             self._pumps.flow_ml_s[job] = flow(calibrations, pump)
-        rows = yield from self._answer(self.web.running)
+        rows = yield from self._answer(self._web.running)
         self._pumps.boot, self._listed = boot_of(rows), {str(row["job_name"]) for row in rows}
-        if AUTOMATION in self._listed and math.isnan(self.handed_over):
+        if AUTOMATION in self._listed and not self.handed_over:
             raise DeviceStateError("a dosing automation of the vendor's runs, and would dose too; stop it in its page")
         self.doses.restore(history)
-        barrier, deadline = Barrier(self.web, self._real), self._real.now() + GRACE_S
-        while not (history.open or math.isfinite(self.handed_over) or barrier.passed()):
+        barrier, deadline = Barrier(self._web, self._real), self._real.now() + GRACE_S
+        while not (history.open or self.handed_over or barrier.passed()):
             if self._real.now() > deadline:
                 huey = "sudo systemctl restart huey"
                 raise LinkError(f"the task queue takes nothing, so a dose would run at any time; on the unit: {huey}")
@@ -87,7 +86,7 @@ class Station:
             if not self._there(job):
                 yield from self._start(job)
         self.book.log(
-            "device", device_id=self.name, url=self.web.url, flows=self._pumps.flow_ml_s, boot=self._pumps.boot
+            "device", device_id=self.name, url=self._web.url, flows=self._pumps.flow_ml_s, boot=self._pumps.boot
         )
         self.book.log("temperature", temperature=self._target)
         self.up = True
@@ -108,15 +107,15 @@ class Station:
 
     def _answer(self, what: Callable[..., T], *given: Any) -> Steps[T]:
         """Wait for a request while the other units go on. Raises: as the request."""
-        future = self.web.ask(what, *given)
+        future = self._web.ask(what, *given)
         while not future.done():
             yield STEP_S
         return future.result()
 
     def _start(self, job: str) -> Iterator[float]:
         """Ask for one of the vendor's jobs. Raises: ReactorError."""
-        options, overrides = request(job, self._config, self._pumps.facts, self._target, self.handed_over)
-        yield from self._answer(self.web.run, job, options, overrides)
+        options, overrides = request(job, self._config, self._pumps.facts, self._target, self.regulated_od)
+        yield from self._answer(self._web.run, job, options, overrides)
         self._asked_s[job] = self._real.now()
         self.book.log("command", job=job, options=options)
 
@@ -132,18 +131,18 @@ class Station:
         readings, events, ignored = self._box.drain()
         for note in ignored:
             self.book.tell(note)
-        self.sampling.take([r._replace(at=r.at * self._config.speed) for r in readings])
+        self.sampling.take([r._replace(at=self._clock.of_real(r.at)) for r in readings])
         self.doses.take(events)
         self.doses.work()
         if not self.up:
             return
-        if rows := self._calls.ask("rows", GRACE_S / 2.0, self.web.running):
+        if rows := self._calls.ask("rows", GRACE_S / 2.0, self._web.running):
             self._listed = {str(row["job_name"]) for row in rows[0]}
             if self._pumps.rebooted(rows[0]) and not self.doses.running:
                 self._pumps.boot = boot_of(rows[0])
-                self.book.log("device", device_id=self.name, url=self.web.url, boot=self._pumps.boot)
+                self.book.log("device", device_id=self.name, url=self._web.url, boot=self._pumps.boot)
         told = math.isnan(self.level_ml) or not self._pumps.facts.ledger
-        if not told and (said := self._calls.ask("level", TELL_S, self.web.set_level, self.level_ml)):
+        if not told and (said := self._calls.ask("level", TELL_S, self._web.set_level, self.level_ml)):
             self.book.tell(f"its own ledger: {said[0] or f'{self.level_ml:g} mL'}")
             self.level_ml = math.nan
         if any(pin.doubt_s > -math.inf for pin in self._box.pins.values()) and self._calls.due("pins", TELL_S):
@@ -156,13 +155,13 @@ class Station:
         self.go_on()
         if not self.up:
             return False
-        undisturbed_s = (self.doses.ended_s * self._config.speed) + self._config.mix_s
+        undisturbed_s = self._clock.of_real(self.doses.ended_s) + self._config.mix_s
         dosing = self.doses.running and not self._pumps.waits  # a dose in doubt may take hours to be known
-        found = None if dosing else self.sampling.look(self._device.now(), undisturbed_s)
+        found = None if dosing else self.sampling.look(self._clock.now(), undisturbed_s)
         self.book.report(self._wrong())
         if found is None:
             return False
-        age = self._device.now() - found.at
+        age = self._clock.now() - found.at
         self.book.log(
             "sample", sample_s=round(self.book.elapsed() - age, 3), od=found.od, spread=found.spread,
             readings=found.number, temperature=self._box.temperature,
@@ -170,9 +169,15 @@ class Station:
         return True
 
     @property
-    def temperature(self) -> float:
-        """Of the culture, degC, nan while none was told."""
-        return self._box.temperature
+    def newest(self) -> Newest:
+        """Its newest sample."""
+        s = self.sampling.newest
+        return Newest(s.at, s.od, self._box.temperature, s.raw, self.sampling.arrived_s)
+
+    @property
+    def handed_over(self) -> bool:
+        """Whether the vendor's turbidostat has it."""
+        return math.isfinite(self.regulated_od)
 
     @property
     def key(self) -> tuple[float, int] | None:
@@ -188,9 +193,9 @@ class Station:
         if other := self._mqtt.holder(self.name):
             who, _, done = other.partition("; ")
             return Fault("mode", who, done)
-        if self._box.live(AUTOMATION) and math.isnan(self.handed_over):
+        if self._box.live(AUTOMATION) and not self.handed_over:
             return Fault("mode", "a dosing automation runs", "stop it in the vendor's page")
-        if self.doses.foreign and math.isnan(self.handed_over):
+        if self.doses.foreign and not self.handed_over:
             return Fault("mode", self.doses.foreign, "one client per unit; it is counted")
         if self._missing:
             forget, job = self._pumps.facts.forget, self._missing[0]
@@ -204,7 +209,7 @@ class Station:
     def _wanted(self) -> list[str]:
         """The jobs that this run keeps going."""
         heated = self._config.thermostat and not self.heat_is_off and math.isfinite(self._target)
-        wanted = {OD: True, STIR: self._config.stirring, HEAT: heated, AUTOMATION: math.isfinite(self.handed_over)}
+        wanted = {OD: True, STIR: self._config.stirring, HEAT: heated, AUTOMATION: self.handed_over}
         return [job for job, it_is in wanted.items() if it_is]
 
     def _there(self, job: str) -> bool:
@@ -212,10 +217,10 @@ class Station:
 
         A job that goes on over a restart of the broker may never say so again.
         """
-        longest_s = FRESH * self._config.reading_s * self._config.speed
+        longest_s = self._clock.of_real(FRESH * self._config.reading_s)
         if job == OD and self.sampling.count:
-            silent_s = self._device.now() - self.sampling.read_s
-            if silent_s < longest_s or silent_s > SILENT_S * self._config.speed:
+            silent_s = self._clock.now() - self.sampling.read_s
+            if silent_s < longest_s or silent_s > self._clock.of_real(SILENT_S):
                 return silent_s < longest_s
         state = self._box.state(job)
         known = state.at > -math.inf or not state.word
@@ -242,7 +247,7 @@ class Station:
     def _again(self, job: str) -> Iterator[float]:
         """Start a job anew; one that is there and does nothing is first ended."""
         try:
-            yield from self._answer(self.web.stop, job) if self._box.live(job) else self._start(job)
+            yield from self._answer(self._web.stop, job) if self._box.live(job) else self._start(job)
             self._trouble = ""
         except ReactorError as error:
             self._trouble = str(error)
@@ -254,11 +259,11 @@ class Station:
         refusal = ""
         if self.given_up:
             refusal = "the unit was given up"
-        elif math.isfinite(self.handed_over):
+        elif self.handed_over:
             refusal = "the unit regulates itself"
         elif self.book.fault is not None:
             refusal = str(self.book.fault)
-        elif self._device.now() - self.sampling.newest.at > self._config.stale_s:
+        elif self._clock.now() - self.sampling.newest.at > self._config.stale_s:
             refusal = "its sample is stale"
         plan = self.doses.begin(rate, self.key, refusal)
         self.doses.foreign = ""
@@ -282,12 +287,16 @@ class Station:
             self._told_s, self._tells = math.inf, 0
         elif self._real.now() > self._told_s + TELL_S:
             self._told_s, self._tells = self._real.now(), self._tells + 1
-            self._pumps.say(f"{HEAT}/target_temperature/set", str(self._target))
-        if self._tells > TELLS and self._calls.ask("deaf", GRACE_S, self.web.stop, HEAT):
+            self.unit.say(f"{HEAT}/target_temperature/set", str(self._target))
+        if self._tells > TELLS and self._calls.ask("deaf", GRACE_S, self._web.stop, HEAT):
             self._tells = 0
             self._listed.discard(HEAT)
 
-    def pumps_off(self, real_s: float, final: bool = False) -> Iterator[float]:
+    def pumps_off(self) -> Iterator[float]:
+        """Course: every pump off, verified, but one that drains what a media pump gives. Raises: DeviceStateError."""
+        return self.end_pumps(PUMPS_S)
+
+    def end_pumps(self, real_s: float, final: bool = False) -> Iterator[float]:
         """Course: every pump off, verified; a dose under way is cut. Args: final: what empties a vial is cut, too.
 
         Raises: DeviceStateError naming what is not verified off.
@@ -309,11 +318,11 @@ class Station:
             pumps.cut = final
 
     def give_up(self) -> Iterator[float]:
-        """Course: no dose in this run any more, by us or by the vendor's turbidostat. Raises: as `pumps_off`."""
-        self.given_up, self.handed_over = True, math.nan
+        """Course: no dose in this run any more, by us or by the vendor's turbidostat. Raises: as `end_pumps`."""
+        self.given_up, self.regulated_od = True, math.nan
         if self._there(AUTOMATION):
             yield from self._end_job(AUTOMATION)
-        yield from self.pumps_off(self._config.stop_s, final=True)
+        yield from self.end_pumps(self._config.stop_s, final=True)
 
     def heat_off(self) -> Iterator[float]:
         """Course: thermostat ended for the rest of the run. Raises: DeviceStateError."""
@@ -327,8 +336,8 @@ class Station:
             if self._real.now() > deadline:
                 raise DeviceStateError(f"{job} of {self.name} does not end; stop it in the vendor's page")
             if self._calls.due(f"end {job}", 1.0):
-                self._pumps.say(f"{job}/$state/set", "disconnected")
-            self._calls.ask(f"stop {job}", 4.0, self.web.stop, job)
+                self.unit.say(f"{job}/$state/set", "disconnected")
+            self._calls.ask(f"stop {job}", 4.0, self._web.stop, job)
             yield STEP_S
 
     def regulate(self, setpoint: float) -> Iterator[float]:
@@ -336,8 +345,8 @@ class Station:
 
         Raises: ReactorError if it does not come up.
         """
-        yield from self.pumps_off(self._config.stop_s)
-        self.handed_over, asked = setpoint, target_of(self._config, self._pumps.facts, setpoint)
+        yield from self.end_pumps(self._config.stop_s)
+        self.regulated_od, asked = setpoint, target_of(self._config, self._pumps.facts, setpoint)
         try:
             yield from self._start(AUTOMATION)
             deadline, ready_s, settings = self._real.now() + GRACE_S, math.inf, None
@@ -346,10 +355,10 @@ class Station:
                     raise DeviceStateError("the vendor's turbidostat does not regulate; look at its log")
                 ready = self._box.state(AUTOMATION).word == "ready"
                 ready_s = min(ready_s, self._real.now()) if ready else math.inf
-                if said := self._calls.ask("settings", 0.5, self.web.get, f"/jobs/settings/job_name/{AUTOMATION}"):
+                if said := self._calls.ask("settings", 0.5, self._web.get, f"/jobs/settings/job_name/{AUTOMATION}"):
                     settings = said[0]
                 yield STEP_S
         except ReactorError:
-            self.handed_over = math.nan
+            self.regulated_od = math.nan
             raise
         self.book.write("regulate", setpoint=setpoint)

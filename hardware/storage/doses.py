@@ -1,7 +1,8 @@
 """What the journal says of doses, in the rows of every family: what each gave, and what was repeated of it.
 
-`intent` before a dose, `feed_on` before its pump is switched on or asked for, `dose_end` after it, `given` for what
-was dosed beside.
+`intent` before a dose that was commanded, `feed_on` before its pump is switched on or asked for, `dose_end` after it,
+`given` for what was dosed without a command. Each says when (run time, s), how much (feed_ml and waste_ml at most,
+feed_low_ml at least), and by which pump where that is not the feed.
 """
 
 from __future__ import annotations
@@ -33,6 +34,12 @@ class Given:
     low_ml: float
     waste_ml: float
     pump: int = 0
+
+    def row(self, why: str) -> dict[str, Any]:
+        """As the journal keeps what was given beside the doses that were commanded."""
+        pump = {"pump": self.pump} if self.pump else {}
+        low_ml = {"feed_low_ml": self.low_ml}
+        return {"at_s": self.at_s, "why": why, "feed_ml": self.feed_ml, **low_ml, "waste_ml": self.waste_ml, **pump}
 
 
 @dataclass(frozen=True)
@@ -164,7 +171,8 @@ class _Ledger:
             self.given[self._begun[name].n] = self._begun[name]
         elif kind == "given":  # beside our doses
             volumes = float(row["feed_ml"]), float(row["waste_ml"])
-            self.repeated.append(Dosed(row["n"], name, float(row["at_s"]), *volumes, again=True))
+            pump = int(row.get("pump", 1))  # earlier journals do not say it
+            self.repeated.append(Dosed(row["n"], name, float(row["at_s"]), *volumes, again=True, pump=pump))
         elif kind == "dose_end" and "feed_times" in row:
             ending = Ending.of_row(row)
             dose = self._begun.pop(name, None)

@@ -20,7 +20,7 @@ from experiments.loop.supply import Supply
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import SupplyConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
-from hardware.chibio.protocol import check_command
+from hardware.chibio.protocol import Permitted, check_command
 from hardware.emulator.faults import inject
 from hardware.errors import DeviceStateError
 from hardware.safety.interlock import Interlock
@@ -291,12 +291,12 @@ def test_the_declared_bias_is_taken_off_a_dose(tmp_path: Path) -> None:
 )
 def test_the_last_gate_lets_only_declared_pumps_pass_and_only_small_doses(path: str, allowed: bool) -> None:
     if allowed:
-        check_command(path, ("M0",), supply_pumps=("Pump3",))
+        check_command(path, Permitted(("M0",), supply_pumps=("Pump3",)))
     else:
         with pytest.raises(DeviceStateError, match="refused"):
-            check_command(path, ("M0",), supply_pumps=("Pump3",))
+            check_command(path, Permitted(("M0",), supply_pumps=("Pump3",)))
     with pytest.raises(DeviceStateError, match="refused"):
-        check_command(path, ("M0",))
+        check_command(path, Permitted(("M0",)))
 
 
 class Still:

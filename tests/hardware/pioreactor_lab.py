@@ -17,7 +17,7 @@ import pytest
 
 from hardware.clock import VirtualClock
 from hardware.errors import LinkError, ProtocolError, ReactorError
-from hardware.pioreactor import reactors, station
+from hardware.pioreactor import reactors
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Mailbox
 from hardware.pioreactor.reactors import PioreactorReactors
@@ -470,7 +470,7 @@ class Lab:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, world: World | None = None, **values: Any) -> None:
         self.world = world or World()
         self.web = FakeWeb(self.world)
-        monkeypatch.setattr(station, "Web", lambda *_given: self.web)
+        monkeypatch.setattr(reactors, "Web", lambda *_given: self.web)
         monkeypatch.setattr(reactors, "Cluster", FakeCluster)
         self.rows: list[dict[str, Any]] = []
         config = PioreactorConfig(**{"thermostat": False, **values})

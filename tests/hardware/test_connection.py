@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from hardware.chibio.connection import Connection
+from hardware.chibio.protocol import Permitted
 from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError
 from hardware.link.transport import Reply
@@ -20,7 +21,7 @@ def connection(steps: Steps, log: list[Any] | None = None) -> tuple[Connection, 
     script = Script(steps)
     rows = [] if log is None else log
     return Connection(
-        "M0", ("M0", "M1"), script, VirtualClock(), lambda kind, fields: rows.append((kind, fields))
+        "M0", Permitted(("M0", "M1")), script, VirtualClock(), lambda kind, fields: rows.append((kind, fields))
     ), script
 
 
@@ -88,7 +89,7 @@ def test_after_a_while_without_a_request_presence_is_looked_at_before_the_next_c
     gone, here, look = answer(state("M1", presentDevices={"M0": 0, "M1": 1})), answer(state("M1")), "GET /getSysdata/"
     clock = VirtualClock()
     script = Script([*read(state()), *posts(OFF[0]), (look, here), *posts(OFF[1], OFF[2]), (look, gone)])
-    m0 = Connection("M0", ("M0", "M1"), script, clock, lambda kind, fields: None)
+    m0 = Connection("M0", Permitted(("M0", "M1")), script, clock, lambda kind, fields: None)
     m0.read()
     m0.post(OFF[0])
     clock.sleep(3.0)

@@ -11,9 +11,11 @@ import pytest
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
+from hardware.chibio.context import Context
 from hardware.chibio.dose_sequence import DoseSequence
 from hardware.chibio.dosing import DosePlan, PumpCalibration, ReactorCalibration, SupplyConfig
-from hardware.chibio.resume import ReactorHistory, remember
+from hardware.chibio.protocol import Permitted
+from hardware.chibio.resume import ReactorHistory
 from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 from hardware.link.transport import Reply, Transport
@@ -78,19 +80,18 @@ class Bench:
         self.clock = VirtualClock(1000.0)
         self.line, self.rows, self.agenda = Line(self.clock), [], Agenda(self.clock)
         self.known = ReactorHistory()
-        self.connection = Connection("M0", ("M0",), self.line, self.clock, self._log)
+        self.connection = Connection("M0", Permitted(("M0",)), self.line, self.clock, self._log)
         self.book = Logbook("M0", self._log, self._log, lambda: self.clock.now() - 1000.0)
-        self.doses = DoseSequence(
-            self.connection, calibration or ReactorCalibration(), ChiBioConfig(), self.agenda, self.book,
-            lambda: self.known,
-        )  # fmt: skip
+        calibration = calibration or ReactorCalibration()
+        parts = self.connection, calibration, ChiBioConfig(), self.agenda, self.book, lambda: self.known
+        self.doses = DoseSequence(Context(*parts))
         start = self.connection.read().start_time
         self._log("device", {"start_time": start})
         self.line.posts.clear()
 
     def _log(self, kind: str, fields: Any) -> None:
         row = {"kind": kind, "time_s": self.clock.now() - 1000.0, **fields}
-        self.known = remember(self.known, row)
+        self.known = self.known.after(row)
         self.rows.append({"posts": len(self.line.posts), **row})
 
     def begin(self, rate: float = 0.01, key: Any = (60.0, 2), past_s: float = 0.0, refusal: str = "") -> DosePlan:
@@ -392,7 +393,7 @@ def supplied() -> Bench:
     """With a supply pump of another flow."""
     bench = Bench()
     bench.doses._config = replace(ChiBioConfig(), supply=SupplyConfig(pump3_ml_s=0.7))
-    bench.connection._supply_pumps = ("Pump3",)
+    bench.connection._permitted = Permitted(("M0",), supply_pumps=("Pump3",))
     return bench
 
 

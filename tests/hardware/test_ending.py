@@ -13,7 +13,7 @@ import pytest
 from hardware.chibio.dosing import PumpCalibration
 from hardware.chibio.ending import conclude, found
 from hardware.chibio.protocol import PERIOD_S, DeviceState, parse_state
-from hardware.chibio.resume import ReactorHistory, remember, replay
+from hardware.chibio.resume import ReactorHistory, replay
 from hardware.errors import RecordingError
 from hardware.storage.doses import REPEAT_S, Ending, Given, dosed
 from tests.hardware.script import state
@@ -43,7 +43,7 @@ def after(
 ) -> tuple[Ending, str]:
     """How the dose ended that is known and was looked at so, its pumps verified off at once."""
     row = found(known, state, now_s, seen_s, SILENCE_S, stopped)
-    return conclude(remember(known, {"kind": "found", **json.loads(json.dumps(row))}), now_s, PUMP, PUMP)
+    return conclude(known.after({"kind": "found", **json.loads(json.dumps(row))}), now_s, PUMP, PUMP)
 
 
 def test_a_dose_whose_every_command_was_answered_gave_what_was_planned() -> None:

@@ -14,7 +14,7 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.fluorescence import FluorescenceSlotConfig
 from hardware.chibio.preflight import Check, preflight
-from hardware.chibio.protocol import check_command, parse_state
+from hardware.chibio.protocol import Permitted, check_command, parse_state
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.errors import DeviceStateError
 from hardware.simulated import SimulatedConfig, SimulatedReactors
@@ -239,14 +239,14 @@ def test_a_frozen_sensor_repeats_exactly() -> None:
 
 
 def test_only_the_configured_toggle_may_be_sent() -> None:
-    check_command(COMMAND, ("M0",), slot_command=COMMAND)
+    check_command(COMMAND, Permitted(("M0",), slot_command=COMMAND))
     for other in (COMMAND.replace("FP1", "FP2"), COMMAND.replace("x10", "x9")):
         with pytest.raises(DeviceStateError, match="refused to send POST /SetFPMeasurement"):
-            check_command(other, ("M0",), slot_command=COMMAND)
+            check_command(other, Permitted(("M0",), slot_command=COMMAND))
     with pytest.raises(DeviceStateError, match="refused"):
-        check_command(COMMAND, ("M0",))
+        check_command(COMMAND, Permitted(("M0",)))
     with pytest.raises(DeviceStateError, match="refused"):
-        check_command("", ("M0",))
+        check_command("", Permitted(("M0",)))
 
 
 def test_the_board_agent_passes_what_the_driver_reads() -> None:

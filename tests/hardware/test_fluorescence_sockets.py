@@ -9,7 +9,7 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.fluorescence import FluorescenceSlotConfig
 from hardware.chibio.reactors import ChiBioReactors
-from hardware.clock import RealClock
+from hardware.clock import DeviceClock
 from hardware.emulator.process import EmulatorProcess
 from hardware.link.http import HttpTransport
 from hardware.link.transport import Transport
@@ -30,7 +30,7 @@ def counts(transport: Transport, names: tuple[str, ...], samples: int) -> dict[s
     """What the driver reads of so many samples of each reactor; the experiments are ended."""
     slot = FluorescenceSlotConfig(measure=True)
     config = ChiBioConfig(reactors=names, speed=SPEED, temperature=33.2, fluorescence=slot)
-    reactors = ChiBioReactors(transport, RealClock(SPEED), config, [ReactorCalibration()] * len(names))
+    reactors = ChiBioReactors(transport, DeviceClock(SPEED), config, [ReactorCalibration()] * len(names))
     reactors.begin()
     found: dict[str, list[float]] = {name: [] for name in names}
     try:

@@ -21,8 +21,9 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.preflight import preflight
+from hardware.chibio.protocol import Permitted
 from hardware.chibio.reactors import ChiBioReactors
-from hardware.clock import RealClock, VirtualClock
+from hardware.clock import DeviceClock, VirtualClock
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import DeviceStateError, LinkError, ProtocolError, ReactorError
 from hardware.link.http import HttpTransport
@@ -184,9 +185,9 @@ def test_one_client_per_device(server: Server) -> None:
 
 
 def test_time_outs_shrink_with_speed_down_to_a_floor() -> None:
-    assert TransportConfig().timeout(20.0, 1.0) == 20.0
-    assert TransportConfig().timeout(20.0, 10.0) == 2.0
-    assert TransportConfig().timeout(20.0, 1000.0) == 1.0
+    assert TransportConfig().timeout(20.0, DeviceClock()) == 20.0
+    assert TransportConfig().timeout(20.0, DeviceClock(10.0)) == 2.0
+    assert TransportConfig().timeout(20.0, DeviceClock(1000.0)) == 1.0
     with pytest.raises(ValueError, match=r"transport.read_s = 30"):
         TransportConfig(read_s=30.0)
 
@@ -222,7 +223,7 @@ def test_fuzz_whatever_comes_back_ends_in_an_answer_or_an_error_of_ours(
     fuzzed.behave = lambda c, request: c.sendall(OK if request.startswith(b"POST /changeDevice") else garbage)
     fuzzed.requests.clear()
     with link(fuzzed.url) as transport:
-        connection = Connection("M0", ("M0",), transport, VirtualClock(), no_log)
+        connection = Connection("M0", Permitted(("M0",)), transport, VirtualClock(), no_log)
         with contextlib.suppress(ReactorError):
             assert connection.read().selected == "M0"
     assert all(r.startswith((b"GET", b"POST /changeDevice")) for r in fuzzed.requests)
@@ -269,7 +270,7 @@ def test_three_reactors_over_http_at_speed_60() -> None:
     names = ("M0", "M1", "M2")
     with EmulatorProcess(["--reactors", ",".join(names), "--speed", "60", "--od", "0.5"]) as emulator:
         config = ChiBioConfig(url=emulator.url, speed=60.0, reactors=names)
-        transport, clock = open_transport(config.transport, config.url, config.speed), RealClock(config.speed)
+        transport, clock = open_transport(config.transport, config.url, config.speed), DeviceClock(config.speed)
         checks = preflight(transport, clock, config, [ReactorCalibration()] * 3)
         assert all(check.ok or not check.required for check in checks), "\n".join(map(str, checks))
         rows: list[dict[str, object]] = []

@@ -52,7 +52,7 @@ def port(tmp_path: Path) -> Iterator[int]:
 
 
 def client(port: int, name: str, *units: str) -> Cluster:
-    clock = RealClock(1.0)
+    clock = RealClock()
     config = PioreactorConfig(reactors=units, broker="127.0.0.1", broker_port=port)
     made = Cluster(config, {unit: Mailbox(unit, config, clock) for unit in units}, name, clock)
     assert holds(lambda: made.connected)

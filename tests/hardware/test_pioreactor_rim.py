@@ -143,7 +143,7 @@ def port(tmp_path: Path) -> Iterator[int]:
 
 def connected(port: int, **values: str) -> bool:
     config = PioreactorConfig(broker="127.0.0.1", broker_port=port, username="ada", **values)  # type: ignore[arg-type]
-    reactors = PioreactorReactors(config, RealClock(1.0))
+    reactors = PioreactorReactors(config, RealClock())
     try:
         reactors.connect()
         return reactors.mqtt.connected

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware.chibio.protocol import PUMPS, check_command, parse_state
+from hardware.chibio.protocol import PUMPS, Permitted, check_command, parse_state
 from hardware.errors import DeviceStateError, ProtocolError
 from tests.hardware.script import state
 
@@ -139,7 +139,7 @@ def test_damaged_bytes_parse_or_are_refused(data: st.DataObject) -> None:
     ],
 )
 def test_allowed(path: str) -> None:
-    check_command(path, ["M0"])
+    check_command(path, Permitted(["M0"]))
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_allowed(path: str) -> None:
 )
 def test_refused(path: str) -> None:
     with pytest.raises(DeviceStateError, match="refused"):
-        check_command(path, ["M0"])
+        check_command(path, Permitted(["M0"]))
 
 
 @pytest.mark.parametrize(
@@ -213,10 +213,10 @@ def test_refused(path: str) -> None:
 )
 def test_an_overflow_pump_has_limits_of_its_own_and_loosens_no_other(path: str, pump: str, allowed: bool) -> None:
     if allowed:
-        check_command(path, ["M0"], pump)
+        check_command(path, Permitted(["M0"], pump))
         return
     with pytest.raises(DeviceStateError, match="refused"):
-        check_command(path, ["M0"], pump)
+        check_command(path, Permitted(["M0"], pump))
 
 
 ITEMS = ["SetOutputTarget", "SetOutputOn", "Experiment", "changeDevice", "CalibrateOD", "Pump1", "Pump2", "Pump3"]
@@ -230,7 +230,7 @@ WORDS = st.sampled_from(
 def test_no_combination_of_words_pumps_too_much_or_reaches_another_reactor(words: list[str], pump: str) -> None:
     path = "/" + "/".join(words)
     try:
-        check_command(path, ["M0"], pump)
+        check_command(path, Permitted(["M0"], pump))
     except DeviceStateError:
         return
     verb, args = words[0], words[1:]

@@ -22,7 +22,7 @@ def sample(time_s: float, cycles: int) -> DeviceState:
 
 def take(sampling: Sampling, clock: VirtualClock, seen: DeviceState) -> str:
     assert sampling.look(seen, clock.now())
-    return sampling.take(seen, clock.now(), clock.now())
+    return sampling.take(seen, clock.now())
 
 
 def test_a_sample_is_new_once_and_never_goes_back() -> None:

@@ -20,7 +20,7 @@ from hardware.board.board_agent import encode_reply
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.protocol import parse_state
 from hardware.chibio.reactors import ChiBioReactors
-from hardware.clock import RealClock
+from hardware.clock import DeviceClock
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import LinkError, ProtocolError
 from hardware.link.open import open_transport
@@ -252,7 +252,7 @@ def test_a_run_over_a_noisy_line_that_is_unplugged_for_a_while(cable: tuple[Cabl
     settings = ChiBioConfig(speed=60.0, reactors=("M0", "M1"), transport=config(line.pc, connect_s=3.0, read_s=20.0))
     transport = open_transport(settings.transport, settings.url, 60.0)
     rows: list[dict[str, object]] = []
-    reactors = ChiBioReactors(transport, RealClock(60.0), settings, log=lambda k, f: rows.append({"kind": k, **f}))
+    reactors = ChiBioReactors(transport, DeviceClock(60.0), settings, log=lambda k, f: rows.append({"kind": k, **f}))
     reactors.begin()
     line.noise = 0.01
     cut = plugged = np.inf

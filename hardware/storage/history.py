@@ -1,0 +1,82 @@
+"""What a run remembers of a reactor, of whatever family, and how the rows of its journal give it back after a crash."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self, TypeVar
+
+from hardware.storage.doses import damaged
+
+__all__ = ["History", "replayed"]
+
+
+@dataclass(frozen=True)
+class History:
+    """One reactor's past; a family adds what it needs beside.
+
+    sample: key of the last sample that a dose was decided for. carry_ml: put off to the next dose. doses: how many were
+      begun. temperature: of the thermostat, degC. handed_over: OD at which the reactor was handed over to the device's
+      own regulation, nan if it was not. seen_s: run time of the newest row, s.
+    open: a dose was begun and its end is not on record. Then feed_ml, waste_ml are its volumes as planned; on_s, run
+      time at which it was intended, or, once it was fed, at which its feed pump was asked on; fed, whether that was;
+      wasted, whether its waste pump was.
+    """
+
+    sample: tuple[float, int] | None = None
+    carry_ml: float = 0.0
+    doses: int = 0
+    temperature: float = math.nan
+    handed_over: float = math.nan
+    seen_s: float = 0.0
+    open: bool = False
+    feed_ml: float = 0.0
+    waste_ml: float = 0.0
+    on_s: float = 0.0
+    fed: bool = False
+    wasted: bool = False
+
+    KINDS: ClassVar[tuple[str, ...]] = ("device", "intent", "feed_on", "dose_end", "temperature", "regulate")
+    KEYS: ClassVar[Mapping[str, Callable[[Any], Any]]] = {"carry_ml": float, "doses": int, "temperature": float}
+
+    def after(self, row: Mapping[str, Any]) -> Self:
+        """What is known after one more row of this reactor. Raises: as a row that is damaged makes it."""
+        kind = row["kind"]
+        if kind not in self.KINDS:
+            return self
+        known = replace(self, **{key: of(row[key]) for key, of in self.KEYS.items() if row.get(key) is not None})
+        if kind == "intent":
+            (at_s, number), feed_ml = row["sample"], float(row["feed_ml"])
+            return replace(
+                known, sample=(float(at_s), int(number)), open=feed_ml > 0.0, feed_ml=feed_ml,
+                waste_ml=float(row["waste_ml"]), on_s=float(row["on_s"]), fed=False, wasted=False,
+            )  # fmt: skip
+        if kind == "feed_on":
+            return replace(known, fed=True, on_s=float(row["on_s"]))
+        if kind == "dose_end":
+            return replace(known, open=False)
+        if kind == "regulate":  # its pumps were verified off before; None: control was taken back
+            setpoint = math.nan if row["setpoint"] is None else float(row["setpoint"])
+            return replace(known, handed_over=setpoint, open=False)
+        return known
+
+
+H = TypeVar("H", bound=History)
+
+
+def replayed(rows: Sequence[Mapping[str, Any]], unknown: H) -> dict[str, H]:
+    """What the journal of a run says of each reactor.
+
+    Args: rows: that a driver has written, oldest first. unknown: of a reactor without rows.
+    Raises: RecordingError for a row that is not as the driver wrote it.
+    """
+    known: dict[str, H] = {}
+    seen_s = 0.0
+    for row in rows:
+        seen_s = max(seen_s, float(row.get("time_s") or 0.0))
+        if row.get("kind") in unknown.KINDS:
+            try:
+                name = str(row["reactor"])
+                known[name] = known.get(name, unknown).after(row)
+            except (IndexError, KeyError, TypeError, ValueError) as error:
+                raise damaged(row, error) from None
+    return {name: replace(entry, seen_s=seen_s) for name, entry in known.items()}
