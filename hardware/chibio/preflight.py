@@ -18,7 +18,7 @@ from hardware.errors import ReactorError
 from hardware.link.transport import Transport
 from hardware.logbook import no_log
 
-__all__ = ["Check", "preflight"]
+__all__ = ["preflight"]
 
 MARGIN = 1.1  # over the feed pump's flow: pumps differ from their calibration
 FULL_SCALE = 65535.0  # counts of the spectrometer

@@ -4,6 +4,7 @@ import os
 from dataclasses import dataclass, replace
 
 from conf.schema import check, part, require, setting
+from hardware.clock import DeviceClock
 from hardware.link.secret import read_secret
 
 __all__ = ["PASSWORD", "PUBLISHED", "PioreactorConfig", "RigBackendConfig", "RigConfig", "UnitConfig", "vial_ml"]
@@ -104,6 +105,9 @@ class PioreactorConfig:
         least = f"min_dose_ml = {self.min_dose_ml} or more"
         require(self.max_dose_ml >= self.min_dose_ml, "backend.max_dose_ml", f"{self.max_dose_ml} mL", least)
         require(len(self.pump_pins) == 3, "backend.pump_pins", self.pump_pins, "three: media, alt-media, waste")
+        apart_s = DeviceClock(self.speed).of_real(self.reading_s)
+        two = f"more than {apart_s:g} s (reading_s * speed), or no two readings fall into it and there is no sample"
+        require(self.window_s > apart_s, "backend.window_s", f"{self.window_s} s", two)
         unknown = [name for name in self.units if name not in self.reactors]
         require(not unknown, "backend.units", tuple(unknown), f"names of {', '.join(self.reactors)}")
         bad = next((c for c in "#+/" if c in self.experiment or not self.experiment), "")

@@ -63,7 +63,7 @@ class Pin:
         self.on_s = self.off_s = self.run_s = self.ended_s = self.doubt_s = -math.inf
         self.event_s = math.inf
 
-    def told(self, on: bool, at: float, word: str, echoes: bool) -> None:
+    def update(self, on: bool, at: float, word: str, echoes: bool) -> None:
         """A message that has all pins of the unit.
 
         Other jobs read them and say so an instant later: a pin that is on without a job is on if it is said twice.
@@ -147,7 +147,7 @@ class Mailbox:
             for job, number in self.jobs.items():
                 word = next((w for w in LIVE if self.live(job)), self.state(job).word)
                 on = duty.get(number, 0.0) > 0.0
-                self.pins[number].told(on, at if on else now, word, echoes)  # off by now, whenever that was said
+                self.pins[number].update(on, at if on else now, word, echoes)  # off by now, whenever that was said
             self.dc_s = max(self.dc_s, at)
         elif rest == "dosing_events" and not retained:
             e = json.loads(payload)

@@ -294,7 +294,7 @@ class Pumps:
         While a media pump goes on, the waste pump keeps the vial from overflowing, until `bottle_ml` may have flowed.
         What only a hand can do is said; once it was done, what is tried here ends the pump.
         """
-        job, ending, off_s, drained = request.job, Ending(self, request), math.nan, 0.0
+        job, ending, off_s, drained = request.job, ForcedEnd(self, request), math.nan, 0.0
         drain: Steps[Moved] | None = None
         while math.isnan(off_s) or drain is not None:
             try:
@@ -323,7 +323,7 @@ class Pumps:
         )
 
 
-class Ending:
+class ForcedEnd:
     """One pump on its way to being proven off: what is tried, and what proves it.
 
     The job is asked by MQTT and by HTTP. Stirring is asked to say all pins again. A short run of the same pump sets its

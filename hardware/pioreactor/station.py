@@ -24,7 +24,7 @@ __all__ = ["Station"]
 T = TypeVar("T")
 
 GRACE_S = 20.0  # in which a job that was asked for may come up; between two attempts at a unit that is in trouble
-TELL_S, TELLS = 3.0, 6  # between two words on the same target; of those before the job is started anew
+RESEND_S, RESENDS = 3.0, 6  # between two sends of the same target; of those before the job is started anew
 SETTLED_S = 2.0  # after which a turbidostat that is wrong has ended
 SILENT_S = 45.0  # without a reading, after which a reader that says it is there is none
 PUMPS_S = 10.0  # in which pumps are verified off while a run goes on
@@ -55,7 +55,7 @@ class Station:
         self._gone, self._been, self._missing = set[str](), set[str](), list[str]()
         self._asked_s: dict[str, float] = {}
         self._listed = set[str]()
-        self._told_s, self._tells, self._trouble = math.inf, 0, ""
+        self._target_sent_s, self._target_sends, self._trouble = math.inf, 0, ""
 
     # -- bringing up -----------------------------------------------------------------------------------------------
 
@@ -81,7 +81,7 @@ class Station:
                 raise LinkError(f"the task queue takes nothing, so a dose would run at any time; on the unit: {huey}")
             yield STEP_S
         target = history.temperature if math.isfinite(history.temperature) else self._config.temperature
-        self._target, self._told_s = target if self._config.thermostat else math.nan, -math.inf
+        self._target, self._target_sent_s = target if self._config.thermostat else math.nan, -math.inf
         for job in self._wanted():
             if not self._there(job):
                 yield from self._start(job)
@@ -141,11 +141,11 @@ class Station:
             if self._pumps.rebooted(rows[0]) and not self.doses.running:
                 self._pumps.boot = boot_of(rows[0])
                 self.book.log("device", device_id=self.name, url=self._web.url, boot=self._pumps.boot)
-        told = math.isnan(self.level_ml) or not self._pumps.facts.ledger
-        if not told and (said := self._calls.ask("level", TELL_S, self._web.set_level, self.level_ml)):
+        unsent = self._pumps.facts.ledger and not math.isnan(self.level_ml)
+        if unsent and (said := self._calls.ask("level", RESEND_S, self._web.set_level, self.level_ml)):
             self.book.tell(f"its own ledger: {said[0] or f'{self.level_ml:g} mL'}")
             self.level_ml = math.nan
-        if any(pin.doubt_s > -math.inf for pin in self._box.pins.values()) and self._calls.due("pins", TELL_S):
+        if any(pin.doubt_s > -math.inf for pin in self._box.pins.values()) and self._calls.due("pins", RESEND_S):
             self._pumps.ask_pins()
         self._missing = [job for job in self._wanted() if self._is_gone(job)] if self._mqtt.connected else []
         self._steer()
@@ -273,23 +273,23 @@ class Station:
         """Thermostat to a target, degC; nan leaves it."""
         if not math.isfinite(target) or not self._config.thermostat or self.heat_is_off or target == self._target:
             return
-        self._target, self._told_s, self._tells = target, -math.inf, 0
+        self._target, self._target_sent_s, self._target_sends = target, -math.inf, 0
         self.book.log("temperature", temperature=target)
 
     def _steer(self) -> None:
-        """Tell the thermostat its target until it says it: what is told while it starts is not heard.
+        """Send the thermostat its target until it says it: what is sent while it starts is not heard.
 
         One that goes on over a restart of the broker may hear nothing any more: it is then started anew.
         """
-        if not self._told_s < math.inf or not self._there(HEAT) or self.heat_is_off:
+        if not self._target_sent_s < math.inf or not self._there(HEAT) or self.heat_is_off:
             return
         if self._box.target == self._target:
-            self._told_s, self._tells = math.inf, 0
-        elif self._real.now() > self._told_s + TELL_S:
-            self._told_s, self._tells = self._real.now(), self._tells + 1
+            self._target_sent_s, self._target_sends = math.inf, 0
+        elif self._real.now() > self._target_sent_s + RESEND_S:
+            self._target_sent_s, self._target_sends = self._real.now(), self._target_sends + 1
             self.unit.say(f"{HEAT}/target_temperature/set", str(self._target))
-        if self._tells > TELLS and self._calls.ask("deaf", GRACE_S, self._web.stop, HEAT):
-            self._tells = 0
+        if self._target_sends > RESENDS and self._calls.ask("deaf", GRACE_S, self._web.stop, HEAT):
+            self._target_sends = 0
             self._listed.discard(HEAT)
 
     def pumps_off(self) -> Iterator[float]:

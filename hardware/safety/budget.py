@@ -51,6 +51,8 @@ class FeedBudget:
         for kind, room in self._room(now).items():
             asked = allowed * bench.period_s
             over = asked > room + 1e-9
+            if kind == "budget":  # a repetition may overdraw it; where nothing is asked, nothing is refused
+                over &= asked > 0.0
             texts = [f"{max(r, 0.0):.2f} mL left, {a:.2f} asked" for r, a in zip(room, asked, strict=True)]
             findings.append(Finding(kind, over, texts.__getitem__))
             allowed = np.where(over, 0.0, allowed)

@@ -10,10 +10,11 @@ import pytest
 
 from envs.plant.plant import Plant
 from hardware.board.board_agent import reduce_sysdata
+from hardware.check import Check
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.fluorescence import FluorescenceSlotConfig
-from hardware.chibio.preflight import Check, preflight
+from hardware.chibio.preflight import preflight
 from hardware.chibio.protocol import Permitted, check_command, parse_state
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.errors import DeviceStateError

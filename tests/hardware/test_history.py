@@ -1,13 +1,13 @@
 """What the journal's rows say of a dose and of a reactor, row by row."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
 
 from hardware.chibio.resume import ReactorHistory, replay
 from hardware.errors import RecordingError
-from hardware.storage.doses import Ending
+from hardware.storage.doses import Ending, Given, dosed
 
 
 def row(n: int, kind: str, reactor: str = "M0", **fields: Any) -> dict[str, Any]:
@@ -27,6 +27,23 @@ def test_nothing_is_known_of_a_reactor_without_rows_and_a_dose_may_have_given_no
     assert {key: value for key, value in known.items() if value} == {"feed_pump": "Pump1"}
     assert {value for value in asdict(Ending(10.0)).values() if value == value} == {10.0, 0}
     assert Ending(100.0, 0.5, 6.0, 2, 0).repeats() == [(163.0, 0.5, 0.0), (226.0, 0.5, 0.0)]
+
+
+def test_what_was_given_beside_says_by_which_pump_and_how_little_and_earlier_journals_did_not():
+    old = {
+        "n": 3,
+        "kind": "given",
+        "reactor": "M0",
+        "at_s": 398.0,
+        "feed_ml": 0.6,
+        "waste_ml": 0.6,
+        "why": "heard late",
+    }
+    new = Given(398.0, 0.6, 0.1, 0.6, pump=3).row("heard late")
+    assert new == {"at_s": 398.0, "feed_ml": 0.6, "feed_low_ml": 0.1, "waste_ml": 0.6, "pump": 3, "why": "heard late"}
+    (before,), (now,) = dosed([old]), dosed([row(3, "given", **new)])
+    assert before == replace(now, pump=1)
+    assert now.pump == 3
 
 
 def test_what_later_rows_say_of_a_dose() -> None:

@@ -108,6 +108,9 @@ def test_budgets() -> None:
     minute(rate=0.02)
     minute.minute -= 1  # a second sample in the same minute
     assert only(minute(od=0.501, rate=0.02)) == ("budget",)
+    minute.interlock.budget.book(np.ones(1), np.ones(1), 60.0 * minute.minute)  # a repetition that overdraws it
+    minute.minute -= 1
+    assert only(minute(od=0.502, rate=0.0)) == ()  # nothing was asked
 
 
 def test_the_hour_rolls() -> None:

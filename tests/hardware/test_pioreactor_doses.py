@@ -1,5 +1,7 @@
 """A dose of a Pioreactor: in order, once, followed to its end; and every odd answer of the vendor's software."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from hardware.pioreactor.resume import History, replay
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import SafetyConfig
 from hardware.storage.doses import dosed
+from hardware.storage.journal import Journal
 from tests.hardware.pioreactor_lab import FLOW, MEDIA_PIN, UNIT, WASTE_PIN, Lab, World
 
 
@@ -331,6 +334,20 @@ def test_a_dose_left_open_is_counted_at_most_whole_and_never_sent_again(monkeypa
     assert len({o["source-of-event"] for o in again.asked("add_media")}) == 2
 
 
+def test_a_run_without_a_thermostat_is_resumed_from_its_journal_on_the_disk(monkeypatch, tmp_path):
+    lab, journal = Lab(monkeypatch, thermostat=False), Journal(tmp_path / "journal.jsonl")
+    lab.begin()
+    lab.sample()
+    lab.dose(0.8)
+    lab.wait(6.0)
+    for row in lab.rows:
+        journal.append(row["kind"], {key: row[key] for key in row.keys() - {"n", "wall", "kind"}})
+    known = replay(journal.reread())[UNIT]
+    assert math.isnan(known.temperature)  # null in the file
+    assert (known.open, known.fed, known.wasted, known.boot, known.doses) == (False, True, True, "boot1", 1)
+    assert known.seen_s == lab.rows[-1]["time_s"]
+
+
 def test_an_open_dose_waits_for_a_dead_queue(monkeypatch):
     lab = Lab(monkeypatch)
     lab.world.queue = False
@@ -390,7 +407,7 @@ def test_the_unit_s_own_ledger_is_put_to_the_level_that_was_read(monkeypatch, ve
 
 
 def test_ten_times_faster_readings_of_a_dose_do_not_count_for_the_sample_after_it(monkeypatch):
-    lab = Lab(monkeypatch, speed=10.0, mix_s=15.0)
+    lab = Lab(monkeypatch, speed=10.0, mix_s=15.0, reading_s=1.0)
     lab.world.od_s = 0.5
     lab.begin()
     lab.sample()

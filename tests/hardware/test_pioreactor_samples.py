@@ -255,6 +255,8 @@ def test_silence_is_told_in_the_age_of_the_sample(monkeypatch):
         ({"reactors": ()}, "backend.reactors"),
         ({"reactors": ("a", "a")}, "backend.reactors"),
         ({"stale_s": 50.0}, "backend.stale_s"),
+        ({"reading_s": 10.0, "window_s": 10.0}, r"backend.window_s = 10.0 s: allowed more than 10 s"),
+        ({"speed": 6.0}, r"backend.window_s = 30.0 s: allowed more than 30 s"),
         ({"max_dose_ml": 0.1, "min_dose_ml": 0.2}, "backend.max_dose_ml"),
         ({"units": {"x": UnitConfig(address="http://y")}}, "backend.units"),
         ({"od_scale": 0.0}, "backend.od_scale"),

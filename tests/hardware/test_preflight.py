@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from hardware.check import Check
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.overflow_pump import OverflowPumpConfig
-from hardware.chibio.preflight import Check, preflight
+from hardware.chibio.preflight import preflight
 from tests.campaigns.rehearsal import SOUND
 from tests.hardware.driver_lab import DriverLab
 

@@ -74,7 +74,7 @@ class Ledger:
         budget = min(c.ml_per_minute - minute, c.ml_per_hour - hour, c.ml_per_run - self.fed)
         bottle = bench.bottle_ml - self.fed
         for kind, room in (("budget", budget), ("bottle", bottle), ("overflow", 25.0 - self.level)):
-            if wanted * bench.period_s > room + 1e-9:
+            if wanted * bench.period_s > room + 1e-9 and (wanted > 0.0 or kind != "budget"):
                 kinds.append(kind)
                 wanted = 0.0
         return wanted, kinds
