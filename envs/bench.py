@@ -49,6 +49,11 @@ class Bench:
         return self.period_s / 60.0
 
     @property
+    def stale_s(self) -> float:
+        """Age at which a newest sample is no basis for a dose, s: the next one is late by 40 s."""
+        return self.period_s + 40.0
+
+    @property
     def tau(self) -> float:
         """V/60: u/tau is the dilution rate in 1/min of a calibrated pump rate u in mL/s."""
         return self.volume_ml / 60.0

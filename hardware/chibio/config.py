@@ -30,7 +30,6 @@ class ChiBioConfig:
     )
     temperature: float = setting(37.0, "thermostat at the start; scenarios may change it", "degC", within=(15, 42))
     stir: float = setting(0.5, "stirrer", within=(0, 1))
-    volume_ml: float = setting(20.0, "culture, only told to the device's own regulator", "mL", within=(10, 30))
     dosing: DosingConfig = part(DosingConfig, "how a rate becomes a dose")
     overflow_pump: OverflowPumpConfig = part(OverflowPumpConfig, "a second waste line against overflow")
     supply: SupplyConfig = part(SupplyConfig, "spare pumps that steps of a scenario give by")
@@ -63,8 +62,6 @@ class ChiBioConfig:
         check(self, "backend")
         unique = len(set(self.reactors)) == len(self.reactors)
         require(unique, "backend.reactors", self.reactors, "1 to 8 different ones of M0 to M7")
-        at = self.dosing.period_s
-        require(abs(at - 60.0) <= 1e-9, "backend.dosing.period_s", at, "60 (the device measures so often)")
         both = self.overflow_pump.pump in self.supply.pumps
         require(not both, "backend.supply", self.overflow_pump.pump, "another pump than the overflow pump")
         later = f"more than stale_s = {self.stale_s} s"
@@ -74,11 +71,6 @@ class ChiBioConfig:
     def permitted(self) -> Permitted:
         """What a client of this config may send."""
         return Permitted(self.reactors, self.overflow_pump.pump, self.fluorescence.command, self.supply.pumps)
-
-    @property
-    def control_min(self) -> float:
-        """Control period, min; a policy must have been trained for the same one."""
-        return self.dosing.period_s / 60.0
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,13 @@ __all__ = ["Context"]
 class Context:
     """One reactor's surroundings.
 
-    connection: its verified conversation. calibration: of its pumps and its zero. config, agenda: shared by all
-    reactors; what must happen later is put on the agenda. book: what it reports. past: gives what this run knows of the
-    reactor by the rows that it wrote, those of earlier lives too.
+    connection: its verified conversation. volume_ml: of its culture. calibration: of its pumps and its zero. config,
+    agenda: shared by all reactors; what must happen later is put on the agenda. book: what it reports. past: gives what
+    this run knows of the reactor by the rows that it wrote, those of earlier lives too.
     """
 
     connection: Connection
+    volume_ml: float
     calibration: ReactorCalibration
     config: ChiBioConfig
     agenda: Agenda

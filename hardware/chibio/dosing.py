@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from hardware.chibio.protocol import FEED, PERIOD_S, SPARE
+from hardware.chibio.protocol import CONTROL_S, FEED, PERIOD_S, SPARE
 
 __all__ = [
     "DosePlan",
@@ -114,7 +114,6 @@ class DosingConfig:
     height of the waste tube, so too much does no harm.
     """
 
-    period_s: float = setting(60.0, "one dose per cycle of the device", "s", within=(10, 600))
     waste_factor: float = setting(4.0, "waste over feed, in time", at_least=4.0, note="less risks an overflow")
     waste_extra_s: float = setting(4.4, "and so much longer", "s", at_least=4.0, note="less risks an overflow")
     clear_every: int = setting(5, "doses from one clearing of the waste tube to the next", at_least=1)
@@ -207,7 +206,7 @@ def plan_dose(
     if not (math.isfinite(rate) and rate >= 0.0):
         raise ValueError(f"pump rate = {rate} mL/s: allowed a finite number >= 0")
     feed, waste = calibration.feed, calibration.waste
-    volume = rate * config.period_s + carry_ml
+    volume = rate * CONTROL_S + carry_ml
     # a rate of 0 doses nothing: what was carried waits until the controller asks for fluid again
     if rate == 0.0 or volume < feed.min_dose_ml or volume == 0.0:
         return DosePlan(carry_ml=min(volume, feed.min_dose_ml))

@@ -62,8 +62,10 @@ class ChiBioFamily(Family):
                 transport, clock = stack.enter_context(self.linked(backend, opening.bench))
                 calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
                 if not earlier:
-                    report(preflight(transport, clock, backend, calibrations, opening.folder))
-                reactors = ChiBioReactors(transport, clock, backend, calibrations, opening.journal.append)
+                    report(preflight(transport, clock, backend, calibrations, opening.folder, opening.bench))
+                reactors = ChiBioReactors(
+                    transport, clock, backend, calibrations, opening.journal.append, opening.bench
+                )
             elapsed_s = opening.elapsed_s(backend.speed)
             reactors.begin(replay(earlier), elapsed_s)
             with left_off(reactors):
@@ -73,7 +75,7 @@ class ChiBioFamily(Family):
         """As `hardware.chibio.preflight`. Raises: ReactorError."""
         calibrations = load_calibrations(Path(backend.calibration), backend.reactors)
         with self.linked(backend, bench) as (transport, clock):
-            return preflight(transport, clock, backend, calibrations, folder)
+            return preflight(transport, clock, backend, calibrations, folder, bench)
 
     def tubes(self, backend: ChiBioConfig, scenarios: Sequence[Scenario], most_ml: float) -> None:
         """By `backend.supply`. Raises: UnfitError."""

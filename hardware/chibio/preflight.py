@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from email.utils import parsedate_to_datetime
 from pathlib import Path
 
-from envs.bench import VIAL_ML
+from envs.bench import VIAL_ML, Bench
 from hardware.check import Check
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
@@ -31,16 +31,18 @@ def preflight(
     config: ChiBioConfig,
     calibrations: list[ReactorCalibration],
     folder: Path | None = None,
+    bench: Bench | None = None,
 ) -> list[Check]:
     """Disk, overflow pump, connection, clock; per reactor presence, identity, blank, modes, sensors, pump calibration.
 
     Args:
-      transport, clock, config, calibrations: as for `ChiBioReactors`.
+      transport, clock, config, calibrations, bench: as for `ChiBioReactors`.
       folder: where the run will write; its disk is checked.
     Raises: nothing about the device; a check that cannot be made has failed.
     """
     checks = [_disk(folder)] if folder is not None else []
-    checks.append(_overflow_pump(config, calibrations))
+    fullest_ml = float((bench or Bench()).volumes(config.reactors).max())
+    checks.append(_overflow_pump(config, calibrations, VIAL_ML - fullest_ml))
     try:
         checks += [_link(transport, clock), _board_clock(transport, clock, config)]
     except ReactorError as error:
@@ -92,14 +94,17 @@ def _board_clock(transport: Transport, clock: Clock, config: ChiBioConfig) -> Ch
     return Check("board clock", abs(drift) < 2.5, seen, "stop clock corrections on the board")
 
 
-def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration]) -> Check:
-    """What the overflow pump covers; without one, what cannot be prevented."""
+def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration], room_ml: float) -> Check:
+    """What the overflow pump covers; without one, what cannot be prevented.
+
+    Args: room_ml: above the fullest culture.
+    """
     overflow, feed = config.overflow_pump, max(calibration.feed.flow_ml_s for calibration in calibrations)
     if not overflow.pump:
         return Check(
             "overflow pump",
             False,
-            f"none: with a blocked waste tube a vial overflows after about {VIAL_ML - config.volume_ml:.0f} mL of feed",
+            f"none: with a blocked waste tube a vial overflows after about {room_ml:.0f} mL of feed",
             "a second waste tube on Pump3, backend.overflow_pump.pump=Pump3 (docs/chibio.md)",
             required=False,
         )

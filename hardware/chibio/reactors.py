@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
+from envs.bench import Bench
 from hardware.chibio.agenda import Agenda
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import Connection
@@ -31,7 +32,7 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
 
     Args:
       transport: the link; this object is its only user. clock: device time.
-      calibrations: one per reactor of `config.reactors`; nominal ones if left out.
+      calibrations: one per reactor of `config.reactors`; nominal ones if left out. bench: volumes of the cultures.
     """
 
     NOT_OFF: ClassVar = "pumps not verified off: {}. Switch the pump boards off by hand now"
@@ -43,12 +44,13 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
         config: ChiBioConfig,
         calibrations: Sequence[ReactorCalibration] | None = None,
         log: Log = no_log,
+        bench: Bench | None = None,
     ) -> None:
         calibrations = calibrations if calibrations is not None else [ReactorCalibration()] * len(config.reactors)
         if len(calibrations) != len(config.reactors):
             raise ValueError(f"calibrations for {len(calibrations)} reactors, reactors = {list(config.reactors)}")
         super().__init__(clock, config.stale_s, log)
-        self.config = config
+        self.config, self._bench = config, bench or Bench()
         self._link = SharedLink(transport, clock)
         self._past = dict.fromkeys(config.reactors, ReactorHistory())
         self._agenda = Agenda(clock)
@@ -58,7 +60,8 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
         connection = Connection(name, self.config.permitted, self._link, self._clock, self.note_down)
         book = Logbook(name, self.note_down, self.write, self.elapsed)
         past = partial(self._past.__getitem__, name)
-        return Station(Context(connection, calibration, self.config, self._agenda, book, past))
+        volume_ml = self._bench.volume_of(name)
+        return Station(Context(connection, volume_ml, calibration, self.config, self._agenda, book, past))
 
     def _take_over(self, histories: Mapping[str, ReactorHistory]) -> None:
         """Sweep the pumps off, pin identities and blanks, start what does not run yet, staggered inside the minute.

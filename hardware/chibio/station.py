@@ -40,6 +40,7 @@ class Station:
     def __init__(self, context: Context) -> None:
         self.connection, self.book = connection, book = context.connection, context.book
         self._calibration, self._config, self._agenda = context.calibration, context.config, context.agenda
+        self._volume_ml = context.volume_ml
         self._past, self._clock, config = context.past, connection.clock, context.config
         self.sampling = Sampling(config, self._clock)
         self.doses = DoseSequence(context)
@@ -174,7 +175,7 @@ class Station:
         if not abs(state.blank - self._blank) <= 0.5:  # also nan
             connection.set_blank(self._blank)
         for item, value, wanted in (
-            ("Volume", state.volume_ml, self._config.volume_ml),
+            ("Volume", state.volume_ml, self._volume_ml),
             ("Stir", state.stir_target, self._config.stir),
             ("Thermostat", state.temperature_target, self._target_c),
         ):

@@ -32,7 +32,6 @@ class UnitConfig:
     channel: str | None = setting(None, "as backend.channel", choices=("1", "2", "3", "4"))
     od_zero: float | None = setting(None, "as backend.od_zero", within=(-10, 10))
     od_scale: float | None = setting(None, "as backend.od_scale", above=0.0, at_most=1000.0)
-    volume_ml: float | None = setting(None, "as backend.volume_ml", "mL", within=(5, 38))
 
     def __post_init__(self) -> None:
         check(self, "backend.units.NAME")
@@ -48,7 +47,7 @@ class PioreactorConfig:
     kind: str = setting("pioreactor", "which backend")
     reactors: tuple[str, ...] = setting(("pio01",), "names of the units, as in the vendor's page", some=True)
     units: dict[str, UnitConfig] = setting(
-        {}, "what single units have otherwise, e.g. units.pio01.address=http://10.42.0.2 or units.pio02.volume_ml=14"
+        {}, "what single units have otherwise, e.g. units.pio01.address=http://10.42.0.2 or units.pio02.channel=1"
     )
     broker: str = setting("pioreactor.local", "host of the cluster's MQTT broker, its leader")
     broker_port: int = setting(1883, "of the broker", within=(1, 65535))
@@ -63,7 +62,6 @@ class PioreactorConfig:
     speed: float = setting(
         1.0, "growth faster than real time, only in the rig: device seconds per real second", within=(1, 60)
     )
-    period_s: float = setting(60.0, "control period", "s", within=(30, 600))
     reading_s: float = setting(5.0, "real time between the vendor's readings", "s", within=(1, 30))
     window_s: float = setting(30.0, "a sample is the median of the readings of at most so long", "s", within=(5, 300))
     mix_s: float = setting(5.0, "after a dose no reading counts for so long", "s", within=(0, 60))
@@ -77,31 +75,21 @@ class PioreactorConfig:
     temperature: float = setting(37.0, "thermostat at the start; scenarios may change it", "degC", within=(15, 42))
     thermostat: bool = setting(True, "run the vendor's thermostat; else temperatures are not controlled")
     stirring: bool = setting(True, "run the vendor's stirring")
-    volume_ml: float = setting(
-        20.0, "culture up to the efflux tube, for the interlock too", "mL", within=(5, 38), note="14 in a 20 mL vial"
-    )
     min_dose_ml: float = setting(
         0.05, "less is put off to the next dose: the pump does not give it well", "mL", within=(0, 1)
     )
     max_dose_ml: float = setting(1.5, "the largest dose", "mL", within=(0.1, 5), note="the vendor has no limit")
     waste_factor: float = setting(2.0, "waste pump over media pump, as the vendor's automations", within=(1, 5))
-    bottle_ml: float = setting(
-        2000.0, "medium of one unit: while a media pump cannot be stopped, until so much may have flowed, the waste "
-        "pump keeps its vial from overflowing", "mL", within=(1, 20_000),
-    )  # fmt: skip
     pump_pins: tuple[int, ...] = setting((13, 16, 12), "GPIO pins of media, alt-media and waste pump", some=True)
     start_s: float = setting(
         JOB_WAIT_S, "real time in which an accepted dose must begin; later its fate is unknown", "s", within=(2, 120)
     )
-    stale_s: float = setting(100.0, "age at which a newest sample is no basis for a dose", "s", within=(35, 1200))
     stop_s: float = setting(30.0, "real time a stop tries to verify the pumps off", "s", within=(1, 600))
 
     def __post_init__(self) -> None:
         check(self, "backend")
         unique = len(set(self.reactors)) == len(self.reactors)
         require(unique, "backend.reactors", self.reactors, "one or more unique names")
-        later = f"more than period_s = {self.period_s} s"
-        require(self.stale_s > self.period_s, "backend.stale_s", f"{self.stale_s} s", later)
         least = f"min_dose_ml = {self.min_dose_ml} or more"
         require(self.max_dose_ml >= self.min_dose_ml, "backend.max_dose_ml", f"{self.max_dose_ml} mL", least)
         require(len(self.pump_pins) == 3, "backend.pump_pins", self.pump_pins, "three: media, alt-media, waste")
@@ -113,25 +101,10 @@ class PioreactorConfig:
         bad = next((c for c in "#+/" if c in self.experiment or not self.experiment), "")
         require(not bad, "backend.experiment", self.experiment, "a name without # + and /")
 
-    @property
-    def control_min(self) -> float:
-        """Control period, min; a policy must have been trained for the same one, or for any."""
-        return self.period_s / 60.0
-
-    @property
-    def volumes_ml(self) -> tuple[float, ...]:
-        """Culture of each unit up to its efflux tube, mL."""
-        return tuple(self.of(unit).volume_ml for unit in self.reactors)
-
-    @property
-    def full_ml(self) -> tuple[float, ...]:
-        """The vendor's most in each unit's vial, mL."""
-        return tuple(FULL_ML[vial_ml(volume_ml)] for volume_ml in self.volumes_ml)
-
     def of(self, unit: str) -> "PioreactorConfig":
         """As one unit has it: its own values in the place of those for all."""
         own = self.units.get(unit, UnitConfig())
-        given = {key: getattr(own, key) for key in ("channel", "od_zero", "od_scale", "volume_ml")}
+        given = {key: getattr(own, key) for key in ("channel", "od_zero", "od_scale")}
         return replace(self, **{key: value for key, value in given.items() if value is not None})
 
     def address(self, unit: str) -> str:

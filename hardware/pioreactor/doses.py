@@ -43,7 +43,7 @@ class Doses:
         self.foreign = ""
         self.sample: tuple[float, int] | None = None
         self.carry_ml, self._count = 0.0, 0
-        self._room_ml = vial_ml(self._config.volume_ml) - self._config.volume_ml  # above the tube; the rest runs over
+        self._room_ml = vial_ml(pumps.unit.volume_ml) - pumps.unit.volume_ml  # above the tube; the rest runs over
         self._course: Iterator[float] | None = None
         self._strange: list[Event] = []
 
@@ -61,7 +61,7 @@ class Doses:
         """What a mean rate comes to, mL. Args: rate: mL/s over a control period, >= 0. Raises: ValueError."""
         if not (rate >= 0.0 and math.isfinite(rate)):
             raise ValueError(f"pump rate = {rate} mL/s: allowed finite numbers >= 0")
-        asked = rate * self._config.period_s + (self.carry_ml if rate > 0.0 else 0.0)
+        asked = rate * self.pumps.unit.bench.period_s + (self.carry_ml if rate > 0.0 else 0.0)
         if asked < self._config.min_dose_ml:
             return Plan(carry_ml=asked if rate > 0.0 else self.carry_ml)
         feed = min(asked, self._config.max_dose_ml)

@@ -9,7 +9,7 @@ import numpy as np
 
 from envs.bench import Bench
 from hardware.check import Check, report
-from hardware.clock import DeviceClock
+from hardware.clock import RealClock
 from hardware.errors import UnfitError
 from hardware.family import Can, Family, Opening, not_looked_at
 from hardware.link.open import DeviceLock
@@ -44,7 +44,7 @@ class PioreactorFamily(Family):
             backend = stack.enter_context(self.reached(backend, bench, folder))
             for unit in backend.reactors:
                 stack.enter_context(closing(DeviceLock(f"unit {unit} of {backend.broker}:{backend.broker_port}")))
-            yield stack.enter_context(closing(PioreactorReactors(backend, DeviceClock(), log_row, run)))
+            yield stack.enter_context(closing(PioreactorReactors(backend, RealClock(), log_row, run, bench)))
 
     @contextmanager
     def open(self, opening: Opening) -> Iterator[Reactor]:
@@ -72,11 +72,19 @@ class PioreactorFamily(Family):
         return None if backend.thermostat else " without backend.thermostat=true"
 
     def doses(self, backend: PioreactorConfig, bench: Bench) -> None:
-        """Whether the largest dose is one that a unit may be given. Raises: UnfitError."""
+        """Whether period, volumes and the largest dose are such as a unit may have. Raises: UnfitError."""
+        where = f"backend={backend.kind}"
+        if not 30.0 <= bench.period_s <= 600.0:
+            raise UnfitError(f"bench.period_s = {bench.period_s:g} s: allowed 30 to 600 with {where}")
+        volumes_ml = bench.volumes(backend.reactors)
+        for name, ml, full_ml in zip(backend.reactors, volumes_ml, self.rim_ml(volumes_ml), strict=True):
+            if ml >= full_ml:
+                given = f"bench.volume_ml = {ml:g} mL of {name}"
+                raise UnfitError(f"{given}: allowed less than the vendor's limit of its vial, {full_ml:g}")
         if bench.max_rate * bench.period_s > backend.max_dose_ml + 1e-9:
             least = math.floor(1e5 * backend.max_dose_ml / bench.period_s) / 1e5
             raise UnfitError(
-                f"backend={backend.kind}: backend.max_dose_ml = {backend.max_dose_ml:g} mL, the interlock allows "
+                f"{where}: backend.max_dose_ml = {backend.max_dose_ml:g} mL, the interlock allows "
                 f"{bench.max_rate * bench.period_s:.3g} mL in a period of {bench.period_s:g} s; "
                 f"give bench.max_rate={least:g} or a larger backend.max_dose_ml"
             )

@@ -41,7 +41,7 @@ def preflight(reactors: PioreactorReactors) -> list[Check]:
 
 def _unit(station: Station, reactors: PioreactorReactors, leader: Web) -> Iterator[Check]:
     """Checks of one unit. Raises: ReactorError where it does not answer."""
-    name, web, config = station.name, station.unit.web, reactors.config.of(station.name)
+    unit, name, web, config = station.unit, station.name, station.unit.web, station.unit.config
     health = web.get("/health")
     who = str(health.get("pioreactor_unit"))
     yield Check(f"{name} identity", who == name, f"the unit at {web.url} is {who}", f"correct backend.units.{name}")
@@ -66,8 +66,8 @@ def _unit(station: Station, reactors: PioreactorReactors, leader: Web) -> Iterat
     yield Check(f"{name} photodiode", config.channel in eyes, f"{config.channel} of {sees}", remedy)
     tube = str(settings.get("bioreactor", {}).get(facts(version).tube, "not set"))
     remedy = "set both to the culture's volume at its efflux tube: the vendor refuses doses by its own"
-    same = tube == "not set" or abs(float(tube) - config.volume_ml) <= 0.5
-    yield Check(f"{name} volume", same, f"{tube} mL in its settings, {config.volume_ml:g} here", remedy, required=False)
+    same = tube == "not set" or abs(float(tube) - unit.volume_ml) <= 0.5
+    yield Check(f"{name} volume", same, f"{tube} mL in its settings, {unit.volume_ml:g} here", remedy, required=False)
     other, _, remedy = reactors.mqtt.holder(name).partition("; ")
     yield Check(f"{name} client", not other, other or "no other client of ours", remedy)
     dosing = sorted({str(job["job_name"]) for job in web.running()} & set(DOSING_JOBS))

@@ -404,7 +404,7 @@ class ForcedEnd:
         p, pin, now = self._p, self._p.pin(self._job), self._p.clock.now()
         silent, broke = now > self._rows_s + QUIET_S, p.broke(self._request) and not self._lost
         flowed = max(now - max(self._since, pin.on_s if pin.on else pin.event_s), 0.0) * p.flow_ml_s[self._job]
-        return flowed if not (silent or broke) and flowed < p.config.bottle_ml else 0.0
+        return flowed if not (silent or broke) and flowed < p.unit.bench.bottle_ml else 0.0
 
     def moved(self, off_s: float) -> Moved:
         """What the pump moved since it was asked. Args: off_s: as of `off_s`."""

@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+from envs.bench import Bench
 from hardware.clock import Clock, DeviceClock
 from hardware.errors import DeviceStateError, LinkError, ReactorError
 from hardware.logbook import Log, Logbook, no_log
@@ -26,13 +27,20 @@ class PioreactorReactors(Stations[Station, History]):
     """Units of one cluster; `close` after `stop`.
 
     Args: config: units and how to reach them. real: clock of messages and jobs; the run's is `config.speed` times as
-      fast. run: of this run, part of every dose's id; the same after a resume.
+      fast. run: of this run, part of every dose's id; the same after a resume. bench: period, volumes, bottle.
     Raises: LinkError if the broker does not answer.
     """
 
-    def __init__(self, config: PioreactorConfig, real: Clock, log: Log = no_log, run: str = "") -> None:
-        clock = DeviceClock(config.speed, real)
-        super().__init__(clock, config.stale_s, log)
+    def __init__(
+        self,
+        config: PioreactorConfig,
+        real: Clock,
+        log: Log = no_log,
+        run: str = "",
+        bench: Bench | None = None,
+    ) -> None:
+        clock, bench = DeviceClock(config.speed, real), bench or Bench()
+        super().__init__(clock, bench.stale_s, log)
         self.config, self._real = config, real
         run = run or format(int(time.time()), "x")
         boxes = {unit: Mailbox(unit, config, real) for unit in config.reactors}
@@ -40,8 +48,8 @@ class PioreactorReactors(Stations[Station, History]):
         self.stations = tuple(
             Station(
                 Unit(
-                    name, config.of(name), Web(config.address(name), config.experiment), self.mqtt, box, clock,
-                    Logbook(name, self.note_down, self.write, self.elapsed), run,
+                    name, config.of(name), bench, bench.volume_of(name), Web(config.address(name), config.experiment),
+                    self.mqtt, box, clock, Logbook(name, self.note_down, self.write, self.elapsed), run,
                 )
             )
             for name, box in boxes.items()

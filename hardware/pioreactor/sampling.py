@@ -33,8 +33,8 @@ class Sampling:
     Attributes: newest, the last sample; arrived_s, clock time at which it was made; read_s, of the newest reading.
     """
 
-    def __init__(self, config: PioreactorConfig, now: float) -> None:
-        self._config = config
+    def __init__(self, config: PioreactorConfig, period_s: float, now: float) -> None:
+        self._config, self._period_s = config, period_s
         self._readings: deque[Reading] = deque(maxlen=1000)
         self.newest = Sample(math.nan, math.nan, math.nan, math.nan, 0)
         self.arrived_s, self.read_s, self.count = now, now, 0
@@ -63,6 +63,6 @@ class Sampling:
             min(max(middle * COUNTS, 0.0), 60_000.0), len(used),
         )  # fmt: skip
         self.arrived_s, self.count = now, self.count + 1
-        late = now - self._due > 0.5 * self._config.period_s
-        self._due = (now if late or self.count == 1 else self._due) + self._config.period_s
+        late = now - self._due > 0.5 * self._period_s
+        self._due = (now if late or self.count == 1 else self._due) + self._period_s
         return self.newest

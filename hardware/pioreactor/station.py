@@ -47,7 +47,7 @@ class Station:
         self._clock, self._real = unit.clock, unit.real
         self._pumps = Pumps(unit)
         self.doses = Doses(self._pumps)
-        self.sampling = Sampling(unit.config, self._clock.now())
+        self.sampling = Sampling(unit.config, unit.bench.period_s, self._clock.now())
         self.regulated_od = self._target = self.level_ml = math.nan
         self.given_up = self.heat_is_off = self.up = False
         self._calls = Calls(self._web, self._real)
@@ -263,7 +263,7 @@ class Station:
             refusal = "the unit regulates itself"
         elif self.book.fault is not None:
             refusal = str(self.book.fault)
-        elif self._clock.now() - self.sampling.newest.at > self._config.stale_s:
+        elif self._clock.now() - self.sampling.newest.at > self.unit.bench.stale_s:
             refusal = "its sample is stale"
         plan = self.doses.begin(rate, self.key, refusal)
         self.doses.foreign = ""

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from envs.bench import Bench
 from hardware.clock import Clock, DeviceClock
 from hardware.logbook import Logbook
 from hardware.pioreactor.config import PioreactorConfig
@@ -15,12 +16,15 @@ __all__ = ["Unit"]
 class Unit:
     """One unit's surroundings.
 
-    name: as in the vendor's page. config: of this unit. web, mqtt, box: the ways to it. clock: of the run, whose `real`
-    is that of messages and jobs. book: what it reports. run: of this run, part of every dose's id.
+    name: as in the vendor's page. config: of this unit. bench: period, bottle. volume_ml: of its culture. web, mqtt,
+    box: the ways to it. clock: of the run, whose `real` is that of messages and jobs. book: what it reports. run: of
+    this run, part of every dose's id.
     """
 
     name: str
     config: PioreactorConfig
+    bench: Bench
+    volume_ml: float
     web: Web
     mqtt: Cluster
     box: Mailbox

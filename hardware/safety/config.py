@@ -206,7 +206,7 @@ class SafetyConfig:
 
         Raises: ValueError for an age that is over before the next sample comes.
         """
-        stale_s = bench.period_s + 40.0 if self.stale_s is None else self.stale_s
+        stale_s = bench.stale_s if self.stale_s is None else self.stale_s
         lost_s = max(3.0 * bench.period_s, stale_s) if self.lost_s is None else self.lost_s
         require(stale_s >= 1.1 * bench.period_s, "safety.stale_s", stale_s, f"{1.1 * bench.period_s:g} to 7200")
         require(lost_s >= stale_s, "safety.lost_s", lost_s, f"{stale_s:g} to 14400")

@@ -52,9 +52,9 @@ def recorded(folder: Path) -> Recorded:
     """The run in a folder, or in `run` of the folder of this command. Raises: UserError naming what it lacks."""
     folder = folder / "run" if (folder / "run" / "journal.jsonl").is_file() else folder
     try:
-        backend: Any = files.load_yaml(folder / "config.yaml").backend
-        reactors, speed, own = tuple(backend.reactors), float(backend.speed), backend.get("units") or {}
-        volume = {u: float((own.get(u) or {}).get("volume_ml") or backend.volume_ml) for u in reactors}
+        config: Any = files.load_yaml(folder / "config.yaml")
+        reactors, speed, bench = tuple(config.backend.reactors), float(config.backend.speed), config.bench
+        volume = {u: float(bench.volumes_ml.get(u, bench.volume_ml)) for u in reactors}
         journal, _ = read_journal(folder / "journal.jsonl")
         truth = _rows(folder / "truth.jsonl")
         events, vendor = (_rows(path) if (path := folder / name).exists() else None for name in BESIDE)

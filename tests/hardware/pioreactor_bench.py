@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs.bench import Bench
 from hardware.clock import RealClock
 from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import PUBLISHED, RigBackendConfig, RigConfig, UnitConfig
@@ -37,10 +38,11 @@ def need_the_rig(package: str = PUBLISHED) -> None:
         pytest.skip(str(error), allow_module_level=True)
 
 
-class Bench:
+class UnitBench:
     """One unit in the rig, and lives of the driver that end without a word and go on from the journal."""
 
-    def __init__(self, folder: Path, package: str = PUBLISHED, **values: Any) -> None:
+    def __init__(self, folder: Path, package: str = PUBLISHED, period_s: float = 60.0, **values: Any) -> None:
+        self.bench = Bench(period_s=period_s)
         self.rig = Rig({UNIT: 20.0}, RigConfig(package=package, od=0.5))
         self.folder, self.run = folder, f"test{time.time():.0f}"
         where: dict[str, Any] = {"broker": "127.0.0.1", "broker_port": self.rig.broker, "leader": self.rig.web[UNIT]}
@@ -55,7 +57,7 @@ class Bench:
     def live(self) -> None:
         """A life of the driver, the first or the next."""
         self.journal = Journal(self.folder / "journal.jsonl")
-        self.reactors = PioreactorReactors(self.config, RealClock(), self.journal.append, self.run)
+        self.reactors = PioreactorReactors(self.config, RealClock(), self.journal.append, self.run, self.bench)
         self.reactors.begin(replay(self.journal.rows), 1e4 * self.journal.next_row)
         self.station = self.reactors.stations[0]
 
@@ -79,7 +81,7 @@ class Bench:
         return False
 
     def dose(self, ml: float) -> float:
-        rate = np.array([ml / self.config.period_s])
+        rate = np.array([ml / self.bench.period_s])
         return float(self.reactors.actuate(Command(np.array([True]), rate, np.array([np.nan]))).volume_ml[0])
 
     def go_on(self, real_s: float, until=lambda: False) -> bool:

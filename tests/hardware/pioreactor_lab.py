@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs.bench import Bench
 from hardware.clock import VirtualClock
 from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.pioreactor import reactors
@@ -473,8 +474,9 @@ class Lab:
         monkeypatch.setattr(reactors, "Web", lambda *_given: self.web)
         monkeypatch.setattr(reactors, "Cluster", FakeCluster)
         self.rows: list[dict[str, Any]] = []
+        self.bench = Bench(**{key: values.pop(key) for key in ("period_s", "bottle_ml", "volume_ml") if key in values})
         config = PioreactorConfig(**{"thermostat": False, **values})
-        self.reactors = PioreactorReactors(config, self.world, self._log, "run")
+        self.reactors = PioreactorReactors(config, self.world, self._log, "run", self.bench)
         self.station = self.reactors.stations[0]
 
     @property
@@ -497,7 +499,7 @@ class Lab:
 
     def dose(self, ml: float) -> float:
         """Ask for this volume; what the receipt says."""
-        rate = np.array([ml / self.reactors.config.period_s])
+        rate = np.array([ml / self.bench.period_s])
         rows, nothing = np.array([True]), np.array([np.nan])
         self.receipt = self.reactors.actuate(Command(rows, rate, nothing))
         return float(self.receipt.volume_ml[0])

@@ -421,7 +421,7 @@ def test_ten_times_faster_readings_of_a_dose_do_not_count_for_the_sample_after_i
 
 
 def test_five_times_faster_a_period_of_two_minutes_is_dosed_whole_and_an_old_sample_not_at_all(monkeypatch):
-    lab = Lab(monkeypatch, speed=5.0, period_s=120.0, stale_s=130.0, waste_factor=3.0)
+    lab = Lab(monkeypatch, speed=5.0, period_s=120.0, waste_factor=3.0)
     lab.begin()
     lab.sample()
     assert lab.dose(0.9) == 0.9

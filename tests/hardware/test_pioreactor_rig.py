@@ -15,7 +15,7 @@ from hardware.pioreactor.jobs import request
 from hardware.pioreactor.preflight import preflight
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.versions import facts
-from tests.hardware.pioreactor_bench import EACH_ML, PACKAGES, UNIT, Bench, need_the_rig
+from tests.hardware.pioreactor_bench import EACH_ML, PACKAGES, UNIT, UnitBench, need_the_rig
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pioreactor")]  # one rig at a time
 
@@ -26,7 +26,7 @@ REPEATS = int(os.environ.get("PIOREACTOR_KILLS", "1"))
 @pytest.fixture(params=PACKAGES)
 def bench(request, tmp_path):
     need_the_rig(PACKAGES[request.param])
-    made = Bench(tmp_path, PACKAGES[request.param])
+    made = UnitBench(tmp_path, PACKAGES[request.param])
     try:
         assert made.sample()
         yield made

@@ -8,8 +8,10 @@ import string
 import numpy as np
 import pytest
 
+from envs.bench import Bench
 from hardware.clock import VirtualClock
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
+from hardware.pioreactor.family import PioreactorFamily
 from hardware.pioreactor.mailbox import LOCKS, Cluster, Mailbox, Reading
 from hardware.pioreactor.sampling import Sampling
 from tests.hardware.pioreactor_lab import EXPERIMENT, UNIT, Lab, World
@@ -246,7 +248,7 @@ def test_silence_is_told_in_the_age_of_the_sample(monkeypatch):
     for _ in range(8):
         m = lab.reactors.measure()
     assert not m.fresh[0]
-    assert m.vitals.age_s[0] > lab.reactors.config.stale_s
+    assert m.vitals.age_s[0] > lab.bench.stale_s
 
 
 @pytest.mark.parametrize(
@@ -254,7 +256,6 @@ def test_silence_is_told_in_the_age_of_the_sample(monkeypatch):
     [
         ({"reactors": ()}, "backend.reactors"),
         ({"reactors": ("a", "a")}, "backend.reactors"),
-        ({"stale_s": 50.0}, "backend.stale_s"),
         ({"reading_s": 10.0, "window_s": 10.0}, r"backend.window_s = 10.0 s: allowed more than 10 s"),
         ({"speed": 6.0}, r"backend.window_s = 30.0 s: allowed more than 30 s"),
         ({"max_dose_ml": 0.1, "min_dose_ml": 0.2}, "backend.max_dose_ml"),
@@ -287,16 +288,17 @@ def test_a_sample_that_is_due_while_pumps_are_switched_off_is_kept_for_whoever_d
 
 
 def test_two_units_have_their_own_values(monkeypatch):
-    units = {"pio02": UnitConfig(channel="1", od_zero=0.2, od_scale=3.0, volume_ml=14.0)}
-    config = PioreactorConfig(reactors=("pio01", "pio02"), units=units, volume_ml=38.0)
-    assert config.volumes_ml == (38.0, 14.0)
-    assert config.full_ml == (36.0, 18.0)
+    units = {"pio02": UnitConfig(channel="1", od_zero=0.2, od_scale=3.0)}
+    config = PioreactorConfig(reactors=("pio01", "pio02"), units=units)
+    volumes_ml = Bench(volume_ml=35.0, volumes_ml={"pio02": 14.0}).volumes(config.reactors)
+    assert volumes_ml.tolist() == [35.0, 14.0]
+    assert PioreactorFamily().rim_ml(volumes_ml).tolist() == [36.0, 18.0]
     own = config.of("pio02")
-    assert (own.channel, own.od_zero, own.od_scale, own.volume_ml) == ("1", 0.2, 3.0, 14.0)
+    assert (own.channel, own.od_zero, own.od_scale) == ("1", 0.2, 3.0)
     box = Mailbox("pio02", config, VirtualClock(5.0))
     said = {"timestamp": "t", "ods": {"1": {"od": 0.4}, "2": {"od": 9.0}}}
     box.take("pioreactor/pio02/turbidostat/od_reading/ods", json.dumps(said).encode(), False)
     (reading,), _, _ = box.drain()
-    sampling = Sampling(own, 0.0)
+    sampling = Sampling(own, 60.0, 0.0)
     sampling.take([reading, reading])
     assert sampling.look(6.0, 0.0).od == pytest.approx(3.0 * (0.4 - 0.2))

@@ -12,11 +12,12 @@ from dataclasses import replace
 
 import pytest
 
+from envs.bench import Bench
 from hardware.clock import RealClock
 from hardware.pioreactor.preflight import preflight
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.versions import facts
-from tests.hardware.pioreactor_bench import PACKAGES, UNIT, Bench, need_the_rig
+from tests.hardware.pioreactor_bench import PACKAGES, UNIT, UnitBench, need_the_rig
 
 pytestmark = [pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(300)]  # one rig
 
@@ -25,11 +26,11 @@ LONG_S = 120.0
 
 
 @pytest.fixture(scope="module", params=PACKAGES)
-def bench(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def bench(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[UnitBench]:
     package = PACKAGES[request.param]
     need_the_rig(package)
     folder, values = tmp_path_factory.mktemp("unit"), {"speed": 10.0, "period_s": 30.0, "start_s": 60.0}
-    made = Bench(folder, package, max_dose_ml=3.0, **values)
+    made = UnitBench(folder, package, max_dose_ml=3.0, **values)
     try:
         assert made.sample(LONG_S)
         yield made
@@ -55,8 +56,8 @@ def test_preflight_passes(bench):
 
 
 def test_what_a_run_would_lack_is_named_with_what_helps(bench):
-    config = replace(bench.config, experiment="other", channel="4", volume_ml=14.0)
-    reactors = PioreactorReactors(config, RealClock())
+    config = replace(bench.config, experiment="other", channel="4")
+    reactors = PioreactorReactors(config, RealClock(), bench=Bench(volume_ml=14.0))
     try:
         checks = {check.name.removeprefix(f"{UNIT} "): check for check in preflight(reactors)}
     finally:
