@@ -82,7 +82,7 @@ class Trial:
 
     def _command(self, run: Path) -> list[str]:
         units = [f"backend.units.{unit}.address={url}" for unit, url in self.rig.web.items()]
-        units += [f"backend.units.{WELL}.volume_ml={WELL_ML}", f"backend.leader={self.rig.web[SICK]}"]
+        units += [f"bench.volumes_ml.{WELL}={WELL_ML}", f"backend.leader={self.rig.web[SICK]}"]
         return [
             "backend=pioreactor", f"backend.reactors=[{SICK},{WELL}]", "backend.broker=127.0.0.1",
             f"backend.broker_port={self.rig.broker}", f"backend.speed={self.speed}", "backend.reading_s=1",

@@ -189,7 +189,7 @@ def deployment(config: RigStudyConfig, rig: Rig, folder: Path, out: Path) -> Ite
     for unit in config.reactors:
         command += [
             f"backend.units.{unit}.address={rig.web[unit]}",
-            f"backend.units.{unit}.volume_ml={rig.units[unit]}",
+            f"bench.volumes_ml.{unit}={rig.units[unit]}",
         ]
     command += ["backend.broker=127.0.0.1", f"backend.broker_port={rig.broker}", f"backend.speed={config.speed}"]
     command += [f"backend.leader={next(iter(rig.web.values()))}"]

@@ -174,7 +174,7 @@ def test_duties_of_our_experiment_count_retained_and_those_of_others_only_as_the
 
 
 def test_a_sample_is_the_median_so_one_bubble_does_not_move_it():
-    sampling = Sampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 0.0)
+    sampling = Sampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 60.0, 0.0)
     values = [0.60, 0.61, 0.59, 2.0, 0.60]
     sampling.take([Reading(40.0 + k, v) for k, v in enumerate(values)])
     sample = sampling.look(45.0, 0.0)
@@ -186,7 +186,7 @@ def test_a_sample_is_the_median_so_one_bubble_does_not_move_it():
 
 
 def test_readings_in_or_just_after_a_dose_do_not_count():
-    sampling = Sampling(PioreactorConfig(), 0.0)
+    sampling = Sampling(PioreactorConfig(), 60.0, 0.0)
     sampling.take([Reading(float(k), 0.5 if k < 20 else 0.4) for k in range(10, 30)])
     assert sampling.look(29.0, 28.5) is None
     sample = sampling.look(29.0, 20.0)
@@ -195,7 +195,7 @@ def test_readings_in_or_just_after_a_dose_do_not_count():
 
 
 def test_one_sample_per_period():
-    sampling = Sampling(PioreactorConfig(), 0.0)
+    sampling = Sampling(PioreactorConfig(), 60.0, 0.0)
     seen = []
     for second in range(600):
         sampling.take([Reading(float(second), 0.5)])
@@ -206,7 +206,7 @@ def test_one_sample_per_period():
 
 
 def test_samples_keep_their_beat_when_each_is_looked_at_late():
-    sampling = Sampling(PioreactorConfig(), 0.0)
+    sampling = Sampling(PioreactorConfig(), 60.0, 0.0)
     seen = 0
     for second in range(0, 3600, 7):
         sampling.take([Reading(float(second - k), 0.5) for k in (6, 4, 2, 0)])

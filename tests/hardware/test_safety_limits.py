@@ -437,7 +437,7 @@ def test_ages_follow_the_period_of_the_bench() -> None:
 def test_each_vial_has_its_own_level() -> None:
     """The ledger is full 5 mL above each tube, and at what a vial holds where that is less."""
     tubes = np.array([12.0, 20.0, 28.0])
-    interlock, fed = Interlock(3, SafetyConfig(ml_per_minute=1e3), Bench(volume_ml=12.0), tubes), np.zeros(3)
+    interlock, fed = Interlock(3, SafetyConfig(ml_per_minute=1e3), Bench(volume_ml=12.0), tubes, 30.0), np.zeros(3)
     for k in range(40):
         now = np.full(3, 60.0 * k)
         m = Measurement(now, np.full(3, 0.5 + 0.001 * (k % 7)), np.full(3, 37.0), np.full(3, True), None)
