@@ -1,10 +1,12 @@
 """What a law of the composition is told and what it answers: N cultures in, N thermostat targets out."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hardware.memory import Remembers
 
 __all__ = ["Array", "Estimate", "Law", "Mask", "Wanted"]
 
@@ -49,7 +51,7 @@ class Wanted:
     minutes: Array
 
 
-class Law(Protocol):
+class Law(Remembers, Protocol):
     """Chooses thermostat targets from an estimate. Rows are independent."""
 
     def reset(self, n: int) -> None:
@@ -62,12 +64,4 @@ class Law(Protocol):
         A law with a longer period of its own keeps its target until that is over. Args: minute: since the program
         began, (N,). rows: True where the estimate is new and a setpoint is in force; only these rows' state advances.
         """
-        ...
-
-    def state(self) -> dict[str, Any]:
-        """Everything that `reset` forgets, as plain numbers and lists."""
-        ...
-
-    def restore(self, state: object) -> None:
-        """Continue as saved. Raises: ValueError naming what is missing or does not fit."""
         ...

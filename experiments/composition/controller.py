@@ -1,7 +1,5 @@
 """Estimator and law in one: readings in, thermostat target out."""
 
-from typing import Any
-
 import numpy as np
 
 from envs.coculture.rates import EQUAL_RATES_C
@@ -16,6 +14,8 @@ class CompositionController:
 
     Args: estimator: what is believed; law: what is done about it.
     """
+
+    remembers = ("estimator", "law")
 
     def __init__(self, estimator: CompositionEstimator, law: Law) -> None:
         self.estimator, self.law = estimator, law
@@ -46,12 +46,3 @@ class CompositionController:
     def explain(self) -> dict[str, Array]:
         """See `CompositionEstimator.explain`."""
         return self.estimator.explain()
-
-    def state(self) -> dict[str, Any]:
-        """Everything that `reset` forgets, as plain numbers and lists."""
-        return {"estimator": self.estimator.state(), "law": self.law.state()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue as saved. Raises: ValueError naming what is missing or does not fit."""
-        self.estimator.restore(state.get("estimator"))
-        self.law.restore(state.get("law"))

@@ -1,7 +1,6 @@
 """What is known of two species in one vial: a Kalman filter on OD, fluorescence, temperature and doses."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,6 @@ from envs.bench import Bench
 from envs.coculture.rates import EQUAL_RATES_C, LAG_E_MIN, LAG_P_MIN, e_coli_rate, p_putida_rate
 from envs.plant.fluorescence import DELAY_MIN, FOLLOW_PER_H, LEAST, steady_production
 from experiments.composition.base import Array, Estimate, Mask
-from experiments.controllers.base import put_back, saved
 
 __all__ = ["CompositionEstimator", "CompositionEstimatorConfig"]
 
@@ -23,9 +21,6 @@ LOWEST_OD = 0.005  # below it a first reading says nothing
 LOWEST_LIGHT = 1.0  # counts; what the logarithm of the pigment begins from at least
 ITERATIONS = 3  # of an update, about the newest estimate
 LONGEST_STEP_MIN = 1.0
-MEMORY = (
-    "mean", "cov", "_minute", "_temperature", "_lagged", "_production", "_past", "_given_ml", "_far",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -83,6 +78,8 @@ class CompositionEstimator:
 
     State: mean (N, 8), cov (N, 8, 8). Args: config: first guesses and noise. volume_ml: V, (N,) or one for all.
     """
+
+    remembers = ("mean", "cov", "minute", "temperature", "lagged", "production", "past", "given_ml", "far")
 
     def __init__(self, config: CompositionEstimatorConfig, volume_ml: Array | float = Bench.volume_ml) -> None:
         self.config, self._volume_ml = config, volume_ml
@@ -285,11 +282,3 @@ class CompositionEstimator:
             "composition_od": np.exp(self.mean[:, LOG_OD]),
             "pigment": np.exp(self.mean[:, LOG_F]),
         }
-
-    def state(self) -> dict[str, Any]:
-        """See `Remembers.state`."""
-        return saved(self, MEMORY)
-
-    def restore(self, state: object) -> None:
-        """See `Remembers.restore`."""
-        put_back(self, MEMORY, state)

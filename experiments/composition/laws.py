@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from envs.coculture.rates import EQUAL_RATES_C, T_MAX, T_MIN
 from envs.coculture.task import CocultureConfig, advance, logit
 from experiments.composition.base import Array, Estimate, Mask, Wanted
 from experiments.composition.estimator import CompositionEstimatorConfig
-from experiments.controllers.base import put_back, saved
 
 __all__ = [
     "PI", "BangBang", "BangBangConfig", "InverseDynamics", "InverseDynamicsConfig", "LawConfig", "Midpoint",
@@ -43,7 +41,7 @@ class Periodic(ABC):
     Args: control_min: the period, min.
     """
 
-    _memory: tuple[str, ...] = ("_target", "_next")
+    remembers: tuple[str, ...] = ("target", "next")
 
     def __init__(self, control_min: float) -> None:
         self.control_min = control_min
@@ -66,14 +64,6 @@ class Periodic(ABC):
     @abstractmethod
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         """Targets of the rows `idx`, whose estimates and wishes are given, degC; clipped by the caller."""
-
-    def state(self) -> dict[str, Any]:
-        """See `Remembers.state`."""
-        return saved(self, self._memory)
-
-    def restore(self, state: object) -> None:
-        """See `Remembers.restore`."""
-        put_back(self, self._memory, state)
 
 
 @dataclass(frozen=True)
@@ -109,7 +99,7 @@ class PI(Periodic):
     Source: program `CustomCompControl` of Janmorlock/ChiBio, the device's code for Lee et al. (2025).
     """
 
-    _memory = ("_target", "_next", "_integral")
+    remembers = ("target", "next", "integral")
 
     def __init__(self, config: PIConfig) -> None:
         self.config = config
@@ -204,7 +194,7 @@ class Midpoint(Periodic):
     announced, as `Proportional`. Once begun it goes on until the change comes.
     """
 
-    _memory = ("_target", "_next", "_towards")
+    remembers = ("target", "next", "towards")
 
     def __init__(self, config: MidpointConfig) -> None:
         self.gain = config.gain

@@ -1,13 +1,11 @@
 """What a controller is: N reactors in, N pump rates out, once per sample. Structural; nothing has to inherit."""
 
-import math
-from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Accounts", "Array", "Controller", "Explains", "Mask", "Remembers", "Watches", "put_back", "saved", "usable"]
+__all__ = ["Accounts", "Array", "Controller", "Explains", "Mask", "Watches", "usable"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -17,7 +15,8 @@ class Controller(Protocol):
     """Decides one pump rate per reactor and sample.
 
     The same controller serves one reactor on the bench and 64 replicates in simulation. Reactors are independent:
-    row i of a batch does exactly what the controller would do for that reactor alone.
+    row i of a batch does exactly what the controller would do for that reactor alone. One with a memory declares
+    `remembers`, everything that `reset` forgets, for a resumed run (`hardware/memory.py`).
     """
 
     def reset(self, n: int) -> None:
@@ -63,50 +62,6 @@ class Watches(Protocol):
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         """Called before each `act`; arguments as there, `rows` also in recovery; temperature: degC, nan if unknown."""
         ...
-
-
-@runtime_checkable
-class Remembers(Protocol):
-    """A controller with a memory, which a resumed run continues."""
-
-    def state(self) -> dict[str, Any]:
-        """Everything that `reset` forgets, as plain numbers and lists; None stands for nan."""
-        ...
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue as saved. Raises: ValueError naming what is missing or does not fit."""
-        ...
-
-
-def saved(owner: object, names: Sequence[str]) -> dict[str, Any]:
-    """The named arrays (and flags) of a controller as plain values; None stands for nan."""
-    values = {name.lstrip("_"): getattr(owner, name) for name in names}
-    return {name: _plain(v.tolist() if isinstance(v, np.ndarray) else v) for name, v in values.items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_plain(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def put_back(owner: object, names: Sequence[str], state: object) -> None:
-    """Set what `saved` read, in the shapes and types that are there. Raises: ValueError naming what does not fit."""
-    for name in names:
-        key, now = name.lstrip("_"), getattr(owner, name)
-        if not isinstance(state, dict) or key not in state:
-            raise ValueError(f"controller.{key}: missing")
-        try:
-            kind = now.dtype if isinstance(now, np.ndarray) else type(now)
-            numbers = np.array(state[key], dtype=np.float64)
-            if kind != np.float64 and not np.isfinite(numbers).all():
-                raise ValueError
-            values = numbers.astype(kind)
-        except (TypeError, ValueError, OverflowError):
-            raise ValueError(f"controller.{key}: {str(state[key])[:40]}, expected numbers") from None
-        if values.shape != np.shape(now):
-            raise ValueError(f"controller.{key} has shape {values.shape}, this run needs {np.shape(now)}")
-        setattr(owner, name, values if isinstance(now, np.ndarray) else kind(values))
 
 
 def usable(od: Array, rows: Mask) -> Mask:

@@ -1,13 +1,12 @@
 """The simple baselines: a classic threshold turbidostat and a constant rate."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from conf.schema import check, setting
 from envs.task import MAX_PUMP_RATE, EnvConfig
-from experiments.controllers.base import Array, Mask, put_back, saved, usable
+from experiments.controllers.base import Array, Mask, usable
 
 __all__ = ["Hold", "HoldConfig", "Threshold", "ThresholdConfig"]
 
@@ -27,7 +26,7 @@ class ThresholdConfig:
 class Threshold:
     """u = rate from x > setpoint until x <= setpoint - hysteresis, else 0: the turbidostat of the textbooks."""
 
-    _memory = ("_on",)
+    remembers = ("on",)
 
     def __init__(self, config: ThresholdConfig) -> None:
         self.config = config
@@ -36,14 +35,6 @@ class Threshold:
     def reset(self, n: int) -> None:
         """See `Controller.reset`."""
         self._on: Mask = np.zeros(n, dtype=bool)
-
-    def state(self) -> dict[str, Any]:
-        """See `Remembers.state`."""
-        return saved(self, self._memory)
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """See `Remembers.restore`."""
-        put_back(self, self._memory, state)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """See `Controller.act`."""

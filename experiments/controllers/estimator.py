@@ -1,14 +1,13 @@
 """What a run knows of one vial: a Kalman filter for OD, growth rate, pump gain and what temperature does to growth."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
 from envs.task import EnvConfig
-from experiments.controllers.base import Array, Mask, put_back, saved, usable
+from experiments.controllers.base import Array, Mask, usable
 
 __all__ = ["LOWEST_OD", "Estimator", "EstimatorConfig"]
 
@@ -19,10 +18,6 @@ TREND_WEIGHT = 0.4  # of the newest surprise in their running mean
 TREND_SD = (TREND_WEIGHT / (2.0 - TREND_WEIGHT)) ** 0.5  # of that mean while the model holds
 CALM = 1.5  # a mean within so many of its sd is no sign of a change
 LOG_OD, MU, GAIN, WARMTH = range(4)
-MEMORY = (
-    "mean", "cov", "_minute", "_thermometer", "_warm", "_first_warm", "_given_ml", "_idle_min", "_heard", "_noise",
-    "_learned", "_far", "_far_surprise", "_trend",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -90,6 +85,11 @@ class Estimator:
 
     Args: config: beliefs and parts; model: mu, tau, control period and largest pump rate, the first guess.
     """
+
+    remembers = (
+        "mean", "cov", "minute", "thermometer", "warm", "first_warm", "given_ml", "idle_min", "heard", "noise",
+        "learned", "far", "far_surprise", "trend",
+    )  # fmt: skip
 
     def __init__(self, config: EstimatorConfig, model: EnvConfig) -> None:
         self.config, self.model = config, model
@@ -199,14 +199,6 @@ class Estimator:
         weight = 1.0 / np.minimum(self._learned[idx] + 5.0, self.config.noise_memory)
         level = self._noise[idx] + weight * (np.clip(observed, 0.0, NOISE_RANGE[1]) - self._noise[idx])
         self._noise[idx] = np.clip(level, *NOISE_RANGE)
-
-    def state(self) -> dict[str, Any]:
-        """See `Remembers.state`."""
-        return saved(self, MEMORY)
-
-    def restore(self, state: object) -> None:
-        """See `Remembers.restore`."""
-        put_back(self, MEMORY, state)
 
     @property
     def gain(self) -> Array:

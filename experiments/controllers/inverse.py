@@ -1,13 +1,12 @@
 """Inverse control on the estimator: the pump rate that puts the next reading on the setpoint."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from conf.schema import check, part, setting
 from envs.task import EnvConfig
-from experiments.controllers.base import Array, Mask, put_back, saved, usable
+from experiments.controllers.base import Array, Mask, usable
 from experiments.controllers.estimator import Estimator, EstimatorConfig
 
 __all__ = ["Inverse", "InverseConfig"]
@@ -31,6 +30,8 @@ class Inverse:
 
     Args: config: the filter's beliefs; model: mu, tau, control period and largest pump rate, the first guess.
     """
+
+    remembers = ("estimator", "rate")
 
     def __init__(self, config: InverseConfig, model: EnvConfig) -> None:
         self.model = model
@@ -58,15 +59,6 @@ class Inverse:
     def dosed(self, volume_ml: Array) -> None:
         """See `Accounts.dosed`."""
         self.estimator.dosed(volume_ml)
-
-    def state(self) -> dict[str, Any]:
-        """See `Remembers.state`."""
-        return {"estimator": self.estimator.state(), **saved(self, ("_rate",))}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """See `Remembers.restore`."""
-        self.estimator.restore(state.get("estimator"))
-        put_back(self, ("_rate",), state)
 
     def explain(self) -> dict[str, Array]:
         """See `Estimator.explain`."""

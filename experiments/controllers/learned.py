@@ -9,7 +9,7 @@ from conf.schema import build, check, setting
 from dqn.policy import RELATIVE, Policy
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
-from experiments.controllers.base import Array, Controller, Mask, put_back, saved, usable
+from experiments.controllers.base import Array, Controller, Mask, usable
 from experiments.controllers.estimator import LOWEST_OD, Estimator, EstimatorConfig
 
 __all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned"]
@@ -87,7 +87,7 @@ class RelativeController:
       largest pump rate; mu and tau are where the estimator begins. bounds: of the certificate; None: nobody supervises.
     """
 
-    _memory = ("_rate", "_q", "_seen", "_supervised")
+    remembers = ("estimator", "rate", "q", "seen", "supervised")
 
     def __init__(
         self, policy: Policy, estimator: EstimatorConfig, model: EnvConfig, bounds: EstimateBounds | None = None
@@ -140,15 +140,6 @@ class RelativeController:
     def dosed(self, volume_ml: Array) -> None:
         """See `Accounts.dosed`."""
         self.estimator.dosed(volume_ml)
-
-    def state(self) -> dict[str, Any]:
-        """See `Remembers.state`."""
-        return {"estimator": self.estimator.state(), **saved(self, self._memory)}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """See `Remembers.restore`."""
-        self.estimator.restore(state.get("estimator"))
-        put_back(self, self._memory, state)
 
     def explain(self) -> dict[str, Array]:
         """What the policy saw, how sure it was, and the estimates behind it, each (N,)."""

@@ -1,14 +1,13 @@
 """Model predictive control of OD on the training model, solved by particle swarm or by gradient."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
 from conf.schema import check, part, setting
 from envs.task import EnvConfig
-from experiments.controllers.base import Array, Mask, put_back, saved, usable
+from experiments.controllers.base import Array, Mask, usable
 from experiments.controllers.pso import SwarmConfig, minimise
 
 __all__ = ["Mpc", "MpcConfig", "Problem"]
@@ -136,7 +135,7 @@ class Mpc:
     Args: config: horizon, penalty, solver; model: mu, tau, control period, integrator and the largest pump rate.
     """
 
-    _memory = ("_moves", "_predicted", "_rate")
+    remembers = ("moves", "predicted", "rate", "rngs")  # with the swarms' random streams
 
     def __init__(self, config: MpcConfig, model: EnvConfig) -> None:
         self.config, self.model = config, model
@@ -149,22 +148,6 @@ class Mpc:
         self._predicted = np.full((n, self.config.horizon), np.nan)
         self._rngs = np.random.default_rng(self.config.seed).spawn(n)
         self._rate = np.zeros(n)
-
-    def state(self) -> dict[str, Any]:
-        """See `Remembers.state`; with the swarms' random streams."""
-        return saved(self, self._memory) | {"rngs": [rng.bit_generator.state for rng in self._rngs]}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """See `Remembers.restore`."""
-        put_back(self, self._memory, state)
-        streams = state.get("rngs")
-        if not isinstance(streams, list) or len(streams) != len(self._rngs):
-            raise ValueError(f"controller.rngs: {str(streams)[:40]}, expected {len(self._rngs)} random streams")
-        for rng, stored in zip(self._rngs, streams, strict=True):
-            try:
-                rng.bit_generator.state = stored
-            except (TypeError, ValueError, KeyError) as error:
-                raise ValueError(f"controller.rngs: no state of a random stream ({error})") from None
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """See `Controller.act`."""

@@ -1,14 +1,13 @@
 """PI control of OD: the Chi.Bio's on-board law as it is, and one that is tuned."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from conf.schema import check, setting
 from envs.bench import Bench
 from envs.task import MAX_PUMP_RATE, EnvConfig
-from experiments.controllers.base import Array, Mask, put_back, saved, usable
+from experiments.controllers.base import Array, Mask, usable
 
 __all__ = ["ChiBioPI", "ChiBioPIConfig", "TunedPI", "TunedPIConfig"]
 
@@ -42,7 +41,7 @@ class ChiBioPI:
     Args: volume_ml: V, what the device is told of the culture, mL, (N,) or one for all.
     """
 
-    _memory = ("_cycles", "_before", "_times", "_p", "_i1", "_i2", "_rate")
+    remembers = ("cycles", "before", "times", "p", "i1", "i2", "rate")
 
     def __init__(self, config: ChiBioPIConfig, volume_ml: Array | float = Bench.volume_ml) -> None:
         self.config, self._volume_ml = config, volume_ml
@@ -54,14 +53,6 @@ class ChiBioPI:
         self._before = np.zeros(n)
         self._times = np.zeros((2, n))  # of the last two recorded cycles, older first
         self._p, self._i1, self._i2, self._rate = (np.zeros(n) for _ in range(4))
-
-    def state(self) -> dict[str, Any]:
-        """See `Remembers.state`."""
-        return saved(self, self._memory)
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """See `Remembers.restore`."""
-        put_back(self, self._memory, state)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """See `Controller.act`."""
@@ -123,7 +114,7 @@ class TunedPI:
     Args: config: the rule's two times; model: mu, tau, control period and the largest pump rate.
     """
 
-    _memory = ("_integral", "_p", "_rate")
+    remembers = ("integral", "p", "rate")
 
     def __init__(self, config: TunedPIConfig, model: EnvConfig) -> None:
         self.config, self.model = config, model
@@ -135,14 +126,6 @@ class TunedPI:
         """See `Controller.reset`."""
         self._integral = np.full(n, self.model.mu if self.config.feed_forward else 0.0)
         self._p, self._rate = np.zeros(n), np.zeros(n)
-
-    def state(self) -> dict[str, Any]:
-        """See `Remembers.state`."""
-        return saved(self, self._memory)
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """See `Remembers.restore`."""
-        put_back(self, self._memory, state)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """See `Controller.act`."""

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from conf.schema import check, setting
 from envs.scenario import Scenario
 from experiments.composition.base import Array, Mask, Wanted
 from experiments.composition.program import Program
-from experiments.controllers.base import put_back, saved
+from hardware.memory import Remembers
 from hardware.reactor import Measurement
 from hardware.safety.interlock import Interlock
 
@@ -58,7 +58,7 @@ def program_of(schedule: Scenario) -> Program:
     return Program(tuple(math.nan if r is None else r for r in ratios), schedule.minutes)
 
 
-class Keeper(Protocol):
+class Keeper(Remembers, Protocol):
     """What is asked of a controller of the composition, structurally; arrays (N,)."""
 
     def reset(self, n: int) -> None:
@@ -79,14 +79,6 @@ class Keeper(Protocol):
 
     def explain(self) -> dict[str, Array]:
         """The estimate behind the last target: ratio, ratio_low, ratio_high and more."""
-        ...
-
-    def state(self) -> dict[str, Any]:
-        """Everything that `reset` forgets, as plain numbers and lists; None stands for nan."""
-        ...
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue as saved. Raises: ValueError naming what is missing or does not fit."""
         ...
 
 
@@ -112,7 +104,7 @@ class Composition:
       recording.
     """
 
-    _memory = ("_goal", "_best", "_nearer_min", "_narrow_min")
+    remembers = ("controller", "goal", "best", "nearer_min", "narrow_min")
 
     def __init__(
         self,
@@ -206,14 +198,3 @@ class Composition:
     def dosed(self, volume_ml: Array) -> None:
         """What went in, mL, (N,)."""
         self.controller.dosed(volume_ml)
-
-    def state(self) -> dict[str, Any]:
-        """The controller's memory and that of the warnings, as plain values."""
-        return {"controller": self.controller.state(), **saved(self, self._memory)}
-
-    def restore(self, state: Any) -> None:
-        """Continue as saved. Raises: ValueError naming what is missing or does not fit."""
-        if not (isinstance(state, dict) and isinstance(state.get("controller"), dict)):
-            raise ValueError(f"composition: {str(state)[:40]}, expected keys and values")
-        put_back(self, self._memory, state)
-        self.controller.restore(state["controller"])

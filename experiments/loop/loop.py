@@ -11,15 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.scenario import Scenario
-from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Remembers, Watches
+from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Watches
 from experiments.loop.composition import Composition
 from experiments.loop.progress import Progress
 from experiments.loop.supply import Supply
+from hardware import memory
+from hardware.memory import Remembers
 from hardware.reactor import Command, KeepsLevels, Reactor, Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock, Verdict
 
 __all__ = ["ClosedLoop", "Step"]
+
+WRONG = "{key}: {value}, expected a list of {what}"
+OWN = memory.Words("{value}, expected keys and values", WRONG, WRONG, "{key} is for {k} reactors, this run has {n}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +85,8 @@ class ClosedLoop:
       composition: decides on the temperature where a share is asked for; None: the schedules do everywhere.
     Raises: ValueError for another number of schedules than of reactors.
     """
+
+    remembers = ("began", "done", "stopped")
 
     def __init__(
         self,
@@ -226,48 +233,29 @@ class ClosedLoop:
 
     def position(self, n: int) -> dict[str, Any]:
         """What a decision for reactor n has to keep of where its schedule stands; plain numbers."""
-        return {"began": float(self.began[n]), **self.progress.row(n), **self.supply.row(n)}
-
-    def take(self, n: int, position: Mapping[str, Any]) -> None:
-        """Put reactor n where a decision kept it. Raises: ValueError naming what does not fit."""
-        began = position.get("began")
-        if began is not None and not isinstance(began, int | float):
-            raise ValueError(f"began: {str(began)[:40]}, expected a number")
-        self.began[n] = np.nan if began is None else began
-        self.progress.take(n, position)
-        self.supply.take(n, position)
+        return {"began": float(self.began[n]), **memory.row(self.progress, n), **memory.row(self.supply, n)}
 
     def state(self) -> dict[str, Any]:
         """Where each reactor's schedule, the interlock and the controllers stand; plain numbers and lists."""
-        known = {"began": self.began, "done": self.done, "stopped": self.stopped}
-        state = {**{key: values.tolist() for key, values in known.items()}, "interlock": self.interlock.state()}
-        state |= self.progress.state() | self.supply.state()
-        state |= {} if self.composition is None else {"composition": self.composition.state()}
-        return state | ({"controller": self.controller.state()} if isinstance(self.controller, Remembers) else {})
+        state = memory.save(self) | {"interlock": self.interlock.state()}
+        state |= {key: found for key, part in self._rows.items() if (found := memory.rows(part))}
+        state |= {} if self.composition is None else {"composition": memory.save(self.composition)}
+        return state | ({"controller": memory.save(self.controller)} if isinstance(self.controller, Remembers) else {})
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit.
 
         A state without `controller` is of a version that did not save it: then the controller begins anew.
         """
-        number = (int, float, type(None))
-        for key, kinds, what in (
-            ("began", number, "numbers"), ("done", bool, "true or false"), ("stopped", bool, "true or false")
-        ):  # fmt: skip
-            values = state.get(key, "missing")
-            if not (isinstance(values, list) and all(isinstance(value, kinds) for value in values)):
-                raise ValueError(f"{key}: {str(values)[:40]}, expected a list of {what}")
-            if len(values) != len(self.done):
-                raise ValueError(f"{key} is for {len(values)} reactors, this run has {len(self.done)}")
-        self.began = np.array(state["began"], dtype=np.float64)
-        self.done = np.array(state["done"], dtype=np.bool_)
-        self.stopped = np.array(state["stopped"], dtype=np.bool_)
-        self.progress.restore(state.get("steps", "missing"))
-        self.supply.restore(state.get("supply", "missing"))
+        memory.restore(self, state, OWN)
+        for key, part in self._rows.items():
+            memory.restore_rows(part, state.get(key, "missing"), key)
         self.interlock.restore(state.get("interlock", "missing"))
         if self.composition is not None:
-            self.composition.restore(state.get("composition", "missing"))
+            memory.restore(self.composition, state.get("composition", "missing"), memory.words("composition"))
         if isinstance(self.controller, Remembers) and "controller" in state:
-            if not isinstance(state["controller"], dict):
-                raise ValueError(f"controller: {str(state['controller'])[:40]}, expected keys and values")
-            self.controller.restore(state["controller"])
+            memory.restore(self.controller, state["controller"], memory.words("controller"))
+
+    @property
+    def _rows(self) -> dict[str, Remembers]:
+        return {"steps": self.progress, "supply": self.supply}

@@ -1,7 +1,6 @@
 """Where each reactor stands in its own schedule, whose steps may end before their longest time."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +29,7 @@ class Progress:
     `settled_band` times the setpoint at every believed sample of `settled_min`, counted anew in every step.
 
     Attributes: edges, start of each step and end of the last, min since the schedule began, (N, P + 1), inf behind the
-    last. conditional, whether any step has a condition.
+    last. conditional, whether any step has a condition; remembers, nothing where none has.
     """
 
     def __init__(self, schedules: Sequence[Scenario]) -> None:
@@ -41,6 +40,7 @@ class Progress:
         width = int(self._counts.max())
         self.conditions = Conditions([[*s.until, *[None] * (width - len(s.until))] for s in schedules])
         self.conditional = self.conditions.any
+        self.remembers = ("edges", "within_since", "judged_at") if self.conditional else ()
         self._band = np.array([s.settled_band for s in schedules])
         self._settled_min = np.array([s.settled_min for s in schedules])
         self.edges = _padded([s.edges.tolist() for s in schedules], np.inf)
@@ -96,38 +96,8 @@ class Progress:
         why = [CONDITION if e else TIME for e in early]
         return list(zip(edges[:-1].tolist(), edges[1:].tolist(), why, strict=True))
 
-    def row(self, n: int) -> dict[str, Any]:
-        """What a decision for reactor n has to keep, so that a kill after it forgets nothing; plain numbers."""
-        if not self.conditional:
-            return {}
-        edges, times = (
-            self.edges[n, : self._counts[n] + 1],
-            {"within_since": self._within_since, "judged_at": self._judged_at},
-        )
-        return {"edges": edges.tolist(), **{key: float(minute[n]) for key, minute in times.items()}}
-
-    def take(self, n: int, row: Mapping[str, Any]) -> None:
-        """Put reactor n where `row` was. Raises: ValueError naming what is missing or does not fit."""
-        if not self.conditional:
-            return
-        try:
-            edges = np.array(row["edges"], dtype=np.float64)
-            since, judged = (float("nan") if row[k] is None else float(row[k]) for k in ("within_since", "judged_at"))
-        except (KeyError, TypeError, ValueError):
-            raise ValueError(f"steps: {str(row)[:60]}, expected edges, within_since and judged_at") from None
-        if edges.shape != (self._counts[n] + 1,) or not (np.diff(edges) > 0.0).all() or edges[0] != 0.0:
-            raise ValueError(f"steps: edges {str(row['edges'])[:60]}, expected {self._counts[n] + 1} rising from 0")
-        self.edges[n, : edges.size], self._within_since[n], self._judged_at[n] = edges, since, judged
-
-    def state(self) -> dict[str, Any]:
-        """Every reactor's `row`; nothing where no step has a condition."""
-        return {"steps": [self.row(n) for n in range(self._counts.size)]} if self.conditional else {}
-
-    def restore(self, state: Any) -> None:
-        """Continue as saved. Raises: ValueError as `take`."""
-        if not self.conditional:
-            return
-        if not (isinstance(state, list) and len(state) == self._counts.size):
-            raise ValueError(f"steps: {str(state)[:40]}, expected one entry for each of {self._counts.size} reactors")
-        for n, row in enumerate(state):
-            self.take(n, row if isinstance(row, Mapping) else {})
+    def resumed(self) -> None:
+        """Refuse edges that were put back and cannot be. Raises: ValueError."""
+        for edges in (self.edges[n, : self._counts[n] + 1] for n in range(self._counts.size)):
+            if edges[0] != 0.0 or not (np.diff(edges) > 0.0).all():
+                raise ValueError(f"steps: edges {str(edges.tolist())[:60]}, expected {edges.size} rising from 0")

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.controllers.base import Accounts, Remembers
+from experiments.controllers.base import Accounts
 from experiments.loop.loop import ClosedLoop, Step
 from hardware.errors import RecordingError
+from hardware.memory import Remembers
 from hardware.reactor import Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import kinds_of
@@ -241,8 +242,8 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
     state = load_state(path)
     doses = [dose for dose in dosed(journal.rows) if dose.n >= state["journal_row"]]
     try:
-        loop.restore(state)
-        _catch_up(loop, [row for row in journal.rows if row["n"] >= state["journal_row"]])
+        newer = [row for row in journal.rows if row["n"] >= state["journal_row"]]
+        loop.restore(_caught_up(state, newer, list(loop.reactors.names)))
     except ValueError as error:
         raise _no_state(path, str(error)) from None
     if isinstance(loop.controller, Remembers) and "controller" not in state:
@@ -272,15 +273,16 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
     log.info("resumed at minute %.1f; %d dose(s) booked from the journal", minute, len(doses))
 
 
-def _catch_up(loop: ClosedLoop, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Put every schedule where the newest decision left it that the saved state does not know of.
-
-    Raises: ValueError for a decision that does not fit.
-    """
-    names = list(loop.reactors.names)
+def _caught_up(state: dict[str, Any], rows: Sequence[Mapping[str, Any]], names: list[str]) -> dict[str, Any]:
+    """The state with every schedule where the newest decision left it that the state does not know of."""
+    found = dict(state)
     for row in rows:
         if row["kind"] == "decision" and isinstance(row.get("position"), Mapping) and row.get("reactor") in names:
-            loop.take(names.index(row["reactor"]), row["position"])
+            n, position = names.index(row["reactor"]), row["position"]
+            for key, new in (("began", position.get("began", "missing")), ("steps", position), ("supply", position)):
+                if isinstance(known := found.get(key), list) and n < len(known):
+                    found[key] = [*known[:n], new, *known[n + 1 :]]
+    return found
 
 
 def _put_off(rows: Sequence[Mapping[str, Any]], loop: ClosedLoop) -> Array:

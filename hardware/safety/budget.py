@@ -1,7 +1,6 @@
 """What may be fed: the ledger of feed and level, and the limits on a proposal."""
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -20,6 +19,8 @@ class FeedBudget:
       overflow, mL, shape (N,).
     Attributes: fed_ml, since the run began; volume_ml, in the vial by this ledger; both of shape (N,).
     """
+
+    remembers = ("volume_ml", "fed_ml", "_hour", "_minute", "_dose_s", "_dose_ml", "_owed_ml", "_unusable")
 
     def __init__(self, config: SafetyConfig, bench: Bench, tube_ml: Array, full_ml: Array) -> None:
         self._config, self._bench, n = config, bench, len(tube_ml)
@@ -99,20 +100,3 @@ class FeedBudget:
         self._owed_ml = np.where(dosed, 0.0, self._owed_ml)
         level = np.maximum(self.volume_ml + feed - waste, self._tube_ml)
         self.volume_ml = np.where(waste != 0.0, level, self.volume_ml + feed)
-
-    def state(self) -> dict[str, Array]:
-        """What it remembers."""
-        return {
-            "volume_ml": self.volume_ml, "fed_ml": self.fed_ml,
-            "_hour": self._hour, "_minute": self._minute,
-            "_dose_s": self._dose_s, "_dose_ml": self._dose_ml,
-            "_owed_ml": self._owed_ml, "_unusable": self._unusable,
-        }  # fmt: skip
-
-    def restore(self, state: Mapping[str, Array]) -> None:
-        """Continue as saved; a dose without a time (nan) was never given."""
-        self.volume_ml, self.fed_ml = state["volume_ml"], state["fed_ml"]
-        self._hour, self._minute = state["_hour"], state["_minute"]
-        self._dose_s = np.where(np.isnan(state["_dose_s"]), -math.inf, state["_dose_s"])
-        self._dose_ml = state["_dose_ml"]
-        self._owed_ml, self._unusable = state["_owed_ml"], state["_unusable"]

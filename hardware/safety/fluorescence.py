@@ -1,7 +1,6 @@
 """What each reading of fluorescence says by itself: whether a working sensor can have given it."""
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -17,6 +16,8 @@ class Light:
 
     Args: n: number of reactors; config: limits.
     """
+
+    remembers = added = ("_light", "_light_repeats", "_light_s")
 
     def __init__(self, n: int, config: SafetyConfig) -> None:
         self._config = config
@@ -56,14 +57,6 @@ class Light:
         repeats = np.where(fresh, np.where(counts == self._light, self._light_repeats + 1, 0), self._light_repeats)
         inside = (counts >= c.light_min) & (counts <= c.raw_max)  # not nan
         return np.asarray(fresh & inside & (repeats < c.frozen_light - 1), dtype=np.bool_), repeats
-
-    def state(self) -> dict[str, Array]:
-        """What it remembers."""
-        return {"_light": self._light, "_light_repeats": self._light_repeats, "_light_s": self._light_s}
-
-    def restore(self, state: Mapping[str, Array]) -> None:
-        """Continue as saved."""
-        self._light, self._light_repeats, self._light_s = (state[key] for key in self.state())
 
 
 def _words(counts: float, repeats: float) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.bench import Bench
+from hardware import memory
 from hardware.reactor import Array, Mask, Measurement, Receipt
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import DONE, REMEDIES, WORDS, Response, SafetyConfig
@@ -25,8 +26,10 @@ from hardware.safety.unexplained_change import UnexplainedChange
 
 __all__ = ["Interlock", "Verdict", "kinds_of"]
 
-ADDED = (  # to the saved state of earlier versions
-    "_helpless_od", "_eased", "_light", "_light_repeats", "_light_s", "_since_low_ml",
+SAID = memory.Words(
+    "saved interlock: {value}, expected its fields", "saved interlock: {key} = {value}: expected {what}",
+    "saved interlock: {key} has the shape {found}, expected {shape}",
+    "saved interlock is for {k} reactors, this run has {n}",
 )  # fmt: skip
 
 
@@ -57,6 +60,8 @@ class Interlock:
       what a vial holds, one for all or (N,).
     Attributes: budget, the ledger of feed and level.
     """
+
+    remembers = ("_hold_until_s", "_hold_kind", "_latched")
 
     def __init__(
         self,
@@ -204,27 +209,24 @@ class Interlock:
 
     # ------------------------------------------------------------------------------------------------------ resume
 
-    def state(self) -> dict[str, list[Any]]:
+    def state(self) -> dict[str, Any]:
         """Everything it remembers, as plain lists; times are those given to `check`, so give it run time."""
-        return {key: array.tolist() for key, array in self._arrays().items()}
-
-    def _arrays(self) -> dict[str, Array]:
-        own = {"_hold_until_s": self._hold_until_s, "_hold_kind": self._hold_kind, "_latched": self._latched}
-        return {key: array for part in self._parts for key, array in part.state().items()} | own
+        return {key: value for part in (*self._parts, self) for key, value in memory.save(part).items()}
 
     def restore(self, state: Any) -> None:
-        """The inverse of `state`, of an interlock that has not been used; None stands for nan or -inf, as in JSON.
+        """The inverse of `state`, of an interlock that has not been used.
 
         Raises: ValueError if it is of another number of reactors or another version, or damaged.
         """
-        saved = _checked(state, self._arrays(), self.n)
+        if isinstance(state, dict):
+            added = {key for part in self._parts for key in getattr(part, "added", ())}
+            if other := (added | set(state)) ^ set(self.state()):
+                raise ValueError(f"saved interlock has other fields: {', '.join(sorted(other))[:80]}")
+        for part in (*self._parts, self):
+            memory.restore(part, state, SAID)
         for key, codes in (("_latched", list(Response)), ("_hold_kind", range(-1, len(REMEDIES)))):
-            if not np.isin(saved[key], np.array(codes)).all():
+            if not np.isin(getattr(self, key), np.array(codes)).all():
                 raise ValueError(f"saved interlock: {key} = {state[key]}: no such code")
-        for part in self._parts:
-            part.restore(saved)
-        self._hold_until_s = np.where(np.isnan(saved["_hold_until_s"]), -math.inf, saved["_hold_until_s"])
-        self._hold_kind, self._latched = saved["_hold_kind"], saved["_latched"]
 
 
 @dataclass(frozen=True)
@@ -242,26 +244,3 @@ class _Reason:
 def kinds_of(text: str) -> list[str]:
     """The kinds of the reasons in a line of the interlock's."""
     return [kind for kind, colon, _ in (part.partition(": ") for part in text.split(" | ")) if colon]
-
-
-def _checked(state: Any, unused: dict[str, Array], n: int) -> dict[str, Array]:
-    """The arrays of a saved state, if they are like those of an `unused` interlock. Raises: ValueError."""
-    if not isinstance(state, dict):
-        raise ValueError(f"saved interlock: {str(state)[:40]}, expected its fields")
-    state = {key: unused[key].tolist() for key in ADDED} | state  # earlier versions did not have them
-    if set(state) != set(unused):
-        raise ValueError(f"saved interlock has other fields: {', '.join(sorted(set(state) ^ set(unused)))[:80]}")
-    saved = {}
-    for key, old in unused.items():
-        try:
-            new = np.array(state[key], dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            raise ValueError(f"saved interlock: {key} = {str(state[key])[:40]}: expected numbers") from None
-        if new.ndim and len(new) != n:
-            raise ValueError(f"saved interlock is for {len(new)} reactors, this run has {n}")
-        if new.shape != old.shape:
-            raise ValueError(f"saved interlock: {key} has the shape {new.shape}, expected {old.shape}")
-        if not np.isfinite(new).all() and np.isfinite(old).all():  # nan would pass every limit
-            raise ValueError(f"saved interlock: {key} = {str(state[key])[:40]}: expected finite numbers")
-        saved[key] = new
-    return saved

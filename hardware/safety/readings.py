@@ -2,7 +2,7 @@
 too hot."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,8 @@ class Readings:
 
     Args: stale_s, lost_s: ages of a newest sample from which it is stale, and lost.
     """
+
+    remembers = ("_fresh_s", "_seen", "_repeats")
 
     def __init__(self, n: int, config: SafetyConfig, stale_s: float, lost_s: float) -> None:
         self._config, self._stale_s, self._lost_s = config, stale_s, lost_s
@@ -85,18 +87,13 @@ class Readings:
         rows = {"stale": stale, "lost": lost, "silent": silent}
         return [Finding(kind, mask, lambda i: f"no new sample for {age[i]:.0f} s") for kind, mask in rows.items()]
 
-    def state(self) -> dict[str, Array]:
-        """What it remembers."""
-        return {"_fresh_s": self._fresh_s, "_seen": self._seen, "_repeats": self._repeats}
-
-    def restore(self, state: Mapping[str, Array]) -> None:
-        """Continue as saved, but for the age of the newest sample, which begins anew.
+    def resumed(self) -> None:
+        """The age of the newest sample begins anew.
 
         While the program was gone nobody could have seen a sample: a reactor is stale, lost or silent only once it
         had its chance.
         """
-        self._fresh_s = np.full_like(state["_fresh_s"], math.nan)
-        self._seen, self._repeats = state["_seen"], state["_repeats"]
+        self._fresh_s = np.full_like(self._fresh_s, math.nan)
 
 
 class Heat:
@@ -105,18 +102,20 @@ class Heat:
     Too hot is not a vial that still cools down to a lower target; a thermometer may read nonsense.
     """
 
+    remembers = ("_target_c", "_relief_c", "_thermo_s", "_hot", "_too_hot", "_nonsense", "_heat_off")
+
     def __init__(self, n: int, config: SafetyConfig) -> None:
         self._config = config
         self._target_c = np.full(n, math.nan)
         self._relief_c = np.zeros(n)  # how far above the target cooling down still explains
         self._thermo_s = np.full(n, math.nan)  # when the temperature was last known
         self._hot, self._too_hot, self._nonsense = np.zeros(n), np.zeros(n), np.zeros(n)  # samples in a row
-        self._off = np.zeros(n)
+        self._heat_off = np.zeros(n)
 
     @property
     def off(self) -> Mask:
         """Reactors whose heating must be off, shape (N,)."""
-        return np.asarray(self._off > 0.0)
+        return np.asarray(self._heat_off > 0.0)
 
     def check(self, reading_c: Array, fresh: Mask, target_c: Array, now: float) -> list[Finding]:
         """Judge the temperatures of the `fresh` rows that have a target (finite `target_c`), degC, shape (N,)."""
@@ -136,7 +135,7 @@ class Heat:
         self._nonsense = np.where(asked, np.where(nonsense, self._nonsense + 1, 0), self._nonsense)
         trip = known & ((self._hot >= 3) | (self._too_hot >= 2) | scalding)
         blind = asked & (self._nonsense >= 3)
-        self._off = np.where(trip | blind, 1.0, self._off)
+        self._heat_off = np.where(trip | blind, 1.0, self._heat_off)
         return [
             Finding("hot", trip, lambda i: f"{temperature[i]:.1f} degC, target {target[i]:.1f}: heating off"),
             Finding("thermometer", blind, lambda i: f"reads {reading_c[i]:.1f} degC: heating off"),
@@ -151,17 +150,3 @@ class Heat:
         relief = np.where(seen, relief, np.maximum(temperature - target, 0.0))
         self._relief_c = np.where(known, relief, self._relief_c)
         self._target_c, self._thermo_s = np.where(known, target, self._target_c), np.where(known, now, self._thermo_s)
-
-    def state(self) -> dict[str, Array]:
-        """What it remembers."""
-        return {
-            "_target_c": self._target_c, "_relief_c": self._relief_c, "_thermo_s": self._thermo_s,
-            "_hot": self._hot, "_too_hot": self._too_hot, "_nonsense": self._nonsense,
-            "_heat_off": self._off,
-        }  # fmt: skip
-
-    def restore(self, state: Mapping[str, Array]) -> None:
-        """Continue as saved."""
-        self._target_c, self._relief_c, self._thermo_s = state["_target_c"], state["_relief_c"], state["_thermo_s"]
-        self._hot, self._too_hot, self._nonsense = state["_hot"], state["_too_hot"], state["_nonsense"]
-        self._off = state["_heat_off"]

@@ -1,7 +1,6 @@
 """Changes of the OD that growth, doses and noise do not explain: steps at once, drifts by a cumulated sum."""
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -21,6 +20,12 @@ class UnexplainedChange:
     not fall at full feed). The last is no event but a condition: it lasts until the feed is no longer full, the
     setpoint is reached, or OD falls after all.
     """
+
+    remembers = (
+        "_od", "_at", "_since_ml", "_since_low_ml", "_suspect", "_suspect_at", "_suspects", "_mu",
+        "_excess", "_deficit", "_futile", "_over", "_helpless_od", "_eased",
+    )  # fmt: skip
+    added = ("_helpless_od", "_eased", "_since_low_ml")
 
     def __init__(self, config: SafetyConfig, max_rate: float, tube_ml: Array) -> None:
         self._config, self._max_rate, self._tube_ml, n = config, max_rate, tube_ml, len(tube_ml)
@@ -154,23 +159,3 @@ class UnexplainedChange:
     def dosed(self, feed_ml: Array, low_ml: Array) -> None:
         """Book what was dosed, at most and at least, mL, shape (N,)."""
         self._since_ml, self._since_low_ml = self._since_ml + feed_ml, self._since_low_ml + low_ml
-
-    def state(self) -> dict[str, Array]:
-        """What it remembers."""
-        return {
-            "_od": self._od, "_at": self._at, "_since_ml": self._since_ml, "_since_low_ml": self._since_low_ml,
-            "_suspect": self._suspect, "_suspect_at": self._suspect_at,
-            "_suspects": self._suspects, "_mu": self._mu,
-            "_excess": self._excess, "_deficit": self._deficit, "_futile": self._futile,
-            "_over": self._over, "_helpless_od": self._helpless_od, "_eased": self._eased,
-        }  # fmt: skip
-
-    def restore(self, state: Mapping[str, Array]) -> None:
-        """Continue as saved."""
-        self._od, self._at = state["_od"], state["_at"]
-        self._since_ml, self._since_low_ml = state["_since_ml"], state["_since_low_ml"]
-        self._suspect, self._suspect_at = state["_suspect"], state["_suspect_at"]
-        self._suspects, self._mu = state["_suspects"], state["_mu"]
-        self._excess, self._deficit, self._futile = state["_excess"], state["_deficit"], state["_futile"]
-        self._over = state["_over"]
-        self._helpless_od, self._eased = state["_helpless_od"], state["_eased"]

@@ -1,13 +1,10 @@
 """A composition controller for tests of the loop: it reckons the share from the temperatures it is shown."""
 
-from typing import Any
-
 import numpy as np
 
 from envs.coculture.rates import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
 from envs.coculture.task import logit, share
 from experiments.composition.base import Array, Mask, Wanted
-from experiments.controllers.base import put_back, saved
 
 
 class Reckoning:
@@ -17,7 +14,7 @@ class Reckoning:
     half_width: of the band around the share that it claims.
     """
 
-    _memory = ("_x", "_rate", "_minute", "told_ml", "looks")
+    remembers = ("x", "rate", "minute", "told_ml", "looks")
 
     def __init__(self, start: float = 0.5, half_width: float = 0.05) -> None:
         self.start, self.half_width = start, half_width
@@ -45,9 +42,3 @@ class Reckoning:
         r = share(self._x)
         band = {"ratio_low": r - self.half_width, "ratio_high": r + self.half_width}
         return {"ratio": r, **band, "bias_e": np.zeros(r.size), "bias_p": np.zeros(r.size)}
-
-    def state(self) -> dict[str, Any]:
-        return saved(self, self._memory)
-
-    def restore(self, state: dict[str, Any]) -> None:
-        put_back(self, self._memory, state)

@@ -17,6 +17,7 @@ from experiments.composition import registry
 from experiments.composition.estimator import FACTOR, LOGIT, OFFSET, CompositionEstimator, CompositionEstimatorConfig
 from experiments.composition.program import Program
 from experiments.controllers import registry as densities
+from hardware import memory
 
 NAN = float("nan")
 QUIET = CompositionEstimatorConfig(
@@ -159,13 +160,13 @@ def test_a_state_that_was_saved_goes_on_to_the_bit():
     whole, first, second = (CompositionEstimator(CompositionEstimatorConfig()) for _ in range(3))
     follow(whole, seen)
     follow(first, seen[:40])
-    second.restore(json.loads(json.dumps(first.state())))
+    memory.restore(second, json.loads(json.dumps(memory.save(first))), memory.words("estimator"))
     for k in range(40, len(seen)):
         second.watch(*(np.array([v]) for v in (*seen[k], WARM, float(k))), rows=np.array([True]))
         second.dosed(np.array([DOSE_ML]))
     np.testing.assert_array_equal(second.mean, whole.mean)
     np.testing.assert_array_equal(second.cov, whole.cov)
-    assert second.state() == whole.state()
+    assert memory.save(second) == memory.save(whole)
 
 
 def test_a_gap_is_as_many_minutes_without_readings():

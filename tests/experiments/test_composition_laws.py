@@ -12,6 +12,7 @@ from envs.coculture.task import CocultureConfig, advance, at_rest, logit, share
 from experiments.composition import registry
 from experiments.composition.base import Estimate, Wanted
 from experiments.composition.program import Program
+from hardware import memory
 
 NAN = float("nan")
 STEPS = Program((NAN, 0.3, 0.7, 0.3), (60.0, 360.0, 600.0, 600.0))
@@ -161,7 +162,7 @@ def test_every_law_goes_on_to_the_bit_from_what_it_saved():
         moves = [(m, 0.2 * np.sin(m / 7.0)) for m in range(60, 160)]
         for m, x in moves[:50]:
             whole.act(seen(x), STEPS.wanted(np.array([float(m)]), 360.0), *at(m))
-        second.restore(json.loads(json.dumps(whole.state())))
+        memory.restore(second, json.loads(json.dumps(memory.save(whole))), memory.words("law"))
         for m, x in moves[50:]:
             told = STEPS.wanted(np.array([float(m)]), 360.0)
             assert whole.act(seen(x), told, *at(m))[0] == second.act(seen(x), told, *at(m))[0], kind

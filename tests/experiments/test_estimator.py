@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from envs.task import EnvConfig
-from experiments.controllers.estimator import GAIN, LOG_OD, MEMORY, MU, Estimator, EstimatorConfig
+from experiments.controllers.estimator import GAIN, LOG_OD, MU, Estimator, EstimatorConfig
+from hardware import memory
 
 MODEL = EnvConfig(mu=0.025, tau=1 / 3)
 DEFAULT = EstimatorConfig()
@@ -214,12 +215,12 @@ def next_readings(e: Estimator) -> list[float]:
     return found
 
 
-@pytest.mark.parametrize("forgotten", ["", *MEMORY])
+@pytest.mark.parametrize("forgotten", ["", *Estimator.remembers])
 def test_everything_that_it_remembers_matters(forgotten: str) -> None:
-    bend = 0.003 if forgotten == "_trend" else 0.002  # with more of it the walks are so fast that no jump stays far
-    kept: dict[str, Any] = json.loads(json.dumps(busy(bend).state()))
+    bend = 0.003 if forgotten == "trend" else 0.002  # with more of it the walks are so fast that no jump stays far
+    kept: dict[str, Any] = json.loads(json.dumps(memory.save(busy(bend))))
     if forgotten:
-        kept[forgotten.lstrip("_")] = estimator().state()[forgotten.lstrip("_")]
+        kept[forgotten] = memory.save(estimator())[forgotten]
     e = estimator()
-    e.restore(kept)
+    memory.restore(e, kept, memory.words("estimator"))
     assert (next_readings(e) == next_readings(busy(bend))) is not bool(forgotten)

@@ -114,7 +114,7 @@ def test_repeats_of_a_dead_program_are_booked_when_they_happened_and_alarm_nobod
     np.testing.assert_allclose(booked, again, atol=0.6 * times)  # the device's period is a little longer
     volume = run.record.series("volume_ml")[0]
     assert volume.sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
-    hour = run.loop.interlock.budget.state()["_hour"][0]
+    hour = run.loop.interlock.budget._hour[0]
     assert hour.max() < 2.5  # a minute holds two repetitions at most
 
 

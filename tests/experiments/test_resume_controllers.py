@@ -18,9 +18,11 @@ from experiments.certification import certificate
 from experiments.cli import files
 from experiments.control.policies import find_policy, load_policy
 from experiments.controllers import registry
-from experiments.controllers.base import Array, Controller, Mask, Remembers
+from experiments.controllers.base import Array, Controller, Mask
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.record.recovery import load_state
+from hardware import memory
+from hardware.memory import Remembers
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
@@ -116,7 +118,8 @@ def parts(state: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
 def test_each_part_of_a_memory_is_asked_for_and_one_that_is_damaged_is_named(kind: str) -> None:
     law = controller(kind)
     law.reset(3)
-    kept = json.loads(json.dumps(law.state()))
+    assert isinstance(law, Remembers)
+    kept = json.loads(json.dumps(memory.save(law)))
     assert kept
     for *path, last in parts(kept):
         for wrong in (None, "x", [1.0], [[1.0, 2.0]] * 7):
@@ -129,7 +132,7 @@ def test_each_part_of_a_memory_is_asked_for_and_one_that_is_damaged_is_named(kin
             else:
                 part[last] = wrong
             with pytest.raises(ValueError, match=f"^controller.{last}") as caught:
-                law.restore(state)
+                memory.restore(law, state, memory.words("controller"))
             assert "\n" not in str(caught.value)
 
 
@@ -146,12 +149,14 @@ def test_a_program_that_is_stopped_takes_up_the_memory_that_it_wrote(tmp_path: P
     assert kept["estimator"]["learned"][0] > 12  # readings since the run began
     r.begin()
     assert isinstance(r.loop.controller, Remembers)
-    assert json.loads(json.dumps(r.loop.controller.state())) == kept
+    assert json.loads(json.dumps(memory.save(r.loop.controller))) == kept
     r.close()
 
 
 class Counting:
     """Asks for a fixed rate, and remembers how much it was told was dosed."""
+
+    remembers = ("told",)
 
     def __init__(self, rate: float) -> None:
         self.rate, self.told = rate, np.zeros(1)
@@ -164,12 +169,6 @@ class Counting:
 
     def dosed(self, volume_ml: Array) -> None:
         self.told = self.told + volume_ml
-
-    def state(self) -> dict[str, Any]:
-        return {"told": self.told.tolist()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.told = np.array(state["told"])
 
 
 class Cut(Rehearsal):

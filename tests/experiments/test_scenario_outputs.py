@@ -17,6 +17,7 @@ from experiments.cli import frame
 from experiments.control import assemble
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.supply import Supply
+from hardware import memory
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import SupplyConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
@@ -241,11 +242,11 @@ def test_a_saved_state_goes_on_and_a_damaged_one_is_named() -> None:
     hourly = [Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 2 mL/h",))]
     first, second = Supply(hourly, 1.2), Supply(hourly, 1.2)
     given(first, range(10))
-    second.restore(json.loads(json.dumps(first.state()))["supply"])
+    memory.restore_rows(second, json.loads(json.dumps(memory.rows(first))), "supply")
     assert given(second, range(10, 16)) == [(15.0, 3, 0.5)]
     for damaged in ("missing", [], [{}], [{"owed_ml": [1.0], "supplied_at": 0.0, "supplied_step": 0}]):
         with pytest.raises(ValueError, match="supply: "):
-            second.restore(damaged)
+            memory.restore_rows(second, damaged, "supply")
 
 
 def test_a_pump_without_a_tube_is_refused_before_anything_begins(tmp_path: Path) -> None:

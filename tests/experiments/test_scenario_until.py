@@ -12,6 +12,7 @@ from envs.scenario import Scenario
 from experiments.comparison.config import BenchmarkConfig
 from experiments.loop.progress import Progress
 from experiments.record.summary import summarise
+from hardware import memory
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
@@ -76,11 +77,11 @@ def test_what_was_counted_is_kept_and_goes_on() -> None:
     for minute in range(8):
         fed(progress, float(minute), 0.8, believed=one)
     second = Progress([replace(STEPS, until=("settled", None, None))])
-    second.restore(json.loads(json.dumps(progress.state()))["steps"])
+    memory.restore_rows(second, json.loads(json.dumps(memory.rows(progress))), "steps")
     assert [fed(second, float(m), 0.8, believed=one)[0] for m in (8, 9, 10)] == [False, False, True]
     for damaged in ("missing", [], [{"edges": [0, 5], "within_since": None}], [{"edges": [0, 5, 4, 9]}]):
         with pytest.raises(ValueError, match="steps: "):
-            second.restore(damaged)
+            memory.restore_rows(second, damaged, "steps")
 
 
 @pytest.mark.parametrize("text", ["od => 0.8", "od >= high", "OD >= 0.8", "setled", "od >= 0", "od <= 7", "time"])

@@ -556,7 +556,7 @@ def test_what_happened_a_while_ago_counts_in_its_own_minute_and_hour() -> None:
         book(second, 3661.0 + 63.0 * k)
     book(second, 3540.0)  # an hour and a minute ago
     book(first, 7200.0)
-    hour = np.array(interlock.budget.state()["_hour"])
+    hour = np.array(interlock.budget._hour)
     assert hour.sum(axis=1).tolist() == [2.0, 8.0]
     assert hour[0, 0] == 2.0
     assert hour[1].max() == 1.0

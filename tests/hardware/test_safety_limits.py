@@ -1,6 +1,7 @@
 """The four parts of the interlock against twins in plain Python, one reactor and one sample at a time, and the limits
 at their boundaries by hand."""
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 
 from envs.bench import Bench
+from hardware import memory
+from hardware.memory import Remembers
 from hardware.reactor import Fault, Measurement, Receipt, Vitals
 from hardware.safety.budget import FeedBudget
 from hardware.safety.config import REMEDIES, Response, Responses, SafetyConfig
-from hardware.safety.interlock import Interlock
+from hardware.safety.interlock import SAID, Interlock
 from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
 
@@ -29,6 +32,12 @@ def told(findings: list[Finding], rows: int = N) -> list[list[str]]:
             assert finding.text(int(i))
             out[i].append(finding.kind + ("+" if finding.cool is not None and finding.cool[i] else ""))
     return out
+
+
+def resumed(owner: Remembers, new: Any) -> Any:
+    """`new` with the memory of another, by way of a file."""
+    memory.restore(new, json.loads(json.dumps(memory.save(owner))), SAID)
+    return new
 
 
 def same(state: dict[str, np.ndarray], twins: list[Any], **names: str) -> None:
@@ -123,10 +132,9 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
         for twin, a, f, w in zip(twins, allowed, feed, waste, strict=True):
             twin.owed += a * bench.period_s
             twin.book(f, w, at)
-        same(budget.state(), twins, volume_ml="level", fed_ml="fed", _owed_ml="owed", _unusable="unusable")
+        same(vars(budget), twins, volume_ml="level", fed_ml="fed", _owed_ml="owed", _unusable="unusable")
         if rng.random() < 0.3:
-            saved, budget = budget.state(), FeedBudget(*given)
-            budget.restore({k: np.where(np.isinf(v), np.nan, v) for k, v in saved.items()})
+            budget = resumed(budget, FeedBudget(*given))
 
 
 # -- readings --------------------------------------------------------------------------------------------------------
@@ -174,8 +182,7 @@ def test_equal_readings_are_counted_over_samples_that_are_new() -> None:
         kinds += told(findings, 1)
         assert believed[0] == (bool(fresh) and kinds[-1] == [])
         if len(kinds) == 3:
-            saved, readings = readings.state(), Readings(1, C, 100.0, 180.0)
-            readings.restore(saved)
+            readings = resumed(readings, Readings(1, C, 100.0, 180.0))
     assert kinds == [[], [], [], ["frozen"], [], ["frozen"], [], [], [], []]
 
 
@@ -259,7 +266,7 @@ def test_heat_is_judged_as_sample_by_sample() -> None:
             assert told(findings) == [t.judge(r, f, g, now) for t, r, f, g in rows]
             assert heat.off.tolist() == [t.off for t in twins]
             same(
-                heat.state(),
+                vars(heat),
                 twins,
                 _relief_c="relief",
                 _target_c="target",
@@ -267,10 +274,9 @@ def test_heat_is_judged_as_sample_by_sample() -> None:
                 _hot="hot",
                 _too_hot="too_hot",
             )
-            same(heat.state(), twins, _nonsense="nonsense")
+            same(vars(heat), twins, _nonsense="nonsense")
             if rng.random() < 0.1:
-                saved, heat = heat.state(), Heat(N, C)
-                heat.restore(saved)
+                heat = resumed(heat, Heat(N, C))
 
 
 # -- changes that nothing explains -----------------------------------------------------------------------------------
@@ -387,19 +393,18 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
             takes = change.takes(od, np.full(N, 60.0 * minute), believed)
             findings = told(change.check(od, np.full(N, 60.0 * minute), believed, setpoint))
             if dt:  # a second sample of the same minute leaves the time as it was
-                assert takes.tolist() == (change.state()["_at"] == minute).tolist()
+                assert takes.tolist() == (change._at == minute).tolist()
             rows = zip(twins, od, believed, setpoint, strict=True)
             expected = [t.judge(o, minute, b, s) for t, o, b, s in rows]
             assert [sorted(kinds) for kinds in findings] == [sorted(kinds) for kinds in expected]
             seen |= {kind for kinds in expected for kind in kinds}
             same(
-                change.state(), twins, _od="od", _at="at", _since_ml="since", _suspect="suspect", _mu="mu",
+                vars(change), twins, _od="od", _at="at", _since_ml="since", _suspect="suspect", _mu="mu",
                 _suspect_at="suspect_at", _suspects="suspects", _excess="excess", _deficit="deficit",
                 _futile="futile", _over="over", _helpless_od="helpless", _eased="eased",
             )  # fmt: skip
             if rng.random() < 0.05:
-                saved, change = change.state(), UnexplainedChange(C, 0.02, np.full(N, 20.0))
-                change.restore(saved)
+                change = resumed(change, UnexplainedChange(C, 0.02, np.full(N, 20.0)))
     assert seen == {"jump", "falls", "falls+", "no_dilution+", "cannot_hold"}
 
 
