@@ -13,8 +13,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, eye_array
-from scipy.sparse.linalg import spsolve
 
 from envs.relative import RelativeConfig
 from envs.task import MAX_OD, SCORED_OD, EnvConfig, step_factors
@@ -184,6 +182,9 @@ def _solve_one(
     setpoint: float, od: Array, left: NDArray[np.intp], weight: Array, factors: Array, gamma: float
 ) -> Array:
     """V of one setpoint on the grid `od`; action a moves grid point g to between left[g, a] and left[g, a] + 1."""
+    from scipy.sparse import csr_array, eye_array
+    from scipy.sparse.linalg import spsolve
+
     n = od.size
     rows = np.arange(n)
     stage = (od[:, None] * factors - setpoint) ** 2

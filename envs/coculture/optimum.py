@@ -11,13 +11,16 @@ with s_k the setpoint in force during decision k. Greedy actions look one decisi
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from envs.coculture.rates import T_MAX, p_putida_rate
 from envs.coculture.task import CocultureConfig, advance, share
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 __all__ = ["Grid", "Transitions", "best_action", "cost_to_go", "transitions"]
 
@@ -52,7 +55,7 @@ class Transitions:
 
     axes: tuple[Array, Array, Array]
     share: Array
-    matrix: csr_array
+    matrix: "csr_array"
 
     def value_at(self, value: Array, state: Array) -> Array:
         """V at states (N, A, 3); of one program, (G,), or of one program per state, (G, N)."""
@@ -85,6 +88,8 @@ def _cell(at: Array, axis: Array) -> tuple[NDArray[np.intp], Array]:
 @lru_cache(maxsize=4)
 def transitions(config: CocultureConfig, grid: Grid = Grid()) -> Transitions:
     """The model on a grid; kept for the last few configs."""
+    from scipy.sparse import csr_array
+
     axes = grid.axes(config)
     t, m, x = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     state = np.stack([x, t, m], axis=-1)

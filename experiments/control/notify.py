@@ -20,8 +20,6 @@ from datetime import datetime
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import httpx
-
 from experiments.cli import frame
 
 __all__ = ["HOOK", "Hook", "Notifier", "hidden", "opened"]
@@ -89,6 +87,8 @@ class Hook:
             return type(error).__name__
 
     def _post(self, line: bytes) -> str:
+        import httpx
+
         headers = {"Content-Type": "application/json"}
         status = httpx.post(self._target, content=line, headers=headers, timeout=self._limit_s).status_code
         return "" if status < 300 else f"status {status}"

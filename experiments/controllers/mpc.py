@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from conf.schema import check, part, setting
 from envs.task import EnvConfig
@@ -92,6 +91,8 @@ class Problem:
 
     def by_gradient(self, start: Array) -> Array:
         """Moves by L-BFGS-B in the box [0, 1] from `start`, row by row, shape (R, H)."""
+        from scipy.optimize import minimize
+
         moves = np.empty_like(start)
         for row in range(start.shape[0]):
             one = Problem(self.start[row : row + 1], self.setpoint[row : row + 1], self.model, self.penalty)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import trim_mean
 
 __all__ = ["Configuration", "Result", "Statistics", "configurations", "curve", "label", "measures", "statistics"]
 
@@ -77,6 +76,8 @@ class Statistics:
 
 def statistics(values: Array) -> Statistics:
     """Statistics of values (n,), n >= 1. The interquartile mean is the mean of the middle half (Agarwal 2021)."""
+    from scipy.stats import trim_mean
+
     low = high = math.nan
     if values.size > 1:
         drawn = np.random.default_rng(0).choice(values, (RESAMPLES, values.size))

@@ -1,5 +1,6 @@
 """Packages of the same names elsewhere are told apart from ours before anything runs; an early Ctrl-C is one line."""
 
+import json
 import os
 import signal
 import subprocess
@@ -8,6 +9,8 @@ import time
 from pathlib import Path
 
 import pytest
+
+from experiments.__main__ import KINDS
 
 ROOT = Path(__file__).parents[2]
 EDITABLE = f"""
@@ -80,4 +83,32 @@ def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, name: str, more: lis
     said = process.communicate()[1]
     assert said == f"stopped before anything began{also}\n"
     assert process.returncode in (130, -signal.SIGINT)
+    assert not list(tmp_path.iterdir())
+
+
+COMMANDS = (*KINDS["From a recording to a reactor"], *KINDS["At the device"], "benchmark")
+SLOW = ("matplotlib", "pandas", "scipy", "tensorboard", "torch")
+REFUSED = {  # out of range; a command that has no number refuses its words in another way
+    "train": "seed=-1", "deploy": "control_min=0", "benchmark": "replicates=0", "certify": "trajectories=-1",
+    "calibrate": "gain=2", "blank": "samples=0", "calibrate_pump": "doses=0",
+}  # fmt: skip
+ASKED = """
+import contextlib, importlib, io, json, sys
+commands, slow = json.loads(sys.argv[1])
+for name, *words in commands:
+    sys.argv = [f"turbidostat {name}", *words]
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        importlib.import_module(f"experiments.{name}").main()
+    if loaded := [each for each in slow if each in sys.modules]:
+        sys.exit(f"{name} {' '.join(words)} loads {', '.join(loaded)}")
+"""
+
+
+def test_help_and_a_refusal_load_nothing_that_is_slow(tmp_path: Path) -> None:
+    """What computes, draws and trains is loaded where it is used: a slip of the pen costs no second."""
+    commands = [[name, word] for name in COMMANDS for word in ("--help", "bogus=1", REFUSED.get(name)) if word]
+    done = started(tmp_path, str(ROOT), "-c", ASKED, json.dumps([commands, SLOW]))
+    assert done.returncode == 0, done.stderr.splitlines()[-1]
+    refusals = [line for line in done.stderr.splitlines() if "error: " in line]
+    assert len(refusals) == sum(word != "--help" for _, word in commands), done.stderr
     assert not list(tmp_path.iterdir())
