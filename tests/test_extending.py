@@ -97,6 +97,28 @@ def test_the_run_folder_keeps_the_file_and_resumes_without_it(folder: Path) -> N
     assert again.returncode == 0, again.stderr
 
 
+def test_a_task_with_a_config_of_its_own_trains(tmp_path: Path) -> None:
+    """A plain dataclass that shares nothing with the configs of the program, and observations of its own."""
+    words = ["-m", "experiments.train", f"extend={ROOT / 'tests' / 'extensions' / 'level.py'}", "env=level"]
+    done = run([*words, "agent.total_steps=200", "agent.learn_start=50", "hydra.run.dir=here"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "learns env=level agent=tuned: a tank that loses 10 % in a step;" in done.stderr + done.stdout
+    assert "experiments.deploy" not in done.stderr + done.stdout  # which cannot run it
+    found = json.loads((tmp_path / "here" / "summary.json").read_text(encoding="utf-8"))
+    assert found["env_steps"] == 200
+    with np.load(tmp_path / "here" / "policy.npz") as stored:
+        assert json.loads(str(stored["metadata"]))["observation"] == ["level", "goal"]
+        np.testing.assert_array_equal(stored["actions"], np.linspace(0.0, 0.2, 5))
+    events = b"".join(path.read_bytes() for path in (tmp_path / "here").rglob("events*"))
+    assert b"leak" in events
+    for flag, expected in ((["--help"], "share of the level that is lost"), (["--cfg", "job"], "leak: 0.1")):
+        shown = run([*words, *flag], tmp_path)
+        assert shown.returncode == 0, shown.stderr
+        assert expected in shown.stdout
+    wrong = run([*words, "env.leak=2"], tmp_path)
+    assert wrong.stderr == "error: env.leak = 2.0: allowed 0 to 1\n"
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -105,11 +105,12 @@ class Events:
     def hyper_parameters(self, values: Mapping[str, float | str], folder: Path, part: str = "") -> None:
         """A row of TensorBoard's HPARAMS table; its results are the last values of the tags in `METRICS`.
 
-        Args: values: by the names in `PARAMETERS`. folder: run folder, whose last two names are those of the row; rows
-          of one name would be averaged. part: of it, where a run has several rows.
+        Args: values: by the names in `PARAMETERS`, or by names of one's own. folder: run folder, whose last two names
+          are those of the row; rows of one name would be averaged. part: of it, where a run has several rows.
         """
         name = "/".join([*folder.resolve().parts[-2:], *([part] if part else [])])
-        columns = [_column(key, column) for key, column in PARAMETERS.items()]
+        own = {key: Column(key, "of the task", True) for key in values if key not in PARAMETERS}
+        columns = [_column(key, column) for key, column in (PARAMETERS | own).items()]
         metrics = [
             api_pb2.MetricInfo(name=api_pb2.MetricName(tag=tag), display_name=title, description=described(tag))
             for tag, title in METRICS.items()
@@ -139,7 +140,7 @@ def _chart(title: str, chart: Chart) -> layout_pb2.Chart:
 
 def _ordered(key: str) -> str:
     """A name that sorts as `PARAMETERS` are written; its title is what is shown."""
-    return f"{list(PARAMETERS).index(key)}_{key}"
+    return f"{[*PARAMETERS, key].index(key)}_{key}"
 
 
 def _column(key: str, column: Column) -> api_pb2.HParamInfo:

@@ -39,7 +39,7 @@ def trainer(task: Task, agent: DQNConfig, seeds: Sequence[int], device: str = "c
     """One group of agents with the given seeds, each in its own copy of the environment; one record per episode."""
     own = streams(seeds, (*STREAMS, "env"))
     learner = DQNAgent(agent, len(task.observation), task.actions.size, own, task.hindsight(agent), device)
-    return Trainer(task.copies(own["env"]), learner, interval=task.config.episode_steps)
+    return Trainer(task.copies(own["env"]), learner, interval=task.episode_steps)
 
 
 def act_with(network: QNetwork, flat: torch.Tensor) -> Act:

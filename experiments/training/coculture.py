@@ -1,6 +1,6 @@
 """The composition of two species for a training run: state and program in, a temperature out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -43,13 +43,20 @@ class Coculture:
 
     unit = "of the share"
     arrived = 0.02
+    scalars: Mapping[str, float] = {}
     steady_unit = 0.02
     """Twice what an estimate is good for: the regret decides, unless a share rests clearly beside its setpoint."""
 
     def __init__(self, config: CocultureConfig) -> None:
         self.config = config
         self.regret_unit = 5.0 if config.preview_min else 0.5  # where planning pays there is more to lose
-        self.steps = config.episode_steps
+        self.steps = self.episode_steps = config.episode_steps
+        ahead, law = "no change known ahead", "dqn"
+        if config.preview_min:
+            ahead, law = f"the next setpoint known {config.preview_min:g} min ahead", "dqn_preview"
+        every = f"a decision every {config.control_min:g} min"
+        self.description = f"shares of two species by temperature, {every}, {ahead}"
+        self.tried = f"plant=coculture scenario=ratio_steps composition={law} composition_policy={{}}"
         self.steady_steps = max(1, config.episode_steps // 6)
         self.observation: tuple[str, ...] = COCULTURE_PREVIEW if config.preview_min else COCULTURE
         self.actions = config.targets()

@@ -1,6 +1,6 @@
 """The paper's task for a training run: OD and setpoint in, a pump rate out, on a model with a known mu and tau."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache
 from typing import Any
@@ -33,10 +33,13 @@ class Density:
     steady_steps = 30
     regret_unit, steady_unit = 0.5, 0.003
     """Half a per cent of cost is not seen in a recording, and 0.003 OD is the noise of the sensor."""
+    tried = "controller=dqn policy={}"
 
     def __init__(self, config: EnvConfig) -> None:
         self.config = config
-        self.steps = config.episode_steps
+        self.steps = self.episode_steps = config.episode_steps
+        self.description = f"mu {config.mu:g} 1/min, tau {config.tau:.4g}, a decision every {config.control_min:g} min"
+        self.scalars: Mapping[str, float] = {"mu": float(config.mu), "tau": float(config.tau)}
         self.actions = config.pump_rates()
         self.limits = (np.full(2, -np.inf), np.full(2, np.inf))
         self._factors = step_factors(config)

@@ -1,6 +1,6 @@
 """The task in relative coordinates for a training run: error and growth share in, a share of the largest rate out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
@@ -32,9 +32,13 @@ class Relative:
     """Its own steady error is half the spacing of the levels and hardly tells policies apart: regret does."""
 
     steps, steady_steps = 100, 30
+    scalars: Mapping[str, float] = {}
+    tried = "controller=dqn policy={}"
 
     def __init__(self, config: RelativeConfig) -> None:
         self.config = config
+        self.episode_steps = config.episode_steps
+        self.description = "growth takes {:g} to {:g} of the largest pump rate".format(*config.growth_shares)
         self.actions = config.levels()
         # Beyond the largest error of training the policy sees that error: full pump or none is right there too.
         span = config.largest_error - 0.05

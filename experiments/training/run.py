@@ -12,11 +12,12 @@ import torch
 from dqn import policy
 from dqn.checkpoint import CheckpointError
 from dqn.export import export
+from dqn.policy import Policy
 from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
 from experiments.controllers.estimator import EstimatorConfig
 from experiments.reporting import charts
-from experiments.training import tasks, words
+from experiments.training import announcements, tasks
 from experiments.training.config import TrainConfig, read_env_file
 from experiments.training.evaluation import Score
 from experiments.training.session import Session
@@ -81,8 +82,8 @@ def _finish(session: Session) -> None:
     c, agents, best = session.config, session.agents, session.best
     report, kept, last = session.report()
     myopic = report(session.task.myopic)
-    path = _export(session, kept)
-    _figures(session, path)
+    path, exported = _export(session, kept)
+    _figures(session, exported)
     summary = {
         "seeds": list(session.seeds),
         "env_steps": agents.steps,
@@ -106,9 +107,9 @@ def _finish(session: Session) -> None:
         "config_hash": fingerprint(c),
     }
     files.write_json(session.folder / "summary.json", summary)
-    words.results(session.writer, agents.steps, kept, session.task, session.seeds)
+    announcements.results(session.writer, agents.steps, kept, session.task, session.seeds)
     spent = f"{agents.steps} steps and {agents.updates} updates of each agent in {session.seconds:.1f} s"
-    words.ended(session.folder, c, session.task, kept, myopic, spent, path)
+    announcements.ended(session.folder, session.task, kept, myopic, spent, path)
 
 
 def fingerprint(config: TrainConfig) -> str:
@@ -117,11 +118,12 @@ def fingerprint(config: TrainConfig) -> str:
     return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def _export(session: Session, score: Score) -> Path:
-    """Every agent's best policy under policies/, the best agent's as policy.npz."""
+def _export(session: Session, score: Score) -> tuple[Path, Policy]:
+    """Every agent's best policy under policies/, the best agent's as policy.npz, which is returned with its file."""
     c, best, task = session.config, session.best, session.task
     folder = session.folder / "policies"
     folder.mkdir(exist_ok=True)
+    exported = []
     for i, seed in enumerate(session.seeds):
         metadata = {
             "seed": seed,
@@ -135,21 +137,21 @@ def _export(session: Session, score: Score) -> Path:
             "regret_pct": float(score.regret_pct[i]),
             "steady_abs_error": float(score.steady_abs_error[i]),
         }
-        exported = export(session.agents.network, i, best.weights, task.actions, task.limits, metadata)
-        policy.save(folder / f"seed{seed:04d}.npz", exported)
-        if i == int(best.merit.argmin()):
-            policy.save(session.folder / "policy.npz", exported)
-    return session.folder / "policy.npz"
+        exported.append(export(session.agents.network, i, best.weights, task.actions, task.limits, metadata))
+        policy.save(folder / f"seed{seed:04d}.npz", exported[i])
+    best_of_all, path = exported[int(best.merit.argmin())], session.folder / "policy.npz"
+    policy.save(path, best_of_all)
+    return path, best_of_all
 
 
-def _figures(session: Session, policy_path: Path) -> None:
+def _figures(session: Session, exported: Policy) -> None:
     """Learning curves, policy map and example trajectories, as files and in TensorBoard."""
     best = session.best
     history = np.array([[step, *regret] for step, regret, _ in best.history])
     returns = np.array(session.returns)
     ended = ~np.isnan(returns).all(axis=1)  # no episode ends in what is left over of the last interval
     curves = (returns[ended], history[:, 0], history[:, 1:], best.step.astype(float))
-    drawn = {"learning": charts.learning(*curves), **session.task.figures(policy.load(policy_path))}
+    drawn = {"learning": charts.learning(*curves), **session.task.figures(exported)}
     for name, figure in drawn.items():
         path = charts.save(figure, session.folder / "figures", name)
         session.writer.events.picture(f"figures/{name}", path, session.agents.steps)

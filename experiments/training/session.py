@@ -19,7 +19,7 @@ from dqn import checkpoint
 from dqn.trainer import TrainRecord
 from experiments.cli import stop
 from experiments.reporting.tensorboard import PopulationWriter
-from experiments.training import build, tasks, words
+from experiments.training import announcements, build, tasks
 from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Evaluation, Score
 from experiments.training.tasks import Task
@@ -113,7 +113,7 @@ class Session:
         if resume:
             self._restore(checkpoint.load(folder / "checkpoint.pt"))
         self.writer = PopulationWriter(folder, self.seeds, self.agents.steps)
-        words.show(self.writer, config, self.seeds, folder)
+        announcements.show(self.writer, config, self.task, self.seeds, folder)
 
     def evaluate(self, step: int) -> Score:
         """Score the greedy policies on the selection grid, keep the best, log."""
@@ -135,7 +135,7 @@ class Session:
 
     @property
     def ended(self) -> str:
-        """Why training ended, in words."""
+        """Why training ended, in announcements."""
         if not self.met():
             return "agent.total_steps"
         limits = f"{self.task.regret_unit:g} % regret and {self.task.steady_unit:g} {self.task.unit} steady error"
@@ -146,7 +146,7 @@ class Session:
         if not record.updates and record.step < self.config.agent.total_steps:
             return f"untrained until step {self.config.agent.learn_start}"
         score, kept = self.evaluate(record.step), (self.best.regret, self.best.steady)
-        return words.progress(record.step, self.config.agent.total_steps, self.seconds, score, kept, self.task)
+        return announcements.progress(record.step, self.config.agent.total_steps, self.seconds, score, kept, self.task)
 
     def report(self) -> tuple[Evaluation, Score, Score]:
         """The reported grid with the scores of the kept policies and of the last iterates on it."""
@@ -198,7 +198,7 @@ class Session:
         total, last = c.agent.total_steps, self.agents.steps
         told = max(c.eval_every, total // TOLD)
         started, earlier = time.perf_counter(), self.seconds
-        words.began(c, self.task, self.seeds, self.folder, last)
+        announcements.began(c, self.task, self.seeds, self.folder, last)
         bars = tqdm(total=total, initial=last, disable=None, unit="step")
         with stop.pausing("at the end of this episode") as stopping, logging_redirect_tqdm(), bars as bar:
             for record in self.agents.run():

@@ -1,6 +1,6 @@
 """What a training run needs to know of a task; `of` finds it from the config of an environment."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,7 +21,7 @@ from experiments.training.density import Density
 from experiments.training.evaluation import Evaluated
 from experiments.training.relative import Relative
 
-__all__ = ["Task", "add", "of"]
+__all__ = ["Task", "add", "kind", "of"]
 
 Array = NDArray[np.float64]
 
@@ -29,12 +29,18 @@ Array = NDArray[np.float64]
 class Task(Evaluated, Protocol):
     """What an agent acts in, is scored on and exports.
 
-    config: of the environment. observation: O names, as in the policy file. actions: the grid, (A,).
+    config: of the environment, of any class. observation: O names, as in the policy file. actions: the grid, (A,).
     limits: of the observation in the policy file, low and high, each (O,). regret_unit, steady_unit: per cent of cost
-    and steady error that weigh alike when policies are compared.
+    and steady error that weigh alike when policies are compared. episode_steps: of a training episode.
+    description: numbers that say which model it is, for the log. scalars: the same for TensorBoard's table of runs.
+    tried: the words with which `deploy` runs a policy of this task, {} for its file; "" where it cannot.
     """
 
     config: Any
+    episode_steps: int
+    description: str
+    scalars: Mapping[str, float]
+    tried: str
     observation: tuple[str, ...]
     actions: Array
     limits: tuple[Array, Array]
@@ -89,6 +95,11 @@ def add(kind: str, config: type[Any], task: Callable[[Any], Task], what: str) ->
     """
     presets.add(f"env/{kind}", {"kind": kind}, what)
     ENVS[kind], TASKS[config] = config, task
+
+
+def kind(config: Any) -> str:
+    """The name under which the config of an environment is known."""
+    return next(name for name, known in ENVS.items() if known is type(config))
 
 
 def of(config: Any) -> Task:

@@ -4,7 +4,6 @@ import logging
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from experiments.cli.choices import choices
 from experiments.reporting import tables
 from experiments.reporting.curves import TRAINING, of_population
 from experiments.reporting.tensorboard import PopulationWriter
+from experiments.training import tasks
 from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Score
 from experiments.training.tasks import Task
@@ -22,29 +22,10 @@ __all__ = ["began", "ended", "progress", "results", "show"]
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-TRIED = {
-    "density": "controller=dqn policy={}",
-    "relative": "controller=dqn policy={}",
-    "coculture": "plant=coculture scenario=ratio_steps composition={law} composition_policy={}",
-}
-
-
-def _kind(config: TrainConfig) -> str:
-    return str(getattr(config.env, "kind", "density"))
 
 
 def _limits(task: Task) -> str:
     return f"{task.regret_unit:g} % regret and {task.steady_unit:g} {task.unit}"
-
-
-def _model(env: Any) -> str:
-    """Numbers that say which model it is."""
-    if hasattr(env, "tau"):
-        return f"mu {env.mu:g} 1/min, tau {env.tau:.4g}, a decision every {env.control_min:g} min"
-    if hasattr(env, "growth_shares"):
-        return "growth takes {:g} to {:g} of the largest pump rate".format(*env.growth_shares)
-    ahead = f"the next setpoint known {env.preview_min:g} min ahead" if env.preview_min else "no change known ahead"
-    return f"shares of two species by temperature, a decision every {env.control_min:g} min, {ahead}"
 
 
 def _seeds(seeds: Sequence[int]) -> str:
@@ -54,11 +35,9 @@ def _seeds(seeds: Sequence[int]) -> str:
 def began(config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path, step: int) -> None:
     """Say what is learned, what is good, and where to watch. Args: step: where a resumed run goes on, else 0."""
     chosen = choices(folder)
-    names = f"env={chosen.get('env', _kind(config))} agent={chosen.get('agent', 'given')}"
+    names = f"env={chosen.get('env', tasks.kind(config.env))} agent={chosen.get('agent', 'given')}"
     where = f"goes on at step {step} of" if step else "for"
-    log.info(
-        "learns %s: %s; %s, %s %d steps", names, _model(config.env), _seeds(seeds), where, config.agent.total_steps
-    )
+    log.info("learns %s: %s; %s, %s %d steps", names, task.description, _seeds(seeds), where, config.agent.total_steps)
     log.info(
         "good is a policy within %s at rest at its worst setpoint (regret: its cost beyond the exact optimum's)",
         _limits(task),
@@ -91,7 +70,7 @@ def _verdict(score: Score, task: Task) -> str:
     return f"{words[0]} the limit of {limits[0]}, {words[1]} that of {limits[1]}"
 
 
-def ended(folder: Path, config: TrainConfig, task: Task, kept: Score, myopic: Score, spent: str, path: Path) -> None:
+def ended(folder: Path, task: Task, kept: Score, myopic: Score, spent: str, path: Path) -> None:
     """Say what was reached, against what, and what to do with it. Args: spent: steps, updates and time, in words."""
     many = kept.regret_pct.size > 1
     worst = f"; the worst of {kept.regret_pct.size}: {kept.regret_pct.max():.2f} %, {kept.steady_abs_error.max():.4f}"
@@ -102,30 +81,27 @@ def ended(folder: Path, config: TrainConfig, task: Task, kept: Score, myopic: Sc
         "for comparison, the one-line law that looks one period ahead: %s",
         _pair(np.abs(myopic.regret_pct), myopic.steady_abs_error, task.unit),
     )
-    law = "dqn_preview" if getattr(config.env, "preview_min", 0.0) else "dqn"
-    file = shlex.quote(str(path))
     log.info("policy %s; figures %s", path, folder / "figures")
-    log.info("next, prove its closed loop: python -m experiments.certify policy=%s", file)
-    log.info(
-        "next, try it: python -m experiments.deploy %s",
-        TRIED.get(_kind(config), TRIED["density"]).format(file, law=law),
-    )
+    if task.tried:
+        file = shlex.quote(str(path))
+        log.info("next, prove its closed loop: python -m experiments.certify policy=%s", file)
+        log.info("next, try it: python -m experiments.deploy %s", task.tried.format(file))
 
 
-def show(writer: PopulationWriter, config: TrainConfig, seeds: Sequence[int], folder: Path) -> None:
+def show(writer: PopulationWriter, config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path) -> None:
     """The custom page of TensorBoard and the configuration, at the start."""
     writer.events.layout(TRAINING if len(seeds) == 1 else of_population(TRAINING))
     path = folder / "config.yaml"
     if path.is_file():
         writer.events.text("run/config", f"```yaml\n{path.read_text(encoding='utf-8')}\n```")
-    chosen, model = choices(folder), config.env
+    chosen = choices(folder)
     values: dict[str, float | str] = {
         "command": "train",
         "decides": chosen.get("agent", "given"),
-        "on": chosen.get("env", _kind(config)),
+        "on": chosen.get("env", tasks.kind(config.env)),
         "steps": config.agent.total_steps,
     }
-    values |= {key: float(getattr(model, key)) for key in ("mu", "tau") if hasattr(model, key)}
+    values |= task.scalars
     for seed, events in zip(seeds, writer.agents, strict=False):
         events.hyper_parameters(values | {"seed": seed}, folder, f"seed{seed:04d}" if len(seeds) > 1 else "")
     writer.flush()
