@@ -13,10 +13,10 @@ from dqn import policy as policies
 from envs.plant.plant import PlantConfig
 from experiments.certification import certificate
 from experiments.cli import files, frame
+from experiments.cli.calibrated import read_plant_file
 from experiments.comparison.config import TWIN, BenchmarkConfig
 from experiments.comparison.trials import Followed, Loops, Trial, cells
 from experiments.composition import registry as laws
-from experiments.control.plant_file import read_plant_file
 from experiments.control.policies import find_policy, load_policy
 from experiments.controllers import registry
 from experiments.training.config import TrainConfig

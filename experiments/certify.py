@@ -14,8 +14,8 @@ from experiments.certification.config import CertifyConfig
 from experiments.certification.judge import Certificate, certify
 from experiments.certification.question import CertificationError, model_of
 from experiments.cli import files, frame
+from experiments.cli.calibrated import read_env_file
 from experiments.control.policies import find_policy
-from experiments.training.config import read_env_file
 
 __all__ = ["main"]
 

@@ -17,9 +17,10 @@ from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame, reference
+from experiments.cli.calibrated import read_env_file
 from experiments.control.config import deploy_schema
 from experiments.train import main
-from experiments.training.config import ENVS, TrainConfig, read_env_file
+from experiments.training.config import ENVS, TrainConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.link.transport import TransportConfig
 from hardware.safety.config import SafetyConfig

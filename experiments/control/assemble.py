@@ -21,17 +21,16 @@ from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
+from experiments.cli.calibrated import read_env_file, read_plant_file
 from experiments.cli.choices import choices
 from experiments.composition import registry as compositions
 from experiments.control.config import DeployConfig
-from experiments.control.plant_file import read_plant_file
 from experiments.control.policies import Wanted, admit, composition_policy, policy_check, run_policy
 from experiments.controllers import registry
 from experiments.loop.composition import Composition, Keeper, ShareWarnings, columns, program_of
 from experiments.loop.loop import ClosedLoop
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, continue_loop
-from experiments.training.config import read_env_file
 from hardware.check import report
 from hardware.errors import ReactorError
 from hardware.family import Family, Opening, family_of

@@ -18,11 +18,11 @@ from envs.identification.model import Parameter
 from envs.identification.screening import Series
 from envs.task import EnvConfig
 from experiments.cli import files, frame
+from experiments.cli.calibrated import read_env_file
 from experiments.reporting.agreement_chart import agreement_figure
 from experiments.reporting.charts import save
 from experiments.reporting.page import Page
 from experiments.reporting.tables import Table, number
-from experiments.training.config import read_env_file
 from hardware.errors import RecordingError
 from hardware.storage.recording_reader import read_recording
 

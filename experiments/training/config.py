@@ -3,16 +3,13 @@
 from dataclasses import dataclass
 from typing import Any
 
-from omegaconf import DictConfig
-
 from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.coculture.task import CocultureConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig
-from experiments.cli import files, frame
 
-__all__ = ["ENVS", "TrainConfig", "env_schema", "read_env_file"]
+__all__ = ["ENVS", "TrainConfig", "env_schema"]
 
 
 ENVS: dict[str, type[Any]] = {"density": EnvConfig, "relative": RelativeConfig, "coculture": CocultureConfig}
@@ -52,18 +49,3 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check(self)
-
-
-def read_env_file(path: str) -> EnvConfig:
-    """The model a calibration wrote. Raises: UserError naming the file and what is wrong with it."""
-    remedy = "give the calibrated.yaml of a calibration run"
-    try:
-        content = files.load_yaml(path)
-    except (OSError, ValueError) as error:
-        raise frame.UserError(f"env_file={path}: {getattr(error, 'strerror', error)}; {remedy}") from None
-    if not isinstance(content, DictConfig):
-        raise frame.UserError(f"env_file={path}: holds no key: value pairs; {remedy}")
-    try:
-        return frame.load(content, EnvConfig(), "env")
-    except frame.UserError as error:
-        raise frame.UserError(f"env_file={path}: {error}") from None

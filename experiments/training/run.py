@@ -15,10 +15,11 @@ from dqn.export import export
 from dqn.policy import Policy
 from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
+from experiments.cli.calibrated import read_env_file
 from experiments.controllers.estimator import EstimatorConfig
 from experiments.reporting import charts
 from experiments.training import announcements, tasks
-from experiments.training.config import TrainConfig, read_env_file
+from experiments.training.config import TrainConfig
 from experiments.training.evaluation import Score
 from experiments.training.session import Session
 

@@ -20,7 +20,7 @@ from envs.task import EnvConfig
 from experiments.calibration.config import CalibrateConfig
 from experiments.calibration.result import environment_yaml
 from experiments.cli import frame
-from experiments.control.plant_file import read_plant_file
+from experiments.cli.calibrated import read_plant_file
 from hardware.storage.recording_reader import read_recording
 from tests.real_recording import DITHER, needs_dither
 

@@ -10,8 +10,8 @@ import pytest
 from envs.plant.plant import PlantConfig
 from experiments import benchmark
 from experiments.cli import frame
+from experiments.cli.calibrated import read_plant_file
 from experiments.control import assemble
-from experiments.control.plant_file import read_plant_file
 from experiments.deploy import main
 
 TWIN = """# as calibrate writes one

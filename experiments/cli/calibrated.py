@@ -1,0 +1,38 @@
+"""What a calibration leaves for other commands: the growth model and the plant behind a recording, from their files."""
+
+from typing import TypeVar
+
+from omegaconf import DictConfig
+
+from envs.plant.plant import PlantConfig
+from envs.task import EnvConfig
+from experiments.cli import files, frame
+
+__all__ = ["read_env_file", "read_plant_file"]
+
+T = TypeVar("T")
+
+
+def read_env_file(path: str) -> EnvConfig:
+    """The model of a calibrated.yaml. Raises: UserError naming the file and what is wrong with it."""
+    return _read("env_file", path, "calibrated.yaml", EnvConfig(), "env")
+
+
+def read_plant_file(path: str) -> PlantConfig:
+    """The plant of a twin.yaml. Raises: UserError naming the file and what is wrong with it."""
+    return _read("plant_file", path, "twin.yaml", PlantConfig(), "plant")
+
+
+def _read(key: str, path: str, usual: str, default: T, prefix: str) -> T:
+    """`default` with what the file says. Raises: UserError."""
+    remedy = f"give the {usual} of a calibration run"
+    try:
+        content = files.load_yaml(path)
+    except (OSError, ValueError) as error:
+        raise frame.UserError(f"{key}={path}: {getattr(error, 'strerror', error)}; {remedy}") from None
+    if not isinstance(content, DictConfig) or not content:
+        raise frame.UserError(f"{key}={path}: holds no key: value pairs; {remedy}")
+    try:
+        return frame.load(content, default, prefix)
+    except frame.UserError as error:
+        raise frame.UserError(f"{key}={path}: {error}; {remedy}") from None
