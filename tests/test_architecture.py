@@ -1,4 +1,4 @@
-"""Rooms and who may import whom, no circles, commands that nobody imports, a bench without torch."""
+"""Layers and who may import whom, no circles, commands that nobody imports, a bench without torch."""
 
 import ast
 import re
@@ -27,15 +27,14 @@ def architecture() -> str:
     return (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 
-def plan() -> dict[str, set[str]]:
-    """Room -> rooms whose files it imports, beside its own: the table of docs/architecture.md."""
-
-    def dotted(name: str) -> str:
-        return name.removesuffix(".py").replace("/", ".")
-
-    text = architecture().partition("## Rooms")[2]
-    rows = re.findall(r"^\| `([\w/.]+)` \|.*\| ([^|]*)\|$", text, re.MULTILINE)
-    return {dotted(name): {dotted(other) for other in re.findall(r"`([\w/.]+)`", cell)} for name, cell in rows}
+def plan() -> dict[str, tuple[int, set[str]]]:
+    """Room -> its layer, and the rooms that it may not import although they are not above it."""
+    text = architecture().partition("## Layers")[2]
+    rows = re.findall(r"^\| (\d) \| `([\w/]+)` \|.*\| ([^|]*)\|$", text, re.MULTILINE)
+    return {
+        room.replace("/", "."): (int(layer), {other.replace("/", ".") for other in re.findall(r"`([\w/]+)`", cell)})
+        for layer, room, cell in rows
+    }
 
 
 PLAN = plan()
@@ -77,27 +76,25 @@ def is_command(module: str) -> bool:
 
 
 def room(module: str) -> str:
-    """The package a module is in; a module with a row of its own on the plan is a room of its own."""
-    return module if module in PLAN or modules()[module].name == "__init__.py" else module.rpartition(".")[0]
+    """The package a module is in."""
+    return module if modules()[module].name == "__init__.py" else module.rpartition(".")[0]
 
 
-def test_every_room_is_on_the_plan():
-    rooms = {room(m) for m in modules() if not is_command(m) and m != "experiments"}
-    assert rooms == set(PLAN)
+def test_every_room_has_its_layer():
+    assert {room(m) for m in modules()} - {"experiments"} == set(PLAN)
+    assert {layer for layer, _ in PLAN.values()} == {1, 2, 3, 4, 5}
 
 
 @pytest.mark.parametrize("name", sorted(PLAN))
-def test_a_room_imports_what_the_plan_says(name):
-    inside = [m for m in modules() if not is_command(m) and room(m) == name]
+def test_a_room_imports_its_own_layer_and_what_is_below(name):
+    layer, barred = PLAN[name]
+    assert not {other for other in barred if PLAN[other][0] > layer}, "said twice: it is above"
+    inside = [m for m in modules() if room(m) == name]
     assert inside
-    used = {room(other): f"{m} imports {other}" for m in inside for other in ours(m) if room(other) != name}
-    unplanned = [used[other] for other in used if other not in PLAN[name]]
-    assert not unplanned
-    assert PLAN[name] == set(used), f"docs/architecture.md names more for {name} than it imports"
-
-
-def test_the_plan_itself_has_no_circle():
-    assert set(TopologicalSorter(PLAN).static_order()) == set(PLAN)
+    used = {f"{m} imports {other}": room(other) for m in inside for other in ours(m) if room(other) != name}
+    up = [line for line, other in used.items() if other == "experiments" or PLAN[other][0] > layer]
+    kept_out = [line for line, other in used.items() if other in barred]
+    assert not up + kept_out
 
 
 def test_no_circle_of_imports():
