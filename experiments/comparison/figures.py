@@ -10,16 +10,18 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
+from experiments.comparison.page import law_of
 from experiments.comparison.published import TABLE_2
-from experiments.comparison.trials import Trial
+from experiments.comparison.trials import DensityTrial, ShareTrial
 from experiments.reporting.charts import COLOURS, new_figure
 
-__all__ = ["LONG_MIN", "bands", "differences", "plants", "published_and_ours"]
+__all__ = ["LONG_MIN", "bands", "differences", "plants", "published_and_ours", "share_errors", "shares"]
 
 Array = NDArray[np.float64]
 
 LONG_MIN = 360.0  # a scenario longer than this is drawn in blocks
 BLOCK = 10  # samples
+STEP = 5  # minutes between the points of a share's curve
 LEAST = 1e-9  # where an interval that reaches zero ends on a logarithmic axis
 NOISELESS = 1e-5  # scores below are those of a plant without noise
 
@@ -49,10 +51,10 @@ def _handles(controllers: Sequence[str]) -> list[Line2D]:
 
 
 def _estimate(
-    ax: Axes, controller: str, y: float, value: float, interval: Sequence[float], hollow: bool = False
+    ax: Axes, mark: tuple[str, str], y: float, value: float, interval: Sequence[float], hollow: bool = False
 ) -> None:
-    """A controller's mark with its 95 % interval, where it has one."""
-    colour, marker = _mark(controller)
+    """A law's mark with its 95 % interval, where it has one."""
+    colour, marker = mark
     if np.isfinite(interval[0]):
         ax.plot(interval, [y, y], color=colour, linewidth=1.3)
     ax.plot(value, y, marker, color=colour, markersize=5, markerfacecolor="white" if hollow else colour)
@@ -67,7 +69,7 @@ def _band(ax: Axes, minute: Array, values: Array, colour: str) -> None:
     ax.plot(minute, mean, color=colour, linewidth=1.3)
 
 
-def _curves(trial: Trial) -> tuple[Array, Array, Array, Array]:
+def _curves(trial: DensityTrial) -> tuple[Array, Array, Array, Array]:
     """Time (K,), OD, pump rate and temperature (N, K): as recorded, or block means without noise in a long scenario."""
     last = trial.minute.size - 1
     if trial.schedule.total_min <= LONG_MIN:
@@ -80,7 +82,7 @@ def _curves(trial: Trial) -> tuple[Array, Array, Array, Array]:
     return blocks(trial.minute), blocks(trial.clean), blocks(trial.rate), blocks(trial.temperature)
 
 
-def bands(trials: Sequence[Trial]) -> Figure:
+def bands(trials: Sequence[DensityTrial]) -> Figure:
     """OD over pump rate (over temperature), a column per controller: mean over replicates, band = one sd."""
     first = trials[0]
     switched = len(set(first.schedule.temperatures)) > 1
@@ -91,7 +93,7 @@ def bands(trials: Sequence[Trial]) -> Figure:
     )
     for column, trial in enumerate(trials):
         top, middle = axes[column], axes[len(trials) + column]
-        colour, _ = _mark(trial.controller)
+        colour, _ = _mark(trial.cell.controller)
         edges = trial.schedule.edges
         goals = np.append(trial.schedule.setpoints, trial.schedule.setpoints[-1])
         top.step(edges, goals, where="post", color="black", linewidth=1.0, linestyle="--")
@@ -103,7 +105,7 @@ def bands(trials: Sequence[Trial]) -> Figure:
             _band(bottom, minute, temperature, colour)
             for ax in (top, middle, bottom):
                 ax.axvline(edges[1], color="#888888", linewidth=0.8, linestyle=":")
-        top.set_title(f"{trial.controller}, n = {trial.od.shape[0]}")
+        top.set_title(f"{trial.cell.controller}, n = {trial.od.shape[0]}")
         axes[(rows - 1) * len(trials) + column].set_xlabel("time, min")
     axes[0].set_ylabel("OD")
     axes[len(trials)].set(ylabel="pump rate, µL/s", ylim=(-0.8, 21.5))
@@ -122,11 +124,11 @@ def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
         for metric, ax in (("ise", left), ("itae", right)):
             for p in (p for p in TABLE_2 if p.controller == controller):
                 y = cells.index((p.scenario, p.window)) + 0.24 * (k - 1)
-                _estimate(ax, controller, y, getattr(p, metric), (np.nan, np.nan), hollow=True)
+                _estimate(ax, _mark(controller), y, getattr(p, metric), (np.nan, np.nan), hollow=True)
                 for r in rows:
                     if (r["controller"], r["scenario"], r["window"]) == (controller, p.scenario, p.window):
                         low, high = r[f"{metric}_ci95"]
-                        _estimate(ax, controller, y, r[f"{metric}_mean"], (max(low, LEAST), high))
+                        _estimate(ax, _mark(controller), y, r[f"{metric}_mean"], (max(low, LEAST), high))
     low_ise = min([p.ise for p in TABLE_2] + [r["ise_mean"] for r in rows])
     left.set(xscale="log", xlabel="ISE (T = 1 min), OD² min", xlim=(0.6 * low_ise, None))
     left.set_yticks(range(len(cells)), names)
@@ -142,28 +144,32 @@ def published_and_ours(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _by_plant(
-    entries: Sequence[Mapping[str, Any]], extra: Line2D
+    entries: Sequence[Mapping[str, Any]], handles: Sequence[Line2D], width: float = 10.4, panels: int = 2
 ) -> tuple[Figure, list[Axes], Callable[[Mapping[str, Any]], float]]:
-    """An empty panel for ISE and one for ITAE with a striped row per plant; returns also the height of an entry.
+    """Empty panels, one per metric, with a striped row per plant; returns also the height of an entry.
 
-    Args: entries: of all plants and controllers that will be drawn. extra: last entry of the legend.
+    Args: entries: of all plants and laws that will be drawn. handles: of the legend.
     """
     names = list(dict.fromkeys(str(e["plant"]) for e in entries))
-    controllers = list(dict.fromkeys(str(e["controller"]) for e in entries))
-    figure, axes = new_figure(10.4, 1.6 + 0.62 * len(names), 1, 2, sharey=True)
+    controllers = list(dict.fromkeys(law_of(e) for e in entries))
+    figure, axes = new_figure(width, 1.6 + 0.62 * len(names), 1, panels, sharey=True)
     for ax in axes:
         for row in range(0, len(names), 2):
             ax.axhspan(row - 0.5, row + 0.5, color="#f3f5f7", zorder=0)
         ax.grid(False, axis="y")
         ax.set_ylim(len(names) - 0.5, -0.5)
     axes[0].set_yticks(range(len(names)), names)
-    figure.legend(handles=[*_handles(controllers), extra], loc="outside upper center", ncols=5)
+    figure.legend(handles=list(handles), loc="outside upper center", ncols=5)
 
     def height(entry: Mapping[str, Any]) -> float:
-        offset = (controllers.index(entry["controller"]) + 0.5) / len(controllers) - 0.5
+        offset = (controllers.index(law_of(entry)) + 0.5) / len(controllers) - 0.5
         return names.index(entry["plant"]) + 0.72 * offset
 
     return figure, axes, height
+
+
+def _controllers(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(str(e["controller"]) for e in entries))
 
 
 def _log_axis(ax: Axes) -> None:
@@ -184,13 +190,13 @@ def plants(entries: Sequence[Mapping[str, Any]]) -> Figure:
     # Whose floor is drawn: all controllers met the same sensors, so their floors nearly agree.
     witness = next((e for e in entries if e["controller"] == "oracle"), entries[0])["controller"]
     floor_line = Line2D([], [], color="#b00020", linewidth=1.4, label="sensor-noise floor")
-    figure, axes, height = _by_plant(entries, floor_line)
+    figure, axes, height = _by_plant(entries, [*_handles(_controllers(entries)), floor_line])
     for metric, unit, ax in zip(("ise", "itae"), ("ISE, OD² min", "ITAE, OD min²"), axes, strict=True):
         seen = np.array([e[key] for e in entries for key in (f"floor_{metric}", f"{metric}_mean")])
         ax.set_xlim(0.6 * seen[seen > NOISELESS].min(), 1.8 * seen.max())
         for e in entries:
             low, high = e[f"{metric}_ci95"]
-            _estimate(ax, e["controller"], height(e), e[f"{metric}_mean"], (max(low, LEAST), high))
+            _estimate(ax, _mark(e["controller"]), height(e), e[f"{metric}_mean"], (max(low, LEAST), high))
             floor = e[f"floor_{metric}"]
             if e["controller"] == witness and floor > NOISELESS:
                 row = round(height(e))
@@ -207,14 +213,14 @@ def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
     """
     entries = [e for e in entries if e["controller"] != "hold"]
     open_mark = Line2D([], [], color="black", marker="o", mfc="white", linestyle="", label="interval holds 0")
-    figure, axes, height = _by_plant(entries, open_mark)
+    figure, axes, height = _by_plant(entries, [*_handles(_controllers(entries)), open_mark])
     for metric, ax in zip(("ise", "itae"), axes, strict=True):
         ax.axvline(0.0, color="black", linewidth=1.0)
         ax.set_xscale("symlog", linthresh=20.0)
         for e in (e for e in entries if e["metric"] == metric and np.isfinite(e["percent"])):
             scale = e["percent"] / e["difference"] if e["difference"] else 0.0
             hollow = e["verdict"] == "no difference shown"
-            _estimate(ax, e["controller"], height(e), e["percent"], [scale * v for v in e["ci95"]], hollow)
+            _estimate(ax, _mark(e["controller"]), height(e), e["percent"], [scale * v for v in e["ci95"]], hollow)
         wide = ax.get_xlim()[1] > 200.0
         few, many = [-100, -20, 0, 20, 100, 1000, 10000], [-100, -50, -20, -10, 0, 10, 20, 50, 100, 200]
         ax.xaxis.set_major_locator(FixedLocator(few if wide else many))
@@ -222,4 +228,34 @@ def differences(entries: Sequence[Mapping[str, Any]], against: str) -> Figure:
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.tick_params(axis="x", labelsize=8)
         ax.set_xlabel(f"{metric.upper()} minus that of {against}, %")
+    return figure
+
+
+def shares(trials: Sequence[ShareTrial]) -> Figure:
+    """A column per law: true share with the setpoint, and the vials' temperature; median and the middle 90 %."""
+    columns = len(trials)
+    figure, axes = new_figure(2.7 * columns, 4.6, 2, columns, sharex=True, sharey="row", height_ratios=[2, 1])
+    for k, trial in enumerate(trials):
+        top, bottom, hours = axes[k], axes[columns + k], trial.minute[::STEP] / 60.0
+        for ax, values, colour in ((top, trial.share, COLOURS[0]), (bottom, trial.temperature, COLOURS[1])):
+            low, middle, high = np.quantile(values[:, ::STEP], (0.05, 0.5, 0.95), axis=0)
+            ax.fill_between(hours, low, high, color=colour, alpha=0.28, linewidth=0)
+            ax.plot(hours, middle, color=colour, linewidth=1.2)
+        top.plot(hours, trial.setpoint[::STEP], color="black", linewidth=1.0, linestyle="--")
+        top.set_title(law_of({"controller": trial.cell.controller, "preview": trial.foresight}))
+        bottom.set_xlabel("hours")
+    axes[0].set(ylabel="share of P. putida", ylim=(0.0, 1.0))
+    axes[columns].set_ylabel("vial, °C")
+    return figure
+
+
+def share_errors(entries: Sequence[Mapping[str, Any]]) -> Figure:
+    """Error of every law on every plant of one scenario: mean and 95 % interval."""
+    labels = list(dict.fromkeys(law_of(e) for e in entries))
+    marks = {label: (COLOURS[k % len(COLOURS)], "o" if k < len(COLOURS) else "D") for k, label in enumerate(labels)}
+    handles = [Line2D([], [], color=colour, marker=m, linestyle="", label=x) for x, (colour, m) in marks.items()]
+    figure, (ax,), height = _by_plant(entries, handles, 9.0, 1)
+    for e in entries:
+        _estimate(ax, marks[law_of(e)], height(e), e["ratio_abs_error_mean"], e["ci95"])
+    ax.set(xlabel="mean |r - setpoint|", xlim=(0.0, None))
     return figure

@@ -1,4 +1,4 @@
-"""The page of a benchmark: the paper's Table 2 beside the run's, every plant, and what the learned policy loses."""
+"""The page of a benchmark: the paper's Table 2 beside the run's, every plant, what the learned policy loses; shares."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -10,14 +10,14 @@ from experiments.comparison.published import TABLE_2
 from experiments.reporting.page import Page, provenance
 from experiments.reporting.tables import Best, Table, number, plus_minus
 
-__all__ = ["losses", "of_benchmark", "published_losses", "table_2"]
+__all__ = ["SECTIONS", "law_of", "losses", "matrix", "of_benchmark", "published_losses", "table_2"]
 
 Row = Mapping[str, Any]
 METRICS = ("ise", "itae")
 PUBLISHED = ("dqn", "pi", "mpc")
 UNITS = {"ise": "OD² min", "itae": "OD min²"}
 
-DEFINITIONS = {
+DENSITY = {
     "error e": "measured OD minus setpoint, once a minute. A sample at the very end of a window belongs to it and to "
     "the next one.",
     "ISE and ITAE, T = 1 min": "ISE = (1/T) ∫ e² dt, ITAE = (1/T) ∫ t |e| dt, t in min from the start of the window, "
@@ -41,6 +41,20 @@ DEFINITIONS = {
     "comparisons.",
     "±": "one standard deviation over replicates.",
 }
+SHARE = {
+    "error": "mean over the scenario of |r - setpoint|, r the true share of P. putida, wherever a share is asked for.",
+    "told ahead": "changes of the setpoint are announced, as early as the scenario's announce_min; `optimum` knows the "
+    "whole program in either case.",
+    "calibrated": "the estimator knows each reactor's factor and offset of the light sensor, with errors of 2 % and "
+    "5 counts; otherwise it begins from the mean of 17 real reactors.",
+    "paired": "law minus the vendor's PI, reactor by reactor: both meet the same vials, sensors and noise.",
+    "band covers": "share of all minutes in which the true share lies within the estimate's 95 % band.",
+}
+
+
+def law_of(entry: Row) -> str:
+    """The law of an entry as a reader knows it."""
+    return f"{entry['controller']}, told ahead" if entry.get("preview") else str(entry["controller"])
 
 
 def name_of(scenario: str, window: str) -> str:
@@ -175,26 +189,35 @@ def published_losses() -> list[str]:
     return found
 
 
-def _matrix(
-    name: str, title: str, entries: Sequence[Row], text: Callable[[Row], str], note: str,
-    ranked_by: str | None = None, floor: Callable[[Row], str] | None = None,
-) -> Table:  # fmt: skip
-    """Plants down, controllers across; the row's lowest `ranked_by` is marked, the oracle is not ranked.
+def matrix(
+    name: str,
+    title: str,
+    entries: Sequence[Row],
+    text: Callable[[Row], str],
+    note: str,
+    ranked_by: str | None = None,
+    floor: Callable[[Row], str] | None = None,
+    laws_down: bool = False,
+) -> Table:
+    """Plants down, laws across, or the other way round; each plant's lowest `ranked_by` is marked, but not the oracle.
 
     Args: text: of a cell. floor: of the last column, the sensor's noise alone, from any controller's entry.
     """
-    controllers = list(dict.fromkeys(str(e["controller"]) for e in entries))
+    laws = list(dict.fromkeys(map(law_of, entries)))
     body = []
     for plant in dict.fromkeys(str(e["plant"]) for e in entries):
-        at = {c: r for c in controllers if (r := _find(entries, controller=c, plant=plant)) is not None}
+        at = {law_of(e): e for e in entries if e["plant"] == plant}
         values = {c: r[ranked_by] for c, r in at.items() if ranked_by and c != "oracle" and r[ranked_by] is not None}
         least = min(values.values()) * (1.0 + 1e-9) if len(values) > 1 else float("-inf")
         cells = [plant]
-        cells += [_mark(text(at[c]), values.get(c, float("inf")) <= least) if c in at else "–" for c in controllers]
+        cells += [_mark(text(at[c]), values.get(c, float("inf")) <= least) if c in at else "–" for c in laws]
         if floor is not None:
             cells.append(floor(at.get("oracle") or next(iter(at.values()))))
         body.append(tuple(cells))
-    columns = ("plant", *controllers, *(("sensor-noise floor",) if floor else ()))
+    columns = ("plant", *laws, *(("sensor-noise floor",) if floor else ()))
+    if laws_down:
+        (_, *columns_), *rows = zip(columns, *body, strict=True)
+        return Table(name, title, ("law", *columns_), tuple(rows), note)
     return Table(name, title, columns, tuple(body), note)
 
 
@@ -224,7 +247,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
     n = totals[0]["n"]
     out.add("subheading", text=scenario)
     for metric, scale, unit in (("ise", 1000.0, "10⁻³ OD² min"), ("itae", 1.0, "OD min²")):
-        table = _matrix(
+        table = matrix(
             f"{scenario}_{metric}",
             f"{metric.upper()} of the measured OD ({unit}, T = 1 min), sum over the windows",
             totals,
@@ -242,7 +265,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
         for metric in METRICS:
             chosen = [p for p in pairs if p["against"] == against and p["metric"] == metric]
             if chosen:
-                table = _matrix(
+                table = matrix(
                     f"{scenario}_{metric}_vs_{against}",
                     f"{heading}, {metric.upper()}, %",
                     chosen,
@@ -261,7 +284,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
     )
     for key, title, ranked in extra:
         ranking = key if ranked else None
-        table = _matrix(f"{scenario}_{key}", title, totals, partial(_scaled, key=key), f"Mean, n = {n}.", ranking)
+        table = matrix(f"{scenario}_{key}", title, totals, partial(_scaled, key=key), f"Mean, n = {n}.", ranking)
         out.table(table, folded=f"{title}: {scenario}")
 
 
@@ -380,17 +403,8 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
             out.figure(run / f["file"], f["title"], f["caption"])
 
 
-def of_benchmark(run: Path) -> Page:
-    """The page of a benchmark's run folder."""
-    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
-    out = Page(
-        "Turbidostat control: benchmark",
-        f"{len(summary['totals'])} closed loops of {summary['replicates']} simulated replicates each, "
-        f"seed {summary['seed']}",
-    )
-    out.section("What was run")
-    provenance(out, run)
-    _learning_section(out, summary, run)
+def _density(out: Page, summary: Row, run: Path) -> None:
+    """The paper's table, the figures, every plant."""
     if summary["beside_paper"]:
         _paper_section(out, summary)
     regulated = _find(summary["rows"], controller="dqn", scenario="regulation")
@@ -414,9 +428,80 @@ def of_benchmark(run: Path) -> Page:
         )
         for scenario in wide:
             every_plant(out, summary, scenario)
+
+
+def _lower(pair: Row) -> str:
+    low, high = pair["ci95"]
+    between = "" if low is None or low != low else f" [{low:+.4f}, {high:+.4f}]"
+    return f"{pair['difference']:+.4f}{between}, lower in {pair['lower_in']} of {pair['n']}"
+
+
+def _estimate(row: Row) -> str:
+    return f"{number(row['estimate_rms'])}, {100.0 * row['band_covers']:.0f} %"
+
+
+def _od(row: Row) -> str:
+    return f"{row['od_min']:.3f}, {row['od_mean']:.3f}, {row['od_max']:.3f}"
+
+
+def _share(out: Page, summary: Row, run: Path) -> None:
+    """A section of every scenario."""
+    errors = {"": "", "_last2h": " in the last 2 h of each window", "_last_day": " on the last day"}
+    for scenario in dict.fromkeys(str(r["scenario"]) for r in summary["rows"]):
+        out.section(scenario)
+
+        def add(
+            key: str, entries: Sequence[Row], title: str, text: Callable[[Row], str],
+            ranked_by: str | None = None, folded: str = "", scenario: str = scenario,
+        ) -> None:  # fmt: skip
+            entries = [e for e in entries if e["scenario"] == scenario]
+            if entries:
+                note = f"n = {entries[0]['n']} reactors each."
+                table = matrix(f"{scenario}_{key}", title, entries, text, note, ranked_by, laws_down=True)
+                out.table(table, folded=folded and f"{folded}: {scenario}")
+
+        rows = summary["rows"]
+        for ending, when in errors.items():
+            key = f"ratio_abs_error{ending or '_mean'}"
+            known = [r for r in rows if r[key] is not None]
+            add(key, known, f"Mean |r - setpoint|{when}", partial(_scaled, key=key), key)
+        add("paired", summary["paired"], "Difference to the vendor's PI", _lower)
+        add("estimate", rows, "Error of the estimate (rms), and how much its band covers", _estimate, folded="Estimate")
+        add("od", rows, "OD: least, mean, largest", _od, folded="OD")
+        for f in (f for f in summary["figures"] if f["title"].startswith(f"{scenario}:")):
+            out.figure(run / f["file"], f["title"], f["caption"])
+
+
+class Section(NamedTuple):
+    """What a page has of a signal: its title, what adds the sections, and the words that these use."""
+
+    title: str
+    add: Callable[[Page, Row, Path], None]
+    definitions: Mapping[str, str]
+
+
+SECTIONS = {
+    "density": Section("Turbidostat control: benchmark", _density, DENSITY),
+    "share": Section("Composition of two species: comparison", _share, SHARE),
+}
+
+
+def of_benchmark(run: Path) -> Page:
+    """The page of a benchmark's run folder."""
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    parts = [SECTIONS[s] for s in dict.fromkeys(r["signal"] for r in summary["rows"])] or [SECTIONS["density"]]
+    out = Page(
+        parts[0].title,
+        f"{summary['loops']} closed loops of {summary['replicates']} simulated replicates each, seed {summary['seed']}",
+    )
+    out.section("What was run")
+    provenance(out, run)
+    _learning_section(out, summary, run)
+    for part in parts:
+        part.add(out, summary, run)
     out.section("Definitions")
-    out.add("definitions", pairs=list(DEFINITIONS.items()))
-    if summary["rows"]:
+    out.add("definitions", pairs=[pair for part in parts for pair in part.definitions.items()])
+    if summary["details"]:
         out.section("All numbers")
-        out.table(all_rows(summary), folded=f"{len(summary['rows'])} rows; also in tables/rows.csv")
+        out.table(all_rows(summary), folded=f"{len(summary['details'])} rows; also in tables/rows.csv")
     return out

@@ -1,19 +1,25 @@
-"""From trials to numbers: means with intervals, and paired differences between controllers that met the same draws."""
+"""From trials to numbers: means with intervals, and paired differences between laws that met the same draws."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom
 from scipy.stats import t as student
 
-from experiments.comparison.trials import Trial, Window, windows
+from experiments.comparison.trials import DensityTrial, ShareTrial, Trial, Window, windows
 
-__all__ = ["Spread", "details", "pairs", "row", "rows", "total_pairs", "totals"]
+__all__ = [
+    "ROWS", "SCORES", "Spread", "abs_error", "details", "last_hours", "pairs", "row", "rows", "share_row",
+    "total_pairs", "totals",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
+T = TypeVar("T", bound=Trial)
 METRICS = ("ise", "itae")
+LAST_MIN, DAY_MIN = 120, 1440  # of a window in which a share is held; of a run of days
 NEGLIGIBLE = 1e-6  # a difference is not stated in percent of a mean below this
 
 
@@ -55,10 +61,14 @@ def _median_or_never(settling: Array) -> float:
 
 
 def _names(trial: Trial) -> dict[str, Any]:
-    return {"controller": trial.controller, "plant": trial.plant, "scenario": trial.scenario}
+    cell = trial.cell
+    found: dict[str, Any] = {key: getattr(cell, key) for key in ("signal", "controller", "plant", "scenario")}
+    if isinstance(trial, ShareTrial):
+        found |= {"preview": trial.foresight, "density": cell.density, "calibrated": cell.calibrated}
+    return found
 
 
-def row(trial: Trial, window: Window) -> dict[str, Any]:
+def row(trial: DensityTrial, window: Window) -> dict[str, Any]:
     """One row of summary.json: measured OD, T = 1 min; settling is the median, the other values are means."""
     score = trial.score(window)
     ise, itae = Spread(score.ise), Spread(score.itae)
@@ -81,11 +91,62 @@ def row(trial: Trial, window: Window) -> dict[str, Any]:
 
 
 def rows(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """`row` of every trial and window."""
-    return [row(trial, window) for trial in trials for window in windows(trial.schedule)]
+    """The rows of every trial: of a density one per window, of a share one."""
+    return [found for trial in trials for found in ROWS[trial.cell.signal](trial)]
 
 
-def details(trials: Sequence[Trial]) -> list[dict[str, Any]]:
+def abs_error(trial: ShareTrial) -> Array:
+    """Mean |r - setpoint| wherever a share is asked for, (N,)."""
+    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint), axis=1))
+
+
+def last_hours(trial: ShareTrial) -> Array:
+    """Mean |r - setpoint| of the last 2 h of every window, (N,); nan where the share asked for changes all the time.
+
+    A law that is told of a change leaves before it comes: then this says nothing of how well it holds.
+    """
+    held, edges = np.zeros(trial.minute.size, dtype=np.bool_), trial.schedule.edges.astype(int)
+    for start, end in pairwise(edges):
+        if np.unique(trial.setpoint[start:end]).size == 1 and np.isfinite(trial.setpoint[start]):
+            held[max(start, end - LAST_MIN) : end] = True
+    error = np.abs(trial.share - trial.setpoint)[:, held]
+    return np.asarray(error.mean(axis=1)) if held.any() else np.full(len(error), np.nan)
+
+
+def _last_day(trial: ShareTrial) -> Array:
+    """Mean |r - setpoint| of the last day of a run of two days or more, else nan, (N,)."""
+    if trial.minute[-1] < 2 * DAY_MIN:
+        return np.full(len(trial.share), np.nan)
+    return np.asarray(np.nanmean(np.abs(trial.share - trial.setpoint)[:, -DAY_MIN:], axis=1))
+
+
+def share_row(trial: ShareTrial) -> dict[str, Any]:
+    """The row of a share in summary.json, judged by what the share truly was."""
+    error = Spread(abs_error(trial))
+    inside = (trial.low <= trial.share) & (trial.share <= trial.high)
+    return _names(trial) | {
+        "n": error.n,
+        "ratio_abs_error_mean": error.mean,
+        "ratio_abs_error_sd": error.sd,
+        "ci95": error.ci95,
+        "ratio_abs_error_last2h": Spread(last_hours(trial)).mean,
+        "ratio_abs_error_last_day": Spread(_last_day(trial)).mean,
+        "estimate_rms": float(np.sqrt(np.square(trial.estimate - trial.share).mean())),
+        "band_covers": float(inside.mean()),
+        "od_min": float(trial.od.min()),
+        "od_max": float(trial.od.max()),
+        "od_mean": float(trial.od.mean()),
+    }
+
+
+ROWS: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
+    "density": lambda trial: [row(trial, window) for window in windows(trial.schedule)],
+    "share": lambda trial: [share_row(trial)],
+}
+"""Signal -> the rows of one of its trials."""
+
+
+def details(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
     """What `rows` leaves out, one entry per row: the other convention, the noise-free OD, the floor, the effort."""
     found = []
     for trial in trials:
@@ -111,13 +172,13 @@ def details(trials: Sequence[Trial]) -> list[dict[str, Any]]:
     return found
 
 
-def _total(trial: Trial, metric: str, kind: str = "score") -> Array:
+def _total(trial: DensityTrial, metric: str, kind: str = "score") -> Array:
     """Sum of a metric over the windows of a trial, (N,)."""
     each = [getattr(getattr(trial, kind)(window), metric) for window in windows(trial.schedule)]
     return np.asarray(np.sum(each, axis=0))
 
 
-def totals(trials: Sequence[Trial]) -> list[dict[str, Any]]:
+def totals(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
     """One entry per trial: ISE and ITAE summed over its windows, and what it cost in medium and pump moves."""
     found = []
     for trial in trials:
@@ -141,11 +202,8 @@ def totals(trials: Sequence[Trial]) -> list[dict[str, Any]]:
 
 def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, theirs: Array) -> dict[str, Any]:
     found, mean = Spread(mine - theirs), Spread(theirs).mean
-    return {
-        "controller": one.controller,
-        "against": other.controller,
-        "plant": one.plant,
-        "scenario": one.scenario,
+    return _names(one) | {
+        "against": other.cell.controller,
         "window": window,
         "metric": metric,
         "n": found.n,
@@ -154,27 +212,51 @@ def _pair(one: Trial, other: Trial, metric: str, window: str, mine: Array, their
         "median": found.median,
         "median_ci95": found.median_ci95,
         "percent": 100.0 * found.mean / mean if mean > NEGLIGIBLE else float("nan"),
+        "lower_in": int((mine < theirs).sum()),
         "verdict": ("lower", "no difference shown", "higher")[found.sign + 1],
     }
 
 
-def _partners(trials: Sequence[Trial], against: str) -> list[tuple[Trial, Trial]]:
-    of = {(t.plant, t.scenario): t for t in trials if t.controller == against}
-    return [(t, of[t.plant, t.scenario]) for t in trials if t.controller != against and (t.plant, t.scenario) in of]
+def _partners(trials: Sequence[T], against: str) -> list[tuple[T, T]]:
+    """Every trial with that of `against` on the same vials."""
+
+    def vials(trial: Trial) -> tuple[object, ...]:
+        cell = trial.cell
+        return cell.signal, cell.plant, cell.scenario, cell.density, cell.calibrated
+
+    of = {vials(t): t for t in trials if t.cell.controller == against}
+    return [(t, of[vials(t)]) for t in trials if t.cell.controller != against and vials(t) in of]
+
+
+Scored = list[tuple[str, str, Array]]
+"""Window, metric and its value in each replicate, (N,)."""
+
+
+def _density_scores(trial: DensityTrial) -> Scored:
+    scores = [(window.label, trial.score(window)) for window in windows(trial.schedule)]
+    return [(label, metric, getattr(score, metric)) for label, score in scores for metric in METRICS]
+
+
+SCORES: dict[str, Callable[[Any], Scored]] = {
+    "density": _density_scores,
+    "share": lambda trial: [("all", "ratio_abs_error", abs_error(trial))],
+}
+"""Signal -> what laws are compared by, reactor by reactor."""
 
 
 def pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:
-    """Every controller minus `against`, window by window: mean difference over replicates and its 95 % interval."""
+    """Every law minus `against` on the same vials, window by window: mean difference over replicates and its 95 %
+    interval, and in how many replicates it is lower.
+    """
     found = []
     for one, other in _partners(trials, against):
-        for window in windows(one.schedule):
-            mine, theirs = one.score(window), other.score(window)
-            scores = ((metric, getattr(mine, metric), getattr(theirs, metric)) for metric in METRICS)
-            found += [_pair(one, other, metric, window.label, a, b) for metric, a, b in scores]
+        scores = SCORES[one.cell.signal]
+        for (window, metric, mine), (_, _, theirs) in zip(scores(one), scores(other), strict=True):
+            found.append(_pair(one, other, metric, window, mine, theirs))
     return found
 
 
-def total_pairs(trials: Sequence[Trial], against: str) -> list[dict[str, Any]]:
+def total_pairs(trials: Sequence[DensityTrial], against: str) -> list[dict[str, Any]]:
     """As `pairs`, of the sums over windows."""
     return [
         _pair(one, other, metric, "all", _total(one, metric), _total(other, metric))

@@ -1,6 +1,6 @@
 """What a benchmark draws and counts: its closed loops, the calibration, the figures of its studies, summary.json."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from envs.identification.screening import Series
 from experiments.comparison import figures, statistics
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.published import SETTLING_MIN, TABLE_2
-from experiments.comparison.trials import Trial
+from experiments.comparison.trials import DensityTrial, ShareTrial, Trial
 from experiments.reporting.calibration_charts import fit_figure
 
 __all__ = ["Drawing", "calibration", "draw", "summarise"]
@@ -23,6 +23,11 @@ CAPTIONS = {
     "temperature_switch": "37 to 30 °C (the paper's Fig. 3c)",
     "comparison": "Controllers side by side at 0.5 (the paper's Fig. 4)",
 }
+
+
+SHOWN = ("pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")  # where there are more than so many laws
+AGAINST = {"density": ("dqn", "dqn_adaptive", "oracle"), "share": ("pi",)}
+"""Signal -> the laws that the others are compared with, replicate by replicate."""
 
 
 class Drawing(NamedTuple):
@@ -62,7 +67,8 @@ def calibration(config: BenchmarkConfig) -> tuple[dict[str, Any], Drawing]:
 
 def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) -> Iterator[Drawing]:
     """The figures of the studies, from the trials and from the numbers of `summarise`."""
-    yield from _closed_loops(config, trials)
+    yield from _shares([t for t in trials if isinstance(t, ShareTrial)], summary["rows"])
+    yield from _closed_loops(config, [t for t in trials if isinstance(t, DensityTrial)])
     if {"setpoint_steps", "temperature_switch"} & set(config.studies):
         yield Drawing(
             "table2",
@@ -96,11 +102,34 @@ def draw(config: BenchmarkConfig, trials: list[Trial], summary: dict[str, Any]) 
             )
 
 
-def _closed_loops(config: BenchmarkConfig, trials: list[Trial]) -> Iterator[Drawing]:
+def _shares(trials: Sequence[ShareTrial], rows: Sequence[dict[str, Any]]) -> Iterator[Drawing]:
+    """Two figures of every scenario in which a share is held: every law and plant; the shares on the first plant."""
+    for scenario in dict.fromkeys(t.cell.scenario for t in trials):
+        here = [t for t in trials if t.cell.scenario == scenario]
+        plant = here[0].cell.plant
+        first = [t for t in here if t.cell.plant == plant]
+        if len(first) > len(SHOWN):
+            first = [t for t in first if t.cell.controller in SHOWN]
+        yield Drawing(
+            f"composition_{scenario}_laws",
+            figures.share_errors([r for r in rows if (r["signal"], r["scenario"]) == ("share", scenario)]),
+            f"{scenario}: every law and plant",
+            "Mean and 95 % interval over the reactors.",
+        )
+        yield Drawing(
+            f"composition_{scenario}_shares",
+            figures.shares(first),
+            f"{scenario}: shares on {plant}",
+            "Line: median over the reactors; band: the middle 90 %; dashed: setpoint.",
+        )
+
+
+def _closed_loops(config: BenchmarkConfig, trials: Sequence[DensityTrial]) -> Iterator[Drawing]:
     """OD and pump rate of every study that is the paper's, or holds a single scenario and plant."""
-    by_cell = {(t.controller, t.plant, t.scenario): t for t in trials}
+    by_cell = {(t.cell.controller, t.cell.plant, t.cell.scenario): t for t in trials}
     for name, study in config.studies.items():
-        if not study.controllers or (name not in CAPTIONS and len(study.plants) * len(study.scenarios) > 1):
+        several = name not in CAPTIONS and len(study.plants) * len(study.scenarios) > 1
+        if study.compositions or not study.controllers or several:
             continue
         for scenario in study.scenarios:
             for plant in study.plants:
@@ -132,21 +161,24 @@ def _table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[d
 def summarise(config: BenchmarkConfig, trials: list[Trial]) -> dict[str, Any]:
     """All numbers of the closed loops, and the paper's."""
     plants, controllers = list(config.plants), list(config.controllers)
-    ordered = sorted(trials, key=lambda t: (plants.index(t.plant), controllers.index(t.controller)))
-    names = {t.controller for t in trials}
-    against = [name for name in ("dqn", "dqn_adaptive", "oracle") if name in names]
+    density = [t for t in trials if isinstance(t, DensityTrial)]
+    ordered = sorted(density, key=lambda t: (plants.index(t.cell.plant), controllers.index(t.cell.controller)))
+    of_signal = {signal: [t for t in trials if t.cell.signal == signal] for signal in AGAINST}
     rows = statistics.rows(trials)
     return {
+        "loops": len(trials),
         "rows": rows,
         "paper": [p._asdict() for p in TABLE_2],
         "paper_settling_min": SETTLING_MIN,
         "beside_paper": [
             {k: r[k] for k in ("controller", "plant", "scenario", "window")} for r in _table_2_rows(rows, config)
         ],
-        "details": statistics.details(trials),
+        "details": statistics.details(density),
         "totals": statistics.totals(ordered),
-        "paired": [p for name in against for p in statistics.pairs(trials, name)],
-        "paired_totals": [p for name in against for p in statistics.total_pairs(ordered, name)],
+        "paired": [
+            p for key, names in AGAINST.items() for name in names for p in statistics.pairs(of_signal[key], name)
+        ],
+        "paired_totals": [p for name in AGAINST["density"] for p in statistics.total_pairs(ordered, name)],
         "replicates": config.replicates,
         "seed": config.seed,
     }

@@ -1,6 +1,7 @@
-"""Closed loops to compare: one is a controller on a plant in a scenario, all replicates as a single batch.
+"""Closed loops to compare: one is a law on a plant in a scenario, all replicates as a single batch.
 
-`Loops` runs those that the studies of a benchmark need, in processes of their own.
+A loop has a signal: what the law holds on its setpoint, the `density` by the pump or the `share` of the second species
+by the temperature. `Loops` runs those that the studies of a benchmark need, in processes of their own.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from concurrent.futures import Future, as_completed
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,28 +21,64 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from dqn.policy import Policy
 from envs.bench import Bench
+from envs.coculture.rates import T_MAX, T_MIN
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli.stop import Workers
 from experiments.comparison.config import BenchmarkConfig
+from experiments.composition import registry as laws
+from experiments.composition.controller import CompositionController
+from experiments.composition.program import Program
+from experiments.control.policies import load_policy
 from experiments.controllers import registry
-from experiments.controllers.base import Controller
+from experiments.controllers.base import Accounts, Controller, Watches
+from experiments.loop.composition import program_of
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.metrics import WindowMetrics, window_metrics
 from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 
-__all__ = ["Cell", "Followed", "Loops", "Trial", "Window", "cells", "run_cell", "run_trial", "windows"]
+__all__ = [
+    "RUNS", "Cell", "DensityTrial", "Followed", "Loops", "ShareTrial", "Trial", "Window", "calibrate",
+    "cells", "run_cell", "run_share", "run_trial", "windows",
+]  # fmt: skip
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-Cell = tuple[str, str, str]  # controller, plant, scenario
+FACTOR_SD, OFFSET_SD = 0.02, 5.0
+"""Errors of a calibrated light sensor: relative of the factor, and of the offset in counts, a blank read 36 times."""
 LEAST_NOISE = 1e-9  # OD, of a sensor that is meant to have none
+
+
+class Cell(NamedTuple):
+    """What is run once: names of the law that is compared, plant and scenario, and of the signal that it holds.
+
+    Of a share: density, the controller that holds the OD beside it; announced: its changes are told ahead, as the
+    scenario has it; calibrated: the light sensor was, with its errors.
+    """
+
+    controller: str
+    plant: str
+    scenario: str
+    signal: str = "density"
+    density: str = ""
+    announced: bool = False
+    calibrated: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What N replicates did, sample by sample since the schedule began; minute (K,), temperature of the vial (N, K)."""
+
+    cell: Cell
+    schedule: Scenario
+    minute: Array
+    temperature: Array
 
 
 @dataclass(frozen=True)
@@ -68,23 +105,17 @@ def windows(schedule: Scenario) -> list[Window]:
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
-    """What N replicates did, sample by sample since the schedule began; arrays (N, K).
+class DensityTrial(Trial):
+    """A density that was held; arrays (N, K).
 
-    minute: (K,). od: as measured. clean: what a sensor without noise would have shown. rate: mL/s after the interlock.
-    temperature: degC. media_ml: fresh medium delivered since the culture began.
+    od: as measured. clean: what a sensor without noise would have shown. rate: mL/s after the interlock.
+    media_ml: fresh medium delivered since the culture began.
     held: samples on which the interlock allowed no dose, (N,). overflowed: at the end, (N,).
     """
 
-    controller: str
-    plant: str
-    scenario: str
-    schedule: Scenario
-    minute: Array
     od: Array
     clean: Array
     rate: Array
-    temperature: Array
     media_ml: Array
     held: Array
     overflowed: NDArray[np.bool_]
@@ -116,21 +147,38 @@ class Trial:
         return np.asarray(1000.0 * np.abs(np.diff(self.rate[:, inside], axis=1)).mean(axis=1))
 
 
+@dataclass(frozen=True, eq=False)
+class ShareTrial(Trial):
+    """A share that was held, minute by minute; arrays (N, K).
+
+    foresight: the law knew of changes ahead. setpoint: (K,), nan where no share is asked for. share, od: true ones.
+    estimate, low, high: of the share and its 95 % band.
+    """
+
+    foresight: bool
+    setpoint: Array
+    share: Array
+    estimate: Array
+    low: Array
+    high: Array
+    od: Array
+
+
 def run_trial(
-    names: Cell,
+    cell: Cell,
     plant_config: PlantConfig,
     schedule: Scenario,
     make: Callable[[Plant], Controller],
     model: EnvConfig,
     replicates: int,
     seed: int,
-) -> Trial:
+) -> DensityTrial:
     """Run N replicates, which are named M0, M1, ..., as one batch.
 
     The plant is built anew from the seed, so every controller meets the same vials, pumps, sensors and noise.
 
     Args:
-      names: of controller, plant and scenario. make: builds the controller for a plant.
+      cell: what it is called. make: builds the controller for a plant.
       model: control period and largest pump rate; the interlock's limit.
     """
     if plant_config.sensor.noise_floor == 0.0:  # the interlock takes a sensor that repeats itself exactly for dead
@@ -158,7 +206,7 @@ def run_trial(
         for key, values in seen.items():
             stored[key][row, column] = values[row]
         held[row] += step.response[row] >= Response.HOLD
-    return Trial(*names, schedule, minute, **stored, held=held, overflowed=plant.vessel.overflowed)
+    return DensityTrial(cell, schedule, minute, **stored, held=held, overflowed=plant.vessel.overflowed)
 
 
 def cells(config: BenchmarkConfig) -> list[Cell]:
@@ -167,7 +215,12 @@ def cells(config: BenchmarkConfig) -> list[Cell]:
     for study in config.studies.values():
         for scenario in study.scenarios:
             for plant in study.plants:
-                wanted.update(dict.fromkeys((controller, plant, scenario) for controller in study.controllers))
+                for controller in study.controllers:
+                    if not study.compositions:
+                        wanted[Cell(controller, plant, scenario)] = None
+                    for law in study.compositions:
+                        told = (study.announced, study.calibrated)
+                        wanted[Cell(law, plant, scenario, "share", controller, *told)] = None
     return list(wanted)
 
 
@@ -175,17 +228,107 @@ Followed = tuple[Policy, EstimateBounds | None]
 """A policy, and within which errors of its estimator its certificate lets it act."""
 
 
-def run_cell(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Trial:
-    """One closed loop of a benchmark; all it needs is in its arguments, so it is the same in any process."""
-    name, plant, scenario = cell
+def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> DensityTrial:
+    """A controller holds the density behind an interlock."""
     policy, bounds = followed or (None, None)
+    plant, schedule = config.plants[cell.plant], config.scenarios[cell.scenario]
 
     def make(vials: Plant) -> Controller:
-        return registry.build(config.controllers[name], config.env, policy, vials, bounds=bounds)
+        return registry.build(config.controllers[cell.controller], config.env, policy, vials, bounds=bounds)
 
-    return run_trial(
-        cell, config.plants[plant], config.scenarios[scenario], make, config.env, config.replicates, config.seed
+    return run_trial(cell, plant, schedule, make, config.env, config.replicates, config.seed)
+
+
+def _share(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> ShareTrial:
+    """A law holds the share, and a controller the density beside it."""
+    scenario, kind = config.scenarios[cell.scenario], config.compositions[cell.controller].kind
+    program = program_of(scenario)
+    plant = Plant(config.plants[cell.plant], config.replicates, np.random.default_rng(config.seed))
+    law = laws.build(config.compositions[cell.controller], followed[0] if followed else None, program)
+    law.reset(plant.n)
+    if cell.calibrated:
+        calibrate(law, plant, config.seed)
+    found = run_share(
+        plant,
+        law,
+        _beside(config, cell.density),
+        program,
+        np.asarray(scenario.setpoints),
+        np.asarray(scenario.temperatures),
+        scenario.announce_min if cell.announced else 0.0,
     )
+    foresight = cell.announced and kind in laws.FORESIGHT
+    minute = np.arange(found["share"].shape[1], dtype=np.float64)
+    return ShareTrial(cell, scenario, minute, foresight=foresight, setpoint=program.setpoint(minute), **found)
+
+
+def run_share(
+    plant: Plant,
+    law: CompositionController,
+    density: Controller,
+    program: Program,
+    setpoints: Array,
+    temperatures: Array,
+    announce_min: float,
+) -> dict[str, Array]:
+    """Read, decide and dose once a minute to the end of the program: the fields of a `ShareTrial` that are (N, K).
+
+    There is no interlock: the plants of these comparisons have no faults, and every law meets the same vials, sensors
+    and noise.
+
+    Args: law: reset for the plant's vials. setpoints, temperatures: OD and degC of each phase, (phases,); the latter
+      where no share is asked for.
+    """
+    n, last = plant.n, round(program.total_min)
+    density.reset(n)
+    rows = np.ones(n, dtype=np.bool_)
+    fields = ("share", "estimate", "low", "high", "temperature", "od")
+    stored: dict[str, Any] = {key: np.empty((n, last + 1), dtype=np.float32) for key in fields}
+    for k in range(last + 1):
+        minute = np.full(n, float(k))
+        phase = min(int(np.searchsorted(program.edges[1:], k + 1e-9, side="right")), len(setpoints) - 1)
+        od, warm = plant.read_od(), plant.thermal.read()
+        law.watch(od, plant.read_fluorescence(), warm, minute, rows)
+        wanted = program.wanted(minute, announce_min)
+        asked = np.isfinite(wanted.setpoint)
+        target = np.where(asked, law.target(wanted, minute, asked), temperatures[phase])
+        if isinstance(density, Watches):
+            density.watch(od, warm, minute, rows)
+        rate = density.act(od, np.full(n, setpoints[phase]), minute, rows)
+        found = law.explain()
+        now = (plant.culture.share, found["ratio"], found["ratio_low"], found["ratio_high"], warm, plant.culture.od)
+        for key, values in zip(fields, now, strict=True):
+            stored[key][:, k] = values
+        plant.advance(1.0, 60.0 * rate, temperature_target=np.where(asked, np.clip(target, T_MIN, T_MAX), target))
+        law.dosed(60.0 * rate)
+        if isinstance(density, Accounts):
+            density.dosed(60.0 * rate)
+    return stored
+
+
+def _beside(config: BenchmarkConfig, name: str) -> Controller:
+    """What holds the density beside a share. Raises: UserError for a policy that does not fit."""
+    kind, policy = config.controllers[name].kind, None
+    if kind == "dqn":
+        policy = load_policy(config.policies.get(name, "shipped"), config.env.control_min, config.env.max_pump_rate)
+    return registry.build(config.controllers[name], config.env, policy)
+
+
+def calibrate(law: CompositionController, plant: Plant, seed: int) -> None:
+    """Tell the estimator each reactor's factor and offset, with the errors that a calibration leaves."""
+    rng = np.random.default_rng([seed, 1])
+    factor = plant.draws["fluorescence_factor"] * (1.0 + FACTOR_SD * rng.standard_normal(plant.n))
+    offset = plant.draws["fluorescence_offset"] + OFFSET_SD * rng.standard_normal(plant.n)
+    law.estimator.calibrate(factor, FACTOR_SD * factor, offset, OFFSET_SD)
+
+
+RUNS: dict[str, Callable[[BenchmarkConfig, Cell, Followed | None], Trial]] = {"density": _density, "share": _share}
+"""Signal -> what runs one of its loops."""
+
+
+def run_cell(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Trial:
+    """One closed loop of a benchmark; all it needs is in its arguments, so it is the same in any process."""
+    return RUNS[cell.signal](config, cell, followed)
 
 
 class Loops:
@@ -226,7 +369,7 @@ class Loops:
                 bar.set_postfix_str(f"{cell[0]} on {cell[1]}")
                 bar.update()
                 if bar.disable and (k % max(total // 10, 1) == 0 or k == total):
-                    log.info("closed loop %d of %d: %s, %s, %s", k, total, cell[2], cell[1], cell[0])
+                    log.info("closed loop %d of %d: %s, %s, %s", k, total, cell.scenario, cell.plant, cell.controller)
         return trials
 
     def __enter__(self) -> Loops:

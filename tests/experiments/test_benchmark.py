@@ -15,12 +15,13 @@ from scipy import stats
 from dqn import policy as policies
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
-from experiments.benchmark import _schema, with_seeds
+from experiments.benchmark import _schema
 from experiments.cli import frame
 from experiments.comparison import statistics as comparison
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.published import TABLE_2
-from experiments.comparison.trials import Trial, Window, cells, run_trial, windows
+from experiments.comparison.run import with_seeds
+from experiments.comparison.trials import Cell, DensityTrial, Window, cells, run_trial, windows
 from experiments.controllers import registry
 from tests.experiments.test_deploy import inverse_policy
 
@@ -28,8 +29,8 @@ ROOT = Path(__file__).parents[2]
 EVERY = ("dqn", "pi", "pi_tuned", "mpc", "adaptive_inverse", "threshold", "hold", "oracle")
 FEEDBACK = ("dqn", "pi_tuned", "mpc", "adaptive_inverse")
 ROW_KEYS = {
-    "controller", "plant", "scenario", "window", "setpoint", "n", "ise_mean", "ise_sd", "itae_mean", "itae_sd",
-    "ise_median", "itae_median", "ise_ci95", "itae_ci95", "settling_min", "steady_abs_error", "media_ml",
+    "signal", "controller", "plant", "scenario", "window", "setpoint", "n", "ise_mean", "ise_sd", "itae_mean",
+    "itae_sd", "ise_median", "itae_median", "ise_ci95", "itae_ci95", "settling_min", "steady_abs_error", "media_ml",
 }  # fmt: skip
 
 
@@ -44,10 +45,10 @@ def config() -> BenchmarkConfig:
 
 
 @cache
-def trial(controller: str, plant: str, scenario: str, replicates: int, seed: int = 0) -> Trial:
+def trial(controller: str, plant: str, scenario: str, replicates: int, seed: int = 0) -> DensityTrial:
     c = config()
     return run_trial(
-        (controller, plant, scenario),
+        Cell(controller, plant, scenario),
         c.plants[plant],
         c.scenarios[scenario],
         lambda vials: registry.build(c.controllers[controller], c.env, inverse_policy(), vials),
@@ -57,7 +58,7 @@ def trial(controller: str, plant: str, scenario: str, replicates: int, seed: int
     )
 
 
-def total(t: Trial, metric: str) -> float:
+def total(t: DensityTrial, metric: str) -> float:
     return float(np.mean([getattr(t.score(w), metric).mean() for w in windows(t.schedule)]) * len(windows(t.schedule)))
 
 
@@ -158,14 +159,15 @@ def test_windows_are_named_by_what_tells_them_apart():
     assert (windows(scenarios["setpoint_steps"])[1].start, windows(scenarios["setpoint_steps"])[1].end) == (30.0, 60.0)
 
 
-def synthetic(controller: str, offset: np.ndarray) -> Trial:
+def synthetic(controller: str, offset: np.ndarray) -> DensityTrial:
     """Two minutes at setpoint 1 with a constant error per replicate; pump and medium by hand."""
     n = offset.size
     ones = np.ones((n, 3))
     od = 1.0 + offset[:, None] * ones
     rate = np.tile([0.01, 0.013, 0.0], (n, 1))
-    return Trial(
-        controller, "p", "s", Scenario((1.0,), (2.0,), (37.0,)), np.arange(3.0), od, od - 0.001, rate, 37.0 * ones,
+    cell, schedule = Cell(controller, "p", "s"), Scenario((1.0,), (2.0,), (37.0,))
+    return DensityTrial(
+        cell, schedule, np.arange(3.0), 37.0 * ones, od, od - 0.001, rate,
         np.tile([1.0, 1.6, 2.4], (n, 1)), np.zeros(n), np.zeros(n, dtype=bool),
     )  # fmt: skip
 
@@ -280,7 +282,7 @@ def test_paper_is_all_recipes_and_each_loop_runs_once():
     # `healthy` is what the emulator runs on by default, `mixed` what it is tried on without a calibration
     # and two species have a comparison of their own
     plants = {p.stem for p in (ROOT / "conf" / "plant").glob("*.yaml") if not p.stem.startswith("coculture")}
-    assert {plant for _, plant, _ in wanted} == plants - {"healthy", "mixed"}
+    assert {cell.plant for cell in wanted} == plants - {"healthy", "mixed"}
 
 
 def test_published_table_is_complete():

@@ -8,17 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from envs.scenario import Scenario
 from experiments.benchmark import _schema, benchmark
 from experiments.cli import frame
-from experiments.comparison import composition_statistics as statistics
-from experiments.comparison.composition_trials import (
-    CompositionCell,
-    CompositionTrial,
-    composition_cells,
-    policies_of,
-    run_cell,
-)
+from experiments.comparison import statistics
 from experiments.comparison.config import BenchmarkConfig
+from experiments.comparison.run import policies_of
+from experiments.comparison.trials import Cell, ShareTrial, cells, run_cell
 
 SHORT = (
     "replicates=3", "workers=1", "studies.composition.scenarios=[ratio_steps]",
@@ -37,7 +33,7 @@ def config() -> BenchmarkConfig:
 
 
 def cell(law, plant="coculture", announced=True, calibrated=True):
-    return CompositionCell(law, "inverse", plant, "ratio_steps", announced, calibrated)
+    return Cell(law, plant, "ratio_steps", "share", "inverse", announced, calibrated)
 
 
 @cache
@@ -48,16 +44,20 @@ def trial(law, plant="coculture", announced=True, calibrated=True):
 def made_up(share, law="proportional", setpoint=(math.nan, 0.5, 0.5, 0.4)):
     """One sample a minute, one phase a minute but the second, which has two."""
     share = np.array(share)
-    return CompositionTrial(
-        cell(law), False, np.array([0.0, 1.0, 3.0, 4.0]), np.arange(4.0), np.array(setpoint), share, share + 0.1,
-        share - 0.05, share + 0.05, share, np.full(share.shape, 0.5),
+    return ShareTrial(
+        cell(law), phases(1.0, 2.0, 1.0), np.arange(4.0), share, False, np.array(setpoint), share, share + 0.1,
+        share - 0.05, share + 0.05, np.full(share.shape, 0.5),
     )  # fmt: skip
+
+
+def phases(*minutes):
+    return Scenario((0.5,) * len(minutes), minutes, (37.0,) * len(minutes))
 
 
 def test_errors_by_hand():
     t = made_up([[0.9, 0.6, 0.5, 0.5], [0.9, 0.5, 0.5, 0.4]])
     np.testing.assert_allclose(statistics.abs_error(t), [0.2 / 3.0, 0.0], atol=1e-12)
-    row = statistics.row(t)
+    row = statistics.share_row(t)
     assert row["ratio_abs_error_mean"] == pytest.approx(0.1 / 3.0)
     assert row["n"] == 2
     assert row["estimate_rms"] == pytest.approx(0.1)
@@ -71,8 +71,7 @@ def test_the_last_two_hours_are_those_of_every_window():
     setpoint = np.where(minute < 300, 0.3, 0.7)
     share = np.where((minute >= 180) & (minute < 300), setpoint + 0.01, setpoint + 0.2)
     share = np.where((minute >= 480) & (minute < 600), setpoint + 0.03, share)[None]
-    edges = np.array([0.0, 300.0, 600.0])
-    t = replace(made_up([[0.0]]), edges=edges, minute=minute, setpoint=setpoint, share=share)
+    t = replace(made_up([[0.0]]), schedule=phases(300.0, 300.0), minute=minute, setpoint=setpoint, share=share)
     assert statistics.last_hours(t)[0] == pytest.approx(0.02)
     wave = replace(t, setpoint=0.5 + 0.1 * np.sin(minute))
     assert math.isnan(statistics.last_hours(wave)[0])
@@ -81,10 +80,10 @@ def test_the_last_two_hours_are_those_of_every_window():
 def test_a_law_is_paired_with_the_vendors_reactor_by_reactor():
     vendor = made_up([[0.9, 0.6, 0.6, 0.5], [0.9, 0.5, 0.5, 0.4], [0.9, 0.5, 0.5, 0.7]], law="pi")
     other = made_up([[0.9, 0.5, 0.5, 0.4], [0.9, 0.5, 0.5, 0.7], [0.9, 0.5, 0.5, 0.4]])
-    (pair,) = statistics.pairs([vendor, other])
+    (pair,) = statistics.pairs([vendor, other], "pi")
     assert pair["lower_in"] == 2
     assert pair["difference"] == pytest.approx((-0.1 + 0.1 - 0.1) / 3.0)
-    assert statistics.pairs([other]) == []
+    assert statistics.pairs([other], "pi") == []
 
 
 def test_every_law_meets_the_same_reactors_and_nothing_happens_before_a_share_is_asked_for():
@@ -108,9 +107,9 @@ def test_who_is_told_and_who_is_calibrated_makes_a_difference():
 
 def test_the_recipe_asks_for_every_law_on_every_plant():
     recipe = load("+experiment=coculture")
-    found = composition_cells(recipe)
+    found = cells(recipe)
     assert len(found) == len(set(found)) == 80 + 4 + 40 + 3
-    assert {c.law for c in found} == set(recipe.compositions)
+    assert {c.controller for c in found} == set(recipe.compositions)
 
 
 def test_the_command_leaves_numbers_figures_and_a_page(tmp_path):
@@ -124,6 +123,7 @@ def test_the_command_leaves_numbers_figures_and_a_page(tmp_path):
     assert [r["controller"] for r in summary["rows"]] == ["pi", "proportional", "dqn_preview"]
     assert [r["preview"] for r in summary["rows"]] == [False, False, True]
     assert all(keys <= set(r) for r in summary["rows"])
+    assert {e["signal"] for e in summary["rows"] + summary["paired"]} == {"share"}
     assert [p["controller"] for p in summary["paired"]] == ["proportional", "dqn_preview"]
     page = (tmp_path / "report.html").read_text()
     assert "Mean |r - setpoint|" in page or "Mean |r − setpoint|" in page

@@ -12,7 +12,7 @@ from envs.coculture.rates import e_coli_rate, p_putida_rate
 from envs.plant.fluorescence import steady_production
 from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
-from experiments.comparison.composition_trials import calibrate, run_composition
+from experiments.comparison.trials import calibrate, run_share
 from experiments.composition import registry
 from experiments.composition.estimator import FACTOR, LOGIT, OFFSET, CompositionEstimator, CompositionEstimatorConfig
 from experiments.composition.program import Program
@@ -106,7 +106,7 @@ def closed_loop(plant_name, calibrated, n=32, flow=1.0):
         calibrate(law, plant, seed=0)
     density = densities.build(densities.config("inverse"), EnvConfig())
     program = Program((NAN, 0.3, 0.7, 0.3), (60.0, 360.0, 600.0, 600.0))
-    found = run_composition(plant, law, density, program, np.full(4, 0.5), np.full(4, 33.2), 0.0)
+    found = run_share(plant, law, density, program, np.full(4, 0.5), np.full(4, 33.2), 0.0)
     return found, law
 
 

@@ -7,7 +7,7 @@ from envs.scenario import Scenario
 from experiments.comparison import figures, page
 from experiments.comparison import statistics as comparison
 from experiments.comparison.published import SETTLING_MIN, TABLE_2
-from experiments.comparison.trials import Trial
+from experiments.comparison.trials import Cell, DensityTrial
 
 CONTROLLERS = ("dqn", "pi", "mpc")
 ISE = {
@@ -91,15 +91,14 @@ def test_the_figure_is_hollow_where_the_paper_is_and_filled_where_we_are():
         assert drawn[False] == {round(2.0 * v, 6) for v in values}
 
 
-def trial(controller: str, error: tuple[float, ...]) -> Trial:
+def trial(controller: str, error: tuple[float, ...]) -> DensityTrial:
     """Two minutes at setpoint 1, the error constant in each replicate."""
     n = len(error)
     od = 1.0 + np.array(error)[:, None] * np.ones((n, 3))
     ones, nothing = np.ones((n, 3)), np.zeros(n)
-    return Trial(
-        controller, "p", "s", Scenario((1.0,), (2.0,), (37.0,)), np.arange(3.0), od, od, 0.01 * ones, 37.0 * ones,
-        ones, nothing, nothing.astype(bool),
-    )  # fmt: skip
+    cell, schedule = Cell(controller, "p", "s"), Scenario((1.0,), (2.0,), (37.0,))
+    flags = nothing.astype(bool)
+    return DensityTrial(cell, schedule, np.arange(3.0), 37.0 * ones, od, od, 0.01 * ones, ones, nothing, flags)
 
 
 @pytest.mark.parametrize("pairs", [comparison.pairs, comparison.total_pairs])

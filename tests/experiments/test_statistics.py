@@ -9,12 +9,12 @@ from scipy.stats import ttest_1samp
 
 from envs.scenario import Scenario
 from experiments.comparison.statistics import Spread, details, pairs, row, rows, total_pairs, totals
-from experiments.comparison.trials import Trial, Window, windows
+from experiments.comparison.trials import Cell, DensityTrial, Window, windows
 
-NAMES = {"controller": "pi", "plant": "quiet", "scenario": "steps"}
+NAMES = {"signal": "density", "controller": "pi", "plant": "quiet", "scenario": "steps"}
 
 
-def trial(controller: str = "pi", error: tuple[float, ...] = (0.1, 0.2), minutes: float = 20.0) -> Trial:
+def trial(controller: str = "pi", error: tuple[float, ...] = (0.1, 0.2), minutes: float = 20.0) -> DensityTrial:
     """Replicates that stay `error` above the setpoint for two phases; their sensor reads 0.01 too much."""
     schedule = Scenario((0.5, 0.8), (minutes, minutes), (37.0, 37.0))
     minute = np.arange(0.0, 2.0 * minutes + 1e-9)
@@ -24,10 +24,8 @@ def trial(controller: str = "pi", error: tuple[float, ...] = (0.1, 0.2), minutes
     media = np.outer(np.arange(1.0, len(error) + 1), minute)  # 1, 2 mL a minute
     held = np.arange(3.0, 3.0 + len(error))
     overflowed = np.arange(len(error)) > 0
-    return Trial(
-        controller, "quiet", "steps", schedule, minute, od, od - 0.01, rate, np.full_like(od, 37.0), media, held,
-        overflowed,
-    )  # fmt: skip
+    cell, warm = Cell(controller, "quiet", "steps"), np.full_like(od, 37.0)
+    return DensityTrial(cell, schedule, minute, warm, od, od - 0.01, rate, media, held, overflowed)
 
 
 def test_the_interval_is_students() -> None:
@@ -116,7 +114,7 @@ def test_totals_keep_replicates_and_windows_apart() -> None:
 
 def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
     mine, theirs = trial("mpc", (0.1, 0.2, 0.15)), trial("pi", (0.2, 0.3, 0.26))
-    strange = replace(theirs, plant="noisy", controller="dqn")
+    strange = replace(theirs, cell=Cell("dqn", "noisy", "steps"))
     found = pairs([mine, theirs, strange], "pi")
     assert [(p["controller"], p["against"], p["window"], p["metric"]) for p in found] == [
         ("mpc", "pi", window, metric) for window in ("0.5", "0.8") for metric in ("ise", "itae")
@@ -130,7 +128,7 @@ def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
     assert [(p["window"], p["metric"]) for p in whole] == [("all", "ise"), ("all", "itae")]
     assert whole[1]["difference"] == pytest.approx(found[1]["difference"] + found[3]["difference"])
     assert total_pairs([mine, theirs], "mpc")[1]["verdict"] == "higher"
-    same = pairs([replace(theirs, controller="dqn"), theirs], "pi")
+    same = pairs([replace(theirs, cell=Cell("dqn", "quiet", "steps")), theirs], "pi")
     assert {p["verdict"] for p in same} == {"no difference shown"}
     perfect = replace(theirs, od=np.where(theirs.minute < 20.0, 0.5, 0.8) * np.ones((3, 1)))
     assert math.isnan(pairs([mine, perfect], "pi")[3]["percent"])

@@ -14,7 +14,7 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame
-from experiments.comparison.trials import run_trial
+from experiments.comparison.trials import Cell, run_trial
 from experiments.controllers import registry
 from experiments.controllers.base import Array, Controller
 from experiments.controllers.mpc import MpcConfig, Problem
@@ -37,7 +37,7 @@ def loops() -> Iterator[Measurement]:
         def make(vials: Plant) -> Controller:
             return registry.build(config, model, policy, vials)
 
-        run_trial((config.kind, "nominal_noise", "setpoint_steps"), plant, scenario, make, model, replicates, seed)
+        run_trial(Cell(config.kind, "nominal_noise", "setpoint_steps"), plant, scenario, make, model, replicates, seed)
 
     def one_by_one(config: Any) -> None:
         for seed in np.arange(REPLICATES):

@@ -1,0 +1,162 @@
+"""A benchmark from its checked config to its page: train, run every closed loop, compare, draw, report."""
+
+import json
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dqn import policy as policies
+from envs.plant.plant import PlantConfig
+from experiments.certification import certificate
+from experiments.cli import files, frame
+from experiments.cli.calibrated import read_plant_file
+from experiments.comparison import page as pages
+from experiments.comparison import studies
+from experiments.comparison.config import TWIN, BenchmarkConfig
+from experiments.comparison.trials import DensityTrial, Followed, Loops, cells
+from experiments.control.policies import composition_policy, find_policy, load_policy
+from experiments.reporting import charts, page
+from experiments.training.config import TrainConfig
+
+__all__ = ["benchmark", "policies_of", "with_seeds", "with_twin"]
+
+log = logging.getLogger(__name__)
+
+
+def learned(
+    config: BenchmarkConfig, wanted: set[str], folder: Path
+) -> tuple[dict[str, Followed], dict[str, Any], list[dict[str, str]]]:
+    """Policies of the learned controllers, where each comes from, and the figures of those trained here."""
+    found: dict[str, Followed] = {}
+    agents: dict[str, Any] = {}
+    figures = []
+    for name in sorted(wanted):
+        if name in config.policies or name not in config.agents:
+            where = config.policies.get(name, "shipped")
+            policy = load_policy(where, config.env.control_min, config.env.max_pump_rate)
+            found[name] = policy, certificate.bounds(policy, find_policy(where))
+            agents[name] = {"policy": where, "regret_pct": policy.metadata.get("regret_pct")}
+    for name in sorted(wanted - set(found)):
+        from experiments.training.run import train  # torch, only where agents are trained
+
+        log.info("training %s: %d seeds", name, config.train_seeds)
+        run = folder / "training" / name
+        run.mkdir(parents=True)
+        setup = TrainConfig(env=config.env, agent=config.agents[name], seed=config.seed, n_agents=config.train_seeds)
+        frame.save_config(setup, run)
+        train(setup, run)
+        found[name] = policies.load(run / "policy.npz"), None
+        summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+        keys = ("seeds", "env_steps", "updates", "regret_pct", "steady_abs_error", "policy_seed", "config_hash")
+        agents[name] = {"policy": f"training/{name}/policy.npz", **{key: summary[key] for key in keys}}
+        agents[name]["agent"] = asdict(config.agents[name])
+        at = summary["seeds"].index(summary["policy_seed"])
+        caption = (
+            f"{config.train_seeds} seeds of {summary['env_steps']} environment steps each, 100 per episode. "
+            f"Bands over seeds: range and middle half. The policy used here is that of seed {summary['policy_seed']}, "
+            f"best on the selection grid: regret {summary['regret_pct'][at]:.2f} % on the reported grid."
+        )
+        title = f"Training of {name} (the paper's Fig. 2b)"
+        figures.append({"file": f"training/{name}/figures/learning.svg", "title": title, "caption": caption})
+    return found, agents, figures
+
+
+def _store(trials: Sequence[DensityTrial], folder: Path) -> None:
+    """Every trajectory, as `scenario/plant/controller/od` etc. of shape (N, K), in trajectories.npz."""
+    arrays = {
+        f"{t.cell.scenario}/{t.cell.plant}/{t.cell.controller}/{key}": getattr(t, key).astype(np.float32)
+        for t in trials
+        for key in ("od", "clean", "rate", "temperature")
+    }
+    np.savez_compressed(folder / "trajectories.npz", **arrays)
+
+
+def with_twin(config: BenchmarkConfig) -> BenchmarkConfig:
+    """With the plant of `plant_file`: its vials begin anywhere in the recording, at the OD of all other plants.
+
+    Raises: frame.UserError.
+    """
+    if config.plant_file is None:
+        return config
+    twin = read_plant_file(config.plant_file)
+    last = max((*twin.growth.knots_min, *twin.pump.knots_min), default=0.0)
+    twin = replace(twin, start_spread_min=max(last - twin.start_min, 0.0), start_od=PlantConfig().start_od)
+    return replace(config, plants={**config.plants, TWIN: twin})
+
+
+def with_seeds(config: BenchmarkConfig) -> BenchmarkConfig:
+    """With a controller of its own for each seed where `policies` names several. Raises: frame.UserError."""
+    for name, where in config.policies.items():
+        if name not in config.controllers or config.controllers[name].kind != "dqn":
+            known = [n for n, c in config.controllers.items() if c.kind == "dqn"]
+            raise frame.UserError(f"policies.{name}: no learned controller; allowed {', '.join(known)}")
+        seeds = {f"{name}_{path.stem}": path for path in sorted(Path(where).glob("seed*.npz"))}
+        if not seeds:
+            continue
+        given = {n: w for n, w in config.policies.items() if n != name} | {n: str(path) for n, path in seeds.items()}
+        laws = config.controllers | {n: config.controllers[name] for n in seeds}
+        studies = {
+            key: replace(s, controllers=tuple(n for c in s.controllers for n in (seeds if c == name else (c,))))
+            for key, s in config.studies.items()
+        }
+        config = replace(config, policies=given, controllers=laws, studies=studies)
+    return config
+
+
+def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> dict[str, Followed | None]:
+    """What each law of a share follows, if anything; the run folder keeps copies. Raises: UserError naming the file."""
+    found: dict[str, Followed | None] = {}
+    for name in names:
+        kept = folder / "policies" / name
+        kept.mkdir(parents=True, exist_ok=True)
+        where = config.composition_policies.get(name, "shipped")
+        policy = composition_policy(config.compositions[name].kind, where, kept, resumed=False)
+        found[name] = None if policy is None else (policy, None)
+    return found
+
+
+def benchmark(config: BenchmarkConfig, folder: Path) -> None:
+    """Calibrate, train, run every closed loop, compare, draw, report."""
+    config = with_seeds(with_twin(config))
+    wanted = cells(config)
+    if not (wanted or config.training or config.calibration):
+        raise frame.UserError("nothing to run: choose a recipe, e.g. +experiment=paper or +experiment=setpoint_steps")
+    shown: list[dict[str, str]] = []
+
+    def keep(drawing: studies.Drawing) -> None:
+        charts.save(drawing.figure, folder / "figures", drawing.name)
+        file = f"figures/{drawing.name}.svg"
+        shown.append({"file": file, "title": drawing.title, "caption": drawing.caption})
+
+    fitted = None
+    if config.calibration:
+        try:
+            fitted, drawing = studies.calibration(config)
+        except ValueError as error:
+            raise frame.UserError(f"calibration: {error}") from None
+        keep(drawing)
+    density = [cell for cell in wanted if cell.signal == "density"]
+    of_share = [cell for cell in wanted if cell.signal == "share"]
+    names = {c.controller for c in density if config.controllers[c.controller].kind == "dqn"}
+    with Loops(config) as loops:
+        for name, followed in policies_of(config, sorted({cell.controller for cell in of_share}), folder).items():
+            loops.start([cell for cell in of_share if cell.controller == name], followed)
+        loops.start([cell for cell in density if cell.controller not in names])  # they run while agents are trained
+        found, agents, learning = learned(config, names | (set(config.agents) if config.training else set()), folder)
+        shown += learning
+        for name in sorted(names):
+            loops.start([cell for cell in density if cell.controller == name], found[name])
+        done = loops.results()
+    trials = [done[cell] for cell in wanted]
+    summary = studies.summarise(config, trials) | {"calibration": fitted, "agents": agents}
+    for drawing in studies.draw(config, trials, summary):
+        keep(drawing)
+    if density:
+        _store([t for t in trials if isinstance(t, DensityTrial)], folder)
+    files.write_json(folder / "summary.json", summary | {"figures": shown})
+    report = page.save(pages.of_benchmark(folder), folder)
+    log.info("%d closed loops of %d replicates; report %s", len(trials), config.replicates, report)
