@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.evolver_stub import EvolverStub
+
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 NAMED = re.compile(r"`(\w+\.(?:py|yaml))`(?:(?!`\w+\.(?:py|yaml)`)[\s\S])*?```(?:python|yaml)\n([\s\S]*?)```")
@@ -86,6 +88,19 @@ def test_a_controller_of_ones_own_decides(folder: Path) -> None:
         proposed = [float(row["proposed_ml_s"]) for row in csv.DictReader(f) if row["proposed_ml_s"]]
     assert len(proposed) >= 30
     np.testing.assert_allclose(proposed, 0.03 / 3.0, rtol=1e-6)
+
+
+def test_a_family_of_ones_own_is_looked_at_before_a_run(tmp_path: Path) -> None:
+    """Its author wrote no preflight."""
+    words = ["-m", "experiments.deploy", f"extend={ROOT}/tests/evolver.py", "backend=evolver", "preflight_only=true"]
+    with EvolverStub() as device:
+        there = run([*words, f"backend.url={device.url}"], tmp_path)
+    assert there.returncode == 0, there.stderr
+    assert there.stderr.count("pass  v") + there.stdout.count("pass  v") == 32  # a sample and its pumps of each vial
+    away = run([*words, "backend.url=http://127.0.0.1:9"], tmp_path)
+    assert away.returncode == 1
+    last = away.stderr.splitlines()[-1]
+    assert last.startswith("error: preflight: 1 of 2 checks failed, the first: FAIL  reactors: no answer from http://")
 
 
 def test_the_run_folder_keeps_the_file_and_resumes_without_it(folder: Path) -> None:
