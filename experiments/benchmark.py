@@ -6,7 +6,6 @@ from omegaconf import DictConfig
 
 from experiments.cli import frame
 from experiments.comparison.config import BenchmarkConfig
-from experiments.composition import registry as laws
 from experiments.controllers import registry
 
 
@@ -21,7 +20,7 @@ def _schema(cfg: DictConfig) -> BenchmarkConfig:
     """A controller's config is that of its kind, and so is a composition's."""
     return BenchmarkConfig(
         controllers={str(name): registry.config(str(c.kind)) for name, c in cfg.controllers.items()},
-        compositions={str(name): laws.config(str(c.kind)) for name, c in cfg.compositions.items()},
+        compositions={str(name): registry.config(str(c.kind), registry.SHARE) for name, c in cfg.compositions.items()},
     )
 
 

@@ -22,9 +22,9 @@ def deploy(config: DeployConfig, folder: Path) -> None:
 
 def _schema(cfg: DictConfig) -> DeployConfig:
     composition = cfg.get("composition")
-    return deploy_schema(
-        str(cfg.backend.kind), str(cfg.controller.kind), None if composition is None else str(composition.kind)
-    )
+    law = None if composition is None else str(composition.kind)
+    own = {str(name): str(part.get("kind")) for name, part in (cfg.get("signals") or {}).items()}
+    return deploy_schema(str(cfg.backend.kind), str(cfg.controller.kind), law, own)
 
 
 class _Deploy(frame.Command[DeployConfig]):

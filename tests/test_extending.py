@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 NAMED = re.compile(r"`(\w+\.(?:py|yaml))`(?:(?!`\w+\.(?:py|yaml)`)[\s\S])*?```(?:python|yaml)\n([\s\S]*?)```")
 FILES = {name: text for name, text in NAMED.findall(PAGE)}
+WHOLE = {"light.py": (ROOT / "tests" / "extensions" / "light.py").read_text(encoding="utf-8")}  # named by the page
 COMMANDS = [line.removeprefix("    ") for line in PAGE.splitlines() if line.startswith("    python ")]
 SHORT = {"experiments.benchmark": ["replicates=1"], "experiments.train": ["agent.total_steps=500"]}
 
@@ -31,7 +32,7 @@ def run(words: list[str], folder: Path, **more: str) -> subprocess.CompletedProc
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for name, text in FILES.items():
+    for name, text in (FILES | WHOLE).items():
         (tmp_path / name).write_text(text, encoding="utf-8")
     return tmp_path
 
@@ -43,8 +44,16 @@ def summary(folder: Path) -> dict[str, object]:
 
 
 def test_the_page_names_every_file_it_shows() -> None:
-    assert set(FILES) == {"steps.yaml", "gentle.py", "heat_shock.py", "logged.py", "log_error.py", "sb3.py"}
-    assert len(COMMANDS) == 8
+    assert set(FILES) == {
+        "steps.yaml",
+        "gentle.py",
+        "patient.py",
+        "heat_shock.py",
+        "logged.py",
+        "log_error.py",
+        "sb3.py",
+    }
+    assert len(COMMANDS) == 10
 
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if "sb3" not in c and "policy.npz" not in c])

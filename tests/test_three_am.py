@@ -185,7 +185,7 @@ RETURNED = {  # functions whose result is said elsewhere
     "experiments/record/recovery.py": "complete",
 }
 NAMED = {  # names whose values are said elsewhere
-    "experiments/loop/composition.py": ("said",),
+    "experiments/loop/share.py": ("said",),
     "experiments/record/record.py": ("repairs",),
     "experiments/record/recovery.py": ("repairs",),
     "experiments/control/run.py": ("outcome",),

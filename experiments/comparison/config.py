@@ -8,7 +8,7 @@ from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.composition.registry import LEARNED
+from experiments.controllers import registry
 
 __all__ = ["TWIN", "BenchmarkConfig", "StudyConfig"]
 
@@ -86,7 +86,7 @@ class BenchmarkConfig:
                 "no until and no outputs in a comparison",
             )
         for name in self.composition_policies:
-            learned = [key for key, c in self.compositions.items() if c.kind in LEARNED]
+            learned = [k for k, c in self.compositions.items() if registry.takes(c.kind, "policy", registry.SHARE)]
             require(name in learned, "composition_policies", name, ", ".join(learned) or "none: no learned law")
         composed = [name for name, study in self.studies.items() if study.compositions]
         same = len(composed) in (0, len(self.studies))

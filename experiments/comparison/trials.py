@@ -28,15 +28,15 @@ from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli.stop import Workers
 from experiments.comparison.config import BenchmarkConfig
-from experiments.composition import registry as laws
-from experiments.composition.controller import CompositionController
+from experiments.composition.base import Law
+from experiments.composition.estimator import CompositionEstimator
 from experiments.composition.program import Program
 from experiments.control.policies import load_policy
 from experiments.controllers import registry
 from experiments.controllers.base import Accounts, Controller, Watches
-from experiments.loop.composition import program_of
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.metrics import WindowMetrics, window_metrics
+from experiments.loop.share import program_of
 from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
@@ -234,7 +234,10 @@ def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> 
     plant, schedule = config.plants[cell.plant], config.scenarios[cell.scenario]
 
     def make(vials: Plant) -> Controller:
-        return registry.build(config.controllers[cell.controller], config.env, policy, vials, bounds=bounds)
+        law: Controller = registry.build(
+            config.controllers[cell.controller], model=config.env, policy=policy, plant=vials, bounds=bounds
+        )
+        return law
 
     return run_trial(cell, plant, schedule, make, config.env, config.replicates, config.seed)
 
@@ -244,12 +247,16 @@ def _share(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Sh
     scenario, kind = config.scenarios[cell.scenario], config.compositions[cell.controller].kind
     program = program_of(scenario)
     plant = Plant(config.plants[cell.plant], config.replicates, np.random.default_rng(config.seed))
-    law = laws.build(config.compositions[cell.controller], followed[0] if followed else None, program)
+    composition, policy = config.compositions[cell.controller], followed[0] if followed else None
+    law = registry.build(composition, registry.SHARE, policy=policy, program=program)
+    estimator = CompositionEstimator(composition.estimator)
+    estimator.reset(plant.n)
     law.reset(plant.n)
     if cell.calibrated:
-        calibrate(law, plant, config.seed)
+        calibrate(estimator, plant, config.seed)
     found = run_share(
         plant,
+        estimator,
         law,
         _beside(config, cell.density),
         program,
@@ -257,14 +264,15 @@ def _share(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> Sh
         np.asarray(scenario.temperatures),
         scenario.announce_min if cell.announced else 0.0,
     )
-    foresight = cell.announced and kind in laws.FORESIGHT
+    foresight = cell.announced and kind in registry.FORESIGHT
     minute = np.arange(found["share"].shape[1], dtype=np.float64)
     return ShareTrial(cell, scenario, minute, foresight=foresight, setpoint=program.setpoint(minute), **found)
 
 
 def run_share(
     plant: Plant,
-    law: CompositionController,
+    estimator: CompositionEstimator,
+    law: Law,
     density: Controller,
     program: Program,
     setpoints: Array,
@@ -276,8 +284,8 @@ def run_share(
     There is no interlock: the plants of these comparisons have no faults, and every law meets the same vials, sensors
     and noise.
 
-    Args: law: reset for the plant's vials. setpoints, temperatures: OD and degC of each phase, (phases,); the latter
-      where no share is asked for.
+    Args: estimator, law: reset for the plant's vials. setpoints, temperatures: OD and degC of each phase, (phases,);
+      the latter where no share is asked for.
     """
     n, last = plant.n, round(program.total_min)
     density.reset(n)
@@ -288,19 +296,20 @@ def run_share(
         minute = np.full(n, float(k))
         phase = min(int(np.searchsorted(program.edges[1:], k + 1e-9, side="right")), len(setpoints) - 1)
         od, warm = plant.read_od(), plant.thermal.read()
-        law.watch(od, plant.read_fluorescence(), warm, minute, rows)
+        estimator.watch(od, plant.read_fluorescence(), warm, minute, rows)
         wanted = program.wanted(minute, announce_min)
         asked = np.isfinite(wanted.setpoint)
-        target = np.where(asked, law.target(wanted, minute, asked), temperatures[phase])
+        chosen = law.act(estimator.estimate(), wanted, minute, asked & estimator.begun)
+        target = np.where(asked, chosen, temperatures[phase])
         if isinstance(density, Watches):
             density.watch(od, warm, minute, rows)
         rate = density.act(od, np.full(n, setpoints[phase]), minute, rows)
-        found = law.explain()
+        found = estimator.explain()
         now = (plant.culture.share, found["ratio"], found["ratio_low"], found["ratio_high"], warm, plant.culture.od)
         for key, values in zip(fields, now, strict=True):
             stored[key][:, k] = values
         plant.advance(1.0, 60.0 * rate, temperature_target=np.where(asked, np.clip(target, T_MIN, T_MAX), target))
-        law.dosed(60.0 * rate)
+        estimator.dosed(60.0 * rate)
         if isinstance(density, Accounts):
             density.dosed(60.0 * rate)
     return stored
@@ -311,15 +320,16 @@ def _beside(config: BenchmarkConfig, name: str) -> Controller:
     kind, policy = config.controllers[name].kind, None
     if kind == "dqn":
         policy = load_policy(config.policies.get(name, "shipped"), config.env.control_min, config.env.max_pump_rate)
-    return registry.build(config.controllers[name], config.env, policy)
+    density: Controller = registry.build(config.controllers[name], model=config.env, policy=policy)
+    return density
 
 
-def calibrate(law: CompositionController, plant: Plant, seed: int) -> None:
+def calibrate(estimator: CompositionEstimator, plant: Plant, seed: int) -> None:
     """Tell the estimator each reactor's factor and offset, with the errors that a calibration leaves."""
     rng = np.random.default_rng([seed, 1])
     factor = plant.draws["fluorescence_factor"] * (1.0 + FACTOR_SD * rng.standard_normal(plant.n))
     offset = plant.draws["fluorescence_offset"] + OFFSET_SD * rng.standard_normal(plant.n)
-    law.estimator.calibrate(factor, FACTOR_SD * factor, offset, OFFSET_SD)
+    estimator.calibrate(factor, FACTOR_SD * factor, offset, OFFSET_SD)
 
 
 RUNS: dict[str, Callable[[BenchmarkConfig, Cell, Followed | None], Trial]] = {"density": _density, "share": _share}

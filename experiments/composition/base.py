@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hardware.memory import Remembers
 
-__all__ = ["Array", "Estimate", "Law", "Mask", "Wanted"]
+__all__ = ["Array", "Estimate", "Law", "Mask", "ShareEstimator", "Wanted"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -49,6 +49,35 @@ class Wanted:
     setpoint: Array
     following: Array
     minutes: Array
+
+
+class ShareEstimator(Remembers, Protocol):
+    """What is believed of N cultures, by their readings and doses; arrays (N,)."""
+
+    @property
+    def begun(self) -> Mask:
+        """Which cultures have been seen."""
+        ...
+
+    def reset(self, n: int) -> None:
+        """Forget everything; n cultures from here on."""
+        ...
+
+    def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
+        """A sample: OD, counts, degC, min since the run began; rows: True where it is new and believed."""
+        ...
+
+    def dosed(self, volume_ml: Array) -> None:
+        """Fresh medium that went in since this was last called, mL."""
+        ...
+
+    def estimate(self) -> Estimate:
+        """What is believed now."""
+        ...
+
+    def explain(self) -> dict[str, Array]:
+        """The estimate for recording and journal: ratio, ratio_low, ratio_high and more."""
+        ...
 
 
 class Law(Remembers, Protocol):

@@ -23,12 +23,14 @@ from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
 from experiments.cli.calibrated import read_env_file, read_plant_file
 from experiments.cli.choices import choices
-from experiments.composition import registry as compositions
+from experiments.composition.estimator import CompositionEstimator
 from experiments.control.config import DeployConfig
 from experiments.control.policies import Wanted, admit, composition_policy, policy_check, run_policy
 from experiments.controllers import registry
-from experiments.loop.composition import Composition, Keeper, ShareWarnings, columns, program_of
+from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
+from experiments.loop.share import Share, program_of
+from experiments.loop.signals import Signal
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, continue_loop
 from hardware.check import report
@@ -54,9 +56,9 @@ class Setup:
       calibrated.
     model: growth model that model-based controllers are given: the calibrated one, else the nominal one.
     law: config of what decides the pump rate. wanted: the policy that controller=dqn asks for, None for another.
-    policy: as read, None for a preflight. bounds: of its certificate. keeper: of the composition, None where none is
-      controlled; warnings: when a share is said to be out of control.
-    columns, fsync: of the record. title: who controls what. row: of the run in TensorBoard's table, but its results.
+    policy: as read, None for a preflight. bounds: of its certificate.
+    further: signals that are held beside the density, which have seen nothing yet.
+    fsync: of the record. title: who controls what. row: of the run in TensorBoard's table, but its results.
     resumed: an earlier life of the run is continued.
     """
 
@@ -73,13 +75,16 @@ class Setup:
     wanted: Wanted | None
     policy: Policy | None
     bounds: EstimateBounds | None
-    keeper: Keeper | None
-    warnings: ShareWarnings
-    columns: tuple[str, ...]
+    further: list[Signal]
     fsync: bool
     title: str
     row: dict[str, float | str]
     resumed: bool
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Of the recordings."""
+        return (*COLUMNS, *(column for signal in self.further for column in signal.columns))
 
 
 def completed(config: DeployConfig) -> DeployConfig:
@@ -95,7 +100,7 @@ def completed(config: DeployConfig) -> DeployConfig:
         return config
     backend, chosen = config.backend, []
     if config.composition is None:
-        law = build(compositions.config(COMPOSITION), load(f"composition/{COMPOSITION}"), "composition")
+        law = build(registry.config(COMPOSITION, registry.SHARE), load(f"composition/{COMPOSITION}"), "composition")
         config = replace(config, composition=law)
         chosen.append(f"composition={COMPOSITION}")
     if (two := family_of(backend).coculture(backend)) != backend:
@@ -129,8 +134,8 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         of_bench = f"bench.volume_ml = {bench.volume_ml:g} mL, which everything else goes by"
         log.warning("plant.vessel.volume_ml = %g mL differs from %s: on purpose?", other_ml, of_bench)
     _check_fit(config, family, scenarios, ends)
-    keeper = _keeper(config, plant, folder, scenarios)
-    if keeper is not None:  # the device has to measure what the estimate needs
+    further = _further(config, plant, folder, scenarios)
+    if further:  # the device has to measure what an estimate may need
         backend = family.seeing_fluorescence(backend)
     fastest = min(model.max_pump_rate, bench.max_rate)
     model = replace(model, control_min=bench.control_min, max_pump_rate=fastest)
@@ -143,10 +148,9 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         policy = run_policy(wanted, folder, resumed)
         admit(policy, folder / "policy.npz", wanted, resumed)
         bounds = certificate.bounds(policy, folder / "policy.npz")
-    recorded = COLUMNS if config.composition is None else (*COLUMNS, *columns(true=family.simulated))
     return Setup(
         family, backend, bench, safety, scenarios, ends, config.roles(), plant, model, config.controller, wanted,
-        policy, bounds, keeper, config.share_warnings, recorded, config.fsync, *_named(config, family, folder), resumed,
+        policy, bounds, further, config.fsync, *_named(config, family, folder), resumed,
     )  # fmt: skip
 
 
@@ -194,11 +198,19 @@ def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dic
     return f"{decides}{law} on {controlled}", row
 
 
-def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Keeper | None:
-    """What controls the composition, None if nothing does. Raises: UserError where scenario, backend and it differ."""
+def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> list[Signal]:
+    """The signals that are held beside the density. Raises: UserError where scenario, backend and they do not fit."""
+    try:
+        share = [] if config.composition is None else [_share(config, plant, folder, scenarios)]
+        own = [signals.made(name, law, scenarios) for name, law in config.signals.items()]
+        return signals.one_each([*share, *own])
+    except ValueError as error:
+        raise frame.UserError(str(error)) from None
+
+
+def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Signal:
+    """The share of the second species. Raises: UserError where scenario, backend and its law do not fit; ValueError."""
     asked = [name for name, s in zip(config.backend.reactors, scenarios, strict=True) if s.composed]
-    if config.composition is None:
-        return None
     kind = config.composition.kind
     if not asked:
         remedy = "give scenario=ratio_steps or scenario.ratios, or drop it"
@@ -211,32 +223,33 @@ def _keeper(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: l
     if kind == "optimum" and any(program_of(s) != program_of(one) for s in scenarios):
         raise frame.UserError("composition=optimum plans one program: give all reactors the same shares and minutes")
     policy = composition_policy(kind, config.composition_policy, folder, config.resume is not None)
-    try:
-        keeper: Keeper = compositions.build(
-            config.composition, policy, program_of(one), config.bench.volumes(config.backend.reactors)
-        )
-    except ValueError as error:
-        raise frame.UserError(str(error)) from None
-    return keeper
+    program, volumes_ml = program_of(one), config.bench.volumes(config.backend.reactors)
+    law = registry.build(config.composition, registry.SHARE, policy=policy, program=program)
+    estimator = CompositionEstimator(config.composition.estimator, volumes_ml)
+    simulated = family_of(config.backend).simulated
+    return Share(estimator, law, scenarios, config.share_warnings, simulated=simulated)
 
 
 def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
-    """Controller, interlock and scenarios around reactors that are ready; a resumed loop stands where it was.
+    """Laws, interlock and scenarios around reactors that are ready; a resumed loop stands where it was.
 
     Raises: UserError naming what the controller needs and does not have here; RecordingError for a state that is
       damaged or does not fit.
     """
     (plant, flow), volumes_ml = setup.family.truth(reactors), setup.bench.volumes(reactors.names)
     try:
-        controller = registry.build(setup.law, setup.model, setup.policy, plant, flow, setup.bounds, volumes_ml)
+        law = registry.build(
+            setup.law, model=setup.model, policy=setup.policy, plant=plant, flow_ml_s=flow, bounds=setup.bounds,
+            volume_ml=volumes_ml,
+        )  # fmt: skip
     except ValueError as error:
         raise frame.UserError(str(error)) from None
-    rim_ml, composition = setup.family.rim_ml(volumes_ml), None
+    rim_ml = setup.family.rim_ml(volumes_ml)
     interlock = Interlock(len(volumes_ml), setup.safety, setup.bench, volumes_ml, rim_ml)
-    if setup.keeper is not None:
-        truth = None if plant is None else partial(getattr, plant.culture, "share")
-        composition = Composition(setup.keeper, setup.scenarios, setup.warnings, truth)
-    loop = ClosedLoop(reactors, controller, interlock, setup.scenarios, record.decided, setup.ends, composition)
+    for signal in setup.further:
+        if isinstance(signal, Share) and plant is not None:
+            signal.truth = partial(getattr, plant.culture, "share")
+    loop = ClosedLoop(reactors, law, interlock, setup.scenarios, record.decided, setup.ends, setup.further)
     if setup.resumed:
         continue_loop(loop, record.journal, record.state_path)
     return loop

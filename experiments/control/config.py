@@ -1,5 +1,6 @@
 """What a closed loop is told: reactors, controller, scenario and safety."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -7,10 +8,9 @@ from conf.schema import check, part, require, setting
 from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
-from experiments.composition import registry as compositions
 from experiments.controllers import registry
 from experiments.controllers.learned import LearnedConfig
-from experiments.loop.composition import ShareWarnings
+from experiments.loop.share import ShareWarnings
 from hardware.family import family, family_of
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
@@ -65,6 +65,9 @@ class DeployConfig:
         "shipped", "of composition=dqn and dqn_preview: `shipped`, a policy.npz, or a run folder"
     )
     share_warnings: ShareWarnings = part(ShareWarnings, "when a share is said to be out of control")
+    signals: dict[str, Any] = setting(
+        {}, "further signals that are held, brought by extend=FILE.py: signals.NAME.kind=LAW signals.NAME.KEY=VALUE"
+    )
     env_file: str | None = setting(None, "a calibrated.yaml, or `latest`, whose model the simulated plant takes")
     plant_file: str | None = setting(None, "a twin.yaml of calibrate, or `latest`, in place of `plant`; backend=sim")
     notify: str = setting(
@@ -124,7 +127,14 @@ class DeployConfig:
         return [str(self.each.get(name, {}).get("role", "replicate")) for name in self.backend.reactors]
 
 
-def deploy_schema(kind: str, controller: str = "dqn", composition: str | None = None) -> DeployConfig:
-    """The schema for the backend and controllers of these kinds. Raises: ValueError naming the kinds there are."""
-    law = None if composition is None else compositions.config(composition)
-    return DeployConfig(backend=family(kind).config(), controller=registry.config(controller), composition=law)
+def deploy_schema(
+    kind: str, controller: str = "dqn", composition: str | None = None, own: Mapping[str, str] | None = None
+) -> DeployConfig:
+    """The schema for the backend and laws of these kinds. Args: own: signal of one's own -> its law.
+
+    Raises: ValueError naming the kinds there are.
+    """
+    law = None if composition is None else registry.config(composition, registry.SHARE)
+    signals = {name: registry.config(law_of, name) for name, law_of in (own or {}).items()}
+    density = registry.config(controller)
+    return DeployConfig(backend=family(kind).config(), controller=density, composition=law, signals=signals)

@@ -13,6 +13,7 @@ from dqn.policy import Policy
 from experiments.certification import certificate
 from experiments.cli import frame
 from experiments.cli.latest import newest
+from experiments.controllers import registry
 from hardware.check import Check
 from hardware.storage import atomic
 
@@ -227,10 +228,10 @@ def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Pol
     Args: kind: of the controller. name: `shipped`, a policy.npz or a run folder.
     Raises: UserError naming the file and what is wrong with it.
     """
-    if kind not in SHIPPED_COMPOSITION:
+    if not registry.takes(kind, "policy", registry.SHARE):
         return None
     kept = folder / "composition_policy.npz"
-    path = SHIPPED_COMPOSITION[kind] if name == "shipped" else find_policy(name)
+    path = SHIPPED_COMPOSITION.get(kind, Path("shipped")) if name == "shipped" else find_policy(name)
     again = resumed and kept.is_file()
     if not again and name == "shipped" and not path.is_file():
         remedy = "give composition_policy=RUN/policy.npz of a training with env=coculture or env=coculture_preview"

@@ -84,7 +84,7 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
     try:
         title = f"{setup.title}: {outcome}"
         figures = {"closed_loop": figure_of(record, setup.scenarios, title)}
-        if setup.keeper is not None:
+        if "ratio" in record.columns:
             figures["composition"] = composition_figure_of(record, title)
         pictures = {name: charts.save(figure, folder / "figures", name) for name, figure in figures.items()}
         summary = {

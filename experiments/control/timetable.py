@@ -100,7 +100,8 @@ def _deciders(c: DeployConfig, setup: Setup) -> str:
     if setup.policy is not None:
         policy = f", policy {c.policy} (regret {float(setup.policy.metadata.get('regret_pct', math.nan)):.2g} %)"
     share = "" if c.composition is None else f"; share: {c.composition.kind}"
-    return f"controller {c.controller.kind}{policy}{share}; at_end {c.at_end}"
+    own = "".join(f"; {name}: {law.kind}" for name, law in c.signals.items())
+    return f"controller {c.controller.kind}{policy}{share}{own}; at_end {c.at_end}"
 
 
 def _device(setup: Setup) -> Iterator[str]:

@@ -1,6 +1,7 @@
-"""Every kind of controller: its config, its class, and what the class is built from."""
+"""Every law of every signal: its config, what makes it, and what it is made from."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from conf import presets
@@ -9,7 +10,24 @@ from envs.bench import Bench
 from envs.plant.plant import Plant
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
-from experiments.controllers.base import Array, Controller
+from experiments.composition.laws import (
+    PI,
+    BangBang,
+    BangBangConfig,
+    InverseDynamics,
+    InverseDynamicsConfig,
+    Midpoint,
+    MidpointConfig,
+    Myopic,
+    MyopicConfig,
+    PIConfig,
+    Proportional,
+    ProportionalConfig,
+)  # fmt: skip
+from experiments.composition.learned import LearnedLaw, LearnedLawConfig, PreviewLawConfig
+from experiments.composition.planned import Optimum, OptimumConfig, Receding, RecedingConfig
+from experiments.composition.program import Program
+from experiments.controllers.base import Array
 from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
 from experiments.controllers.inverse import Inverse, InverseConfig
 from experiments.controllers.learned import LearnedConfig, learned
@@ -17,83 +35,131 @@ from experiments.controllers.mpc import Mpc, MpcConfig
 from experiments.controllers.oracle import Oracle, OracleConfig
 from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 
-__all__ = ["add", "build", "config", "on_device"]
+__all__ = ["DENSITY", "FORESIGHT", "KINDS", "SHARE", "Kind", "add", "build", "config", "on_device", "takes"]
 
-KINDS: dict[str, tuple[type[Any], Callable[..., Controller], tuple[str, ...]]] = {
-    "dqn": (LearnedConfig, learned, ("config", "policy", "model", "bounds")),
-    "pi": (ChiBioPIConfig, ChiBioPI, ("config", "volume_ml")),
-    "pi_tuned": (TunedPIConfig, TunedPI, ("config", "model")),
-    "mpc": (MpcConfig, Mpc, ("config", "model")),
-    "inverse": (InverseConfig, Inverse, ("config", "model")),
-    "threshold": (ThresholdConfig, Threshold, ("config",)),
-    "hold": (HoldConfig, Hold, ("config", "model")),
-    "oracle": (OracleConfig, Oracle, ("config", "plant", "model", "flow_ml_s")),
-}
-PARTS = ("model", "policy", "plant", "bounds", "flow_ml_s", "volume_ml")
+DENSITY, SHARE = "density", "share"
+GROUPS = {DENSITY: "controller", SHARE: "composition"}  # of presets, and key of the config
+PARTS = ("model", "policy", "plant", "bounds", "flow_ml_s", "program", "volume_ml")
 MISSING = {
-    "policy": "needs a policy; give policy=RUN/policy.npz",
-    "plant": "knows a simulated plant; allowed with backend=sim only",
+    (DENSITY, "policy"): "needs a policy; give policy=RUN/policy.npz",
+    (DENSITY, "plant"): "knows a simulated plant; allowed with backend=sim only",
+    (SHARE, "policy"): "needs a policy; give policy=RUN/policy.npz of a training with env=coculture or "
+    "env=coculture_preview",
+    (SHARE, "program"): "plans the whole program; give a scenario with ratios",
+}
+FORESIGHT = ("dqn_preview", "midpoint", "receding", "optimum")
+"""Laws of the share that act on what is announced."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A law: the class of its config, what makes it, and the parts with which that is called after the config."""
+
+    config: type[Any]
+    make: Callable[..., Any]
+    parts: tuple[str, ...] = ()
+
+
+KINDS: dict[str, dict[str, Kind]] = {
+    DENSITY: {
+        "dqn": Kind(LearnedConfig, learned, ("policy", "model", "bounds")),
+        "pi": Kind(ChiBioPIConfig, ChiBioPI, ("volume_ml",)),
+        "pi_tuned": Kind(TunedPIConfig, TunedPI, ("model",)),
+        "mpc": Kind(MpcConfig, Mpc, ("model",)),
+        "inverse": Kind(InverseConfig, Inverse, ("model",)),
+        "threshold": Kind(ThresholdConfig, Threshold),
+        "hold": Kind(HoldConfig, Hold, ("model",)),
+        "oracle": Kind(OracleConfig, Oracle, ("plant", "model", "flow_ml_s")),
+    },
+    SHARE: {
+        "dqn": Kind(LearnedLawConfig, LearnedLaw, ("policy",)),
+        "dqn_preview": Kind(PreviewLawConfig, LearnedLaw, ("policy",)),
+        "pi": Kind(PIConfig, PI),
+        "proportional": Kind(ProportionalConfig, Proportional),
+        "inverse_dynamics": Kind(InverseDynamicsConfig, InverseDynamics),
+        "bang_bang": Kind(BangBangConfig, BangBang),
+        "myopic": Kind(MyopicConfig, Myopic),
+        "midpoint": Kind(MidpointConfig, Midpoint),
+        "receding": Kind(RecedingConfig, Receding),
+        "optimum": Kind(OptimumConfig, Optimum, ("program",)),
+    },
 }
 
 
-def add(kind: str, config: type[Any], make: Callable[..., Controller], what: str, parts: Sequence[str] = ()) -> None:
-    """Make a controller known as `controller=KIND` to every command.
+def add(
+    kind: str, config: type[Any], make: Callable[..., Any], what: str, parts: Sequence[str] = (), signal: str = DENSITY
+) -> None:
+    """Make a law known: `controller=KIND` of the density, `composition=KIND` of the share, `signals.NAME.kind=KIND`.
 
     Args:
       kind: its name, the default of the field `kind` of `config`.
-      config: dataclass of its values, whose fields are made by `conf.schema.setting`.
-      make: called with the config and then the `parts`, returns the controller.
+      config: dataclass of its values, whose fields are made by `conf.schema.setting`; one of the share also has the
+        field `estimator` of `experiments.composition.laws.LawConfig`.
+      make: called with the config and then the `parts`, returns the law.
       what: the sentence that the help shows.
-      parts: what else it is built from, arguments of `build`.
+      parts: what else it is made from, arguments of `build`.
+      signal: which it holds: density, share, or one of one's own (`experiments.loop.signals.add`).
     Raises: ValueError for a kind that exists, or a part that nobody has.
     """
     if wrong := set(parts) - set(PARTS):
-        raise ValueError(f"controller {kind}: no part {sorted(wrong)[0]}; allowed {', '.join(PARTS)}")
-    presets.add(f"controller/{kind}", {"kind": kind}, what)
-    KINDS[kind] = (config, make, ("config", *parts))
+        raise ValueError(f"{signal}, law {kind}: no part {sorted(wrong)[0]}; allowed {', '.join(PARTS)}")
+    if signal in GROUPS:
+        presets.add(f"{GROUPS[signal]}/{kind}", {"kind": kind}, what)
+    KINDS.setdefault(signal, {})[kind] = Kind(config, make, tuple(parts))
+
+
+def _kind(kind: str, signal: str) -> Kind:
+    if kind not in KINDS.get(signal, {}):
+        key = f"{GROUPS.get(signal, f'signals.{signal}')}.kind"
+        raise ValueError(f"{key} = {kind}: allowed {', '.join(KINDS.get(signal, {}))}")
+    return KINDS[signal][kind]
+
+
+def takes(kind: str, part: str, signal: str = DENSITY) -> bool:
+    """Whether a law is made from this part, "policy" say. Raises: ValueError naming the laws there are."""
+    return part in _kind(kind, signal).parts
 
 
 def on_device(kind: str) -> str:
-    """The kind itself, if it needs no simulated plant. Raises: ValueError naming the kinds that can run a device."""
-    known = [name for name, (_, _, parts) in KINDS.items() if "plant" not in parts]
+    """The law of the density itself, if it needs no simulated plant. Raises: ValueError naming those that do not."""
+    known = [name for name, law in KINDS[DENSITY].items() if "plant" not in law.parts]
     if kind not in known:
         raise ValueError(f"controller_kind = {kind}: allowed {', '.join(known)}")
     return kind
 
 
-def config(kind: str) -> Any:
-    """The default config of this kind of controller. Raises: ValueError naming the kinds there are."""
-    if kind not in KINDS:
-        raise ValueError(f"controller.kind = {kind}: allowed {', '.join(KINDS)}")
-    return KINDS[kind][0]()
+def config(kind: str, signal: str = DENSITY) -> Any:
+    """The default config of a law. Raises: ValueError naming the laws there are."""
+    return _kind(kind, signal).config()
 
 
 def build(
     config: Any,
-    model: EnvConfig,
+    signal: str = DENSITY,
+    *,
+    model: EnvConfig | None = None,
     policy: Policy | None = None,
     plant: Plant | None = None,
     flow_ml_s: float = 1.0,
     bounds: EstimateBounds | None = None,
+    program: Program | None = None,
     volume_ml: Array | float = Bench.volume_ml,
-) -> Controller:
-    """The controller that a config describes.
+) -> Any:
+    """The law that a config describes, a `Controller` of the density or a `Law` of the share.
 
     Args:
-      config: as `config` gives it; `kind` names the controller.
-      model: the calibrated growth model, control period and largest pump rate, for those that use a model.
-      policy: what `dqn` follows. plant: the vials that `oracle` knows; only a simulation has it.
+      config: as `config` gives it; `kind` names the law.
+      model: the calibrated growth model, control period and largest pump rate.
+      policy: what a learned law follows. program: of shares, which `optimum` plans.
+      plant: the vials that `oracle` knows; only a simulation has it. flow_ml_s: what the backend believes its pumps
+        deliver (the oracle must know what a rate becomes).
       bounds: within which the certificate of `policy` lets it act; None where it has none, and nobody supervises.
-      flow_ml_s: what the backend believes its pumps deliver (the oracle must know what a rate becomes).
       volume_ml: of the cultures, as the bench says, (N,) or one for all.
-    Raises: ValueError naming what is missing for this kind of controller.
+    Raises: ValueError naming what is missing for this law.
     """
-    if config.kind not in KINDS:
-        raise ValueError(f"controller.kind = {config.kind}: no such controller")
-    _, make, parts = KINDS[config.kind]
-    given = {"config": config, "model": model, "policy": policy, "plant": plant, "flow_ml_s": flow_ml_s}
-    given |= {"bounds": bounds, "volume_ml": volume_ml}
-    for part in parts:
-        if given[part] is None and part in MISSING:
-            raise ValueError(f"controller = {config.kind}: {MISSING[part]}")
-    return make(**{part: given[part] for part in parts})
+    law = _kind(config.kind, signal)
+    given = dict(zip(PARTS, (model, policy, plant, bounds, flow_ml_s, program, volume_ml), strict=True))
+    for part in law.parts:
+        if given[part] is None and (signal, part) in MISSING:
+            raise ValueError(f"{GROUPS[signal]} = {config.kind}: {MISSING[signal, part]}")
+    return law.make(config, **{part: given[part] for part in law.parts})

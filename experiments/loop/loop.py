@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.scenario import Scenario
-from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Watches
-from experiments.loop.composition import Composition
+from experiments.controllers.base import Array, Controller, Mask
 from experiments.loop.progress import Progress
+from experiments.loop.signals import Density, Sample, Signal, one_each
 from experiments.loop.supply import Supply
 from hardware import memory
 from hardware.memory import Remembers
@@ -36,8 +36,8 @@ class Step:
     phase: of the schedule, -1 in recovery. proposed, rate: before and after the interlock, mL/s.
     volume_ml: asked of the pump, and what the device repeated since the row before; known only after the dose was
     begun. reasons: of the interlock, for all reactors.
-    response: of the interlock. notes: of the reactors. explanation: of the controller. done: schedule over.
-    composition: further columns of the recording, where a composition is controlled.
+    response: of the interlock. notes: of the reactors. explanation: of the laws. done: schedule over.
+    columns: further ones of the recording, of the signals beside the density.
     raw, blank: counts behind the OD and those of clear medium; nan where the reactors have none.
     pump: number of the pump that gives the dose, 1 (the feed), 3 or 4. believed: rows whose OD the interlock takes for
       the culture's.
@@ -61,7 +61,7 @@ class Step:
     notes: Sequence[str]
     explanation: dict[str, Array]
     done: Mask
-    composition: dict[str, Array] = field(default_factory=dict)
+    columns: dict[str, Array] = field(default_factory=dict)
     position: Sequence[dict[str, Any]] = ()
     ended: Mask | None = None
     raw: Array | None = None
@@ -71,19 +71,20 @@ class Step:
 
 
 class ClosedLoop:
-    """Controller x interlock x reactors over one schedule per reactor; reactors may be sampled at different moments.
+    """Signals x interlock x reactors over one schedule per reactor; reactors may be sampled at different moments.
 
     Each reactor first recovers (grows undiluted until `recovery_od`), then runs its schedule on its own time. A reading
     that the interlock does not believe begins no schedule and is not shown to the controller.
 
     Args:
-      reactors: N reactors. controller: decides. interlock: of N reactors.
+      reactors: N reactors. controller: decides on the feed. interlock: of N reactors.
       schedules: one per reactor, or one for all.
       at_end: of each reactor, or one for all, once its schedule is over and others are not: "hold" goes on at the last
         setpoint, "stop" gives no dose any more, "regulate" hands over to the device's own regulation for good.
       before_dose: called with the step as decided, before anything is dosed (volume_ml still nan): the journal.
-      composition: decides on the temperature where a share is asked for; None: the schedules do everywhere.
-    Raises: ValueError for another number of schedules than of reactors.
+      further: signals beside the density; what acts by the thermostat decides on the temperature in place of the
+        schedules wherever it gives a target.
+    Raises: ValueError for another number of schedules than of reactors, or two signals with one actuator.
     """
 
     remembers = ("began", "done", "stopped")
@@ -96,11 +97,11 @@ class ClosedLoop:
         schedules: Sequence[Scenario] | Scenario,
         before_dose: Callable[[Step], None] | None = None,
         at_end: Sequence[str] | str = "stop",
-        composition: Composition | None = None,
+        further: Sequence[Signal] = (),
     ) -> None:
         n = len(reactors.names)
-        self.reactors, self.controller, self.interlock = reactors, controller, interlock
-        self.composition = composition
+        self.reactors, self.interlock, self.density = reactors, interlock, Density(controller)
+        self.signals = one_each([self.density, *further])
         self.schedules = [schedules] * n if isinstance(schedules, Scenario) else list(schedules)
         if len(self.schedules) != n:
             raise ValueError(f"{len(self.schedules)} schedules: allowed one for each of the {n} reactors")
@@ -142,14 +143,12 @@ class ClosedLoop:
         phase, setpoint, temperature = self.progress.asked(elapsed)
         self.done = self.done | (rows & (elapsed >= self.progress.totals - 1e-6))
 
-        composed = None
-        if self.composition is not None:
-            composed = self.composition.step(m, self.interlock, elapsed, believed, temperature)
-            temperature = composed.target
+        sample = Sample.of(m, self.interlock, rows, believed, elapsed, phase, setpoint, temperature)
+        decided = self.density.decide(sample)
+        for signal in self.signals[1:]:
+            allowed = self.interlock.temperature(signal.decide(sample))
+            temperature = np.where(np.isfinite(allowed), allowed, temperature)
         steered = believed & (phase >= 0)
-        if isinstance(self.controller, Watches):
-            self.controller.watch(m.od, m.temperature, minute, believed)
-        decided = self.controller.act(np.where(rows & ~believed, np.nan, m.od), setpoint, minute, steered)
         proposed = np.where(steered & ~(self.done & (self._at_end != "hold")), decided, 0.0)
         pump, extra_ml = self.supply.due(elapsed, phase, steered & ~self.done)
         proposed = np.where(pump == 1, proposed, extra_ml / self.interlock.bench.period_s)
@@ -157,16 +156,19 @@ class ClosedLoop:
         sound = rows & (verdict.response == Response.PASS)  # the device will dose by the same sensor
         left = self.done & (self._at_end == "regulate") & sound
         self.interlock.latch(Response.REGULATE, left)
-        explanation = self.controller.explain() if isinstance(self.controller, Explains) else {}
+        columns: dict[str, Array] = {}
+        explanation: dict[str, Array] = {}
         reasons: Sequence[str | None] = verdict.reasons
-        if composed is not None:
-            explanation = explanation | composed.why
-            reasons = [" | ".join(filter(None, both)) or None for both in zip(reasons, composed.warnings, strict=True)]
+        for signal in self.signals:
+            found = signal.find(sample, verdict.rate if signal is self.density else temperature)
+            columns, explanation = columns | dict(found.columns), explanation | dict(found.why)
+            if found.warnings:
+                reasons = [" | ".join(filter(None, both)) or None for both in zip(reasons, found.warnings, strict=True)]
 
         decision = Step(
             now, rows, minute, elapsed, phase, m.od, m.temperature, setpoint, proposed, verdict.rate,
             np.full(len(self.done), np.nan), reasons, verdict.response, (), explanation, self.done.copy(),
-            {} if composed is None else composed.columns,
+            columns,
             [self.position(n) for n in range(len(self.done))], ended,
             None if m.vitals is None else m.vitals.raw, None if m.vitals is None else m.vitals.blank, pump, believed,
         )  # fmt: skip
@@ -192,12 +194,11 @@ class ClosedLoop:
             self.repeated_ml = self.repeated_ml + receipt.volume_ml
 
     def book(self, receipt: Receipt, at_s: float) -> None:
-        """What was dosed counts for the interlock, and for a controller that goes by it. Args: at_s: run time, s."""
+        """What was dosed counts for the interlock, and for every signal. Args: at_s: run time, s."""
         self.interlock.confirm(receipt, at_s)
-        if isinstance(self.controller, Accounts):
-            self.controller.dosed(receipt.volume_ml + (0.0 if receipt.kept_ml is None else receipt.kept_ml))
-        if self.composition is not None:
-            self.composition.dosed(receipt.volume_ml)
+        kept_ml = np.zeros(len(self.done)) if receipt.kept_ml is None else receipt.kept_ml
+        for signal in self.signals:
+            signal.dosed(receipt.volume_ml, kept_ml)
 
     def set_level(self, name: str, level_ml: float) -> float:
         """The ledger of a vial, and the device's own where it keeps one, set to what was read; what it was, mL."""
@@ -236,25 +237,24 @@ class ClosedLoop:
         return {"began": float(self.began[n]), **memory.row(self.progress, n), **memory.row(self.supply, n)}
 
     def state(self) -> dict[str, Any]:
-        """Where each reactor's schedule, the interlock and the controllers stand; plain numbers and lists."""
+        """Where each reactor's schedule, the interlock and the signals stand; plain numbers and lists."""
         state = memory.save(self) | {"interlock": self.interlock.state()}
         state |= {key: found for key, part in self._rows.items() if (found := memory.rows(part))}
-        state |= {} if self.composition is None else {"composition": memory.save(self.composition)}
-        return state | ({"controller": memory.save(self.controller)} if isinstance(self.controller, Remembers) else {})
+        kept = {signal.name: signal.memory for signal in self.signals}
+        return state | {name: memory.save(one) for name, one in kept.items() if one is not None}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue as saved; None stands for nan. Raises: ValueError naming what is missing or does not fit.
 
-        A state without `controller` is of a version that did not save it: then the controller begins anew.
+        A state without `controller` is of a version that did not save it: then the law of the density begins anew.
         """
         memory.restore(self, state, OWN)
         for key, part in self._rows.items():
             memory.restore_rows(part, state.get(key, "missing"), key)
         self.interlock.restore(state.get("interlock", "missing"))
-        if self.composition is not None:
-            memory.restore(self.composition, state.get("composition", "missing"), memory.words("composition"))
-        if isinstance(self.controller, Remembers) and "controller" in state:
-            memory.restore(self.controller, state["controller"], memory.words("controller"))
+        for signal in self.signals:
+            if signal.memory is not None and (signal is not self.density or signal.name in state):
+                memory.restore(signal.memory, state.get(signal.name, "missing"), memory.words(signal.name))
 
     @property
     def _rows(self) -> dict[str, Remembers]:

@@ -17,7 +17,7 @@ __all__ = ["Curves"]
 
 Array = NDArray[np.float64]
 
-NAMES = {  # of the columns that a composition adds to a recording
+NAMES = {  # of the columns that the share adds to a recording; those of other signals keep theirs below further/
     "fluorescence": "share/fluorescence",
     "ratio_setpoint": "share/setpoint",
     "ratio": "share/estimate",
@@ -69,7 +69,7 @@ class Curves:
             "culture/setpoint_high": setpoint * (1.0 + BAND),
             "culture/temperature_degc": step.temperature,
             "pump/rate_ml_s": step.rate,
-            **{NAMES[key]: value for key, value in step.composition.items()},
+            **{NAMES.get(key, f"further/{key}"): value for key, value in step.columns.items()},
             **{f"controller/{key}": value for key, value in step.explanation.items() if value.ndim == 1},
         }
         for n in map(int, np.flatnonzero(step.rows)):

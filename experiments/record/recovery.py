@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.controllers.base import Accounts
 from experiments.loop.loop import ClosedLoop, Step
 from hardware.errors import RecordingError
 from hardware.memory import Remembers
@@ -46,7 +45,7 @@ ADDED = ("raw_counts", "blank_counts", "feed_pump", "believed")  # columns of a 
 
 def row_of(step: Step, n: int) -> Row:
     """The CSV row of reactor n in a step."""
-    further = {key: float(value[n]) for key, value in step.composition.items()}
+    further = {key: float(value[n]) for key, value in step.columns.items()}
     return {
         "time_min": round(float(step.minute[n]), 4),
         "elapsed_min": round(float(step.elapsed[n]), 4),
@@ -246,7 +245,7 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
         loop.restore(_caught_up(state, newer, list(loop.reactors.names)))
     except ValueError as error:
         raise _no_state(path, str(error)) from None
-    if isinstance(loop.controller, Remembers) and "controller" not in state:
+    if isinstance(loop.density.law, Remembers) and loop.density.name not in state:
         log.warning(
             "%s: an earlier version wrote it, without the controller's memory: the controller begins anew", path
         )
@@ -266,9 +265,10 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
             loop.supply.given(np.where(mine, dose.pump, 0), mine * dose.feed_ml)
         if dose.again and dose.n > decided.get(dose.reactor, -1):  # in no row yet
             loop.repeated_ml += mine * dose.feed_ml
-    if isinstance(loop.controller, Accounts):
-        before = [row for row in journal.rows if row["n"] < state["journal_row"]]
-        loop.controller.dosed(_put_off(journal.rows, loop) - _put_off(before, loop))
+    before = [row for row in journal.rows if row["n"] < state["journal_row"]]
+    kept_ml = _put_off(journal.rows, loop) - _put_off(before, loop)
+    for signal in loop.signals:
+        signal.dosed(np.zeros(kept_ml.size), kept_ml)
     minute = loop.reactors.elapsed() / 60.0
     log.info("resumed at minute %.1f; %d dose(s) booked from the journal", minute, len(doses))
 

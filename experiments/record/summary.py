@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs.scenario import Scenario
-from experiments.loop.composition import TRUE
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.progress import Progress
@@ -71,7 +70,7 @@ class ChangeLog:
             if step.rows[n] and int(step.phase[n]) != self._phase[n]:
                 self._window(step, n)
                 self._phase[n] = int(step.phase[n])
-                share = step.composition.get("ratio_setpoint", np.full(len(self._names), np.nan))[n]
+                share = step.columns.get("ratio_setpoint", np.full(len(self._names), np.nan))[n]
                 what = "recovery" if self._phase[n] < 0 else f"setpoint {step.setpoint[n]:g}"
                 what += f", share {share:g}" if np.isfinite(share) else ""
                 log.info("%s: %s from minute %.0f, OD %.3f", name, what, step.minute[n], step.od[n])
@@ -191,27 +190,30 @@ def _windows(record: Record, scenarios: Sequence[Scenario], progress: Progress) 
             window["ended"] = step[2] if latest >= end - 1e-6 else None
             window["temperature"] = scenario.temperatures[phase]
             window |= {key: float(getattr(m, key)[0]) for key in FORMATS}
-            if "ratio" in record.columns:
-                window |= _shares(record, n, start, end)
+            window |= _further(record, n, start, end)
             rows.append(window)
     return rows
 
 
-def _shares(record: Record, n: int, start: float, end: float) -> dict[str, Any]:
-    """How well reactor n's share, by the estimate and, where it is known, in truth, and its OD followed.
+def _further(record: Record, n: int, start: float, end: float) -> dict[str, Any]:
+    """How well reactor n's further signals, as estimated and, where it is known, in truth, and its OD followed.
 
-    The setpoint is None where none or more than one was asked for.
+    A signal has a column NAME, maybe true_NAME, and NAME_setpoint; None where none or more than one was asked for.
     """
-    columns = {key: record.series(key)[n : n + 1] for key in ("elapsed_min", "ratio", "ratio_setpoint")}
-    minute, asked = columns["elapsed_min"], columns["ratio_setpoint"]
-    found = np.unique(asked[(minute >= start - 1e-6) & (minute < end - 1e-6) & np.isfinite(asked)])
-    told: dict[str, Any] = {"ratio_setpoint": float(found[0]) if found.size == 1 else None}
-    for key in ("ratio", TRUE):
-        if key in record.columns:
-            whole, late = mean_errors(minute, record.series(key)[n : n + 1], asked, start, end)
-            told |= {f"{key}_abs_error_mean": float(whole[0]), f"{key}_abs_error_last2h": float(late[0])}
-    density, _ = mean_errors(minute, record.od()[n : n + 1], record.series("setpoint")[n : n + 1], start, end)
-    return told | {"od_abs_error_mean": float(density[0])}
+    minute = record.series("elapsed_min")[n : n + 1]
+    told: dict[str, Any] = {}
+    for name in (key.removesuffix("_setpoint") for key in record.columns if key.endswith("_setpoint")):
+        asked = record.series(f"{name}_setpoint")[n : n + 1]
+        found = np.unique(asked[(minute >= start - 1e-6) & (minute < end - 1e-6) & np.isfinite(asked)])
+        told[f"{name}_setpoint"] = float(found[0]) if found.size == 1 else None
+        for key in (name, f"true_{name}"):
+            if key in record.columns:
+                whole, late = mean_errors(minute, record.series(key)[n : n + 1], asked, start, end)
+                told |= {f"{key}_abs_error_mean": float(whole[0]), f"{key}_abs_error_last2h": float(late[0])}
+    if told:
+        density, _ = mean_errors(minute, record.od()[n : n + 1], record.series("setpoint")[n : n + 1], start, end)
+        told["od_abs_error_mean"] = float(density[0])
+    return told
 
 
 def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:

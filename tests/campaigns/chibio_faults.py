@@ -129,7 +129,7 @@ def control(rate: float | None) -> Act:
     """Replace the controller of all reactors."""
 
     def act(r: Rehearsal) -> None:
-        r.loop.controller = _Broken(rate)
+        r.loop.density.law = _Broken(rate)
 
     return act
 

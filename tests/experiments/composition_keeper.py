@@ -1,10 +1,10 @@
-"""A composition controller for tests of the loop: it reckons the share from the temperatures it is shown."""
+"""Estimator and law in one, for tests of the loop: it reckons the share from the temperatures it is shown."""
 
 import numpy as np
 
 from envs.coculture.rates import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
 from envs.coculture.task import logit, share
-from experiments.composition.base import Array, Mask, Wanted
+from experiments.composition.base import Array, Estimate, Mask, Wanted
 
 
 class Reckoning:
@@ -34,7 +34,14 @@ class Reckoning:
     def dosed(self, volume_ml: Array) -> None:
         self.told_ml = self.told_ml + volume_ml
 
-    def target(self, wanted: Wanted, minute: Array, rows: Mask) -> Array:
+    @property
+    def begun(self) -> Mask:
+        return np.isfinite(self._x)
+
+    def estimate(self) -> Estimate:
+        return Estimate(self._x, np.zeros(self._x.size), np.full(self._x.size, EQUAL_RATES_C), self._rate)
+
+    def act(self, estimate: Estimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
         with np.errstate(invalid="ignore"):
             return np.clip(EQUAL_RATES_C - 20.0 * (logit(wanted.setpoint) - self._x), T_MIN, T_MAX)
 

@@ -51,7 +51,7 @@ def trial(controller: str, plant: str, scenario: str, replicates: int, seed: int
         Cell(controller, plant, scenario),
         c.plants[plant],
         c.scenarios[scenario],
-        lambda vials: registry.build(c.controllers[controller], c.env, inverse_policy(), vials),
+        lambda vials: registry.build(c.controllers[controller], model=c.env, policy=inverse_policy(), plant=vials),
         c.env,
         replicates,
         seed,

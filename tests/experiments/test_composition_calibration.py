@@ -19,7 +19,7 @@ def protocol(share, n=40, hours=5, factor=0.8, offset=300.0):
     light = replace(config.fluorescence, factor=(factor, factor), offset=(offset, offset))
     config = replace(config, fluorescence=light, second=replace(config.second, start_share=(share, share)))
     plant = Plant(config, n, np.random.default_rng(1))
-    density = registry.build(registry.config("inverse"), EnvConfig())
+    density = registry.build(registry.config("inverse"), model=EnvConfig())
     density.reset(n)
     readings, ods = [], []
     for k in range(60 * hours):

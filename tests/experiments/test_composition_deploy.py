@@ -12,8 +12,8 @@ from experiments import report
 from experiments.cli import frame
 from experiments.control import policies, run
 from experiments.deploy import main
-from experiments.loop.composition import COLUMNS
 from experiments.loop.metrics import mean_errors
+from experiments.loop.share import COLUMNS
 from experiments.record.recovery import COLUMNS as USUAL
 from hardware.storage.recording_reader import read_recording
 

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,9 @@ import pytest
 from conf import presets
 from conf.schema import build
 from envs.scenario import Scenario
-from experiments.composition import registry as compositions
+from experiments.control import assemble
+from experiments.controllers import registry
+from experiments.loop.share import Share
 from experiments.record.recovery import COLUMNS as USUAL
 from hardware.chibio.calibrations import save_calibration
 from hardware.emulator.device import DeviceOptions, plant_preset
@@ -40,14 +42,19 @@ TWO = DeviceOptions(vial=VialConfig(outlier_rate=0.0), plant=PLANT)
 def rehearsal(
     folder: Path, scenario: Scenario, names: tuple[str, ...] = ("M0",), kind: str = "proportional"
 ) -> Rehearsal:
-    config = replace(rehearsed(names, scenario), composition=compositions.config(kind))
+    config = replace(rehearsed(names, scenario), composition=registry.config(kind, registry.SHARE))
     return Rehearsal(folder, config, TWO, seed=1)
+
+
+def share(scenarios: Sequence[Scenario]) -> Share:
+    keeper = Reckoning()
+    return Share(keeper, keeper, scenarios)
 
 
 def error(run: Rehearsal, n: int = 0) -> Iterator[float]:
     """Distance of the true share from what is asked for, sample by sample."""
     for step in run.run():
-        asked = float(step.composition["ratio_setpoint"][n])
+        asked = float(step.columns["ratio_setpoint"][n])
         if np.isfinite(asked):
             yield abs(float(run.device.vials[run.names[n]].plant.culture.share[0]) - asked)
 
@@ -113,7 +120,7 @@ def test_what_the_device_dosed_while_the_program_was_dead_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A pump left on repeats its dose; the estimate's dilution is the interlock's account of it."""
-    monkeypatch.setattr(compositions, "build", lambda *_: Reckoning())
+    monkeypatch.setattr(assemble, "_share", lambda config, plant, folder, scenarios: share(scenarios))
     run = rehearsal(tmp_path, SHORT)
     run.begin()
     whole = run.device.submit
@@ -130,11 +137,12 @@ def test_what_the_device_dosed_while_the_program_was_dead_is_told(
     with pytest.raises(Killed):
         list(run.run())
     run.close()
-    told = json.loads((tmp_path / "state.json").read_text())["composition"]["controller"]["told_ml"][0]
+    told = json.loads((tmp_path / "state.json").read_text())["composition"]["controller"]["law"]["told_ml"][0]
     run.wait(400.0)
     run.begin()
     list(run.run(run.clock.now() + 240.0))
-    keeper = run.loop.composition.controller if run.loop.composition else None
+    (held,) = (each for each in run.loop.signals if isinstance(each, Share))
+    keeper = held.law
     assert isinstance(keeper, Reckoning)
     assert keeper.told_ml[0] == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]), abs=1e-6)
     assert keeper.told_ml[0] > told + 3.0  # six repetitions of half a millilitre and more

@@ -13,10 +13,9 @@ from envs.plant.fluorescence import steady_production
 from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
 from experiments.comparison.trials import calibrate, run_share
-from experiments.composition import registry
 from experiments.composition.estimator import FACTOR, LOGIT, OFFSET, CompositionEstimator, CompositionEstimatorConfig
 from experiments.composition.program import Program
-from experiments.controllers import registry as densities
+from experiments.controllers import registry
 from hardware import memory
 
 NAN = float("nan")
@@ -100,14 +99,16 @@ def closed_loop(plant_name, calibrated, n=32, flow=1.0):
     config = build(PlantConfig(), presets.load(f"plant/{plant_name}"))
     config = replace(config, pump=replace(config.pump, gain_ml_s=flow))
     plant = Plant(config, n, np.random.default_rng(0))
-    law = registry.build(registry.config("proportional"))
+    config = registry.config("proportional", registry.SHARE)
+    estimator, law = CompositionEstimator(config.estimator), registry.build(config, registry.SHARE)
+    estimator.reset(n)
     law.reset(n)
     if calibrated:
-        calibrate(law, plant, seed=0)
-    density = densities.build(densities.config("inverse"), EnvConfig())
+        calibrate(estimator, plant, seed=0)
+    density = registry.build(registry.config("inverse"), model=EnvConfig())
     program = Program((NAN, 0.3, 0.7, 0.3), (60.0, 360.0, 600.0, 600.0))
-    found = run_share(plant, law, density, program, np.full(4, 0.5), np.full(4, 33.2), 0.0)
-    return found, law
+    found = run_share(plant, estimator, law, density, program, np.full(4, 0.5), np.full(4, 33.2), 0.0)
+    return found, estimator
 
 
 @pytest.mark.parametrize(
@@ -128,15 +129,15 @@ def test_its_band_covers_the_truth_as_often_as_it_says(plant, calibrated, most, 
 
 
 def test_errors_of_both_growth_curves_are_found():
-    _, law = closed_loop("coculture_growth_both", calibrated=True, n=8)
-    told = law.explain()
+    _, estimator = closed_loop("coculture_growth_both", calibrated=True, n=8)
+    told = estimator.explain()
     np.testing.assert_allclose(told["bias_e"].mean(), -0.05, atol=0.02)
     np.testing.assert_allclose(told["bias_p"].mean(), -0.10, atol=0.02)
 
 
 def test_a_pump_that_gives_a_tenth_less_is_found_and_does_not_mislead():
-    found, law = closed_loop("coculture", calibrated=True, flow=0.9)
-    np.testing.assert_allclose(law.explain()["dose_gain"].mean(), 0.9, atol=0.02)
+    found, estimator = closed_loop("coculture", calibrated=True, flow=0.9)
+    np.testing.assert_allclose(estimator.explain()["dose_gain"].mean(), 0.9, atol=0.02)
     inside = (found["low"] <= found["share"]) & (found["share"] <= found["high"])
     assert inside[:, 60:].mean() >= 0.9
     assert np.sqrt(np.square(found["estimate"] - found["share"]).mean()) < 0.016

@@ -9,9 +9,10 @@ import pytest
 from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
 from envs.coculture.rates import e_coli_rate, p_putida_rate
 from envs.coculture.task import CocultureConfig, advance, at_rest, logit, share
-from experiments.composition import registry
 from experiments.composition.base import Estimate, Wanted
 from experiments.composition.program import Program
+from experiments.controllers import registry
+from experiments.controllers.registry import SHARE
 from hardware import memory
 
 NAN = float("nan")
@@ -20,8 +21,8 @@ BLIND = ("pi", "proportional", "inverse_dynamics", "bang_bang", "myopic", "reced
 
 
 def law(kind, program=STEPS, policy=None, **values):
-    made = type(registry.config(kind))(**values)
-    return registry.build(made, policy, program).law
+    made = type(registry.config(kind, SHARE))(**values)
+    return registry.build(made, SHARE, policy=policy, program=program)
 
 
 def seen(x, temperature=33.2, rate=None):
@@ -214,11 +215,11 @@ def test_a_policy_decides_as_often_as_in_training():
 
 def test_what_cannot_be_built_is_said_in_one_line():
     with pytest.raises(ValueError, match=r"^composition.kind = pid: allowed dqn, dqn_preview, pi"):
-        registry.config("pid")
+        registry.config("pid", SHARE)
     with pytest.raises(ValueError, match=r"^composition = dqn: needs a policy"):
-        registry.build(registry.config("dqn"))
+        registry.build(registry.config("dqn", SHARE), SHARE)
     with pytest.raises(ValueError, match=r"^composition = optimum: plans the whole program"):
-        registry.build(registry.config("optimum"))
+        registry.build(registry.config("optimum", SHARE), SHARE)
     with pytest.raises(ValueError, match=r"^policy = .*logit_next.*env=coculture trains"):
         law("dqn", policy=linear_policy(COCULTURE_PREVIEW, "rate"))
     with pytest.raises(ValueError, match=r"^composition.gain = 0.0 degC"):

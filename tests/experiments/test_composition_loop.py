@@ -1,7 +1,7 @@
 """The composition in the loop: what is shown to its controller, what comes of its targets, what is warned of."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,12 @@ import pytest
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.composition import registry as compositions
-from experiments.composition.base import Array, Mask, Wanted
+from experiments.composition.base import Array, Estimate, Mask, Wanted
+from experiments.composition.estimator import CompositionEstimator
 from experiments.controllers import registry
-from experiments.loop.composition import COLUMNS, Composition, ShareWarnings, program_of
 from experiments.loop.loop import ClosedLoop, Step
+from experiments.loop.share import COLUMNS, Share, ShareWarnings, program_of
+from experiments.loop.signals import Sample, Signal
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Measurement
 from hardware.safety.config import SafetyConfig
@@ -36,7 +37,7 @@ class Scripted(Reckoning):
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         self.seen.append((od, fluorescence, temperature, minute, rows))
 
-    def target(self, wanted: Wanted, minute: Array, rows: Mask) -> Array:
+    def act(self, estimate: Estimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
         self.asked = wanted, minute, rows
         return np.full(minute.shape, self.answer)
 
@@ -48,19 +49,38 @@ class Scripted(Reckoning):
         }
 
 
+def held(keeper: Any, schedules: list[Scenario], limits: ShareWarnings | None = None) -> Share:
+    """A keeper is both estimator and law."""
+    return Share(keeper, keeper, schedules, limits)
+
+
+@dataclass
+class Composed:
+    """What the loop makes of a sample of a share."""
+
+    target: Any
+    columns: Any
+    warnings: Any
+
+
 def step(
-    composition: Composition, minute: float, believed: bool = True, elapsed: float | None = None, **safety: Any
-) -> Any:
+    composition: Share, minute: float, believed: bool = True, elapsed: float | None = None, **safety: Any
+) -> Composed:
     n = len(composition.schedules)
-    at = np.full(n, minute)
+    at, fresh = np.full(n, minute), np.ones(n, dtype=np.bool_)
     light = np.full(n, 900.0 + minute)
-    m = Measurement(60.0 * at, np.full(n, 0.5), np.full(n, 33.0), np.ones(n, dtype=np.bool_), fluorescence=light)
+    m = Measurement(60.0 * at, np.full(n, 0.5), np.full(n, 33.0), fresh, fluorescence=light)
     since = at if elapsed is None else np.full(n, elapsed)
     interlock = Interlock(n, SafetyConfig(**safety))
-    return composition.step(m, interlock, since, np.full(n, believed), np.full(n, 33.2))
+    phase, od, degc = np.zeros(n, dtype=np.intp), np.full(n, 0.5), np.full(n, 33.2)
+    sample = Sample.of(m, interlock, fresh, np.full(n, believed), since, phase, od, degc)
+    allowed = interlock.temperature(composition.decide(sample))
+    target = np.where(np.isfinite(allowed), allowed, degc)
+    found = composition.find(sample, target)
+    return Composed(target, found.columns, found.warnings)
 
 
-def warned(composition: Composition, minute: float, believed: bool = True) -> list[str]:
+def warned(composition: Share, minute: float, believed: bool = True) -> list[str]:
     (line,) = step(composition, minute, believed).warnings
     return kinds_of(line or "")
 
@@ -69,15 +89,15 @@ def warned(composition: Composition, minute: float, believed: bool = True) -> li
 def test_a_target_goes_through_the_limits_and_one_that_is_no_number_leaves_the_schedules(
     answer: float, target: float
 ) -> None:
-    composed = step(Composition(Scripted(target=answer), [HOLD]), 5.0)
+    composed = step(held(Scripted(target=answer), [HOLD]), 5.0)
     assert composed.target == composed.columns["temperature_target_degc"] == target
     assert tuple(composed.columns) == COLUMNS
 
 
 def test_the_limits_are_the_interlocks_and_a_target_at_one_of_them_may_be_stuck() -> None:
     limits = {"composition_low": 30.0, "composition_high": 35.0}
-    assert step(Composition(Scripted(target=10.0), [HOLD]), 5.0, **limits).target == 30.0
-    composition = Composition(Scripted(target=90.0), [HOLD])
+    assert step(held(Scripted(target=10.0), [HOLD]), 5.0, **limits).target == 30.0
+    composition = held(Scripted(target=90.0), [HOLD])
     assert step(composition, 5.0, **limits).target == 35.0
     assert step(composition, 200.0, **limits).warnings[0].startswith("share_stuck")
 
@@ -87,7 +107,7 @@ def test_where_no_share_is_asked_for_the_schedule_decides_and_the_controller_goe
     schedule: Scenario,
 ) -> None:
     keeper = Scripted(target=30.0)
-    composed = step(Composition(keeper, [schedule]), 5.0)
+    composed = step(held(keeper, [schedule]), 5.0)
     assert composed.target == 33.2
     assert np.isnan(composed.columns["ratio_setpoint"]).all()
     od, fluorescence, temperature, minute, rows = keeper.seen[0]
@@ -97,7 +117,7 @@ def test_where_no_share_is_asked_for_the_schedule_decides_and_the_controller_goe
 
 def test_nothing_is_asked_for_before_the_schedule_begins() -> None:
     keeper = Scripted(target=30.0)
-    composed = step(Composition(keeper, [HOLD]), 5.0, elapsed=np.nan)
+    composed = step(held(keeper, [HOLD]), 5.0, elapsed=np.nan)
     assert composed.target == 33.2
     assert np.isnan(keeper.asked[0].setpoint)
     assert len(keeper.seen) == 1
@@ -107,7 +127,7 @@ def test_each_reactor_has_its_own_program_and_is_told_its_changes_as_far_ahead_a
     phases = {"setpoints": (0.5, 0.5), "minutes": (100.0, 100.0), "temperatures": (33.2, 33.2)}
     steps = [Scenario(**phases, ratios=(0.3, 0.7), announce_min=ahead) for ahead in (60.0, 20.0)]
     keeper = Scripted()
-    step(Composition(keeper, [*steps, replace(HOLD, ratios=(0.4,))]), 500.0, elapsed=50.0)
+    step(held(keeper, [*steps, replace(HOLD, ratios=(0.4,))]), 500.0, elapsed=50.0)
     wanted, minute, _ = keeper.asked
     assert wanted.setpoint.tolist() == [0.3, 0.3, 0.4]
     assert wanted.following.tolist() == [0.7, 0.3, 0.4]
@@ -123,7 +143,7 @@ def test_a_sine_falls_first() -> None:
 
 def test_a_share_that_comes_no_nearer_at_full_authority_is_stuck_until_it_moves() -> None:
     keeper = Scripted(ratio=0.5, target=29.0)
-    composition = Composition(keeper, [HOLD])
+    composition = held(keeper, [HOLD])
     told = {minute: warned(composition, minute) for minute in np.arange(0.0, 260.0, 10.0)}
     assert [minute for minute, kinds in told.items() if kinds] == list(np.arange(180.0, 260.0, 10.0))
     assert told[250.0] == ["share_stuck"]
@@ -142,7 +162,7 @@ def test_a_share_that_comes_no_nearer_at_full_authority_is_stuck_until_it_moves(
 
 def test_a_share_that_is_too_large_comes_nearer_by_falling() -> None:
     keeper = Scripted(ratio=0.9, target=36.0)
-    composition = Composition(keeper, [HOLD])
+    composition = held(keeper, [HOLD])
     assert not warned(composition, 0.0)
     keeper.ratio = 0.93
     assert not warned(composition, 100.0)
@@ -153,13 +173,13 @@ def test_a_share_that_is_too_large_comes_nearer_by_falling() -> None:
 
 @pytest.mark.parametrize(("ratio", "target"), [(0.61, 29.0), (0.5, 29.2), (0.5, 35.9)])
 def test_a_share_that_is_near_or_a_target_inside_the_limits_is_not_stuck(ratio: float, target: float) -> None:
-    composition = Composition(Scripted(ratio=ratio, target=target), [HOLD])
+    composition = held(Scripted(ratio=ratio, target=target), [HOLD])
     assert not any(warned(composition, minute) for minute in np.arange(0.0, 600.0, 10.0))
 
 
 def test_another_setpoint_begins_anew_also_for_a_share_that_is_stuck() -> None:
     schedule = Scenario((0.5, 0.5), (200.0, 400.0), (33.2, 33.2), ratios=(0.7, 0.9), announce_min=0.0)
-    composition = Composition(Scripted(ratio=0.5), [schedule])
+    composition = held(Scripted(ratio=0.5), [schedule])
     told = [minute for minute in np.arange(0.0, 600.0, 10.0) if warned(composition, minute)]
     assert told == [180.0, 190.0, *np.arange(380.0, 600.0, 10.0)]
 
@@ -167,7 +187,7 @@ def test_another_setpoint_begins_anew_also_for_a_share_that_is_stuck() -> None:
 def test_a_share_on_its_way_to_one_that_is_announced_is_not_stuck() -> None:
     schedule = Scenario((0.5, 0.5), (400.0, 400.0), (33.2, 33.2), ratios=(0.3, 0.7), announce_min=360.0)
     keeper = Scripted(ratio=0.3)
-    composition = Composition(keeper, [schedule])
+    composition = held(keeper, [schedule])
     for minute in np.arange(0.0, 700.0, 10.0):
         keeper.ratio = 0.3 if minute < 100.0 else min(0.3 + 0.001 * (minute - 100.0), 0.7)
         assert not warned(composition, minute)
@@ -178,7 +198,7 @@ def test_a_share_on_its_way_to_one_that_is_announced_is_not_stuck() -> None:
 @pytest.mark.parametrize(("per_h", "stuck"), [(0.01, False), (0.0, True)])
 def test_a_share_that_lags_behind_a_sine_is_stuck_only_if_it_stands_still(per_h: float, stuck: bool) -> None:
     keeper = Scripted(ratio=0.2)
-    composition = Composition(keeper, [Scenario((0.5,), (2400.0,), (33.2,), ratio_sine=(0.5, 0.4, 1200.0))])
+    composition = held(keeper, [Scenario((0.5,), (2400.0,), (33.2,), ratio_sine=(0.5, 0.4, 1200.0))])
     told = []
     for minute in np.arange(600.0, 900.0, 10.0):  # from 0.5 up to 0.9, ever further away
         keeper.ratio += per_h * 10.0 / 60.0
@@ -188,7 +208,7 @@ def test_a_share_that_lags_behind_a_sine_is_stuck_only_if_it_stands_still(per_h:
 
 def test_an_estimate_that_stays_wide_is_uncertain() -> None:
     keeper = Scripted(ratio=0.7, width=0.5)
-    composition = Composition(keeper, [HOLD])
+    composition = held(keeper, [HOLD])
     told = [minute for minute in np.arange(0.0, 200.0, 10.0) if warned(composition, minute) == ["share_uncertain"]]
     assert told == list(np.arange(120.0, 200.0, 10.0))
     (line,) = step(composition, 200.0).warnings
@@ -206,12 +226,16 @@ def vials(n: int) -> SimulatedReactors:
 
 
 def loop(
-    reactors: SimulatedReactors, keeper: Any, scenario: Scenario, limits: ShareWarnings | None = None
+    reactors: SimulatedReactors,
+    keeper: Any,
+    scenario: Scenario,
+    limits: ShareWarnings | None = None,
+    law_of_share: Any = None,
 ) -> ClosedLoop:
     n = len(reactors.names)
-    composition = Composition(keeper, [scenario] * n, limits)
-    law = registry.build(registry.config("inverse"), EnvConfig())
-    return ClosedLoop(reactors, law, Interlock(n), scenario, composition=composition)
+    law = registry.build(registry.config("inverse"), model=EnvConfig())
+    further: list[Signal] = [Share(keeper, law_of_share or keeper, [scenario] * n, limits)]
+    return ClosedLoop(reactors, law, Interlock(n), scenario, further=further)
 
 
 def test_the_vials_follow_the_target_and_the_controller_is_told_what_went_in() -> None:
@@ -220,9 +244,9 @@ def test_the_vials_follow_the_target_and_the_controller_is_told_what_went_in() -
     assert keeper.looks.tolist() == [len(steps)] * 2
     np.testing.assert_allclose(keeper.told_ml, np.sum([s.volume_ml for s in steps], axis=0))
     assert keeper.told_ml.min() > 30.0
-    np.testing.assert_allclose(steps[-1].composition["ratio"], reactors.plant.culture.share, atol=0.01)
+    np.testing.assert_allclose(steps[-1].columns["ratio"], reactors.plant.culture.share, atol=0.01)
     np.testing.assert_allclose(reactors.plant.culture.share, 0.7, atol=0.02)
-    assert {float(s.composition["temperature_target_degc"][0]) for s in steps[1:100]} == {29.0}
+    assert {float(s.columns["temperature_target_degc"][0]) for s in steps[1:100]} == {29.0}
     assert abs(steps[60].temperature - 29.0).max() < 0.1
 
 
@@ -250,13 +274,12 @@ LENGTH, CUT = 110, 55
 def test_a_resumed_run_decides_what_one_without_a_pause_decides(kind: str) -> None:
     def fresh(reactors: SimulatedReactors) -> ClosedLoop:
         limits = ShareWarnings(wide=0.01, wide_h=0.5)
-        return loop(reactors, compositions.build(compositions.config(kind)), SCHEDULE, limits)
+        config = registry.config(kind, registry.SHARE)
+        law = registry.build(config, registry.SHARE)
+        return loop(reactors, CompositionEstimator(config.estimator), SCHEDULE, limits, law)
 
     def told(steps: list[Step]) -> list[Any]:
-        return [
-            [s.composition["temperature_target_degc"].tolist(), s.composition["ratio"].tolist(), s.reasons]
-            for s in steps
-        ]
+        return [[s.columns["temperature_target_degc"].tolist(), s.columns["ratio"].tolist(), s.reasons] for s in steps]
 
     reactors = vials(2)
     whole = fresh(reactors)
@@ -301,7 +324,7 @@ def test_a_fluorescence_that_no_sensor_gives_is_recorded_and_not_shown() -> None
     assert reactors.plant.fluorescence is not None
     reactors.plant.fluorescence.dead[:] = True
     last = run.step()
-    assert last.composition["fluorescence"] == [0.0]
+    assert last.columns["fluorescence"] == [0.0]
     assert kinds_of(last.reasons[0] or "") == ["fluorescence"]
     assert [bool(np.isfinite(light[0])) for light in keeper.light] == [True, False]
 

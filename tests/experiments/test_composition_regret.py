@@ -8,8 +8,8 @@ import pytest
 
 from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import CocultureConfig, advance, passed, share
-from experiments.composition import registry
 from experiments.composition.base import Array, Estimate, Law, Wanted
+from experiments.controllers import registry
 from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Evaluation
 
@@ -44,7 +44,7 @@ def regret() -> Callable[[str, CocultureConfig], float]:
         if config not in known:
             task = Coculture(config)
             known[config] = Evaluation(task, task.report_grid())
-        law = registry.build(replace(registry.config(name), **values)).law
+        law = registry.build(replace(registry.config(name, registry.SHARE), **values), registry.SHARE)
         return 100.0 * (cost(law, config, known[config].start) / known[config].optimum_cost - 1.0)
 
     return of

@@ -41,7 +41,7 @@ class Listening(Law):
 
 def begun(od: float, scenario: Scenario, rate: float | None = None) -> tuple[DriverLab, Listening]:
     lab, law = DriverLab(od=od, options=QUIET, scenario=scenario), Listening(rate)
-    lab.loop.controller = law
+    lab.loop.density.law = law
     lab.reactors.begin()
     return lab, law
 

@@ -59,7 +59,7 @@ class Losable(Rehearsal):
 
     def begin(self) -> None:
         super().begin()
-        self.loop.controller = Losing(self.loop.controller, self)
+        self.loop.density.law = Losing(self.loop.density.law, self)
 
     def _counted(self, method: str, path: str, *rest: Any) -> Any:
         exchange = self._submit(method, path, *rest)

@@ -50,7 +50,7 @@ class Cut(Rehearsal):
 
     def begin(self) -> None:
         super().begin()
-        self.loop.controller = Full()
+        self.loop.density.law = Full()
 
     def _until_cut(self) -> None:
         for _ in self.run(300.0):
@@ -186,7 +186,7 @@ def test_a_stop_after_the_row_was_written_puts_the_dose_right_in_it(tmp_path: Pa
     """The row comes with the feed pump's start, the end half a second later."""
     run = Rehearsal(tmp_path, rehearsed(("M0",), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
     run.begin()
-    run.loop.controller = Full()
+    run.loop.density.law = Full()
     steps = [step for step in run.run(300.0) if step.rows[0]]
     assert run.device.apps["M0"].data["Pump1"]["ON"]
     run.clock.sleep(0.6)
@@ -232,7 +232,7 @@ def test_repeats_before_a_board_agent_ended_them_are_booked(
 def test_repeats_under_a_lost_link_are_booked_before_the_next_sample_is_judged(tmp_path: Path) -> None:
     run = Rehearsal(tmp_path, rehearsed(("M0", "M1"), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
     run.begin()
-    run.loop.controller = Full()
+    run.loop.density.law = Full()
     for _ in run.run(300.0):
         pass
     while not run.device.apps["M0"].data["Pump1"]["ON"]:
@@ -255,7 +255,7 @@ def test_repeats_under_a_lost_link_are_booked_before_the_next_sample_is_judged(t
 def test_a_device_that_was_restarted_in_a_dose_repeated_nothing(tmp_path: Path) -> None:
     run = Rehearsal(tmp_path, rehearsed(("M0",), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
     run.begin()
-    run.loop.controller = Full()
+    run.loop.density.law = Full()
     for _ in run.run(300.0):
         pass
     while not run.device.apps["M0"].data["Pump1"]["ON"]:

@@ -48,7 +48,7 @@ def controller(kind: str) -> Controller:
         config = type(config)(hysteresis=0.05)
     policy = load_policy("shipped", 1.0, 0.02)
     bounds = certificate.bounds(policy, find_policy("shipped"))
-    return registry.build(config, EnvConfig(), policy, bounds=bounds)
+    return registry.build(config, model=EnvConfig(), policy=policy, bounds=bounds)
 
 
 def vials() -> SimulatedReactors:
@@ -148,8 +148,8 @@ def test_a_program_that_is_stopped_takes_up_the_memory_that_it_wrote(tmp_path: P
     kept = json.loads((tmp_path / "state.json").read_text())["controller"]
     assert kept["estimator"]["learned"][0] > 12  # readings since the run began
     r.begin()
-    assert isinstance(r.loop.controller, Remembers)
-    assert json.loads(json.dumps(memory.save(r.loop.controller))) == kept
+    assert isinstance(r.loop.density.law, Remembers)
+    assert json.loads(json.dumps(memory.save(r.loop.density.law))) == kept
     r.close()
 
 
@@ -175,7 +175,7 @@ class Cut(Rehearsal):
     """One reactor at a fixed rate; the program is killed at a request of the dose after minute 6, and resumed."""
 
     def __init__(self, folder: Path, request: str, rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(registry, "build", lambda *_: Counting(rate))
+        monkeypatch.setattr(registry, "build", lambda *_, **__: Counting(rate))
         super().__init__(folder, rehearsed(("M0",), HOLD), quiet(mu=0.03), od=0.8)
         self.begin()
         list(self.run(360.0))
@@ -195,7 +195,7 @@ class Cut(Rehearsal):
         self.close()
 
     def told_ml(self) -> float:
-        law = self.loop.controller
+        law = self.loop.density.law
         assert isinstance(law, Counting)
         return float(law.told[0])
 

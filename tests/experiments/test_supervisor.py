@@ -89,7 +89,7 @@ def test_the_console_says_once_when_the_supervisor_begins_and_ends_and_the_journ
     """M0's estimate is spoilt for five samples; M1's never is."""
     run = Rehearsal(tmp_path, rehearsed(("M0", "M1"), Scenario((0.5,), (600.0,), (37.0,))), od=0.5)
     run.begin()
-    law, log_changes, spoilt = run.loop.controller, ChangeLog(run.loop), 0
+    law, log_changes, spoilt = run.loop.density.law, ChangeLog(run.loop), 0
     assert isinstance(law, RelativeController)
     with caplog.at_level(logging.INFO):
         for step in run.run(1860.0):

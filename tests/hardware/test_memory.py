@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import files
-from experiments.composition import registry as compositions
+from experiments.composition.estimator import CompositionEstimator
 from experiments.control.policies import load_policy
 from experiments.controllers import registry
-from experiments.loop.composition import Composition
 from experiments.loop.loop import ClosedLoop
+from experiments.loop.share import Share
 from hardware.memory import Remembers
 from hardware.safety.interlock import Interlock
 
@@ -58,10 +58,11 @@ def policy() -> Any:
 
 def unused(kind: str) -> ClosedLoop:
     """A loop in which everything that can remember does."""
-    law = registry.build(registry.config(kind), EnvConfig(), policy())
-    share = Composition(compositions.build(compositions.config(LAWS[kind])), SCHEDULES)
+    law = registry.build(registry.config(kind), model=EnvConfig(), policy=policy())
+    config = registry.config(LAWS[kind], registry.SHARE)
+    share = Share(CompositionEstimator(config.estimator), registry.build(config, registry.SHARE), SCHEDULES)
     reactors: Any = SimpleNamespace(names=("M0", "M1"))
-    return ClosedLoop(reactors, law, Interlock(2), SCHEDULES, composition=share)
+    return ClosedLoop(reactors, law, Interlock(2), SCHEDULES, further=[share])
 
 
 def written(loop: ClosedLoop) -> dict[str, Any]:

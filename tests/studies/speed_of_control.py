@@ -35,7 +35,8 @@ def loops() -> Iterator[Measurement]:
 
     def loop(config: Any, replicates: int, seed: int) -> None:
         def make(vials: Plant) -> Controller:
-            return registry.build(config, model, policy, vials)
+            law: Controller = registry.build(config, model=model, policy=policy, plant=vials)
+            return law
 
         run_trial(Cell(config.kind, "nominal_noise", "setpoint_steps"), plant, scenario, make, model, replicates, seed)
 

@@ -1,34 +1,27 @@
-"""Composition in the loop: from believed samples to thermostat targets, within limits, with lasting warnings."""
+"""The share of two species as a signal: held by the thermostat, within limits, with lasting warnings."""
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from conf.schema import check, setting
 from envs.scenario import Scenario
-from experiments.composition.base import Array, Mask, Wanted
+from experiments.composition.base import Array, Law, Mask, ShareEstimator, Wanted
 from experiments.composition.program import Program
+from experiments.loop.signals import THERMOSTAT, Findings, Sample
 from hardware.memory import Remembers
-from hardware.reactor import Measurement
-from hardware.safety.interlock import Interlock
 
-__all__ = ["COLUMNS", "TRUE", "Composed", "Composition", "Keeper", "ShareWarnings", "columns", "program_of"]
+__all__ = ["COLUMNS", "TRUE", "Share", "ShareWarnings", "program_of"]
 
-ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what a controller explains, the columns of a recording
+ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what the estimator explains, the columns of a recording
 COLUMNS = ("fluorescence", "ratio_setpoint", *ESTIMATE, "temperature_target_degc")
 TRUE = "true_ratio"
 EDGE_C = 0.05  # a target so near a limit is at it
 NEARER = 0.02  # a share that has moved so far towards its goal comes nearer; a goal that jumps by more is another one
 STUCK = "check that the vial follows the thermostat and that both species grow; the program may ask for too much"
 UNCERTAIN = "check the fluorescence and calibrate its sensor (docs/coculture.md, Calibration of the sensor)"
-
-
-def columns(true: bool) -> tuple[str, ...]:
-    """The columns that a composition adds at the end of a recording. Args: true: of a simulation, which knows it."""
-    return (*COLUMNS, TRUE) if true else COLUMNS
 
 
 @dataclass(frozen=True)
@@ -58,94 +51,75 @@ def program_of(schedule: Scenario) -> Program:
     return Program(tuple(math.nan if r is None else r for r in ratios), schedule.minutes)
 
 
-class Keeper(Remembers, Protocol):
-    """What is asked of a controller of the composition, structurally; arrays (N,)."""
-
-    def reset(self, n: int) -> None:
-        """Forget everything; n cultures from here on."""
-        ...
-
-    def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
-        """A sample: OD, counts, degC, min since the run began; rows: True where it is new and believed."""
-        ...
-
-    def dosed(self, volume_ml: Array) -> None:
-        """Fresh medium that went in since this was last called, mL."""
-        ...
-
-    def target(self, wanted: Wanted, minute: Array, rows: Mask) -> Array:
-        """Thermostat targets, degC; minute: since the program began; rows: where readings are new and a share asked."""
-        ...
-
-    def explain(self) -> dict[str, Array]:
-        """The estimate behind the last target: ratio, ratio_low, ratio_high and more."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
-class Composed:
-    """What came of a sample: thermostat targets, degC, (N,); columns of the recording; further reasons; warnings."""
+class Decider:
+    """What is believed of the share, and what is done about it."""
 
-    target: Array
-    columns: dict[str, Array]
-    why: dict[str, Array]
-    warnings: list[str | None]
+    remembers = ("estimator", "law")
+    estimator: ShareEstimator
+    law: Law
 
 
-class Composition:
-    """A controller of the composition on N reactors, each with its own program of shares.
+class Share:
+    """The share of the second species in N reactors, each with its own program; held by the thermostat.
 
     Targets are cut by the interlock. There is no limit of their rate: the device's thermostat takes any step, and the
     interlock allows for a vial that still cools (docs/biology.md, Vial temperature).
     A share is out of control, which is said in every sample until it is over, where it is stuck or its estimate is
     uncertain as `ShareWarnings` has it. Another share that is asked for or announced begins anew.
 
-    Args: controller; schedules: one per reactor; warnings: when to warn. truth: the shares of a simulation, for its
-      recording.
+    Args: estimator: what is believed; law: what is done about it; schedules: one per reactor; warnings: when to warn.
+      simulated: the recording has the true share, which `truth` gives.
     """
 
+    name, actuator = "composition", THERMOSTAT
     remembers = ("controller", "goal", "best", "nearer_min", "narrow_min")
 
     def __init__(
         self,
-        controller: Keeper,
+        estimator: ShareEstimator,
+        law: Law,
         schedules: Sequence[Scenario],
         warnings: ShareWarnings | None = None,
-        truth: Callable[[], Array] | None = None,
+        simulated: bool = False,
     ) -> None:
-        self.controller, self.schedules, self.warnings = controller, schedules, warnings or ShareWarnings()
-        self._truth, n = truth, len(schedules)
+        self.estimator, self.law, self.controller = estimator, law, Decider(estimator, law)
+        self.schedules, self.warnings, self.simulated = schedules, warnings or ShareWarnings(), simulated
+        self.truth: Callable[[], Array] = lambda: np.full(n, np.nan)
+        n = len(schedules)
         self._programs = [program_of(s) for s in schedules]
         self._goal, self._best = np.full(n, np.nan), np.full(n, np.nan)  # the nearest share to it so far
         self._nearer_min, self._narrow_min = np.full(n, np.nan), np.full(n, np.nan)
-        controller.reset(n)
+        estimator.reset(n)
+        law.reset(n)
 
-    def step(self, m: Measurement, interlock: Interlock, elapsed: Array, believed: Mask, scheduled: Array) -> Composed:
-        """Watch a sample and decide.
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """See `Signal`; a simulation's true share is the last."""
+        return (*COLUMNS, TRUE) if self.simulated else COLUMNS
 
-        Args:
-          m: the sample. interlock: says which fluorescence is believed, and cuts targets. elapsed: min since the
-            schedule began, nan before, (N,). believed: rows whose OD is new and believed, (N,).
-          scheduled: the schedule's targets, degC, (N,).
-        """
-        minute, none = m.time_s / 60.0, np.full(m.od.shape, np.nan)
-        wanted = self.wanted(elapsed)
+    def decide(self, sample: Sample) -> Array:
+        """See `Signal.decide`; nan where no share is asked for."""
+        m, wanted = sample.measured, self.wanted(sample.elapsed)
         asked = np.isfinite(wanted.setpoint)
-        light = interlock.fluorescence(m)
-        self.controller.watch(m.od, none if light is None else light, m.temperature, minute, believed)
-        chosen = self.controller.target(wanted, elapsed, believed & asked)
-        allowed = interlock.temperature(np.where(asked, chosen, np.nan))
-        target = np.where(np.isfinite(allowed), allowed, scheduled)
-        told = self.controller.explain()
-        known = {"ratio_setpoint": wanted.setpoint, "temperature_target_degc": target}
-        known |= {"fluorescence": none if m.fluorescence is None else m.fluorescence}
+        self.estimator.watch(m.od, sample.light, m.temperature, sample.minute, sample.believed)
+        on = sample.believed & asked & self.estimator.begun
+        return np.where(asked, self.law.act(self.estimator.estimate(), wanted, sample.elapsed, on), np.nan)
+
+    def find(self, sample: Sample, given: Array) -> Findings:
+        """See `Signal.find`."""
+        m, wanted, told = sample.measured, self.wanted(sample.elapsed), self.estimator.explain()
+        known = {"ratio_setpoint": wanted.setpoint, "temperature_target_degc": given}
+        known |= {"fluorescence": np.full(m.od.shape, np.nan) if m.fluorescence is None else m.fluorescence}
         known |= {key: told[key] for key in ESTIMATE}
-        found = {key: known[key] for key in COLUMNS} | ({TRUE: self._truth()} if self._truth else {})
+        found = {key: known[key] for key in COLUMNS}
+        if self.simulated:
+            found[TRUE] = self.truth()
         why = {key: value for key, value in told.items() if key not in ESTIMATE}
-        safety = interlock.config
-        inside = (target > safety.composition_low + EDGE_C) & (target < safety.composition_high - EDGE_C)
+        low, high = sample.limits
+        inside = (given > low + EDGE_C) & (given < high - EDGE_C)
         goal = np.where(wanted.minutes > 0.0, wanted.following, wanted.setpoint)
-        return Composed(target, found, why, self._warned(found, goal, inside, minute, believed))
+        return Findings(found, why, self._warned(found, goal, inside, sample.minute, sample.believed))
 
     def wanted(self, elapsed: Array) -> Wanted:
         """What each reactor's program asks for, `elapsed` min after it began; nothing where that is nan."""
@@ -195,6 +169,11 @@ class Composition:
         self._narrow_min = np.where(narrow | first, minute, self._narrow_min)
         return np.asarray(believed & ~narrow & (minute - self._narrow_min >= 60.0 * self.warnings.wide_h))
 
-    def dosed(self, volume_ml: Array) -> None:
-        """What went in, mL, (N,)."""
-        self.controller.dosed(volume_ml)
+    @property
+    def memory(self) -> Remembers:
+        """See `Signal.memory`."""
+        return self
+
+    def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
+        """See `Signal.dosed`; what was put off comes later."""
+        self.estimator.dosed(volume_ml)

@@ -1,0 +1,170 @@
+"""What the loop holds: signals. Each has an estimate, a law that decides, an actuator, columns and warnings of its own.
+
+The density, held by the feed pump, is always one of them (`Density`). The share of two species, held by the thermostat,
+is another (`experiments/loop/share.py`). One of one's own is made known by `add` (docs/extending.md).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.scenario import Scenario
+from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Watches
+from hardware.memory import Remembers
+from hardware.reactor import Measurement
+from hardware.safety.interlock import Interlock
+
+__all__ = ["FEED", "THERMOSTAT", "Density", "Findings", "Sample", "Signal", "add", "made", "one_each"]
+
+FEED, THERMOSTAT = "feed pump", "thermostat"
+TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "composition", "journal_row")
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """What every signal is shown of a sample; arrays (N,).
+
+    measured: by the reactors. light: counts of its fluorescence that are believed, nan for all others.
+    rows: reactors with a new sample; believed: those whose OD is taken for the culture's.
+    minute: when it was taken, min since the run began. elapsed: min since the schedule began, nan before.
+    phase: of the schedule, -1 before. setpoint: OD asked for. temperature: the schedule's target, degC.
+    limits: lowest and highest target of the thermostat, degC.
+    """
+
+    measured: Measurement
+    light: Array
+    rows: Mask
+    believed: Mask
+    minute: Array
+    elapsed: Array
+    phase: NDArray[np.intp]
+    setpoint: Array
+    temperature: Array
+    limits: tuple[float, float]
+
+    @classmethod
+    def of(
+        cls, m: Measurement, interlock: Interlock, rows: Mask, believed: Mask, elapsed: Array, phase: NDArray[np.intp],
+        setpoint: Array, temperature: Array,
+    ) -> "Sample":  # fmt: skip
+        """A measurement with what the interlock says of its light and of targets; the others as they are."""
+        light, safety = interlock.fluorescence(m), interlock.config
+        light = np.full(m.od.shape, np.nan) if light is None else light
+        limits = safety.composition_low, safety.composition_high
+        return cls(m, light, rows, believed, m.time_s / 60.0, elapsed, phase, setpoint, temperature, limits)
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What a signal tells of a sample.
+
+    columns: of the recording, (N,) each. why: further reasons for the journal. warnings: a line for each reactor that
+    has one, None for the others; empty: nothing is ever warned of.
+    """
+
+    columns: Mapping[str, Array] = field(default_factory=dict)
+    why: Mapping[str, Array] = field(default_factory=dict)
+    warnings: Sequence[str | None] = ()
+
+
+class Signal(Protocol):
+    """A quantity that is held, structurally.
+
+    name: under which its state is saved. actuator: what acts on it. columns: that it adds to a recording, behind those
+    of signals before it. Of a column NAME and one NAME_setpoint the summary gives the errors of every window.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def actuator(self) -> str: ...
+
+    @property
+    def columns(self) -> tuple[str, ...]: ...
+
+    def decide(self, sample: Sample) -> Array:
+        """Watch a sample and decide, (N,): mL/s of the feed pump, or the thermostat's target, degC.
+
+        A target is cut to the interlock's limits; one that is nan leaves the schedule's.
+        """
+        ...
+
+    def find(self, sample: Sample, given: Array) -> Findings:
+        """What is told of the sample. Args: given: what the actuator was told, in the unit of `decide`, (N,)."""
+        ...
+
+    def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
+        """Fresh medium that went in since this was last called, and what was put off to the next dose, mL, (N,)."""
+        ...
+
+    @property
+    def memory(self) -> Remembers | None:
+        """What a resumed run continues, the signal itself as a rule; None where there is nothing to remember."""
+        ...
+
+
+class Density:
+    """The density, held by the feed pump. Args: law: decides on the pump rate; what it can do beyond is asked of it."""
+
+    name, actuator = "controller", FEED
+    columns: tuple[str, ...] = ()  # the recording has them in any case
+
+    def __init__(self, law: Controller) -> None:
+        self.law = law
+
+    def decide(self, sample: Sample) -> Array:
+        """See `Signal.decide`."""
+        m = sample.measured
+        if isinstance(self.law, Watches):
+            self.law.watch(m.od, m.temperature, sample.minute, sample.believed)
+        od = np.where(sample.rows & ~sample.believed, np.nan, m.od)
+        return self.law.act(od, sample.setpoint, sample.minute, sample.believed & (sample.phase >= 0))
+
+    def find(self, sample: Sample, given: Array) -> Findings:
+        """See `Signal.find`."""
+        return Findings(why=self.law.explain() if isinstance(self.law, Explains) else {})
+
+    def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
+        """See `Signal.dosed`."""
+        if isinstance(self.law, Accounts):
+            self.law.dosed(volume_ml + kept_ml)
+
+    @property
+    def memory(self) -> Remembers | None:
+        """See `Signal.memory`: that of the law."""
+        return self.law if isinstance(self.law, Remembers) else None
+
+
+Make = Callable[[Any, Sequence[Scenario]], Signal]
+"""From a law's config and the schedules, one for each reactor, to a signal that has seen nothing."""
+MAKERS: dict[str, Make] = {}
+
+
+def add(name: str, make: Make) -> None:
+    """Make a signal known as `signals.NAME.kind=LAW` of deploy; its laws are registered with `signal=NAME`.
+
+    Raises: ValueError for a name that is taken.
+    """
+    if name in (*TAKEN, *MAKERS):
+        raise ValueError(f"signal {name}: there is one of this name already; choose another")
+    MAKERS[name] = make
+
+
+def made(name: str, config: Any, schedules: Sequence[Scenario]) -> Signal:
+    """A signal of one's own. Raises: ValueError naming the signals there are, or what does not fit."""
+    if name not in MAKERS:
+        raise ValueError(f"signals.{name}: no such signal; allowed {', '.join(MAKERS) or 'those of extend=FILE.py'}")
+    return MAKERS[name](config, schedules)
+
+
+def one_each(signals: Sequence[Signal]) -> list[Signal]:
+    """The signals, no two of which share an actuator. Raises: ValueError naming both."""
+    for k, signal in enumerate(signals):
+        for other in signals[:k]:
+            if signal.actuator == other.actuator:
+                raise ValueError(f"{other.name} and {signal.name} act by the same {signal.actuator}: allowed one")
+    return list(signals)

@@ -1,0 +1,140 @@
+"""A signal of one's own from one file outside the program: recorded, warned of, summed up, saved, resumed, refused."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.plant.plant import Plant
+from envs.scenario import Scenario
+from envs.task import EnvConfig
+from experiments.cli import frame
+from experiments.control import run
+from experiments.control.assemble import unpack
+from experiments.controllers import registry
+from experiments.deploy import main
+from experiments.loop import signals
+from experiments.loop.loop import ClosedLoop
+from experiments.loop.share import COLUMNS
+from experiments.record.recovery import COLUMNS as USUAL
+from hardware.emulator.device import plant_preset
+from hardware.safety.interlock import Interlock, kinds_of
+from hardware.simulated import SimulatedConfig, SimulatedReactors
+from tests.extensions import light
+
+ROOT = Path(__file__).parents[2]
+HOLD = ("plant=coculture", "scenario=hold", "scenario.setpoints=[0.5]", "scenario.temperatures=[33.2]")
+WORDS = (*HOLD, "scenario.recovery_od=0", "scenario.minutes=[300]", "fsync=false")
+LIGHT = ("signals.light.kind=integral", "signals.light.setpoint=1400")
+SCHEDULE = Scenario((0.5,), (80.0,), (33.2,))
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with open(folder / "recordings" / "M0.csv", newline="", encoding="utf-8") as f:
+        return list(csv.DictReader(f))
+
+
+def test_a_command_takes_it_from_a_file_outside(tmp_path: Path) -> None:
+    words = [f"extend={ROOT / 'tests' / 'extensions' / 'light.py'}", *WORDS, *LIGHT, "hydra.run.dir=here"]
+    python = [sys.executable, "-m", "experiments.deploy", *words]
+    place = {"cwd": tmp_path, "env": {"PYTHONPATH": str(ROOT)}, "capture_output": True, "text": True, "check": False}
+    done: Any = subprocess.run(python, **place)  # type: ignore[call-overload]
+    assert done.returncode == 0, done.stderr
+    found = rows(tmp_path / "here")
+    assert tuple(found[0]) == (*USUAL, "light", "light_setpoint")
+    minute, mean = (np.array([float(row[key]) for row in found]) for key in ("elapsed_min", "light"))
+    assert {row["light_setpoint"] for row in found} == {"1400.0"}
+    assert np.abs(mean[minute > 150.0] - 1400.0).mean() < 80.0  # it begins at 1786
+    assert {kind for row in found for kind in kinds_of(row["interlock"])} == {"light_far"}
+    assert "WARNING M0: light_far: 1786 counts; reported; wait" in done.stderr + done.stdout
+    summary = json.loads((tmp_path / "here" / "summary.json").read_text(encoding="utf-8"))
+    (window,), told = summary["windows"], summary["reactors"]["M0"]["reasons"]
+    inside = minute < 300.0
+    assert window["light_setpoint"] == 1400.0
+    assert window["light_abs_error_mean"] == pytest.approx(np.abs(mean[inside] - 1400.0).mean())
+    assert window["light_abs_error_last2h"] < window["light_abs_error_mean"]
+    assert window["od_abs_error_mean"] < 0.02
+    assert "ratio_setpoint" not in window
+    assert told["light_far"]["first_min"] == 0.0
+    state = json.loads((tmp_path / "here" / "state.json").read_text(encoding="utf-8"))
+    assert state["light"]["mean"] == [mean[-1]]
+    assert state["light"]["law"]["integral"] != [0.0]
+    assert (tmp_path / "here" / "extensions" / "light.py").is_file()
+    decided = [json.loads(line) for line in (tmp_path / "here" / "journal.jsonl").read_text().splitlines()]
+    assert all("thermostat_degc" in row["why"] for row in decided if row["kind"] == "decision")
+    shown: Any = subprocess.run([*python, "--help"], **place)  # type: ignore[call-overload]
+    assert "signals.NAME.setpoint = 1400" in shown.stdout
+    told_first: Any = subprocess.run([*python, "dry_run=true"], **place)  # type: ignore[call-overload]
+    assert "controller dqn" in told_first.stdout
+    assert "; light: integral;" in told_first.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("signals.light.kind=pid",), "signals.light.kind = pid: allowed integral"),
+        (("signals.dark.kind=integral",), "signals.dark.kind = integral: allowed "),
+        ((*LIGHT, "signals.light.far=0"), "signals.light.far = 0.0 counts: allowed greater than 0"),
+        ((*LIGHT, "signals.light.near=0"), "signals.light.near: no such key"),
+        ((*LIGHT, "scenario.ratios=[0.5]"), "composition and light act by the same thermostat: allowed one"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    with pytest.raises((frame.UserError, ValueError), match=said.replace("[", r"\[")) as caught:
+        run.deploy(main.config([*WORDS, *words]), tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_columns_of_every_signal_follow_one_another(tmp_path: Path) -> None:
+    setup = unpack(main.config([*WORDS, *LIGHT]), tmp_path)
+    assert setup.columns == (*USUAL, "light", "light_setpoint")
+    shares = main.config(["plant=coculture", "scenario=ratio_steps", "composition=pi"])
+    assert unpack(shares, tmp_path).columns == (*USUAL, *COLUMNS, "true_ratio")
+
+
+def loop(reactors: SimulatedReactors) -> ClosedLoop:
+    n = len(reactors.names)
+    held = signals.made("light", light.IntegralConfig(far=50.0), [SCHEDULE] * n)
+    law = registry.build(registry.config("inverse"), model=EnvConfig())
+    return ClosedLoop(reactors, law, Interlock(n), SCHEDULE, further=[held])
+
+
+def vials() -> SimulatedReactors:
+    return SimulatedReactors(
+        Plant(plant_preset("coculture"), 2, np.random.default_rng(3)), SimulatedConfig(reactors=("M0", "M1"))
+    )
+
+
+def test_a_resumed_run_decides_what_one_without_a_pause_decides() -> None:
+    def told(run: ClosedLoop, steps: int) -> list[Any]:
+        found = [run.step() for _ in range(steps)]
+        return [[s.columns["light"].tolist(), s.temperature.tolist(), s.rate.tolist(), s.reasons] for s in found]
+
+    expected = told(loop(vials()), 80)
+    reactors = vials()
+    first = loop(reactors)
+    begun = told(first, 35)
+    state = json.loads(json.dumps(first.state()))
+    second = loop(reactors)
+    second.restore(state)
+    assert begun + told(second, 45) == expected
+    del state["light"]
+    with pytest.raises(ValueError, match="^light: missing, expected keys and values"):
+        loop(vials()).restore(state)
+
+
+def test_names_and_actuators_are_used_once() -> None:
+    with pytest.raises(ValueError, match="signal light: there is one of this name already"):
+        signals.add("light", light.Light)
+    with pytest.raises(ValueError, match="signal interlock: there is one of this name already"):
+        signals.add("interlock", light.Light)
+    held = [signals.made("light", light.IntegralConfig(), [SCHEDULE]) for _ in range(2)]
+    with pytest.raises(ValueError, match="light and light act by the same thermostat"):
+        signals.one_each(held)
+    with pytest.raises(ValueError, match=r"signals\.dark: no such signal; allowed light"):
+        signals.made("dark", None, [SCHEDULE])
