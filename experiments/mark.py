@@ -13,7 +13,6 @@ from omegaconf import OmegaConf
 from conf.schema import check, require, setting
 from experiments.cli import files, frame
 from hardware.errors import RecordingError
-from hardware.family import family, known
 from hardware.storage.journal import read_journal
 from hardware.storage.marks import Mark, add_mark
 
@@ -50,6 +49,8 @@ class MarkConfig:
 
 def _minute_now(folder: Path, stored: Any) -> float:
     """The minute of a run that is under way. Raises: UserError for one that is over, or has not begun."""
+    from hardware.family import family, known  # and with it the plant, only for this
+
     kind = str(OmegaConf.select(stored, "backend.kind"))
     over = frame.UserError(f"run={folder}: not under way; give minute=MINUTE of the run")
     if kind in known() and family(kind).simulated:

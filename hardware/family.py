@@ -85,12 +85,14 @@ class Family:
       config: dataclass of its values, whose fields are made by `conf.schema.setting`. It needs `kind`, the name of the
         family, and `reactors`, their names.
       can: what its reactors can do.
+      called: its reactors, for a reader.
       at_stake: a culture is: a policy that is doubtful or not certified is refused.
       simulated: its vials are of `plant`, in this process and in virtual time, and the program knows their truth.
     """
 
     config: type[Any]
     can = Can()
+    called = "the reactors"
     at_stake = True
     simulated = False
 

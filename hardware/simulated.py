@@ -129,6 +129,7 @@ class SimulatedFamily(Family):
 
     config = SimulatedConfig
     can = Can(fluorescence=True, spare_pumps=True, thermostat=True)
+    called = "simulated vials"
     at_stake = False
     simulated = True
 

@@ -68,9 +68,11 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Verdict:
 
 
 def _deployment(summary: Summary, config: Mapping[str, Any]) -> Verdict:
+    from hardware.family import family, known  # and with it the plant, only where a deployment is reported
+
     windows: Sequence[Summary] = summary["windows"]
     backend = config["backend"]["kind"]
-    where = "simulated vials" if backend == "sim" else "the emulated device" if backend == "emulator" else "the Chi.Bio"
+    where = family(backend).called if backend in known() else f"the reactors of {backend}"
     hours = summary["minutes"] / 60.0
     claim = (
         f"Deployment: {config['controller']['kind']} held {', '.join(summary['reactors'])} on {where} for "

@@ -48,6 +48,7 @@ class ChiBioFamily(Family):
 
     config = ChiBioConfig
     can = Can(fluorescence=True, spare_pumps=True, thermostat=True, regulation=True, resume=True)
+    called = "the Chi.Bio"
 
     def linked(self, backend: ChiBioConfig, bench: Bench) -> AbstractContextManager[Link]:
         """The device of a config: its link and its clock. Raises: ReactorError."""

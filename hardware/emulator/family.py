@@ -33,6 +33,7 @@ class EmulatorFamily(ChiBioFamily):
     """A device of the run's own, which ends with it."""
 
     config = EmulatorConfig
+    called = "the emulated device"
     at_stake = False
 
     @contextmanager

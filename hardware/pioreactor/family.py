@@ -28,6 +28,7 @@ class PioreactorFamily(Family):
 
     config = PioreactorConfig
     can = Can(thermostat=True, regulation=True, resume=True)
+    called = "Pioreactors"
 
     def reached(
         self, backend: PioreactorConfig, bench: Bench, folder: Path

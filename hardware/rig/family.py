@@ -20,6 +20,7 @@ class RigFamily(PioreactorFamily):
     """Units of the run's own, which end with it."""
 
     config = RigBackendConfig
+    called = "the Pioreactor rig"
     at_stake = False
 
     @contextmanager

@@ -52,6 +52,9 @@ def test_errors_of_other_tasks_are_not_called_od() -> None:
 def test_a_deployment_is_good_if_every_window_ends_at_its_setpoint() -> None:
     said = verdict(DEPLOYED, LOOP)
     assert said.claim == "Deployment: pi held M0, M1 on the Chi.Bio for 1.5 h; completed."
+    units, own = (verdict(DEPLOYED, LOOP | {"backend": {"kind": kind}}) for kind in ("pioreactor", "mine"))
+    assert "on Pioreactors for" in units.claim
+    assert "on the reactors of mine for" in own.claim
     assert said.items == [
         "largest error at rest 0.004 OD, the mean over the last 10 min of a window",
         "fresh medium 65 mL",
