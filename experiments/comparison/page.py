@@ -418,8 +418,11 @@ def _density(out: Page, summary: Row, run: Path) -> None:
             )
         for f in rest:
             out.figure(run / f["file"], f["title"], f["caption"])
-    wide = [s for s in dict.fromkeys(e["scenario"] for e in summary["totals"])
-            if len({e["controller"] for e in summary["totals"] if e["scenario"] == s}) > 4]  # fmt: skip
+    wide = [
+        s
+        for s in dict.fromkeys(e["scenario"] for e in summary["totals"])
+        if len({e["controller"] for e in summary["totals"] if e["scenario"] == s}) > 4
+    ]
     if wide:
         out.section("Every plant")
         out.text(

@@ -152,9 +152,10 @@ def _table_2_rows(rows: list[dict[str, Any]], config: BenchmarkConfig) -> list[d
         if name in config.studies and config.studies[name].plants:
             study = config.studies[name]
             shown += [
-                r for r in rows
+                r
+                for r in rows
                 if r["scenario"] == name and r["plant"] == study.plants[0] and r["controller"] in study.controllers
-            ]  # fmt: skip
+            ]
     return shown
 
 

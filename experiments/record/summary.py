@@ -16,7 +16,7 @@ from experiments.loop.progress import Progress
 from experiments.record.record import Record
 from experiments.record.recovery import Rows
 from experiments.reporting import charts
-from experiments.reporting.composition_chart import composition_figure
+from experiments.reporting.composition_charts import composition_figure
 from hardware.errors import RecordingError
 from hardware.safety.interlock import kinds_of
 from hardware.storage.marks import Mark, read_marks
