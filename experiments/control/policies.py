@@ -1,7 +1,8 @@
 """The policy file of a run: finding it, checking it, judging whether it may run, and keeping a copy with the run."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -130,6 +131,18 @@ def find_policy(name: str, root: Path = Path("runs")) -> Path:
     return path / "policy.npz" if path.is_dir() else path
 
 
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Reading a policy. Raises: UserError naming the file and what is wrong with it."""
+    try:
+        yield
+    except policies.PolicyError as error:
+        raise frame.UserError(str(error)) from None
+    except Exception as error:  # whatever a damaged file makes NumPy say
+        why = (str(error).splitlines() or [type(error).__name__])[0]
+        raise frame.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
+
+
 def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     """The policy that `find_policy` finds, checked against control period and interlock.
 
@@ -137,15 +150,10 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
     Raises: UserError naming the file and, for a mismatch, both values.
     """
     path = find_policy(name)
-    try:
+    with _readable(path):
         policy = policies.load(path)
         training = Training.of(policy)
         fastest = 0.0 if training.relative else float(policy.actions.max())
-    except policies.PolicyError as error:
-        raise frame.UserError(str(error)) from None
-    except Exception as error:  # whatever a damaged file makes NumPy say
-        why = (str(error).splitlines() or [type(error).__name__])[0]
-        raise frame.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
     if not (training.relative or abs(training.control_min - control_min) <= 1e-9):
         raise frame.UserError(
             f"policy {path} was trained for a control period of {training.control_min} min, "
@@ -236,13 +244,8 @@ def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Pol
     if not again and name == "shipped" and not path.is_file():
         remedy = "give composition_policy=RUN/policy.npz of a training with env=coculture or env=coculture_preview"
         raise frame.UserError(f"composition={kind}: no policy for it comes with this version; {remedy}")
-    try:
+    with _readable(path):
         policy = policies.load(kept if again else path)
-    except policies.PolicyError as error:
-        raise frame.UserError(str(error)) from None
-    except Exception as error:  # whatever a damaged file makes NumPy say
-        why = (str(error).splitlines() or [type(error).__name__])[0]
-        raise frame.UserError(f"policy {path}: damaged ({why}); give the policy.npz of a training run") from None
     if not again:
         _keep(policy, kept)
     return policy

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from experiments.loop.loop import ClosedLoop, Step
 from hardware.errors import RecordingError
-from hardware.memory import Remembers
 from hardware.reactor import Receipt
 from hardware.safety.config import Response
 from hardware.safety.interlock import kinds_of
@@ -245,7 +244,7 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
         loop.restore(_caught_up(state, newer, list(loop.reactors.names)))
     except ValueError as error:
         raise _no_state(path, str(error)) from None
-    if isinstance(loop.density.law, Remembers) and loop.density.name not in state:
+    if loop.density.memory is not None and loop.density.name not in state:
         log.warning(
             "%s: an earlier version wrote it, without the controller's memory: the controller begins anew", path
         )
