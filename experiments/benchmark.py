@@ -6,7 +6,7 @@ from omegaconf import DictConfig
 
 from experiments.cli import frame
 from experiments.comparison.config import BenchmarkConfig
-from experiments.controllers import registry
+from experiments.laws import registry
 
 
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:

@@ -155,7 +155,7 @@ def test_no_module_level_random_numbers():
 
 def test_the_bench_path_loads_no_torch():
     """Deploying needs NumPy policy, loop, recorder and TensorBoard's writer; none of them may pull torch."""
-    names = [m for m in modules() if room(m) in ("experiments.control", "experiments.controllers", "hardware.chibio")]
+    names = [m for m in modules() if room(m) in ("experiments.control", "experiments.laws.density", "hardware.chibio")]
     code = f"import sys, {', '.join([*names, 'experiments.deploy'])}; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert done.stdout.strip() == "False"

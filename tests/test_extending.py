@@ -150,7 +150,7 @@ def test_a_task_with_a_config_of_its_own_trains(tmp_path: Path) -> None:
         ("import numpy\nnumpy.nothing\n", "mine.py:2: AttributeError"),
         ("def (:\n", "mine.py:1: SyntaxError"),
         (
-            "from experiments.controllers import registry\nregistry.add('pi', int, int, 'x')\n",
+            "from experiments.laws import registry\nregistry.add('pi', int, int, 'x')\n",
             "controller = pi: there is a preset of this name already",
         ),
         ("from envs.plant import disturbance\ndisturbance.add('', print)\n", "a name that is not taken"),

@@ -13,8 +13,8 @@ from envs.identification.screening import Series
 from envs.task import MAX_PUMP_RATE
 from experiments.calibration.config import CalibrateConfig
 from experiments.cli import files
-from experiments.controllers.baselines import Threshold, ThresholdConfig
-from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig
+from experiments.laws.density.baselines import Threshold, ThresholdConfig
+from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig
 
 __all__ = ["coverage", "simulated"]
 

@@ -8,7 +8,7 @@ from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.controllers import registry
+from experiments.laws import registry
 
 __all__ = ["TWIN", "BenchmarkConfig", "StudyConfig"]
 

@@ -28,12 +28,12 @@ from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.cli.stop import Workers
 from experiments.comparison.config import BenchmarkConfig
-from experiments.composition.base import Law
-from experiments.composition.estimator import CompositionEstimator
-from experiments.composition.program import Program
 from experiments.control.policies import load_policy
-from experiments.controllers import registry
-from experiments.controllers.base import Accounts, Controller, Watches
+from experiments.laws import registry
+from experiments.laws.base import Accounts, Controller, Watches
+from experiments.laws.share.base import Law
+from experiments.laws.share.estimator import CompositionEstimator
+from experiments.laws.share.program import Program
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.metrics import WindowMetrics, window_metrics
 from experiments.loop.share import program_of

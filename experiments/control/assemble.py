@@ -23,10 +23,10 @@ from experiments.certification.bounds import EstimateBounds
 from experiments.cli import frame
 from experiments.cli.calibrated import read_env_file, read_plant_file
 from experiments.cli.choices import choices
-from experiments.composition.estimator import CompositionEstimator
 from experiments.control.config import DeployConfig
 from experiments.control.policies import Wanted, admit, composition_policy, policy_check, run_policy
-from experiments.controllers import registry
+from experiments.laws import registry
+from experiments.laws.share.estimator import CompositionEstimator
 from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.share import Share, program_of

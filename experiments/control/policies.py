@@ -14,7 +14,7 @@ from dqn.policy import Policy
 from experiments.certification import certificate
 from experiments.cli import frame
 from experiments.cli.latest import newest
-from experiments.controllers import registry
+from experiments.laws import registry
 from hardware.check import Check
 from hardware.storage import atomic
 

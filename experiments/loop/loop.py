@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.scenario import Scenario
-from experiments.controllers.base import Array, Controller, Mask
+from experiments.laws.base import Array, Controller, Mask
 from experiments.loop.progress import Progress
 from experiments.loop.signals import Density, Sample, Signal, one_each
 from experiments.loop.supply import Supply

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from envs.scenario import Scenario
 from envs.until import Conditions
-from experiments.controllers.base import Array, Mask
+from experiments.laws.base import Array, Mask
 
 __all__ = ["CONDITION", "TIME", "Progress"]
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from conf.schema import check, setting
 from envs.scenario import Scenario
-from experiments.composition.base import Array, Law, Mask, ShareEstimator, Wanted
-from experiments.composition.program import Program
+from experiments.laws.share.base import Array, Law, Mask, ShareEstimator, Wanted
+from experiments.laws.share.program import Program
 from experiments.loop.signals import THERMOSTAT, Findings, Sample
 from hardware.memory import Remembers
 

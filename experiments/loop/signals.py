@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.scenario import Scenario
-from experiments.controllers.base import Accounts, Array, Controller, Explains, Mask, Watches
+from experiments.laws.base import Accounts, Array, Controller, Explains, Mask, Watches
 from hardware.memory import Remembers
 from hardware.reactor import Measurement
 from hardware.safety.interlock import Interlock

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from envs.outputs import DOSE_ML, MADE_UP_MIN, PUMPS, outputs_of
 from envs.scenario import Scenario
-from experiments.controllers.base import Array, Mask
+from experiments.laws.base import Array, Mask
 
 __all__ = ["Supply"]
 

@@ -16,7 +16,7 @@ from dqn.policy import Policy
 from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file
-from experiments.controllers.estimator import EstimatorConfig
+from experiments.laws.density.estimator import EstimatorConfig
 from experiments.reporting import charts
 from experiments.training import announcements, tasks
 from experiments.training.config import TrainConfig

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.control.config import DeployConfig
-from experiments.controllers.base import Array
+from experiments.laws.base import Array
 from experiments.loop.loop import Step
 from hardware.emulator.device import DeviceOptions
 from hardware.emulator.vial import VialConfig

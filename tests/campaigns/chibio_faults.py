@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from envs.scenario import Scenario
-from experiments.controllers.base import Array, Mask
+from experiments.laws.base import Array, Mask
 from hardware.emulator.faults import inject
 from tests.campaigns.fault import Fault
 from tests.campaigns.rehearsal import Rehearsal

@@ -15,8 +15,8 @@ import numpy as np
 from conf.schema import check, part, setting
 from envs.bench import Bench
 from envs.scenario import Scenario
-from experiments.controllers.base import Mask
-from experiments.controllers.registry import on_device
+from experiments.laws.base import Mask
+from experiments.laws.registry import on_device
 from experiments.loop.loop import Step
 from hardware.chibio.protocol import POSITIONS
 from hardware.emulator.vial import Dose

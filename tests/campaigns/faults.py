@@ -18,7 +18,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from conf.schema import check, part, require, setting
 from envs.scenario import Scenario
 from experiments.cli import files, frame, stop
-from experiments.controllers.registry import on_device
+from experiments.laws.registry import on_device
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.pioreactor.config import PUBLISHED
 from hardware.safety.config import SafetyConfig

@@ -16,7 +16,7 @@ import numpy as np
 
 from conf.presets import groups
 from conf.schema import check, require, setting
-from experiments.controllers.registry import on_device
+from experiments.laws.registry import on_device
 from hardware.emulator.process import EmulatorProcess
 from hardware.emulator.vial import Dose, Sample
 from hardware.storage.journal import read_journal

@@ -17,7 +17,7 @@ from envs.bench import Bench
 from envs.scenario import Scenario
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
-from experiments.controllers import registry
+from experiments.laws import registry
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.record.record import Record
 from hardware.chibio.config import ChiBioConfig

@@ -13,7 +13,7 @@ from envs.plant.culture import GrowthConfig
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
-from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig
+from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from experiments.calibration.twin_file import plant_of, twin_yaml
-from experiments.controllers.baselines import Threshold, ThresholdConfig
-from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig
+from experiments.laws.density.baselines import Threshold, ThresholdConfig
+from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig
 
 Array = NDArray[np.float64]
 

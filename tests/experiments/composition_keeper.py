@@ -4,7 +4,7 @@ import numpy as np
 
 from envs.coculture.rates import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
 from envs.coculture.task import logit, share
-from experiments.composition.base import Array, Estimate, Mask, Wanted
+from experiments.laws.share.base import Array, Estimate, Mask, Wanted
 
 
 class Reckoning:

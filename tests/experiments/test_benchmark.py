@@ -22,7 +22,7 @@ from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.published import TABLE_2
 from experiments.comparison.run import with_seeds
 from experiments.comparison.trials import Cell, DensityTrial, Window, cells, run_trial, windows
-from experiments.controllers import registry
+from experiments.laws import registry
 from tests.experiments.test_deploy import inverse_policy
 
 ROOT = Path(__file__).parents[2]

@@ -9,8 +9,8 @@ from conf import presets
 from conf.schema import build
 from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
-from experiments.composition.calibration import calibrate_sensor
-from experiments.controllers import registry
+from experiments.laws import registry
+from experiments.laws.share.calibration import calibrate_sensor
 
 
 def protocol(share, n=40, hours=5, factor=0.8, offset=300.0):

@@ -18,7 +18,7 @@ from conf import presets
 from conf.schema import build
 from envs.scenario import Scenario
 from experiments.control import assemble
-from experiments.controllers import registry
+from experiments.laws import registry
 from experiments.loop.share import Share
 from experiments.record.recovery import COLUMNS as USUAL
 from hardware.chibio.calibrations import save_calibration

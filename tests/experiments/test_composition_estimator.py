@@ -13,9 +13,9 @@ from envs.plant.fluorescence import steady_production
 from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
 from experiments.comparison.trials import calibrate, run_share
-from experiments.composition.estimator import FACTOR, LOGIT, OFFSET, CompositionEstimator, CompositionEstimatorConfig
-from experiments.composition.program import Program
-from experiments.controllers import registry
+from experiments.laws import registry
+from experiments.laws.share.estimator import FACTOR, LOGIT, OFFSET, CompositionEstimator, CompositionEstimatorConfig
+from experiments.laws.share.program import Program
 from hardware import memory
 
 NAN = float("nan")

@@ -9,10 +9,10 @@ import pytest
 from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
 from envs.coculture.rates import e_coli_rate, p_putida_rate
 from envs.coculture.task import CocultureConfig, advance, at_rest, logit, share
-from experiments.composition.base import Estimate, Wanted
-from experiments.composition.program import Program
-from experiments.controllers import registry
-from experiments.controllers.registry import SHARE
+from experiments.laws import registry
+from experiments.laws.registry import SHARE
+from experiments.laws.share.base import Estimate, Wanted
+from experiments.laws.share.program import Program
 from hardware import memory
 
 NAN = float("nan")

@@ -10,9 +10,9 @@ import pytest
 from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.composition.base import Array, Estimate, Mask, Wanted
-from experiments.composition.estimator import CompositionEstimator
-from experiments.controllers import registry
+from experiments.laws import registry
+from experiments.laws.share.base import Array, Estimate, Mask, Wanted
+from experiments.laws.share.estimator import CompositionEstimator
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.share import COLUMNS, Share, ShareWarnings, program_of
 from experiments.loop.signals import Sample, Signal

@@ -8,8 +8,8 @@ import pytest
 
 from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import CocultureConfig, advance, passed, share
-from experiments.composition.base import Array, Estimate, Law, Wanted
-from experiments.controllers import registry
+from experiments.laws import registry
+from experiments.laws.share.base import Array, Estimate, Law, Wanted
 from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Evaluation
 

@@ -7,8 +7,8 @@ import pytest
 
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.controllers.base import Array, Mask
-from experiments.controllers.inverse import Inverse, InverseConfig
+from experiments.laws.base import Array, Mask
+from experiments.laws.density.inverse import Inverse, InverseConfig
 from hardware.emulator.device import DeviceOptions
 from hardware.emulator.vial import VialConfig
 from tests.hardware.driver_lab import DriverLab, Law

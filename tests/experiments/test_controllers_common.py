@@ -9,12 +9,12 @@ import pytest
 from conf import presets
 from conf.schema import build
 from envs.task import EnvConfig
-from experiments.controllers.base import Controller, Explains
-from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
-from experiments.controllers.inverse import Inverse, InverseConfig
-from experiments.controllers.mpc import Mpc, MpcConfig
-from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
-from experiments.controllers.pso import SwarmConfig
+from experiments.laws.base import Controller, Explains
+from experiments.laws.density.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
+from experiments.laws.density.inverse import Inverse, InverseConfig
+from experiments.laws.density.mpc import Mpc, MpcConfig
+from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
+from experiments.laws.density.pso import SwarmConfig
 
 MODEL = EnvConfig()
 QUICK = SwarmConfig(particles=6, iterations=8)

@@ -8,8 +8,8 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from envs.task import EnvConfig
-from experiments.controllers.estimator import EstimatorConfig
-from experiments.controllers.inverse import Inverse, InverseConfig
+from experiments.laws.density.estimator import EstimatorConfig
+from experiments.laws.density.inverse import Inverse, InverseConfig
 
 ONE = np.ones(1, dtype=bool)
 PLAIN = {"noise_memory": 0.0, "warmth": 0.0, "warmth_sd": 0.0, "first_dose": 1.0, "first_dose_sd": 0.0, "hurry": 0.0}

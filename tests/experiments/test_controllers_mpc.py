@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from envs.optimum import solve
 from envs.task import EnvConfig, step_factors
-from experiments.controllers.mpc import Mpc, MpcConfig, Problem
-from experiments.controllers.pso import SwarmConfig, minimise
+from experiments.laws.density.mpc import Mpc, MpcConfig, Problem
+from experiments.laws.density.pso import SwarmConfig, minimise
 
 Array = NDArray[np.float64]
 MODEL = EnvConfig()

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from envs.task import EnvConfig
-from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
+from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 
 Array = NDArray[np.float64]
 

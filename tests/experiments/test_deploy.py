@@ -19,8 +19,8 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
 from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
-from experiments.controllers import registry
-from experiments.controllers.learned import LearnedController
+from experiments.laws import registry
+from experiments.laws.density.learned import LearnedController
 from experiments.loop.loop import ClosedLoop
 from experiments.record.record import Record
 from experiments.record.summary import ChangeLog

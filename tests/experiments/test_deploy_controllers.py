@@ -26,7 +26,7 @@ from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.control import run
 from experiments.control.config import DeployConfig, deploy_schema
-from experiments.controllers.registry import DENSITY, KINDS
+from experiments.laws.registry import DENSITY, KINDS
 from hardware.chibio.config import EmulatorConfig
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice

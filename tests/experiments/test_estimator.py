@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from envs.task import EnvConfig
-from experiments.controllers.estimator import GAIN, LOG_OD, MU, Estimator, EstimatorConfig
+from experiments.laws.density.estimator import GAIN, LOG_OD, MU, Estimator, EstimatorConfig
 from hardware import memory
 
 MODEL = EnvConfig(mu=0.025, tau=1 / 3)

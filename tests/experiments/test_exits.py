@@ -23,7 +23,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 SPEED = 30.0
 BROKEN = """
 import experiments.deploy
-from experiments.controllers.inverse import Inverse
+from experiments.laws.density.inverse import Inverse
 whole = Inverse.act
 calls = []
 def act(self, *arguments):

@@ -10,8 +10,8 @@ from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
-from experiments.controllers import registry
 from experiments.deploy import main
+from experiments.laws import registry
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
 
 CALM = Scenario((0.5, 0.6), (10.0, 10.0), (37.0, 37.0))

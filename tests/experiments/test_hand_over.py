@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
-from experiments.controllers.base import Array, Controller, Mask
+from experiments.laws.base import Array, Controller, Mask
 from hardware.emulator.faults import inject
 from hardware.emulator.process import EmulatorProcess
 from hardware.safety.interlock import Response
@@ -21,7 +21,7 @@ from tests.experiments.test_exits import SPEED, Bench
 LOST = """
 import experiments.deploy
 import numpy as np
-from experiments.controllers.inverse import Inverse
+from experiments.laws.density.inverse import Inverse
 whole = Inverse.act
 calls = []
 def act(self, *arguments):

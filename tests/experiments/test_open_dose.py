@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from envs.scenario import Scenario
-from experiments.controllers.base import Array, Mask
+from experiments.laws.base import Array, Mask
 from experiments.loop.loop import Step
 from experiments.record.record import Record
 from hardware.emulator.faults import inject

@@ -21,7 +21,7 @@ from experiments.cli.frame import UserError
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
 from experiments.control.policies import find_policy
-from experiments.controllers import registry
+from experiments.laws import registry
 from experiments.training.config import TrainConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.emulator.process import EmulatorProcess

@@ -17,8 +17,8 @@ from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.cli import files
 from experiments.control.policies import find_policy, load_policy
-from experiments.controllers import registry
-from experiments.controllers.base import Array, Controller, Mask
+from experiments.laws import registry
+from experiments.laws.base import Array, Controller, Mask
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.record.recovery import load_state
 from hardware import memory

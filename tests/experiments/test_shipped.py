@@ -15,7 +15,7 @@ from dqn.policy import RELATIVE, Policy
 from envs.relative import nearest_level
 from experiments.certification import certificate
 from experiments.control.policies import SHIPPED, find_policy
-from experiments.controllers.estimator import EstimatorConfig
+from experiments.laws.density.estimator import EstimatorConfig
 from experiments.train import main
 from experiments.training.run import fingerprint
 

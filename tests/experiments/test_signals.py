@@ -16,8 +16,8 @@ from envs.task import EnvConfig
 from experiments.cli import frame
 from experiments.control import run
 from experiments.control.assemble import unpack
-from experiments.controllers import registry
 from experiments.deploy import main
+from experiments.laws import registry
 from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.share import COLUMNS

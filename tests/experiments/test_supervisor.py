@@ -10,8 +10,8 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.control.policies import find_policy, load_policy
-from experiments.controllers.estimator import LOG_OD, EstimatorConfig
-from experiments.controllers.learned import RelativeController
+from experiments.laws.density.estimator import LOG_OD, EstimatorConfig
+from experiments.laws.density.learned import RelativeController
 from experiments.record.summary import ChangeLog
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.storage.journal import read_journal

@@ -7,8 +7,8 @@ import numpy as np
 
 from conf.schema import check, setting
 from envs.scenario import Scenario
-from experiments.controllers import registry
-from experiments.controllers.base import Array, Mask
+from experiments.laws import registry
+from experiments.laws.base import Array, Mask
 from experiments.loop import signals
 from experiments.loop.signals import THERMOSTAT, Findings, Sample
 from hardware.memory import Remembers

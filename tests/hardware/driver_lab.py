@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from envs.scenario import Scenario
-from experiments.controllers.base import Array, Mask
+from experiments.laws.base import Array, Mask
 from experiments.loop.loop import ClosedLoop, Step
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration

@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import files
-from experiments.composition.estimator import CompositionEstimator
 from experiments.control.policies import load_policy
-from experiments.controllers import registry
+from experiments.laws import registry
+from experiments.laws.share.estimator import CompositionEstimator
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.share import Share
 from hardware.memory import Remembers

@@ -15,9 +15,9 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import frame
 from experiments.comparison.trials import Cell, run_trial
-from experiments.controllers import registry
-from experiments.controllers.base import Array, Controller
-from experiments.controllers.mpc import MpcConfig, Problem
+from experiments.laws import registry
+from experiments.laws.base import Array, Controller
+from experiments.laws.density.mpc import MpcConfig, Problem
 from tests.studies.measurement import Measurement
 
 __all__ = ["loops", "mpc"]

@@ -7,8 +7,8 @@ import numpy as np
 from conf.schema import require
 from envs.coculture.rates import T_MAX, T_MIN, p_putida_rate
 from envs.plant.fluorescence import steady_production
-from experiments.composition.base import Array
-from experiments.composition.estimator import CompositionEstimatorConfig
+from experiments.laws.share.base import Array
+from experiments.laws.share.estimator import CompositionEstimatorConfig
 
 __all__ = ["SensorCalibration", "calibrate_sensor"]
 

@@ -9,7 +9,7 @@ from conf.schema import check, setting
 from envs.bench import Bench
 from envs.coculture.rates import EQUAL_RATES_C, LAG_E_MIN, LAG_P_MIN, e_coli_rate, p_putida_rate
 from envs.plant.fluorescence import DELAY_MIN, FOLLOW_PER_H, LEAST, steady_production
-from experiments.composition.base import Array, Estimate, Mask
+from experiments.laws.share.base import Array, Estimate, Mask
 
 __all__ = ["CompositionEstimator", "CompositionEstimatorConfig"]
 

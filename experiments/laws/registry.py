@@ -10,7 +10,14 @@ from envs.bench import Bench
 from envs.plant.plant import Plant
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
-from experiments.composition.laws import (
+from experiments.laws.base import Array
+from experiments.laws.density.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
+from experiments.laws.density.inverse import Inverse, InverseConfig
+from experiments.laws.density.learned import LearnedConfig, learned
+from experiments.laws.density.mpc import Mpc, MpcConfig
+from experiments.laws.density.oracle import Oracle, OracleConfig
+from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
+from experiments.laws.share.laws import (
     PI,
     BangBang,
     BangBangConfig,
@@ -24,16 +31,9 @@ from experiments.composition.laws import (
     Proportional,
     ProportionalConfig,
 )  # fmt: skip
-from experiments.composition.learned import LearnedLaw, LearnedLawConfig, PreviewLawConfig
-from experiments.composition.planned import Optimum, OptimumConfig, Receding, RecedingConfig
-from experiments.composition.program import Program
-from experiments.controllers.base import Array
-from experiments.controllers.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
-from experiments.controllers.inverse import Inverse, InverseConfig
-from experiments.controllers.learned import LearnedConfig, learned
-from experiments.controllers.mpc import Mpc, MpcConfig
-from experiments.controllers.oracle import Oracle, OracleConfig
-from experiments.controllers.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
+from experiments.laws.share.learned import LearnedLaw, LearnedLawConfig, PreviewLawConfig
+from experiments.laws.share.planned import Optimum, OptimumConfig, Receding, RecedingConfig
+from experiments.laws.share.program import Program
 
 __all__ = ["DENSITY", "FORESIGHT", "KINDS", "SHARE", "Kind", "add", "build", "config", "on_device", "takes"]
 
@@ -94,7 +94,7 @@ def add(
     Args:
       kind: its name, the default of the field `kind` of `config`.
       config: dataclass of its values, whose fields are made by `conf.schema.setting`; one of the share also has the
-        field `estimator` of `experiments.composition.laws.LawConfig`.
+        field `estimator` of `experiments.laws.share.laws.LawConfig`.
       make: called with the config and then the `parts`, returns the law.
       what: the sentence that the help shows.
       parts: what else it is made from, arguments of `build`.

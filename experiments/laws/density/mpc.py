@@ -6,8 +6,8 @@ import numpy as np
 
 from conf.schema import check, part, setting
 from envs.task import EnvConfig
-from experiments.controllers.base import Array, Mask, usable
-from experiments.controllers.pso import SwarmConfig, minimise
+from experiments.laws.base import Array, Mask, usable
+from experiments.laws.density.pso import SwarmConfig, minimise
 
 __all__ = ["Mpc", "MpcConfig", "Problem"]
 

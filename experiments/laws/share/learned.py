@@ -7,8 +7,8 @@ import numpy as np
 from conf.schema import require, setting
 from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
 from envs.coculture.task import logit
-from experiments.composition.base import Array, Estimate, Wanted
-from experiments.composition.laws import Index, LawConfig, Periodic
+from experiments.laws.share.base import Array, Estimate, Wanted
+from experiments.laws.share.laws import Index, LawConfig, Periodic
 
 __all__ = ["LearnedLaw", "LearnedLawConfig", "PreviewLawConfig"]
 

@@ -7,7 +7,7 @@ import numpy as np
 from conf.schema import check, setting
 from envs.bench import Bench
 from envs.task import MAX_PUMP_RATE, EnvConfig
-from experiments.controllers.base import Array, Mask, usable
+from experiments.laws.base import Array, Mask, usable
 
 __all__ = ["ChiBioPI", "ChiBioPIConfig", "TunedPI", "TunedPIConfig"]
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from conf.schema import check, part, setting
 from envs.task import EnvConfig
-from experiments.controllers.base import Array, Mask, usable
-from experiments.controllers.estimator import Estimator, EstimatorConfig
+from experiments.laws.base import Array, Mask, usable
+from experiments.laws.density.estimator import Estimator, EstimatorConfig
 
 __all__ = ["Inverse", "InverseConfig"]
 

@@ -9,7 +9,7 @@ from conf.schema import check, setting
 from envs.optimum import OptimalPolicy, solve
 from envs.plant.plant import Plant
 from envs.task import EnvConfig
-from experiments.controllers.base import Array, Mask
+from experiments.laws.base import Array, Mask
 
 __all__ = ["Oracle", "OracleConfig"]
 

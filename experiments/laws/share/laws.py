@@ -10,8 +10,8 @@ from conf.schema import check, part, setting
 from envs.coculture.optimum import best_action
 from envs.coculture.rates import EQUAL_RATES_C, T_MAX, T_MIN
 from envs.coculture.task import CocultureConfig, advance, logit
-from experiments.composition.base import Array, Estimate, Mask, Wanted
-from experiments.composition.estimator import CompositionEstimatorConfig
+from experiments.laws.share.base import Array, Estimate, Mask, Wanted
+from experiments.laws.share.estimator import CompositionEstimatorConfig
 
 __all__ = [
     "PI", "BangBang", "BangBangConfig", "InverseDynamics", "InverseDynamicsConfig", "LawConfig", "Midpoint",

@@ -8,9 +8,9 @@ import numpy as np
 from conf.schema import setting
 from envs.coculture.optimum import best_action, cost_to_go, transitions
 from envs.coculture.task import CocultureConfig
-from experiments.composition.base import Array, Estimate, Wanted
-from experiments.composition.laws import Index, LawConfig, Periodic
-from experiments.composition.program import Program
+from experiments.laws.share.base import Array, Estimate, Wanted
+from experiments.laws.share.laws import Index, LawConfig, Periodic
+from experiments.laws.share.program import Program
 
 __all__ = ["Optimum", "OptimumConfig", "Receding", "RecedingConfig"]
 

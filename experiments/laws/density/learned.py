@@ -9,8 +9,8 @@ from conf.schema import build, check, setting
 from dqn.policy import RELATIVE, Policy
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
-from experiments.controllers.base import Array, Controller, Mask, usable
-from experiments.controllers.estimator import LOWEST_OD, Estimator, EstimatorConfig
+from experiments.laws.base import Array, Controller, Mask, usable
+from experiments.laws.density.estimator import LOWEST_OD, Estimator, EstimatorConfig
 
 __all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned"]
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from conf.schema import check, setting
 from envs.task import EnvConfig
-from experiments.controllers.base import Array, Mask, usable
+from experiments.laws.base import Array, Mask, usable
 
 __all__ = ["LOWEST_OD", "Estimator", "EstimatorConfig"]
 

@@ -1,0 +1,1 @@
+"""What decides: what a law is asked (`base`), and every law of every signal by its name (`registry`)."""
