@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from hardware.safety.config import Responses
+from hardware.safety.config import RESPONSES, WORDS, Responses, SafetyConfig
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "three_am.md"
 GAP = "…"
-KINDS = {f.name for f in fields(Responses)}
+KINDS = set(RESPONSES)
 CODE = re.compile(r"`([^`]+)`")
 
 
@@ -270,13 +270,14 @@ def test_the_page_has_every_word_of_the_screen_and_no_other():
 
 
 def test_every_reason_of_the_interlock_is_on_the_page_with_its_response():
-    defaults = {f.name: f.default for f in fields(Responses)}
     told = {}
     for cells in tables():
         for text in CODE.findall(cells[0]):
-            if (kind := text.partition(": ")[0]) in defaults:
+            if (kind := text.partition(": ")[0]) in RESPONSES:
                 told.setdefault(kind, set()).add(CODE.findall(cells[2])[0])
-    assert told == {kind: {word} for kind, word in defaults.items()}
+    assert told == {kind: {word} for kind, word in RESPONSES.items()}
+    chosen = {f.name: SafetyConfig().response(f.name) for f in fields(Responses)}
+    assert chosen == {kind: WORDS[RESPONSES[kind]] for kind in chosen}
 
 
 @pytest.mark.parametrize(

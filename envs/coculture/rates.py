@@ -9,18 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["EQUAL_RATES_C", "LAG_E_MIN", "LAG_P_MIN", "T_MAX", "T_MIN", "e_coli_rate", "p_putida_rate"]
+__all__ = [
+    "EQUAL_RATES_C", "E_SLOPE", "E_ZERO", "LAG_E_MIN", "LAG_P_MIN", "T_MAX", "T_MIN", "e_coli_rate", "p_putida_rate",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
 T_MIN, T_MAX = 29.0, 36.0  # degC, range of the fits
 EQUAL_RATES_C = 33.2  # degC at which both grow alike
+E_SLOPE, E_ZERO = 0.07727, 1.66954  # mu_e(T) = E_SLOPE T - E_ZERO, 1/h
 LAG_E_MIN, LAG_P_MIN = 2.0, 60.0  # min, first-order lag of the rate behind the temperature
 
 
 def e_coli_rate(temperature: Any) -> Array:
     """mu_e(T) = 0.07727 T - 1.66954, 1/h, of a temperature in degC, any shape."""
-    return np.asarray(0.07727 * np.clip(temperature, T_MIN, T_MAX) - 1.66954)
+    return np.asarray(E_SLOPE * np.clip(temperature, T_MIN, T_MAX) - E_ZERO)
 
 
 def p_putida_rate(temperature: Any) -> Array:

@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 Decide = Callable[[float, Array], Array]
 """(minute, readings of shape (N,)) -> pump rates in mL/s, shape (N,), held to the next row."""
 
+GROWTH_MIN, DILUTE_TO, HOLD_MIN = 60.0, 0.3, 30.0  # min without feed; OD down to which the pump runs; min of each rate
+
 
 @dataclass(frozen=True)
 class OpenLoop:
@@ -32,11 +34,6 @@ class OpenLoop:
     start_od: float = setting(0.12, "at the start", "OD", above=0.0, at_most=2.0)
     hours: float = setting(6.0, "length of the recording", "h", within=(1, 100))
     control_min: float = setting(1.0, "between rows", "min", within=(0.1, 10))
-    growth_min: float = setting(60.0, "growth without feed (paper)", "min", at_least=0.0)
-    dilute_to: float = setting(0.3, "then the pump at its maximum until the OD is below (paper)", "OD", above=0.0)
-    hold_min: float = setting(
-        30.0, "then a random pump rate for so long, again and again (paper); control_min or more", "min"
-    )
     keep_od: tuple[float, float] = setting(
         (0.08, 1.2),
         "outside, a new rate is drawn at once from the half that leads back (not in the paper)",
@@ -57,7 +54,6 @@ class OpenLoop:
         check(self, "protocol")
         outrun = "> 0 and below 0.02/mu, so that the pump can outrun growth"
         require(self.tau < self.fastest, "protocol.tau", self.tau, outrun)
-        require(self.hold_min >= self.control_min, "protocol.hold_min", self.hold_min, f">= {self.control_min} min")
         require(self.keep_od[0] < self.keep_od[1], "protocol.keep_od", self.keep_od, "0 < low < high")
 
     @property
@@ -125,8 +121,8 @@ class OpenLoopLaw:
         """Pump rates from `t` min on, mL/s, shape (N,)."""
         c = self.config
         pick = self.rng.random(len(od))
-        grown = t >= c.growth_min
-        self.diluted |= grown & (od < c.dilute_to)
+        grown = t >= GROWTH_MIN
+        self.diluted |= grown & (od < DILUTE_TO)
         low, high = od < c.keep_od[0], od > c.keep_od[1]
         lost = (low & (self.rate / c.tau > c.mu)) | (high & (self.rate / c.tau < c.mu))
         due = self.diluted & ((t >= self.until) | lost)
@@ -134,5 +130,5 @@ class OpenLoopLaw:
         count = np.where(low, len(self.rates) // 2, len(self.rates)) - first
         drawn = self.rates[first + np.floor(pick * count).astype(np.int64)]
         self.rate = np.where(due, drawn, np.where(self.diluted, self.rate, MAX_PUMP_RATE if grown else 0.0))
-        self.until = np.where(due, t + c.hold_min, self.until)
+        self.until = np.where(due, t + HOLD_MIN, self.until)
         return self.rate

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 SETTLED_FRACTION = 0.08  # of the OD lost from the light path when the stirrer stands still (docs/biology.md, Stirring)
 SETTLING_MIN = 1.5  # min, so that it is lost within about three readings (docs/biology.md, Stirring)
+SUBSTEP_MIN = 0.1  # longest integration step (paper)
 UNSTIRRED_GROWTH = 0.5  # relative growth without stirring (docs/biology.md, Stirring)
 
 
@@ -79,7 +80,7 @@ class Culture:
 
     Args:
       config: how cells grow; rngs: one stream per vial, for its growth rate.
-      integrate, substep_min: integrator and longest integration step, min.
+      integrate: integrator.
       second: another species beside that of `config`, S = 2; second_rngs: one stream per vial, for its draws.
     State: `biomass` (true, suspended), shape (N, S); `substrate`, shape (N,). Fault switches, shape (N,): `mu_factor`,
     and `stir_factor` (1 turning, 0 stopped; for a stirrer that fails, not for the still phase of each cycle).
@@ -90,12 +91,11 @@ class Culture:
         config: GrowthConfig,
         rngs: Streams,
         integrate: Integrator,
-        substep_min: float,
         second: SecondSpeciesConfig,
         second_rngs: Streams,
     ) -> None:
         self.config, self._n = config, len(rngs)
-        self._integrate, self._substep_min = integrate, substep_min
+        self._integrate = integrate
         self.draws: dict[str, Array] = {"mu": spread(rngs, config.mu, config.mu_cv)}
         species: list[GrowthConfig | SecondSpeciesConfig] = [config]
         rates = [self.draws["mu"]]
@@ -185,7 +185,7 @@ class Culture:
 
     def substeps(self, minutes: float) -> int:
         """Integration steps in an interval of `minutes`."""
-        return max(1, int(np.ceil(minutes / self._substep_min - 1e-9)))
+        return max(1, int(np.ceil(minutes / SUBSTEP_MIN - 1e-9)))
 
     def rates(self, age_min: Array) -> Array:
         """Specific growth rate of each species at this moment, 1/min, shape (N, S).
@@ -194,10 +194,6 @@ class Culture:
         """
         substrate = np.broadcast_to(self.substrate[:, None], self.biomass.shape)
         return self._law.specific_rate(substrate) * self._relative_rate(age_min)
-
-    def specific_rate(self, age_min: Array) -> Array:
-        """Specific growth rate of the first species, 1/min, shape (N,); arguments as `rates`."""
-        return self.rates(age_min)[:, 0]
 
     def _phi(self, temperature: Array) -> Array:
         """phi_i(T) of every species, shape (N, S)."""

@@ -55,7 +55,6 @@ class PlantConfig:
     )
     disturbances: tuple[str, ...] = setting((), "functions of one's own that act on the vials every minute, by name")
     integrator: str = setting("euler", "scheme of the mass balances", choices=tuple(INTEGRATORS))
-    substep_min: float = setting(0.1, "longest integration step (paper)", "min", within=(1e-3, 1))
 
     def __post_init__(self) -> None:
         check(self, "plant")
@@ -100,7 +99,7 @@ class Plant:
         once, process, reading, start, second, light = ([p[k] for p in parts] for k in range(6))
         # The parts draw from the same streams: their order belongs to what a seed means.
         integrate = INTEGRATORS[config.integrator]
-        self.culture = Culture(config.growth, once, integrate, config.substep_min, config.second, second)
+        self.culture = Culture(config.growth, once, integrate, config.second, second)
         self.vessel = Vessel(config.vessel, config.pump, once, np.full(n, volume_ml, dtype=np.float64))
         self.feed = FeedPump(config.pump, once)
         self.sensor = OdSensor(config.sensor, once, reading)

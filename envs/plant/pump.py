@@ -13,6 +13,8 @@ __all__ = ["FeedPump", "PumpConfig"]
 
 Array = NDArray[np.float64]
 
+PRIME_IDLE_MIN = 10.0  # rest after which the line must be primed
+
 
 @dataclass(frozen=True)
 class PumpConfig:
@@ -43,7 +45,6 @@ class PumpConfig:
     timing_error_s: float = setting(
         0.0, "each pulse lasts longer by a uniform draw from 0 to this", "s", within=(0, 0.5)
     )
-    prime_idle_min: float = setting(10.0, "rest after which the line must be primed", "min", within=(0, 1440))
     prime_low: float = setting(1.0, "fraction that the priming pulse delivers, lowest", within=(0, 1))
     prime_high: float = setting(1.0, "and highest", within=(0, 1))
     waste_ml_s: float = setting(1.0, "flow of the waste pump at full power (vendor)", "mL/s", within=(0.05, 5))
@@ -141,7 +142,7 @@ class FeedPump:
         """
         pulsing = on_s > 0.0
         start = pulsing & ~self._running
-        primed = np.where(self._idle_min > self.config.prime_idle_min, self._prime, 1.0)
+        primed = np.where(self._idle_min > PRIME_IDLE_MIN, self._prime, 1.0)
         self._pulse_prime = np.where(start, primed, self._pulse_prime)
         for store in (self._on_s, self._moved_ml, self._dosed_ml):
             store[start] = 0.0

@@ -38,14 +38,16 @@ def plant_preset(name: str) -> PlantConfig:
     return replace(plant, pump=replace(plant.pump, dosing="pulse"))
 
 
+BOOT_S = 8.0  # from a dead worker to a serving one
+REQUEST_S = 0.005  # what any request takes
+WORKER_TIMEOUT_S = 30.0  # gunicorn kills a worker whose request takes longer
+
+
 @dataclass(frozen=True)
 class DeviceOptions:
     """How the emulated device is built."""
 
-    worker_timeout_s: float = setting(30.0, "gunicorn kills a worker whose request takes longer", "s", within=(1, 3600))
-    boot_s: float = setting(8.0, "from a dead worker to a serving one", "s", within=(0, 600))
     unit: int = setting(0, "which of several devices: no two of them have the same identities", at_least=0)
-    request_s: float = setting(0.005, "what any request takes", "s", within=(0, 5))
     vial: VialConfig = part(VialConfig, "optics and electronics")
     plant: PlantConfig = part(lambda: plant_preset("healthy"), "cultures and pumps, with pulse dosing")
 
@@ -102,7 +104,7 @@ class ChiBioDevice:
             plant = Plant(o.plant, 1, [plant_stream], tube_ml)
             plant.reset(start_od, temperature)
             self.vials[name] = Vial(plant, o.vial, vial_stream, clock.now())
-        self.supervisor = Supervisor(self.computer, self.vials, o.boot_s, o.request_s, o.worker_timeout_s)
+        self.supervisor = Supervisor(self.computer, self.vials, BOOT_S, REQUEST_S, WORKER_TIMEOUT_S)
         for name, vial in self.vials.items() if blanked else ():
             self.apps[name].data["OD0"]["target"] = round(vial.spectrometer.blank)
 

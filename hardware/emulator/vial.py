@@ -20,6 +20,7 @@ FEED, WASTE = "Pump1", "Pump2"
 SPARE = ("Pump3", "Pump4")
 
 FULL_SCALE = 65535
+AIR_C = 24.0  # outside
 DARK_COUNTS = 3.0  # what the spectrometer counts without light
 LONGEST_STEP_S = 60.0
 SENSOR_STEP_S = 2.0
@@ -74,7 +75,6 @@ class VialConfig:
         0.2, "least time from the answer to a pump command until the motor turns", "s", within=(0, 5)
     )
     pump_start_high_s: float = setting(0.7, "and most", "s", at_most=5.0)
-    air_c: float = setting(24.0, "air outside", "degC", within=(0, 45))
     pump3_ml_s: float = setting(0.0, "flow of Pump3 where it supplies a second fluid", "mL/s", within=(0, 5))
     pump4_ml_s: float = setting(0.0, "of Pump4", "mL/s", within=(0, 5))
     overflow_pump: str = setting("", "pump whose tube ends a little above the waste tube", choices=(*SPARE, ""))
@@ -307,8 +307,8 @@ class Vial:
         if which == "IR":
             value = float(self.plant.thermal.read()[0]) + self._rng.normal(0.0, 0.05)
             return round(value / 0.02) * 0.02
-        warmed = 0.15 * (float(self.plant.thermal.temperature[0]) - self.config.air_c) if which == "Internal" else 0.0
-        return round((self.config.air_c + warmed + self._rng.normal(0.0, 0.05)) * 16.0) / 16.0
+        warmed = 0.15 * (float(self.plant.thermal.temperature[0]) - AIR_C) if which == "Internal" else 0.0
+        return round((AIR_C + warmed + self._rng.normal(0.0, 0.05)) * 16.0) / 16.0
 
     def counts(self, at: float, exposure_s: float) -> int:
         """One spectrometer reading, as `Spectrometer.counts`."""

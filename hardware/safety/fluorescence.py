@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from hardware.reactor import Array, Mask, Measurement
-from hardware.safety.config import SafetyConfig
+from hardware.safety.config import RAW_MAX, SafetyConfig
 from hardware.safety.readings import Finding
 
 __all__ = ["Light"]
@@ -55,7 +55,7 @@ class Light:
         """Fresh rows that may be believed; equal samples in a row, of all."""
         c = self._config
         repeats = np.where(fresh, np.where(counts == self._light, self._light_repeats + 1, 0), self._light_repeats)
-        inside = (counts >= c.light_min) & (counts <= c.raw_max)  # not nan
+        inside = (counts >= c.light_min) & (counts <= RAW_MAX)  # not nan
         return np.asarray(fresh & inside & (repeats < c.frozen_light - 1), dtype=np.bool_), repeats
 
 

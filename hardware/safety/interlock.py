@@ -19,7 +19,7 @@ from envs.bench import Bench
 from hardware import memory
 from hardware.reactor import Array, Mask, Measurement, Receipt
 from hardware.safety.budget import FeedBudget
-from hardware.safety.config import DONE, REMEDIES, WORDS, Response, SafetyConfig
+from hardware.safety.config import DONE, MAX_SETPOINT, REMEDIES, Response, SafetyConfig
 from hardware.safety.fluorescence import Light
 from hardware.safety.readings import Finding, Heat, Readings
 from hardware.safety.unexplained_change import UnexplainedChange
@@ -103,7 +103,7 @@ class Interlock:
         believed, of_readings = self._readings.check(measurement, fresh, now)
         of_changes = self._change.check(measurement.od, measurement.time_s, believed, setpoint)
         of_heat = self._heat.check(measurement.temperature, fresh, target_c, now)
-        sound = (setpoint > 0.0) & (setpoint <= self.config.max_setpoint)
+        sound = (setpoint > 0.0) & (setpoint <= MAX_SETPOINT)
         of_setpoint = Finding("setpoint", ~sound, lambda i: f"setpoint {setpoint[i]:g}")
         allowed, of_rates = self.budget.check(rate, fresh, now)
         found = self._reported(measurement)
@@ -147,7 +147,7 @@ class Interlock:
         return Finding("temperature_limit", ~np.isnan(asked), lambda i: f"{asked[i]:.1f} degC asked, allowed {limits}")
 
     def _response(self, kind: str) -> Response:
-        return WORDS[getattr(self.config.responses, kind)]
+        return self.config.response(kind)
 
     def _reported(self, m: Measurement) -> list[list[_Reason]]:
         """The faults that the reactors report themselves."""

@@ -8,16 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from hardware.reactor import Array, Mask, Measurement
-from hardware.safety.config import SafetyConfig
+from hardware.safety.config import RAW_MAX, RAW_MIN, SafetyConfig
 
 __all__ = ["Finding", "Heat", "Readings"]
+
+FROZEN_SAMPLES = 3  # equal readings in a row that no noisy sensor gives
+HOT_EXCESS_C = 2.0  # above the thermostat's target, in three samples
+MAX_TEMPERATURE_C = 42.0  # the device's own limit, in two samples
 
 
 @dataclass(frozen=True)
 class Finding:
     """Something is wrong with some reactors.
 
-    kind: the reason, a field of `Responses`.
+    kind: the reason, of `RESPONSES`.
     rows: the reactors concerned, shape (N,).
     text: what was seen, for a reactor's index.
     cool: reactors that get no dose for a while after this, unless the reason is only reported; None for none.
@@ -63,16 +67,16 @@ class Readings:
 
     def _raw(self, m: Measurement) -> Array:
         """Counts; without a device there are none, and they pass."""
-        return m.vitals.raw if m.vitals is not None else np.full(len(m.od), self._config.raw_min)
+        return m.vitals.raw if m.vitals is not None else np.full(len(m.od), RAW_MIN)
 
     def _doubts(self, m: Measurement, fresh: Mask) -> tuple[Mask, Mask, Mask, Array]:
         """Fresh rows whose sensor failed, that no culture can read, that are frozen; equal samples in a row, of all."""
         c, od, raw = self._config, m.od, self._raw(m)
         with np.errstate(invalid="ignore"):
-            broken = fresh & ((od > 10.0) | (raw < c.raw_min))
-            impossible = fresh & ~broken & ~((od > c.od_min) & (od < c.od_max) & (raw <= c.raw_max))  # also nan
+            broken = fresh & ((od > 10.0) | (raw < RAW_MIN))
+            impossible = fresh & ~broken & ~((od > c.od_min) & (od < c.od_max) & (raw <= RAW_MAX))  # also nan
             repeats = np.where(fresh, np.where(od == self._seen, self._repeats + 1, 0), self._repeats)
-        frozen = fresh & ~broken & ~impossible & (repeats >= c.frozen_samples - 1)
+        frozen = fresh & ~broken & ~impossible & (repeats >= FROZEN_SAMPLES - 1)
         return broken, impossible, frozen, repeats
 
     def _ages(self, m: Measurement, fresh: Mask, now: float) -> list[Finding]:
@@ -119,7 +123,6 @@ class Heat:
 
     def check(self, reading_c: Array, fresh: Mask, target_c: Array, now: float) -> list[Finding]:
         """Judge the temperatures of the `fresh` rows that have a target (finite `target_c`), degC, shape (N,)."""
-        c = self._config
         asked = fresh & np.isfinite(target_c)
         known = asked & np.isfinite(reading_c)
         temperature, target = np.where(known, reading_c, 37.0), np.where(known, target_c, 37.0)
@@ -127,9 +130,9 @@ class Heat:
         self._relieve(temperature, target, known, now)
         in_range = known & (temperature > 5.0) & (temperature < 70.0)
         nonsense = asked & ~in_range & (seen | known)  # a thermometer that falls silent, too
-        hot = in_range & (temperature > target + c.hot_excess + self._relief_c)
-        too_hot = in_range & (temperature > c.max_temperature)
-        scalding = too_hot & (temperature > c.max_temperature + 3.0)
+        hot = in_range & (temperature > target + HOT_EXCESS_C + self._relief_c)
+        too_hot = in_range & (temperature > MAX_TEMPERATURE_C)
+        scalding = too_hot & (temperature > MAX_TEMPERATURE_C + 3.0)
         self._hot = np.where(known, np.where(hot, self._hot + 1, 0), self._hot)
         self._too_hot = np.where(known, np.where(too_hot, self._too_hot + 1, 0), self._too_hot)
         self._nonsense = np.where(asked, np.where(nonsense, self._nonsense + 1, 0), self._nonsense)

@@ -10,6 +10,10 @@ from hardware.safety.readings import Finding
 
 __all__ = ["UnexplainedChange"]
 
+GAIN_MIN, GAIN_MAX = 0.5, 1.6  # least and most that a dose delivers, of what its calibration says
+ACCEPT_UP, ACCEPT_DOWN = 6, 3  # consistent readings after which a step is believed; bubbles last up to five
+PERSISTENCE = 3  # samples in a row
+
 
 class UnexplainedChange:
     """The newest believed reading of N reactors, what was dosed since, and what of the changes nothing explains.
@@ -74,7 +78,7 @@ class UnexplainedChange:
 
         Args: od: believed readings, else nan, shape (N,). t: when they were taken, min, shape (N,).
         """
-        c, known = self._config, np.isfinite(od)
+        known = np.isfinite(od)
         with np.errstate(invalid="ignore"):
             low, high = self._band(self._od, t - self._at)
             step = known & ~np.isnan(self._od) & ~((od >= low) & (od <= high))
@@ -82,14 +86,14 @@ class UnexplainedChange:
             consistent = (od >= near_low) & (od <= near_high)
             down = od < low
         suspects = np.where(step, np.where(consistent, self._suspects + 1, 1), np.where(known, 0, self._suspects))
-        return step, down, suspects, step & (suspects >= np.where(down, c.accept_down, c.accept_up))
+        return step, down, suspects, step & (suspects >= np.where(down, ACCEPT_DOWN, ACCEPT_UP))
 
     def _band(self, od: Array, minutes: Array) -> tuple[Array, Array]:
         """Lowest and highest reading that growth, the doses since the believed one, and noise can make of `od`."""
         c = self._config
         tolerance = np.maximum(c.jump, c.jump_fraction * np.abs(od))
         base = np.maximum(od, 0.0)
-        low = base * np.exp(-c.gain_max * self._since_ml / self._tube_ml - c.death * minutes) - tolerance
+        low = base * np.exp(-GAIN_MAX * self._since_ml / self._tube_ml - c.death * minutes) - tolerance
         high = base * np.exp(np.minimum(c.mu_max * minutes, 5.0)) + tolerance
         return low, high
 
@@ -108,8 +112,8 @@ class UnexplainedChange:
             x = np.where(usual, np.log(np.where(usual, od / self._od, 1.0)), 0.0)
         d, least = self._since_ml / self._tube_ml, self._since_low_ml / self._tube_ml
         cap = np.minimum(c.mu_max, self._mu + 0.01)
-        rise = np.where(least > 0.0, x - cap * dt + c.gain_min * least, np.minimum(x - c.mu_max * dt, 0.0))
-        fall = -x - c.gain_max * d - c.death * dt
+        rise = np.where(least > 0.0, x - cap * dt + GAIN_MIN * least, np.minimum(x - c.mu_max * dt, 0.0))
+        fall = -x - GAIN_MAX * d - c.death * dt
         full = least / dt >= 0.8 * self._max_rate * 60.0 / self._tube_ml
         excess = np.where(usual, np.maximum(self._excess + rise, 0.0), self._excess)
         deficit = np.where(usual, np.maximum(self._deficit + fall, 0.0), self._deficit)
@@ -122,7 +126,7 @@ class UnexplainedChange:
         sums = np.stack([excess, deficit, futile], axis=1)
         over = np.where(sums > limit[:, None], self._over + 1, 0)  # an outlier is over it once only
         self._over = np.where(usual[:, None], over, self._over)
-        rising, falling, futile_now = (self._over >= c.persistence).T & usual
+        rising, falling, futile_now = (self._over >= PERSISTENCE).T & usual
         short = full & (od > setpoint * (1.0 + c.drift))
         helpless = self._lasting(futile_now & ~rising & short, od, usual, short, limit)
         self._excess, self._deficit = np.where(rising, 0.0, excess), np.where(falling, 0.0, deficit)
@@ -151,7 +155,7 @@ class UnexplainedChange:
         with np.errstate(invalid="ignore", divide="ignore"):
             falls = lasts & (np.log(od / highest) < -limit)
         self._eased = np.where(usual, np.where(lasts & (~short | falls), self._eased + 1, 0), self._eased)
-        ends = lasts & (self._eased >= self._config.persistence)
+        ends = lasts & (self._eased >= PERSISTENCE)
         self._helpless_od = np.where(ends, math.nan, np.where(lasts & usual, highest, self._helpless_od))
         self._helpless_od = np.where(begins & ~lasts, od, self._helpless_od)
         return np.asarray(np.isfinite(self._helpless_od))

@@ -178,7 +178,7 @@ def _doses(mine: Sequence[Mapping[str, Any]], seen: Seen, out: Outcome) -> None:
 
 def _volumes(mine: Sequence[Mapping[str, Any]], seen: Seen, out: Outcome) -> None:
     """What was fed by the journal, at least and at most, and in truth; how full the vial was."""
-    ends = [row for row in mine if row["kind"] == "dose_end"]
+    ends = [row for row in mine if row["kind"] in ("dose_end", "given")]  # given: what somebody else asked for
     out.low_ml = sum(row.get("feed_low_ml", row["feed_ml"]) for row in ends)
     out.high_ml = sum(row["feed_ml"] for row in ends)
     vials = seen.vials[SICK]

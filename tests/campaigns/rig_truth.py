@@ -269,7 +269,8 @@ def _owners(doses: Sequence[Dose], starts: Array) -> NDArray[np.intp]:
 
 def _booked(journal: Rows, doses: Sequence[Dose], unit: str) -> float:
     """mL that the journal counts: of every end, also of what nobody commanded, and whole of a dose without an end."""
-    ends = [float(r["feed_ml"]) for r in of_unit(journal, unit, "reactor") if r["kind"] == "dose_end"]
+    kinds = ("dose_end", "given")
+    ends = [float(r["feed_ml"]) for r in of_unit(journal, unit, "reactor") if r["kind"] in kinds]
     return sum(ends) + sum(dose.ml for dose in doses if math.isinf(dose.end))
 
 

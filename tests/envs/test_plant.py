@@ -394,7 +394,7 @@ def test_growth_follows_its_knots_and_stays_at_the_last() -> None:
     before = p.culture.od[0]
     p.advance(10.0, np.zeros(1))
     assert np.log(p.culture.od[0] / before) == pytest.approx(10 * 0.04, rel=1e-6)
-    np.testing.assert_allclose(p.culture.specific_rate(np.array([30.0])), 0.03)
+    np.testing.assert_allclose(p.culture.rates(np.array([30.0]))[:, 0], 0.03)
 
 
 def test_the_pump_follows_its_knots() -> None:
@@ -412,7 +412,7 @@ def test_vials_begin_at_ages_of_their_own() -> None:
     starts = p.draws["start_min"]
     assert 15.0 <= starts.min() < 16.0
     assert 44.0 < starts.max() <= 45.0
-    np.testing.assert_allclose(p.culture.specific_rate(p.age_min), 0.02 + 0.02 * starts / 60.0)
+    np.testing.assert_allclose(p.culture.rates(p.age_min)[:, 0], 0.02 + 0.02 * starts / 60.0)
     once = plant(replace(KNOTS, start_min=30.0))
     once.advance(1.0, np.array([1.2]))
     assert once.culture.od[0] == pytest.approx(0.5 * np.exp(-0.9 / 20.0 + 0.03), rel=1e-9)

@@ -14,7 +14,7 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Fault, Measurement, Receipt, Vitals
-from hardware.safety.config import REMEDIES, Response, Responses, SafetyConfig
+from hardware.safety.config import REMEDIES, RESPONSES, Response, Responses, SafetyConfig
 from hardware.safety.interlock import Interlock, Verdict, kinds_of
 
 
@@ -453,17 +453,18 @@ def test_the_yaml_file_says_what_the_code_does() -> None:
     assert build(SafetyConfig(), presets.load("safety/default")) == SafetyConfig()
 
 
-@pytest.mark.parametrize("reason", ["spectrometer", "frozen", "jump", "stale", "blank"])
+@pytest.mark.parametrize("reason", ["jump", "no_dilution", "falls"])
 def test_a_sensor_that_is_not_believed_may_never_regulate(reason: str) -> None:
-    with pytest.raises(ValueError, match=rf"safety.responses.{reason} = regulate: not allowed"):
+    with pytest.raises(ValueError, match=rf"safety.responses.{reason} = regulate: allowed (report, )?hold"):
         Responses(**{reason: "regulate"})
+    assert {RESPONSES[kind] for kind in ("spectrometer", "frozen", "jump", "stale", "blank")} == {"pumps_off", "hold"}
 
 
 def test_words_and_ranges_are_checked() -> None:
-    with pytest.raises(ValueError, match=r"safety.responses.frozen = ignore: allowed report, hold"):
-        Responses(frozen="ignore")
-    with pytest.raises(ValueError, match="at least hold"):
-        Responses(frozen="report")
+    with pytest.raises(ValueError, match=r"safety.responses.jump = ignore: allowed report, hold"):
+        Responses(jump="ignore")
+    with pytest.raises(ValueError, match=r"safety.responses.falls = report: allowed hold, pumps_off, stop"):
+        Responses(falls="report")
     for key, value in (
         ("overflow_ml", 11.0),
         ("lost_s", 1e5),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from conf.schema import check, part, setting
 from envs.coculture.optimum import best_action
-from envs.coculture.rates import EQUAL_RATES_C, T_MAX, T_MIN
+from envs.coculture.rates import E_SLOPE, E_ZERO, EQUAL_RATES_C, T_MAX, T_MIN
 from envs.coculture.task import CocultureConfig, advance, logit
 from experiments.laws.share.base import Array, Estimate, Mask, Wanted
 from experiments.laws.share.estimator import CompositionEstimatorConfig
@@ -19,8 +19,6 @@ __all__ = [
 ]  # fmt: skip
 
 Index = NDArray[np.intp]
-
-E_SLOPE, E_ZERO = 0.07727, 1.66954  # mu_e(T) = E_SLOPE T - E_ZERO, 1/h (envs/coculture/rates.py)
 
 
 @dataclass(frozen=True)
