@@ -1,6 +1,6 @@
 """Training as a user runs it: real processes, real files, real kills.
 
-KILL_SEED=7 python -m pytest tests/experiments/test_train.py tests/experiments/test_kill.py     kills at other moments
+KILL_SEED=7 python -m pytest tests/experiments/test_train.py tests/campaigns/test_kills.py     kills at other moments
 """
 
 import json
