@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from conf.schema import check, require, setting
 from experiments.cli import files, frame
+from hardware.clock import DeviceClock
 from hardware.errors import RecordingError
 from hardware.storage.journal import read_journal
 from hardware.storage.marks import Mark, add_mark
@@ -61,7 +62,7 @@ def _minute_now(folder: Path, stored: Any) -> float:
     if not rows:
         raise frame.UserError(f"run={folder}: has not begun; wait for its first sample")
     speed = float(OmegaConf.select(stored, "backend.speed") or 1.0)  # an emulated device may run faster
-    return (time.time() - float(rows[0]["wall"])) * speed / 60.0
+    return DeviceClock(speed).of_real(time.time() - float(rows[0]["wall"])) / 60.0
 
 
 def mark(config: MarkConfig) -> str:

@@ -22,6 +22,7 @@ from envs.outputs import DOSE_ML, MADE_UP_MIN
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from hardware.check import Check
+from hardware.clock import DeviceClock
 from hardware.errors import ReactorError, RecordingError, UnfitError
 from hardware.reactor import Array, Reactor
 from hardware.storage.journal import Journal
@@ -75,7 +76,7 @@ class Opening:
 
     def elapsed_s(self, speed: float = 1.0) -> float:
         """Run time that has passed, s; 0 in a new run. Args: speed: device seconds per real second."""
-        return (time.time() - self.began) * speed if self.journal.rows else 0.0
+        return DeviceClock(speed).of_real(time.time() - self.began) if self.journal.rows else 0.0
 
 
 class Family:
