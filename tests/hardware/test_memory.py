@@ -196,9 +196,10 @@ def test_every_class_that_remembers_is_tried_here() -> None:
     def visit(owner: Any) -> None:
         seen.update(base.__name__ for base in type(owner).__mro__)
         for part in vars(owner).values():
-            for each in part if isinstance(part, tuple) else (part,):
-                if isinstance(each, Remembers):
-                    visit(each)
+            for each in part if isinstance(part, tuple | list) else (part,):
+                held = getattr(each, "memory", each)  # of a signal
+                if isinstance(held, Remembers):
+                    visit(held)
 
     for kind in LAWS:
         visit(unused(kind))
