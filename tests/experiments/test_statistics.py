@@ -8,8 +8,9 @@ import pytest
 from scipy.stats import ttest_1samp
 
 from envs.scenario import Scenario
+from experiments.comparison import statistics
 from experiments.comparison.statistics import Spread, details, pairs, row, rows, total_pairs, totals
-from experiments.comparison.trials import Cell, DensityTrial, Window, windows
+from experiments.comparison.trials import Cell, DensityTrial, Trial, Window, windows
 
 NAMES = {"signal": "density", "controller": "pi", "plant": "quiet", "scenario": "steps"}
 
@@ -132,3 +133,17 @@ def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
     assert {p["verdict"] for p in same} == {"no difference shown"}
     perfect = replace(theirs, od=np.where(theirs.minute < 20.0, 0.5, 0.8) * np.ones((3, 1)))
     assert math.isnan(pairs([mine, perfect], "pi")[3]["percent"])
+
+
+def test_a_third_signal_has_rows_and_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it adds is what a row holds and what laws are compared by; the rest is as for the others."""
+    monkeypatch.setitem(statistics.ROWS, "heat", lambda t: [{"signal": "heat", "warmest": t.temperature.max()}])
+    monkeypatch.setitem(statistics.SCORES, "heat", lambda t: [("all", "warmth", t.temperature.mean(axis=1))])
+    density = trial("pi")
+    mine, theirs = (
+        Trial(Cell(name, "quiet", "steps", "heat"), density.schedule, density.minute, np.full((2, 3), warm))
+        for name, warm in (("mine", 30.0), ("theirs", 31.0))
+    )
+    assert [r["signal"] for r in rows([density, mine])] == ["density", "density", "heat"]
+    [found] = pairs([density, trial("mine"), mine, theirs], "theirs")
+    assert (found["signal"], found["metric"], found["difference"], found["lower_in"]) == ("heat", "warmth", -1.0, 2)
