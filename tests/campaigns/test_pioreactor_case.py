@@ -94,6 +94,13 @@ def test_the_truth_outside_the_record_is_seen() -> None:
     assert not wrong(vial(sound(), SICK, 100, fed_ml=6.0), replace(FAULT, flow=True))
 
 
+def test_what_somebody_else_dosed_is_booked_in_a_row_of_its_own() -> None:
+    more = vial(sound(), SICK, 100, fed_ml=5.5)
+    given = {"kind": "given", "reactor": SICK, "wall": 40.0, "feed_ml": 0.5, "feed_low_ml": 0.5}
+    assert wrong(more) == ["volume not as booked"]
+    assert not wrong(replace(more, journal=[*more.journal, given]))
+
+
 def test_a_lost_row_and_a_row_too_many_are_seen() -> None:
     seen = sound()
     without = replace(seen, rows={**seen.rows, SICK: seen.rows[SICK][:4] + seen.rows[SICK][5:]})
