@@ -46,7 +46,7 @@ JSON = st.recursive(
 NEVER = st.sampled_from(
     [
         "x", {}, {"mean": 1}, [], [[]], ["x"] * 2, ["1"] * 2, [[1.0], [1.0, 2.0]], [1.0], [1.0] * 3, [[[[1.0]]]],
-        [10**400] * 2, [float("inf")] * 2, [float("-inf")] * 2, [{}] * 2, 10**400, float("nan"), -1, 2.5,
+        [10**400] * 2, [float("inf")] * 2, [float("-inf")] * 2, [{}] * 2, [True, 1.0], 10**400, float("nan"), -1, 2.5,
     ]
 )  # fmt: skip
 
@@ -156,11 +156,13 @@ def test_a_memory_of_any_numbers_comes_back_to_the_bit(data: st.DataObject) -> N
         return None if value is None and rng.random() < 0.3 else float(scale * rng.standard_normal())
 
     for path in leaves(state):
-        if path[-1] not in BOUND | ANEW:
+        if path[-1] not in BOUND:
             at(state, path[:-1])[path[-1]] = filled(at(state, path))
     loop = unused(kind)
     loop.restore(json.loads(json.dumps(state)))
+    state["interlock"] |= {key: [None, None] for key in ANEW}
     assert json.dumps(written(loop)) == json.dumps(state)
+    assert not np.isnan(loop.interlock.budget._dose_s).any()  # None stands for what an unused one has: never
     again = unused(kind)
     again.restore(loop.state())
     assert json.dumps(written(again)) == json.dumps(state)
@@ -184,10 +186,18 @@ def test_a_random_stream_that_is_none_is_refused(stream: Any) -> None:
 
 
 @pytest.mark.parametrize("edges", [[0.0, 5.0, 4.0], [1.0, 5.0, 9.0], [0.0, 5.0, 5.0]])
-def test_edges_rise_from_nought(edges: list[float]) -> None:
+def test_edges_rise_from_nought_and_are_saved_without_what_pads_them(edges: list[float]) -> None:
     state = written(unused("pi"))
+    assert [row["edges"] for row in state["steps"]] == [[0.0, 30.0, 70.0], [0.0, 30.0, 70.0, 75.0]]
     state["steps"][0]["edges"] = edges
     refused("pi", state, "steps: edges")
+
+
+@pytest.mark.parametrize("key", ["steps", "supply"])
+def test_there_is_one_row_for_each_reactor(key: str) -> None:
+    state = written(unused("pi"))
+    for rows in ([], state[key][:1], [*state[key], state[key][0]], "rows", [None, None]):
+        refused("pi", state | {key: rows}, f"{key}: ")
 
 
 def test_every_class_that_remembers_is_tried_here() -> None:
@@ -202,7 +212,9 @@ def test_every_class_that_remembers_is_tried_here() -> None:
                     visit(held)
 
     for kind in LAWS:
-        visit(unused(kind))
+        loop = unused(kind)
+        for owner in (loop, *(signal.memory for signal in loop.signals)):
+            visit(owner)
     declared = set()
     for package in ("hardware", "envs", "experiments"):
         for path in (ROOT / package).rglob("*.py"):
