@@ -50,8 +50,8 @@ class Bench:
 
     @property
     def stale_s(self) -> float:
-        """Age at which a newest sample is no basis for a dose, s: the next one is late by 40 s."""
-        return self.period_s + 40.0
+        """Age at which a newest sample is no basis for a dose, s: the next one is late by 40 s, or a tenth more."""
+        return max(self.period_s + 40.0, 1.1 * self.period_s)
 
     @property
     def tau(self) -> float:
