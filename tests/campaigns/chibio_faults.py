@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from envs.scenario import Scenario
 from experiments.laws.base import Array, Mask
 from hardware.emulator.faults import inject
 from tests.campaigns.fault import Fault
@@ -94,19 +93,9 @@ def torn(r: Rehearsal) -> None:
         os.truncate(path, os.path.getsize(path) - 7)
 
 
-class _Typo(Scenario):
-    """A schedule whose setpoints all read 5.0: one that got past the check of its values."""
-
-    def at(self, minute: Array) -> tuple[Array, Array]:
-        setpoint, temperature = super().at(minute)
-        return np.full_like(setpoint, 5.0), temperature
-
-
 def typo(r: Rehearsal) -> None:
-    """From now on the schedule of the faulty reactor asks for OD 5.0."""
-    s = r.loop.schedules[0]
-    bad = _Typo(s.setpoints, s.minutes, s.temperatures, s.recovery_od, s.recovery_limit_min)
-    r.loop.schedules = [bad, *r.loop.schedules[1:]]
+    """From now on the schedule of the faulty reactor asks for OD 5.0, which got past the check of its values."""
+    r.loop.progress._setpoints[0] = 5.0
 
 
 class _Broken:
