@@ -213,4 +213,4 @@ def test_the_command(tmp_path: Path) -> None:
 @pytest.mark.parametrize("override", ["moments=[noon]", "reactors=[M1]", "controller_kind=oracle", "faults=[nonsense]"])
 def test_bad_values_are_named(override: str) -> None:
     with pytest.raises(frame.UserError, match="allowed|nonsense"):
-        frame.load(frame.compose("fault_matrix", [override]), FaultsConfig())
+        frame.load(frame.compose("faults", [override]), FaultsConfig())
