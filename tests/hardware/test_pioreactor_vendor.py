@@ -38,16 +38,16 @@ def bench(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         made.end()
 
 
-def asked_for(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def asked_for(bench: UnitBench, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The pump jobs that are asked for from now on, apart from short ones that switch a pin off."""
     jobs: list[str] = []
-    run = bench.station.web.run
+    run = bench.station.unit.web.run
 
     def noted(job, options, overrides=()):
         jobs.extend([job] * ("ml" in options))
         return run(job, options, overrides)
 
-    monkeypatch.setattr(bench.station.web, "run", noted)
+    monkeypatch.setattr(bench.station.unit.web, "run", noted)
     return jobs
 
 
