@@ -110,7 +110,7 @@ class UnitBench:
 
     def target(self) -> float:
         """Of the thermostat, as the unit says."""
-        said = self.station.web.get("/jobs/settings/job_name/temperature_automation")
+        said = self.station.unit.web.get("/jobs/settings/job_name/temperature_automation")
         return float(said["settings"]["target_temperature"])
 
     def pumping(self) -> bool:

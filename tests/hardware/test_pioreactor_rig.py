@@ -138,7 +138,7 @@ def test_the_remedy_of_the_preflight_for_a_killed_dose_works(bench):
 
 
 def test_a_second_client_is_counted(bench):
-    bench.station.web.run("add_media", {"ml": 0.5, "source-of-event": "UI"})
+    bench.station.unit.web.run("add_media", {"ml": 0.5, "source-of-event": "UI"})
     assert bench.go_on(30.0, lambda: bench.station.book.fault is not None and bench.station.book.fault.kind == "mode")
     time.sleep(2.0)
     bench.go_on(1.0)
@@ -162,10 +162,10 @@ def test_the_vendors_turbidostat_takes_over_and_is_ended(bench):
 
 def test_an_automation_that_somebody_starts_is_a_fault_and_holds_ours(bench):
     options, overrides = request("dosing_automation", bench.config, facts(bench.rig.version), 37.0, 3.0)
-    bench.station.web.run("dosing_automation", options, overrides)
+    bench.station.unit.web.run("dosing_automation", options, overrides)
     assert bench.go_on(30.0, lambda: bench.station.book.fault is not None and bench.station.book.fault.kind == "mode")
     assert bench.dose(0.5) == 0.0
-    bench.station.web.stop("dosing_automation")
+    bench.station.unit.web.stop("dosing_automation")
     assert bench.sample(60.0)
     assert bench.dose(0.5) == 0.5
     assert bench.settled()
