@@ -83,12 +83,13 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
             record.complete()
     try:
         title = f"{setup.title}: {outcome}"
-        figures = {"closed_loop": figure_of(record, setup.scenarios, title)}
-        if "ratio" in record.columns:
-            figures["composition"] = composition_figure_of(record, title)
+        table = record.table()
+        figures = {"closed_loop": figure_of(table, setup.scenarios, title)}
+        if "ratio" in table.columns:
+            figures["composition"] = composition_figure_of(table, title)
         pictures = {name: charts.save(figure, folder / "figures", name) for name, figure in figures.items()}
         summary = {
-            **summarise(record, setup.scenarios, setup.roles, outcome, loop.progress),
+            **summarise(table, setup.scenarios, setup.roles, outcome, loop.progress),
             "figure": str(folder / "figures" / "closed_loop.png"),
         }
         files.write_json(folder / "summary.json", summary)

@@ -6,7 +6,9 @@ that is killed in between is completed from the journal when it is resumed.
 """
 
 import contextlib
+import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,12 +18,34 @@ import numpy as np
 from experiments.cli import files
 from experiments.loop.loop import Step
 from experiments.record.curves import Curves
-from experiments.record.recovery import COLUMNS, REBUILD, Array, Row, complete, cut_short, read_rows, row_of
+from experiments.record.recovery import COLUMNS, REBUILD, Array, Row, Rows, complete, cut_short, read_rows, row_of
 from hardware.errors import RecordingError
 from hardware.storage.journal import Journal
+from hardware.storage.marks import Mark, read_marks
 from hardware.storage.recorder import Recorder
 
-__all__ = ["Record"]
+__all__ = ["Record", "Table"]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The recordings of a run side by side.
+
+    names: of the reactors. columns: NAME -> (N, K); shorter recordings end in nan. rows: of each reactor, with what the
+    interlock said. repairs: what was mended. marks: what somebody did at the bench, in order of time.
+    """
+
+    names: tuple[str, ...]
+    columns: Mapping[str, Array]
+    rows: Sequence[Rows]
+    repairs: Sequence[str]
+    marks: Sequence[Mark]
+
+    def od(self, refused: bool = False) -> Array:
+        """OD, nan where the interlock did not believe it, or, if `refused`, where it did; (N, K)."""
+        return np.where((self.columns["believed"] == 0.0) == refused, self.columns["od"], np.nan)
 
 
 class Record:
@@ -112,9 +136,15 @@ class Record:
             own[: len(rows)] = rows.columns[column]
         return values
 
-    def od(self, refused: bool = False) -> Array:
-        """OD of all recordings, nan where the interlock did not believe it, or, if `refused`, where it did; (N, K)."""
-        return np.where((self.series("believed") == 0.0) == refused, self.series("od"), np.nan)
+    def table(self) -> Table:
+        """All recordings; a damaged file of marks is said and costs nothing else."""
+        try:
+            marks = sorted(read_marks(self.folder), key=lambda mark: mark.time_min)
+        except RecordingError as error:
+            log.warning("%s", error)
+            marks = []
+        columns = {key: self.series(key) for key in self.columns if key != "interlock"}
+        return Table(self.names, columns, self.rows, self.repairs, marks)
 
     def close(self) -> None:
         """Close all files. Idempotent."""

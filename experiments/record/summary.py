@@ -13,13 +13,11 @@ from envs.scenario import Scenario
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.progress import Progress
-from experiments.record.record import Record
+from experiments.record.record import Table
 from experiments.record.recovery import Rows
 from experiments.reporting import charts
 from experiments.reporting.composition_charts import composition_figure
-from hardware.errors import RecordingError
 from hardware.safety.interlock import kinds_of
-from hardware.storage.marks import Mark, read_marks
 
 __all__ = [
     "ChangeLog",
@@ -145,7 +143,7 @@ def reasons_line(rows: Rows) -> str:
 
 
 def summarise(
-    record: Record,
+    table: Table,
     scenarios: Sequence[Scenario],
     roles: Sequence[str],
     outcome: str,
@@ -155,7 +153,7 @@ def summarise(
 
     Args: scenarios, roles: one per reactor. outcome: how it ended. progress: when each step ended; None: by its time.
     """
-    volume, minute = np.nansum(record.series("volume_ml"), axis=1), record.series("time_min")
+    volume, minute = np.nansum(table.columns["volume_ml"], axis=1), table.columns["time_min"]
     reactors = {
         name: {
             "role": role,
@@ -164,24 +162,24 @@ def summarise(
             "interlock": rows.alarms,
             "reasons": {kind: asdict(told) for kind, told in rows.told.items()},
         }
-        for name, role, ml, rows in zip(record.names, roles, volume, record.rows, strict=True)
+        for name, role, ml, rows in zip(table.names, roles, volume, table.rows, strict=True)
     }
     return {
         "outcome": outcome,
         "minutes": float(np.nanmax(minute)) if np.isfinite(minute).any() else 0.0,
-        "windows": _windows(record, scenarios, progress or Progress(scenarios)),
+        "windows": _windows(table, scenarios, progress or Progress(scenarios)),
         "volume_ml": float(volume.sum()),
         "reactors": reactors,
-        "repairs": record.repairs,
-        "marks": [asdict(mark) for mark in _marks(record)],
+        "repairs": list(table.repairs),
+        "marks": [asdict(mark) for mark in table.marks],
     }
 
 
-def _windows(record: Record, scenarios: Sequence[Scenario], progress: Progress) -> list[dict[str, Any]]:
+def _windows(table: Table, scenarios: Sequence[Scenario], progress: Progress) -> list[dict[str, Any]]:
     """Metrics of every phase of every reactor; `ended` is what ended it, null if it is not over."""
-    elapsed, od = record.series("elapsed_min"), record.od()
+    elapsed, od = table.columns["elapsed_min"], table.od()
     rows = []
-    for n, (name, scenario) in enumerate(zip(record.names, scenarios, strict=True)):
+    for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
         latest = float(np.nanmax(elapsed[n], initial=-1.0))
         for phase, (setpoint, step) in enumerate(zip(scenario.setpoints, progress.steps(n), strict=True)):
             start, end = round(step[0], 4), round(step[1], 4)  # as the recording has its minutes
@@ -190,28 +188,29 @@ def _windows(record: Record, scenarios: Sequence[Scenario], progress: Progress) 
             window["ended"] = step[2] if latest >= end - 1e-6 else None
             window["temperature"] = scenario.temperatures[phase]
             window |= {key: float(getattr(m, key)[0]) for key in FORMATS}
-            window |= _further(record, n, start, end)
+            window |= _further(table, n, start, end)
             rows.append(window)
     return rows
 
 
-def _further(record: Record, n: int, start: float, end: float) -> dict[str, Any]:
+def _further(table: Table, n: int, start: float, end: float) -> dict[str, Any]:
     """How well reactor n's further signals, as estimated and, where it is known, in truth, and its OD followed.
 
     A signal has a column NAME, maybe true_NAME, and NAME_setpoint; None where none or more than one was asked for.
     """
-    minute = record.series("elapsed_min")[n : n + 1]
+    own = {key: values[n : n + 1] for key, values in table.columns.items()}
+    minute = own["elapsed_min"]
     told: dict[str, Any] = {}
-    for name in (key.removesuffix("_setpoint") for key in record.columns if key.endswith("_setpoint")):
-        asked = record.series(f"{name}_setpoint")[n : n + 1]
+    for name in (key.removesuffix("_setpoint") for key in own if key.endswith("_setpoint")):
+        asked = own[f"{name}_setpoint"]
         found = np.unique(asked[(minute >= start - 1e-6) & (minute < end - 1e-6) & np.isfinite(asked)])
         told[f"{name}_setpoint"] = float(found[0]) if found.size == 1 else None
         for key in (name, f"true_{name}"):
-            if key in record.columns:
-                whole, late = mean_errors(minute, record.series(key)[n : n + 1], asked, start, end)
+            if key in own:
+                whole, late = mean_errors(minute, own[key], asked, start, end)
                 told |= {f"{key}_abs_error_mean": float(whole[0]), f"{key}_abs_error_last2h": float(late[0])}
     if told:
-        density, _ = mean_errors(minute, record.od()[n : n + 1], record.series("setpoint")[n : n + 1], start, end)
+        density, _ = mean_errors(minute, table.od()[n : n + 1], own["setpoint"], start, end)
         told["od_abs_error_mean"] = float(density[0])
     return told
 
@@ -230,29 +229,17 @@ def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines) if kept else ""
 
 
-def figure_of(record: Record, scenarios: Sequence[Scenario], title: str) -> Figure:
+def figure_of(table: Table, scenarios: Sequence[Scenario], title: str) -> Figure:
     """OD over setpoint, pump rate and, where a scenario changes it, temperature of all reactors."""
-    setpoint = np.where(record.series("phase") >= 0, record.series("setpoint"), np.nan)
+    c = table.columns
+    setpoint = np.where(c["phase"] >= 0, c["setpoint"], np.nan)
     switched = any(len(set(s.temperatures)) > 1 for s in scenarios)
-    temperature = record.series("temperature_degc").T if switched else None
-    series = (record.series("time_min").T, record.od().T, setpoint.T, record.series("pump_rate_ml_s").T)
-    marks = [(m.time_min, f"{m.reactor} {m.text}".strip()) for m in _marks(record)]
-    return charts.closed_loop(*series, record.names, temperature, title, marks, record.od(refused=True).T)
+    temperature = c["temperature_degc"].T if switched else None
+    series = (c["time_min"].T, table.od().T, setpoint.T, c["pump_rate_ml_s"].T)
+    marks = [(m.time_min, f"{m.reactor} {m.text}".strip()) for m in table.marks]
+    return charts.closed_loop(*series, table.names, temperature, title, marks, table.od(refused=True).T)
 
 
-def _marks(record: Record) -> list[Mark]:
-    """What somebody did at the bench; a damaged file of it is said and costs the figure nothing else."""
-    try:
-        return sorted(read_marks(record.folder), key=lambda mark: mark.time_min)
-    except RecordingError as error:
-        log.warning("%s", error)
-        return []
-
-
-def composition_figure_of(record: Record, title: str) -> Figure:
+def composition_figure_of(table: Table, title: str) -> Figure:
     """Share, temperature, OD and fluorescence of all reactors, of a run that controlled a composition."""
-    return composition_figure(
-        {key: record.series(key) for key in record.columns if key != "interlock"} | {"od": record.od()},
-        record.names,
-        title,
-    )
+    return composition_figure({**table.columns, "od": table.od()}, table.names, title)

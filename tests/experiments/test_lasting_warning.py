@@ -36,6 +36,6 @@ def test_half_the_flow_is_told_at_its_beginning_at_its_end_and_in_every_row_betw
     assert told[1].rows == pytest.approx(told[1].last_min - told[1].first_min + 1.0, abs=1.5)  # without a gap
     rows = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "decision"]
     assert sum("cannot_hold" in row["row"]["interlock"] for row in rows) == told[1].rows
-    summary = summarise(run.record, [scenario], ["replicate"], "completed")
+    summary = summarise(run.record.table(), [scenario], ["replicate"], "completed")
     assert summary["reactors"]["M0"]["reasons"]["cannot_hold"]["rows"] == told[1].rows
     assert reasons_line(run.record.rows[0]).startswith(f"cannot_hold in {told[1].rows} of {len(rows)} rows, minute ")

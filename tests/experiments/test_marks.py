@@ -113,12 +113,12 @@ def test_a_reading_that_is_not_believed_counts_for_no_metric_and_is_a_cross_in_t
     wild = od > 5.0
     assert 2 <= wild.sum() <= 5
     assert (record.series("believed")[0] == 0.0)[wild].all()
-    [window] = summarise(record, scenarios, ["policy"], "completed")["windows"]
+    [window] = summarise(record.table(), scenarios, ["policy"], "completed")["windows"]
     kept = record.series("believed")[0] == 1.0
     by_hand = np.trapezoid((od[kept] - 0.5) ** 2, minute[kept])
     assert window["ise"] == pytest.approx(by_hand, rel=1e-3)
     assert window["ise"] < 0.5  # 400 with them
-    axis = figure_of(record, scenarios, "").axes[0]
+    axis = figure_of(record.table(), scenarios, "").axes[0]
     assert axis.get_ylim()[1] < 1.5
     lines = {str(line.get_label()): np.asarray(line.get_ydata(), dtype=float) for line in axis.get_lines()}
     assert np.nanmax(lines["M0"]) < 1.5
@@ -131,18 +131,18 @@ def test_a_mark_stands_in_the_figure_and_in_the_summary(run: Rehearsal) -> None:
     add_mark(run.folder, Mark(9.0, "", "new bottle"))
     add_mark(run.folder, Mark(3.5, "M0", "inoculated, twice"))
     assert read_marks(run.folder) == [Mark(9.0, "", "new bottle"), Mark(3.5, "M0", "inoculated, twice")]
-    axes = figure_of(run.record, [SCHEDULE], "").axes
+    axes = figure_of(run.record.table(), [SCHEDULE], "").axes
     assert [text.get_text() for text in axes[0].texts] == ["M0 inoculated, twice", "new bottle"]
     for ax in axes:
         at = [line.get_xdata()[0] for line in ax.lines if len(set(line.get_xdata())) == 1]
         assert at == [3.5, 9.0]
-    summary = summarise(run.record, [SCHEDULE], ["replicate"], "completed", run.loop.progress)
+    summary = summarise(run.record.table(), [SCHEDULE], ["replicate"], "completed", run.loop.progress)
     assert [m["text"] for m in summary["marks"]] == ["inoculated, twice", "new bottle"]
 
 
 def test_a_damaged_file_of_marks_costs_no_summary(run: Rehearsal, caplog: pytest.LogCaptureFixture) -> None:
     (run.folder / "marks.csv").write_text("time_min,reactor,text,written\nnever,M0,x,y\n")
-    assert not figure_of(run.record, [SCHEDULE], "").axes[0].texts
+    assert not figure_of(run.record.table(), [SCHEDULE], "").axes[0].texts
     assert "marks.csv: damaged" in caplog.text
     with pytest.raises(RecordingError, match="mend it or move it away"):
         read_marks(run.folder)

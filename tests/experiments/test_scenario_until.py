@@ -132,7 +132,7 @@ def test_on_the_device_steps_end_where_growth_by_hand_has_them_and_windows_follo
 
 
 def _windows(run: Rehearsal) -> list[dict[str, object]]:
-    summary = summarise(run.record, run.loop.schedules, ["replicate"] * 2, "completed", run.loop.progress)
+    summary = summarise(run.record.table(), run.loop.schedules, ["replicate"] * 2, "completed", run.loop.progress)
     return list(summary["windows"])
 
 
