@@ -129,7 +129,7 @@ def write(page: Page, run: Path, label: str = "") -> None:
         f"The model: growth {number(model.mu, 4)} 1/min, tau {number(model.tau, 4)} ({model.source}). Growth and pump "
         "gain are estimated from segments of about two hours, each alone. Net growth is what a sample grew or shrank "
         "beyond the prediction from the one before; it shows also where growth and pump hide one behind the other. A "
-        "value no longer holds from where on the intervals exclude it and it is off by 10 % or more."
+        "value no longer holds once the intervals exclude it and it is off by 10 % or more."
     )
     for path in sorted((run / "recordings").glob("*.csv")):
         known = reactors.get(path.stem) if isinstance(reactors, Mapping) else None

@@ -12,7 +12,7 @@ from typing import Any
 from hardware.errors import ReactorError
 from tests.campaigns.fault import Fault
 from tests.campaigns.outcome import Outcome, judged
-from tests.campaigns.pioreactor_trial import SETPOINT, SICK, WELL, Seen, Trial
+from tests.campaigns.pioreactor_trial import SETPOINT, FAULTED, WELL, Seen, Trial
 
 __all__ = ["PioreactorCase", "found_in"]
 
@@ -110,7 +110,7 @@ def found_in(seen: Seen, fault: Fault, moment: str, struck: Sequence[float]) -> 
     out.allowed_s = 60.0 / seen.speed + fault.within_s
     if fault.refused:
         return _refused(fault, seen, out)
-    mine = [row for row in seen.journal if row.get("reactor") == SICK]
+    mine = [row for row in seen.journal if row.get("reactor") == FAULTED]
     if not mine:
         out.trouble = "nothing is on record"
         return out
@@ -119,7 +119,7 @@ def found_in(seen: Seen, fault: Fault, moment: str, struck: Sequence[float]) -> 
     _volumes(mine, seen, out)
     _rows(fault, seen, out)
     _cultures(seen, out)
-    out.pumps_off = not any(seen.vials[unit][-1]["duty"][pin] for unit in (SICK, WELL) for pin in ("12", "13"))
+    out.pumps_off = not any(seen.vials[unit][-1]["duty"][pin] for unit in (FAULTED, WELL) for pin in ("12", "13"))
     return out
 
 
@@ -157,7 +157,7 @@ def _told(fault: Fault, struck: Sequence[float], seen: Seen, mine: Sequence[Mapp
 
 def _doses(mine: Sequence[Mapping[str, Any]], seen: Seen, out: Outcome) -> None:
     """Every run of the media pump has its request; none was sent while the fate of another was open."""
-    pulses = [p for p in seen.pulses if p.unit == SICK and p.pump == "media" and p.seconds > PULSE_S]
+    pulses = [p for p in seen.pulses if p.unit == FAULTED and p.pump == "media" and p.seconds > PULSE_S]
     asked = [row for row in mine if row["kind"] == "feed_on"]
     at = [row["wall"] - 0.2 for row in asked]
     runs = [0] * (len(at) + 1)
@@ -181,7 +181,7 @@ def _volumes(mine: Sequence[Mapping[str, Any]], seen: Seen, out: Outcome) -> Non
     ends = [row for row in mine if row["kind"] in ("dose_end", "given")]  # given: what somebody else asked for
     out.low_ml = sum(row.get("feed_low_ml", row["feed_ml"]) for row in ends)
     out.high_ml = sum(row["feed_ml"] for row in ends)
-    vials = seen.vials[SICK]
+    vials = seen.vials[FAULTED]
     began = seen.journal[0]["wall"]
     before = max((row["fed_ml"] for row in vials if row["wall"] <= began), default=0.0)
     out.fed_ml, out.peak_ml = vials[-1]["fed_ml"] - before, vials[-1]["peak_ml"]
@@ -190,12 +190,12 @@ def _volumes(mine: Sequence[Mapping[str, Any]], seen: Seen, out: Outcome) -> Non
 
 def _rows(fault: Fault, seen: Seen, out: Outcome) -> None:
     """Every sample of both units is in one row."""
-    for unit in (SICK, WELL):
+    for unit in (FAULTED, WELL):
         samples = [r["sample_s"] for r in seen.journal if r["kind"] == "sample" and r["reactor"] == unit]
         rows = [minute * 60.0 for minute, _ in seen.rows[unit]]
         out.rows_lost += sum(not any(abs(s - row) <= SAME_S for row in rows) for s in samples)
         out.rows_doubled += max(len(rows) - len(samples), 0)
-    minutes = [minute for minute, _ in seen.rows[SICK]]
+    minutes = [minute for minute, _ in seen.rows[FAULTED]]
     out.rows = len(minutes)
     out.gap_min = max((b - a for a, b in itertools.pairwise(minutes)), default=math.inf)
     out.allowed_gap_min = GAP_MIN + fault.minutes * seen.speed
@@ -203,7 +203,7 @@ def _rows(fault: Fault, seen: Seen, out: Outcome) -> None:
 
 def _cultures(seen: Seen, out: Outcome) -> None:
     """Where the sick culture is at the end, and how far the well one ever was."""
-    last = seen.vials[SICK][-1]["wall"] - LAST_MIN * 60.0 / seen.speed
-    errors = [abs(row["od"] - SETPOINT) for row in seen.vials[SICK] if row["wall"] >= last]
+    last = seen.vials[FAULTED][-1]["wall"] - LAST_MIN * 60.0 / seen.speed
+    errors = [abs(row["od"] - SETPOINT) for row in seen.vials[FAULTED] if row["wall"] >= last]
     out.end_error = sum(errors) / len(errors)
     out.neighbour_error = max(abs(row["od"] - SETPOINT) for row in seen.vials[WELL])

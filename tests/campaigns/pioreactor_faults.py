@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.campaigns.fault import Fault
-from tests.campaigns.pioreactor_trial import MEDIA_PIN, SICK, WASTE_PIN, WELL, Trial
+from tests.campaigns.pioreactor_trial import MEDIA_PIN, FAULTED, WASTE_PIN, WELL, Trial
 
 __all__ = ["FAULTS"]
 
@@ -41,13 +41,13 @@ def rig(
 
 def process(name: str) -> tuple[Act, Act]:
     """kill -9 of one of the rig's processes, and its start."""
-    full = name if name == "broker" else f"{SICK} {name}"
+    full = name if name == "broker" else f"{FAULTED} {name}"
     return lambda t: t.rig.kill(full), lambda t: t.rig.start(full)
 
 
 def hangs(name: str) -> tuple[Act, Act]:
     """One of the rig's processes stands still, and goes on."""
-    full = name if name == "broker" else f"{SICK} {name}"
+    full = name if name == "broker" else f"{FAULTED} {name}"
     return (
         lambda t: t.rig.processes[full].send_signal(signal.SIGSTOP),
         lambda t: t.rig.processes[full].send_signal(signal.SIGCONT),
@@ -96,12 +96,12 @@ def left_lock(t: Trial) -> None:
     t.run_job("add_media", ml=0.2, source_of_event="before")
     t.until(t.pumping, 20.0)
     kill_job("add_media")(t)
-    t.rig.vials.power_cut(SICK)  # of the pumps, by hand
+    t.rig.vials.power_cut(FAULTED)  # of the pumps, by hand
 
 
 def cannot_start(t: Trial) -> None:
     """The unit's own program is broken, as by a bad update: jobs are accepted and die."""
-    path = Path(t.rig.folder / SICK / "pio")
+    path = Path(t.rig.folder / FAULTED / "pio")
     path.rename(path.with_name("pio.whole"))
     path.write_text("#!/bin/sh\nexit 1\n", encoding="utf-8")
     path.chmod(0o755)
@@ -109,18 +109,18 @@ def cannot_start(t: Trial) -> None:
 
 def starts_again(t: Trial) -> None:
     """Undo `cannot_start`."""
-    path = Path(t.rig.folder / SICK / "pio")
+    path = Path(t.rig.folder / FAULTED / "pio")
     path.with_name("pio.whole").replace(path)
 
 
 def vial(**values: float) -> Act:
     """What the photodiode of the sick unit sees."""
-    return lambda t: t.rig.vials.vials[SICK].__dict__.update(values)
+    return lambda t: t.rig.vials.vials[FAULTED].__dict__.update(values)
 
 
 def held(t: Trial) -> None:
     """The reading stands still."""
-    seen = t.rig.vials.vials[SICK]
+    seen = t.rig.vials.vials[FAULTED]
     seen.held_od = seen.seen_od
 
 
@@ -128,14 +128,14 @@ def plant(part: str, switch: str, value: float) -> Act:
     """A switch of the sick unit's plant."""
 
     def act(t: Trial) -> None:
-        getattr(getattr(t.rig.vials.vials[SICK].plant, part), switch)[:] = value
+        getattr(getattr(t.rig.vials.vials[FAULTED].plant, part), switch)[:] = value
 
     return act
 
 
 def swapped(t: Trial) -> None:
     """The address of the sick unit leads to the other."""
-    t.words.append(f"backend.units.{SICK}.address={t.rig.web[WELL]}")
+    t.words.append(f"backend.units.{FAULTED}.address={t.rig.web[WELL]}")
 
 
 def flood(t: Trial) -> None:
@@ -164,7 +164,7 @@ KILLS = (
     ),
     rig(
         "reader_killed", "kill -9 of od_reading, mended by a reboot", kill_job("od_reading"),
-        lambda t: t.rig.reboot(SICK), ("between", "in"), 30.0, by=("takes no OD readings",), within_s=30.0, blind=True,
+        lambda t: t.rig.reboot(FAULTED), ("between", "in"), 30.0, by=("takes no OD readings",), within_s=30.0, blind=True,
     ),
     rig("queue_killed", "kill -9 of the task queue", *process("tasks"), ("between", "in"),
              by=("fate of a dose", "takes nothing")),
@@ -222,9 +222,9 @@ OTHERS = (
              lambda t: t.post("/active_calibrations/media_pump", method="DELETE"),
              lambda t: t.post("/active_calibrations/media_pump/rig-media_pump", method="PATCH"),
              by=("accepted and not carried out", "fate of a dose")),
-    rig("unit_rebooted", "the unit loses its power and boots", lambda t: t.rig.reboot(SICK), seconds=1.0,
+    rig("unit_rebooted", "the unit loses its power and boots", lambda t: t.rig.reboot(FAULTED), seconds=1.0,
              by=("takes no OD readings", "does not list", "no dose"), within_s=30.0, blind=True),
-    rig("rebooted_in_a_dose", "the same in a dose", lambda t: t.rig.reboot(SICK), moments=("in",), seconds=1.0,
+    rig("rebooted_in_a_dose", "the same in a dose", lambda t: t.rig.reboot(FAULTED), moments=("in",), seconds=1.0,
              by=("takes no OD readings", "counted whole", "ended early"), within_s=40.0, blind=True),
     rig("sensor_stuck", "the reading stands still", held, vial(held_od=float("nan")), seconds=75.0,
              why_not="the vendor's noise stays on it; the interlock knows it by what doses do not do",

@@ -21,9 +21,9 @@ from hardware.rig.vials import Pulse
 from hardware.storage.journal import read_journal
 from tests.campaigns.client import Client
 
-__all__ = ["MEDIA_PIN", "SETPOINT", "SICK", "WASTE_PIN", "WELL", "Seen", "Trial", "log_rows"]
+__all__ = ["MEDIA_PIN", "SETPOINT", "FAULTED", "WASTE_PIN", "WELL", "Seen", "Trial", "log_rows"]
 
-SICK, WELL = "pio01", "pio02"
+FAULTED, WELL = "pio01", "pio02"
 MEDIA_PIN, WASTE_PIN = 13, 12
 SETPOINT = 0.5  # OD
 WELL_ML = 14.0
@@ -61,7 +61,7 @@ class Trial:
         self.stopping = stopping
         self.folder, self.run, self.speed = folder, folder / "run", speed
         vials = RigConfig(package=package, od=SETPOINT, seed=seed)
-        self.rig = Rig({SICK: 20.0, WELL: WELL_ML}, vials, speed, folder)
+        self.rig = Rig({FAULTED: 20.0, WELL: WELL_ML}, vials, speed, folder)
         self.known = facts(self.rig.version)
         self.client: Client | None = None
         self.lives = 0
@@ -82,9 +82,9 @@ class Trial:
 
     def _command(self, run: Path) -> list[str]:
         units = [f"backend.units.{unit}.address={url}" for unit, url in self.rig.web.items()]
-        units += [f"bench.volumes_ml.{WELL}={WELL_ML}", f"backend.leader={self.rig.web[SICK]}"]
+        units += [f"bench.volumes_ml.{WELL}={WELL_ML}", f"backend.leader={self.rig.web[FAULTED]}"]
         return [
-            "backend=pioreactor", f"backend.reactors=[{SICK},{WELL}]", "backend.broker=127.0.0.1",
+            "backend=pioreactor", f"backend.reactors=[{FAULTED},{WELL}]", "backend.broker=127.0.0.1",
             f"backend.broker_port={self.rig.broker}", f"backend.speed={self.speed}", "backend.reading_s=1",
             *units, "scenario=hold", f"scenario.setpoints=[{SETPOINT}]", "scenario.minutes=[100000]",
             "safety.silent=100000", f"hydra.run.dir={run}", *self.words,
@@ -114,11 +114,11 @@ class Trial:
 
     def pumping(self, pin: int = MEDIA_PIN) -> bool:
         """Whether a pump of the sick unit runs."""
-        return self.rig.vials.vials[SICK].duty[pin] > 0.0
+        return self.rig.vials.vials[FAULTED].duty[pin] > 0.0
 
     def near(self) -> bool:
         """Whether the sick culture is at its setpoint, in truth."""
-        return abs(float(self.rig.vials.vials[SICK].plant.apparent_od[0]) - SETPOINT) < NEAR_OD
+        return abs(float(self.rig.vials.vials[FAULTED].plant.apparent_od[0]) - SETPOINT) < NEAR_OD
 
     def journal(self) -> list[dict[str, Any]]:
         """The journal up to now."""
@@ -127,7 +127,7 @@ class Trial:
 
     def ended(self) -> int:
         """How many of the sick unit's doses have an end."""
-        return sum(r["kind"] == "dose_end" and bool(r.get("id")) and r["reactor"] == SICK for r in self.journal())
+        return sum(r["kind"] == "dose_end" and bool(r.get("id")) and r["reactor"] == FAULTED for r in self.journal())
 
     def doses(self, more: int, real_s: float = START_S) -> bool:
         """Wait for so many more doses of the sick unit to end."""
@@ -139,7 +139,7 @@ class Trial:
     def post(self, path: str, body: Mapping[str, Any] | None = None, method: str = "POST") -> None:
         """What somebody's browser asks of the unit."""
         data = json.dumps(body or {}).encode()
-        request = urllib.request.Request(f"{self.rig.web[SICK]}/unit_api{path}", data, method=method)
+        request = urllib.request.Request(f"{self.rig.web[FAULTED]}/unit_api{path}", data, method=method)
         request.add_header("Content-Type", "application/json")
         urllib.request.urlopen(request, timeout=10.0).close()
 
@@ -155,24 +155,24 @@ class Trial:
 
     def signal_job(self, job: str, number: int) -> int:
         """A signal to every process of one of the unit's jobs; how many there were."""
-        found = self.rig.jobs(SICK, job)
+        found = self.rig.jobs(FAULTED, job)
         for pid in found:
             os.kill(pid, number)
         return len(found)
 
     def pio(self, *words: str) -> None:
         """A command that the operator types at the unit."""
-        subprocess.run([str(self.rig.folder / SICK / "pio"), *words], check=True, capture_output=True, timeout=60.0)
+        subprocess.run([str(self.rig.folder / FAULTED / "pio"), *words], check=True, capture_output=True, timeout=60.0)
 
     # -- what is left ----------------------------------------------------------------------------------------------
 
     def seen(self, status: int | None) -> Seen:
         """Everything that it left behind."""
-        vials: dict[str, list[Mapping[str, Any]]] = {SICK: [], WELL: []}
+        vials: dict[str, list[Mapping[str, Any]]] = {FAULTED: [], WELL: []}
         for row in log_rows(self.folder / "truth.jsonl"):
             if "od" in row:
                 vials[row["unit"]].append(row)
-        rows = {unit: _recorded(self.run / "recordings" / f"{unit}.csv") for unit in (SICK, WELL)}
+        rows = {unit: _recorded(self.run / "recordings" / f"{unit}.csv") for unit in (FAULTED, WELL)}
         pulses = [pulse for vial in self.rig.vials.vials.values() for pulse in vial.pulses]
         told = (self.folder / "client.log").read_text(encoding="utf-8")
         return Seen(self.journal(), rows, pulses, vials, told, status, self.speed)
