@@ -12,7 +12,7 @@ from typing import Any
 from hardware.errors import ReactorError
 from tests.campaigns.fault import Fault
 from tests.campaigns.outcome import Outcome, judged
-from tests.campaigns.pioreactor_trial import SETPOINT, FAULTED, WELL, Seen, Trial
+from tests.campaigns.pioreactor_trial import FAULTED, SETPOINT, WELL, Seen, Trial
 
 __all__ = ["PioreactorCase", "found_in"]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.campaigns.fault import Fault
-from tests.campaigns.pioreactor_trial import MEDIA_PIN, FAULTED, WASTE_PIN, WELL, Trial
+from tests.campaigns.pioreactor_trial import FAULTED, MEDIA_PIN, WASTE_PIN, WELL, Trial
 
 __all__ = ["FAULTS"]
 
@@ -164,7 +164,8 @@ KILLS = (
     ),
     rig(
         "reader_killed", "kill -9 of od_reading, mended by a reboot", kill_job("od_reading"),
-        lambda t: t.rig.reboot(FAULTED), ("between", "in"), 30.0, by=("takes no OD readings",), within_s=30.0, blind=True,
+        lambda t: t.rig.reboot(FAULTED), ("between", "in"), 30.0,
+        by=("takes no OD readings",), within_s=30.0, blind=True,
     ),
     rig("queue_killed", "kill -9 of the task queue", *process("tasks"), ("between", "in"),
              by=("fate of a dose", "takes nothing")),

@@ -21,7 +21,7 @@ from hardware.rig.vials import Pulse
 from hardware.storage.journal import read_journal
 from tests.campaigns.client import Client
 
-__all__ = ["MEDIA_PIN", "SETPOINT", "FAULTED", "WASTE_PIN", "WELL", "Seen", "Trial", "log_rows"]
+__all__ = ["FAULTED", "MEDIA_PIN", "SETPOINT", "WASTE_PIN", "WELL", "Seen", "Trial", "log_rows"]
 
 FAULTED, WELL = "pio01", "pio02"
 MEDIA_PIN, WASTE_PIN = 13, 12
