@@ -64,7 +64,9 @@ def emulated(monkeypatch: pytest.MonkeyPatch) -> list[ChiBioDevice]:
     devices = []
 
     @contextmanager
-    def linked(_: EmulatorFamily, backend: EmulatorConfig) -> Iterator[tuple[EmulatorTransport, VirtualClock]]:
+    def linked(
+        _: EmulatorFamily, backend: EmulatorConfig, bench: Bench
+    ) -> Iterator[tuple[EmulatorTransport, VirtualClock]]:
         clock = VirtualClock()
         rng = np.random.default_rng(1)
         devices.append(ChiBioDevice(backend.reactors, clock, rng, od=0.5, temperature=37.0, blanked=True))
@@ -143,7 +145,7 @@ def test_a_stop_before_the_pumps_were_looked_at_says_so(
     """Ctrl-C at the first request, by which the device is found: what an earlier life left on may run on."""
 
     @contextmanager
-    def stopped(_: EmulatorFamily, backend: EmulatorConfig) -> Iterator[None]:
+    def stopped(_: EmulatorFamily, backend: EmulatorConfig, bench: Bench) -> Iterator[None]:
         raise KeyboardInterrupt
         yield
 
