@@ -11,6 +11,8 @@ from envs.plant.plant import PlantConfig
 from experiments import benchmark
 from experiments.cli import frame
 from experiments.cli.calibrated import read_plant_file
+from experiments.comparison.run import benchmark as run_benchmark
+from experiments.comparison.run import with_twin
 from experiments.control import assemble
 from experiments.deploy import main
 
@@ -82,10 +84,10 @@ def test_a_benchmark_meets_all_hours_of_the_twin(file: str, tmp_path: Path) -> N
     overrides = ["+experiment=comparison", "studies.comparison.plants=[nominal_noise,twin]", "replicates=40",
                  "studies.comparison.controllers=[pi]", f"plant_file={file}", "workers=1"]  # fmt: skip
     config = benchmark.main.config(overrides)
-    twin = benchmark.with_twin(config).plants["twin"]
+    twin = with_twin(config).plants["twin"]
     assert (twin.start_min, twin.start_spread_min, twin.start_od) == (0.0, 600.0, 0.5)
     assert twin.growth == read_plant_file(file).growth
-    benchmark.benchmark(config, tmp_path)
+    run_benchmark(config, tmp_path)
     rows = json.loads((tmp_path / "summary.json").read_text())["rows"]
     assert [row["plant"] for row in rows] == ["nominal_noise", "twin"]
     with np.load(tmp_path / "trajectories.npz") as stored:

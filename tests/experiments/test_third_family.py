@@ -106,7 +106,7 @@ def test_a_culture_is_at_stake(known: None, tmp_path: Path) -> None:
 def test_its_dry_run_says_where_it_is(known: None) -> None:
     text = timetable(main.config(words(AWAY)), "HERE", datetime(2026, 3, 2, 12, 0))
     assert f"backend evolver ({AWAY}), reactors v0, v1" in text
-    assert text.count("safety.bottle_ml=2000 lasts") == VIALS
+    assert text.count("bench.bottle_ml=2000 lasts") == VIALS
 
 
 def client(folder: Path, *given: str) -> list[str]:
