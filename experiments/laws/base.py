@@ -1,14 +1,27 @@
 """What a controller is: N reactors in, N pump rates out, once per sample. Structural; nothing has to inherit."""
 
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Accounts", "Array", "Controller", "Explains", "Mask", "Watches", "usable"]
+from conf.schema import check, setting
+
+__all__ = ["Accounts", "Array", "Controller", "ControllerConfig", "Explains", "Mask", "Watches", "usable"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ControllerConfig:
+    """What the config of every controller has."""
+
+    kind: str = setting("", "which controller")
+
+    def __post_init__(self) -> None:
+        check(self, "controller")
 
 
 class Controller(Protocol):

@@ -4,23 +4,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from conf.schema import check, setting
+from conf.schema import setting
 from envs.task import MAX_PUMP_RATE, EnvConfig
-from experiments.laws.base import Array, Mask, usable
+from experiments.laws.base import Array, ControllerConfig, Mask, usable
 
 __all__ = ["Hold", "HoldConfig", "Threshold", "ThresholdConfig"]
 
 
 @dataclass(frozen=True)
-class ThresholdConfig:
+class ThresholdConfig(ControllerConfig):
     """A rate above the setpoint, none below."""
 
     kind: str = setting("threshold", "which controller")
     rate: float = setting(MAX_PUMP_RATE, "while OD is above the setpoint", "mL/s", above=0.0, at_most=0.05)
     hysteresis: float = setting(0.0, "OD below the setpoint at which it stops again", "OD", within=(0, 0.2))
-
-    def __post_init__(self) -> None:
-        check(self, "controller")
 
 
 class Threshold:
@@ -45,16 +42,13 @@ class Threshold:
 
 
 @dataclass(frozen=True)
-class HoldConfig:
+class HoldConfig(ControllerConfig):
     """A constant rate. mu tau of the model holds any OD if the model is true."""
 
     kind: str = setting("hold", "which controller")
     rate: float | None = setting(
         None, "pump rate; null: mu tau of the model, 0.01 for the nominal one", "mL/s", within=(0, 0.05)
     )
-
-    def __post_init__(self) -> None:
-        check(self, "controller")
 
 
 class Hold:

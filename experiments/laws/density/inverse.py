@@ -4,23 +4,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from conf.schema import check, part, setting
+from conf.schema import part, setting
 from envs.task import EnvConfig
-from experiments.laws.base import Array, Mask, usable
+from experiments.laws.base import Array, ControllerConfig, Mask, usable
 from experiments.laws.density.estimator import Estimator, EstimatorConfig
 
 __all__ = ["Inverse", "InverseConfig"]
 
 
 @dataclass(frozen=True)
-class InverseConfig:
+class InverseConfig(ControllerConfig):
     """The one-line law and what it believes."""
 
     kind: str = setting("inverse", "which controller")
     estimator: EstimatorConfig = part(EstimatorConfig, "what the filter believes")
-
-    def __post_init__(self) -> None:
-        check(self, "controller")
 
 
 class Inverse:

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from conf.schema import build, check, setting
+from conf.schema import build, setting
 from dqn.policy import RELATIVE, Policy
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
-from experiments.laws.base import Array, Controller, Mask, usable
+from experiments.laws.base import Array, Controller, ControllerConfig, Mask, usable
 from experiments.laws.density.estimator import LOWEST_OD, Estimator, EstimatorConfig
 
 __all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned"]
@@ -18,16 +18,13 @@ WATCHED = 2.0  # sd of an estimate that count as its error
 
 
 @dataclass(frozen=True)
-class LearnedConfig:
+class LearnedConfig(ControllerConfig):
     """Everything about a policy is in its file, the estimator's settings too."""
 
     kind: str = setting("dqn", "which controller")
     estimator: dict[str, Any] = setting(
         {}, "of a policy in relative coordinates: what replaces the settings in its file, estimator.noise_memory=0"
     )
-
-    def __post_init__(self) -> None:
-        check(self, "controller")
 
 
 def learned(config: LearnedConfig, policy: Policy, model: EnvConfig, bounds: EstimateBounds | None) -> Controller:

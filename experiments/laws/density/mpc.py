@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from conf.schema import check, part, setting
+from conf.schema import part, setting
 from envs.task import EnvConfig
-from experiments.laws.base import Array, Mask, usable
+from experiments.laws.base import Array, ControllerConfig, Mask, usable
 from experiments.laws.density.pso import SwarmConfig, minimise
 
 __all__ = ["Mpc", "MpcConfig", "Problem"]
@@ -15,7 +15,7 @@ LOWEST_OD = 1e-3  # a reading below is taken for this: the model cannot grow fro
 
 
 @dataclass(frozen=True)
-class MpcConfig:
+class MpcConfig(ControllerConfig):
     """The paper's receding-horizon controller; `gradient` is L-BFGS-B with the exact gradient, as a cross-check."""
 
     kind: str = setting("mpc", "which controller")
@@ -31,9 +31,6 @@ class MpcConfig:
     solver: str = setting("pso", "of the paper: pso", choices=("pso", "gradient"))
     swarm: SwarmConfig = part(SwarmConfig, "how the swarms search; the paper names the method and no numbers")
     seed: int = setting(0, "of the swarms", at_least=0)
-
-    def __post_init__(self) -> None:
-        check(self, "controller")
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,11 +5,11 @@ from functools import cache
 
 import numpy as np
 
-from conf.schema import check, setting
+from conf.schema import setting
 from envs.optimum import OptimalPolicy, solve
 from envs.plant.plant import Plant
 from envs.task import EnvConfig
-from experiments.laws.base import Array, Mask
+from experiments.laws.base import Array, ControllerConfig, Mask
 
 __all__ = ["Oracle", "OracleConfig"]
 
@@ -20,15 +20,12 @@ DRAWN = ("mu", "volume_ml", "pump_gain_ml_s")
 
 
 @dataclass(frozen=True)
-class OracleConfig:
+class OracleConfig(ControllerConfig):
     """Action grid and discount. 129 levels hold the learned policy's 17, and finer ones gain nothing measurable."""
 
     kind: str = setting("oracle", "which controller")
     levels: int = setting(129, "pump rates on [0, max_pump_rate]", within=(2, 1001))
     gamma: float = setting(0.99, "discount per control period, the agent's", at_least=0.0, below=1.0)
-
-    def __post_init__(self) -> None:
-        check(self, "controller")
 
 
 @cache

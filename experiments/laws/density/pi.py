@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from conf.schema import check, setting
+from conf.schema import setting
 from envs.bench import Bench
 from envs.task import MAX_PUMP_RATE, EnvConfig
-from experiments.laws.base import Array, Mask, usable
+from experiments.laws.base import Array, ControllerConfig, Mask, usable
 
 __all__ = ["ChiBioPI", "ChiBioPIConfig", "TunedPI", "TunedPIConfig"]
 
@@ -16,14 +16,11 @@ LOWEST_OD = 1e-6  # the device puts this for a setpoint of 0 or less
 
 
 @dataclass(frozen=True)
-class ChiBioPIConfig:
+class ChiBioPIConfig(ControllerConfig):
     """What the device's law is told; its gains are constants of the device's code."""
 
     kind: str = setting("pi", "which controller")
     max_pump_rate: float = setting(MAX_PUMP_RATE, "the device's clamp", "mL/s", above=0.0, at_most=0.05)
-
-    def __post_init__(self) -> None:
-        check(self, "controller")
 
 
 class ChiBioPI:
@@ -86,7 +83,7 @@ class ChiBioPI:
 
 
 @dataclass(frozen=True)
-class TunedPIConfig:
+class TunedPIConfig(ControllerConfig):
     """The two times of the tuning rule; mu, tau and the largest pump rate come from the model."""
 
     kind: str = setting("pi_tuned", "which controller")
@@ -95,9 +92,6 @@ class TunedPIConfig:
         1.0, "wanted time constant; SIMC's tight setting is the delay", "min", within=(0.5, 60)
     )
     feed_forward: bool = setting(True, "start the integrator at mu of the model instead of 0")
-
-    def __post_init__(self) -> None:
-        check(self, "controller")
 
 
 class TunedPI:

@@ -4,14 +4,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from experiments.laws.base import Array, Mask
 from hardware.memory import Remembers
 
 __all__ = ["Array", "Estimate", "Law", "Mask", "ShareEstimator", "Wanted"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

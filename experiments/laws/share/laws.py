@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,16 +34,16 @@ class LawConfig:
         check(self, "composition")
 
 
-class Periodic(ABC):
-    """A law that decides at whole multiples of its period since the program began, and keeps its target in between.
+Config = TypeVar("Config", bound=LawConfig)
 
-    Args: control_min: the period, min.
-    """
+
+class Periodic(ABC, Generic[Config]):
+    """A law that decides at whole multiples of its period since the program began, and keeps its target in between."""
 
     remembers: tuple[str, ...] = ("target", "next")
 
-    def __init__(self, control_min: float) -> None:
-        self.control_min = control_min
+    def __init__(self, config: Config) -> None:
+        self.config, self.control_min = config, config.control_min
         self.reset(1)
 
     def reset(self, n: int) -> None:
@@ -71,15 +72,11 @@ class ProportionalConfig(LawConfig):
     gain: float = setting(20.0, "colder per logit that the share is too small", "degC", within=(0.1, 1000))
 
 
-class Proportional(Periodic):
+class Proportional(Periodic[ProportionalConfig]):
     """T = 33.2 - gain (logit s - logit r): at equal rates on the setpoint s, colder where the share r is too small."""
 
-    def __init__(self, config: ProportionalConfig) -> None:
-        self.gain = config.gain
-        super().__init__(config.control_min)
-
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
-        return np.asarray(EQUAL_RATES_C - self.gain * (logit(wanted.setpoint) - estimate.logit))
+        return np.asarray(EQUAL_RATES_C - self.config.gain * (logit(wanted.setpoint) - estimate.logit))
 
 
 @dataclass(frozen=True)
@@ -91,17 +88,13 @@ class PIConfig(LawConfig):
     integral: float = setting(0.01, "per unit of the share and decision", "degC", within=(0, 10))
 
 
-class PI(Periodic):
+class PI(Periodic[PIConfig]):
     """T = 33.2 - 15 (s - r) - I, I <- I + 0.01 (s - r) each minute; I rests while T is at the limit it pushes against.
 
     Source: program `CustomCompControl` of Janmorlock/ChiBio, the device's code for Lee et al. (2025).
     """
 
     remembers = ("target", "next", "integral")
-
-    def __init__(self, config: PIConfig) -> None:
-        self.config = config
-        super().__init__(config.control_min)
 
     def reset(self, n: int) -> None:
         """See `Law.reset`."""
@@ -124,11 +117,8 @@ class BangBangConfig(LawConfig):
     kind: str = setting("bang_bang", "which law of the composition")
 
 
-class BangBang(Periodic):
+class BangBang(Periodic[BangBangConfig]):
     """T = 29 while the share is too small, else 36."""
-
-    def __init__(self, config: BangBangConfig) -> None:
-        super().__init__(config.control_min)
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         return np.where(logit(wanted.setpoint) > estimate.logit, T_MIN, T_MAX)
@@ -142,18 +132,15 @@ class InverseDynamicsConfig(LawConfig):
     reach_min: float = setting(30.0, "time constant with which the error is to vanish", "min", within=(1, 1440))
 
 
-class InverseDynamics(Periodic):
+class InverseDynamics(Periodic[InverseDynamicsConfig]):
     """The temperature at which E. coli, which answers at once, makes the error vanish like exp(-t / reach):
 
     mu_e(T) = m_p - (logit s - logit r) / reach
     """
 
-    def __init__(self, config: InverseDynamicsConfig) -> None:
-        self.reach_h = config.reach_min / 60.0
-        super().__init__(config.control_min)
-
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
-        rate = estimate.rate - (logit(wanted.setpoint) - estimate.logit) / self.reach_h
+        reach_h = self.config.reach_min / 60.0
+        rate = estimate.rate - (logit(wanted.setpoint) - estimate.logit) / reach_h
         return np.asarray((rate + E_ZERO) / E_SLOPE)
 
 
@@ -165,12 +152,12 @@ class MyopicConfig(LawConfig):
     control_min: float = setting(10.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
-class Myopic(Periodic):
+class Myopic(Periodic[MyopicConfig]):
     """The one of 17 temperatures after which, by the model, the share is nearest to the setpoint."""
 
     def __init__(self, config: MyopicConfig) -> None:
         self.model = CocultureConfig(control_min=config.control_min)
-        super().__init__(config.control_min)
+        super().__init__(config)
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         return self.model.targets()[best_action(self.model, None, None, estimate.state, wanted.setpoint)]
@@ -185,7 +172,7 @@ class MidpointConfig(LawConfig):
     gain: float = setting(20.0, "colder per logit that the share is too small", "degC", within=(0.1, 1000))
 
 
-class Midpoint(Periodic):
+class Midpoint(Periodic[MidpointConfig]):
     """Half-way, in logit, when an announced change comes: full authority from so early that the model is there then.
 
     The error is convex in the share, so being early by as much as late costs least. Before that, and where nothing is
@@ -195,9 +182,8 @@ class Midpoint(Periodic):
     remembers = ("target", "next", "towards")
 
     def __init__(self, config: MidpointConfig) -> None:
-        self.gain = config.gain
         self.model = CocultureConfig(control_min=config.control_min)
-        super().__init__(config.control_min)
+        super().__init__(config)
 
     def reset(self, n: int) -> None:
         """See `Law.reset`."""
@@ -213,7 +199,7 @@ class Midpoint(Periodic):
         begun = self._towards[idx] == wanted.following
         moving = known & (late | begun)
         self._towards[idx] = np.where(moving, wanted.following, np.nan)
-        return np.where(moving, full, EQUAL_RATES_C - self.gain * (now - estimate.logit))
+        return np.where(moving, full, EQUAL_RATES_C - self.config.gain * (now - estimate.logit))
 
     def _reached(self, state: Array, target: Array, minutes: Array) -> Array:
         """Logit after `minutes`, (N,), at targets (N,), from states (N, 3); to the nearest period."""

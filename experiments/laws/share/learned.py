@@ -30,7 +30,7 @@ class PreviewLawConfig(LearnedLawConfig):
     kind: str = setting("dqn_preview", "which law of the composition")
 
 
-class LearnedLaw(Periodic):
+class LearnedLaw(Periodic[LearnedLawConfig]):
     """T = actions[argmax_a Q(o, a)] with o = [logit r, T, m_p, logit s], and with preview [..., logit of the next
     setpoint, minutes until then].
 
@@ -47,7 +47,8 @@ class LearnedLaw(Periodic):
         require(policy.observation == expected, "policy", list(policy.observation), f"one with observation {remedy}")
         self.policy, self._expected = policy, expected
         self.preview_min = float(policy.metadata["model"]["preview_min"])
-        super().__init__(float(policy.metadata["control_min"]))
+        super().__init__(config)
+        self.control_min = float(policy.metadata["control_min"])
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         now = logit(wanted.setpoint)

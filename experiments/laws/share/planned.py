@@ -30,7 +30,7 @@ class RecedingConfig(LawConfig):
     horizon_min: float = setting(360.0, "how far ahead it plans", "min", within=(1, 1440))
 
 
-class Receding(Periodic):
+class Receding(Periodic[RecedingConfig]):
     """The first action of the best plan for the next hours: least sum of (r - s)^2 after each decision, on the model.
 
     The setpoint is that in force until the announced change, then the next one. Programs are planned once and kept.
@@ -39,7 +39,7 @@ class Receding(Periodic):
     def __init__(self, config: RecedingConfig) -> None:
         self.model = CocultureConfig(control_min=config.control_min)
         self.steps = max(round(config.horizon_min / config.control_min), 1)
-        super().__init__(config.control_min)
+        super().__init__(config)
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         until = np.where(wanted.minutes > 0.0, np.ceil(wanted.minutes / self.control_min - 1e-6), self.steps)
@@ -62,7 +62,7 @@ class OptimumConfig(LawConfig):
     control_min: float = setting(30.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
-class Optimum(Periodic):
+class Optimum(Periodic[OptimumConfig]):
     """Dynamic programming over the whole program, known from its beginning; what is announced does not matter to it.
 
     Where no share is asked for, the next one counts already. After the end the last decision's value holds.
@@ -77,7 +77,7 @@ class Optimum(Periodic):
         following = known[np.minimum(np.searchsorted(known, np.arange(steps)), known.size - 1)]
         self._asked = asked[following]
         self._value: Array | None = None
-        super().__init__(config.control_min)
+        super().__init__(config)
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         if self._value is None:
