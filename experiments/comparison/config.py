@@ -91,19 +91,16 @@ class BenchmarkConfig:
         composed = [name for name, study in self.studies.items() if study.compositions]
         same = len(composed) in (0, len(self.studies))
         require(same, "studies", ", ".join(self.studies), "all with compositions, or none: their numbers differ")
-        self._check_composed(composed)
+        for name in composed:
+            study = self.studies[name]
+            asks = [key for key, s in self.scenarios.items() if s.composed]
+            two = [key for key, p in self.plants.items() if p.second.present]
+            for key, given, having, known in (
+                ("scenarios", study.scenarios, "those with ratios", asks),
+                ("plants", study.plants, "those with two species", two),
+            ):
+                wrong = next((one for one in given if one not in known), None)
+                require(wrong is None, f"studies.{name}.{key}", wrong, f"{having}: {', '.join(known)}")
         met = any(TWIN in study.plants for study in self.studies.values())
         wanted = f"null, or a study on it, as studies.NAME.plants=[nominal,{TWIN}]"
         require(met or self.plant_file is None, "plant_file", self.plant_file, wanted)
-
-    def _check_composed(self, names: list[str]) -> None:
-        """A composition needs a share to be asked for, and two species."""
-        for name in names:
-            for scenario in self.studies[name].scenarios:
-                asks = [key for key, s in self.scenarios.items() if s.composed]
-                require(
-                    scenario in asks, f"studies.{name}.scenarios", scenario, f"those with ratios: {', '.join(asks)}"
-                )
-            for plant in self.studies[name].plants:
-                two = [key for key, p in self.plants.items() if p.second.present]
-                require(plant in two, f"studies.{name}.plants", plant, f"those with two species: {', '.join(two)}")

@@ -151,7 +151,7 @@ def details(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
     found = []
     for trial in trials:
         for window in windows(trial.schedule):
-            measured, clean, floor = trial.score(window), trial.score_clean(window), trial.score_floor(window)
+            measured, clean, floor = (trial.score(window, of) for of in ("measured", "clean", "floor"))
             found.append(
                 _names(trial)
                 | {
@@ -172,9 +172,9 @@ def details(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
     return found
 
 
-def _total(trial: DensityTrial, metric: str, kind: str = "score") -> Array:
+def _total(trial: DensityTrial, metric: str, of: str = "measured") -> Array:
     """Sum of a metric over the windows of a trial, (N,)."""
-    each = [getattr(getattr(trial, kind)(window), metric) for window in windows(trial.schedule)]
+    each = [getattr(trial.score(window, of), metric) for window in windows(trial.schedule)]
     return np.asarray(np.sum(each, axis=0))
 
 
@@ -187,11 +187,10 @@ def totals(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
             value = Spread(_total(trial, metric))
             entry |= {f"{metric}_mean": value.mean, f"{metric}_sd": value.sd, f"{metric}_ci95": value.ci95}
             entry[f"{metric}_median"] = value.median
-            entry[f"clean_{metric}"] = Spread(_total(trial, metric, "score_clean")).mean
-            entry[f"floor_{metric}"] = Spread(_total(trial, metric, "score_floor")).mean
+            entry |= {f"{of}_{metric}": Spread(_total(trial, metric, of)).mean for of in ("clean", "floor")}
         parts = windows(trial.schedule)
         length = np.array([w.end - w.start for w in parts])
-        steady = np.mean([trial.score_clean(w).steady_abs_error for w in parts], axis=0)
+        steady = np.mean([trial.score(w, "clean").steady_abs_error for w in parts], axis=0)
         entry["clean_steady_abs_error"] = Spread(steady).mean
         entry["effort_ul_s"] = Spread(np.average([trial.effort(w) for w in parts], axis=0, weights=length)).mean
         entry["held"] = Spread(trial.held).mean

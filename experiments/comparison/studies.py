@@ -23,8 +23,6 @@ CAPTIONS = {
     "temperature_switch": "37 to 30 °C (the paper's Fig. 3c)",
     "comparison": "Controllers side by side at 0.5 (the paper's Fig. 4)",
 }
-
-
 SHOWN = ("pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")  # where there are more than so many laws
 AGAINST = {"density": ("dqn", "dqn_adaptive", "oracle"), "share": ("pi",)}
 """Signal -> the laws that the others are compared with, replicate by replicate."""

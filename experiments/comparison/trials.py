@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -120,21 +121,15 @@ class DensityTrial(Trial):
     held: Array
     overflowed: NDArray[np.bool_]
 
-    def score(self, window: Window) -> WindowMetrics:
-        """Metrics of the measured OD, as the paper takes them."""
-        return self._score(self.od, window)
+    def score(self, window: Window, of: str = "measured") -> WindowMetrics:
+        """Metrics of a window.
 
-    def score_clean(self, window: Window) -> WindowMetrics:
-        """Metrics of the noise-free OD: how well the culture really was on the setpoint."""
-        return self._score(self.clean, window)
-
-    def score_floor(self, window: Window) -> WindowMetrics:
-        """Metrics of the sensor's error alone: what a culture that is exactly on the setpoint would be scored."""
-        return self._score(self.od - self.clean, replace(window, setpoint=0.0))
-
-    def _score(self, od: Array, window: Window) -> WindowMetrics:
-        minute = np.broadcast_to(self.minute, od.shape)
-        return window_metrics(minute, od, window.setpoint, window.start, window.end)
+        Args: of: `measured`, the OD as the paper takes it; `clean`, the noise-free OD: how well the culture really was
+          on the setpoint; `floor`, the sensor's error alone: what a culture exactly on the setpoint would be scored.
+        """
+        od = {"measured": self.od, "clean": self.clean, "floor": self.od - self.clean}[of]
+        setpoint = 0.0 if of == "floor" else window.setpoint
+        return window_metrics(np.broadcast_to(self.minute, od.shape), od, setpoint, window.start, window.end)
 
     def media(self, window: Window) -> Array:
         """Fresh medium delivered within the window, mL, (N,)."""
@@ -233,13 +228,8 @@ def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> 
     policy, bounds = followed or (None, None)
     plant, schedule = config.plants[cell.plant], config.scenarios[cell.scenario]
 
-    def make(vials: Plant) -> Controller:
-        law: Controller = registry.build(
-            config.controllers[cell.controller], model=config.env, policy=policy, plant=vials, bounds=bounds
-        )
-        return law
-
-    return run_trial(cell, plant, schedule, make, config.env, config.replicates, config.seed)
+    law = partial(registry.build, config.controllers[cell.controller], model=config.env, policy=policy, bounds=bounds)
+    return run_trial(cell, plant, schedule, lambda vials: law(plant=vials), config.env, config.replicates, config.seed)
 
 
 def _share(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> ShareTrial:
@@ -371,7 +361,6 @@ class Loops:
 
     def results(self) -> dict[Cell, Trial]:
         """Wait for all trials; a bar on a terminal, ten lines in a log."""
-
         total, trials = len(self._waiting) + len(self._running), {}
         with logging_redirect_tqdm(), tqdm(total=total, disable=None, unit="loop") as bar:
             for k, (cell, trial) in enumerate(self._finished(), 1):

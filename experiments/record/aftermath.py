@@ -26,7 +26,7 @@ from experiments.reporting.tables import Table, number
 from hardware.errors import RecordingError
 from hardware.storage.recording_reader import read_recording
 
-__all__ = ["Believed", "believed", "told", "write"]
+__all__ = ["Believed", "believed", "decisions", "write"]
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ def _config(run: Path) -> Mapping[str, Any]:
     return config if isinstance(config, DictConfig) else {}
 
 
-def told(run: Path, reactor: str) -> dict[str, Array]:
+def decisions(run: Path, reactor: str) -> dict[str, Array]:
     """What the journal says of each decision for a reactor: `minute`, `supervised` and the controller's estimates.
 
     A key that no decision has is left out; one that some lack is nan there. All of shape (K,).
@@ -139,7 +139,7 @@ def write(page: Page, run: Path, label: str = "") -> None:
 def _reactor(page: Page, run: Path, path: Path, model: Believed, summary: Mapping[str, Any], prefix: str) -> None:
     name = path.stem
     page.add("subheading", text=name)
-    why = told(run, name)
+    why = decisions(run, name)
     supervised = why["minute"][why["supervised"] > 0.0] if "supervised" in why else np.empty(0)
     try:
         recording = read_recording(path)
@@ -194,17 +194,10 @@ def _acted(summary: Mapping[str, Any], supervised: Array) -> str:
 def _segments(found: Agreement, name: str, reactor: str) -> Table:
     """Every segment: the hours it covers and the three estimates with their intervals."""
     spans = sorted({s for c in (found.growth, found.net) for s in zip(c.first_min, c.end_min, strict=True)})
-    rows = []
-    for first, end in spans:
-        cells = [_at(c, first) for c in (found.growth, found.gain, found.net)]
-        rows.append((f"{first / 60:.1f} to {end / 60:.1f}", *cells))
+    estimates = [dict(zip(c.first_min, c.found, strict=True)) for c in (found.growth, found.gain, found.net)]
+    rows = [(f"{a / 60:.1f} to {b / 60:.1f}", *(_shown(each.get(a)) for each in estimates)) for a, b in spans]
     return Table(name, f"{reactor}: estimates along the run with their 95 % intervals", COLUMNS, tuple(rows))
 
 
-def _at(c: Compared, first: float) -> str:
-    found = dict(zip(c.first_min, c.found, strict=True)).get(first)
-    return "–" if found is None else _shown(found)
-
-
-def _shown(p: Parameter) -> str:
-    return f"{number(p.value)} ({number(p.low)} to {number(p.high)})"
+def _shown(p: Parameter | None) -> str:
+    return "–" if p is None else f"{number(p.value)} ({number(p.low)} to {number(p.high)})"

@@ -40,21 +40,21 @@ class Curves:
     of some seconds too.
 
     Args:
-      folder: run folder. names: of the reactors. first_minute: where a resumed run goes on, or 0.
+      folder: run folder. names: of the reactors. composed: a share is controlled.
+      first_minute: where a resumed run goes on, or 0.
       began: when the run began, s since 1970; None: now.
     """
 
-    def __init__(self, folder: Path, names: Sequence[str], first_minute: int = 0, began: float | None = None) -> None:
+    def __init__(
+        self, folder: Path, names: Sequence[str], composed: bool, first_minute: int, began: float | None
+    ) -> None:
         self._folder, self._names, self._last = folder, tuple(names), first_minute
         self._began = time.time() if began is None else began
         self.run = Events(folder, first_minute)
         single = len(names) == 1
         self._each = [self.run if single else Events(folder / "reactors" / name, first_minute) for name in names]
-
-    def begin(self, composed: bool) -> None:
-        """The custom page and the configuration. Args: composed: a share is controlled."""
         self.run.layout({**DEPLOYMENT, **(SHARES if composed else {})})
-        path = self._folder / "config.yaml"
+        path = folder / "config.yaml"
         if path.is_file():
             self.run.text("run/config", f"```yaml\n{path.read_text(encoding='utf-8')}\n```")
         self.run.flush()

@@ -74,8 +74,7 @@ class Record:
         self.repairs += self._completed(self.journal.rows)
         began = float(self.journal.rows[0]["wall"]) if self.journal.rows else None
         newest = max((float(rows.columns["time_min"][-1]) for rows in self.rows if len(rows)), default=-1.0)
-        self.curves = Curves(folder, self.names, round(newest) + 1, began)
-        self.curves.begin(composed="ratio" in columns)
+        self.curves = Curves(folder, self.names, "ratio" in columns, round(newest) + 1, began)
 
     def complete(self) -> None:
         """Write what the end of the loop kept from being written, as the journal has it: rows, and a dose cut short.

@@ -65,7 +65,7 @@ def row_of(step: Step, n: int) -> Row:
 
 
 @dataclass
-class Told:
+class Reason:
     """A reason of the interlock: in how many rows, and the minutes of the first and the last of them."""
 
     rows: int
@@ -77,14 +77,14 @@ class Rows:
     """All rows of one reactor's recording: the numbers by column, and what the interlock said.
 
     Args: columns: of the recording, `COLUMNS` and maybe more behind them.
-    Attributes: names, of the columns; columns, the numbers; alarms, in how many rows it spoke; told, by kind of reason.
+    Attributes: names, of the columns; columns, the numbers; alarms, in how many rows it spoke; reasons, by kind.
     """
 
     def __init__(self, columns: Sequence[str] = COLUMNS) -> None:
         self.names = tuple(columns)
         self.columns = {key: array("d") for key in self.names if key != "interlock"}
         self.alarms = 0
-        self.told: dict[str, Told] = {}
+        self.reasons: dict[str, Reason] = {}
 
     def __len__(self) -> int:
         return len(self.columns["time_min"])
@@ -96,8 +96,8 @@ class Rows:
         self.alarms += bool(row["interlock"])
         for kind in kinds_of(str(row["interlock"])):
             minute = float(row["time_min"])
-            told = self.told.setdefault(kind, Told(0, minute, minute))
-            told.rows, told.last_min = told.rows + 1, minute
+            reason = self.reasons.setdefault(kind, Reason(0, minute, minute))
+            reason.rows, reason.last_min = reason.rows + 1, minute
 
     def last(self) -> dict[str, float]:
         """The numbers of the newest row; none for an empty recording."""

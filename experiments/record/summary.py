@@ -39,8 +39,6 @@ FORMATS = {  # of the metrics of a window
     "settling_min": "8.1f",
     "steady_abs_error": "8.4f",
 }
-
-
 AGAIN_S = 3600.0
 
 
@@ -136,7 +134,7 @@ def _cell(value: float) -> str:
 
 def reasons_line(rows: Rows) -> str:
     """What the interlock said in a run, most frequent first; "" if it had nothing to say."""
-    often = sorted(rows.told.items(), key=lambda item: -item[1].rows)
+    often = sorted(rows.reasons.items(), key=lambda item: -item[1].rows)
     return "; ".join(
         f"{kind} in {t.rows} of {len(rows)} rows, minute {t.first_min:.0f} to {t.last_min:.0f}" for kind, t in often
     )
@@ -160,7 +158,7 @@ def summarise(
             "volume_ml": float(ml),
             "rows": len(rows),
             "interlock": rows.alarms,
-            "reasons": {kind: asdict(told) for kind, told in rows.told.items()},
+            "reasons": {kind: asdict(reason) for kind, reason in rows.reasons.items()},
         }
         for name, role, ml, rows in zip(table.names, roles, volume, table.rows, strict=True)
     }
@@ -200,19 +198,19 @@ def _further(table: Table, n: int, start: float, end: float) -> dict[str, Any]:
     """
     own = {key: values[n : n + 1] for key, values in table.columns.items()}
     minute = own["elapsed_min"]
-    told: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for name in (key.removesuffix("_setpoint") for key in own if key.endswith("_setpoint")):
         asked = own[f"{name}_setpoint"]
-        found = np.unique(asked[(minute >= start - 1e-6) & (minute < end - 1e-6) & np.isfinite(asked)])
-        told[f"{name}_setpoint"] = float(found[0]) if found.size == 1 else None
+        values = np.unique(asked[(minute >= start - 1e-6) & (minute < end - 1e-6) & np.isfinite(asked)])
+        found[f"{name}_setpoint"] = float(values[0]) if values.size == 1 else None
         for key in (name, f"true_{name}"):
             if key in own:
                 whole, late = mean_errors(minute, own[key], asked, start, end)
-                told |= {f"{key}_abs_error_mean": float(whole[0]), f"{key}_abs_error_last2h": float(late[0])}
-    if told:
+                found |= {f"{key}_abs_error_mean": float(whole[0]), f"{key}_abs_error_last2h": float(late[0])}
+    if found:
         density, _ = mean_errors(minute, table.od()[n : n + 1], own["setpoint"], start, end)
-        told["od_abs_error_mean"] = float(density[0])
-    return told
+        found["od_abs_error_mean"] = float(density[0])
+    return found
 
 
 def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:

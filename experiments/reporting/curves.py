@@ -4,13 +4,15 @@ docs/tensorboard.md explains the same tags to whoever looks at them.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 __all__ = [
-    "BAND", "CURVES", "DEPLOYMENT", "METRICS", "PARAMETERS", "PICTURES", "POPULATION", "SHARES", "TRAINING",
-    "Chart", "Column", "Curve", "described", "folded", "of_population",
+    "BAND", "CURVES", "DEPLOYMENT", "ERROR_UNITS", "METRICS", "PARAMETERS", "PICTURES", "POPULATION", "SHARES",
+    "TRAINING", "Chart", "Column", "Curve", "described", "of_population",
 ]  # fmt: skip
 
+ERROR_UNITS = {"density": "OD", "relative": "periods of full pump", "coculture": "of the share"}
+"""Task -> unit of its steady error."""
 BAND = 0.05  # of the setpoint: the band in which a culture counts as settled
 POPULATION = {"iqm": "mean of the middle half of the agents", "min": "lowest agent", "max": "highest agent"}
 
@@ -100,18 +102,12 @@ def described(tag: str) -> str:
     return CURVES[tag].text if tag in CURVES else PICTURES.get(tag, "")
 
 
-def folded(tag: str) -> str:
-    """The tag without the statistic of a population."""
-    base, _, end = tag.rpartition("/")
-    return base if base in CURVES and end in POPULATION else tag
-
-
 @dataclass(frozen=True)
 class Chart:
     """A chart of the custom page: tags as lines, or triples (middle, low, high), each a line with its band."""
 
     lines: Sequence[str] = ()
-    bands: Sequence[tuple[str, str, str]] = field(default=())
+    bands: Sequence[tuple[str, str, str]] = ()
 
 
 def _line(tag: str) -> tuple[str, str, str]:

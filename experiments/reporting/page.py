@@ -18,6 +18,7 @@ import yaml  # type: ignore[import-untyped]
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from experiments.reporting import tables
+from experiments.reporting.curves import ERROR_UNITS
 from experiments.reporting.tables import Best, Table, number, typeset
 from experiments.reporting.verdict import verdict
 
@@ -40,7 +41,6 @@ UNITS = {
 }  # fmt: skip
 """Of keys of summary.json; a key with one of `ENDINGS` has its unit in it."""
 ENDINGS = {"_pct": "%", "_min": "min", "_ml": "mL", "_s": "s"}
-OTHER_ERRORS = {"relative": "periods of full pump", "coculture": "of the share"}
 
 templates = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
 templates.filters["typeset"] = typeset
@@ -167,8 +167,8 @@ def _labelled(key: str, kind: str) -> str:
     """A key of summary.json with its unit. Args: kind: of the task whose error it may be."""
     *parents, name = key.split(".")
     unit = UNITS.get(parents[-1] if parents and name in ("value", "ci95") else name, "")
-    if unit == "OD" and kind in OTHER_ERRORS and "error" in name:
-        unit = OTHER_ERRORS[kind]
+    if unit == "OD" and "error" in name:
+        unit = ERROR_UNITS.get(kind, unit)
     for ending, own in ENDINGS.items():
         if name.endswith(ending):
             key, unit = key.removesuffix(ending), own

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.reporting.curves import ERROR_UNITS
+
 __all__ = ["Configuration", "Result", "Statistics", "configurations", "curve", "label", "measures", "statistics"]
 
 Array = NDArray[np.float64]
 RESAMPLES = 2000
-UNITS = {"density": "OD", "relative": "periods of full pump", "coculture": "of the share"}  # of a steady error
 LABELS = {
     "regret_pct": "regret against the optimum, %",
     "steady_abs_error": "steady error at the worst setpoint, {unit}",
@@ -90,7 +91,7 @@ def label(measure: str, task: str, command: str) -> str:
     """A measure with its unit."""
     if (measure, command) == ("objective", "train"):
         return MERIT
-    return LABELS.get(measure, measure).format(unit=UNITS.get(task, ""))
+    return LABELS.get(measure, measure).format(unit=ERROR_UNITS.get(task, ""))
 
 
 def measures(summary: Mapping[str, Any]) -> dict[str, list[float]]:
@@ -123,16 +124,12 @@ def _of_windows(summary: Mapping[str, Any]) -> dict[str, list[float]]:
     return {name: values for name, values in found.items() if values}
 
 
-def _seed(key: str) -> bool:
-    return key.rpartition(".")[2] == "seed"
-
-
 def configurations(jobs: Sequence[Result]) -> tuple[list[Configuration], dict[str, str]]:
     """Finished jobs pooled over seeds, the best first, and the overrides that all jobs share.
 
     The best has the least objective at its worst seed; where no objective was returned, the least worst first measure.
     """
-    keys = list(dict.fromkeys(key for job in jobs for key in job.overrides if not _seed(key)))
+    keys = list(dict.fromkeys(key for job in jobs for key in job.overrides if key.rpartition(".")[2] != "seed"))
     done = [job for job in jobs if job.state == "finished"]
     varied = [key for key in keys if len({job.overrides.get(key) for job in done or jobs}) > 1]
     pooled: dict[tuple[str, ...], list[Result]] = {}

@@ -72,10 +72,6 @@ class Events:
         """One point of each curve. Args: values: by tag. wall: s since 1970, where it is not now."""
         self._add([self._point(tag, value) for tag, value in values.items()], step, wall)
 
-    def scalar(self, tag: str, value: float, step: int) -> None:
-        """One point of a curve."""
-        self.scalars({tag: value}, step)
-
     def picture(self, tag: str, png: Path, step: int) -> None:
         """A PNG file under TensorBoard's images. Raises: OSError for one that cannot be read."""
         data = png.read_bytes()
@@ -201,9 +197,8 @@ class PopulationWriter:
             if each.size == 1:
                 shared[tag] = float(each[0])
             else:
-                middle = interquartile_mean(each)
                 shared |= {
-                    f"{tag}/iqm": middle,
+                    f"{tag}/iqm": interquartile_mean(each),
                     f"{tag}/min": float(np.nanmin(each)),
                     f"{tag}/max": float(np.nanmax(each)),
                 }

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.reporting.curves import BAND, ERROR_UNITS
 from experiments.reporting.tables import number
 
 __all__ = ["Verdict", "verdict"]
@@ -15,7 +16,6 @@ Summary = Mapping[str, Any]
 REGRET, STEADY = 0.5, 0.003
 """Per cent and OD that `env=sim` aims for (experiments/training/density.py); half a per cent is not seen in a
 recording, and 0.003 OD is the noise of the sensor."""
-SETTLED = 0.05  # of the setpoint
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def _training(summary: Summary, config: Mapping[str, Any]) -> Verdict:
     kind = env.get("kind", "density")
     model = f"mu {number(env['mu'])} 1/min, tau {number(env['tau'])}" if "tau" in env else f"the task env={kind}"
     claim = f"Training: {agents} learned {model} for {summary['env_steps']} steps in {summary['train_seconds']:.0f} s."
-    unit = "OD" if kind == "density" else "of the share" if kind == "coculture" else "periods of full pump"
+    unit = ERROR_UNITS.get(kind, ERROR_UNITS["relative"])
     worst = "of the worst agent " if regret.size > 1 else ""
     items = [
         f"regret {worst}{number(regret.max())} %: what the policy costs beyond the exact optimum",
@@ -88,7 +88,7 @@ def _deployment(summary: Summary, config: Mapping[str, Any]) -> Verdict:
         return Verdict(claim, items, "No window was long enough to say how well its setpoint was held.")
     worst = max(w["steady_abs_error"] for w in windows if w["steady_abs_error"] is not None)
     items.insert(0, f"largest error at rest {number(worst)} OD, the mean over the last 10 min of a window")
-    held = sum(error <= SETTLED for error in steady)
+    held = sum(error <= BAND for error in steady)
     word = "Good" if held == len(windows) else "Not good"
     return Verdict(claim, items, f"{word}: {held} of {len(windows)} windows ended within 5 % of their setpoint.")
 

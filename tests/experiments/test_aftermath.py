@@ -14,7 +14,7 @@ from dqn import policy as policies
 from experiments import deploy, report
 from experiments.cli import frame
 from experiments.control import run
-from experiments.record.aftermath import believed, told
+from experiments.record.aftermath import believed, decisions
 from tests.experiments.test_deploy import inverse_policy
 
 pytestmark = pytest.mark.xdist_group("aftermath")  # its tests share runs, made once
@@ -68,7 +68,7 @@ def test_a_drifting_run_is_told_to_calibrate_again(copy):
 
 
 def test_the_controllers_own_estimates_are_read_from_the_journal(drifting):
-    why = told(drifting, "M0")
+    why = decisions(drifting, "M0")
     assert set(why) == {"minute", "mu", "gain"}
     with open(drifting / "recordings" / "M0.csv", newline="") as f:
         minutes = [float(row["time_min"]) for row in csv.DictReader(f)]

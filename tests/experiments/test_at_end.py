@@ -48,7 +48,7 @@ def test_it_is_handed_over_to_the_device_and_stays_so(tmp_path: Path) -> None:
     assert (data["OD"]["ON"], data["OD"]["target"]) == (1, 0.4)
     assert run.truth("M0")["od"] == pytest.approx(0.4, abs=0.1)
     assert run.truth("M1")["od"] > 0.6  # nobody doses it after the run
-    assert "falls" not in run.record.rows[0].told
+    assert "falls" not in run.record.rows[0].reasons
 
 
 def test_it_is_not_handed_over_by_a_sensor_that_is_not_believed(tmp_path: Path) -> None:

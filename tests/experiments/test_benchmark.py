@@ -88,7 +88,7 @@ def test_oracle_knows_each_vial_and_gains_by_it():
 
 def total_clean(controller: str) -> float:
     t = trial(controller, "bench", "setpoint_steps", 16)
-    return float(sum(t.score_clean(w).itae.mean() for w in windows(t.schedule)))
+    return float(sum(t.score(w, "clean").itae.mean() for w in windows(t.schedule)))
 
 
 def test_oracle_is_the_dynamic_programme_of_the_training_model():

@@ -29,13 +29,13 @@ def test_half_the_flow_is_told_at_its_beginning_at_its_end_and_in_every_row_betw
         "M0: cannot_hold: full feed does not bring OD down to 0.5",
         "M0: interlock: all well again",
     ]
-    (told,) = run.record.rows[0].told.items()
-    assert told[0] == "cannot_hold"
-    assert told[1].first_min < 40.0
-    assert 70.0 < told[1].last_min < 100.0
-    assert told[1].rows == pytest.approx(told[1].last_min - told[1].first_min + 1.0, abs=1.5)  # without a gap
+    (reason,) = run.record.rows[0].reasons.items()
+    assert reason[0] == "cannot_hold"
+    assert reason[1].first_min < 40.0
+    assert 70.0 < reason[1].last_min < 100.0
+    assert reason[1].rows == pytest.approx(reason[1].last_min - reason[1].first_min + 1.0, abs=1.5)  # without a gap
     rows = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "decision"]
-    assert sum("cannot_hold" in row["row"]["interlock"] for row in rows) == told[1].rows
+    assert sum("cannot_hold" in row["row"]["interlock"] for row in rows) == reason[1].rows
     summary = summarise(run.record.table(), [scenario], ["replicate"], "completed")
-    assert summary["reactors"]["M0"]["reasons"]["cannot_hold"]["rows"] == told[1].rows
-    assert reasons_line(run.record.rows[0]).startswith(f"cannot_hold in {told[1].rows} of {len(rows)} rows, minute ")
+    assert summary["reactors"]["M0"]["reasons"]["cannot_hold"]["rows"] == reason[1].rows
+    assert reasons_line(run.record.rows[0]).startswith(f"cannot_hold in {reason[1].rows} of {len(rows)} rows, minute ")

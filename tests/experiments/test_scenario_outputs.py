@@ -131,7 +131,7 @@ def test_on_the_device_both_pumps_give_what_the_step_says_and_it_counts(tmp_path
         assert columns["elapsed_min"][mine].max() < 60.0
     assert run.loop.interlock.budget.fed_ml[0] == pytest.approx(np.nansum(columns["volume_ml"]))
     assert columns["od"][10:] == pytest.approx(0.4, abs=0.03)  # the controller makes up for it
-    assert "falls" not in run.record.rows[0].told
+    assert "falls" not in run.record.rows[0].reasons
     assert vial.peak_ml < 21.5
     run.reactors.stop()
     assert not any(run.truth("M0")["motors"].values())

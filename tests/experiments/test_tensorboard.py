@@ -17,7 +17,7 @@ from tensorboard.plugins.hparams import metadata as hparams
 from experiments.cli import frame
 from experiments.control import run as control
 from experiments.deploy import main as deploy
-from experiments.reporting.curves import METRICS, PARAMETERS, described, folded
+from experiments.reporting.curves import CURVES, METRICS, PARAMETERS, POPULATION, described
 from experiments.reporting.tensorboard import Events
 from experiments.train import main as train
 from experiments.training import run as training
@@ -69,6 +69,12 @@ def scalars(events: EventAccumulator, kind: str = "scalars") -> set[str]:
         return set(events.PluginTagToContent(kind))
     except KeyError:
         return set()
+
+
+def folded(tag: str) -> str:
+    """The tag without the statistic of a population."""
+    base, _, end = tag.rpartition("/")
+    return base if base in CURVES and end in POPULATION else tag
 
 
 def test_the_page_explains_the_curves_that_runs_write_and_no_other(runs: Path) -> None:
@@ -175,7 +181,7 @@ def test_a_run_can_be_watched_while_it_goes_on(tmp_path: Path, monkeypatch: pyte
     events = Events(tmp_path)
     for minute in range(3):
         now[0] += 60.0
-        events.scalar("culture/od", 0.5, minute)
+        events.scalars({"culture/od": 0.5}, minute)
         (live,) = parts(tmp_path)
         assert curve(live, "culture/od")[:, 0].tolist() == list(range(minute + 1))
     events.close()
