@@ -341,8 +341,7 @@ def _paper_section(out: Page, summary: Row) -> None:
     remark = f"In the published table the DQN loses {len(theirs)} of 10: {', '.join(theirs)}."
     out.add("verdict", claim=claim, items=[loss.sentence for loss in lost], remark=remark)
     out.table(cell_by_cell(rows))
-    bounded = _below_bound(summary)
-    if bounded:
+    if bounded := _below_bound(summary):
         out.text(bounded)
 
 
@@ -383,16 +382,14 @@ def _learning_section(out: Page, summary: Row, run: Path) -> None:
     if not first and not summary["agents"]:
         return
     out.section("Model and learned policy")
-    fitted = summary["calibration"]
-    if fitted:
+    if fitted := summary["calibration"]:
         parts = [
             f"{k} {number(fitted[k]['value'], 4)} (95 % {number(fitted[k]['ci95'][0], 4)} to "
             f"{number(fitted[k]['ci95'][1], 4)}; true {number(fitted[k]['truth'], 4)})"
             for k in ("mu", "tau")
         ]
         out.text(f"Calibration: {', '.join(parts)}; PMSE {number(fitted['pmse_pct'])} %.")
-    settings = _settings(summary["agents"])
-    if settings is not None:
+    if settings := _settings(summary["agents"]):
         out.table(settings)
     for name, entry in summary["agents"].items():
         regret = entry["regret_pct"]

@@ -214,8 +214,8 @@ def cells(config: BenchmarkConfig) -> list[Cell]:
                     if not study.compositions:
                         wanted[Cell(controller, plant, scenario)] = None
                     for law in study.compositions:
-                        told = (study.announced, study.calibrated)
-                        wanted[Cell(law, plant, scenario, "share", controller, *told)] = None
+                        cell = Cell(law, plant, scenario, "share", controller, study.announced, study.calibrated)
+                        wanted[cell] = None
     return list(wanted)
 
 

@@ -220,17 +220,14 @@ class ClosedLoop:
             failed += self.reactors.pumps_off(off)
         if stop.any():
             failed += self.reactors.give_up(stop)
-            self.stopped = self.stopped | (stop & ~self._named(failed))
+            unsure = [any(line.startswith(f"{name}:") for line in failed) for name in self.reactors.names]
+            self.stopped = self.stopped | (stop & ~np.array(unsure))
         regulate = (left | (verdict.response == Response.REGULATE)) & ~self.reactors.handed_over
         if regulate.any():
             failed += self.reactors.regulate(regulate, verdict.setpoint)
         if verdict.heat_off.any():
             failed += self.reactors.heat_off(verdict.heat_off)
         return failed
-
-    def _named(self, failures: Sequence[str]) -> Mask:
-        """Reactors that a list of failures speaks of."""
-        return np.array([any(line.startswith(f"{name}:") for line in failures) for name in self.reactors.names])
 
     def position(self, n: int) -> dict[str, Any]:
         """What a decision for reactor n has to keep of where its schedule stands; plain numbers."""

@@ -108,14 +108,14 @@ class Share:
 
     def find(self, sample: Sample, given: Array) -> Findings:
         """See `Signal.find`."""
-        m, wanted, told = sample.measured, self.wanted(sample.elapsed), self.estimator.explain()
+        m, wanted, believed = sample.measured, self.wanted(sample.elapsed), self.estimator.explain()
         known = {"ratio_setpoint": wanted.setpoint, "temperature_target_degc": given}
         known |= {"fluorescence": np.full(m.od.shape, np.nan) if m.fluorescence is None else m.fluorescence}
-        known |= {key: told[key] for key in ESTIMATE}
+        known |= {key: believed[key] for key in ESTIMATE}
         found = {key: known[key] for key in COLUMNS}
         if self.simulated:
             found[TRUE] = self.truth()
-        why = {key: value for key, value in told.items() if key not in ESTIMATE}
+        why = {key: value for key, value in believed.items() if key not in ESTIMATE}
         low, high = sample.limits
         inside = (given > low + EDGE_C) & (given < high - EDGE_C)
         goal = np.where(wanted.minutes > 0.0, wanted.following, wanted.setpoint)

@@ -132,19 +132,16 @@ def _segments(ax: Axes, time: Array, segments: tuple[Segment, ...], values: list
         ax.text(0.5, 0.5, "not identifiable in any segment", transform=ax.transAxes, ha="center", color="0.4")
         return []
     middle = np.array([s.middle_min / 60 for s, _ in known])
-    value = np.array([v.value for _, v in known])
+    value, low, high = np.array([(v.value, v.low, v.high) for _, v in known]).T
     across = np.array([0.5 * (time[s.end - 1] - time[s.first]) for s, _ in known])
-    down, up = (
-        np.array([max(d, 0.0) for d in side])
-        for side in zip(*((v.value - v.low, v.high - v.value) for _, v in known), strict=True)
-    )
+    down, up = np.maximum(value - low, 0.0), np.maximum(high - value, 0.0)
     ax.errorbar(
         middle, value, yerr=[down, up], xerr=across, fmt="o", ms=5, color=DATA, elinewidth=1.1, capsize=2.5,
         label="segment alone, 95 % interval",
     )  # fmt: skip
     margin = 0.15 * max(value.max() - value.min(), 0.05 * abs(float(value.mean())))
-    low, high = value.min() - 1.1 * np.median(down) - margin, value.max() + 1.1 * np.median(up) + margin
-    ax.set_ylim(low, high + 0.2 * (high - low))  # one wide interval must not flatten the rest; the legend has room
+    least, most = value.min() - 1.1 * np.median(down) - margin, value.max() + 1.1 * np.median(up) + margin
+    ax.set_ylim(least, most + 0.2 * (most - least))  # one wide interval must not flatten the rest; the legend has room
     return [float(m) for m in middle]
 
 

@@ -104,8 +104,8 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Verdict:
         f"PMSE {number(summary['pmse_pct'])} % of the squared OD; {summary['n_used']} readings used, "
         f"{summary['n_rejected']} rejected",
     ]
-    told = "; ".join(summary["warnings"])
-    return Verdict(claim, items, f"Warnings: {told}." if told else "Good: nothing to warn of.")
+    warnings = "; ".join(summary["warnings"])
+    return Verdict(claim, items, f"Warnings: {warnings}." if warnings else "Good: nothing to warn of.")
 
 
 def _certificate(summary: Summary, config: Mapping[str, Any]) -> Verdict:

@@ -40,11 +40,10 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
     """
 
     def __init__(self, config: LearnedLawConfig, policy: Policy) -> None:
-        expected = COCULTURE_PREVIEW if config.kind == "dqn_preview" else COCULTURE
-        remedy = (
-            f"{list(expected)}, as env={'coculture_preview' if expected == COCULTURE_PREVIEW else 'coculture'} trains"
-        )
-        require(policy.observation == expected, "policy", list(policy.observation), f"one with observation {remedy}")
+        preview = config.kind == "dqn_preview"
+        task, expected = ("coculture_preview", COCULTURE_PREVIEW) if preview else ("coculture", COCULTURE)
+        remedy = f"one with observation {list(expected)}, as env={task} trains"
+        require(policy.observation == expected, "policy", list(policy.observation), remedy)
         self.policy, self._expected = policy, expected
         self.preview_min = float(policy.metadata["model"]["preview_min"])
         super().__init__(config)
