@@ -36,7 +36,7 @@ def linked(backend: ChiBioConfig, own_url: str = "") -> Iterator[Link]:
     """
     with ExitStack() as stack:
         url = own_url or backend.url
-        transport = stack.enter_context(closing(open_transport(backend.transport, url, backend.speed)))
+        transport = stack.enter_context(open_transport(backend.transport, url, backend.speed))
         clock = DeviceClock(backend.speed)
         if not own_url:
             stack.enter_context(closing(DeviceLock(f"the device with reactor {identity(transport, clock)}")))

@@ -13,15 +13,7 @@ import httpx
 from hardware.clock import DeviceClock
 from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.link.secret import read_secret
-from hardware.link.transport import (
-    MAX_BODY,
-    Reply,
-    SwitchedOff,
-    Transport,
-    TransportConfig,
-    new_session,
-    switched_off,
-)
+from hardware.link.transport import MAX_BODY, Reply, SwitchedOff, Transport, TransportConfig, new_session, switched_off
 
 __all__ = ["HttpTransport", "fetch"]
 

@@ -35,7 +35,7 @@ class MqttLink:
             paho = importlib.import_module("paho.mqtt.client")
         except ImportError:
             raise LinkError("MQTT needs its library: pip install 'paho-mqtt>=2'") from None
-        self._clock, self._topics, self._again, self._will, self._said = clock, tuple(topics), again, will, ""
+        self._clock, self._topics, self._again, self._will, self._kept = clock, tuple(topics), again, will, ""
         self.broke_s, self.refusal, self._is_up = -math.inf, "", False
         self._client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id=name)
         self._client.username_pw_set(username, password)
@@ -68,11 +68,11 @@ class MqttLink:
         if not reason.is_failure:
             self._again()
             client.subscribe([(topic, 1) for topic in self._topics])
-            if self._said:  # the last will of the connection before cleared it
-                client.publish(self._will, self._said, qos=1, retain=True)
+            if self._kept:  # the last will of the connection before cleared it
+                client.publish(self._will, self._kept, qos=1, retain=True)
             self._is_up = True
 
-    def _down(self, *_said: Any) -> None:
+    def _down(self, *_: Any) -> None:
         self.broke_s = self._clock.now() if self._is_up else self.broke_s
         self._is_up = False
 
@@ -83,13 +83,13 @@ class MqttLink:
 
     def keep(self, payload: str) -> None:
         """The retained message on `will`, as long as we are there."""
-        self._said = payload
+        self._kept = payload
         self._client.publish(self._will, payload, qos=1, retain=True)
 
     def close(self) -> None:
         """Idempotent."""
-        if self._said and self.connected:
-            self._said = ""
+        if self._kept and self.connected:
+            self._kept = ""
             with contextlib.suppress(RuntimeError, ValueError):
                 self._client.publish(self._will, b"", qos=1, retain=True).wait_for_publish(1.0)
         self._client.loop_stop()

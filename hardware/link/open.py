@@ -5,12 +5,14 @@ import hashlib
 import json
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from hardware.errors import DeviceStateError
 from hardware.link.http import HttpTransport
 from hardware.link.serial import SerialTransport
-from hardware.link.transport import Reply, SwitchedOff, Transport, TransportConfig, new_session
+from hardware.link.transport import Transport, TransportConfig, new_session
 
 __all__ = ["DeviceLock", "open_transport"]
 
@@ -55,38 +57,15 @@ class DeviceLock:
         self._file.close()
 
 
-class _Owned(Transport):
-    """A link with the device's lock held as long as it is open."""
-
-    def __init__(self, link: Transport, lock: DeviceLock) -> None:
-        self._link, self._lock = link, lock
-
-    def _request(self, method: str, path: str) -> Reply:
-        return self._link._request(method, path)
-
-    def disarm(self) -> None:
-        self._link.disarm()
-
-    def switched_off(self) -> SwitchedOff | None:
-        return self._link.switched_off()
-
-    def close(self) -> None:
-        self._link.close()
-        self._lock.close()
-
-
-def open_transport(config: TransportConfig, url: str, speed: float = 1.0) -> Transport:
-    """The configured link, owned exclusively on this computer.
+@contextmanager
+def open_transport(config: TransportConfig, url: str, speed: float = 1.0) -> Iterator[Transport]:
+    """The configured link, owned exclusively on this computer as long as it is open.
 
     Raises: ValueError for a malformed address, LinkError if a serial line cannot be opened, its agent does not answer
       or the token of an agent cannot be read, DeviceStateError if another process holds the device.
     """
     serial = config.kind == "serial"
-    lock = DeviceLock(config.port if serial else url.rstrip("/"))
-    try:
-        if serial:
-            return _Owned(SerialTransport(config.port, speed, config, session=lock.session), lock)
-        return _Owned(HttpTransport(url, speed, config, session=lock.session), lock)
-    except BaseException:
-        lock.close()
-        raise
+    with closing(DeviceLock(config.port if serial else url.rstrip("/"))) as lock:
+        make, address = (SerialTransport, config.port) if serial else (HttpTransport, url)
+        with closing(make(address, speed, config, session=lock.session)) as link:
+            yield link

@@ -15,11 +15,11 @@ def read_secret(key: str, path: str, least: int, remedy: str, printable: str = r
     """
     file = Path(path).expanduser()
     try:
-        mode, said = file.stat().st_mode, file.read_bytes()[:2048].decode("utf-8", "replace").strip()
+        mode, secret = file.stat().st_mode, file.read_bytes()[:2048].decode("utf-8", "replace").strip()
     except OSError as error:
         raise LinkError(f"{key} = {path}: {error.strerror}; {remedy}") from None
     if mode & 0o077:
         raise LinkError(f"{key} = {path}: others may use it (mode {mode & 0o777:o}); chmod 600 {path}")
-    if not re.fullmatch(f"{printable}{{{least},256}}", said):
+    if not re.fullmatch(f"{printable}{{{least},256}}", secret):
         raise LinkError(f"{key} = {path}: not one line of {least} to 256 characters; {remedy}")
-    return said
+    return secret

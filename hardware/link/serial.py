@@ -16,15 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from hardware.clock import DeviceClock
 from hardware.errors import LinkError, ProtocolError
-from hardware.link.transport import (
-    MAX_BODY,
-    Reply,
-    SwitchedOff,
-    Transport,
-    TransportConfig,
-    new_session,
-    switched_off,
-)
+from hardware.link.transport import MAX_BODY, Reply, SwitchedOff, Transport, TransportConfig, new_session, switched_off
 
 if TYPE_CHECKING:
     import serial
@@ -109,10 +101,6 @@ class SerialTransport(Transport):
             self._open()
         return switched_off(self._exchange("PING", "/").body, self._clock)
 
-    def close(self) -> None:
-        """Release the port; the agent's switch stays as it is. Idempotent."""
-        self._drop()
-
     def _open(self) -> None:
         import serial  # only users of the serial link need pyserial
 
@@ -128,7 +116,7 @@ class SerialTransport(Transport):
         try:
             self.hello = self._parse_hello(self._exchange("HELLO", "/"))
         except BaseException:
-            self._drop()
+            self.close()
             raise
 
     @staticmethod
@@ -142,7 +130,8 @@ class SerialTransport(Transport):
             raise ProtocolError(f"the board agent speaks protocol {protocol}, this driver 2: install the same version")
         return dict(hello)
 
-    def _drop(self) -> None:
+    def close(self) -> None:
+        """Release the port; the agent's switch stays as it is. Idempotent."""
         if self._line is not None:
             with contextlib.suppress(OSError):  # the device may be gone already
                 self._line.close()
@@ -185,9 +174,9 @@ class SerialTransport(Transport):
                 if reply is not None:
                     return reply
         except OSError as error:
-            self._drop()
+            self.close()
             raise LinkError(f"serial port {self.port} was lost ({error}); reopened at the next request") from error
-        self._drop()  # a fresh session cannot be answered by stale replies
+        self.close()  # a fresh session cannot be answered by stale replies
         if garbage:
             raise ProtocolError(
                 f"{method} {path}: {garbage} damaged frames on {self.port}, none whole in {self._attempts} tries"

@@ -21,7 +21,7 @@ from hardware.board.board_agent import Agent, Device, Proxy
 from hardware.errors import LinkError, ProtocolError
 from hardware.link.http import HttpTransport
 from hardware.link.open import open_transport
-from hardware.link.transport import Transport, TransportConfig, switched_off
+from hardware.link.transport import TransportConfig, switched_off
 from tests.hardware.test_board_agent import PYTHON, SOURCE, TOKEN, AgentLab, Recorder, make_token
 from tests.hardware.test_http_transport import Server
 
@@ -430,27 +430,20 @@ def test_a_killed_client_goes_on_at_once_and_another_computer_waits(
     door: tuple[Proxy, Recorder], linked: tuple[str, TransportConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url, config = linked
-
-    def opened() -> Transport:
-        return open_transport(config, url)
-
-    first = opened()
-    assert first.post("/first").status == 204
-    first.close()  # as the kernel does for a killed one: no BYE
+    with open_transport(config, url) as first:
+        assert first.post("/first").status == 204  # closed as the kernel does for a killed one: no BYE
     (tmp_path / "other").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "other"))
-    foreign = opened()
-    with pytest.raises(LinkError, match="another client is in charge"):
-        foreign.post("/foreign")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    resumed = opened()
-    assert resumed.post("/resumed").status == 204
-    resumed.disarm()
-    assert door[0].agent.armed is False
-    assert foreign.post("/foreign").status == 204
-    assert [path for _, path in door[1].asked] == ["/first", "/resumed", "/foreign"]
-    resumed.close()
-    foreign.close()
+    with open_transport(config, url) as foreign:
+        with pytest.raises(LinkError, match="another client is in charge"):
+            foreign.post("/foreign")
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+        with open_transport(config, url) as resumed:
+            assert resumed.post("/resumed").status == 204
+            resumed.disarm()
+            assert door[0].agent.armed is False
+            assert foreign.post("/foreign").status == 204
+            assert [path for _, path in door[1].asked] == ["/first", "/resumed", "/foreign"]
 
 
 # -- the client's side of the token ----------------------------------------------------------------------------------

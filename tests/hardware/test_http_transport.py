@@ -11,6 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -177,11 +178,14 @@ def test_a_malformed_address_says_what_is_allowed(url: str) -> None:
 
 
 def test_one_client_per_device(server: Server) -> None:
-    first = open_transport(TransportConfig(), server.url)
-    with pytest.raises(DeviceStateError, match=f"process {os.getpid()}"):
-        open_transport(TransportConfig(), server.url)
-    first.close()
-    open_transport(TransportConfig(), server.url).close()
+    with (
+        open_transport(TransportConfig(), server.url),
+        pytest.raises(DeviceStateError, match=f"process {os.getpid()}"),
+        open_transport(TransportConfig(), server.url),
+    ):
+        pass
+    with open_transport(TransportConfig(), server.url):
+        pass
 
 
 def test_time_outs_shrink_with_speed_down_to_a_floor() -> None:
@@ -268,9 +272,13 @@ def test_fuzz_no_dose_on_garbage() -> None:
 
 def test_three_reactors_over_http_at_speed_60() -> None:
     names = ("M0", "M1", "M2")
-    with EmulatorProcess(["--reactors", ",".join(names), "--speed", "60", "--od", "0.5"]) as emulator:
+    with (
+        EmulatorProcess(["--reactors", ",".join(names), "--speed", "60", "--od", "0.5"]) as emulator,
+        ExitStack() as own,
+    ):
         config = ChiBioConfig(url=emulator.url, speed=60.0, reactors=names)
-        transport, clock = open_transport(config.transport, config.url, config.speed), DeviceClock(config.speed)
+        transport = own.enter_context(open_transport(config.transport, config.url, config.speed))
+        clock = DeviceClock(config.speed)
         checks = preflight(transport, clock, config, [ReactorCalibration()] * 3)
         assert all(check.ok or not check.required for check in checks), "\n".join(map(str, checks))
         rows: list[dict[str, object]] = []
@@ -283,7 +291,6 @@ def test_three_reactors_over_http_at_speed_60() -> None:
             reactors.actuate(Command(m.fresh, np.where(m.fresh, rate, 0.0), np.full(3, 37.0)))
             samples += m.fresh
         reactors.stop()
-        transport.close()
     assert np.all(samples >= 4)
     acted = [(r["reactor"], *r["sample"]) for r in rows if r["kind"] == "intent"]  # type: ignore[misc]
     assert len(set(acted)) == len(acted)

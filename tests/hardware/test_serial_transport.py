@@ -10,7 +10,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -154,8 +154,8 @@ def test_one_client_per_line_and_no_line_at_all(board: Callable[..., Board], tmp
         SerialTransport(str(b.port), config=config(b.port))
     link.close()
     SerialTransport(str(b.port), config=config(b.port)).close()
-    with pytest.raises(LinkError, match="check cable and port name"):
-        open_transport(config(tmp_path / "ttyACM9"), "")
+    with pytest.raises(LinkError, match="check cable and port name"), open_transport(config(tmp_path / "ttyACM9"), ""):
+        pass
 
 
 class Cable:
@@ -239,18 +239,18 @@ def wired(folder: Path, *words: str) -> Iterator[tuple[Cable, EmulatorProcess]]:
 
 def test_the_agents_reduced_state_is_a_state(cable: tuple[Cable, EmulatorProcess]) -> None:
     line, _ = cable
-    link = open_transport(config(line.pc), "")
-    link.post("/changeDevice/M1")
-    body = link.get("/getSysdata/").body
+    with open_transport(config(line.pc), "") as link:
+        link.post("/changeDevice/M1")
+        body = link.get("/getSysdata/").body
     assert len(body) < 1500
     assert parse_state(body).selected == "M1"
-    link.close()
 
 
 def test_a_run_over_a_noisy_line_that_is_unplugged_for_a_while(cable: tuple[Cable, EmulatorProcess]) -> None:
     line, _ = cable
     settings = ChiBioConfig(speed=60.0, reactors=("M0", "M1"), transport=config(line.pc, connect_s=3.0, read_s=20.0))
-    transport = open_transport(settings.transport, settings.url, 60.0)
+    own = ExitStack()
+    transport = own.enter_context(open_transport(settings.transport, settings.url, 60.0))
     rows: list[dict[str, object]] = []
     reactors = ChiBioReactors(transport, DeviceClock(60.0), settings, log=lambda k, f: rows.append({"kind": k, **f}))
     reactors.begin()
@@ -268,7 +268,7 @@ def test_a_run_over_a_noisy_line_that_is_unplugged_for_a_while(cable: tuple[Cabl
             plugged = reactors.elapsed()
             line.plug()
     reactors.stop()
-    transport.close()
+    own.close()
     assert len([t for t in samples if t < cut]) >= 5
     assert not [t for t in samples if cut + 1.0 < t < plugged]
     back = [t for t in samples if t > plugged + 90.0]  # two a minute again, of which noise may cost some
