@@ -38,11 +38,6 @@ def plant_preset(name: str) -> PlantConfig:
     return replace(plant, pump=replace(plant.pump, dosing="pulse"))
 
 
-BOOT_S = 8.0  # from a dead worker to a serving one
-REQUEST_S = 0.005  # what any request takes
-WORKER_TIMEOUT_S = 30.0  # gunicorn kills a worker whose request takes longer
-
-
 @dataclass(frozen=True)
 class DeviceOptions:
     """How the emulated device is built."""
@@ -104,7 +99,7 @@ class ChiBioDevice:
             plant = Plant(o.plant, 1, [plant_stream], tube_ml)
             plant.reset(start_od, temperature)
             self.vials[name] = Vial(plant, o.vial, vial_stream, clock.now())
-        self.supervisor = Supervisor(self.computer, self.vials, BOOT_S, REQUEST_S, WORKER_TIMEOUT_S)
+        self.supervisor = Supervisor(self.computer, self.vials)
         for name, vial in self.vials.items() if blanked else ():
             self.apps[name].data["OD0"]["target"] = round(vial.spectrometer.blank)
 
@@ -112,8 +107,6 @@ class ChiBioDevice:
     def apps(self) -> dict[str, ReactorApp]:
         """What the software that runs, or ran last, holds of each position M0 to M7."""
         return self.supervisor.worker.software.apps
-
-    # -- events ----------------------------------------------------------------------------------------------------
 
     def next_time(self) -> float:
         """When the next event is due, device s; inf if none."""
@@ -152,8 +145,6 @@ class ChiBioDevice:
         self.supervisor.kill_worker()
         yield from ()
 
-    # -- requests --------------------------------------------------------------------------------------------------
-
     def submit(self, method: str, path: str, headers: Mapping[str, str] | None = None) -> Exchange:
         """Hand a request to the server; run events until `done` to get its answer."""
         exchange = Exchange(method, path, headers or {})
@@ -184,11 +175,8 @@ class ChiBioDevice:
             self.run_until(self.clock.now())
         if exchange.answer is None:
             raise ConnectionError(exchange.fate)
-        return exchange.answer[0], exchange.answer[1]
-
-    # -- truth -----------------------------------------------------------------------------------------------------
+        return exchange.answer[:2]
 
     def truth(self, name: str) -> dict[str, Any]:
         """What only the emulator knows of one reactor. Raises: KeyError for a position without one."""
-        now = self._events.now
-        return {"device_s": now} | self.vials[name].truth(now)
+        return {"device_s": self._events.now} | self.vials[name].truth(self._events.now)

@@ -43,7 +43,7 @@ class Experiment:
             yield from self._outputs.everything_off()
             yield from self._outputs.set_on("Thermostat", 1)
             yield BUS_S
-            self._position.computer.spawn(self._cycle(), f"{self._position.name}/Experiment")
+            self._position.spawn(self._cycle(), "Experiment")
             return
         experiment["ON"] = 0
         data["OD"]["ON"] = 0
@@ -93,7 +93,7 @@ class Experiment:
         yield from self._outputs.set_on(data["Light"]["Excite"], 0)
         self._position.terminal(f"Cycle {experiment['cycles']} Complete")
         if experiment["ON"] and experiment["threadCount"] == mine:
-            computer.spawn(self._cycle(), f"{self._position.name}/Experiment")
+            self._position.spawn(self._cycle(), "Experiment")
         else:
             yield from self._finish()
 

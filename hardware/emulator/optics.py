@@ -5,13 +5,13 @@ from collections.abc import Generator
 
 from hardware.emulator.computer import AppError, Steps
 from hardware.emulator.outputs import Outputs, Position, store_target
-from hardware.emulator.sysdata import SLOTS, SysData
+from hardware.emulator.sysdata import SLOTS
 
 __all__ = ["Optics"]
 
 EXPOSURE_S = 0.97  # one spectrometer reading
 FLUORESCENCE_S = 1.0  # LED on, one reading, LED off
-EXCITES, SHINES = "LEDA", "nm440"  # of pyoverdine: 395 nm in, 440 nm out (docs/plant.md, Two species)
+PYOVERDINE = ("LEDA", "nm440")  # 395 nm in, 440 nm out (docs/plant.md, Two species)
 DARK_BASE = 120.0  # counts of the base band where no culture fluoresces
 BASE = 20000.0  # and where one does
 
@@ -52,7 +52,8 @@ class Optics:
                 self._position.hardware()
                 yield FLUORESCENCE_S
                 base, light = self._light()
-                first, second = (light if self._shines(slot, band) else 0.0 for band in ("Emit1Band", "Emit2Band"))
+                bands = (slot["Emit1Band"], slot["Emit2Band"])
+                first, second = (light if (slot["LED"], band) == PYOVERDINE else 0.0 for band in bands)
                 slot.update({"Base": base, "Emit1": first / base, "Emit2": second / base})
 
     def _light(self) -> tuple[float, float]:
@@ -62,10 +63,6 @@ class Optics:
             return 1.0, 0.0
         light = vial.fluorescence(self._position.computer.now())
         return (DARK_BASE, 0.0) if math.isnan(light) else (BASE, light)
-
-    @staticmethod
-    def _shines(slot: SysData, band: str) -> bool:
-        return (slot["LED"], slot[band]) == (EXCITES, SHINES)
 
     def calibrate(self, item: str, raw: float, od: float) -> None:
         """`CalibrateOD`: the zero with which `raw` reads as `od` (docs/device.md, OD measurement)."""

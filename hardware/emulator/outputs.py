@@ -39,6 +39,10 @@ class Position:
         """One line in the web page's log."""
         add_terminal(self.data, self.computer.stamp(), text)
 
+    def spawn(self, steps: Steps, what: str) -> None:
+        """Start the reactor's thread `what`."""
+        self.computer.spawn(steps, f"{self.name}/{what}")
+
     def hardware(self) -> Vial:
         """The reactor behind the bus. Raises: BusStuck, ProcessDied (absent or unplugged reactor)."""
         self.computer.bus(self.name)
@@ -108,11 +112,11 @@ class Outputs:
         elif item == "LASER650":
             self._position.hardware().spectrometer.set_laser(output["target"] * output["ON"] > 0, now)
         elif item == "Thermostat":
-            self._start_thermostat()
+            self._position.spawn(self._thermostat(), item)
         elif item in PUMPS:
             if output["target"] == 0:
                 output["ON"] = 0
-            self._start_pump(item)
+            self._position.spawn(self._period(item), item)
         elif item == "OD":
             yield from self.set_on("Pump1", 0)
             yield from self.set_on("Pump2", 0)
@@ -145,9 +149,6 @@ class Outputs:
         for item in ("Stir", "Thermostat", "Heat", "UV", *PUMPS):
             yield from self.set_on(item, 0)
 
-    def _start_thermostat(self) -> None:
-        self._position.computer.spawn(self._thermostat(), f"{self._position.name}/Thermostat")
-
     def _thermostat(self) -> Steps:
         """`Thermostat`: one step of the PI law with feed-forward, every 30 s (docs/device.md, Thermostat)."""
         data, thermostat, heat = self._position.data, self._position.data["Thermostat"], self._position.data["Heat"]
@@ -173,13 +174,10 @@ class Outputs:
         yield from self._apply("Heat")
         yield step
         if thermostat["ON"] == 1 and mine == self._thermostats:
-            self._start_thermostat()
+            self._position.spawn(self._thermostat(), "Thermostat")
         else:
             heat["ON"], heat["target"] = 0, 0
             yield from self._apply("Heat")
-
-    def _start_pump(self, item: str) -> None:
-        self._position.computer.spawn(self._period(item), f"{self._position.name}/{item}")
 
     def _period(self, item: str) -> Steps:
         """`PumpModulation`: one period of 63 s; a newer thread of the same pump takes over.
@@ -212,4 +210,4 @@ class Outputs:
         if pause > 0.0:
             yield pause
         if pump["ON"] == 1 and mine == self._pump_threads[item]:
-            self._start_pump(item)
+            self._position.spawn(self._period(item), item)

@@ -12,7 +12,6 @@ from hardware.errors import LinkError
 
 __all__ = ["EmulatorProcess"]
 
-
 START_S = 60.0
 
 
@@ -43,13 +42,12 @@ class EmulatorProcess:
 
     def close(self) -> None:
         """End it. Idempotent."""
-        if self._process.poll() is None:
-            self._process.terminate()
-            try:
-                self._process.wait(5.0)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+        self._process.terminate()
+        try:
+            self._process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
         if self._process.stdout is not None:
             self._process.stdout.close()
 

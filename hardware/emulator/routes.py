@@ -49,16 +49,6 @@ class Route(NamedTuple):
     run: Callable[..., Steps | None]
 
 
-def _set_target(s: Software, item: str, m: str, value: str) -> Steps:
-    number = float(value)
-    yield from s.app(m).outputs.set_target(item, number)
-
-
-def _set_on(s: Software, item: str, force: str, m: str) -> Steps:
-    number = int(force)
-    yield from s.app(m).outputs.set_on(item, number)
-
-
 def _change(s: Software, m: str) -> None:
     if s.apps[m].data["present"] == 1:
         s.select(m)
@@ -132,8 +122,8 @@ ROUTES = (
     Route("GET", "/getSysdata/", lambda s: None),
     Route("POST", "/changeDevice/*", _change),
     Route("POST", "/scanDevices/*", _scan),
-    Route("POST", "/SetOutputTarget/*/*/*", _set_target),
-    Route("POST", "/SetOutputOn/*/*/*", _set_on),
+    Route("POST", "/SetOutputTarget/*/*/*", lambda s, item, m, value: s.app(m).outputs.set_target(item, float(value))),
+    Route("POST", "/SetOutputOn/*/*/*", lambda s, item, force, m: s.app(m).outputs.set_on(item, int(force))),
     Route("POST", "/Direction/*/*", _direction),
     Route("POST", "/MeasureOD/*", lambda s, m: s.app(m).optics.measure_od()),
     Route("POST", "/CalibrateOD/*/*/*/*", _calibrate),

@@ -20,8 +20,10 @@ import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer, ThreadingHTTPServer
 from types import FrameType
+from typing import Any
 
 import numpy as np
 
@@ -53,7 +55,7 @@ class EmulatorServer:
         self._web: _DevicePort | None = _DevicePort((host, port), self)
         self.port = int(self._web.server_address[1])
         try:
-            self._control = _ControlPort((host, control_port), self)
+            self._control = ThreadingHTTPServer((host, control_port), partial(_Handler, self))
         except OSError as problem:
             self._web.server_close()
             raise OSError(problem.errno, f"control port {control_port}: {problem.strerror}") from problem
@@ -147,10 +149,9 @@ class _DevicePort(HTTPServer):
     request_queue_size = 64
 
     def __init__(self, address: tuple[str, int], owner: EmulatorServer) -> None:
-        self.owner = owner
         self.fates: dict[socket.socket, str] = {}
         self.held: list[socket.socket] = []
-        super().__init__(address, _DeviceHandler)
+        super().__init__(address, partial(_Handler, owner))
 
     def shutdown_request(self, request: socket.socket | tuple[bytes, socket.socket]) -> None:
         assert isinstance(request, socket.socket)
@@ -174,19 +175,14 @@ class _DevicePort(HTTPServer):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
 
-class _ControlPort(ThreadingHTTPServer):
-    daemon_threads = True
-
-    def __init__(self, address: tuple[str, int], owner: EmulatorServer) -> None:
-        self.owner = owner
-        super().__init__(address, _ControlHandler)
-
-
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "gunicorn", ""
     timeout = CLIENT_PATIENCE_S
-    server: _DevicePort | _ControlPort
+
+    def __init__(self, owner: EmulatorServer, *connection: Any) -> None:
+        self._owner = owner
+        super().__init__(*connection)
 
     def log_message(self, format: str, *args: object) -> None:
         """Silent: thousands of requests a day."""
@@ -202,33 +198,14 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(b"" if self.command == "HEAD" else body[: len(body) - cut])
 
-    def _control(self) -> None:
-        status, body = self.server.owner.control(self.command, self.path)
-        self._send(status, body, {"Content-Type": "application/json" if status == 200 else "text/plain"})
-
-    def _read_body(self) -> None:
+    def do_GET(self) -> None:
         length = self.headers.get("Content-Length", "0")
         self.rfile.read(min(int(length), 65536) if length.isdigit() else 0)
-
-
-class _ControlHandler(_Handler):
-    def do_GET(self) -> None:
-        self._read_body()
-        self._control()
-
-    do_POST = do_GET
-
-
-class _DeviceHandler(_Handler):
-    server: _DevicePort
-
-    def do_GET(self) -> None:
-        self._read_body()
-        if self.path.startswith(PREFIX):
-            self._control()
+        if not isinstance(self.server, _DevicePort) or self.path.startswith(PREFIX):
+            status, body = self._owner.control(self.command, self.path)
+            self._send(status, body, {"Content-Type": "application/json" if status == 200 else "text/plain"})
             return
-        owner = self.server.owner
-        exchange = owner.exchange(self.command, self.path, dict(self.headers.items()))
+        exchange = self._owner.exchange(self.command, self.path, dict(self.headers.items()))
         self.close_connection = True
         if exchange.answer is not None:
             self._send(*exchange.answer, cut=exchange.cut)
@@ -236,9 +213,6 @@ class _DeviceHandler(_Handler):
             self.server.fates[self.connection] = exchange.fate or "reset"
 
     do_POST = do_HEAD = do_PUT = do_DELETE = do_PATCH = do_OPTIONS = do_GET
-
-
-# -- command line --------------------------------------------------------------------------------------------------
 
 
 def parser() -> argparse.ArgumentParser:

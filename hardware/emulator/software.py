@@ -44,9 +44,9 @@ class Software:
     def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:
         self.computer, self.selected = computer, "M0"
         self._reactors = tuple(vials)
-        identities = {name: device_id(name, computer.unit) for name in ALL_REACTORS}
         self.apps = {
-            name: ReactorApp(name, computer, vials.get(name), identities[name], self.selected) for name in ALL_REACTORS
+            name: ReactorApp(name, computer, vials.get(name), device_id(name, computer.unit), self.selected)
+            for name in ALL_REACTORS
         }
 
     def app(self, name: str) -> ReactorApp:

@@ -12,19 +12,20 @@ __all__ = ["REQUEST", "Supervisor", "WebWorker"]
 
 REQUEST = "request"  # owner of the events of the request being served
 ERROR_PAGE = b"<!doctype html>\n<title>500 Internal Server Error</title>\n<h1>Internal Server Error</h1>\n"
+BOOT_S = 8.0  # from a dead worker to a serving one
+REQUEST_S = 0.005  # what any request takes
+WORKER_TIMEOUT_S = 30.0  # gunicorn kills a worker whose request takes longer
 POWER_LATCH_S = 1.0  # the watchdog cuts power about a second after the software stopped
 
 
 class WebWorker:
     """The worker and the requests that wait for it.
 
-    Args: request_s: what any request takes; timeout_s: how long one may take.
     `software` is what it runs, `ready` whether it serves, `deadline` when the request being served has taken too long.
     """
 
-    def __init__(self, software: Software, request_s: float, timeout_s: float) -> None:
+    def __init__(self, software: Software) -> None:
         self.software, self.ready, self.deadline = software, True, 0.0
-        self._request_s, self._timeout_s = request_s, timeout_s
         self._waiting: deque[Exchange] = deque()
         self._serving: Exchange | None = None
 
@@ -53,14 +54,13 @@ class WebWorker:
         if self.ready and self._serving is None and self._waiting:
             self._serving = self._waiting.popleft()
             computer = self.software.computer
-            self.deadline = computer.now() + self._timeout_s
+            self.deadline = computer.now() + WORKER_TIMEOUT_S
             computer.spawn(self._serve(self._serving), REQUEST)
 
     def _serve(self, exchange: Exchange) -> Steps:
-        computer = self.software.computer
-        faults = computer.faults
+        computer, faults = self.software.computer, self.software.computer.faults
         hang, faults.hang_s = faults.hang_s, 0.0
-        yield self._request_s + hang
+        yield REQUEST_S + hang
         self.software.foreign_select()
         try:
             answer = yield from answer_request(self.software, exchange)
@@ -82,18 +82,15 @@ class WebWorker:
 class Supervisor:
     """Keeps one process of the software running, or none.
 
-    Args:
-      vials: whose power it switches. boot_s: from a dead worker to a serving one. request_s, timeout_s: as `WebWorker`.
+    Args: vials: whose power it switches.
     `alive` is whether anybody listens; `restarts` and `exits` count.
     """
 
-    def __init__(
-        self, computer: Computer, vials: Mapping[str, Vial], boot_s: float, request_s: float, timeout_s: float
-    ) -> None:
-        self._computer, self._vials, self._boot_s = computer, vials, boot_s
+    def __init__(self, computer: Computer, vials: Mapping[str, Vial]) -> None:
+        self._computer, self._vials = computer, vials
         self.alive = True
         self.restarts = self.exits = 0
-        self.worker = WebWorker(self._started(), request_s, timeout_s)
+        self.worker = WebWorker(self._started())
 
     def _started(self) -> Software:
         """Import of the app: every position initialised, power on, all outputs off."""
@@ -127,7 +124,7 @@ class Supervisor:
     def _start_soon(self) -> None:
         self.restarts += 1
         events = self._computer.events
-        events.add(self._boot_s, self._boot(events.life), HARDWARE, "boot")
+        events.add(BOOT_S, self._boot(events.life), HARDWARE, "boot")
 
     def _boot(self, life: int) -> Steps:
         if life == self._computer.events.life and self.alive:

@@ -191,8 +191,6 @@ class Vial:
         self._motors = dict.fromkeys(self.on_s, 0)
         self._since: dict[str, tuple[float, float]] = {}
 
-    # -- motors, heater, stirrer -----------------------------------------------------------------------------------
-
     def motor(self, pump: str) -> int:
         """What the motor really does: 1, -1 or 0."""
         if not self.powered or self.faults.unplugged:
@@ -268,8 +266,6 @@ class Vial:
             self._stirred_at = at
         self.stir = power if self.powered and not self.faults.stirrer_dead else 0.0
 
-    # -- the culture -----------------------------------------------------------------------------------------------
-
     def sync(self, at: float) -> None:
         """Bring the plant up to device time `at`."""
         while at - self._at > 1e-9:
@@ -298,8 +294,6 @@ class Vial:
         )
         self._at += seconds
         self.peak_ml = max(self.peak_ml, float(plant.vessel.volume_ml[0]))
-
-    # -- sensors ---------------------------------------------------------------------------------------------------
 
     def temperature(self, which: str, at: float) -> float:
         """Reading of a thermometer, degC: IR (culture, 0.02 degC steps), Internal or External (air, 1/16 degC)."""
