@@ -84,7 +84,7 @@ def environment(package: str = PUBLISHED, folder: str = "") -> Path:
         variables = {k: v for k, v in os.environ.items() if k not in ours}
         ran = subprocess.run(command, capture_output=True, text=True, check=False, env=variables)
         if ran.returncode:
-            said = (ran.stderr.strip() or ran.stdout.strip() or "no word").splitlines()[-1]
-            raise DeviceStateError(f"the rig cannot be built: {said}; try {' '.join(command)}")
+            reason = (ran.stderr.strip() or ran.stdout.strip() or "no word").splitlines()[-1]
+            raise DeviceStateError(f"the rig cannot be built: {reason}; try {' '.join(command)}")
     (env / "done").touch()
     return env

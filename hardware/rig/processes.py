@@ -57,7 +57,7 @@ class Rig:
         env = environment(c.package, c.folder)
         self._bin, self.version = env / "bin", version(env)
         self.folder = Path(tempfile.mkdtemp(prefix="pioreactor-rig-"))
-        self.broker, self.port = _free_port("127.0.0.1"), _free_port("127.0.0.1")
+        self.broker, self.port = _free_port(), _free_port()
         self.hosts = {unit: f"127.0.0.{k}" for k, unit in enumerate(self.units, 1)}
         self.web = {unit: f"http://{host}:{self.port}" for unit, host in self.hosts.items()}
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -195,21 +195,17 @@ def _end_with_us() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
-def _free_port(host: str) -> int:
+def _free_port() -> int:
     with socket.socket() as probe:
-        probe.bind((host, 0))
+        probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def _listens(host: str, port: int) -> bool:
-    with contextlib.suppress(OSError), socket.create_connection((host, port), 0.5):
-        return True
-    return False
 
 
 def _wait(host: str, port: int, what: str) -> None:
     deadline = time.monotonic() + BOOT_S
-    while not _listens(host, port):
+    while True:
+        with contextlib.suppress(OSError), socket.create_connection((host, port), 0.5):
+            return
         if time.monotonic() > deadline:
             raise DeviceStateError(f"{what} of the rig did not start within {BOOT_S:.0f} s; look at its log")
         time.sleep(0.1)

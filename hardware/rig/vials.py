@@ -104,10 +104,9 @@ class _Vial:
             self._since[pin] = (now, fed)
         if duty == 0.0 and was > 0.0:
             start, had = self._since.pop(pin)
-            pump = "media" if pin == MEDIA else "waste"
-            pulse = Pulse(self.unit, pump, start, now - start, fed - had if pin == MEDIA else 0.0)
-            self.pulses.append(pulse)
-            self._log({"unit": pulse.unit, "pump": pump, "start": start, "s": pulse.seconds, "ml": pulse.feed_ml})
+            pump, ml = ("media", fed - had) if pin == MEDIA else ("waste", 0.0)
+            self.pulses.append(Pulse(self.unit, pump, start, now - start, ml))
+            self._log({"unit": self.unit, "pump": pump, "start": start, "s": now - start, "ml": ml})
         self.duty[pin] = duty
 
     def truth(self) -> dict[str, Any]:
@@ -149,7 +148,7 @@ class VialServer:
         self._file.write(json.dumps({"wall": round(time.time(), 3), **row}) + "\n")
 
     def _serve(self) -> None:
-        told = 0.0
+        logged = 0.0
         while not self._ended.is_set():
             try:
                 data, sender = self._wire.recvfrom(4096)
@@ -164,9 +163,9 @@ class VialServer:
             with self._lock:
                 for vial in self.vials.values():
                     vial.sync(now)
-                    if now - told >= 1.0:
+                    if now - logged >= 1.0:
                         self._log({"unit": vial.unit, **vial.truth()})
-            told = now if now - told >= 1.0 else told
+            logged = now if now - logged >= 1.0 else logged
 
     def _answer(self, asked: Mapping[str, Any]) -> dict[str, Any]:
         now = time.time()

@@ -119,7 +119,7 @@ class Interlock:
         A step that nothing explains may be only where `jump` is no more than reported.
         """
         believed = self._readings.believed(measurement, np.asarray(measurement.fresh, dtype=np.bool_))
-        if self._response("jump") is Response.PASS:
+        if self.config.response("jump") is Response.PASS:
             return believed
         return believed & self._change.takes(measurement.od, measurement.time_s, believed)
 
@@ -146,21 +146,18 @@ class Interlock:
         limits = f"{self.config.composition_low:g} to {self.config.composition_high:g}"
         return Finding("temperature_limit", ~np.isnan(asked), lambda i: f"{asked[i]:.1f} degC asked, allowed {limits}")
 
-    def _response(self, kind: str) -> Response:
-        return self.config.response(kind)
-
     def _reported(self, m: Measurement) -> list[list[_Reason]]:
         """The faults that the reactors report themselves."""
         faults = m.vitals.faults if m.vitals is not None else (None,) * self.n
         return [
-            [_Reason(f.kind, self._response(f.kind), f"{f.detail}; {f.remedy}")] if f is not None else []
+            [_Reason(f.kind, self.config.response(f.kind), f"{f.detail}; {f.remedy}")] if f is not None else []
             for f in faults
         ]
 
     def _collect(self, found: list[list[_Reason]], findings: Sequence[Finding], now: float) -> None:
         """Add the findings to each reactor's reasons; some begin a while without a dose."""
         for finding in findings:
-            response = self._response(finding.kind)
+            response = self.config.response(finding.kind)
             for i in np.flatnonzero(finding.rows):
                 found[i].append(_Reason(finding.kind, response, finding.text(int(i))))
             if finding.cool is not None and response is not Response.PASS:
@@ -178,8 +175,9 @@ class Interlock:
 
     def _conclude(self, found: list[list[_Reason]], allowed: Array, setpoint: Array) -> Verdict:
         """The most severe response per reactor, never below what is latched."""
-        worst = [max((reason.response for reason in reasons), default=0) for reasons in found]
-        response = np.array(worst, dtype=np.int64)
+        response = np.array(
+            [max((reason.response for reason in reasons), default=0) for reasons in found], dtype=np.int64
+        )
         self._latched = np.where(response >= Response.REGULATE, np.maximum(self._latched, response), self._latched)
         response = np.maximum(response, self._latched.astype(np.int64))
         lines: list[str | None] = []
@@ -206,8 +204,6 @@ class Interlock:
     def latch(self, response: Response, rows: Mask) -> None:
         """Never respond with less than this for `rows`, shape (N,), in this run."""
         self._latched = np.where(rows, np.maximum(self._latched, float(response)), self._latched)
-
-    # ------------------------------------------------------------------------------------------------------ resume
 
     def state(self) -> dict[str, Any]:
         """Everything it remembers, as plain lists; times are those given to `check`, so give it run time."""

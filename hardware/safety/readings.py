@@ -51,33 +51,34 @@ class Readings:
         """The fresh rows whose reading may be believed, and what is wrong with the others."""
         findings = self._ages(m, fresh, now)
         od, raw = m.od, self._raw(m)
-        broken, impossible, frozen, repeats = self._doubts(m, fresh)
+        believed, broken, impossible, frozen, repeats = self._judge(m, fresh)
         self._seen, self._repeats = np.where(fresh, od, self._seen), repeats
         findings += [
             Finding("spectrometer", broken, lambda i: f"OD {od[i]:.2f}, raw {raw[i]:.0f}: the light sensor failed"),
             Finding("impossible", impossible, lambda i: f"OD {od[i]:.3f}, raw {raw[i]:.0f}: outside what can be"),
             Finding("frozen", frozen, lambda i: f"OD exactly {od[i]:.6f} in {repeats[i] + 1:.0f} samples"),
         ]
-        return np.asarray(fresh & ~broken & ~impossible & ~frozen, dtype=np.bool_), findings
+        return believed, findings
 
     def believed(self, m: Measurement, fresh: Mask) -> Mask:
         """The fresh rows whose reading `check` would say may be believed; changes nothing."""
-        broken, impossible, frozen, _ = self._doubts(m, fresh)
-        return np.asarray(fresh & ~broken & ~impossible & ~frozen, dtype=np.bool_)
+        return self._judge(m, fresh)[0]
 
     def _raw(self, m: Measurement) -> Array:
         """Counts; without a device there are none, and they pass."""
         return m.vitals.raw if m.vitals is not None else np.full(len(m.od), RAW_MIN)
 
-    def _doubts(self, m: Measurement, fresh: Mask) -> tuple[Mask, Mask, Mask, Array]:
-        """Fresh rows whose sensor failed, that no culture can read, that are frozen; equal samples in a row, of all."""
+    def _judge(self, m: Measurement, fresh: Mask) -> tuple[Mask, Mask, Mask, Mask, Array]:
+        """Fresh rows to be believed, whose sensor failed, that no culture can read, that are frozen; equal samples in a
+        row, of all."""
         c, od, raw = self._config, m.od, self._raw(m)
         with np.errstate(invalid="ignore"):
             broken = fresh & ((od > 10.0) | (raw < RAW_MIN))
             impossible = fresh & ~broken & ~((od > c.od_min) & (od < c.od_max) & (raw <= RAW_MAX))  # also nan
             repeats = np.where(fresh, np.where(od == self._seen, self._repeats + 1, 0), self._repeats)
         frozen = fresh & ~broken & ~impossible & (repeats >= FROZEN_SAMPLES - 1)
-        return broken, impossible, frozen, repeats
+        believed = np.asarray(fresh & ~broken & ~impossible & ~frozen, dtype=np.bool_)
+        return believed, broken, impossible, frozen, repeats
 
     def _ages(self, m: Measurement, fresh: Mask, now: float) -> list[Finding]:
         """How old the newest sample is, on this computer's clock or by what the driver says, whichever is more."""

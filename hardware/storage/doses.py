@@ -37,9 +37,8 @@ class Given:
 
     def row(self, why: str) -> dict[str, Any]:
         """As the journal keeps what was given beside the doses that were commanded."""
-        pump = {"pump": self.pump} if self.pump else {}
-        low_ml = {"feed_low_ml": self.low_ml}
-        return {"at_s": self.at_s, "why": why, "feed_ml": self.feed_ml, **low_ml, "waste_ml": self.waste_ml, **pump}
+        volumes = {"feed_ml": self.feed_ml, "feed_low_ml": self.low_ml, "waste_ml": self.waste_ml}
+        return {"at_s": self.at_s, "why": why, **volumes, **({"pump": self.pump} if self.pump else {})}
 
 
 @dataclass(frozen=True)
@@ -142,44 +141,34 @@ def dosed(rows: Sequence[Mapping[str, Any]]) -> list[Dosed]:
 
     Args: rows: of a journal, oldest first. Raises: RecordingError for a row that is not as the driver wrote it.
     """
-    ledger = _Ledger()
+    given: dict[int, Dosed] = {}  # by the row of the intent
+    begun: dict[str, Dosed] = {}  # by reactor, the one that has not ended
+    repeated: list[Dosed] = []
     for row in rows:
-        if row.get("kind") in ("intent", "feed_on", "dose_end", "given"):
-            try:
-                ledger.take(row)
-            except (KeyError, TypeError, ValueError) as error:
-                raise damaged(row, error) from None
-    return sorted([*ledger.given.values(), *ledger.repeated], key=lambda d: d.at_s)
+        if (kind := row.get("kind")) not in ("intent", "feed_on", "dose_end", "given"):
+            continue
+        try:
+            name = str(row["reactor"])
+            if kind == "intent":
+                begun[name] = Dosed(row["n"], name, *_moved(row, "on_s"), pump=FEEDS[feeds_by(row)])
+            elif kind == "feed_on" and name in begun:
+                given[begun[name].n] = begun[name]
+            elif kind == "given":  # beside our doses; earlier journals do not say the pump
+                repeated.append(Dosed(row["n"], name, *_moved(row, "at_s"), again=True, pump=int(row.get("pump", 1))))
+            elif kind == "dose_end" and "feed_times" in row:
+                ending, pump = Ending.of_row(row), 1
+                if (ended := begun.pop(name, None)) is not None:
+                    pump = ended.pump
+                    given[ended.n] = replace(ended, at_s=ending.on_s, feed_ml=ending.feed_ml, waste_ml=ending.waste_ml)
+                repeated += [Dosed(row["n"], name, *one, again=True, pump=pump) for one in ending.repeats()]
+        except (KeyError, TypeError, ValueError) as error:
+            raise damaged(row, error) from None
+    return sorted([*given.values(), *repeated], key=lambda d: d.at_s)
 
 
-class _Ledger:
-    """Doses by the row of their intent, their repetitions, and by reactor the one that has not ended."""
-
-    def __init__(self) -> None:
-        self.given: dict[int, Dosed] = {}
-        self.repeated: list[Dosed] = []
-        self._begun: dict[str, Dosed] = {}
-
-    def take(self, row: Mapping[str, Any]) -> None:
-        """Enter what one row says."""
-        kind, name = row["kind"], str(row["reactor"])
-        if kind == "intent":
-            volumes = float(row["feed_ml"]), float(row["waste_ml"])
-            number = FEEDS[feeds_by(row)]
-            self._begun[name] = Dosed(row["n"], name, float(row["on_s"]), *volumes, pump=number)
-        elif kind == "feed_on" and name in self._begun:
-            self.given[self._begun[name].n] = self._begun[name]
-        elif kind == "given":  # beside our doses
-            volumes = float(row["feed_ml"]), float(row["waste_ml"])
-            pump = int(row.get("pump", 1))  # earlier journals do not say it
-            self.repeated.append(Dosed(row["n"], name, float(row["at_s"]), *volumes, again=True, pump=pump))
-        elif kind == "dose_end" and "feed_times" in row:
-            ending = Ending.of_row(row)
-            dose = self._begun.pop(name, None)
-            if dose is not None:
-                self.given[dose.n] = replace(dose, at_s=ending.on_s, feed_ml=ending.feed_ml, waste_ml=ending.waste_ml)
-            pump = 1 if dose is None else dose.pump
-            self.repeated += [Dosed(row["n"], name, *one, again=True, pump=pump) for one in ending.repeats()]
+def _moved(row: Mapping[str, Any], when: str) -> tuple[float, float, float]:
+    """Run time, s, and volumes of feed and waste, mL, of a row."""
+    return float(row[when]), float(row["feed_ml"]), float(row["waste_ml"])
 
 
 def damaged(row: Mapping[str, Any], error: Exception) -> RecordingError:

@@ -32,12 +32,8 @@ def add_mark(folder: Path, mark: Mark) -> Path:
     """
     written = datetime.now().astimezone().isoformat(timespec="seconds")
     with Recorder(folder / NAME, COLUMNS) as file:
-        file.write(
-            {
-                "time_min": round(mark.time_min, 3), "reactor": mark.reactor, "text": mark.text, "written": written,
-                "level_ml": "" if mark.level_ml is None else mark.level_ml,
-            }
-        )  # fmt: skip
+        cells = (round(mark.time_min, 3), mark.reactor, mark.text, written, mark.level_ml)
+        file.write(dict(zip(COLUMNS, cells, strict=True)))
     return folder / NAME
 
 
@@ -49,13 +45,8 @@ def read_marks(folder: Path) -> list[Mark]:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             return [
-                Mark(
-                    float(row["time_min"]),
-                    row["reactor"],
-                    row["text"],
-                    float(level) if (level := row.get("level_ml")) else None,
-                )
-                for row in csv.DictReader(file)
+                Mark(float(r["time_min"]), r["reactor"], r["text"], float(r["level_ml"]) if r.get("level_ml") else None)
+                for r in csv.DictReader(file)
             ]
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise RecordingError(f"{path}: damaged ({type(error).__name__}: {error}); mend it or move it away") from None

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -118,11 +117,9 @@ class Recorder:
 
 
 def _cell(value: Value) -> str:
-    if value is None or (isinstance(value, float) and math.isnan(value)):
+    if value is None or value != value:
         return ""
-    if isinstance(value, float):
-        return repr(float(value))  # shortest text that reads back to the same number, also for NumPy scalars
-    return str(value)
+    return repr(float(value)) if isinstance(value, float) else str(value)  # a float is read back as the same number
 
 
 def _csv_line(cells: Sequence[str]) -> bytes:

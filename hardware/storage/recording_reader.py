@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,9 +138,8 @@ def read_recording(
     _note(notes, number[backward], "pump runs backwards: dropped, the rate before it is taken to go on")
     values, number, starts = values[~backward], number[~backward], starts[~backward]
     runs = _runs(values[:, 0], starts)
-    chosen = _choose_run(path, runs, number, run, notes)
-    _note(notes, number[chosen.stale], "time does not advance (repeated or backward): dropped")
-    keep = chosen.rows
+    keep, stale = _choose_run(path, runs, number, run, notes)
+    _note(notes, number[stale], "time does not advance (repeated or backward): dropped")
     od = _usable_od(path, values[keep, 1], number[keep], notes)
     return Recording(
         time_min=values[keep, 0],
@@ -189,10 +189,7 @@ def _cells(path: Path, lines: Sequence[str]) -> Iterator[tuple[int, list[str]]]:
         raise RecordingError(f"{path}: holds no data; expected a recording (time, OD and pump rate per row)")
     delimiter = next((d for d in ",;\t" if d in kept[0][1]), None)
     for i, line in kept:
-        if delimiter is None:
-            yield i, line.split()
-        else:
-            yield i, [cell.strip().strip('"') for cell in line.split(delimiter)]
+        yield i, [cell.strip().strip('"') for cell in line.split(delimiter)] if delimiter else line.split()
 
 
 def _layout(path: Path, first: Sequence[str], pump_ml_s: float, pumps: Sequence[int]) -> _Layout:
@@ -215,25 +212,24 @@ def _layout(path: Path, first: Sequence[str], pump_ml_s: float, pumps: Sequence[
 def _named_layout(path: Path, first: Sequence[str], pump_ml_s: float, pumps: Sequence[int]) -> _Layout:
     names = [re.sub(r"[^a-z0-9]+", "_", cell.lower()).strip("_") for cell in first]
 
-    def find(known: Iterable[str]) -> str | None:
-        return next((name for name in known if name in names), None)
+    def find(what: str, known: Iterable[str]) -> str:
+        if name := next((name for name in known if name in names), ""):
+            return name
+        raise RecordingError(
+            f"{path}: no column for the {what}; looked for {', '.join(known)}; found {', '.join(first)[:120]}"
+        )
 
-    duties = {pump: names.index(DUTY.format(pump)) for pump in PUMPS if DUTY.format(pump) in names}
-    pump_columns = (DUTY.format(1), *PUMP)
-    found = [find(TIME), find(OD), DUTY.format(1) if duties else find(PUMP)]
-    for what, known, name in zip(("time", "OD", "pump rate"), (TIME, OD, pump_columns), found, strict=True):
-        if name is None:
-            raise RecordingError(
-                f"{path}: no column for the {what}; looked for {', '.join(known)}; found {', '.join(first)[:120]}"
-            )
-    time, od, pump = (str(name) for name in found)
-    temperature, at = find(TEMPERATURE), names.index
-    fed, idle = _feeding(path, duties, pumps) if duties else ((at(pump),), {})
+    at, time, od = names.index, find("time", TIME), find("OD", OD)
+    duties = {pump: at(DUTY.format(pump)) for pump in PUMPS if DUTY.format(pump) in names}
+    if duties:
+        fed, idle = _feeding(path, duties, pumps)
+    else:
+        fed, idle = (at(find("pump rate", (DUTY.format(1), *PUMP))),), {}
     return _Layout(
         source="Chi.Bio CSV" if duties else "recording with header",
         time=at(time),
         od=at(od),
-        temperature=None if temperature is None else at(temperature),
+        temperature=next((at(name) for name in TEMPERATURE if name in names), None),
         pumps=fed,
         minutes=TIME[time],
         ml_s=pump_ml_s if duties else 1.0,
@@ -337,33 +333,27 @@ def _note_idle_pumps(layout: _Layout, values: Array, number: NDArray[np.int64], 
             _note(notes, ran, f"pump {pump} ran and is not counted; if it feeds the vial, name it in pumps=[...]")
 
 
-@dataclass(frozen=True, eq=False)
-class _Run:
+class _Run(NamedTuple):
     """Positions of the rows of one run, and of those left out because time did not advance."""
 
-    rows: NDArray[np.int64]
-    stale: NDArray[np.int64]
+    rows: list[int]
+    stale: list[int]
 
 
 def _runs(time: Array, starts: NDArray[np.bool_]) -> list[_Run]:
     """Split where a header is repeated or the clock starts again; single rows behind the clock are left out."""
-    runs: list[_Run] = []
-    rows: list[int] = []
-    stale: list[int] = []
+    runs = [_Run([], [])]
     for i, t in enumerate(time):
+        rows, stale = runs[-1]
         ahead = time[i : i + RESTART_ROWS]
         behind = bool(rows) and t <= time[rows[-1]]
         restarted = (
             behind and len(ahead) == RESTART_ROWS and bool((np.diff(ahead) > 0).all()) and ahead[-1] <= time[rows[-1]]
         )
-        if rows and (restarted or (starts[i] and behind)):
-            runs.append(_Run(np.array(rows), np.array(stale, dtype=np.int64)))
-            rows, stale = [i], []
-        elif behind:
-            stale.append(i)
+        if restarted or (starts[i] and behind):
+            runs.append(_Run([i], []))
         else:
-            rows.append(i)
-    runs.append(_Run(np.array(rows), np.array(stale, dtype=np.int64)))
+            (stale if behind else rows).append(i)
     return runs
 
 
