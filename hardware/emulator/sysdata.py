@@ -1,5 +1,6 @@
 """The device's memory: the sysData dictionary of one reactor as it is after `initialise()`, and its record lists."""
 
+from bisect import bisect_left
 from collections.abc import Iterator
 from typing import Any
 
@@ -149,11 +150,5 @@ def thin_records(data: SysData) -> None:
 
 def _nearest(times: list[float], wanted: float) -> int:
     """Index of the entry closest to `wanted` in an ascending list."""
-    low, high = 0, len(times) - 1
-    while low < high:
-        middle = (low + high) // 2
-        if times[middle] < wanted:
-            low = middle + 1
-        else:
-            high = middle
+    low = bisect_left(times, wanted, 0, len(times) - 1)
     return low - 1 if low > 0 and wanted - times[low - 1] < times[low] - wanted else low

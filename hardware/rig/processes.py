@@ -201,11 +201,15 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def _listens(host: str, port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection((host, port), 0.5):
+        return True
+    return False
+
+
 def _wait(host: str, port: int, what: str) -> None:
     deadline = time.monotonic() + BOOT_S
-    while True:
-        with contextlib.suppress(OSError), socket.create_connection((host, port), 0.5):
-            return
+    while not _listens(host, port):
         if time.monotonic() > deadline:
             raise DeviceStateError(f"{what} of the rig did not start within {BOOT_S:.0f} s; look at its log")
         time.sleep(0.1)

@@ -35,7 +35,7 @@ def real_broker(folder: Path, settings: str) -> Iterator[int]:
     pytest.importorskip("paho.mqtt.client", reason="pip install 'paho-mqtt>=2'")
     if (program := broker()) is None:
         pytest.skip("no MQTT broker: apt-get install mosquitto")
-    number, conf = _free_port("127.0.0.1"), folder / "mosquitto.conf"
+    number, conf = _free_port(), folder / "mosquitto.conf"
     conf.write_text(f"listener {number} 127.0.0.1\n{settings}\n", encoding="utf-8")
     with (folder / "log").open("wb") as log, subprocess.Popen([program, "-c", str(conf)], stdout=log, stderr=log) as p:
         try:

@@ -104,7 +104,7 @@ def test_an_answer_that_is_none_is_named_and_may_have_been_heard(server, body):
 
 
 def test_nobody_there_was_not_heard_and_one_who_is_silent_may_have(server):
-    port = _free_port("127.0.0.1")
+    port = _free_port()
     with pytest.raises(NotHeard):
         Web(f"http://127.0.0.1:{port}").run("add_media", {"ml": 0.5})
     server.status = 0
