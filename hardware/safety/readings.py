@@ -69,8 +69,7 @@ class Readings:
         return m.vitals.raw if m.vitals is not None else np.full(len(m.od), RAW_MIN)
 
     def _judge(self, m: Measurement, fresh: Mask) -> tuple[Mask, Mask, Mask, Mask, Array]:
-        """Fresh rows to be believed, whose sensor failed, that no culture can read, that are frozen; equal samples in a
-        row, of all."""
+        """Fresh rows: believed, of a failed sensor, that no culture reads, frozen; of all: equal samples in a row."""
         c, od, raw = self._config, m.od, self._raw(m)
         with np.errstate(invalid="ignore"):
             broken = fresh & ((od > 10.0) | (raw < RAW_MIN))
