@@ -10,16 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "REFERENCE_TEMPERATURE",
-    "Arrhenius",
-    "Cardinal",
-    "DilutedCulture",
-    "Exponential",
-    "GrowthLaw",
-    "Monod",
-    "relative_to_37",
-]
+__all__ = ["Arrhenius", "Cardinal", "DilutedCulture", "Exponential", "GrowthLaw", "Monod", "relative_to_37"]
 
 Array = NDArray[np.float64]
 
@@ -137,7 +128,7 @@ class DilutedCulture:
         """d[x, s]/dt in 1/min.
 
         Args: state: [x, s], shape (N, 2). pump_rate: u, mL/s, shape (N,), >= 0.
-        Returns: shape (N, 2). Raises: nothing.
+        Returns: shape (N, 2).
         """
         x, s = state[:, 0], state[:, 1]
         mu = self.law.specific_rate(s)

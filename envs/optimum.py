@@ -56,7 +56,6 @@ def solve_episode(config: EnvConfig, setpoint: float, spacing: float = SPACING) 
     """The least undiscounted cost of an episode of `config.episode_steps` steps at one setpoint, and how to reach it.
 
     Args: config: the task; its actions and its integrator are used as they are. setpoint: OD. spacing: of log OD.
-    Raises: nothing.
     """
     factors = step_factors(config)
     log_od = _reach(config, setpoint, factors, spacing)

@@ -73,16 +73,16 @@ class Scenario:
         object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
         object.__setattr__(self, "outputs", tuple(None if o is None or o != o else str(o) for o in self.outputs))
         check(self, "scenario")
+        for name in ("until", "outputs", "ratios"):
+            given, phases = getattr(self, name), len(self.setpoints)
+            allowed = f"none or one for each of the {phases} phases"
+            require(len(given) in (0, phases), f"scenario.{name}", given, allowed)
         self._check_until()
-        whole = len(self.outputs) in (0, len(self.setpoints))
-        require(whole, "scenario.outputs", self.outputs, f"none or one for each of the {len(self.setpoints)} phases")
         for text in self.outputs:
             outputs_of(text)
         self._check_composition()
 
     def _check_until(self) -> None:
-        whole = len(self.until) in (0, len(self.setpoints))
-        require(whole, "scenario.until", self.until, f"none or one for each of the {len(self.setpoints)} phases")
         for text in self.until:
             try:
                 Condition(text)
@@ -93,8 +93,6 @@ class Scenario:
             require(not self.composed, "scenario.until", self.until, why)
 
     def _check_composition(self) -> None:
-        whole = len(self.ratios) in (0, len(self.setpoints))
-        require(whole, "scenario.ratios", self.ratios, f"none or one for each of the {len(self.setpoints)} phases")
         if not self.ratio_sine:
             return
         require(not self.ratios, "scenario.ratios", self.ratios, "[] beside ratio_sine")

@@ -16,24 +16,11 @@ from numpy.typing import NDArray
 from conf.schema import require
 from envs.task import MAX_OD, EnvConfig, step_factors, tracking_reward
 
-__all__ = [
-    "BioreactorVectorEnv", "EpisodeSpec", "EpisodeStreams", "EpisodeVectorEnv", "action_space", "checked_actions",
-    "observation_space",
-]  # fmt: skip
+__all__ = ["BioreactorVectorEnv", "EpisodeSpec", "EpisodeStreams", "EpisodeVectorEnv", "checked_actions"]
 
 Array = NDArray[np.float64]
 C = TypeVar("C", bound=Any)  # the task's config dataclass
 EPISODES_PER_BLOCK = 64
-
-
-def observation_space() -> spaces.Box:
-    """[x, setpoint], OD without unit, shape (2,), float32, each >= 0; x is capped where no sensor reads further."""
-    return spaces.Box(low=0.0, high=np.array([MAX_OD, 2.0], dtype=np.float32), shape=(2,), dtype=np.float32)
-
-
-def action_space(n_actions: int) -> spaces.Discrete:
-    """Index into the pump rates, 0 (pump off) to n_actions - 1 (maximum rate)."""
-    return spaces.Discrete(n_actions)
 
 
 def checked_actions(actions: Any, shape: tuple[int, ...], n_actions: int) -> NDArray[np.intp]:
@@ -150,7 +137,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         self.num_envs = num_envs
         self.render_mode = None
         self.single_observation_space = self.observations(self.config)
-        self.single_action_space = action_space(self.config.n_actions)
+        self.single_action_space = spaces.Discrete(self.config.n_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.state = np.ones((num_envs, *self.single_observation_space.shape))
@@ -289,8 +276,8 @@ class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
 
     @staticmethod
     def observations(config: EnvConfig) -> spaces.Box:
-        """As `observation_space`."""
-        return observation_space()
+        """[x, setpoint], OD without unit, shape (2,), float32, each >= 0; x is capped where no sensor reads further."""
+        return spaces.Box(low=0.0, high=np.array([MAX_OD, 2.0], dtype=np.float32), shape=(2,), dtype=np.float32)
 
     def _prepare(self) -> None:
         self._factors = step_factors(self.config)

@@ -127,19 +127,19 @@ def _words(c: Compared) -> str:
     return f"{c.name} is off by 10 % or more {since}, by {c.off_pct(c.latest):+.0f} % at the end"
 
 
-def agreement(raw: Series, mu: float, tau: float, segment_min: float = SEGMENT_MIN) -> Agreement:
+def agreement(raw: Series, mu: float, tau: float) -> Agreement:
     """Compare a run with the model (mu in 1/min, tau) that it was planned with.
 
     Raises: ValueError when no trustworthy readings are left.
     """
     screened = screen(raw)
     clean = screened.series
-    along = segments(screened, segment_min, "prediction_error")
+    along = segments(screened, SEGMENT_MIN, "prediction_error")
     used = np.flatnonzero(np.isfinite(clean.od))
     log_change, error = _one_ahead(clean, screened, mu, tau)
     predicted = np.full(len(clean.od), np.nan)
     predicted[1:] = clean.od[:-1] * np.exp(log_change)
-    pieces = [p for first, end in screened.stretches for p in cuts(clean, first, end, segment_min)]
+    pieces = [p for first, end in screened.stretches for p in cuts(clean, first, end, SEGMENT_MIN)]
     means, left = [], np.full(len(error), np.nan)
     for a, b in pieces:
         means.append(_mean(error[a : b - 1], clean.time[a:b]))

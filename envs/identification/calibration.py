@@ -6,6 +6,7 @@ the numbers wander. Two methods: `prediction_error` holds whatever moves the pum
 """
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,13 +122,12 @@ class Calibration:
         return int(np.isfinite(self.inside.od).sum())
 
 
-def calibrate(series: Series, config: IdentifyConfig | None = None) -> Calibration:
+def calibrate(series: Series, config: IdentifyConfig = IdentifyConfig()) -> Calibration:
     """Fit (mu, tau) to the best window of a recording and report how far that pair can be trusted.
 
-    Args: series: raw recording. config: see `IdentifyConfig`; None is the default.
+    Args: series: raw recording.
     Raises: NotIdentifiable when the trustworthy rows cannot give tau; ValueError when none are left.
     """
-    config = IdentifyConfig() if config is None else config
     screened = screen(series)
     if config.method == "prediction_error":
         screened = _without_outliers(screened, config.segment_min)
@@ -167,7 +167,8 @@ def calibrate(series: Series, config: IdentifyConfig | None = None) -> Calibrati
         drift_tau=drift(along, [s.tau for s in along]),
         warnings=(),
     )
-    return replace(result, warnings=tuple(_warnings(result, limit)))
+    warnings = _drift_warnings(result), _fit_warnings(result, limit), _prediction_warnings(result.validation, limit)
+    return replace(result, warnings=tuple(chain.from_iterable(warnings)))
 
 
 def refusal(found: Estimate, series: Series) -> str | None:
@@ -252,7 +253,7 @@ def _validate(
     start = max(a, int(np.searchsorted(clean.time, clean.time[cut] - EARLY_MIN)))
     before = clean.part(start, cut)
     mu, tau = pairs([before], config.method)[0] if enough(before) else (None, None)
-    late, early = _Scored.empty(), _Scored.empty()
+    late = early = _Scored(np.empty(0), np.empty(0))
     if mu is not None and tau is not None:
         late = _predictions(clean, [(cut, b)], (mu.value, tau.value), config.horizon_min)
         early = _predictions(clean, [(start, cut)], (mu.value, tau.value), config.horizon_min)
@@ -268,11 +269,6 @@ class _Scored:
 
     od: Array
     predicted: Array
-
-    @classmethod
-    def empty(cls) -> "_Scored":
-        """Nothing scored."""
-        return cls(np.empty(0), np.empty(0))
 
     @property
     def pmse_pct(self) -> float | None:
@@ -290,10 +286,6 @@ def _predictions(clean: Series, places: list[tuple[int, int]], pair: tuple[float
             od.append(part.od[used])
             predicted.append(model[used])
     return _Scored(np.concatenate(od), np.concatenate(predicted))
-
-
-def _warnings(result: Calibration, limit: float) -> list[str]:
-    return [*_drift_warnings(result), *_fit_warnings(result, limit), *_prediction_warnings(result.validation, limit)]
 
 
 def _drift_warnings(result: Calibration) -> list[str]:

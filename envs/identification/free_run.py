@@ -5,7 +5,6 @@ or doses and growth vary, estimates are shrunk and intervals too narrow (docs/ca
 Pure functions of arrays; no file, no clock, no random numbers.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,57 +29,25 @@ class Fit:
     """A fitted pair and how well it describes its rows.
 
     mu: 1/min. tau: u/tau is the dilution rate in 1/min for u in mL/s; None where only mu was fitted.
-    start_od: fitted OD at the first row of each segment, shape (S,).
-    model: simulated OD, shape (n,). residual: OD minus model, nan without reading, shape (n,).
-    pmse_pct, rms: see `pmse`; root mean square of the residuals, OD.
+    start_od: fitted OD at the first row.
+    model: simulated OD, shape (n,). pmse_pct, rms: see `pmse`; root mean square of the residuals, OD.
     n_used: readings fitted. autocorrelation: of the residuals at lag 1.
     """
 
     mu: Parameter
     tau: Parameter | None
-    start_od: Array
+    start_od: float
     model: Array
-    residual: Array
     pmse_pct: float
     rms: float
     n_used: int
     autocorrelation: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """The readings of a fit: y, minutes and pumped volume since the segment's start, segment of each reading."""
-
-    y: Array
-    elapsed: Array
-    volume: Array
-    segment: NDArray[np.int64]
-    n_segments: int
-    with_tau: bool
-
-    def basis(self) -> Array:
-        """Derivatives of ln x with respect to (mu, [1/tau], ln x_0 per segment), shape (m, p); ln x is linear."""
-        starts = np.zeros((len(self.y), self.n_segments))
-        starts[np.arange(len(self.y)), self.segment] = 1.0
-        slopes = [self.elapsed, -self.volume] if self.with_tau else [self.elapsed]
-        return np.column_stack([*slopes, starts])
-
-
-def _problem(series: Series, starts: Sequence[int], with_tau: bool) -> _Problem:
-    used = np.flatnonzero(np.isfinite(series.od))
-    begin = np.asarray(starts, dtype=np.int64)
-    volume = pumped_volume(series.time, series.pump_rate)
-    segment = np.searchsorted(begin, used, side="right") - 1
-    present, segment = np.unique(segment, return_inverse=True)
-    origin = begin[present][segment]
-    return _Problem(
-        y=series.od[used],
-        elapsed=series.time[used] - series.time[origin],
-        volume=volume[used] - volume[origin],
-        segment=segment,
-        n_segments=len(present),
-        with_tau=with_tau,
-    )
+def _basis(series: Series, used: NDArray[np.intp], with_tau: bool) -> Array:
+    """Derivatives of ln x at the rows `used` with respect to (mu, [1/tau], ln x_0), shape (m, p); ln x is linear."""
+    elapsed, volume = series.time[used] - series.time[0], pumped_volume(series.time, series.pump_rate)[used]
+    return np.column_stack([elapsed, *([-volume] if with_tau else []), np.ones(len(used))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +60,7 @@ class _Solution:
     clipped: NDArray[np.bool_]
 
 
-def _solve(problem: _Problem, robust: bool) -> _Solution:
+def _solve(y: Array, basis: Array, robust: bool) -> _Solution:
     """Levenberg-Marquardt with the exact derivatives; Huber's loss by reweighting.
 
     A reading counts in full up to 3 robust sd, the larger of that of the residuals and that of the relative residuals
@@ -101,7 +68,6 @@ def _solve(problem: _Problem, robust: bool) -> _Solution:
     """
     from scipy.optimize import least_squares  # half a second, which a refused command line need not wait for
 
-    y, basis = problem.y, problem.basis()
     size = np.maximum(y, OD_FLOOR)
     best = np.linalg.lstsq(basis * size[:, None], np.log(size) * size, rcond=None)[0]  # sd of ln y is sd(y) / y
     weight = np.ones(len(y))
@@ -132,8 +98,8 @@ def _solve(problem: _Problem, robust: bool) -> _Solution:
     return _Solution(best, model[:, None] * basis, np.clip(model - y, -limit, limit), np.abs(model - y) > limit)
 
 
-def fit(series: Series, starts: Sequence[int] = (0,), robust: bool = True) -> Fit:
-    """Least squares of the simulated OD on the readings: sum rho(x_i - y_i) over mu, 1/tau and the starts' ln x_0.
+def fit(series: Series, robust: bool = True) -> Fit:
+    """Least squares of the simulated OD on the readings: sum rho(x_i - y_i) over mu, 1/tau and ln x_0.
 
     rho is the square, beyond 3 robust sd linear (Huber). Intervals come from the sandwich covariance
     H^-1 S H^-1 with S the long-run covariance of the scores (see `_sum_variance`), so that correlated and uneven
@@ -143,16 +109,15 @@ def fit(series: Series, starts: Sequence[int] = (0,), robust: bool = True) -> Fi
 
     Args:
       series: readings may be nan; time and pump rate count throughout.
-      starts: positions at which the trajectory starts anew from its own fitted OD, the first 0, ascending.
       robust: False is plain least squares.
     Returns: see `Fit`; tau is None when the pump never runs.
     Raises: NotIdentifiable when the readings are too few or the interval of 1/tau reaches zero.
     """
     with_tau = bool((series.pump_rate[:-1] > 0.0).any())
-    problem = _problem(series, starts, with_tau)
-    if len(problem.y) <= problem.n_segments + 3:
-        raise NotIdentifiable(f"rows {series.row[0]}-{series.row[-1]}: {len(problem.y)} readings are too few for a fit")
-    solution = _solve(problem, robust)
+    used = np.flatnonzero(np.isfinite(series.od))
+    if len(used) < 5:
+        raise NotIdentifiable(f"rows {series.row[0]}-{series.row[-1]}: {len(used)} readings are too few for a fit")
+    solution = _solve(series.od[used], _basis(series, used, with_tau), robust)
     best, jacobian = solution.best, solution.jacobian
     normal = jacobian[~solution.clipped].T @ jacobian[~solution.clipped]
     if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)))) > WORST_CONDITION:
@@ -166,35 +131,19 @@ def fit(series: Series, starts: Sequence[int] = (0,), robust: bool = True) -> Fi
     influence = inverse @ score.T  # (p, m): how far each reading pulled a parameter
     mu = Parameter(*_interval(best[0], influence[0], len(best)))
     tau = _turned_over(series, _interval(best[1], influence[1], len(best))) if with_tau else None
-    model = _model(series, starts, problem, best)
-    residual = series.od - model
-    r = residual[np.isfinite(residual)]
+    rate, start_od = 1.0 / best[1] if with_tau else np.inf, float(np.exp(best[-1]))
+    model = trajectory(series.time, series.pump_rate, float(best[0]), rate, start_od)
+    r = (series.od - model)[used]
     return Fit(
         mu=mu,
         tau=tau,
-        start_od=np.exp(best[2 if with_tau else 1 :]),
+        start_od=start_od,
         model=model,
-        residual=residual,
         pmse_pct=pmse(series.od, model),
         rms=float(np.sqrt(np.mean(r**2))),
         n_used=len(r),
         autocorrelation=float(np.sum(r[1:] * r[:-1]) / max(np.sum(r * r), 1e-300)),
     )
-
-
-def _model(series: Series, starts: Sequence[int], problem: _Problem, best: Array) -> Array:
-    """Simulated OD at every row, also at those without a reading, shape (n,); a segment without readings is nan."""
-    used = np.flatnonzero(np.isfinite(series.od))
-    rate = 1.0 / best[1] if problem.with_tau else np.inf
-    first_level = 2 if problem.with_tau else 1
-    model = np.full(len(series.time), np.nan)
-    ends = [*starts[1:], len(series.time)]
-    for a, b in zip(starts, ends, strict=True):
-        inside = (used >= a) & (used < b)
-        if inside.any():
-            level = float(np.exp(best[first_level + problem.segment[int(np.argmax(inside))]]))
-            model[a:b] = trajectory(series.time[a:b], series.pump_rate[a:b], float(best[0]), rate, level)
-    return model
 
 
 def _turned_over(series: Series, inverse: tuple[float, float, float]) -> Parameter:

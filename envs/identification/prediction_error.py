@@ -297,9 +297,8 @@ class Quality:
 class Estimate:
     """mu (mean over the rows) and tau of one series, None where the rows do not show it; both with 95 % intervals.
 
-    net: mu - u/tau over the rows' mean pump rate, 1/min, which also a constant pump shows. condition: of the normal
-    equations, scaled. expected: OD that the readings before each row and the pump predict, nan without a reading (n,).
-    innovation: of each reading in units of its predicted sd, (n,). n_used: readings.
+    condition: of the normal equations, scaled. expected: OD that the readings before each row and the pump predict, nan
+    without a reading (n,). innovation: of each reading in units of its predicted sd, (n,).
     """
 
     mu: Parameter
@@ -309,7 +308,6 @@ class Estimate:
     expected: Array
     innovation: Array
     quality: Quality
-    n_used: int
 
 
 def _with_late_shares(batch: _Batch) -> Array:
@@ -358,7 +356,6 @@ def estimate(parts: list[Series], cells: _Cells = GRID) -> list[Estimate]:
                 expected=level,
                 innovation=innovation,
                 quality=_quality(batch, solved, cells, m, part, innovation, sigma, mu.value),
-                n_used=int(seen.sum()),
             )
         )
     return found

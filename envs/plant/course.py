@@ -6,7 +6,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["allowed", "along", "rises"]
+from conf.schema import require
+
+__all__ = ["along", "check_knots"]
 
 Array = NDArray[np.float64]
 
@@ -20,11 +22,7 @@ def along(knots_min: Sequence[float], knots: Sequence[float], mean: float, age_m
     return np.interp(age_min, knots_min, knots) / mean if len(knots) else np.ones_like(age_min)
 
 
-def rises(knots_min: Sequence[float]) -> bool:
-    """Whether each age is greater than the one before."""
-    return all(a < b for a, b in pairwise(knots_min))
-
-
-def allowed(knots_min: Sequence[float]) -> str:
-    """The rule in words, for a value beside these ages."""
-    return f"one value for each of knots_min = {list(knots_min)}, which must rise"
+def check_knots(key: str, knots_min: Sequence[float], knots: Sequence[float]) -> None:
+    """Raises: ValueError unless ages rise and each has a value. Args: key: of the values."""
+    fits = len(knots) == len(knots_min) and all(a < b for a, b in pairwise(knots_min))
+    require(fits, key, knots, f"one value for each of knots_min = {list(knots_min)}, which must rise")

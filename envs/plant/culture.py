@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from conf.schema import check, require, setting
 from envs.growth import Exponential, GrowthLaw, Monod
 from envs.integrators import Integrator
-from envs.plant.course import allowed, along, rises
+from envs.plant.course import along, check_knots
 from envs.plant.noise import Streams, spread, uniform
 from envs.plant.species import TEMPERATURE_LAWS, SecondSpeciesConfig, response
 
@@ -66,8 +66,7 @@ class GrowthConfig:
 
     def __post_init__(self) -> None:
         check(self, "plant.growth")
-        fits = rises(self.knots_min) and len(self.knots_mu) == len(self.knots_min)
-        require(fits, "plant.growth.knots_mu", self.knots_mu, allowed(self.knots_min))
+        check_knots("plant.growth.knots_mu", self.knots_min, self.knots_mu)
         require(self.mu > 0.0 or not self.knots_mu, "plant.growth.mu", self.mu, "> 0 beside knots_mu, e.g. their mean")
 
 

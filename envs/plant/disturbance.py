@@ -5,7 +5,7 @@ from typing import Any
 
 from conf.schema import require
 
-__all__ = ["Disturbance", "add", "known", "named"]
+__all__ = ["Disturbance", "add", "named"]
 
 Disturbance = Callable[[Any], None]
 """Called with the `Plant`; sets fault switches of its parts, arrays of shape (N,), by `plant.age_min` or any state."""
@@ -17,11 +17,6 @@ def add(name: str, disturb: Disturbance) -> None:
     """Make a disturbance known as `plant.disturbances=[NAME]`. Raises: ValueError for a name that is taken or empty."""
     require(bool(name) and name not in _known, "disturbance", repr(name), "a name that is not taken")
     _known[name] = disturb
-
-
-def known() -> tuple[str, ...]:
-    """Every name."""
-    return tuple(_known)
 
 
 def named(name: str) -> Disturbance:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
-from envs.plant.course import allowed, along, rises
+from envs.plant.course import along, check_knots
 from envs.plant.noise import Streams, spread
 
 __all__ = ["FeedPump", "PumpConfig"]
@@ -57,8 +57,7 @@ class PumpConfig:
 
     def __post_init__(self) -> None:
         check(self, "plant.pump")
-        fits = rises(self.knots_min) and len(self.knots_ml_s) == len(self.knots_min)
-        require(fits, "plant.pump.knots_ml_s", self.knots_ml_s, allowed(self.knots_min))
+        check_knots("plant.pump.knots_ml_s", self.knots_min, self.knots_ml_s)
         highest = f"0 to prime_high = {self.prime_high}; lower it"
         require(self.prime_low <= self.prime_high, "plant.pump.prime_low", self.prime_low, highest)
         per_pulse = self.dead_time_s + self.min_pulse_s + self.timing_error_s + self.back_leak_ml

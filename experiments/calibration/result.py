@@ -11,6 +11,7 @@ from envs.identification.drift import Drift
 from envs.identification.model import Parameter
 from envs.identification.screening import Series, row_spans
 from envs.task import EnvConfig
+from experiments.calibration.twin_file import yaml_line
 from hardware.storage.recording_reader import Recording
 
 __all__ = ["environment_yaml", "report", "summary"]
@@ -71,7 +72,7 @@ def _free_run(result: Calibration) -> dict[str, Any] | None:
     if found is None or found.tau is None:
         return None
     fit = {"pmse_pct": found.pmse_pct, "rms_od": found.rms, "residual_autocorrelation": found.autocorrelation}
-    return {"mu": _interval(found.mu), "tau": _interval(found.tau), **fit, "start_od": float(found.start_od[0])}
+    return {"mu": _interval(found.mu), "tau": _interval(found.tau), **fit, "start_od": found.start_od}
 
 
 def _interval(p: Parameter) -> dict[str, Any]:
@@ -100,17 +101,8 @@ def environment_yaml(result: Calibration, source: str) -> str:
         f"# 95 % intervals: mu {mu.low:.6g} to {mu.high:.6g} 1/min, tau {tau.low:.6g} to {tau.high:.6g}.",
         *(f"# Warning: {w}." for w in result.warnings),
     ]
-    for entry in entries(model):
-        comment = ", ".join(filter(None, (entry.said.what, entry.said.unit)))
-        lines.append(f"{entry.name}: {_yaml(entry.value)} # {comment}")
+    lines += map(yaml_line, entries(model))
     return "\n".join(lines) + "\n"
-
-
-def _yaml(value: Any) -> str:
-    """A value as YAML reads it back: 5e-05 would be a string there."""
-    if isinstance(value, float):
-        return np.format_float_positional(value, trim="0")
-    return str(list(value)) if isinstance(value, tuple) else str(value)
 
 
 def report(result: Calibration, recording: Recording, content: dict[str, Any]) -> str:
