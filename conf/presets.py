@@ -84,7 +84,7 @@ def sentence(name: str) -> str:
 
 
 def place(path: Path) -> None:
-    """Make the command known that a file beside its module tells. Args: path: NAME.yaml of this source tree."""
+    """Make the command of a file beside its module known. Args: path: NAME.yaml of this source tree."""
     _placed[path.stem] = path
 
 
@@ -100,7 +100,7 @@ def program(command: str) -> str:
 
 
 def commands() -> list[str]:
-    """Every command that is told by a file of conf/."""
+    """Every command that has a file of its own in conf/."""
     return [path.stem for path in sorted(ROOT.glob("*.yaml")) if path.stem != "base"]
 
 

@@ -40,7 +40,7 @@ def blank(config: BlankConfig, folder: Path) -> None:
     backend = config.backend
     what = "clear medium in %s: to %g degC first, then %d minutes"
     log.info(what, ", ".join(backend.reactors), backend.temperature, config.samples + 1)
-    try:
+    with frame.refusing(ReactorError):
         with one_interrupt(), linked(backend) as (transport, clock):
             reactors = ChiBioReactors(transport, clock, backend)
             try:
@@ -60,8 +60,6 @@ def blank(config: BlankConfig, folder: Path) -> None:
             path = save_calibration(Path(backend.calibration), name, "blank", values)
             rows[name] = {**values, "file": str(path)}
             log.info("%s: blank %.0f +- %.0f counts, stored in %s", name, raw, sd, path)
-    except ReactorError as error:
-        raise frame.UserError(str(error)) from None
     files.write_json(folder / "summary.json", rows)
 
 

@@ -40,7 +40,7 @@ def body(config: CalibrateConfig, folder: Path) -> float | None:
 def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     source = config.data or str(resources.files("experiments") / "data" / "open_loop.csv")
     print(f"reading {config.data or 'the shipped recording'}", flush=True)
-    try:
+    with frame.refusing(RecordingError):
         recording = read_recording(
             source,
             pump_ml_s=config.pump_ml_s,
@@ -49,15 +49,11 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
             reactor=config.reactor,
             rows=_rows(config.rows),
         )
-    except RecordingError as error:
-        raise frame.UserError(str(error)) from None
     raw = Series(recording.time_min, recording.od, recording.pump_rate, recording.row)
     hours = (raw.time[-1] - raw.time[0]) / 60
     print(f"{recording.source}: rows {raw.row[0]}-{raw.row[-1]}, {hours:.1f} h; fitting", flush=True)
-    try:
+    with frame.refusing(ValueError, about=f"{source}: "):
         result = calibrate(raw, config.identify)
-    except ValueError as error:
-        raise frame.UserError(f"{source}: {error}") from None
     name = Path(source).name
     environment = folder / f"{config.name}.yaml"
     content = summary(result, recording, raw)
@@ -117,12 +113,9 @@ def _generate(config: CalibrateConfig, folder: Path) -> None:
     if path.exists():
         raise frame.UserError(f"out={path}: exists; remove it or choose another file")
     time, od, pump_rate, _ = simulated(config, 1)
-    try:
-        with Recorder(path, COLUMNS, fsync=False) as recorder:
-            for t, y, u in zip(time, od[0], pump_rate[0], strict=True):
-                recorder.write({"time_min": round(float(t), 4), "od": round(float(y), 5), "pump_rate_ml_s": float(u)})
-    except RecordingError as error:
-        raise frame.UserError(str(error)) from None
+    with frame.refusing(RecordingError), Recorder(path, COLUMNS, fsync=False) as recorder:
+        for t, y, u in zip(time, od[0], pump_rate[0], strict=True):
+            recorder.write({"time_min": round(float(t), 4), "od": round(float(y), 5), "pump_rate_ml_s": float(u)})
     files.write_json(
         folder / "summary.json", {"file": str(path), "rows": len(time), "mu": protocol.mu, "tau": protocol.tau}
     )

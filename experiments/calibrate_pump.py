@@ -143,7 +143,7 @@ def report(fit: PumpFit, found: list[Series]) -> str:
 
 def calibrate(config: CalibratePumpConfig, folder: Path) -> None:
     """Weigh (or read weighings), fit, store. Raises: UserError."""
-    try:
+    with frame.refusing(ReactorError, ValueError):
         if config.csv is not None:
             found, identity = read_weighings(Path(config.csv)), ""
         elif sys.stdin.isatty():
@@ -156,8 +156,6 @@ def calibrate(config: CalibratePumpConfig, folder: Path) -> None:
         uncertainty = {"flow_se": fit.flow_se, "bias_se": fit.bias_se}
         values = {**fit.calibration.as_dict(), **uncertainty, "weighings": weighings}
         path = save_calibration(Path(config.backend.calibration), config.reactor, config.pump, values)
-    except (ReactorError, ValueError) as error:
-        raise frame.UserError(str(error)) from None
     files.write_json(folder / "summary.json", {**values, "file": str(path)})
     log.info("%s %s pump\n%s\nstored in %s", config.reactor, config.pump, report(fit, found), path)
 

@@ -29,14 +29,11 @@ def body(config: CertifyConfig, folder: Path) -> None:
         config = replace(config, env=read_env_file(config.env_file), env_file=None)
     began = time.perf_counter()
     log.info("proving the closed loop of %s, for every reading, setpoint and case; a minute or less", source)
-    try:
+    with frame.refusing(policies.PolicyError):
         policy = policies.load(source)
+    with frame.refusing(CertificationError, about=f"policy {source}: "):
         config = replace(config, env=model_of(policy, config))
         found = certify(policy, config)
-    except policies.PolicyError as error:
-        raise frame.UserError(str(error)) from None
-    except CertificationError as error:
-        raise frame.UserError(f"policy {source}: {error}") from None
     log.info("%s: proven in %.1f s", source, time.perf_counter() - began)
     for check in found.checks:
         log.info("%s  %s", "pass" if check.holds else "FAIL", check)

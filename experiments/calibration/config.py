@@ -1,4 +1,4 @@
-"""What `calibrate` is told."""
+"""The config of `calibrate`."""
 
 import re
 from dataclasses import dataclass

@@ -76,15 +76,14 @@ def coverage(config: CalibrateConfig, folder: Path) -> float:
             for column in ([c.mu for c in found], [c.tau for c in found])
         )
         truth = (growth[kept], np.full(len(kept), protocol.tau))
-        study = [_judged(values, true) for values, true in zip((mu, tau), truth, strict=True)]
-        for key in study[0]:
-            numbers[key] = {"mu": study[0][key], "tau": study[1][key]}
-        worst = min(part["coverage_pct"] for part in study)
+        study = {"mu": _judged(mu, truth[0]), "tau": _judged(tau, truth[1])}
+        numbers |= {key: {name: part[key] for name, part in study.items()} for key in study["mu"]}
+        worst = min(part["coverage_pct"] for part in study.values())
         from experiments.reporting.calibration_charts import coverage_figure
         from experiments.reporting.charts import save
 
         save(coverage_figure(mu, tau, truth, f"{title} (seed {protocol.seed})"), folder / "figures", "coverage")
-        for name, part in zip(("mu", "tau"), study, strict=True):
+        for name, part in study.items():
             print(
                 f"{name}: 95 % intervals hold the truth in {part['coverage_pct']:.1f} %, median bias "
                 f"{part['median_bias_pct']:+.2f} %, half width {part['relative_half_width_pct']:.1f} %"

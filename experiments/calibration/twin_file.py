@@ -15,7 +15,7 @@ from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from envs.plant.vessel import VesselConfig
 
-__all__ = ["plant_of", "twin_yaml"]
+__all__ = ["plant_of", "twin_yaml", "yaml_line"]
 
 Array = NDArray[np.float64]
 
@@ -69,13 +69,14 @@ def twin_yaml(found: Twin, source: str) -> str:
         if own.name in ("growth", "pump", "sensor", "vessel"):
             lines.append(f"{own.name}:")
             changed = zip(entries(own.value), entries(usual.value), strict=True)
-            lines += [f"  {_line(e)}" for e, was in changed if e.value != was.value]
+            lines += [f"  {yaml_line(e)}" for e, was in changed if e.value != was.value]
         else:
-            lines.append(_line(own))
+            lines.append(yaml_line(own))
     return "\n".join(lines) + "\n"
 
 
-def _line(entry: Entry) -> str:
+def yaml_line(entry: Entry) -> str:
+    """A value with its meaning and unit behind it."""
     value = entry.value
     if isinstance(value, tuple):
         text = "[" + ", ".join(_plain(v) for v in value) + "]"

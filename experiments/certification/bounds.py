@@ -1,7 +1,7 @@
 """Within which errors of an estimator a policy that sees (error, growth share) is proven; what a supervisor watches."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -43,10 +43,6 @@ class EstimateBounds:
         low, high = self.proven
         inside = (growth_share >= low) & (growth_share <= high)
         return np.asarray((error <= self.error_bound(od)) & (share_error <= self.growth_share) & inside)
-
-    def plain(self) -> dict[str, Any]:
-        """As it stands in a certificate."""
-        return asdict(self)
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> "EstimateBounds":

@@ -38,7 +38,6 @@ class Stored:
     passed: bool
     failed: tuple[str, ...]
     config: CertifyConfig
-    observation: tuple[str, ...]
     setpoints: tuple[float, float]
     bounds: EstimateBounds | None
 
@@ -79,7 +78,7 @@ def content(policy: Policy, config: CertifyConfig, found: Certificate) -> dict[s
         "checks": [{**asdict(check), "holds": check.holds} for check in found.checks],
         "setpoints": list(asked.setpoints),
         "strips": [float(asked.loop.low[0]), float(asked.loop.high[-1]), int(asked.loop.low.size)],
-        "bounds": asked.bounds.plain() if asked.bounds else None,
+        "bounds": asdict(asked.bounds) if asked.bounds else None,
         "cannot_hold": found.cannot_hold(),
         "dose_below": dict(zip(map(str, found.levels), _outward(found.doses, 1e3), strict=True)),
         "not_monotone": [dict(zip(("first", "second", "from", "to"), drop, strict=True)) for drop in found.drops],
@@ -100,7 +99,6 @@ def load(path: Path) -> Stored:
             given["passed"] is True,
             tuple(str(check["name"]) for check in given["checks"] if not check["holds"]),
             build(CertifyConfig(), given["config"]),
-            tuple(given["observation"]),
             (float(low), float(high)),
             EstimateBounds.of(given["bounds"]) if given["bounds"] else None,
         )

@@ -4,7 +4,7 @@ millisecond."""
 import numpy as np
 
 from experiments.certification.intervals import Index, Points
-from experiments.certification.network import Array, Network, rounding
+from experiments.certification.network import Array, Network, q_values, rounding
 
 __all__ = ["on_lines"]
 
@@ -20,14 +20,9 @@ def _knots(network: Network, low: float, high: float, second: float) -> tuple[Ar
         value = value @ layers[depth][0] + layers[depth][1]
         k, unit = np.nonzero(value[:-1] * value[1:] < 0.0)
         share = value[k, unit] / (value[k, unit] - value[k + 1, unit])
-        x = np.concatenate([points[:, 0], points[k, 0] + share * (points[k + 1, 0] - points[k, 0])])
-        x = np.unique(x)
+        x = np.unique(np.concatenate([points[:, 0], points[k, 0] + share * (points[k + 1, 0] - points[k, 0])]))
         points = np.stack([x, np.full_like(x, second)], axis=1)
-    value = points
-    for weight, bias in layers:
-        value = np.maximum(value @ weight + bias, 0.0)
-    weight, bias = network.output
-    return points, value @ weight + bias
+    return points, q_values(network, points)
 
 
 def _along(network: Network, low: float, high: float, second: float) -> tuple[Array, Index]:

@@ -30,9 +30,9 @@ from conf.presets import program
 from conf.schema import build
 from experiments.cli import extensions, files, help_page, latest, search, stop, sweep, words
 from experiments.cli.start import stopped
-from experiments.cli.words import UserError, normalise
+from experiments.cli.words import UserError, normalise, refusing
 
-__all__ = ["Command", "UserError", "compose", "load", "normalise", "save_config", "swept"]
+__all__ = ["Command", "UserError", "compose", "load", "normalise", "refusing", "save_config", "swept"]
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -188,10 +188,8 @@ class Command(Generic[T]):
 
     def _answer(self, given: list[str]) -> None:
         """Help, the config, or a run or sweep of it."""
-        try:
+        with refusing(ValueError):
             given = [latest.resolved(arg, self.name) for arg in given]
-        except ValueError as error:
-            raise UserError(str(error)) from None
         flags = {a for a in given if a.startswith("-")}
         plain = [a for a in given if not a.startswith("-")]
         if flags & {"--help", "-h"}:
@@ -201,11 +199,7 @@ class Command(Generic[T]):
             plain.remove("job")
             print(OmegaConf.to_yaml(asdict(cast(Any, self.config(plain)))))
             return
-        try:
-            swept = sweep.asked(given, self.name) if flags <= set(sweep.FLAGS) else None  # others are Hydra's to read
-        except sweep.Again as error:
-            raise UserError(str(error)) from None
-        if swept:
+        if flags <= set(sweep.FLAGS) and (swept := sweep.asked(given, self.name)):  # other flags are Hydra's to read
             self._sweep(swept)
             return
         sys.argv[1:] = normalise(given, self.name)
@@ -233,20 +227,17 @@ class Command(Generic[T]):
         self._refuse([swept.arguments] if expected is None else expected)
         if expected is None:
             search.register()
-        try:
-            swept.save()
-        except sweep.Again as error:
-            raise UserError(str(error)) from None
+        swept.save()
         try:
             self._hydra()
         except (KeyboardInterrupt, SystemExit):
-            print(f"stopped; {sweep.told(swept, expected)}", file=sys.stderr)
+            print(f"stopped; {sweep.progress(swept, expected)}", file=sys.stderr)
             sys.exit(stop.STATUS)
         except Exception:  # a bug in a job, which Hydra raises again once all have ended; or in a launcher
-            print(sweep.told(swept, expected), file=sys.stderr)
+            print(sweep.progress(swept, expected), file=sys.stderr)
             raise
         errors = sweep.errors(swept.folder, expected)
-        print(f"{errors}{sweep.told(swept, expected)}", file=sys.stderr if errors else sys.stdout, flush=True)
+        print(f"{errors}{sweep.progress(swept, expected)}", file=sys.stderr if errors else sys.stdout, flush=True)
         if errors:
             sys.exit(1)
 
@@ -330,7 +321,7 @@ class Command(Generic[T]):
             if job.state != "finished":  # what it found stands, whatever was asked of it now
                 with suppress(OSError):  # a disk that is full
                     job.save("failed", error=line)
-            if not isinstance(error, UserError | sweep.Again) and _refusal(error) is None:
+            if not isinstance(error, UserError) and _refusal(error) is None:
                 raise
             log.error("%s", line)
             return None

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["newest", "resolved"]
+__all__ = ["ROOT", "newest", "resolved"]
 
 ROOT = Path("runs")
 WRITTEN = {
@@ -11,13 +11,13 @@ WRITTEN = {
     "plant_file": (("calibrate/**/twin.yaml", "demo/*/1_calibrate/twin.yaml"), "calibrate"),
     "runs": (("*/*/sweep.json",), "train -m 'seed=range(0,4)'"),
 }
-FOLDERS = ("resume", "runs")  # keys that are given the folder of the file that is found
 """Key -> where its files are below runs/, and the command that writes them."""
+FOLDERS = ("resume", "runs")  # keys that are given the folder of the file that is found
 
 
-def newest(patterns: Sequence[str], root: Path = ROOT) -> Path | None:
-    """The file written last of those that match, None if there is none."""
-    found = [path for pattern in patterns for path in root.glob(pattern)]
+def newest(patterns: Sequence[str]) -> Path | None:
+    """The file written last of those that match below `ROOT`, None if there is none."""
+    found = [path for pattern in patterns for path in ROOT.glob(pattern)]
     return max(found, key=lambda path: path.stat().st_mtime, default=None)
 
 

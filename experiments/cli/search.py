@@ -32,15 +32,10 @@ NAME = "hydra_plugins.search.Search"  # as conf/hydra/sweeper/search.yaml calls 
 JOURNAL = "search.journal"
 
 
-def _optuna(name: str = "optuna") -> Any:
-    """A module of Optuna, which only a search needs."""
-    return import_module(name)
-
-
 def register() -> None:
     """Make the search known to Hydra. Raises: UserError where Optuna is missing or too old."""
     try:
-        _optuna("optuna.storages.journal")
+        import_module("optuna.storages.journal")  # which only a search needs
     except ImportError:
         raise UserError(f"hparams_search: needs optuna 4 or newer; {EXTRA}") from None
     Plugins.instance().class_name_to_class[NAME] = Search
@@ -48,7 +43,7 @@ def register() -> None:
 
 def _distribution(name: str, said: Mapping[str, Any]) -> Any:
     """An entry of `space`: {choices: [...]} or {low, high, log, step}. Raises: UserError naming it."""
-    of = _optuna("optuna.distributions")
+    of: Any = import_module("optuna.distributions")
     try:
         if "choices" in said:
             return of.CategoricalDistribution(list(said["choices"]))
@@ -83,10 +78,10 @@ class Search(Sweeper):
 
     def _open(self) -> Any:
         """The study in the folder, begun by whoever comes first."""
-        optuna = _optuna()
+        optuna: Any = import_module("optuna")
         optuna.logging.set_verbosity(logging.WARNING)
         (self.folder / ".trials").mkdir(parents=True, exist_ok=True)
-        file = _optuna("optuna.storages.journal").JournalFileBackend(str(self.folder / JOURNAL))
+        file = import_module("optuna.storages.journal").JournalFileBackend(str(self.folder / JOURNAL))
         storage = optuna.storages.JournalStorage(file)
         sampler = optuna.samplers.TPESampler(constant_liar=True)  # trials at work elsewhere count as poor ones
         with self._alone():
@@ -120,7 +115,7 @@ class Search(Sweeper):
         return taken
 
     def _hold(self, number: int) -> bool:
-        """Take a trial for this process, until it is told or the process ends; False where another one has it."""
+        """Take a trial for this process, until its result is in or the process ends; False where another one has it."""
         if number in self._held:
             return False
         file = open(self.folder / ".trials" / str(number), "w")  # noqa: SIM115  (open as long as it is held)
@@ -145,7 +140,7 @@ class Search(Sweeper):
             study.tell(number, float(job.return_value))
         except Exception as error:  # whatever the job raised
             log.warning("trial %d failed: %s", number, error)
-            study.tell(number, state=_optuna().trial.TrialState.FAIL)
+            study.tell(number, state=import_module("optuna").trial.TrialState.FAIL)
         self._held.pop(number).close()
 
     def _best(self, study: Any) -> None:

@@ -16,25 +16,9 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from experiments.cli import files
+from experiments.cli.words import UserError
 
-__all__ = [
-    "FLAGS",
-    "FOLDER",
-    "JOB",
-    "RECORD",
-    "Again",
-    "Busy",
-    "Job",
-    "Sweep",
-    "asked",
-    "errors",
-    "fresh",
-    "jobs",
-    "read",
-    "survey",
-    "told",
-    "working",
-]
+__all__ = ["FLAGS", "Busy", "Job", "Sweep", "asked", "errors", "fresh", "jobs", "progress", "read", "survey", "working"]
 
 RECORD, JOB = "sweep.json", "job.json"
 SEARCH = "hparams_search="
@@ -45,10 +29,6 @@ LATER = ("hydra/launcher=", "hydra.launcher.", "hydra.sweeper.")  # what another
 
 class Busy(Exception):
     """Another process works on this job; the message is one line."""
-
-
-class Again(Exception):
-    """A sweep cannot go on in a folder; the message is one line with the remedy."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +44,11 @@ class Sweep:
         return [FLAGS[0], *self.arguments, f"{FOLDER}{self.folder}"]  # argparse takes the flag only in front
 
     def save(self) -> None:
-        """Write down what was asked for. Raises: Again where the folder holds a sweep of something else."""
+        """Write down what was asked for. Raises: UserError where the folder holds a sweep of something else."""
         before = read(self.folder)
         if before and (before.command, _lasting(before.arguments)) != (self.command, _lasting(self.arguments)):
-            told = shlex.join([f"experiments.{before.command}", *before.line()])
-            raise Again(f"{FOLDER}{self.folder}: holds another sweep ({told}); give another folder")
+            other = shlex.join([f"experiments.{before.command}", *before.line()])
+            raise UserError(f"{FOLDER}{self.folder}: holds another sweep ({other}); give another folder")
         self.folder.mkdir(parents=True, exist_ok=True)
         files.write_json(self.folder / RECORD, {"command": self.command, "arguments": self.arguments})
 
@@ -100,7 +80,7 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
     """The sweep that a command line asks for, None where it asks for a single run.
 
     `resume=SWEEP` is the sweep that was begun there, by whatever launcher it names now.
-    Raises: Again where it names anything else beside.
+    Raises: UserError where it names anything else beside.
     """
     plain = [a for a in given if a not in FLAGS]
     folder = next((Path(a.removeprefix("resume=")) for a in reversed(plain) if a.startswith("resume=")), None)
@@ -109,15 +89,15 @@ def asked(given: Sequence[str], command: str) -> Sweep | None:
         others = [a for a in plain if not a.startswith(("resume=", *LATER))]
         if others or before.command != command:
             what = others[0] if others else f"experiments.{command}"
-            raise Again(f"{what}: a resumed sweep is {before.again()}, with all its values; drop it")
+            raise UserError(f"{what}: a resumed sweep is {before.again()}, with all its values; drop it")
         new = [a for a in plain if not a.startswith("resume=")]
         keys = {a.partition("=")[0] for a in new}
         kept = [a for a in before.arguments if a.partition("=")[0] not in keys]
-        if any(a.startswith("hydra/launcher=") for a in new):  # what the launcher before was told is not for this one
+        if any(a.startswith("hydra/launcher=") for a in new):  # settings of the launcher before are not for this one
             kept = [a for a in kept if not a.startswith("hydra.launcher.")]
         return Sweep(before.folder, command, kept + new)
     if folder and len(plain) < len(given):
-        raise Again(f"resume={folder}: no sweep; a single run goes on without -m")
+        raise UserError(f"resume={folder}: no sweep; a single run goes on without -m")
     if len(plain) == len(given) and not searches(plain):
         return None
     named = [a.removeprefix(FOLDER) for a in plain if a.startswith(FOLDER)]
@@ -151,7 +131,7 @@ def jobs(arguments: Sequence[str]) -> list[list[str]] | None:
 class Job:
     """What job.json says of a job.
 
-    state: running (or stopped, if no process works on it), finished, failed. config: hash of what it was told.
+    state: running (or stopped, if no process works on it), finished, failed. config: hash of its config.
     objective: what it returned. error: why it failed, one line.
     """
 
@@ -178,11 +158,11 @@ class Job:
         files.write_json(self.folder / JOB, kept)
 
     def begin(self, config: Any) -> None:
-        """The job is to do this. Raises: Again where its folder holds a run of another config."""
-        told = hashlib.sha256(json.dumps(asdict(config), sort_keys=True, default=str).encode()).hexdigest()
-        if self.config not in ("", told):
-            raise Again(f"{self.folder}: holds a run of another config; give another {FOLDER}FOLDER")
-        self.config = told
+        """The job is to do this. Raises: UserError where its folder holds a run of another config."""
+        digest = hashlib.sha256(json.dumps(asdict(config), sort_keys=True, default=str).encode()).hexdigest()
+        if self.config not in ("", digest):
+            raise UserError(f"{self.folder}: holds a run of another config; give another {FOLDER}FOLDER")
+        self.config = digest
         if self.state != "finished":
             self.save("running")
 
@@ -255,7 +235,7 @@ def _given(folder: Path) -> list[str]:
         return []
 
 
-def told(sweep: Sweep, expected: list[list[str]] | None) -> str:
+def progress(sweep: Sweep, expected: list[list[str]] | None) -> str:
     """How many jobs of a sweep came to their end, and what to do about the others, one line."""
     found = survey(sweep.folder, expected)
     done = sum(job.state == "finished" for job in found)

@@ -1,14 +1,15 @@
 """The words of a command line in the form that Hydra takes, and the line about those that nobody can take."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
 from conf import presets
 from experiments.cli import extensions, latest
 
-__all__ = ["EXTRA", "RUN", "UserError", "normalise", "resumed"]
+__all__ = ["EXTRA", "RUN", "UserError", "normalise", "refusing", "resumed"]
 
 RUN = "hydra.run.dir="
 EXTRA = "pip install 'turbidostat-dqn[sweep]'"
@@ -18,8 +19,17 @@ class UserError(Exception):
     """Something the user can mend; the message is one line and is all that is shown."""
 
 
+@contextmanager
+def refusing(*errors: type[Exception], about: str = "") -> Iterator[None]:
+    """Inside, these errors are raised as a UserError. Args: about: stands before their message."""
+    try:
+        yield
+    except errors as error:
+        raise UserError(f"{about}{error}") from None
+
+
 def _choose(command: str, group: str, option: str) -> None:
-    """Whether a command can be told `group=option`. Raises: UserError naming what it takes, or the right command."""
+    """Check that a command takes `group=option`. Raises: UserError naming what it takes, or the right command."""
     given, own = f"{group}={option}", presets.chosen(command)
     known = presets.groups()[group]
     of = presets.owner(f"{group}/{option}") if option in known else None
@@ -44,16 +54,14 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
     Raises: UserError for a group or option that the command does not take, naming those that it does, and for a file
       that cannot be used.
     """
-    try:
+    with refusing(ValueError):
         argv = [latest.resolved(arg, command) for arg in argv]
         old = resumed(argv)
         if old:
             if others := [arg for arg in argv if arg.startswith("extend=")]:
-                raise ValueError(f"{others[0]}: a resumed run loads its own copy from {old}/extensions; drop it")
+                raise UserError(f"{others[0]}: a resumed run loads its own copy from {old}/extensions; drop it")
             extensions.kept(Path(old))
         argv = [_with_preset_files(arg) for arg in extensions.taken(argv)]
-    except ValueError as error:
-        raise UserError(str(error)) from None
     extensions.offer()
     known = presets.groups()
     out: list[str] = []

@@ -92,10 +92,8 @@ def completed(config: DeployConfig) -> DeployConfig:
 
     Raises: UserError for a schedule that is not allowed.
     """
-    try:
+    with frame.refusing(ValueError):
         composed = any(s.composed for s in config.schedules())
-    except ValueError as error:
-        raise frame.UserError(str(error)) from None
     if not composed:
         return config
     backend, chosen = config.backend, []
@@ -122,10 +120,8 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     """
     family, backend, safety = family_of(config.backend), config.backend, config.safety
     resumed = config.resume is not None
-    try:
+    with frame.refusing(ValueError):
         scenarios, ends = config.schedules(), config.ends()
-    except ValueError as error:
-        raise frame.UserError(str(error)) from None
     if resumed and not family.can.resume:
         why = "a simulated run takes a second; run it again" if family.simulated else "its reactors cannot; start anew"
         raise frame.UserError(f"resume={config.resume}: {why}")
@@ -177,10 +173,8 @@ def _check_fit(config: DeployConfig, family: Family, scenarios: list[Scenario], 
         except ValueError:
             remedy = f"allowed with backend=sim only, not backend={kind}"
             raise frame.UserError(f"controller = {law}: knows a simulated plant; {remedy}") from None
-    try:
+    with frame.refusing(ReactorError):
         family.fits(config.backend, config.bench, scenarios, ends)
-    except ReactorError as error:
-        raise frame.UserError(str(error)) from None
 
 
 def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dict[str, float | str]]:
@@ -200,12 +194,10 @@ def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dic
 
 def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> list[Signal]:
     """The signals that are held beside the density. Raises: UserError where scenario, backend and they do not fit."""
-    try:
+    with frame.refusing(ValueError):
         share = [] if config.composition is None else [_share(config, plant, folder, scenarios)]
         own = [signals.made(name, law, scenarios) for name, law in config.signals.items()]
         return signals.one_each([*share, *own])
-    except ValueError as error:
-        raise frame.UserError(str(error)) from None
 
 
 def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Signal:
@@ -237,13 +229,11 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
       damaged or does not fit.
     """
     (plant, flow), volumes_ml = setup.family.truth(reactors), setup.bench.volumes(reactors.names)
-    try:
+    with frame.refusing(ValueError):
         law = registry.build(
             setup.law, model=setup.model, policy=setup.policy, plant=plant, flow_ml_s=flow, bounds=setup.bounds,
             volume_ml=volumes_ml,
         )  # fmt: skip
-    except ValueError as error:
-        raise frame.UserError(str(error)) from None
     rim_ml = setup.family.rim_ml(volumes_ml)
     interlock = Interlock(len(volumes_ml), setup.safety, setup.bench, volumes_ml, rim_ml)
     for signal in setup.further:
@@ -272,7 +262,5 @@ def run_preflight(setup: Setup, folder: Path) -> None:
     if setup.family.simulated:
         raise frame.UserError("preflight_only=true: a simulated reactor needs no preflight; use backend=chibio")
     policy = [] if setup.wanted is None else [policy_check(setup.wanted)]
-    try:
+    with frame.refusing(ReactorError):
         report([*setup.family.preflight(setup.backend, setup.bench, folder), *policy])
-    except ReactorError as error:
-        raise frame.UserError(str(error)) from None

@@ -1,4 +1,4 @@
-"""What a closed loop is told: reactors, controller, scenario and safety."""
+"""The config of a closed loop: reactors, controller, scenario and safety."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -16,7 +16,6 @@ from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
 
 __all__ = ["DeployConfig", "deploy_schema"]
-
 
 AT_END = ("hold", "stop", "regulate")
 OF_RUN = ("role", "at_end")  # keys of `each` that are not of its scenario

@@ -13,7 +13,7 @@ from dqn import policy as policies
 from dqn.policy import Policy
 from experiments.certification import certificate
 from experiments.cli import frame
-from experiments.cli.latest import newest
+from experiments.cli.latest import ROOT, newest
 from experiments.laws import registry
 from hardware.check import Check
 from hardware.storage import atomic
@@ -115,17 +115,17 @@ class Training:
         return said if not missing else f"{said}; it does not say {', '.join(missing)}: an earlier version wrote it"
 
 
-def find_policy(name: str, root: Path = Path("runs")) -> Path:
-    """A policy.npz from a path, a run folder, `shipped`, or `latest`: what `train` or `demo` wrote last under `root`.
+def find_policy(name: str) -> Path:
+    """A policy.npz from a path, a run folder, `shipped`, or `latest`: what `train` or `demo` wrote last.
 
     Raises: UserError saying what to give instead.
     """
     if name == "shipped":
         return SHIPPED
     if name == "latest":
-        found = newest(TRAINED, root)
+        found = newest(TRAINED)
         if found is None:
-            raise NoPolicyError(f"policy=latest: no training run under {root}/; train one first or give policy=PATH")
+            raise NoPolicyError(f"policy=latest: no training run under {ROOT}/; train one first or give policy=PATH")
         return found
     path = Path(name)
     return path / "policy.npz" if path.is_dir() else path
@@ -206,28 +206,22 @@ def run_policy(wanted: Wanted, folder: Path, resumed: bool) -> Policy:
     Raises: UserError as `load_policy`, and if the copy cannot be written.
     """
     kept = folder / "policy.npz"
-    if resumed and kept.is_file():
-        return load_policy(str(kept), wanted.control_min, wanted.max_rate)
-    source = find_policy(wanted.name)
+    again = resumed and kept.is_file()
+    source = kept if again else find_policy(wanted.name)
     policy = load_policy(str(source), wanted.control_min, wanted.max_rate)
-    _keep(policy, kept)
-    try:
-        if certificate.beside(source).is_file():
-            atomic.write(certificate.beside(kept), certificate.beside(source).read_text(encoding="utf-8"), fsync=False)
-    except OSError as error:
-        raise _not_kept(kept, error) from None
+    if not again:
+        _keep(policy, kept, certificate.beside(source))
     return policy
 
 
-def _keep(policy: Policy, kept: Path) -> None:
+def _keep(policy: Policy, kept: Path, proof: Path | None = None) -> None:
+    """Write the copy of a policy, and of its certificate `proof` where there is one. Raises: UserError."""
     try:
         policies.save(kept, policy)
+        if proof is not None and proof.is_file():
+            atomic.write(certificate.beside(kept), proof.read_text(encoding="utf-8"), fsync=False)
     except OSError as error:
-        raise _not_kept(kept, error) from None
-
-
-def _not_kept(kept: Path, error: OSError) -> frame.UserError:
-    return frame.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free the disk")
+        raise frame.UserError(f"{kept}: copy of the policy not written ({error.strerror}); free the disk") from None
 
 
 def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Policy | None:

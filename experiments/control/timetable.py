@@ -107,11 +107,10 @@ def _deciders(c: DeployConfig, setup: Setup) -> str:
 def _device(setup: Setup) -> Iterator[str]:
     family, backend = setup.family, setup.backend
     yield f"backend {backend.kind} ({family.address(backend)}), reactors {', '.join(backend.reactors)}"
-    try:
-        if line := family.unmeasured(backend):
-            yield line
-    except ReactorError as error:
-        raise frame.UserError(str(error)) from None
+    with frame.refusing(ReactorError):
+        unmeasured = family.unmeasured(backend)
+    if unmeasured:
+        yield unmeasured
 
 
 def _start_od(setup: Setup, scenario: Scenario) -> float:
@@ -141,27 +140,20 @@ def _reactor(setup: Setup, name: str, role: str, scenario: Scenario, now: dateti
             f"  {k + 1:>8} {_clock(now, at)} {_clock(now, at + step.minutes)} {step.minutes:7.0f} {most_min:8.0f} "
             f"{setpoint:6.2f} {degc:6.1f} {step.ml:7.1f}  {said}"
         )
-        if scenario.outputs and scenario.outputs[k]:
-            yield f"  {'':>8} gives {scenario.outputs[k]}: {_supplied(scenario, k, most_min)}"
-        at += step.minutes
-        ml, most = (
-            ml + max(step.ml, _spare(scenario, k, step.minutes)),
-            most + max(step.longest_ml, _spare(scenario, k, most_min)),
-        )
-        od = step.od
+        if longest_spare := _spare(scenario, k, most_min):
+            given = ", ".join(f"at most {spare:.1f} mL by Pump{pump}" for pump, spare in longest_spare.items())
+            yield f"  {'':>8} gives {scenario.outputs[k]}: {given}"
+        # What a spare pump gives dilutes as feed does, which is then left out.
+        ml += max(step.ml, sum(_spare(scenario, k, step.minutes).values()))
+        most += max(step.longest_ml, sum(longest_spare.values()))
+        at, od = at + step.minutes, step.od
     yield f"  {ml:.0f} mL of medium expected, {most:.0f} mL if every step takes its longest; {_lasts(setup, ml, most)}"
 
 
-def _supplied(scenario: Scenario, k: int, minutes: float) -> str:
-    """What each spare pump gives in a step that takes its longest."""
-    given = [(o.pump, o.ml + o.ml_h * minutes / 60.0) for o in outputs_of(scenario.outputs[k])]
-    return ", ".join(f"at most {ml:.1f} mL by Pump{pump}" for pump, ml in given)
-
-
-def _spare(scenario: Scenario, k: int, minutes: float) -> float:
-    """What all spare pumps give in so many minutes of a step, mL; it dilutes as feed does, which is then left out."""
-    outputs = outputs_of(scenario.outputs[k]) if scenario.outputs else []
-    return sum(o.ml + o.ml_h * minutes / 60.0 for o in outputs)
+def _spare(scenario: Scenario, k: int, minutes: float) -> dict[int, float]:
+    """What each spare pump gives in so many minutes of a step, mL."""
+    outputs = outputs_of(scenario.outputs[k]) if scenario.outputs else ()
+    return {o.pump: o.ml + o.ml_h * minutes / 60.0 for o in outputs}
 
 
 def _lasts(setup: Setup, ml: float, most: float) -> str:

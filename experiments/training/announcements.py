@@ -24,10 +24,6 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 
-def _limits(task: Task) -> str:
-    return f"{task.regret_unit:g} % regret and {task.steady_unit:g} {task.unit}"
-
-
 def _seeds(seeds: Sequence[int]) -> str:
     return f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} agents, seeds {seeds[0]} to {seeds[-1]}"
 
@@ -38,10 +34,8 @@ def began(config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path, s
     names = f"env={chosen.get('env', tasks.kind(config.env))} agent={chosen.get('agent', 'given')}"
     where = f"goes on at step {step} of" if step else "for"
     log.info("learns %s: %s; %s, %s %d steps", names, task.description, _seeds(seeds), where, config.agent.total_steps)
-    log.info(
-        "good is a policy within %s at rest at its worst setpoint (regret: its cost beyond the exact optimum's)",
-        _limits(task),
-    )
+    limits = f"{task.regret_unit:g} % regret and {task.steady_unit:g} {task.unit} at rest"
+    log.info("good is a policy within %s at its worst setpoint (regret: its cost beyond the exact optimum's)", limits)
     log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
 
 

@@ -1,4 +1,4 @@
-"""What a training run is told: its config, a calibrated model. Free of torch."""
+"""The config of a training run. Free of torch."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dqn.config import DQNConfig
 from dqn.hindsight import GoalRelabel, Relabel
 from dqn.policy import ABSOLUTE, Policy
-from envs.optimum import EpisodeOptimum, solve_episode
+from envs.optimum import solve_episode
 from envs.task import MAX_OD, SCORED_OD, EnvConfig, step_factors, tracking_reward
 from envs.vector_env import BioreactorVectorEnv
 from experiments.reporting import charts
@@ -128,6 +128,4 @@ def first_actions(env: EnvConfig, od: Array, setpoint: Array) -> NDArray[np.intp
     return solve_episode(wide, lowest, COARSE).act(scaled, env.episode_steps)
 
 
-@lru_cache(maxsize=16)  # the grids of a run have the same setpoints
-def _optimum(config: EnvConfig, setpoint: float) -> EpisodeOptimum:
-    return solve_episode(config, setpoint)
+_optimum = lru_cache(maxsize=16)(solve_episode)  # the grids of a run have the same setpoints

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dqn.config import DQNConfig
 from dqn.hindsight import Relabel, ShiftRelabel
 from dqn.policy import RELATIVE, Policy
-from envs.optimum import RelativeOptimum, solve_relative
+from envs.optimum import solve_relative
 from envs.relative import RelativeConfig, RelativeVectorEnv, nearest_level, relative_reward
 from experiments.reporting import charts
 from experiments.training.evaluation import Rollout, each, pairs, rollout
@@ -118,6 +118,4 @@ class Relative:
         }
 
 
-@lru_cache(maxsize=256)
-def _optimum(config: RelativeConfig, growth_share: float, steps: int) -> RelativeOptimum:
-    return solve_relative(config, growth_share, steps)
+_optimum = lru_cache(maxsize=256)(solve_relative)

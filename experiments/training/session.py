@@ -28,7 +28,8 @@ __all__ = ["Best", "Session", "merit"]
 
 log = logging.getLogger(__name__)
 
-TOLD = 20  # lines of progress where there is no terminal
+LINES = 20  # of progress where there is no terminal
+PER_AGENT = ("merit", "regret", "steady", "step")  # arrays of `Best`, (S,)
 
 
 def merit(score: Score, task: Task) -> NDArray[np.float64]:
@@ -72,22 +73,14 @@ class Best:
 
     def state_dict(self) -> dict[str, Any]:
         """Complete state, tensors and plain values."""
-        return {
-            "weights": self.weights,
-            "merit": self.merit.tolist(),
-            "regret": self.regret.tolist(),
-            "steady": self.steady.tolist(),
-            "step": self.step.tolist(),
-            "history": self.history,
-        }
+        kept = {name: getattr(self, name).tolist() for name in PER_AGENT}
+        return {"weights": self.weights, **kept, "history": self.history}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue as saved."""
         self.weights.copy_(state["weights"])
-        self.merit[:] = state["merit"]
-        self.regret[:] = state["regret"]
-        self.steady[:] = state["steady"]
-        self.step[:] = state["step"]
+        for name in PER_AGENT:
+            getattr(self, name)[:] = state[name]
         self.history = [(step, list(regret), list(steady)) for step, regret, steady in state["history"]]
 
 
@@ -196,7 +189,7 @@ class Session:
         if self.met():  # resumed after its end
             return
         total, last = c.agent.total_steps, self.agents.steps
-        told = max(c.eval_every, total // TOLD)
+        line_every = max(c.eval_every, total // LINES)
         started, earlier = time.perf_counter(), self.seconds
         announcements.began(c, self.task, self.seeds, self.folder, last)
         bars = tqdm(total=total, initial=last, disable=None, unit="step")
@@ -210,7 +203,7 @@ class Session:
                     line = self._news(record)
                     bar.set_postfix_str(line)
                     final = final or self.met()
-                    if bar.disable and (final or record.step // told > last // told):
+                    if bar.disable and (final or record.step // line_every > last // line_every):
                         log.info("step %d of %d, %s", record.step, total, line)
                 stopped = stopping()
                 if final or stopped or record.step // c.checkpoint_every > last // c.checkpoint_every:

@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -188,7 +188,7 @@ def test_bounds_of_an_estimator_depend_on_the_od_and_return_from_a_file() -> Non
          [1.0, np.nan, 0.5, 0.05], [0.1, 0.8, 0.5, 0.05]]
     )  # fmt: skip
     np.testing.assert_array_equal(bounds.hold(*cases.T), [True, False, False, False, False, True])
-    assert EstimateBounds.of(json.loads(json.dumps(bounds.plain()))) == bounds
+    assert EstimateBounds.of(json.loads(json.dumps(asdict(bounds)))) == bounds
 
 
 def test_the_shipped_policy_has_its_certificate() -> None:

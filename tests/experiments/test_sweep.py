@@ -17,6 +17,7 @@ import pytest
 
 from dqn import checkpoint
 from experiments.cli import frame, sweep
+from experiments.cli.frame import UserError
 from experiments.control import run as control
 from experiments.control.config import DeployConfig
 from experiments.train import main, train
@@ -118,9 +119,13 @@ def test_a_resumed_sweep_takes_no_other_values_but_another_launcher(tmp_path, mo
     assert sweep.asked(["resume=old", "hydra/launcher=slurm"], "train").line() == [
         "-m", "seed=0,1", "hydra/launcher=slurm", "hydra.sweep.dir=old",
     ]  # fmt: skip
-    with pytest.raises(sweep.Again, match=r"^seed=3: a resumed sweep is python -m experiments\.train -m resume=old"):
+    with pytest.raises(
+        frame.UserError, match=r"^seed=3: a resumed sweep is python -m experiments\.train -m resume=old"
+    ):
         sweep.asked(["-m", "resume=old", "seed=3"], "train")
-    with pytest.raises(sweep.Again, match=r"^hydra\.sweep\.dir=old: holds another sweep .*seed=0,1.*another folder$"):
+    with pytest.raises(
+        frame.UserError, match=r"^hydra\.sweep\.dir=old: holds another sweep .*seed=0,1.*another folder$"
+    ):
         sweep.asked(["-m", "seed=0,2", "hydra.sweep.dir=old"], "train").save()
     sweep.asked(["-m", "seed=0,1", "hydra.sweep.dir=old"], "train").save()  # the same, by another launcher
     assert sweep.asked(["seed=0"], "train") is None
@@ -138,7 +143,7 @@ def test_jobs_are_those_that_hydra_makes_of_the_command_line():
 
 
 def test_a_launcher_that_does_not_exist_is_one_line(tmp_path):
-    with pytest.raises(frame.UserError, match=r"^hydra/launcher=ray: no such option; allowed: basic, joblib"):
+    with pytest.raises(UserError, match=r"^hydra/launcher=ray: no such option; allowed: basic, joblib"):
         frame.normalise(["-m", "hydra/launcher=ray"], "train")
 
 
@@ -146,7 +151,7 @@ def test_a_folder_goes_on_with_the_same_config_only_and_one_process_at_a_time(tm
     job = sweep.Job.at(tmp_path)
     job.begin(TrainConfig())
     sweep.Job.at(tmp_path).begin(TrainConfig())
-    with pytest.raises(sweep.Again, match=r"holds a run of another config; give another hydra\.sweep\.dir="):
+    with pytest.raises(UserError, match=r"holds a run of another config; give another hydra\.sweep\.dir="):
         sweep.Job.at(tmp_path).begin(TrainConfig(seed=1))
     (tmp_path / "progress.csv").touch()
     job.put_aside()
@@ -183,7 +188,7 @@ def test_another_launcher_is_not_told_what_the_one_before_was(tmp_path):
 
 
 def test_a_single_run_is_not_resumed_as_a_sweep(tmp_path):
-    with pytest.raises(sweep.Again, match="no sweep; a single run goes on without -m"):
+    with pytest.raises(UserError, match="no sweep; a single run goes on without -m"):
         sweep.asked(["-m", f"resume={tmp_path}"], "train")
 
 
