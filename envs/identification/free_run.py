@@ -50,21 +50,13 @@ def _basis(series: Series, used: NDArray[np.intp], with_tau: bool) -> Array:
     return np.column_stack([elapsed, *([-volume] if with_tau else []), np.ones(len(used))])
 
 
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    """Parameters (p,), derivatives of the model (m, p), residuals model - y clipped by the loss (m,), where it did."""
-
-    best: Array
-    jacobian: Array
-    error: Array
-    clipped: NDArray[np.bool_]
-
-
-def _solve(y: Array, basis: Array, robust: bool) -> _Solution:
+def _solve(y: Array, basis: Array, robust: bool) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Levenberg-Marquardt with the exact derivatives; Huber's loss by reweighting.
 
     A reading counts in full up to 3 robust sd, the larger of that of the residuals and that of the relative residuals
     times the model, so that the noisier readings at a high OD are not taken for outliers.
+
+    Returns: parameters (p,), derivatives of the model (m, p), residuals model - y clipped by the loss and where, (m,).
     """
     from scipy.optimize import least_squares  # half a second, which a refused command line need not wait for
 
@@ -95,7 +87,7 @@ def _solve(y: Array, basis: Array, robust: bool) -> _Solution:
         if (weight == 1.0).all() or np.allclose(best, previous, rtol=1e-7, atol=1e-12):
             break
     model = simulated(best)
-    return _Solution(best, model[:, None] * basis, np.clip(model - y, -limit, limit), np.abs(model - y) > limit)
+    return best, model[:, None] * basis, np.clip(model - y, -limit, limit), np.abs(model - y) > limit
 
 
 def fit(series: Series, robust: bool = True) -> Fit:
@@ -117,9 +109,8 @@ def fit(series: Series, robust: bool = True) -> Fit:
     used = np.flatnonzero(np.isfinite(series.od))
     if len(used) < 5:
         raise NotIdentifiable(f"rows {series.row[0]}-{series.row[-1]}: {len(used)} readings are too few for a fit")
-    solution = _solve(series.od[used], _basis(series, used, with_tau), robust)
-    best, jacobian = solution.best, solution.jacobian
-    normal = jacobian[~solution.clipped].T @ jacobian[~solution.clipped]
+    best, jacobian, error, clipped = _solve(series.od[used], _basis(series, used, with_tau), robust)
+    normal = jacobian[~clipped].T @ jacobian[~clipped]
     if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)))) > WORST_CONDITION:
         raise NotIdentifiable(
             f"rows {series.row[0]}-{series.row[-1]}: growth and dilution cannot be told apart (the pump's rate never "
@@ -127,7 +118,7 @@ def fit(series: Series, robust: bool = True) -> Fit:
         )
     inverse = np.linalg.inv(normal)
     leverage = np.minimum(np.einsum("ij,jk,ik->i", jacobian, inverse, jacobian), 0.5)
-    score = jacobian * (solution.error / (1.0 - leverage))[:, None]
+    score = jacobian * (error / (1.0 - leverage))[:, None]
     influence = inverse @ score.T  # (p, m): how far each reading pulled a parameter
     mu = Parameter(*_interval(best[0], influence[0], len(best)))
     tau = _turned_over(series, _interval(best[1], influence[1], len(best))) if with_tau else None

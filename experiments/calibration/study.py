@@ -24,14 +24,10 @@ Array = NDArray[np.float64]
 def simulated(config: CalibrateConfig, n: int) -> tuple[Array, Array, Array, Array]:
     """n recordings under the configured law: time (T,), OD and pump rate (n, T), mean growth rate (n,)."""
     protocol, rng = config.protocol, np.random.default_rng(config.protocol.seed)
-    decide = OpenLoopLaw(protocol, n, rng).decide if config.law == "open_loop" else _resting(config, n)
-    return recordings(protocol, decide, rng, n)
-
-
-def _resting(config: CalibrateConfig, n: int) -> Decide:
-    """The law that regulates, with the pump at rest at the start of every hour."""
-    regulate = _regulation(config, n)
-    return lambda t, od: regulate(t, od) * (t % 60.0 >= config.rest_min)
+    if config.law == "open_loop":
+        return recordings(protocol, OpenLoopLaw(protocol, n, rng).decide, rng, n)
+    regulate = _regulation(config, n)  # with the pump at rest at the start of every hour
+    return recordings(protocol, lambda t, od: regulate(t, od) * (t % 60.0 >= config.rest_min), rng, n)
 
 
 def _regulation(config: CalibrateConfig, n: int) -> Decide:

@@ -12,6 +12,7 @@ import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from traceback import walk_tb
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
@@ -73,11 +74,7 @@ def _load(path: Path) -> None:
 def _line_in(path: Path, error: Exception) -> str:
     """Where in the file it went wrong, ":12"."""
     numbers = [error.lineno or 0] if isinstance(error, SyntaxError) else []
-    trace = error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(path):
-            numbers.append(trace.tb_lineno)
-        trace = trace.tb_next
+    numbers += [line for stack, line in walk_tb(error.__traceback__) if stack.f_code.co_filename == str(path)]
     return f":{numbers[-1]}" if numbers else ""
 
 

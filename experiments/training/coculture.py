@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dqn.config import DQNConfig
 from dqn.hindsight import ProgramRelabel, Relabel
 from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
-from envs.coculture.optimum import Grid, Transitions, best_action, cost_to_go, transitions
+from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import (
     LOGIT,
     NEXT,
@@ -124,32 +124,18 @@ class Coculture:
         run = Rollout(np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.intp))
         for first in range(0, len(programs), 24):  # so many at a time bound the memory
             rows = np.flatnonzero((which >= first) & (which < first + 24))
-            self._follow(model, programs[first : first + 24], which[rows] - first, start[rows, :3], run, rows)
+            own, state, goal = which[rows] - first, start[rows, :3], programs[first : first + 24]
+            setpoints = np.empty((self.steps, len(goal)))
+            for k in range(self.steps):
+                setpoints[k], goal = share(goal[:, 0]), passed(self.config, goal)
+            value = cost_to_go(model, setpoints)
+            for k in range(self.steps):
+                wanted = setpoints[k, own]
+                action = best_action(self.config, model, value[k + 1][:, own], state, wanted)
+                state = advance(self.config, state, self.actions[action], self.config.control_min)
+                run.action[k, 0, rows], run.state[k, 0, rows] = action, state[:, 0]
+                run.error[k, 0, rows] = share(state[:, 0]) - wanted
         return run
-
-    def _follow(
-        self,
-        model: Transitions,
-        programs: Array,
-        own: NDArray[np.intp],
-        state: Array,
-        run: Rollout,
-        rows: NDArray[np.intp],
-    ) -> None:
-        """Fill `rows` of a rollout with the optimum of each episode.
-
-        Args: programs: goals at the start, (P, 1 or 3). own: index of each episode's program, (R,). state: (R, 3).
-        """
-        goal, setpoints = programs, np.empty((self.steps, len(programs)))
-        for k in range(self.steps):
-            setpoints[k], goal = share(goal[:, 0]), passed(self.config, goal)
-        value = cost_to_go(model, setpoints)
-        for k in range(self.steps):
-            wanted = setpoints[k, own]
-            action = best_action(self.config, model, value[k + 1][:, own], state, wanted)
-            state = advance(self.config, state, self.actions[action], self.config.control_min)
-            run.action[k, 0, rows], run.state[k, 0, rows] = action, state[:, 0]
-            run.error[k, 0, rows] = share(state[:, 0]) - wanted
 
     def myopic(self, observation: Array) -> NDArray[np.intp]:
         """The temperature after which the share is nearest to the setpoint in force."""
