@@ -119,13 +119,9 @@ def test_a_resumed_sweep_takes_no_other_values_but_another_launcher(tmp_path, mo
     assert sweep.asked(["resume=old", "hydra/launcher=slurm"], "train").line() == [
         "-m", "seed=0,1", "hydra/launcher=slurm", "hydra.sweep.dir=old",
     ]  # fmt: skip
-    with pytest.raises(
-        frame.UserError, match=r"^seed=3: a resumed sweep is python -m experiments\.train -m resume=old"
-    ):
+    with pytest.raises(UserError, match=r"^seed=3: a resumed sweep is python -m experiments\.train -m resume=old"):
         sweep.asked(["-m", "resume=old", "seed=3"], "train")
-    with pytest.raises(
-        frame.UserError, match=r"^hydra\.sweep\.dir=old: holds another sweep .*seed=0,1.*another folder$"
-    ):
+    with pytest.raises(UserError, match=r"^hydra\.sweep\.dir=old: holds another sweep .*seed=0,1.*another folder$"):
         sweep.asked(["-m", "seed=0,2", "hydra.sweep.dir=old"], "train").save()
     sweep.asked(["-m", "seed=0,1", "hydra.sweep.dir=old"], "train").save()  # the same, by another launcher
     assert sweep.asked(["seed=0"], "train") is None
