@@ -128,7 +128,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     bench, (plant, model) = config.bench, _models(config)
     if family.simulated and (other_ml := plant.vessel.volume_ml or bench.volume_ml) != bench.volume_ml:
         of_bench = f"bench.volume_ml = {bench.volume_ml:g} mL, which everything else goes by"
-        log.warning("plant.vessel.volume_ml = %g mL differs from %s: on purpose?", other_ml, of_bench)
+        log.info("plant.vessel.volume_ml = %g mL differs from %s: on purpose?", other_ml, of_bench)
     _check_fit(config, family, scenarios, ends)
     further = _further(config, plant, folder, scenarios)
     if further:  # the device has to measure what an estimate may need

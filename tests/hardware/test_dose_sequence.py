@@ -83,7 +83,7 @@ class Bench:
         self.connection = Connection("M0", Permitted(("M0",)), self.line, self.clock, self._log)
         self.book = Logbook("M0", self._log, self._log, lambda: self.clock.now() - 1000.0)
         calibration = calibration or ReactorCalibration()
-        parts = self.connection, calibration, ChiBioConfig(), self.agenda, self.book, lambda: self.known
+        parts = self.connection, 20.0, calibration, ChiBioConfig(), self.agenda, self.book, lambda: self.known
         self.doses = DoseSequence(Context(*parts))
         start = self.connection.read().start_time
         self._log("device", {"start_time": start})
