@@ -5,7 +5,7 @@ A family gives a `Station` per reactor and says in a subclass what it does betwe
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -107,8 +107,6 @@ class Stations(Generic[S, H]):
     """
 
     stations: Sequence[S]
-    NOT_OFF: ClassVar[str] = "{}"
-    """What `stop` raises of reactors whose pumps could not be verified off, a format for a line on each."""
 
     def __init__(self, clock: Clock, stale_s: float, log: Log) -> None:
         self._clock, self._stale_s, self._log, self._zero = clock, stale_s, log, clock.now()
@@ -263,6 +261,10 @@ class Stations(Generic[S, H]):
                 failed[station] = error
         return failed
 
+    def _not_off(self, failed: str) -> str:
+        """What is said of pumps that could not be verified off."""
+        return failed
+
     def stop(self) -> None:
         """All pumps off, verified, but those of a reactor that was handed over; the rest goes on. Idempotent.
 
@@ -271,7 +273,7 @@ class Stations(Generic[S, H]):
         failed = self._lines(self._silence([station for station in self.stations if not station.handed_over]))
         self.note_down("stop", {"reactors": self.names, "not_verified": failed})
         if failed:
-            raise DeviceStateError(self.NOT_OFF.format("; ".join(failed)))
+            raise DeviceStateError(self._not_off("; ".join(failed)))
 
     def _silence(self, stations: Sequence[S]) -> dict[S, ReactorError]:
         """All pumps of these off for good; what could not be verified."""

@@ -177,10 +177,14 @@ SAID: dict[str, dict[str, Reader]] = {  # which call says something, in which fi
     "hardware/storage/journal.py": ERRORS,
     "hardware/storage/recorder.py": ERRORS,
     "experiments/control/*.py": LOGS,
+    "experiments/record/*.py": LOGS,
+    "experiments/cli/stop.py": LOGS,
+    "hardware/family.py": LOGS,
     "hardware/board/board_agent.py": LOGS,
 }  # fmt: skip
 RETURNED = {  # functions whose result is said elsewhere
     "hardware/chibio/ending.py": "_words",
+    "hardware/chibio/reactors.py": "_not_off",
     "hardware/chibio/sampling.py": "_measure_lateness",
     "experiments/record/recovery.py": "complete",
 }
@@ -189,7 +193,7 @@ NAMED = {  # names whose values are said elsewhere
     "experiments/record/record.py": ("repairs",),
     "experiments/record/recovery.py": ("repairs",),
     "experiments/control/run.py": ("outcome",),
-    "experiments/record/summary.py": ("who",),
+    "experiments/record/summary.py": ("who", "said"),
     "hardware/chibio/fluorescence.py": ("trouble",),
     "hardware/chibio/overflow_pump.py": ("trouble",),
     "hardware/pioreactor/doses.py": ("foreign",),

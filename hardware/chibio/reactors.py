@@ -8,7 +8,7 @@ carried out even when other requests fail.
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 from envs.bench import Bench
 from hardware.chibio.agenda import Agenda
@@ -34,8 +34,6 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
       transport: the link; this object is its only user. clock: device time.
       calibrations: one per reactor of `config.reactors`; nominal ones if left out. bench: volumes of the cultures.
     """
-
-    NOT_OFF: ClassVar = "pumps not verified off: {}. Switch the pump boards off by hand now"
 
     def __init__(
         self,
@@ -139,6 +137,9 @@ class ChiBioReactors(Stations[Station, ReactorHistory]):
         for station in pending:
             station.connection.escalate()
         return failed(list(pending))
+
+    def _not_off(self, failed: str) -> str:
+        return f"pumps not verified off: {failed}. Switch the pump boards off by hand now"
 
     def end(self) -> None:
         """`stop`, then end every experiment. Raises: ReactorError if one goes on."""
