@@ -17,6 +17,7 @@ __all__ = ["Entry", "build", "check", "entries", "part", "require", "setting"]
 
 T = TypeVar("T")
 
+ON_BENCH = ("volume_ml", "period_s", "control_min", "max_rate", "bottle_ml")  # of everybody alike (envs/bench.py)
 TRUE, FALSE = ("true", "yes", "on", "1", "y", "t"), ("false", "no", "off", "0", "n", "f")
 
 
@@ -160,7 +161,8 @@ def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
         key = f"{prefix}.{name}" if prefix else str(name)
         if name not in of:
             where = f"under {prefix}" if prefix else "here"
-            raise ValueError(f"{key}: no such key; allowed {where}: {', '.join(of)}")
+            moved = "; it is said under bench" if name in ON_BENCH else ""
+            raise ValueError(f"{key}: no such key{moved}; allowed {where}: {', '.join(of)}")
         given[name] = _converted(entry, hints[name], getattr(default, name), key)
     return replace(cast(Any, default), **given)  # type: ignore[no-any-return]
 

@@ -3,9 +3,11 @@
 import os
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
+from conf.schema import require
 from experiments.cli import frame
 from experiments.control.config import DeployConfig, deploy_schema
 from experiments.control.notify import hidden
@@ -23,7 +25,11 @@ def deploy(config: DeployConfig, folder: Path) -> None:
 def _schema(cfg: DictConfig) -> DeployConfig:
     composition = cfg.get("composition")
     law = None if composition is None else str(composition.kind)
-    own = {str(name): str(part.get("kind")) for name, part in (cfg.get("signals") or {}).items()}
+    given: Any = cfg.get("signals") or DictConfig({})
+    require(isinstance(given, DictConfig), "signals", given, "a law for each, as signals.NAME.kind=LAW")
+    for name, part in given.items():
+        require(isinstance(part, DictConfig), f"signals.{name}", part, f"a law, as signals.{name}.kind=LAW")
+    own = {str(name): str(part.get("kind")) for name, part in given.items()}
     return deploy_schema(str(cfg.backend.kind), str(cfg.controller.kind), law, own)
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from conf.schema import check, require, setting
-from envs.bench import VIAL_ML
 from envs.plant.plant import Plant, PlantConfig
 from hardware.clock import Clock, VirtualClock
 from hardware.family import Can, Family, Opening
@@ -140,10 +139,6 @@ class SimulatedFamily(Family):
         volumes_ml = bench.volumes(backend.reactors)
         vials = Plant(opening.plant, len(backend.reactors), np.random.default_rng(backend.seed), volumes_ml)
         yield SimulatedReactors(vials, backend, bench.control_min)
-
-    def rim_ml(self, volumes_ml: Array) -> float:
-        """As a Chi.Bio's."""
-        return VIAL_ML
 
     def vials(self, backend: SimulatedConfig, plant: PlantConfig) -> tuple[str, PlantConfig]:
         """Those of deploy's `plant`."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
+from envs.bench import VIAL_ML
 from envs.plant.noise import Streams, spread
 from envs.plant.pump import PumpConfig
 
@@ -29,9 +30,10 @@ class VesselConfig:
     overflow_above_ml: float = setting(
         2.0, "the overflow pump's tube ends so far above the waste tube", "mL", within=(0, 10)
     )
-    capacity_ml: float = setting(
-        30.0, "overflows above; 4.5 mL over volume_ml or more (30 mL vial)", "mL", at_most=200.0
-    )
+    capacity_ml: float | None = setting(
+        None, "overflows above; null: a vial of 30 mL, or 10 mL above the waste tube where that is more", "mL",
+        at_most=200.0,
+    )  # fmt: skip
     evaporation_ml_day: float = setting(0.0, "water lost", "mL/day", within=(0, 50))
     media_ml: float = setting(math.inf, "fresh medium in the bottle; inf: never empty", "mL", within=(0, math.inf))
 
@@ -42,7 +44,8 @@ class VesselConfig:
 
     def _holds(self, volume_ml: float) -> None:
         lowest = volume_ml + 4.5
-        require(self.capacity_ml >= lowest, "plant.vessel.capacity_ml", f"{self.capacity_ml} mL", f"{lowest:g} to 200")
+        enough = self.capacity_ml is None or self.capacity_ml >= lowest
+        require(enough, "plant.vessel.capacity_ml", f"{self.capacity_ml} mL", f"{lowest:g} to 200")
 
     def of(self, bench_ml: Array) -> Array:
         """Mean culture of each vial, mL, (N,); `bench_ml` unless the config differs.
@@ -71,6 +74,8 @@ class Vessel:
         self.config, self._pump = config, pump
         mean = config.of(bench_ml)
         self._tube_ml = spread(rngs, mean, config.volume_sd_ml / mean)
+        given = config.capacity_ml
+        self._capacity_ml = np.maximum(VIAL_ML, mean + 10.0) if given is None else np.full(len(rngs), given)
         self.draws: dict[str, Array] = {"volume_ml": self._tube_ml}
         self.waste_gain_factor, self.overflow_gain_factor = np.ones(len(rngs)), np.ones(len(rngs))
         self.reset()
@@ -102,10 +107,10 @@ class Vessel:
             level, left, outlet[1] = level + fill, left - fill - swapped, able - swapped
         kept = kept * (level / (level + left))
         level = level + left
-        self.overflowed = self.overflowed | (level > self.config.capacity_ml)
+        self.overflowed = self.overflowed | (level > self._capacity_ml)
         for tube, able in outlets:
             level = np.maximum(level - able, np.minimum(tube, level))
-        self.volume_ml = np.minimum(level, self.config.capacity_ml)
+        self.volume_ml = np.minimum(level, self._capacity_ml)
         return np.asarray(kept)
 
     def draw_out(self, volume_ml: Array) -> None:

@@ -129,7 +129,9 @@ def _stored(path: Path, resume: str, fitting: Callable[[DictConfig], T]) -> T:
         return load(stored, fitting(stored))
     except (UserError, OSError, ValueError, AttributeError, OmegaConfBaseException) as error:
         why = _one_line(error) or type(error).__name__
-        remedy = "put it back as the run wrote it, or start a new run"
+        remedy = (
+            "put it back as the run wrote it, finish a run of an earlier version with that version, or start a new run"
+        )
         raise UserError(f"{path}: not the config of this run ({why}); {remedy}") from None
 
 

@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from conf.presets import load
 from conf.schema import build
 from dqn.policy import Policy
@@ -34,7 +36,7 @@ from experiments.loop.signals import Signal
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, continue_loop
 from hardware.check import report
-from hardware.errors import ReactorError
+from hardware.errors import ReactorError, UnfitError
 from hardware.family import Family, Opening, family_of
 from hardware.reactor import Reactor
 from hardware.safety.config import SafetyConfig
@@ -126,8 +128,9 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         why = "a simulated run takes a second; run it again" if family.simulated else "its reactors cannot; start anew"
         raise frame.UserError(f"resume={config.resume}: {why}")
     bench, (plant, model) = config.bench, _models(config)
-    if family.simulated and (other_ml := plant.vessel.volume_ml or bench.volume_ml) != bench.volume_ml:
-        of_bench = f"bench.volume_ml = {bench.volume_ml:g} mL, which everything else goes by"
+    volumes_ml = bench.volumes(backend.reactors)
+    if family.simulated and (other_ml := plant.vessel.volume_ml) is not None and (volumes_ml != other_ml).any():
+        of_bench = f"bench.volume_ml = {bench.volume_ml:g} mL or bench.volumes_ml, which everything else goes by"
         log.info("plant.vessel.volume_ml = %g mL differs from %s: on purpose?", other_ml, of_bench)
     _check_fit(config, family, scenarios, ends)
     further = _further(config, plant, folder, scenarios)
@@ -175,6 +178,23 @@ def _check_fit(config: DeployConfig, family: Family, scenarios: list[Scenario], 
             raise frame.UserError(f"controller = {law}: knows a simulated plant; {remedy}") from None
     with frame.refusing(ReactorError):
         family.fits(config.backend, config.bench, scenarios, ends)
+        _check_room(config, family)
+
+
+def _check_room(config: DeployConfig, family: Family) -> None:
+    """Whether the largest dose may be given at all: by the vial and by the budget of a minute. Raises: UnfitError."""
+    bench, tubes_ml = config.bench, config.bench.volumes(config.backend.reactors)
+    room_ml = float(np.min(np.minimum(config.safety.overflow_ml, family.rim_ml(tubes_ml) - tubes_ml)))
+    largest_ml, allowed_ml = bench.max_rate * bench.period_s, min(room_ml, config.safety.ml_a_minute(bench))
+    if largest_ml > allowed_ml + 1e-9:
+        given = (
+            f"bench.max_rate = {bench.max_rate:g} mL/s over {bench.period_s:g} s comes to {largest_ml:.3g} mL at once"
+        )
+        why = "what a vial has room for above its tube, and safety.ml_per_minute"
+        least = max(np.floor(1e5 * allowed_ml / bench.period_s) / 1e5, 0.0)
+        raise UnfitError(
+            f"{given}: allowed {max(allowed_ml, 0.0):.3g} mL ({why}); give bench.max_rate={least:g} or less"
+        )
 
 
 def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dict[str, float | str]]:
@@ -239,7 +259,9 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     for signal in setup.further:
         if isinstance(signal, Share) and plant is not None:
             signal.truth = partial(getattr, plant.culture, "share")
-    loop = ClosedLoop(reactors, law, interlock, setup.scenarios, record.decided, setup.ends, setup.further)
+    counts = registry.takes(setup.law.kind, "model") and not registry.takes(setup.law.kind, "plant")
+    scale = volumes_ml / setup.bench.volume_ml if counts else np.ones(len(volumes_ml))  # its model is of one volume
+    loop = ClosedLoop(reactors, law, interlock, setup.scenarios, record.decided, setup.ends, setup.further, scale)
     if setup.resumed:
         continue_loop(loop, record.journal, record.state_path)
     return loop

@@ -82,7 +82,8 @@ class DeployConfig:
     def __post_init__(self) -> None:
         check(self)
         self.safety.ages_s(self.bench)
-        self.plant.vessel.of(self.bench.volumes(self.backend.reactors))
+        if family_of(self.backend).simulated:
+            self.plant.vessel.of(self.bench.volumes(self.backend.reactors))
         unknown = [name for name in self.bench.volumes_ml if name not in self.backend.reactors]
         require(not unknown, "bench.volumes_ml", tuple(unknown), f"names of {', '.join(self.backend.reactors)}")
         if "://" in self.notify.split(" ")[0]:

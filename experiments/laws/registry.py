@@ -111,7 +111,9 @@ def add(
 def _kind(kind: str, signal: str) -> Kind:
     if kind not in KINDS.get(signal, {}):
         key = f"{GROUPS.get(signal, f'signals.{signal}')}.kind"
-        raise ValueError(f"{key} = {kind}: allowed {', '.join(KINDS.get(signal, {}))}")
+        missing = f"none: no such signal; bring it by extend=FILE.py, or one of {', '.join(KINDS)}"
+        allowed = ", ".join(KINDS.get(signal, {})) or missing
+        raise ValueError(f"{key} = {kind}: allowed {allowed}")
     return KINDS[signal][kind]
 
 

@@ -82,6 +82,7 @@ class ClosedLoop:
       at_end: of each reactor, or one for all, once its schedule is over and others are not: "hold" goes on at the last
         setpoint, "stop" gives no dose any more, "regulate" hands over to the device's own regulation for good.
       before_dose: called with the step as decided, before anything is dosed (volume_ml still nan): the journal.
+      scale: of each culture over that of the law's model, as of `Density`.
       further: signals beside the density; what acts by the thermostat decides on the temperature in place of the
         schedules wherever it gives a target.
     Raises: ValueError for another number of schedules than of reactors, or two signals with one actuator.
@@ -98,9 +99,14 @@ class ClosedLoop:
         before_dose: Callable[[Step], None] | None = None,
         at_end: Sequence[str] | str = "stop",
         further: Sequence[Signal] = (),
+        scale: Array | float = 1.0,
     ) -> None:
         n = len(reactors.names)
-        self.reactors, self.interlock, self.density = reactors, interlock, Density(controller)
+        self.reactors, self.interlock, self.density = (
+            reactors,
+            interlock,
+            Density(controller, scale, interlock.bench.max_rate),
+        )
         self.signals = one_each([self.density, *further])
         self.schedules = [schedules] * n if isinstance(schedules, Scenario) else list(schedules)
         if len(self.schedules) != n:

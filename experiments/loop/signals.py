@@ -4,6 +4,7 @@ The density, held by the feed pump, is always one of them (`Density`). The share
 is another (`experiments/loop/share.py`). One of one's own is made known by `add` (docs/extending.md).
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -108,13 +109,20 @@ class Signal(Protocol):
 
 
 class Density:
-    """The density, held by the feed pump. Args: law: decides on the pump rate; what it can do beyond is asked of it."""
+    """The density, held by the feed pump.
+
+    A culture of volume s V answers to a rate s u as one of V does to u, since tau = V/60. So a law whose model is of V
+    decides for every volume.
+
+    Args: law: decides on the pump rate; what it can do beyond is asked of it. scale: s, (N,) or one for all.
+      max_rate: largest rate, mL/s.
+    """
 
     name, actuator = "controller", FEED
     columns: tuple[str, ...] = ()  # the recording has them in any case
 
-    def __init__(self, law: Controller) -> None:
-        self.law = law
+    def __init__(self, law: Controller, scale: Array | float = 1.0, max_rate: float = math.inf) -> None:
+        self.law, self._scale, self._max_rate = law, scale, max_rate
 
     def decide(self, sample: Sample) -> Array:
         """See `Signal.decide`."""
@@ -122,7 +130,8 @@ class Density:
         if isinstance(self.law, Watches):
             self.law.watch(m.od, m.temperature, sample.minute, sample.believed)
         od = np.where(sample.rows & ~sample.believed, np.nan, m.od)
-        return self.law.act(od, sample.setpoint, sample.minute, sample.believed & (sample.phase >= 0))
+        rate = self.law.act(od, sample.setpoint, sample.minute, sample.believed & (sample.phase >= 0))
+        return np.where(np.equal(self._scale, 1.0), rate, np.minimum(rate * self._scale, self._max_rate))
 
     def find(self, sample: Sample, given: Array) -> Findings:
         """See `Signal.find`."""
@@ -131,7 +140,7 @@ class Density:
     def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
         """See `Signal.dosed`."""
         if isinstance(self.law, Accounts):
-            self.law.dosed(volume_ml + kept_ml)
+            self.law.dosed((volume_ml + kept_ml) / self._scale)
 
     @property
     def memory(self) -> Remembers | None:

@@ -12,7 +12,7 @@ from hardware.chibio.calibrations import load_calibrations
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.connection import identity
 from hardware.chibio.preflight import preflight
-from hardware.chibio.protocol import CONTROL_S
+from hardware.chibio.protocol import CONTROL_S, LEAST_ML
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
 from hardware.clock import DeviceClock
@@ -99,8 +99,11 @@ class ChiBioFamily(Family):
             where = f"allowed {CONTROL_S:g} with backend={backend.kind}, which measures so often"
             raise UnfitError(f"bench.period_s = {bench.period_s:g} s: {where}")
         for name in backend.reactors:
-            if (ml := bench.volume_of(name)) >= VIAL_ML:
-                raise UnfitError(f"bench.volume_ml = {ml:g} mL of {name}: the vial holds {VIAL_ML:g}; allowed less")
+            if not LEAST_ML <= (ml := bench.volume_of(name)) < VIAL_ML:
+                allowed = (
+                    f"allowed {LEAST_ML:g}, which the device takes, to less than {VIAL_ML:g}, which the vial holds"
+                )
+                raise UnfitError(f"bench.volume_ml = {ml:g} mL of {name}: {allowed}")
 
     def rim_ml(self, volumes_ml: Array) -> float:
         """Of the glass vial."""

@@ -16,6 +16,7 @@ __all__ = [
     "BANDS",
     "CONTROL_S",
     "FEED",
+    "LEAST_ML",
     "LEDS",
     "MAX_OVERFLOW_DUTY",
     "PERIOD_S",
@@ -40,6 +41,8 @@ MAX_OVERFLOW_DUTY = 0.95
 """Never 1: the device does not switch such a pump off between its periods (docs/device.md, Pumps)."""
 PERIOD_S = 63.0
 """A pump that is ON runs at full power for PERIOD_S * target seconds of every PERIOD_S (docs/device.md, Pumps)."""
+LEAST_ML = 10.0
+"""A smaller culture is not told to the device's own regulator."""
 CONTROL_S = 60.0
 """One dose per cycle of the device: the control period, s."""
 MAX_TEXT = 160
@@ -60,7 +63,7 @@ _LIMITS: Mapping[str, tuple[float, float]] = {
     "Stir": (0.0, 1.0),
     "Thermostat": (0.0, 42.0),  # the device has no over-temperature cut-off of its own
     "OD": (0.01, 1.5),
-    "Volume": (10.0, 30.0),
+    "Volume": (LEAST_ML, 30.0),
 }
 _SWITCHES = (*PUMPS, "OD", "Stir", "Thermostat", "Heat")
 PUMPING_MODES = ("Zigzag", "Custom", "Chemostat")

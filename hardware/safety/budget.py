@@ -64,7 +64,8 @@ class FeedBudget:
         c = self._config
         self._roll(now)
         recent = np.where(now - self._dose_s < 60.0, self._dose_ml, 0.0).sum(axis=1)
-        left = [c.ml_per_minute - recent, c.ml_per_hour - self._hour.sum(axis=1), c.ml_per_run - self.fed_ml]
+        per_minute = c.ml_a_minute(self._bench)
+        left = [per_minute - recent, c.ml_per_hour - self._hour.sum(axis=1), c.ml_per_run - self.fed_ml]
         return {
             "budget": np.minimum.reduce(left),
             "bottle": self._bench.bottle_ml - self.fed_ml,

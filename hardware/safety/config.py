@@ -129,8 +129,12 @@ class Responses:
 class SafetyConfig:
     """Limits of the interlock between every controller and every pump, beside what the bench says; its own ledger."""
 
-    ml_per_minute: float = setting(
-        3.0, "feed budget; two doses may fall into 60 s when a sample is late", "mL", above=0.0, below=math.inf
+    ml_per_minute: float | None = setting(
+        None,
+        "feed budget; null: two and a half of the largest doses, since two may fall into 60 s when a sample is late",
+        "mL",
+        above=0.0,
+        below=math.inf,
     )
     ml_per_hour: float = setting(75.0, "feed budget", "mL", above=0.0, below=math.inf)
     ml_per_run: float = setting(10000.0, "feed budget", "mL", above=0.0, below=math.inf)
@@ -184,6 +188,10 @@ class SafetyConfig:
     def response(self, kind: str) -> Response:
         """What is done about a reason. Raises: KeyError if there is none of that name."""
         return WORDS[getattr(self.responses, kind, RESPONSES[kind])]
+
+    def ml_a_minute(self, bench: Bench) -> float:
+        """Feed budget of a minute, mL."""
+        return 2.5 * (bench.max_rate * bench.period_s) if self.ml_per_minute is None else self.ml_per_minute
 
     def ages_s(self, bench: Bench) -> tuple[float, float]:
         """Ages of a newest sample that is stale and that is lost, s.

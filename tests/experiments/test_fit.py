@@ -68,3 +68,36 @@ def test_a_volume_and_a_period_are_said_once_and_by_the_bench(key: str) -> None:
     for backend in ("sim", "chibio", "pioreactor"):
         with pytest.raises(frame.UserError, match=f"(?i){key.rpartition('.')[2]}"):
             main.config([f"backend={backend}", "controller=pi", f"+{key}=28"])
+
+
+@pytest.mark.parametrize("ml", [26.0, 30.0, 34.5])
+def test_a_large_pioreactor_runs_up_to_the_limit_of_its_vial(ml: float, tmp_path: Path) -> None:
+    words = ["backend=pioreactor", f"bench.volume_ml={ml}", "controller=pi"]
+    setup = assemble.unpack(main.config(words), tmp_path)
+    tubes_ml = setup.bench.volumes(setup.backend.reactors)
+    assert tubes_ml.tolist() == [ml]
+    assert setup.family.rim_ml(tubes_ml).tolist() == [36.0]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["backend=pioreactor", "bench.volume_ml=36"], "allowed less than the vendor's limit of its vial, 36"),
+        (["backend=chibio", "bench.volume_ml=7"], "bench.volume_ml = 7 mL of M0: allowed 10"),
+        (["backend=chibio", "bench.volume_ml=30"], "bench.volume_ml = 30 mL of M0: allowed 10"),
+        (["backend=chibio", "bench.volume_ml=29.5"], "comes to 1.2 mL at once: allowed 0.5 mL"),
+        (["backend=sim", "bench.period_s=600"], "comes to 12 mL at once: allowed 5 mL .* give bench.max_rate=0.00833"),
+        (["backend=sim", "safety.ml_per_minute=1"], "comes to 1.2 mL at once: allowed 1 mL"),
+    ],
+)
+def test_what_no_vial_or_budget_can_take_is_one_line(words: list[str], said: str, tmp_path: Path) -> None:
+    with pytest.raises(frame.UserError, match=said) as told:
+        assemble.unpack(main.config([*words, "controller=pi"]), tmp_path)
+    assert "\n" not in str(told.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", [["signals.x=1"], ["signals=slope"], ["signals=[pace]"], ["signals.x.kind=slope"]])
+def test_a_signal_that_is_none_is_one_line(words: list[str]) -> None:
+    with pytest.raises((frame.UserError, ValueError), match="signals.* allowed .|signals"):
+        main.config(words)

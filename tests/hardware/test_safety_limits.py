@@ -80,7 +80,11 @@ class Ledger:
         wanted = min(wanted, bench.max_rate)
         minute = sum(ml for t, ml in self.doses[-4:] if now - t < 60.0)
         hour = sum(ml for t, ml in self.doses if now // 60.0 - t // 60.0 < 60.0)
-        budget = min(c.ml_per_minute - minute, c.ml_per_hour - hour, c.ml_per_run - self.fed)
+        budget = min(
+            (c.ml_per_minute or 2.5 * bench.max_rate * bench.period_s) - minute,
+            c.ml_per_hour - hour,
+            c.ml_per_run - self.fed,
+        )
         bottle = bench.bottle_ml - self.fed
         for kind, room in (("budget", budget), ("bottle", bottle), ("overflow", 25.0 - self.level)):
             if wanted * bench.period_s > room + 1e-9 and (wanted > 0.0 or kind != "budget"):
