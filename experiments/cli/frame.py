@@ -129,9 +129,8 @@ def _stored(path: Path, resume: str, fitting: Callable[[DictConfig], T]) -> T:
         return load(stored, fitting(stored))
     except (UserError, OSError, ValueError, AttributeError, OmegaConfBaseException) as error:
         why = _one_line(error) or type(error).__name__
-        remedy = (
-            "put it back as the run wrote it, finish a run of an earlier version with that version, or start a new run"
-        )
+        older = "a run of an earlier version goes on with that version only"
+        remedy = f"{older}; put it back as the run wrote it, or start a new run"
         raise UserError(f"{path}: not the config of this run ({why}); {remedy}") from None
 
 
