@@ -34,7 +34,6 @@ class Bench:
     max_rate: float = setting(
         0.02, "largest feed rate; the Chi.Bio's own regulator has this cap", "mL/s", above=0.0, at_most=0.05
     )
-
     bottle_ml: float = setting(2000.0, "fresh medium at the start, per reactor", "mL", above=0.0, below=math.inf)
 
     def __post_init__(self) -> None:

@@ -102,11 +102,8 @@ class ClosedLoop:
         scale: Array | float = 1.0,
     ) -> None:
         n = len(reactors.names)
-        self.reactors, self.interlock, self.density = (
-            reactors,
-            interlock,
-            Density(controller, scale, interlock.bench.max_rate),
-        )
+        self.reactors, self.interlock = reactors, interlock
+        self.density = Density(controller, scale, interlock.bench.max_rate)
         self.signals = one_each([self.density, *further])
         self.schedules = [schedules] * n if isinstance(schedules, Scenario) else list(schedules)
         if len(self.schedules) != n:
@@ -173,8 +170,7 @@ class ClosedLoop:
 
         decision = Step(
             now, rows, minute, elapsed, phase, m.od, m.temperature, setpoint, proposed, verdict.rate,
-            np.full(len(self.done), np.nan), reasons, verdict.response, (), explanation, self.done.copy(),
-            columns,
+            np.full(len(self.done), np.nan), reasons, verdict.response, (), explanation, self.done.copy(), columns,
             [self.position(n) for n in range(len(self.done))], ended,
             None if m.vitals is None else m.vitals.raw, None if m.vitals is None else m.vitals.blank, pump, believed,
         )  # fmt: skip
