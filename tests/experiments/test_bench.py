@@ -2,12 +2,18 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from envs.bench import Bench
 from experiments.control import run
 from experiments.deploy import main
+from experiments.loop.signals import Density
+from hardware.chibio.config import EmulatorConfig
+from hardware.emulator.family import _words
+from hardware.emulator.server import build, parser
 
 
 def error(folder: Path, *words: str) -> dict[str, float]:
@@ -25,6 +31,28 @@ def test_a_law_of_one_volume_decides_for_every_volume(law: str, tmp_path: Path) 
     found = error(tmp_path / "each", *vials, "bench.volumes_ml.M1=9", "bench.volumes_ml.M2=31")
     usual = error(tmp_path / "all", *vials)
     assert max(found.values()) < 1.5 * max(usual.values())
+
+
+def test_a_law_decides_in_shares_of_the_bench_s_own_volume(tmp_path: Path) -> None:
+    words = ["plant=nominal_noise", "backend.reactors=[M0,M1]", "controller=inverse"]
+    found = error(tmp_path / "run", *words, "bench.volume_ml=9", "bench.volumes_ml.M1=18")
+    assert max(found.values()) < 0.03
+
+
+def test_no_rate_for_a_larger_volume_passes_the_cap() -> None:
+    law = SimpleNamespace(act=lambda *_given: np.array([0.004, 0.015, 0.02]))
+    yes, none = np.ones(3, dtype=bool), np.zeros(3)
+    sample = SimpleNamespace(
+        measured=SimpleNamespace(od=none), rows=yes, believed=yes, setpoint=none, minute=none, phase=none
+    )
+    rate = Density(law, np.array([1.5, 1.5, 0.5]), 0.02).decide(sample)  # type: ignore[arg-type]
+    assert rate.tolist() == pytest.approx([0.006, 0.02, 0.01])
+
+
+def test_each_emulated_vial_has_its_own_volume() -> None:
+    bench = Bench(volume_ml=12.0, volumes_ml={"M2": 21.5})
+    device = build(parser().parse_args(_words(EmulatorConfig(reactors=("M0", "M2")), bench)))
+    assert [float(vial.plant.vessel.volume_ml[0]) for vial in device.vials.values()] == [12.0, 21.5]
 
 
 def test_a_slow_bench_is_fed(tmp_path: Path) -> None:
