@@ -34,7 +34,8 @@ def test_a_law_of_one_volume_decides_for_every_volume(law: str, tmp_path: Path) 
 
 
 def test_a_law_decides_in_shares_of_the_bench_s_own_volume(tmp_path: Path) -> None:
-    words = ["plant=nominal_noise", "backend.reactors=[M0,M1]", "controller=inverse"]
+    """The law that only balances growth learns nothing: scaled wrongly it lets the culture go."""
+    words = ["plant=nominal_noise", "backend.reactors=[M0,M1]", "controller=hold", "plant.start_od=0.6"]
     found = error(tmp_path / "run", *words, "bench.volume_ml=9", "bench.volumes_ml.M1=18")
     assert max(found.values()) < 0.03
 
