@@ -15,7 +15,8 @@ from typing import ParamSpec, TypeVar
 from experiments.cli import extensions
 
 __all__ = [
-    "SIGNALS", "STATUS", "Pause", "Workers", "handled", "interrupts", "one_interrupt", "pausing", "unmasked",
+    "SIGNALS", "STATUS", "Pause", "Workers", "handled", "interrupts", "one_interrupt", "pausing", "undisturbed",
+    "unmasked",
 ]  # fmt: skip
 
 P = ParamSpec("P")
@@ -40,30 +41,52 @@ def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> 
             signal.signal(number, old)
 
 
+class _Wait:
+    """Whether a stop waits, and whether one does."""
+
+    asked = came = False
+
+
+def _interrupt(number: int, stack: FrameType | None) -> None:
+    if not _Wait.asked:
+        raise KeyboardInterrupt
+    _Wait.came = True
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Inside, a stop waits: for calls that take a queue's lock, which a KeyboardInterrupt might leave taken for good.
+
+    Whoever needs that lock next, if only to close the writer at the end, would wait for ever. Not to be nested.
+    """
+    _Wait.asked = True
+    try:
+        yield
+    finally:
+        _Wait.asked = False
+        if _Wait.came:
+            _Wait.came = False
+            raise KeyboardInterrupt
+
+
 @contextmanager
 def interrupts() -> Iterator[None]:
-    """SIGTERM (a service manager, a shutting-down PC) and SIGHUP (a closed terminal) raise KeyboardInterrupt."""
-
-    def interrupt(number: int, stack: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    with handled(interrupt, signal.SIGTERM, signal.SIGHUP):
+    """Ctrl-C, SIGTERM (a service manager, a shutting-down PC) or SIGHUP (a closed terminal) raise KeyboardInterrupt."""
+    with handled(_interrupt, *SIGNALS):
         yield
 
 
 @contextmanager
 def one_interrupt() -> Iterator[None]:
-    """Ctrl-C, SIGTERM (a service manager, a shutting-down PC) or SIGHUP (a closed terminal) raise KeyboardInterrupt.
-
-    Only the first of them: what comes after it does not cut short the switching off of the pumps, nor the summary.
-    """
+    """As `interrupts`, but only the first: others do not cut short the switching off of pumps, nor the summary."""
     came: list[int] = []
 
     def answer(number: int, stack: FrameType | None) -> None:
         came.append(number)
         if len(came) == 1:
-            raise KeyboardInterrupt
-        log.warning("the pumps are being switched off and verified; this takes up to a minute")
+            _interrupt(number, stack)
+        else:
+            log.warning("the pumps are being switched off and verified; this takes up to a minute")
 
     with handled(answer, *SIGNALS):
         yield

@@ -27,6 +27,7 @@ from tensorboard.plugins.scalar import metadata as scalar
 from tensorboard.plugins.text import metadata as text
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
+from experiments.cli.stop import undisturbed
 from experiments.reporting.curves import METRICS, PARAMETERS, Chart, Column, described
 
 __all__ = ["Events", "PopulationWriter", "interquartile_mean"]
@@ -46,17 +47,19 @@ class Events:
     """
 
     def __init__(self, folder: Path, first_step: int = 0) -> None:
-        self._writer = EventFileWriter(str(folder))
+        with undisturbed():
+            self._writer = EventFileWriter(str(folder))
         self._known: set[str] = set()
         self._flushed = time.monotonic()
         if first_step:
-            self._writer.add_event(
-                Event(step=first_step, wall_time=time.time(), session_log=SessionLog(status=SessionLog.START))
-            )
+            started = SessionLog(status=SessionLog.START)
+            with undisturbed():
+                self._writer.add_event(Event(step=first_step, wall_time=time.time(), session_log=started))
 
     def _add(self, values: Sequence[Summary.Value], step: int, wall: float | None = None) -> None:
         when = time.time() if wall is None else wall
-        self._writer.add_event(Event(step=step, wall_time=when, summary=Summary(value=values)))
+        with undisturbed():
+            self._writer.add_event(Event(step=step, wall_time=when, summary=Summary(value=values)))
         if time.monotonic() - self._flushed >= LIVE_S:
             self.flush()
 
@@ -118,12 +121,14 @@ class Events:
 
     def flush(self) -> None:
         """Make everything so far visible to a reader."""
-        self._writer.flush()
+        with undisturbed():
+            self._writer.flush()
         self._flushed = time.monotonic()
 
     def close(self) -> None:
         """Flush and close. Idempotent."""
-        self._writer.close()
+        with undisturbed():
+            self._writer.close()
 
 
 def _chart(title: str, chart: Chart) -> layout_pb2.Chart:

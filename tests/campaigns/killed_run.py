@@ -299,7 +299,7 @@ class _Comparison:
         count, strangers = rows_per_sample([at for at, _ in rows], [od for _, od in rows], served, early, late)
         f.rows += len(rows)
         f.rows_doubled += strangers + int((count[count > 1] - 1).sum())
-        lives = [self._life(at) for at in served.stored_s]
+        lives = [self._life(at, name) for at in served.stored_s]
         for at, in_rows, life in zip(served.stored_s, count, lives, strict=True):
             if life is not None and at <= life[1] - self.config.answer_s * self.config.speed:
                 f.samples += 1
@@ -319,13 +319,20 @@ class _Comparison:
         f.out_min = max(f.out_min, longest_out_min(errors))
         f.mean_error = float(np.fmax(f.mean_error, np.mean(last))) if last else math.inf
 
-    def _life(self, at: float) -> Life | None:
-        """Begin and end, device s, of the life of the client that watched at device time `at`; None if none did."""
-        watching = np.array([self._device_s(r["wall"]) for r in self._journal if r["kind"] == "start"])
+    def _life(self, at: float, name: str) -> Life | None:
+        """Begin and end, device s, of the life of the client that watched a reactor at `at`; None if none did.
+
+        It watches from its start, or from where it took over a reactor that did not answer then.
+        """
         ends = np.array([self._device_s(t) for t in [*self._killed, self._ended]])
         k = int(np.searchsorted(ends, at))  # the client that watched then, or the one after the pause
-        begun = watching[(watching > (ends[k - 1] if k else -np.inf)) & (watching <= at)]
-        return None if begun.size == 0 or k == ends.size else (float(begun.max()), float(ends[k]))
+        if k == ends.size:
+            return None
+        begun = [ends[k - 1] if k else -np.inf]
+        for kind, reactors in (("start", (None,)), ("device", (name,))):
+            rows = [r for r in self._journal if r["kind"] == kind and r.get("reactor") in reactors]
+            begun.append(min((t for r in rows if (t := self._device_s(r["wall"])) > begun[0]), default=np.inf))
+        return None if max(begun) > at else (float(max(begun)), float(ends[k]))
 
     def _settled(self, at: float, life: Life) -> bool:
         return life[1] == self._device_s(self._ended) and at >= life[0] + SETTLING_S

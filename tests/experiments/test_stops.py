@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from uuid import uuid4
 
@@ -16,6 +18,7 @@ import pytest
 
 from dqn import checkpoint
 from experiments.cli import frame, stop
+from experiments.reporting.tensorboard import Events
 from experiments.training.config import TrainConfig
 from experiments.training.session import Session
 from tests.studies.ablate import AblateConfig, _read
@@ -163,6 +166,33 @@ def test_a_stop_while_an_extension_module_loads_is_a_stop() -> None:
         raise masked
     with pytest.raises(ImportError, match="no module"), stop.unmasked():
         raise ImportError("no module")
+
+
+@pytest.mark.parametrize("kept", [stop.interrupts, stop.one_interrupt])
+def test_a_stop_waits_until_the_writer_of_events_holds_no_lock(
+    kept: Callable[[], AbstractContextManager[None]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[str] = []
+
+    def slow(of: str, call: Callable[..., None]) -> Callable[..., None]:
+        def write(*given: object) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+            call(*given)
+            written.append(of)
+
+        return write
+
+    events = Events(tmp_path)
+    for of, call in (("add_event", lambda: events.scalars({"a": 1.0}, 1)), ("flush", events.flush)):
+        with monkeypatch.context() as patched, kept():
+            patched.setattr(events._writer, of, slow(of, getattr(events._writer, of)))
+            with pytest.raises(KeyboardInterrupt):
+                call()
+        assert written[-1:] == [of]
+    with kept(), pytest.raises(KeyboardInterrupt):
+        slow("elsewhere", lambda: None)()  # it comes at once
+    assert written == ["add_event", "flush"]
+    events.close()
 
 
 def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
