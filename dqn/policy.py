@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "ABSOLUTE", "COCULTURE", "COCULTURE_PREVIEW", "FORMAT", "RELATIVE", "Policy", "PolicyError", "fingerprint", "load",
+    "ABSOLUTE", "COCULTURE", "COCULTURE_PREVIEW", "FORMAT", "RELATIVE", "Policy", "PolicyError", "fingerprints", "load",
     "save",
 ]  # fmt: skip
 
@@ -94,14 +94,21 @@ def _arrays(policy: Policy) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def fingerprint(policy: Policy) -> str:
-    """SHA-256 over everything that decides which action is chosen and what it means: arrays, observation, model."""
+def fingerprints(policy: Policy) -> dict[str, str]:
+    """SHA-256 of everything that decides which action is chosen and what it means, by name."""
     said = {key: policy.metadata.get(key) for key in ("observation", "control_min", "model")}
-    digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
-    for name, array in sorted(_arrays(policy).items()):
-        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    arrays = _arrays(policy)
+    limits = ("observation_low", "observation_high")
+    weights = [name for name in arrays if name not in ("input_matrix", "input_offset", "actions", *limits)]
+    parts = {"map of the inputs": ("input_matrix", "input_offset"), "actions": ("actions",), "limits": limits}
+    found = {"observation or model": hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()}
+    for part, names in {"weights": sorted(weights), **parts}.items():
+        digest = hashlib.sha256()
+        for name in names:
+            digest.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())
+            digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+        found[part] = digest.hexdigest()
+    return found
 
 
 def save(path: Path, policy: Policy) -> None:

@@ -7,15 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dqn import policy as policies
 from dqn.policy import Policy
 from experiments.certification import certificate
 from experiments.certification.config import CertifyConfig
 from experiments.certification.judge import Certificate, certify
 from experiments.certification.question import CertificationError, model_of
+from experiments.certification.verdict import Proof
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file
-from experiments.control.policies import find_policy
+from experiments.control.policies import SHIPPED, find_policy
+from experiments.laws.density.learned import settings
 
 __all__ = ["main"]
 
@@ -35,8 +39,8 @@ def body(config: CertifyConfig, folder: Path) -> None:
         config = replace(config, env=model_of(policy, config))
         found = certify(policy, config)
     log.info("%s: proven in %.1f s", source, time.perf_counter() - began)
-    for check in found.checks:
-        log.info("%s  %s", "pass" if check.holds else "FAIL", check)
+    for line in found.told():
+        log.info("%s", line)
     for line in found.cannot_hold():
         log.info("said, not judged: %s", line)
     _write(folder, source, policy, config, found)
@@ -51,36 +55,55 @@ def _write(folder: Path, source: Path, policy: Policy, config: CertifyConfig, fo
     from experiments.reporting import charts, page
     from experiments.reporting.tensorboard import Events
 
-    content = certificate.content(policy, config, found)
+    content = certificate.content(policy, settings(policy), config, found)
     files.write_json(folder / "certificate.json", content, indent=None)
-    try:
-        files.write_json(certificate.beside(source), content, indent=None)
-    except OSError as error:
-        log.warning("%s: not written (%s); %s/certificate.json is the same", certificate.beside(source),
-                    error.strerror, folder)  # fmt: skip
+    to = _place(config, source)
+    if to is None:
+        log.info("%s is part of the program, whose certificate stays as it is; to=FILE writes elsewhere, too", source)
+    else:
+        try:
+            files.write_json(to, content, indent=None)
+            log.info("certificate %s", to)
+        except OSError as error:
+            log.warning("%s: not written (%s); %s/certificate.json is the same", to, error.strerror, folder)
     drawn = charts.save(figure(found), folder / "figures", "certificate")
     files.write_json(folder / "summary.json", _summary(source, content, found))
     with closing(Events(folder)) as events:
         events.picture("figures/certificate", drawn, 0)
-        events.text("run/summary", "\n".join(f"- {'pass' if c.holds else 'FAIL'}: {c}" for c in found.checks))
-    log.info("certificate %s; report %s", certificate.beside(source), page.save(page.of_runs(folder, [folder]), folder))
+        events.text("run/summary", "\n".join(f"- {line}" for line in found.told()))
+    log.info(
+        "certificate %s; report %s", folder / "certificate.json", page.save(page.of_runs(folder, [folder]), folder)
+    )
+
+
+def _place(config: CertifyConfig, source: Path) -> Path | None:
+    """Where the certificate goes beside the run folder, if anywhere."""
+    if config.to is not None:
+        return Path(config.to)
+    return None if source.resolve().parent == SHIPPED.resolve().parent else certificate.beside(source)
 
 
 def _summary(source: Path, content: dict[str, Any], found: Certificate) -> dict[str, Any]:
     """What a page shows: the verdict, every requirement, and a row per case."""
-    kept = ("passed", "fingerprint", "observation", "setpoints", "bounds", "checks", "cannot_hold", "not_monotone")
-    cases = [
-        {
-            "case": proof.case.name,
-            "half-width, least": float(proof.half_width.min()),
-            "half-width, largest": float(proof.half_width.max()),
-            "law, largest": float(proof.law_half_width.max()),
-            "entry over physics, largest": float(proof.entry.max()),
-            "periods, largest": int(proof.band.periods.max()),
-        }
-        for proof in found.proofs
-    ]
+    kept = ("passed", "of", "observation", "setpoints", "bounds", "checks", "cannot_hold", "not_monotone")
+    cases = [_row(found.question.loop, proof) for proof in found.proofs if proof.holdable.any()]
     return {"policy": str(source), **{key: content[key] for key in kept}, "cases": cases}
+
+
+def _row(loop: Any, proof: Proof) -> dict[str, Any]:
+    """A case over the strips that the pump can hold; OD: of the strip in their middle."""
+    held = np.flatnonzero(proof.holdable)
+    middle = held[np.abs((loop.low + loop.high)[held] / 2.0 - np.mean((loop.low[0], loop.high[-1]))).argmin()]
+    return {
+        "case": proof.case.name,
+        "half-width, least": float(proof.half_width[held].min()),
+        "half-width, largest": float(proof.half_width[held].max()),
+        "law, largest": float(proof.law_half_width[held].max()),
+        "over the law, largest": float(proof.excess[held].max()),
+        "half-width in OD, middle strip": loop.in_od(proof.case, float(proof.half_width[middle])),
+        "periods after the law, largest": float(proof.later[held].max()),
+        "periods, largest": float(proof.band.periods[held].max()),
+    }
 
 
 main = frame.Command("certify", CertifyConfig(), body)

@@ -35,6 +35,27 @@ class EstimateBounds:
         ratio = np.divide(self.od, od, out=np.full_like(od, np.inf), where=od > 0.0)
         return np.maximum(self.error, np.log1p(ratio) / self.full_pump)
 
+    def error_at(self, estimate: Array, setpoint: float | None) -> Array:
+        """The same at an estimate of e and a setpoint; None: `error` alone. Shape of `estimate`."""
+        if setpoint is None:
+            return np.full_like(estimate, self.error)
+        return self.error_bound(setpoint * np.exp(self.full_pump * estimate))
+
+    def estimate(self, e: Array, side: Array, setpoint: float | None) -> Array:
+        """The farthest estimate to the side (1: above, -1: below) behind which e may stand, (N,); inverts `error_at`.
+
+        With c the error of the OD and x = r exp(B e): above, ln(y) - ln(1 + c/y) = ln(x) gives y = (x + sqrt(x^2 +
+        4 c x)) / 2; below, y + c = x. Where the constant bound is the larger one, it counts.
+        """
+        far = e + side * self.error
+        if setpoint is None:
+            return np.asarray(far)
+        od = setpoint * np.exp(self.full_pump * e)
+        above = (od + np.sqrt(od**2 + 4.0 * self.od * od)) / 2.0
+        found = np.where(side > 0, above, np.maximum(od - self.od, np.finfo(np.float64).tiny))
+        by_od = np.log(found / setpoint) / self.full_pump
+        return np.asarray(np.where(side > 0, np.maximum(far, by_od), np.minimum(far, by_od)))
+
     def hold(self, od: Array, error: Array, growth_share: Array, share_error: Array) -> NDArray[np.bool_]:
         """Whether errors of these sizes, of e and of s, are within the bounds at this OD and this s; all (N,).
 

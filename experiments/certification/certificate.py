@@ -1,7 +1,7 @@
 """The file of a certificate: what it holds, where it lies, and whether it is that of a policy at hand."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 
 from conf.schema import build
-from dqn.policy import Policy, fingerprint
+from dqn.policy import RELATIVE, Policy, fingerprints
+from envs.bench import Bench
+from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
 from experiments.certification.judge import Certificate, recheck
 from experiments.certification.network import Array
-from experiments.certification.question import CertificationError
+from experiments.certification.question import CertificationError, full_pump, model_of
 from experiments.certification.verdict import Proof
 
 __all__ = ["FORMAT", "Stored", "beside", "bounds", "content", "doubts", "load"]
 
-FORMAT = 1
+FORMAT = 2
 
 
 def beside(policy: Path) -> Path:
@@ -29,17 +31,25 @@ def beside(policy: Path) -> Path:
 
 @dataclass(frozen=True)
 class Stored:
-    """A certificate as it was read: which policy it is of, what was asked, and what failed.
+    """A certificate as it was read: what it is of, what was asked, and what failed.
 
+    of: what decides, by name: fingerprints of the parts of a policy, and the settings that act beside it.
     setpoints: lowest and highest that it speaks of, OD. bounds: of an estimator's errors, and its growth shares.
     """
 
-    fingerprint: str
+    of: Mapping[str, Any]
     passed: bool
     failed: tuple[str, ...]
     config: CertifyConfig
     setpoints: tuple[float, float]
     bounds: EstimateBounds | None
+
+    def differs(self, policy: Policy, settings: Mapping[str, Any]) -> list[str]:
+        """Every part of a policy, and every setting, that is another than the one it was made for."""
+        parts, given = fingerprints(policy), {**fingerprints(policy), **settings}
+        names = [name for name in sorted({*given, *self.of}) if given.get(name) != self.of.get(name)]
+        shown = {name: f"{name} = {given.get(name)}, certified {self.of.get(name)}" for name in names}
+        return [f"its {name}" if name in parts else shown[name] for name in names]
 
 
 def _outward(value: Array, digits: float = 1e6) -> Array:
@@ -61,19 +71,21 @@ def _case(proof: Proof) -> dict[str, Any]:
     }
 
 
-def content(policy: Policy, config: CertifyConfig, found: Certificate) -> dict[str, Any]:
+def content(policy: Policy, settings: Mapping[str, Any], config: CertifyConfig, found: Certificate) -> dict[str, Any]:
     """A certificate as it is written.
 
     `band` is in ln(x / r) of a policy that sees the OD, else in e. `strips`: lowest and highest setpoint or growth
     share, and into how many equal strips it is cut; columns have an entry per strip.
+    `cases`: those that are drawn; of all others `checks` have the worst.
 
-    Args: config: with the nominal model in `env`, so that whoever reads it proves the same.
+    Args: settings: that decide beside the policy. config: with the nominal model in `env`, so that whoever reads it
+      proves the same.
     """
     asked = found.question
     return {
         "format": FORMAT,
         "passed": found.passed,
-        "fingerprint": fingerprint(policy),
+        "of": {**fingerprints(policy), **settings},
         "observation": list(policy.observation),
         "checks": [{**asdict(check), "holds": check.holds} for check in found.checks],
         "setpoints": list(asked.setpoints),
@@ -82,8 +94,8 @@ def content(policy: Policy, config: CertifyConfig, found: Certificate) -> dict[s
         "cannot_hold": found.cannot_hold(),
         "dose_below": dict(zip(map(str, found.levels), _outward(found.doses, 1e3), strict=True)),
         "not_monotone": [dict(zip(("first", "second", "from", "to"), drop, strict=True)) for drop in found.drops],
-        "cases": [_case(proof) for proof in found.proofs],
-        "config": asdict(replace(config, policy="", env_file=None)),
+        "cases": [_case(proof) for proof in found.proofs if proof.case.name in asked.drawn],
+        "config": asdict(replace(config, policy="", to=None, env_file=None)),
     }
 
 
@@ -95,7 +107,7 @@ def load(path: Path) -> Stored:
             raise ValueError(f"format {given['format']}, allowed {FORMAT}")
         low, high = given["setpoints"]
         return Stored(
-            str(given["fingerprint"]),
+            dict(given["of"]),
             given["passed"] is True,
             tuple(str(check["name"]) for check in given["checks"] if not check["holds"]),
             build(CertifyConfig(), given["config"]),
@@ -106,25 +118,37 @@ def load(path: Path) -> Stored:
         raise ValueError(f"{type(error).__name__}: {error}") from None
 
 
-def bounds(policy: Policy, file: Path) -> EstimateBounds | None:
-    """Within which errors of its estimator a policy may act; None without a certificate that is this policy's.
+def bounds(policy: Policy, settings: Mapping[str, Any], file: Path, model: EnvConfig) -> EstimateBounds | None:
+    """Within which errors of its estimator a policy may act; None without a certificate that is of these.
 
-    Args: file: of the policy, beside which its certificate lies.
+    Args: settings: that decide beside the policy. file: of the policy, beside which its certificate lies. model: tau,
+    control period and largest pump rate of the run.
     """
     try:
         stored = load(beside(file))
     except (OSError, ValueError):
         return None
-    return stored.bounds if stored.passed and stored.fingerprint == fingerprint(policy) else None
+    if stored.bounds is None or not stored.passed or stored.differs(policy, settings):
+        return None
+    return replace(stored.bounds, full_pump=full_pump(model))
 
 
-def doubts(policy: Policy, file: Path, setpoints: Sequence[float], name: str) -> list[str]:
-    """Reasons not to let a policy pump that its certificate gives, with the remedy; setpoints are proven anew.
+def doubts(
+    policy: Policy,
+    settings: Mapping[str, Any],
+    file: Path,
+    setpoints: Sequence[float],
+    bench: Bench,
+    model: EnvConfig,
+    name: str,
+) -> list[str]:
+    """Reasons not to let a policy pump that its certificate gives, with the remedy.
 
-    A policy that sees the growth share is proven anew along nine of those.
+    It is proven anew for the setpoints and the bench of the run: another bench is no reason by itself.
 
-    Args: file: of the policy, beside which the certificate lies. setpoints: those of the run, OD. name: what the user
-    calls the policy.
+    Args: settings: that decide beside the policy. file: of the policy, beside which the certificate lies. setpoints:
+    those of the run, OD. model: tau, control period and largest pump rate of the run. name: what the user calls the
+    policy.
     """
     path, remedy = beside(file), f"python -m experiments.certify policy={name}"
     try:
@@ -134,20 +158,33 @@ def doubts(policy: Policy, file: Path, setpoints: Sequence[float], name: str) ->
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         return [f"its certificate {path} is damaged ({why}; {remedy})"]
-    if stored.fingerprint != fingerprint(policy):
-        return [f"its certificate {path} is of another policy: one of them was changed ({remedy})"]
+    if different := stored.differs(policy, settings):
+        what = f"{'; '.join(different[:3])}{' and others' if len(different) > 3 else ''}"
+        return [f"its certificate {path} is of another: {what} (put it back, or {remedy})"]
     if not stored.passed:
         failing = f"{len(stored.failed)} requirements, the first: {'; '.join(stored.failed[:1])}"
         return [f"its certificate fails {failing} (train with another seed, then {remedy})"]
+    if stored.config.quick:
+        return [f"its certificate is a quick one, without errors of the gain ({remedy})"]
     low, high = stored.setpoints
     outside = sorted({r for r in setpoints if not low - 1e-9 <= r <= high + 1e-9})
     if outside:
         asked = ", ".join(f"{r:g}" for r in outside)
         more = f"{remedy} 'setpoints=[LOW,HIGH]'"
         return [f"it is certified for setpoints {low:g} to {high:g}, the scenario asks for {asked} ({more})"]
-    lines = np.linspace(*stored.bounds.proven, 9) if stored.bounds else np.unique(setpoints)
     try:
-        failed = recheck(policy, stored.config, lines.tolist())
+        failed = recheck(policy, on_bench(policy, stored.config, bench, model), sorted(set(setpoints)))
     except CertificationError as error:
         return [f"its certificate {path} asks for something else: {error} ({remedy})"]
-    return [f"proven anew, it fails: {check} ({remedy})" for check in failed[:1]]
+    return [f"proven anew for this bench and scenario, it fails: {check} ({remedy})" for check in failed[:1]]
+
+
+def on_bench(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> CertifyConfig:
+    """What a certificate asks, of the bench of a run.
+
+    A policy of (error, growth share) meets another B; the nominal model of one of the OD has another volume.
+    """
+    if policy.observation == RELATIVE:
+        return replace(config, bench=bench, env=model, full_pumps=())
+    env = model_of(policy, config)
+    return replace(config, bench=bench, env=replace(env, tau=env.tau * bench.tau / config.bench.tau))

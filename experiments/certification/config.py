@@ -30,14 +30,19 @@ class Limits:
         "periods of growth",
         within=(0, 100),
     )
-    half_width: float = setting(
-        0.25, "of the band in e, of a policy that sees (error, growth share), for inner_shares", within=(0, 10)
+    excess_nominal: float = setting(
+        0.005,
+        "of a policy that sees (error, growth share): half-width over that of the law, exact estimates",
+        "periods of full pump",
+        within=(0, 10),
     )
-    half_width_outer: float = setting(0.45, "the same for all growth_shares", within=(0, 10))
-    half_width_watched: float = setting(
-        2.0, "the same with errors as large as the supervisor lets them grow, at the middle setpoint", within=(0, 10)
+    excess_share: float = setting(
+        1 / 64, "the same under errors, in every case", "periods of full pump", within=(0, 10)
     )
-    inner_shares: tuple[float, float] = setting((0.2, 0.8), "growth shares", within=(0, 1), interval=True)
+    late: float = setting(1, "its entry after that of the law", "periods", within=(0, 1000))
+    late_slow: float = setting(4, "the same under a slow error of the gain", "periods", within=(0, 1000))
+    reached: float = setting(0.95, "least share of a band that the attack reaches, errors", within=(0, 1))
+    reached_nominal: float = setting(0.9, "the same, exact estimates", within=(0, 1))
 
     def __post_init__(self) -> None:
         check(self, "limits")
@@ -48,6 +53,10 @@ class CertifyConfig:
     """`python -m experiments.certify`. Raises: ValueError naming key, value and allowed range."""
 
     policy: str = setting("latest", "a policy.npz, a run folder, or `latest`: what train or demo wrote last")
+    to: str | None = setting(
+        None,
+        "where the certificate goes beside the run folder; null: beside the policy, but never into the program itself",
+    )
     bench: Bench = part(Bench, "where it is to run: full pump is max_rate period / tau with tau = volume / 60")
     env: EnvConfig | None = setting(
         None, "the nominal model: its mu and tau; null: the one the policy was trained on, or that of the bench"
@@ -72,12 +81,24 @@ class CertifyConfig:
     error: float = setting(0.1, "largest error of the estimate of e = ln(x / r) / B", within=(0, 5))
     error_od: float = setting(0.005, "or of the OD estimate, where that is more", "OD", within=(0, 0.2))
     error_share: float = setting(0.05, "largest error of the estimate of the growth share", within=(0, 0.5))
-    error_gain: float = setting(0.0, "relative error of a dose's effect", within=(0, 0.5))
+    error_gain: float = setting(
+        0.2, "relative error of a dose's effect: of each dose anew, and of the estimated gain for long", within=(0, 0.5)
+    )
+    full_pumps: tuple[float, ...] = setting(
+        (0.01, 0.03, 0.06, 0.12, 0.3),
+        "values of B for which it is proven beside that of the bench, of a policy that sees (error, growth share)",
+        within=(1e-3, 2),
+    )
+    quick: bool = setting(False, "without errors of the gain and for the bench's B alone; a device asks for all")
     watched_od: float = setting(
         0.04, "error of the OD estimate up to which the supervisor lets a policy act", "OD", within=(0, 0.2)
     )
     watched_share: float = setting(0.5, "the same of the growth share", within=(0, 0.5))
-    trajectories: int = setting(20_000, "adversarial ones that try to leave the band", within=(0, 10_000_000))
+    trajectories: int = setting(
+        20_000,
+        "adversarial ones of each case, that try to leave the band or reach its ends",
+        within=(0, 10_000_000),
+    )
     limits: Limits = part(Limits, "what is required")
 
     def __post_init__(self) -> None:

@@ -17,17 +17,18 @@ def figure(found: Certificate) -> Figure:
     _polygons(polygons, found)
     asked = found.question
     middle = (asked.loop.low + asked.loop.high) / 2.0
-    for k, proof in enumerate(found.proofs):
+    for k, proof in enumerate(p for p in found.proofs if p.case.name in asked.drawn):
         colour, name = COLOURS[k % len(COLOURS)], proof.case.name
         shown = np.where(proof.holdable, 1.0, np.nan)
         widths.plot(middle, shown * proof.half_width, color=colour, linewidth=1.3, label=name)
         widths.plot(middle, shown * proof.law_half_width, color=colour, linewidth=0.9, linestyle=":")
-        entries.plot(middle, shown * proof.entry, color=colour, linewidth=1.3, label=name)
+        entries.plot(middle, shown * (proof.later if asked.late else proof.entry), color=colour, linewidth=1.3)
     widths.set(xlabel=asked.what, ylabel=f"half-width, {asked.unit}", ylim=(0.0, None))
     widths.set_title("Band that is entered and never left (dotted: the one-line law)")
     widths.set(yscale="log", ylim=(0.7 * widths.dataLim.y0, 8.0 * widths.dataLim.y1))
     widths.legend(ncols=2)
-    entries.set(xlabel=asked.what, ylabel="entry time over the pump's own")
+    what = "periods after the one-line law" if asked.late else "entry time over the pump's own"
+    entries.set(xlabel=asked.what, ylabel=what)
     entries.set_title("Time into the band, from anywhere in the range of starts")
     for colour, level, depth in zip(COLOURS, found.levels, found.doses, strict=False):
         doses.plot(middle, depth, color=colour, linewidth=1.3, label=f"action {level} and higher")

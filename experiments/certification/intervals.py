@@ -21,7 +21,7 @@ States = Callable[[Array, Array], tuple[Array, Array]]
 
 OUTWARD = 1e-12  # every image is wider by this much: more than double precision loses in adding
 ENTERED = 1e-9  # as close to the limit as this counts as inside
-MAX_PERIODS = 5000
+MAX_IMAGES = 10_000
 SAME = 1e-12  # corners closer than this are one corner
 
 
@@ -58,29 +58,47 @@ class Band:
     """What the closed loop enters and never leaves, for each strip, (N,).
 
     invariant: the image of the start lies inside it. low, high: of the limit of images; nan where there is none.
-    periods: after this many the state is inside, wherever it began.
+    path: the images, from the start to the last, (K + 1, N, 2); taken: periods from one to the next, (K, N), in which
+    the ends move evenly.
     """
 
     invariant: Mask
     low: Array
     high: Array
-    periods: Index
+    path: Array
+    taken: Index
+
+    def until(self, low: Array, high: Array) -> Array:
+        """Periods until the state lies in [low, high], wherever it began, (N,); inf where it is not said to."""
+        beyond = np.stack([low - self.path[..., 0], self.path[..., 1] - high], axis=2)
+        moved = beyond[:-1] - beyond[1:]
+        share = np.divide(beyond[:-1], moved, out=np.sign(beyond[:-1]), where=moved > 0.0)
+        outside = np.clip(np.ceil(share * self.taken[..., None]), 0, self.taken[..., None]).max(axis=2).sum(axis=0)
+        return np.asarray(np.where((beyond[-1] <= 0.0).all(axis=1), outside, np.inf))
+
+    @property
+    def periods(self) -> Array:
+        """Periods until the state is inside, wherever it began, (N,)."""
+        return self.until(*(self.path[-1] + ENTERED * np.array([-1.0, 1.0])).T)
 
 
 def images(pieces: Pieces, shift: Array, start: Array) -> Band:
     """The limit of F^k(start), F(I) = hull of the union over the pieces of (piece and I) + shift of its action.
 
     F(I) is part of F(J) for I inside J. So if F(start) is part of the start, every F^k(start) is part of the one before
-    it and is never left again; k periods are enough to reach it.
+    it and is never left again; k periods are enough to reach it. Far out, where only the pieces without an end meet an
+    end of the interval, that end moves by the same step each period, and many periods are taken at once.
 
     Args: shift: [low, high] that an action adds to the state, (N, A, 2). start: [low, high], (N, 2).
     """
     row = np.arange(len(start))[:, None]
     low, high = np.moveaxis(shift[row, pieces.action], -1, 0) + np.array([-OUTWARD, OUTWARD])[:, None, None]
-    reached = [start]
+    outer = np.stack([_outer(-pieces.high, -pieces.low, -low), _outer(pieces.low, pieces.high, high)], axis=2)
+    reached: list[Array] = [start]
+    taken: list[Index] = []
     active = np.arange(len(start))
     invariant = np.ones(len(start), dtype=bool)
-    while active.size and len(reached) <= MAX_PERIODS:
+    while active.size and len(taken) < MAX_IMAGES:
         now = reached[-1][active]
         first = np.maximum(pieces.low[active], now[:, :1])
         last = np.minimum(pieces.high[active], now[:, 1:])
@@ -94,13 +112,35 @@ def images(pieces: Pieces, shift: Array, start: Array) -> Band:
         )
         inside = (image[:, 0] >= now[:, 0]) & (image[:, 1] <= now[:, 1])
         invariant[active] &= inside  # by induction only the first image can be outside
-        following = reached[-1].copy()
-        following[active[inside]] = image[inside]
-        reached.append(following)
-        active = active[inside & (np.abs(image - now).max(axis=1) > ENTERED)]
+        moved = np.abs(image - now) > ENTERED
+        step, reach = outer[active].transpose(1, 0, 2)
+        ahead = image * np.array([-1.0, 1.0]) - reach  # periods in which an end goes on as it did
+        further = np.floor(np.divide(ahead, -step, out=np.zeros_like(step), where=(step < 0.0) & (ahead > 0.0)))
+        further = np.where(moved, further, np.inf).min(axis=1)
+        further = np.where(np.isfinite(further), further, 0.0)
+        alike = np.where(moved, further[:, None] * step * np.array([-1.0, 1.0]), 0.0)
+        for ends, periods in ((image, np.ones_like(further)), (image + alike, further)):
+            following, lasted = reached[-1].copy(), np.zeros(len(start), np.intp)
+            following[active[inside]], lasted[active] = ends[inside], periods
+            reached.append(following)
+            taken.append(lasted)
+        active = active[inside & moved.any(axis=1)]
     limit = np.where(invariant[:, None], reached[-1], np.nan)
-    outside = [(np.abs(r - reached[-1]) > ENTERED).any(axis=1) for r in reached]
-    return Band(invariant, limit[:, 0], limit[:, 1], np.sum(outside, axis=0))
+    return Band(invariant, limit[:, 0], limit[:, 1], np.stack(reached), np.stack(taken))
+
+
+def _outer(low: Array, high: Array, shift: Array) -> Array:
+    """How the upper end of an interval moves far out: [step, the least end from which it moves by that alone], (N, 2).
+
+    Args: low, high: of the pieces; shift: their largest shift; (N, P) each.
+    """
+    endless = np.isposinf(high) & (low <= high)
+    step = np.where(endless.any(axis=1), np.where(endless, shift, -np.inf).max(axis=1), 0.0)
+    ended = ~endless & (low <= high)
+    least = np.where(endless & np.isfinite(low), low, -np.inf).max(axis=1)
+    least = np.maximum(least, np.where(ended, high, -np.inf).max(axis=1))
+    others = np.where(ended, high + shift, -np.inf).max(axis=1)
+    return np.stack([step, np.maximum(least, others - step) - step], axis=1)
 
 
 def _spread(first: Index, last: Index) -> tuple[Index, Index]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dqn.policy import Policy
+from dqn.policy import RELATIVE, Policy
 from experiments.certification.boxes import contradictions
 from experiments.certification.config import CertifyConfig, Limits
 from experiments.certification.intervals import Mask, Points, drops, points_in_strips
@@ -14,7 +14,7 @@ from experiments.certification.line import on_lines
 from experiments.certification.network import Array, Network
 from experiments.certification.polygons import Regions, partition
 from experiments.certification.question import Question, actions, question
-from experiments.certification.verdict import Loop, Proof, dose_below, escapes, prove
+from experiments.certification.verdict import Loop, Proof, attacked, dose_below, prove
 
 __all__ = ["Certificate", "Check", "certify", "recheck"]
 
@@ -62,12 +62,31 @@ class Certificate:
         return all(check.holds for check in self.checks)
 
     def cannot_hold(self) -> list[str]:
-        """What no policy holds, because the pump or the growth is too weak."""
+        """What no policy holds, because pump or growth are too weak; a line for all cases that share a stretch."""
+        found: dict[tuple[float, float], list[str]] = {}
+        for proof in self.proofs:
+            for stretch in _runs(self.question.loop, ~proof.holdable):
+                found.setdefault(stretch, []).append(proof.case.name)
         return [
-            f"{proof.case.name}: from {self.question.what} {low:.4g} to {high:.4g} no pump rate holds the culture"
-            for proof in self.proofs
-            for low, high in _runs(self.question.loop, ~proof.holdable)
+            f"{names[0]}{f' and {len(names) - 1} more cases' if names[1:] else ''}: from {self.question.what} "
+            f"{low:.4g} to {high:.4g} no pump rate holds the culture"
+            for (low, high), names in found.items()
         ]
+
+    def told(self) -> list[str]:
+        """Every requirement that fails, and of each kind that is met the case that comes closest to its limit."""
+        kinds: dict[str, list[Check]] = {}
+        for check in self.checks:
+            kinds.setdefault(check.name.split(": ", 1)[-1], []).append(check)
+        lines = []
+        for checks in kinds.values():
+            lines += [f"FAIL  {check}" for check in checks if not check.holds]
+            met = [check for check in checks if check.holds]
+            if met:
+                closest = max(met, key=lambda check: check.value - check.limit)
+                others = len(met) - 1
+                lines.append(f"pass  {closest}" + (f"; and {others} more" if others else ""))
+        return lines
 
 
 def _runs(loop: Loop, where: np.ndarray[Any, Any]) -> Iterator[tuple[float, float]]:
@@ -85,13 +104,15 @@ def certify(policy: Policy, config: CertifyConfig) -> Certificate:
     def points(case: Any) -> Points:
         return points_in_strips(wider, *asked.loop.seen(case))
 
-    proofs = tuple(prove(asked.loop, points(case), wider.action, case) for case in asked.cases)
+    proofs = tuple(
+        prove(asked.loop, points(case), wider.action, case, asked.judged.get(case.name, 0.0)) for case in asked.cases
+    )
     levels = (1, 2, _half(policy))
     doses = dose_below(asked.loop, points(asked.cases[0]), wider.action, asked.cases[0], levels)
     checks = (
         Check("polygons that the bounds of boxes contradict", contradictions(network, exact, GRID), 0),
         *_required(asked, proofs, doses[-1], config.limits),
-        Check("adversarial trajectories that left the band", _escaped(policy, asked, proofs, config.trajectories), 0),
+        *_attacks(policy, asked, proofs, config.trajectories),
     )
     return Certificate(asked, proofs, checks, levels, doses, drops(exact), exact)
 
@@ -101,11 +122,23 @@ def _half(policy: Policy) -> int:
     return max(1, (actions(policy).size - 1) // 2)
 
 
-def _escaped(policy: Policy, asked: Question, proofs: Sequence[Proof], trajectories: int) -> int:
-    """Under the worst case that can be held."""
-    names = [*asked.judged, *(name for name, *_ in asked.widths)]
-    held = [proof for proof in proofs if proof.holdable.any() and proof.case.name in names]
-    return escapes(policy, asked.loop, held[-1], trajectories) if held else 0
+def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajectories: int) -> Iterator[Check]:
+    """What attacks on every case find: whether a band is left, and whether it is wider than it need be."""
+    found = [attacked(policy, asked.loop, proof, trajectories) for proof in proofs] if trajectories else []
+    if found:
+        yield Check("adversarial trajectories that left the band", sum(left for left, _ in found), 0)
+    if asked.reached is None:
+        return
+    for least, named, some in zip(asked.reached, ("exact", "errors"), (slice(1), slice(1, None)), strict=True):
+        worst = [
+            Check(proof.case.name, float(np.nanmax(1.0 - share)), 0.0, _strip(asked, int(np.nanargmin(share))))
+            for proof, (_, share) in list(zip(proofs, found, strict=False))[some]
+            if np.isfinite(share).any()
+        ]
+        if worst:
+            most = max(worst, key=lambda check: check.value)
+            title = f"{named}: share of the band that no attack reaches"
+            yield Check(title, most.value, round(1.0 - least, 9), f"{most.name}, {most.where}")
 
 
 def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Limits) -> Iterator[Check]:
@@ -121,15 +154,13 @@ def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Lim
             continue
         yield _count(f"{name}: strips without a band", asked, held & ~proof.band.invariant)
         yield _count(f"{name}: strips in which a low culture may be washed out", asked, held & ~proof.grows)
-        yield _worst(f"{name}: entry time over the pump's own", asked, proof.entry, limits.entry, held)
+        if name in asked.late:
+            yield _worst(f"{name}: entry after the law's, periods", asked, proof.later, asked.late[name], held)
+        else:
+            yield _worst(f"{name}: entry time over the pump's own", asked, proof.entry, limits.entry, held)
         if name in asked.judged:
             title = f"{name}: half-width over that of the law, {asked.unit}"
             yield _worst(title, asked, proof.excess, asked.judged[name], held)
-    for name, low, high, limit in asked.widths:
-        proof = next(p for p in proofs if p.case.name == name)
-        inside = (asked.loop.low >= low - 1e-9) & (asked.loop.high <= high + 1e-9)
-        title = f"{name}: half-width, {asked.what} {low:g} to {high:g}, {asked.unit}"
-        yield _worst(title, asked, proof.half_width, limit, inside & proof.holdable)
     yield _worst("half of the largest dose below the setpoint, periods of growth", asked, dose, limits.low_dose, every)
 
 
@@ -144,24 +175,32 @@ def _worst(name: str, asked: Question, value: Array, limit: float, where: Mask) 
     if not where.any():
         return Check(name, 0.0, limit)
     at = int(np.where(where, np.where(np.isnan(value), np.inf, value), -np.inf).argmax())
-    return Check(name, float(value[at]), limit, _place(asked, asked.loop.low[at], asked.loop.high[at]))
+    return Check(name, float(value[at]), limit, _strip(asked, at))
+
+
+def _strip(asked: Question, at: int) -> str:
+    return _place(asked, float(asked.loop.low[at]), float(asked.loop.high[at]))
 
 
 def _place(asked: Question, low: float, high: float) -> str:
     return f"{asked.what} {low:.4g}" + (f" to {high:.4g}" if high > low else "")
 
 
-def recheck(policy: Policy, config: CertifyConfig, strips: Sequence[float]) -> list[Check]:
-    """The requirements that single setpoints, or growth shares, fail, along their own lines.
+def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -> list[Check]:
+    """The requirements that a policy fails at single setpoints, without an attack on its bands.
 
-    Lines need no polygons: this is another way to the same numbers. On a line the policy is shown a single second
-    coordinate, so cases in which that one has an error are left out.
+    Of a policy of the OD along their lines, which need no polygons: another way to the same numbers.
     """
-    asked, network = question(policy, config), Network.of(policy)
-    loop = asked.loop.at(np.asarray(strips, dtype=np.float64))
-    points, action = on_lines(network, asked.box[0], loop.low)
-    cases = [case for case in asked.cases if np.equal(*loop.seen(case)).all()]
-    proofs = [prove(loop, points, action, case) for case in cases]
-    doses = dose_below(loop, points, action, cases[0], (_half(policy),))
-    line = replace(asked, loop=loop, widths=tuple(w for w in asked.widths if w[0] in {c.name for c in cases}))
-    return [check for check in _required(line, proofs, doses[0], config.limits) if not check.holds]
+    asked, network = question(policy, config, setpoints), Network.of(policy)
+    if policy.observation == RELATIVE:
+        wider = partition(network, asked.box)[1]
+        met = {c.name: points_in_strips(wider, *asked.loop.seen(c)) for c in asked.cases}
+        points, action = met["nominal"], wider.action
+    else:
+        asked = replace(asked, loop=asked.loop.at(np.asarray(setpoints, dtype=np.float64)))
+        points, action = on_lines(network, asked.box[0], asked.loop.low)
+        met = dict.fromkeys((case.name for case in asked.cases), points)
+    margin = asked.judged
+    proofs = [prove(asked.loop, met[c.name], action, c, margin.get(c.name, 0.0)) for c in asked.cases]
+    dose = dose_below(asked.loop, points, action, asked.cases[0], (_half(policy),))[0]
+    return [check for check in _required(asked, proofs, dose, config.limits) if not check.holds]

@@ -55,7 +55,7 @@ class OdLoop:
         change = self.control_min * (self.mu * factor - self.rates[:, None] / (self.tau * factor))
         return np.broadcast_to(change, (self.low.size, *change.shape))
 
-    def range(self) -> Array:
+    def range(self, case: OdCase) -> Array:
         """The start as d, for every setpoint of each strip, (S, 2)."""
         return np.log(np.stack([self.start[0] / self.high, self.start[1] / self.low], axis=1))
 
@@ -80,16 +80,22 @@ class OdLoop:
         """Largest |x - r| of a band in d, OD, (S,)."""
         return self.high * np.maximum(np.expm1(high), -np.expm1(low))
 
-    def attack(self, case: OdCase, state: Array, second: Array, push: Array) -> tuple[Array, Array]:
-        """What the policy is shown, (N, 2), and what a period adds to d for each action, (N, A), under disturbances.
+    def in_od(self, case: OdCase, half_width: float) -> float:
+        """A half-width, which is in OD."""
+        return half_width
 
-        Args: state d (N,); second: setpoints (N,). push: share of each disturbance's bound, in [-1, 1], (N, 3): of
-        reading, mu and tau.
+    def attack(self, case: OdCase, state: Array, second: Array, push: Array) -> tuple[Array, Array]:
+        """What the policy is shown, (N, 2), and what a period adds to d for each action then, (N, A).
+
+        At 1, the reading is as low as it can be, growth is fastest and a dose takes off least; at -1 the other way
+        round; in between all of it is so much less.
+        Args: state: d (N,). second: [lowest, highest] setpoint of the strips, (N, 2). push: in [-1, 1], (N,).
         """
-        reading = second * np.exp(state) + push[:, 0] * case.noise
-        mu, tau = (nominal * (1.0 + case.share * push[:, k]) for k, nominal in ((1, self.mu), (2, self.tau)))
-        change = self.control_min * (mu[:, None] - self.rates / tau[:, None])
-        return np.stack([reading, second], axis=1), change
+        setpoint = second.mean(axis=1) - push * (second[:, 1] - second[:, 0]) / 2.0
+        reading = setpoint * np.exp(state) - push * case.noise
+        factor = 1.0 + push * case.share
+        change = self.control_min * ((self.mu * factor)[:, None] - self.rates / (self.tau * factor)[:, None])
+        return np.stack([reading, setpoint], axis=1), change
 
 
 def _log(ratio: Array) -> Array:

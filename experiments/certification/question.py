@@ -1,5 +1,6 @@
 """What is to be proven of a policy: its closed loops, what may disturb them, and how much is allowed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from experiments.certification.network import Array
 from experiments.certification.od_loop import OdCase, OdLoop
 from experiments.certification.share_loop import ShareCase, ShareLoop
 
-__all__ = ["CertificationError", "Question", "actions", "model_of", "question"]
+__all__ = ["CertificationError", "Question", "actions", "full_pump", "model_of", "question"]
 
 BEYOND = 1e-6  # the plane that is cut reaches this much beyond what is asked
 MODEL = ("mu", "tau", "control_min", "max_pump_rate", "setpoints")
@@ -30,19 +31,24 @@ class Question:
 
     loop: its closed loops. cases: what may disturb them; the first one is the nominal.
     judged: case -> largest excess of the half-width over that of the law.
-    widths: (case, lowest, highest strip, largest half-width). box: of the plane that the policy is shown.
+    late: case -> how many periods after the law the state may come to within the law's half-width and that excess; a
+    case that is not in it is judged by the pump's own time. box: of the plane that the policy is shown.
+    reached: least share of the band that the attack is to reach, under exact estimates and under errors; None: not
+    judged, for a policy of the OD may rest at several places of a strip, and the hull of them is its band.
     unit: of half-widths. what: a strip is one of. setpoints: lowest and highest, OD.
-    bounds: of an estimator, where the policy needs one.
+    drawn: cases that a figure shows. bounds: of an estimator, where the policy needs one.
     """
 
     loop: Any
     cases: tuple[Any, ...]
     judged: dict[str, float]
-    widths: tuple[tuple[str, float, float, float], ...]
+    late: dict[str, float]
     box: tuple[tuple[float, float], tuple[float, float]]
+    reached: tuple[float, float] | None
     unit: str
     what: str
     setpoints: tuple[float, float]
+    drawn: tuple[str, ...]
     bounds: EstimateBounds | None = None
 
 
@@ -64,8 +70,7 @@ def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
     model = config.env
     if policy.observation == RELATIVE:
         bench = config.bench
-        own = EnvConfig(tau=bench.tau, control_min=bench.control_min, max_pump_rate=bench.max_rate)
-        return model or own
+        return model or EnvConfig(tau=bench.tau, control_min=bench.control_min, max_pump_rate=bench.max_rate)
     if model is None:
         if not {"mu", "tau"} <= set(said):
             raise CertificationError("it does not say which model it was trained on; give env.mu=MU env.tau=TAU")
@@ -76,6 +81,11 @@ def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
             f"it acts every {period:g} min, env.control_min = {model.control_min:g}; give env.control_min={period:g}"
         )
     return model
+
+
+def full_pump(model: EnvConfig) -> float:
+    """B, what one period of full pump takes off ln x."""
+    return model.max_pump_rate * model.control_min / model.tau
 
 
 def _strips(low: float, high: float, width: float) -> tuple[Array, Array]:
@@ -103,10 +113,12 @@ def _of_od(policy: Policy, config: CertifyConfig) -> Question:
     judged = {"nominal": limits.excess, "noise and uncertain": limits.excess_uncertain}
     highest = config.start_od[1] * float((strips[1] / strips[0]).max())  # of any setpoint that starts at a strip's d
     box = ((-config.noise - BEYOND, highest + config.noise + BEYOND), (low, high))
-    return Question(loop, cases, judged, (), box, "OD", "setpoint", (low, high))
+    return Question(
+        loop, cases, judged, {}, box, None, "OD", "setpoint", (low, high), tuple(case.name for case in cases)
+    )
 
 
-def _of_share(policy: Policy, config: CertifyConfig) -> Question:
+def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None) -> Question:
     """(error, growth share) in, a share of the largest dose out."""
     model, limits, (low, high) = model_of(policy, config), config.limits, config.growth_shares
     clip = (np.asarray(policy.low, dtype=np.float64), np.asarray(policy.high, dtype=np.float64))
@@ -114,33 +126,42 @@ def _of_share(policy: Policy, config: CertifyConfig) -> Question:
         raise CertificationError(
             f"growth_shares = [{low:g}, {high:g}]: allowed {clip[0][1]:g} to {clip[1][1]:g}, which it was trained for"
         )
-    span = model.max_pump_rate * model.control_min / model.tau
+    full = full_pump(model)
     lowest, highest = config.setpoints or (min(model.setpoints), max(model.setpoints))
-    start = (float(np.log(config.start_od[0] / highest)) / span, float(np.log(config.start_od[1] / lowest)) / span)
-    off = EstimateBounds(
-        span, config.error, config.error_od, config.error_share, config.error_gain, (low, high), (lowest, highest)
-    )
-    watched = replace(off, od=config.watched_od, growth_share=config.watched_share)
     middle = float(np.round((lowest + highest) / 2.0, 3))
-    cases = (
-        ShareCase("nominal", replace(off, error=0.0, od=0.0, growth_share=0.0, gain=0.0)),
-        ShareCase("errors", off),
-        *(ShareCase(f"errors at setpoint {r:g}", off, r) for r in (lowest, middle, highest)),
-        *(ShareCase(f"watched errors at setpoint {r:g}", watched, r) for r in (lowest, middle, highest)),
-    )
-    inner, outer = limits.inner_shares, (low, high)
-    widths = (
-        ("nominal", *outer, limits.half_width_outer),
-        ("errors", *inner, limits.half_width),
-        ("errors", *outer, limits.half_width_outer),
-        (f"watched errors at setpoint {middle:g}", *outer, limits.half_width_watched),
-    )
-    loop = ShareLoop(actions(policy), start, *_strips(low, high, config.strip), clip)
+    at_setpoints = sorted({lowest, middle, highest} if setpoints is None else set(setpoints))
+    off = EstimateBounds(full, config.error, config.error_od, config.error_share, 0.0, (low, high), (lowest, highest))
+    watched = replace(off, od=config.watched_od, growth_share=config.watched_share)
+    cases = [ShareCase("nominal", replace(off, error=0.0, od=0.0, growth_share=0.0)), ShareCase("errors", off)]
+    late = {case.name: limits.late for case in cases}
+    drawn = [case.name for case in cases]
+    for b in sorted({round(b, 9) for b in (full, *(() if config.quick else config.full_pumps))}):
+        own = replace(off, full_pump=b)
+        for r in at_setpoints:
+            at = f"at setpoint {r:g}, B = {b:.3g}"
+            uncertain = replace(own, gain=config.error_gain)
+            spread = ShareCase(f"spread doses {at}", uncertain, r)
+            slow = ShareCase(f"slow gain error {at}", uncertain, r, slow=True)
+            new = [ShareCase(f"errors {at}", own, r)] if config.quick or r == middle else []
+            new += [] if config.quick else [spread, slow]
+            cases += new
+            drawn += [case.name for case in new] if (b, r) == (round(full, 9), middle) else []
+            late |= {case.name: limits.late_slow if case.slow else limits.late for case in new}
+    cases.append(ShareCase(f"watched errors at setpoint {middle:g}", watched, middle))
+    late[cases[-1].name] = limits.late
+    judged = {case.name: limits.excess_share for case in cases} | {"nominal": limits.excess_nominal}
+    loop = ShareLoop(actions(policy), config.start_od, (lowest, highest), *_strips(low, high, config.strip), clip)
     seen = loop.seen(cases[-1])
     box = ((float(clip[0][0]), float(clip[1][0])), (float(seen[0].min()), float(seen[1].max())))
-    return Question(loop, cases, {}, widths, box, "periods of full pump", "growth share", (lowest, highest), watched)
+    reached = limits.reached_nominal, limits.reached
+    what = "periods of full pump", "growth share"
+    drawn.append(cases[-1].name)
+    return Question(loop, tuple(cases), judged, late, box, reached, *what, (lowest, highest), tuple(drawn), watched)
 
 
-def question(policy: Policy, config: CertifyConfig) -> Question:
-    """What is to be proven of this kind of policy. Raises: CertificationError where it cannot be asked."""
-    return _of_share(policy, config) if policy.observation == RELATIVE else _of_od(policy, config)
+def question(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None = None) -> Question:
+    """What is to be proven of this kind of policy. Raises: CertificationError where it cannot be asked.
+
+    Args: setpoints: at which errors that depend on the OD are asked about; None: the lowest, the middle, the highest.
+    """
+    return _of_share(policy, config, setpoints) if policy.observation == RELATIVE else _of_od(policy, config)

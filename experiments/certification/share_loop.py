@@ -1,11 +1,12 @@
 """The closed loop of a policy that sees (error, growth share): e' = e + s - v, with e = ln(x / r) / B, s = mu h / B.
 
-B is what one period of full pump takes off ln x, for the estimated pump gain; v is the share of the full pump that is
-dosed. Where the true gain is another, v acts as v (1 + its relative error); e and s are in units of the estimate and do
-not change.
+B is what one period of full pump takes off ln x; v is the share of the full pump that is dosed. A pump gives another
+dose than it is asked for, in one of two forms. Every dose is off anew (`spread`): v acts as v (1 +- gain). Or the
+estimate of the gain is off for long (`slow`): v acts as asked, and e is seen in units of the estimated B, as
+(1 +- gain) e.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,23 +19,39 @@ __all__ = ["ShareCase", "ShareLoop"]
 
 @dataclass(frozen=True)
 class ShareCase:
-    """Bounds on the errors of e, s and the gain; at a setpoint where the bound of e depends on the OD."""
+    """Bounds on the errors of e, s and the gain; at a setpoint where the bound of e depends on the OD.
+
+    slow: the error of the gain is that of its estimate, not of each dose.
+    """
 
     name: str
     bounds: EstimateBounds
     setpoint: float | None = None
+    slow: bool = False
+
+    @property
+    def spread(self) -> float:
+        """Relative error of each dose."""
+        return 0.0 if self.slow else self.bounds.gain
+
+    @property
+    def scale(self) -> float:
+        """Relative error of the unit in which e is seen."""
+        return self.bounds.gain if self.slow else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class ShareLoop:
     """Doses and strips of the growth share.
 
-    doses: shares of the full pump, rising from 0 to 1, (A,). start: range of e from which the band is entered.
-    low, high: s of each strip, (S,). clip: ((e, s) lowest, (e, s) highest) that the policy sees; beyond, the nearest.
+    doses: shares of the full pump, rising from 0 to 1, (A,). start: range of OD from which the band is entered.
+    setpoints: lowest and highest. low, high: s of each strip, (S,). clip: ((e, s) lowest, (e, s) highest) that the
+    policy sees; beyond, the nearest.
     """
 
     doses: Array
     start: tuple[float, float]
+    setpoints: tuple[float, float]
     low: Array
     high: Array
     clip: tuple[Array, Array]
@@ -44,19 +61,16 @@ class ShareLoop:
         """What a period of growth adds to e, (S,)."""
         return self.low
 
-    def at(self, shares: Array) -> "ShareLoop":
-        """The same for single values of s in place of strips."""
-        return replace(self, low=shares, high=shares)
-
     def shift(self, case: ShareCase) -> Array:
         """[least, largest] change of e by each action in a period, (S, A, 2)."""
-        gain = case.bounds.gain
-        least = self.low[:, None] - self.doses * (1.0 + gain)
-        return np.stack([least, self.high[:, None] - self.doses * (1.0 - gain)], axis=2)
+        least = self.low[:, None] - self.doses * (1.0 + case.spread)
+        return np.stack([least, self.high[:, None] - self.doses * (1.0 - case.spread)], axis=2)
 
-    def range(self) -> Array:
-        """The start, (S, 2)."""
-        return np.broadcast_to(np.array(self.start), (self.low.size, 2))
+    def range(self, case: ShareCase) -> Array:
+        """The start as e, at the case's setpoint or at any, (S, 2)."""
+        lowest, highest = self.setpoints if case.setpoint is None else (case.setpoint, case.setpoint)
+        ratio = np.array([self.start[0] / highest, self.start[1] / lowest])
+        return np.broadcast_to(np.log(ratio) / (case.bounds.full_pump * (1.0 - case.scale)), (self.low.size, 2))
 
     def seen(self, case: ShareCase) -> tuple[Array, Array]:
         """Growth shares that the policy may be shown in each strip."""
@@ -66,11 +80,10 @@ class ShareLoop:
 
     def _around(self, case: ShareCase, seen: Array) -> tuple[Array, Array]:
         """The lowest and the highest e behind an estimate of it; both rise with the estimate."""
-        b, off = case.bounds, np.full_like(seen, case.bounds.error)
-        if case.setpoint is not None:
-            od = case.setpoint * np.exp(b.full_pump * seen)
-            off = np.maximum(off, np.log1p(b.od / od) / b.full_pump)
-        return seen - off, seen + off
+        off = case.bounds.error_at(seen, case.setpoint)
+        low, high = seen - off, seen + off
+        least, most = 1.0 - case.scale, 1.0 + case.scale
+        return low / np.where(low > 0.0, most, least), high / np.where(high > 0.0, least, most)
 
     def states(self, case: ShareCase) -> States:
         """States behind an estimate. One on the edge of what the policy sees stands for all beyond."""
@@ -96,11 +109,22 @@ class ShareLoop:
         """Largest |e| of a band, (S,)."""
         return np.maximum(-low, high)
 
-    def attack(self, case: ShareCase, state: Array, second: Array, push: Array) -> tuple[Array, Array]:
-        """What the policy is shown, (N, 2), and what a period adds to e for each action, (N, A), under disturbances.
+    def in_od(self, case: ShareCase, half_width: float) -> float | None:
+        """A half-width at the case's setpoint, OD; None for a case of none. B is at most (1 + gain) the case's."""
+        if case.setpoint is None:
+            return None
+        return float(case.setpoint * np.expm1(case.bounds.full_pump * (1.0 + case.scale) * half_width))
 
-        Args: state e (N,); second: s (N,). push: share of each bound, in [-1, 1], (N, 3): of e, s and gain.
+    def attack(self, case: ShareCase, state: Array, second: Array, push: Array) -> tuple[Array, Array]:
+        """What a state allows the policy to be shown, (N, 2), and what a period adds to e for each action then, (N, A).
+
+        At 1, e and s are shown as low as they can be, doses give least and s is the strip's highest, of which the
+        policy may still be shown the lowest; at -1 the other way round; in between all of it is so much less.
+        Args: state: e (N,). second: [lowest, highest] s of the strips, (N, 2). push: in [-1, 1], (N,).
         """
-        shown = [state + push[:, 0] * case.bounds.error, second + push[:, 1] * case.bounds.growth_share]
-        change = second[:, None] - self.doses * (1.0 + push[:, 2:] * case.bounds.gain)
-        return np.stack(shown, axis=1), change
+        b, side, size = case.bounds, np.sign(push), np.abs(push)
+        half = push * (second[:, 1] - second[:, 0]) / 2.0
+        middle = second.mean(axis=1)
+        furthest = b.estimate((1.0 - np.sign(state) * side * case.scale) * state, -side, case.setpoint)
+        shown = state + size * (furthest - state), middle - half - push * b.growth_share
+        return np.stack(shown, axis=1), (middle + half)[:, None] - self.doses * (1.0 - push[:, None] * case.spread)

@@ -19,6 +19,7 @@ from experiments.comparison import studies
 from experiments.comparison.config import TWIN, BenchmarkConfig
 from experiments.comparison.trials import DensityTrial, Followed, Loops, cells
 from experiments.control.policies import composition_policy, find_policy, load_policy
+from experiments.laws.density.learned import settings
 from experiments.reporting import charts, page
 from experiments.training.config import TrainConfig
 
@@ -38,7 +39,9 @@ def learned(
         if name in config.policies or name not in config.agents:
             where = config.policies.get(name, "shipped")
             policy = load_policy(where, config.env.control_min, config.env.max_pump_rate)
-            found[name] = policy, certificate.bounds(policy, find_policy(where))
+            laws = config.controllers.get(name)
+            own = settings(policy, getattr(laws, "estimator", {}))
+            found[name] = policy, certificate.bounds(policy, own, find_policy(where), config.env)
             agents[name] = {"policy": where, "regret_pct": policy.metadata.get("regret_pct")}
     for name in sorted(wanted - set(found)):
         from experiments.training.run import train  # torch, only where agents are trained

@@ -28,6 +28,7 @@ from experiments.cli.choices import choices
 from experiments.control.config import DeployConfig
 from experiments.control.policies import Wanted, admit, composition_policy, policy_check, run_policy
 from experiments.laws import registry
+from experiments.laws.density.learned import settings
 from experiments.laws.share.estimator import CompositionEstimator
 from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
@@ -141,12 +142,13 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     wanted = policy = bounds = None
     if config.controller.kind == "dqn":
         asked = tuple(setpoint for scenario in scenarios for setpoint in scenario.setpoints)
-        limits = bench.control_min, bench.max_rate, asked, config.poor_regret_pct
-        wanted = Wanted(config.policy, *limits, family.at_stake, config.force_policy)
+        changes = config.controller.estimator
+        stake = config.poor_regret_pct, family.at_stake, config.force_policy
+        wanted = Wanted(config.policy, bench, model, changes, asked, *stake)
     if wanted is not None and not config.preflight_only:
         policy = run_policy(wanted, folder, resumed)
         admit(policy, folder / "policy.npz", wanted, resumed)
-        bounds = certificate.bounds(policy, folder / "policy.npz")
+        bounds = certificate.bounds(policy, settings(policy, changes), folder / "policy.npz", model)
     return Setup(
         family, backend, bench, safety, scenarios, ends, config.roles(), plant, model, config.controller, wanted,
         policy, bounds, further, config.fsync, *_named(config, family, folder), resumed,

@@ -1,25 +1,29 @@
 """The policy file of a run: finding it, checking it, judging whether it may run, and keeping a copy with the run."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dqn import policy as policies
 from dqn.policy import Policy
+from envs.bench import Bench
+from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.cli import frame
 from experiments.cli.latest import ROOT, newest
 from experiments.laws import registry
+from experiments.laws.density.learned import settings
 from hardware.check import Check
 from hardware.storage import atomic
 
 __all__ = [
-    "SHIPPED_COMPOSITION", "Training", "Wanted", "admit", "composition_policy", "find_policy", "load_policy",
+    "SHIPPED", "SHIPPED_COMPOSITION", "Training", "Wanted", "admit", "composition_policy", "find_policy", "load_policy",
     "policy_check", "run_policy",
 ]  # fmt: skip
 
@@ -43,14 +47,16 @@ class NoPolicyError(frame.UserError):
 class Wanted:
     """The policy that a run is to have, and what that run asks of it.
 
-    name: as of `find_policy`. control_min: control period, min. max_rate: largest pump rate that the interlock allows,
-    mL/s. setpoints: OD. poor_regret_pct: more regret than this is poor, per cent. at_stake: a culture is: a policy that
-    is doubtful or not certified is refused. forced: it is not refused.
+    name: as of `find_policy`. bench: with the control period and the largest pump rate that the interlock allows.
+    model: tau, control period and largest pump rate that laws are given. estimator: settings of the policy's estimator
+    that are changed. setpoints: OD. poor_regret_pct: more regret than this is poor, per cent. at_stake: a culture is: a
+    policy that is doubtful or not certified is refused. forced: it is not refused.
     """
 
     name: str
-    control_min: float
-    max_rate: float
+    bench: Bench
+    model: EnvConfig
+    estimator: Mapping[str, Any]
     setpoints: tuple[float, ...]
     poor_regret_pct: float
     at_stake: bool
@@ -183,13 +189,17 @@ def admit(policy: Policy, file: Path, wanted: Wanted, resumed: bool) -> None:
 
 def _doubts(policy: Policy, file: Path, wanted: Wanted) -> list[str]:
     doubts = Training.of(policy).doubts(wanted.setpoints, wanted.poor_regret_pct)
-    return doubts + (certificate.doubts(policy, file, wanted.setpoints, wanted.name) if wanted.at_stake else [])
+    if not wanted.at_stake:
+        return doubts
+    own = settings(policy, wanted.estimator)
+    run = wanted.setpoints, wanted.bench, wanted.model, wanted.name
+    return doubts + certificate.doubts(policy, own, file, *run)
 
 
 def policy_check(wanted: Wanted) -> Check:
     """The policy's line of a preflight; that none has been trained yet does not stop a look at the device."""
     try:
-        policy = load_policy(wanted.name, wanted.control_min, wanted.max_rate)
+        policy = load_policy(wanted.name, wanted.bench.control_min, wanted.bench.max_rate)
     except NoPolicyError as error:
         return Check("policy", False, str(error), "python -m experiments.train", required=False)
     except frame.UserError as error:
@@ -208,7 +218,7 @@ def run_policy(wanted: Wanted, folder: Path, resumed: bool) -> Policy:
     kept = folder / "policy.npz"
     again = resumed and kept.is_file()
     source = kept if again else find_policy(wanted.name)
-    policy = load_policy(str(source), wanted.control_min, wanted.max_rate)
+    policy = load_policy(str(source), wanted.bench.control_min, wanted.bench.max_rate)
     if not again:
         _keep(policy, kept, certificate.beside(source))
     return policy

@@ -17,6 +17,12 @@ NOISE_RANGE = (0.1, 25.0)  # of the learned variance over the assumed one
 TREND_WEIGHT = 0.4  # of the newest surprise in their running mean
 TREND_SD = (TREND_WEIGHT / (2.0 - TREND_WEIGHT)) ** 0.5  # of that mean while the model holds
 CALM = 1.5  # a mean within so many of its sd is no sign of a change
+FARTHEST = 3.0  # a surprise beyond so many of its sd tells no more
+LAST, LONG = 10, 40  # newest readings whose surprises are watched: too large ones, too small ones
+LOUD = 21.0  # their sum of squares over `LAST` above which the filter is wrong: less than once a day on a sound reactor
+QUIET = 6.0 / 40.0  # their mean over `LONG` below which it takes itself for less sure than it is
+USUAL = 0.75  # the mean on a sound reactor
+SHARE_SD = 0.02  # what the growth share that holds at rest changes by beside the filter's error of it
 LOG_OD, MU, GAIN, WARMTH = range(4)
 
 
@@ -88,7 +94,7 @@ class Estimator:
 
     remembers = (
         "mean", "cov", "minute", "thermometer", "warm", "first_warm", "given_ml", "idle_min", "heard", "noise",
-        "learned", "far", "far_surprise", "trend",
+        "learned", "far", "far_surprise", "trend", "squares",
     )  # fmt: skip
 
     def __init__(self, config: EstimatorConfig, model: EnvConfig) -> None:
@@ -106,6 +112,7 @@ class Estimator:
         self._noise, self._learned = np.ones(n), np.zeros(n)
         self._far, self._far_surprise = np.zeros(n, dtype=np.int64), np.zeros(n)
         self._trend = np.zeros(n)  # running mean of the surprises in units of their sd
+        self._squares = np.full((n, LONG), np.nan)  # squares of the newest of them
 
     def dosed(self, volume_ml: Array) -> None:
         """Fresh medium that went in since this was last called, mL, (N,)."""
@@ -188,6 +195,8 @@ class Estimator:
         self.cov[idx] = np.where(anew[:, None, None], fresh, smaller)
         self._far[idx] = np.where(anew, 0, self._far[idx])
         self._learn(idx[~far & began], (surprise**2 - cov[:, LOG_OD, LOG_OD])[~far & began] / assumed[~far & began])
+        square = np.where(began, np.minimum(surprise**2 / total, FARTHEST**2), np.nan)
+        self._squares[idx] = np.concatenate([self._squares[idx, 1:], square[:, None]], axis=1)
         trend = self._trend[idx] + TREND_WEIGHT * (surprise / np.sqrt(total) - self._trend[idx])
         self._trend[idx] = np.where(anew, 0.0, np.where(far, self._trend[idx], trend))
 
@@ -218,17 +227,48 @@ class Estimator:
         error = self.mean[:, LOG_OD] - np.log(np.maximum(setpoint, LOWEST_OD))
         return error / self.full_pump, mu * self.model.control_min / self.full_pump
 
+    @property
+    def loudness(self) -> Array:
+        """Sum of squares of the last ten surprises in units of their sd, each at most 9; about 8 where all is well."""
+        return np.asarray(np.nansum(self._squares[:, -LAST:], axis=1))
+
+    @property
+    def loud(self) -> NDArray[np.bool_]:
+        """Whether surprises are far larger than the filter believes, (N,); readings left out as outliers count."""
+        return self.loudness > LOUD
+
+    @property
+    def quiet(self) -> NDArray[np.bool_]:
+        """Whether they have long been far smaller, (N,)."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self._squares.mean(axis=1) < QUIET)
+
     def doubt(self, setpoint: Array) -> tuple[Array, Array]:
         """Standard deviations of the error e and of the growth share s of `relative`, by the filter itself, each (N,).
 
-        Of s = mu h / B to first order, with what mu and g have in common: at rest mu = g u / tau is known better than
-        either. B is taken as known for e.
+        To first order, with what ln x, mu and g have in common: at rest mu = g u / tau is known better than either.
+        B is taken as known for e, as the proof has it, which takes an error of the gain by itself.
         """
         warmer = np.nan_to_num(self._warm - self._first_warm)
-        period, share = self.model.control_min / self.full_pump, self.relative(setpoint)[1]
+        share, period = self.relative(setpoint)[1], self.model.control_min / self.full_pump
         slope = np.stack([np.zeros_like(share), period, -share / self.gain, period * warmer], axis=1)
         variance = np.einsum("ni,nij,nj->n", slope, self.cov, slope)
         return np.sqrt(self.cov[:, LOG_OD, LOG_OD]) / self.full_pump, np.sqrt(np.maximum(variance, 0.0))
+
+    def sd(self, setpoint: Array) -> tuple[Array, Array]:
+        """The same as they are told: with B's part in e, and as much larger as surprises lately were than usual.
+
+        That of s is of the share that holds the culture at rest, which changes beside the filter's error of it.
+        """
+        _, share = self.doubt(setpoint)
+        slope = np.zeros((len(share), 4))
+        slope[:, LOG_OD], slope[:, GAIN] = 1.0 / self.full_pump, -self.relative(setpoint)[0] / self.gain
+        error = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", slope, self.cov, slope), 0.0))
+        larger = np.ones_like(share)
+        for recent in (self._squares[:, -LAST:], self._squares):
+            count = np.maximum(np.isfinite(recent).sum(axis=1), 1)
+            larger = np.maximum(larger, np.sqrt(np.nansum(recent, axis=1) / count / USUAL))
+        return error * larger, np.hypot(share * larger, SHARE_SD)
 
     def explain(self) -> dict[str, Array]:
         """The estimates: OD, growth rate (1/min), relative pump gain, sd of a reading over the assumed one."""

@@ -1,6 +1,8 @@
 """The exported DQN policy as a controller: of (OD, setpoint), without memory, or of (error, growth share) estimated."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -10,11 +12,13 @@ from dqn.policy import RELATIVE, Policy
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.laws.base import Array, Controller, ControllerConfig, Mask, usable
-from experiments.laws.density.estimator import LOWEST_OD, Estimator, EstimatorConfig
+from experiments.laws.density import estimator as filters
+from experiments.laws.density.estimator import Estimator, EstimatorConfig
 
-__all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned"]
+__all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned", "settings"]
 
 WATCHED = 2.0  # sd of an estimate that count as its error
+SUPERVISOR = {"law": "clip(e + s, 0, 1)", "watched_sd": WATCHED, "loud": filters.LOUD, "quiet": filters.QUIET}
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,24 @@ def learned(config: LearnedConfig, policy: Policy, model: EnvConfig, bounds: Est
     """
     if policy.observation != RELATIVE:
         return LearnedController(policy)
+    return RelativeController(policy, _estimator(policy, config.estimator), model, bounds)
+
+
+def _estimator(policy: Policy, changes: Mapping[str, Any]) -> EstimatorConfig:
     own = build(EstimatorConfig(), policy.metadata.get("estimator", {}), "policy.estimator")
-    return RelativeController(policy, build(own, config.estimator, "controller.estimator"), model, bounds)
+    return build(own, dict(changes), "controller.estimator")
+
+
+def settings(policy: Policy, changes: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
+    """What decides beside a policy's network, by the names of settings; a certificate is of these, too.
+
+    Args: changes: of its estimator. Raises: ValueError for settings that do not exist or fit.
+    """
+    if policy.observation != RELATIVE:
+        return {}
+    own = {f"estimator.{key}": value for key, value in asdict(_estimator(policy, changes)).items()}
+    second = {f"fallback.estimator.{key}": value for key, value in asdict(EstimatorConfig()).items()}
+    return own | second | {f"fallback.{key}": value for key, value in SUPERVISOR.items()}
 
 
 class LearnedController:
@@ -75,71 +95,80 @@ def lead(q: np.ndarray) -> dict[str, Array]:
 class RelativeController:
     """u = u_max v with v = actions[argmax_a Q([e, s], a)], error e and growth share s as `Estimator` knows them.
 
-    A supervisor stands over it: where twice the estimator's own sd of e or s leaves the bounds of the certificate, the
-    one-line law on the nominal model acts instead, u = tau (mu + ln(x/r)/h) of the reading, clipped to the pump's
-    range (docs/certificate.md, What is assumed). The error of s is how far the s that the policy is shown may lie from
-    the true one, which is between 0 and the highest that was proven: above it no pump rate holds the culture.
+    A supervisor stands over it. Where the estimator's surprises do not fit what it believes, or twice its sd of e or s
+    leaves the bounds of the certificate, the one-line law u = u_max clip(e + s, 0, 1) decides, on a second filter whose
+    settings nobody can change (docs/certificate.md, The supervisor). Surprises do not fit that are far too large, or
+    long far too small while those of the second filter are not. The error of s is how far the s that the policy is
+    shown may lie from the true one, which is between 0 and the highest that was proven: above it no pump rate holds the
+    culture.
 
     Args: policy: with observation (error, growth_share). estimator: its settings. model: mu, tau, control period and
-      largest pump rate; mu and tau are where the estimator begins. bounds: of the certificate; None: nobody supervises.
+      largest pump rate; mu and tau are where the filters begin. bounds: of the certificate; None: surprises alone.
     """
 
-    remembers = ("estimator", "rate", "q", "seen", "supervised")
+    remembers = ("estimator", "second", "rate", "q", "seen", "sure", "supervised", "alarm")
 
     def __init__(
         self, policy: Policy, estimator: EstimatorConfig, model: EnvConfig, bounds: EstimateBounds | None = None
     ) -> None:
         self.policy, self.model, self.bounds = policy, model, bounds
-        self.estimator = Estimator(estimator, model)
+        self.estimator, self.second = Estimator(estimator, model), Estimator(EstimatorConfig(), model)
         self.reset(1)
 
     def reset(self, n: int) -> None:
         """See `Controller.reset`."""
         self.estimator.reset(n)
+        self.second.reset(n)
         self._rate, self._q = np.zeros(n), np.full((n, self.policy.actions.size), np.nan)
-        self._seen, self._supervised = np.full((n, 2), np.nan), np.zeros(n, dtype=np.bool_)
+        self._seen, self._sure = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
+        self._supervised, self._alarm = np.zeros((2, n), dtype=np.bool_)
 
     def watch(self, od: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         """See `Watches.watch`."""
-        self.estimator.watch(od, temperature, minute, rows)
+        for each in (self.estimator, self.second):
+            each.watch(od, temperature, minute, rows)
 
     def act(self, od: Array, setpoint: Array, minute: Array, rows: Mask) -> Array:
         """See `Controller.act`."""
-        self.estimator.see(od, minute, rows)
+        for each in (self.estimator, self.second):
+            each.see(od, minute, rows)
         now = usable(od, rows)
-        observation = np.stack(self.estimator.relative(setpoint), axis=1)
-        q = self.policy.q_values(observation)
-        outside = self._outside(setpoint, observation)
-        rate = np.where(outside, self._nominal(od, setpoint), self.policy.actions[q.argmax(axis=1)])
-        rate = self.model.max_pump_rate * rate
-        self._supervised = np.where(now, outside, self._supervised)
-        self._q[now], self._seen[now] = q[now], observation[now]
-        self._rate = np.where(now, rate, self._rate)
-        self.estimator.decided(self._rate)
+        observation, sure = (np.stack(pair(setpoint), axis=1) for pair in (self.estimator.relative, self.estimator.sd))
+        q, alarm = self.policy.q_values(observation), self.estimator.loud | (self.estimator.quiet & ~self.second.quiet)
+        supervised = alarm | self._outside(setpoint, observation)
+        error, share = self.second.relative(setpoint)
+        rate = np.where(supervised, np.clip(error + share, 0.0, 1.0), self.policy.actions[q.argmax(axis=1)])
+        for kept, new in (
+            (self._supervised, supervised),
+            (self._alarm, alarm),
+            (self._q, q),
+            (self._seen, observation),
+        ):
+            kept[now] = new[now]
+        self._sure[now], self._rate[now] = sure[now], self.model.max_pump_rate * rate[now]
+        for each in (self.estimator, self.second):
+            each.decided(self._rate)
         return self._rate.copy()
 
-    def _outside(self, setpoint: Array, observation: np.ndarray) -> Mask:
-        """Where the policy may not act, (N,)."""
+    def _outside(self, setpoint: Array, observation: Array) -> Mask:
+        """Where the estimate may be off by more than was proven, (N,)."""
         if self.bounds is None:
             return np.zeros(setpoint.size, dtype=np.bool_)
         error, doubt = (WATCHED * sd for sd in self.estimator.doubt(setpoint))
         estimate, (low, high) = observation[:, 1], self.bounds.proven
         shown = np.clip(estimate, low, high)
         largest, least = np.minimum(estimate + doubt, high), np.maximum(estimate - doubt, 0.0)
-        return ~self.bounds.hold(setpoint, error, shown, np.maximum(largest - shown, shown - least))
-
-    def _nominal(self, od: Array, setpoint: Array) -> Array:
-        """Share of the largest pump rate by the one-line law on the nominal model, (N,)."""
-        m = self.model
-        error = np.log(np.maximum(np.nan_to_num(od), LOWEST_OD) / np.maximum(setpoint, LOWEST_OD))
-        return np.clip(m.tau / m.max_pump_rate * (m.mu + error / m.control_min), 0.0, 1.0)
+        od = setpoint * np.exp(observation[:, 0] * self.bounds.full_pump)
+        return ~self.bounds.hold(od, error, shown, np.maximum(largest - shown, shown - least))
 
     def dosed(self, volume_ml: Array) -> None:
         """See `Accounts.dosed`."""
-        self.estimator.dosed(volume_ml)
+        for each in (self.estimator, self.second):
+            each.dosed(volume_ml)
 
     def explain(self) -> dict[str, Array]:
-        """What the policy saw, how sure it was, and the estimates behind it, each (N,)."""
-        seen = {"error": self._seen[:, 0].copy(), "growth_share": self._seen[:, 1].copy()}
-        supervised = {"supervised": self._supervised.astype(np.float64)}
-        return {**supervised, **seen, **lead(self._q), **self.estimator.explain()}
+        """Whether the supervisor decided, what the policy saw with its sd, and the estimates behind it, each (N,)."""
+        said = {"supervised": self._supervised.astype(np.float64), "alarm": self._alarm.astype(np.float64)}
+        (error, share), (error_sd, share_sd) = self._seen.T.copy(), self._sure.T.copy()
+        seen = {"error": error, "growth_share": share, "error_sd": error_sd, "growth_share_sd": share_sd}
+        return {**said, **seen, **lead(self._q), **self.estimator.explain()}
