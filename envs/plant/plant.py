@@ -242,13 +242,13 @@ class Plant:
         grown = (1.0 + change) ** steps if self.config.integrator == "euler" else np.exp(steps * change)
         return np.asarray((self.culture.biomass * grown * (1.0 if continuous else np.exp(-dose))).sum(axis=-1))
 
-    def at_rest(self, minutes: float, feed_s: float) -> tuple[Array, Array]:
+    def at_rest(self, minutes: float, feed_s: Array | float) -> tuple[Array, Array]:
         """What one mean dose of `feed_s` s takes off ln x, and the share of it that growth makes up for, each (N,).
 
         Args: minutes: between two doses. As `expected_od`, of this moment.
         """
         rate, biomass = self.culture.rates(self.age_min), self.culture.biomass
-        taken = self.feed.expected(np.full(self.n, feed_s), self.age_min) / self.vessel.volume_ml
+        taken = self.feed.expected(np.broadcast_to(feed_s, (self.n,)), self.age_min) / self.vessel.volume_ml
         grown = minutes * (rate * biomass).sum(axis=-1) / biomass.sum(axis=-1)
         return taken, np.divide(grown, taken, out=np.full(self.n, np.nan), where=taken > 0.0)
 

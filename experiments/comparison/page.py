@@ -41,6 +41,12 @@ DENSITY = {
     "comparisons.",
     "±": "one standard deviation over replicates.",
 }
+ESTIMATES = (
+    ("error_2sd_pct", "Decisions in which e lay within two of its own sd of the truth, %"),
+    ("share_2sd_pct", "Decisions in which s lay within two of its own sd of the share that holds at rest, %"),
+    ("supervised_pct", "Decisions by the supervisor's law, %"),
+    ("alarm_pct", "Decisions by it because of surprises, %"),
+)
 SHARE = {
     "error": "mean over the scenario of |r - setpoint|, r the true share of P. putida, wherever a share is asked for.",
     "told ahead": "changes of the setpoint are announced, as early as the scenario's announce_min; `optimum` knows the "
@@ -276,6 +282,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
                 out.table(table, folded=f"{heading}, {metric.upper()}: {scenario}")
     extra = (
         ("itae_median", "ITAE of the measured OD (OD min²), sum over the windows, median over vials", True),
+        ("clean_ise", "ISE of the noise-free OD (OD² min), sum over the windows", True),
         ("clean_itae", "ITAE of the noise-free OD (OD min²), sum over the windows", True),
         ("clean_steady_abs_error", "Steady error of the noise-free OD", True),
         ("effort_ul_s", "Control effort (µL/s per minute)", False),
@@ -286,6 +293,9 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
         ranking = key if ranked else None
         table = matrix(f"{scenario}_{key}", title, totals, partial(_scaled, key=key), f"Mean, n = {n}.", ranking)
         out.table(table, folded=f"{title}: {scenario}")
+    estimating = [e for e in totals if ESTIMATES[0][0] in e]
+    for key, title in ESTIMATES if estimating else ():
+        out.table(matrix(f"{scenario}_{key}", title, estimating, partial(_scaled, key=key), f"Mean, n = {n}."))
 
 
 def all_rows(summary: Row) -> Table:

@@ -19,6 +19,9 @@ __all__ = [
 Array = NDArray[np.float64]
 T = TypeVar("T", bound=Trial)
 METRICS = ("ise", "itae")
+TOLD = {
+    "supervised_pct": "supervised", "alarm_pct": "alarm", "error_2sd_pct": "error", "share_2sd_pct": "growth_share",
+}  # fmt: skip
 LAST_MIN, DAY_MIN = 120, 1440  # of a window in which a share is held; of a run of days
 NEGLIGIBLE = 1e-6  # a difference is not stated in percent of a mean below this
 
@@ -194,6 +197,7 @@ def totals(trials: Sequence[DensityTrial]) -> list[dict[str, Any]]:
         entry["clean_steady_abs_error"] = Spread(steady).mean
         entry["effort_ul_s"] = Spread(np.average([trial.effort(w) for w in parts], axis=0, weights=length)).mean
         entry["held"] = Spread(trial.held).mean
+        entry |= {key: 100.0 * Spread(trial.told[of]).mean for key, of in TOLD.items() if of in trial.told}
         entry["media_ml"] = Spread(np.sum([trial.media(w) for w in parts], axis=0)).mean
         found.append(entry)
     return found

@@ -7,9 +7,9 @@ by the temperature. `Loops` runs those that the studies of a benchmark need, in 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from types import TracebackType
@@ -38,6 +38,7 @@ from experiments.laws.share.program import Program
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.metrics import WindowMetrics, window_metrics
 from experiments.loop.share import program_of
+from experiments.loop.signals import within_2sd
 from hardware.safety.config import Response
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
@@ -53,6 +54,7 @@ Array = NDArray[np.float64]
 
 FACTOR_SD, OFFSET_SD = 0.02, 5.0
 """Errors of a calibrated light sensor: relative of the factor, and of the offset in counts, a blank read 36 times."""
+SUPERVISED = ("supervised", "alarm")
 LEAST_NOISE = 1e-9  # OD, of a sensor that is meant to have none
 
 
@@ -112,6 +114,8 @@ class DensityTrial(Trial):
     od: as measured. clean: what a sensor without noise would have shown. rate: mL/s after the interlock.
     media_ml: fresh medium delivered since the culture began.
     held: samples on which the interlock allowed no dose, (N,). overflowed: at the end, (N,).
+    told: of a law that estimates, shares of its decisions, (N,) each: in which its supervisor decided, in which it was
+    alarmed by surprises, and in which an estimate lay within two of its sd of the truth, by the estimate's name.
     """
 
     od: Array
@@ -120,6 +124,7 @@ class DensityTrial(Trial):
     media_ml: Array
     held: Array
     overflowed: NDArray[np.bool_]
+    told: Mapping[str, Array] = field(default_factory=dict)
 
     def score(self, window: Window, of: str = "measured") -> WindowMetrics:
         """Metrics of a window.
@@ -184,10 +189,12 @@ def run_trial(
         plant, SimulatedConfig(reactors=tuple(f"M{i}" for i in range(replicates))), bench.control_min
     )
     loop = ClosedLoop(reactors, make(plant), Interlock(replicates, bench=bench), schedule)
+    loop.density.known(plant, reactors.config.pump_ml_s, bench)
     minute = np.arange(0.0, schedule.total_min + 1e-6, model.control_min)
     fields = ("od", "clean", "rate", "temperature", "media_ml")
     stored: dict[str, Any] = {key: np.full((replicates, minute.size), np.nan) for key in fields}
     held = np.zeros(replicates)
+    told: dict[str, list[Array]] = {}
     for step in loop.run():
         row = np.flatnonzero(step.rows & (step.phase >= 0))
         column = np.rint(step.elapsed[row] / model.control_min).astype(np.intp)
@@ -201,7 +208,12 @@ def run_trial(
         for key, values in seen.items():
             stored[key][row, column] = values[row]
         held[row] += step.response[row] >= Response.HOLD
-    return DensityTrial(cell, schedule, minute, **stored, held=held, overflowed=plant.vessel.overflowed)
+        why = step.explanation
+        beside = {key: why[key] for key in SUPERVISED if key in why} | within_2sd(why)
+        for key, value in beside.items():
+            told.setdefault(key, []).append(np.where(step.rows & (step.phase >= 0), value, np.nan))
+    parts = {key: np.nanmean(values, axis=0) for key, values in told.items()}
+    return DensityTrial(cell, schedule, minute, **stored, held=held, overflowed=plant.vessel.overflowed, told=parts)
 
 
 def cells(config: BenchmarkConfig) -> list[Cell]:

@@ -264,6 +264,8 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     counts = registry.takes(setup.law.kind, "model") and not registry.takes(setup.law.kind, "plant")
     scale = volumes_ml / setup.bench.volume_ml if counts else np.ones(len(volumes_ml))  # its model is of one volume
     loop = ClosedLoop(reactors, law, interlock, setup.scenarios, record.decided, setup.ends, setup.further, scale)
+    if plant is not None:
+        loop.density.known(plant, flow, setup.bench)
     if setup.resumed:
         continue_loop(loop, record.journal, record.state_path)
     return loop

@@ -12,15 +12,33 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.bench import Bench
+from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from experiments.laws.base import Accounts, Array, Controller, Explains, Mask, Watches
 from hardware.memory import Remembers
 from hardware.reactor import Measurement
 from hardware.safety.interlock import Interlock
 
-__all__ = ["FEED", "THERMOSTAT", "Density", "Findings", "Sample", "Signal", "add", "made", "one_each"]
+__all__ = [
+    "ESTIMATED",
+    "FEED",
+    "THERMOSTAT",
+    "TRUE",
+    "Density",
+    "Findings",
+    "Sample",
+    "Signal",
+    "add",
+    "made",
+    "one_each",
+    "within_2sd",
+]
 
 FEED, THERMOSTAT = "feed pump", "thermostat"
+TRUE = ("true_error", "true_growth_share")
+ESTIMATED = ("error", "growth_share")
+ALARM = "filter_alarm: readings do not fit what the estimator believes; the law on a second filter decides; reported"
 TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "composition", "journal_row")
 
 
@@ -123,6 +141,21 @@ class Density:
 
     def __init__(self, law: Controller, scale: Array | float = 1.0, max_rate: float = math.inf) -> None:
         self.law, self._scale, self._max_rate = law, scale, max_rate
+        self.truth: Callable[[Array], tuple[Array, Array]] | None = None
+
+    def known(self, plant: Plant, flow_ml_s: float, bench: Bench) -> None:
+        """In a simulation: e = ln(x/r)/B and the share of the full pump at which the culture rests are known.
+
+        Args: flow_ml_s: of a pump as the driver takes it.
+        """
+        most_s = 60.0 * bench.control_min * bench.max_rate * self._scale / flow_ml_s
+
+        def truth(setpoint: Array) -> tuple[Array, Array]:
+            full, share = plant.at_rest(bench.control_min, most_s)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                return np.log(plant.apparent_od / setpoint) / full, share
+
+        self.truth = truth
 
     def decide(self, sample: Sample) -> Array:
         """See `Signal.decide`."""
@@ -134,8 +167,12 @@ class Density:
         return np.where(np.equal(self._scale, 1.0), rate, np.minimum(rate * self._scale, self._max_rate))
 
     def find(self, sample: Sample, given: Array) -> Findings:
-        """See `Signal.find`."""
-        return Findings(why=self.law.explain() if isinstance(self.law, Explains) else {})
+        """See `Signal.find`; in a simulation also what e and s truly are, where the law estimates them."""
+        why = self.law.explain() if isinstance(self.law, Explains) else {}
+        if self.truth is not None and "growth_share" in why:
+            why = {**why, **dict(zip(TRUE, self.truth(sample.setpoint), strict=True))}
+        alarm = why.get("alarm", np.zeros(sample.rows.size)) * (sample.believed & (sample.phase >= 0))
+        return Findings(why=why, warnings=[ALARM if a else None for a in alarm] if alarm.any() else ())
 
     def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
         """See `Signal.dosed`."""
@@ -146,6 +183,16 @@ class Density:
     def memory(self) -> Remembers | None:
         """See `Signal.memory`: that of the law."""
         return self.law if isinstance(self.law, Remembers) else None
+
+
+def within_2sd(why: Mapping[str, Array]) -> dict[str, Array]:
+    """Where each estimate lies within two of its own sd of the truth: 1 or 0, nan where either is not known."""
+    found = {}
+    for name, true in zip(ESTIMATED, TRUE, strict=True):
+        if true in why:
+            off = np.abs(why[name] - why[true]) / why[f"{name}_sd"]
+            found[name] = np.where(np.isfinite(off), off <= 2.0, np.nan)
+    return found
 
 
 Make = Callable[[Any, Sequence[Scenario]], Signal]

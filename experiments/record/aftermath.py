@@ -19,6 +19,7 @@ from envs.identification.screening import Series
 from envs.task import EnvConfig
 from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file
+from experiments.loop.signals import ESTIMATED, within_2sd
 from experiments.reporting.agreement_chart import agreement_figure
 from experiments.reporting.charts import save
 from experiments.reporting.page import Page
@@ -87,7 +88,8 @@ def decisions(run: Path, reactor: str) -> dict[str, Array]:
     A key that no decision has is left out; one that some lack is nan there. All of shape (K,).
     """
     rows = list(_decisions(run / "journal.jsonl", reactor))
-    keys = [key for key in ("supervised", *ESTIMATES) if any(key in why for _, why in rows)]
+    known = [key for name in ESTIMATED for key in (name, f"{name}_sd", f"true_{name}")]
+    keys = [key for key in ("supervised", "alarm", *ESTIMATES, *known) if any(key in why for _, why in rows)]
     found = {key: np.array([_real(why.get(key)) for _, why in rows]) for key in keys}
     return {"minute": np.array([minute for minute, _ in rows]), **found}
 
@@ -148,9 +150,9 @@ def _reactor(page: Page, run: Path, path: Path, model: Believed, summary: Mappin
     except (RecordingError, ValueError) as error:
         page.text(f"Not compared: {error}")
     else:
-        page.add("verdict", claim=found.verdict(), items=_facts(found), remark=_acted(summary, supervised))
+        page.add("verdict", claim=found.verdict(), items=_facts(found) + _sure(why), remark=_acted(summary, why))
         page.table(_segments(found, f"{prefix}after_{name}", name))
-        estimates = {key: values for key, values in why.items() if key != "supervised"}
+        estimates = {key: values for key, values in why.items() if key in ("minute", *ESTIMATES)}
         figure = agreement_figure(found, estimates, supervised, f"{name}: growth and pump along the run")
         page.figure(save(figure, run / "report", name).with_suffix(".svg"), f"{name}, predicted and measured")
 
@@ -176,8 +178,21 @@ def _fact(c: Compared) -> str:
     return last
 
 
-def _acted(summary: Mapping[str, Any], supervised: Array) -> str:
+def _sure(why: Mapping[str, Array]) -> list[str]:
+    """How often an estimate was as near to the truth as it said, where the truth is known."""
+    names = {"error": "error e", "growth_share": "growth share s"}
+    found = {key: values[np.isfinite(values)] for key, values in within_2sd(why).items()}
+    within = "within two of its own sd of the truth in"
+    return [
+        f"{names[key]}: {within} {100.0 * values.mean():.0f} % of {values.size} decisions"
+        for key, values in found.items()
+        if values.size
+    ]
+
+
+def _acted(summary: Mapping[str, Any], why: Mapping[str, Array]) -> str:
     """What the interlock and a supervisor did."""
+    supervised = why["minute"][why["supervised"] > 0.0] if "supervised" in why else np.empty(0)
     reasons = summary.get("reasons")
     kinds = "; ".join(
         f"{kind} in {t['rows']} rows, minute {number(t['first_min'])} to {number(t['last_min'])}"
@@ -188,6 +203,8 @@ def _acted(summary: Mapping[str, Any], supervised: Array) -> str:
     acted = f"A supervisor acted on {len(supervised)} rows"
     if len(supervised):
         acted += f", minute {supervised[0]:.0f} to {supervised[-1]:.0f}"
+        if (alarmed := int((why.get("alarm", np.zeros(1)) > 0.0).sum())) > 0:
+            acted += f", on {alarmed} of them because readings did not fit the estimate"
     return f"{interlock}{': ' if kinds else ''}{kinds}. {acted}."
 
 

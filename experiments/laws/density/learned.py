@@ -138,14 +138,9 @@ class RelativeController:
         supervised = alarm | self._outside(setpoint, observation)
         error, share = self.second.relative(setpoint)
         rate = np.where(supervised, np.clip(error + share, 0.0, 1.0), self.policy.actions[q.argmax(axis=1)])
-        for kept, new in (
-            (self._supervised, supervised),
-            (self._alarm, alarm),
-            (self._q, q),
-            (self._seen, observation),
-        ):
-            kept[now] = new[now]
-        self._sure[now], self._rate[now] = sure[now], self.model.max_pump_rate * rate[now]
+        self._supervised[now], self._alarm[now] = supervised[now], alarm[now]
+        self._q[now], self._seen[now], self._sure[now] = q[now], observation[now], sure[now]
+        self._rate[now] = self.model.max_pump_rate * rate[now]
         for each in (self.estimator, self.second):
             each.decided(self._rate)
         return self._rate.copy()
