@@ -59,8 +59,7 @@ class DQNAgent:
             matrix = torch.tensor(config.input_matrix, dtype=torch.float32, device=self.device).view(len(offset), -1)
         features = observations if offset is None else len(offset)
         self.sizes = (features, *config.hidden, actions)
-        start = (config.init_mirror, config.init_zero_output)
-        flat = np.stack([initial_weights(self.sizes, seed, *start) for seed in streams["init"]])
+        flat = np.stack([initial_weights(self.sizes, seed, config.init_zero_output) for seed in streams["init"]])
         weights = torch.from_numpy(flat).to(self.device)
         basis = action_basis(actions, config.output_basis_decay).to(self.device) if config.output_basis_decay else None
         self.online = QNetwork(weights, self.sizes, matrix, offset, basis)

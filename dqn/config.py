@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from conf.schema import check, require, setting
+from conf.schema import check, setting
 
 __all__ = ["DQNConfig"]
 
@@ -57,9 +57,6 @@ class DQNConfig:
     )
     input_matrix: tuple[float, ...] = setting((), "features = M observation + c, M row by row; []: identity")
     input_offset: tuple[float, ...] = setting((), "c, one number per feature")
-    init_mirror: tuple[int, ...] = setting(
-        (), "-1 or 1 per feature: half of the units start as mirror images; []: none"
-    )
     init_zero_output: bool = setting(False, "the last layer starts at zero")
 
     def __post_init__(self) -> None:
@@ -71,15 +68,6 @@ class DQNConfig:
                 f"agent.input_matrix has {len(self.input_matrix)} values and agent.input_offset "
                 f"{len(self.input_offset)}: allowed one row of the matrix per value of the offset, or neither"
             )
-        mirror = self.init_mirror
-        require(
-            not mirror or (len(mirror) == len(self.input_offset) and set(mirror) <= {-1, 1}),
-            "agent.init_mirror",
-            mirror,
-            f"-1 or 1 for each of the {len(self.input_offset)} values of agent.input_offset, or []",
-        )
-        even = not mirror or not any(units % 2 for units in self.hidden)
-        require(even, "agent.hidden", self.hidden, "even sizes with agent.init_mirror, or []")
 
     def epsilon(self, step: int) -> float:
         """Probability of a random action at an environment step: linear in the step, then constant."""

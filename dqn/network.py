@@ -13,34 +13,22 @@ __all__ = ["QNetwork", "action_basis", "initial_weights"]
 Layer = tuple[torch.Tensor, torch.Tensor]
 
 
-def initial_weights(
-    sizes: Sequence[int], seed: np.random.SeedSequence, mirror: Sequence[int] = (), zero_output: bool = False
-) -> np.ndarray:
+def initial_weights(sizes: Sequence[int], seed: np.random.SeedSequence, zero_output: bool = False) -> np.ndarray:
     """Weights of one network, flat: W and b of each layer uniform in +-1/sqrt(inputs) (the default of torch.nn.Linear).
 
-    With `mirror`, each hidden layer starts as two halves. Every unit of the first half has a partner in the second
-    half, which gives for the features f what the unit gives for the mirrored features, mirror * f. A preference that
-    the draw creates on one side is then there on the other side as well.
-
     Args:
-      sizes: units of feature, hidden and output layers; hidden ones even with `mirror`.
-      seed: the agent's own stream. mirror: 1 or -1 for each feature; () = every unit is drawn.
+      sizes: units of feature, hidden and output layers. seed: the agent's own stream.
       zero_output: the last layer starts at 0, and with it every Q value.
     Returns: float32, shape (P,), laid out as `QNetwork` wants it.
     """
     rng = np.random.default_rng(seed)
     parts = []
-    signs = np.asarray(mirror, dtype=np.float64)
     for layer, (inputs, outputs) in enumerate(pairwise(sizes)):
         bound = 1.0 / np.sqrt(inputs)
         weight, bias = rng.uniform(-bound, bound, (inputs, outputs)), rng.uniform(-bound, bound, outputs)
-        last, half = layer == len(sizes) - 2, outputs // 2
+        last = layer == len(sizes) - 2
         if last and zero_output:
             weight[:], bias[:] = 0.0, 0.0
-        elif signs.size and not last:
-            # the mirrored inputs: features with their signs, units of the layer before with the halves exchanged
-            image = weight[:, :half] * signs[:, None] if layer == 0 else np.roll(weight[:, :half], inputs // 2, axis=0)
-            weight[:, half:], bias[half:] = image, bias[:half]
         parts += [(weight.T if last else weight).ravel(), bias]
     return np.concatenate(parts).astype(np.float32)
 

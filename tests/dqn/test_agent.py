@@ -241,15 +241,6 @@ def test_epsilon_without_steps_is_its_end() -> None:
     assert DQNConfig(epsilon_end=0.05, epsilon_steps=0).epsilon(0) == 0.05
 
 
-def test_a_mirrored_start_needs_even_layers() -> None:
-    given = {"input_matrix": (1.0, 0.0, 0.0, 1.0), "input_offset": (0.0, 0.0), "init_mirror": (-1, 1)}
-    assert DQNConfig(**given).init_mirror == (-1, 1)
-    with pytest.raises(ValueError, match=r"agent\.hidden = \[64, 33\]: allowed even sizes"):
-        DQNConfig(**given, hidden=(64, 33))
-    with pytest.raises(ValueError, match=r"agent\.init_mirror = \[0, 1\]"):
-        DQNConfig(**{**given, "init_mirror": (0, 1)})
-
-
 def test_relabelling_without_a_goal_is_refused() -> None:
     config = DQNConfig(**{**SMALL.__dict__, "hindsight_share": 0.5})
     with pytest.raises(ValueError, match=r"agent\.hindsight_share = 0\.5"):
@@ -267,7 +258,6 @@ def test_relabelling_without_a_goal_is_refused() -> None:
         ("action_gap", 1.0),
         ("hindsight_share", -0.1),
         ("input_offset", (1.0,)),
-        ("init_mirror", (-1, 1)),
     ],
 )
 def test_values_out_of_range_are_named(key: str, value: Any) -> None:

@@ -116,22 +116,6 @@ def test_three_functions_of_the_basis_make_a_parabola() -> None:
     torch.testing.assert_close((basis[:3].T @ weights)[:, 0], q, rtol=1e-5, atol=1e-4)
 
 
-@pytest.mark.parametrize("hidden", [(8, 6), (8,), (4, 6, 8)])
-def test_half_of_the_units_start_as_mirror_images(hidden: tuple[int, ...]) -> None:
-    """In each layer, the second half gives for the features what the first half gives for the mirrored ones."""
-    mirror = (-1, -1, 1)
-    sizes = (3, *hidden, 4)
-    flat = torch.from_numpy(initial_weights(sizes, np.random.SeedSequence(3), mirror)[None])
-    network = QNetwork(flat, sizes)
-    features = torch.randn(1, 50, 3, generator=torch.Generator().manual_seed(0))
-    _, seen = network.forward(features)
-    _, mirrored = network.forward(features * torch.tensor(mirror))
-    for units, images in zip(seen[1:], mirrored[1:], strict=True):
-        half = units.shape[-1] // 2
-        torch.testing.assert_close(units[..., half:], images[..., :half])
-        assert not torch.allclose(units[..., half:], units[..., :half])
-
-
 def test_outputs_may_start_at_zero() -> None:
     drawn = initial_weights((3, 8, 4), np.random.SeedSequence(3))
     flat = initial_weights((3, 8, 4), np.random.SeedSequence(3), zero_output=True)

@@ -90,10 +90,6 @@ def test_how_many_updates_a_training_takes(total: int, start: int, each: int, up
             {"input_matrix": (1.0, 0.0, 1.0), "input_offset": (0.0, 0.0)},
             "input_matrix has 3 values and agent.input_offset 2: allowed one row",
         ),
-        ({"init_mirror": (1,)}, "init_mirror"),
-        ({"input_matrix": (1.0, 0.0), "input_offset": (0.0, 0.0), "init_mirror": (1,)}, "init_mirror"),
-        ({"input_matrix": (1.0, 0.0), "input_offset": (0.0, 0.0), "init_mirror": (1, 2)}, "init_mirror"),
-        ({"input_matrix": (1.0, 0.0), "input_offset": (0.0, 0.0), "init_mirror": (1, -1), "hidden": (4, 5)}, "hidden"),
     ],
 )
 def test_parts_of_the_input_map_that_do_not_fit_are_refused(changes: dict[str, Any], key: str) -> None:

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from conf.schema import part, setting
+from conf.schema import part, require, setting
+from envs.relative import nearest_level
 from envs.task import EnvConfig
 from experiments.laws.base import Array, ControllerConfig, Mask, usable
 from experiments.laws.density.estimator import Estimator, EstimatorConfig
@@ -17,13 +18,20 @@ class InverseConfig(ControllerConfig):
     """The one-line law and what it believes."""
 
     kind: str = setting("inverse", "which controller")
+    levels: int = setting(
+        0, "pump rates it chooses from, equally spaced, the nearest one; 0: any rate", within=(0, 1001)
+    )
     estimator: EstimatorConfig = part(EstimatorConfig, "what the filter believes")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.levels != 1, "controller.levels", self.levels, "0, or 2 to 1001")
 
 
 class Inverse:
     """Certainty-equivalent inverse control: u = u_max clip(e + s, 0, 1) with the estimates of error and growth share.
 
-    That is u = tau/g (mu + ln(x/r)/h), clipped to the pump's range.
+    That is u = tau/g (mu + ln(x/r)/h), clipped to the pump's range, and to the nearest of its levels where it has some.
 
     Args: config: the filter's beliefs; model: mu, tau, control period and largest pump rate, the first guess.
     """
@@ -31,7 +39,7 @@ class Inverse:
     remembers = ("estimator", "rate")
 
     def __init__(self, config: InverseConfig, model: EnvConfig) -> None:
-        self.model = model
+        self.model, self._levels = model, config.levels
         self.estimator = Estimator(config.estimator, model)
         self.reset(1)
 
@@ -48,7 +56,10 @@ class Inverse:
         """See `Controller.act`."""
         self.estimator.see(od, minute, rows)
         error, share = self.estimator.relative(setpoint)
-        wanted = self.model.max_pump_rate * np.clip(error + share, 0.0, 1.0)
+        wanted = np.clip(error + share, 0.0, 1.0)
+        if self._levels:
+            wanted = nearest_level(error, share, self._levels) / (self._levels - 1)
+        wanted = self.model.max_pump_rate * wanted
         self._rate = np.where(usable(od, rows), wanted, self._rate)
         self.estimator.decided(self._rate)
         return self._rate.copy()
