@@ -26,7 +26,7 @@ def figure(found: Certificate) -> Figure:
     widths.set(xlabel=asked.what, ylabel=f"half-width, {asked.unit}", ylim=(0.0, None))
     widths.set_title("Band that is entered and never left (dotted: the one-line law)")
     widths.set(yscale="log", ylim=(0.7 * widths.dataLim.y0, 8.0 * widths.dataLim.y1))
-    widths.legend(ncols=2)
+    widths.legend(ncols=2, fontsize=7, loc="upper right")
     what = "periods after the one-line law" if asked.late else "entry time over the pump's own"
     entries.set(xlabel=asked.what, ylabel=what)
     entries.set_title("Time into the band, from anywhere in the range of starts")

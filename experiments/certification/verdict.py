@@ -16,7 +16,7 @@ STILL = 1e-9  # a smaller change of the state in a period is none
 ATTACKED = 45  # periods of a trajectory that tries to leave the band
 SETTLED = 20  # of them until it has forgotten where it began
 LESS = (0.0, 0.3)  # chances that disturbances are smaller than they could be, a half of the trajectories each
-TURNS = (0.5, 0.2, 0.05, 0.0)  # chances that it turns to the other side, a fourth of the trajectories each
+TURNS = (0.5, 0.05, 0.0)  # chances that it turns to the other side, a third of the trajectories each
 
 
 class Loop(Protocol):
