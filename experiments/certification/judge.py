@@ -124,7 +124,9 @@ def _half(policy: Policy) -> int:
 
 def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajectories: int) -> Iterator[Check]:
     """What attacks on every case find: whether a band is left, and whether it is wider than it need be."""
-    found = [attacked(policy, asked.loop, proof, trajectories) for proof in proofs] if trajectories else []
+    once = {asked.loop.key(proof.case): proof for proof in reversed(proofs)} if trajectories else {}
+    proofs = [proof for proof in proofs if proof in once.values()]
+    found = [attacked(policy, asked.loop, proof, trajectories) for proof in proofs]
     if found:
         yield Check("adversarial trajectories that left the band", sum(left for left, _ in found), 0)
     if asked.reached is None:

@@ -80,6 +80,10 @@ class OdLoop:
         """Largest |x - r| of a band in d, OD, (S,)."""
         return self.high * np.maximum(np.expm1(high), -np.expm1(low))
 
+    def key(self, case: OdCase) -> object:
+        """Every case is a loop of its own."""
+        return case
+
     def in_od(self, case: OdCase, half_width: float) -> float:
         """A half-width, which is in OD."""
         return half_width
@@ -89,11 +93,13 @@ class OdLoop:
 
         At 1, the reading is as low as it can be, growth is fastest and a dose takes off least; at -1 the other way
         round; in between all of it is so much less.
-        Args: state: d (N,). second: [lowest, highest] setpoint of the strips, (N, 2). push: in [-1, 1], (N,).
+        Args: state: d (N,). second: [lowest, highest] setpoint of the strips, (N, 2). push: in [-1, 1], of what is shown
+          and of what acts, (N, 2).
         """
-        setpoint = second.mean(axis=1) - push * (second[:, 1] - second[:, 0]) / 2.0
-        reading = setpoint * np.exp(state) - push * case.noise
-        factor = 1.0 + push * case.share
+        shows, acts = push.T
+        setpoint = second.mean(axis=1) - shows * (second[:, 1] - second[:, 0]) / 2.0
+        reading = setpoint * np.exp(state) - shows * case.noise
+        factor = 1.0 + acts * case.share
         change = self.control_min * ((self.mu * factor)[:, None] - self.rates / (self.tau * factor)[:, None])
         return np.stack([reading, setpoint], axis=1), change
 

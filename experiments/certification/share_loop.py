@@ -109,6 +109,12 @@ class ShareLoop:
         """Largest |e| of a band, (S,)."""
         return np.maximum(-low, high)
 
+    def key(self, case: ShareCase) -> object:
+        """Cases of one key have the same loop, as far as the policy tells errors apart."""
+        (low, _), (high, _) = self.clip
+        errors = case.bounds.error_at(np.linspace(low, high, 65), case.setpoint)
+        return case.slow, case.bounds.gain, case.bounds.growth_share, errors.round(12).tobytes()
+
     def in_od(self, case: ShareCase, half_width: float) -> float | None:
         """A half-width at the case's setpoint, OD; None for a case of none. B is at most (1 + gain) the case's."""
         if case.setpoint is None:
@@ -120,11 +126,13 @@ class ShareLoop:
 
         At 1, e and s are shown as low as they can be, doses give least and s is the strip's highest, of which the
         policy may still be shown the lowest; at -1 the other way round; in between all of it is so much less.
-        Args: state: e (N,). second: [lowest, highest] s of the strips, (N, 2). push: in [-1, 1], (N,).
+        Args: state: e (N,). second: [lowest, highest] s of the strips, (N, 2). push: in [-1, 1], of what is shown and of
+          what acts, (N, 2).
         """
-        b, side, size = case.bounds, np.sign(push), np.abs(push)
-        half = push * (second[:, 1] - second[:, 0]) / 2.0
-        middle = second.mean(axis=1)
+        b, (shows, acts) = case.bounds, push.T
+        side, size = np.sign(shows), np.abs(shows)
+        half, middle = (second[:, 1] - second[:, 0]) / 2.0, second.mean(axis=1)
         furthest = b.estimate((1.0 - np.sign(state) * side * case.scale) * state, -side, case.setpoint)
-        shown = state + size * (furthest - state), middle - half - push * b.growth_share
-        return np.stack(shown, axis=1), (middle + half)[:, None] - self.doses * (1.0 - push[:, None] * case.spread)
+        shown = state + size * (furthest - state), middle - shows * (half + b.growth_share)
+        change = (middle + acts * half)[:, None] - self.doses * (1.0 - acts[:, None] * case.spread)
+        return np.stack(shown, axis=1), change

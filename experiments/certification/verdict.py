@@ -13,10 +13,10 @@ from experiments.certification.network import Array
 __all__ = ["Loop", "Proof", "attacked", "dose_below", "prove"]
 
 STILL = 1e-9  # a smaller change of the state in a period is none
-ATTACKED = 45  # periods of a trajectory that tries to leave the band
+ATTACKED = 60  # periods of a trajectory that tries to leave the band
 SETTLED = 20  # of them until it has forgotten where it began
-LESS = (0.0, 0.3)  # chances that disturbances are smaller than they could be, a half of the trajectories each
-TURNS = (0.5, 0.05, 0.0)  # chances that it turns to the other side, a third of the trajectories each
+LESS = (0.0, 0.3)  # chances that disturbances are anything between, a half of the trajectories each
+TURNS = (0.5, 0.2, 0.05, 0.0)  # chances that it turns to the other side, a fourth of the trajectories each
 
 
 class Loop(Protocol):
@@ -33,6 +33,7 @@ class Loop(Protocol):
     def states(self, case: Any) -> States: ...
     def law(self, case: Any) -> Pieces: ...
     def half_width(self, low: Array, high: Array) -> Array: ...
+    def key(self, case: Any) -> object: ...
     def in_od(self, case: Any, half_width: float) -> float | None: ...
     def attack(self, case: Any, state: Array, second: Array, push: Array) -> tuple[Array, Array]: ...
 
@@ -120,7 +121,7 @@ def attacked(policy: Policy, loop: Loop, proof: Proof, trajectories: int) -> tup
 
     They start anywhere in the band of any strip that has one. Everything that may be off is off as far as it can be to
     one side, which turns at random: often, which finds the steps of the policy, or seldom, which goes a long way. Now
-    and then it is off by less, which leads to places between the steps.
+    and then it is anywhere in between, which leads to the places from which the ends are reached.
     Returns: how many left the band. Share of each strip's band that they reached after `SETTLED` periods, (S,); nan for
     strips without one.
     """
@@ -138,7 +139,8 @@ def attacked(policy: Policy, loop: Loop, proof: Proof, trajectories: int) -> tup
     side, turn, weak = (rng.choice(values, strip.size) for values in ((-1.0, 1.0), TURNS, LESS))
     for period in range(ATTACKED):
         side = np.where(rng.uniform(size=strip.size) < turn, -side, side)
-        push = side * np.where(rng.uniform(size=strip.size) < weak, rng.uniform(size=strip.size), 1.0)
+        free = (rng.uniform(size=strip.size) < weak)[:, None]
+        push = np.where(free, rng.uniform(-1.0, 1.0, (strip.size, 2)), side[:, None])
         seen, change = loop.attack(proof.case, state, second, push)
         state = state + np.take_along_axis(change, policy.act(seen)[:, None], axis=1)[:, 0]
         left |= (state < low - 1e-9) | (state > high + 1e-9)

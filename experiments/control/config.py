@@ -49,7 +49,7 @@ class DeployConfig:
     )
     poor_regret_pct: float = setting(
         10.0,
-        "a policy of more regret than this is refused on a device; the worst of 32 seeds of agent=paper has 8",
+        "a policy of more regret than this is refused on a device; the worst of 32 seeds of agent=paper has 11",
         "%",
         above=0.0,
     )
