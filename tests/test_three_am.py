@@ -190,6 +190,7 @@ RETURNED = {  # functions whose result is said elsewhere
 }
 NAMED = {  # names whose values are said elsewhere
     "experiments/loop/share.py": ("said",),
+    "experiments/loop/signals.py": ("said",),
     "experiments/record/record.py": ("repairs",),
     "experiments/record/recovery.py": ("repairs",),
     "experiments/control/run.py": ("outcome",),

@@ -128,7 +128,7 @@ def bounds(policy: Policy, settings: Mapping[str, Any], file: Path, model: EnvCo
         stored = load(beside(file))
     except (OSError, ValueError):
         return None
-    if stored.bounds is None or not stored.passed or stored.differs(policy, settings):
+    if stored.bounds is None or not stored.passed or stored.config.quick or stored.differs(policy, settings):
         return None
     return replace(stored.bounds, full_pump=full_pump(model))
 
@@ -164,7 +164,7 @@ def doubts(
     if not stored.passed:
         failing = f"{len(stored.failed)} requirements, the first: {'; '.join(stored.failed[:1])}"
         return [f"its certificate fails {failing} (train with another seed, then {remedy})"]
-    if stored.config.quick:
+    if stored.config.quick and stored.bounds is not None:
         return [f"its certificate is a quick one, without errors of the gain ({remedy})"]
     low, high = stored.setpoints
     outside = sorted({r for r in setpoints if not low - 1e-9 <= r <= high + 1e-9})

@@ -68,7 +68,7 @@ class Certificate:
             for stretch in _runs(self.question.loop, ~proof.holdable):
                 found.setdefault(stretch, []).append(proof.case.name)
         return [
-            f"{names[0]}{f' and {len(names) - 1} more cases' if names[1:] else ''}: from {self.question.what} "
+            f"{names[0]}{f' and {len(names) - 1} others' if names[1:] else ''}: from {self.question.what} "
             f"{low:.4g} to {high:.4g} no pump rate holds the culture"
             for (low, high), names in found.items()
         ]

@@ -93,8 +93,8 @@ class OdLoop:
 
         At 1, the reading is as low as it can be, growth is fastest and a dose takes off least; at -1 the other way
         round; in between all of it is so much less.
-        Args: state: d (N,). second: [lowest, highest] setpoint of the strips, (N, 2). push: in [-1, 1], of what is shown
-          and of what acts, (N, 2).
+        Args: state: d (N,). second: [lowest, highest] setpoint of the strips, (N, 2). push: in [-1, 1], of what is
+          shown and of what acts, (N, 2).
         """
         shows, acts = push.T
         setpoint = second.mean(axis=1) - shows * (second[:, 1] - second[:, 0]) / 2.0

@@ -142,13 +142,14 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
             uncertain = replace(own, gain=config.error_gain)
             spread = ShareCase(f"spread doses {at}", uncertain, r)
             slow = ShareCase(f"slow gain error {at}", uncertain, r, slow=True)
-            new = [ShareCase(f"errors {at}", own, r)] if config.quick or r == middle else []
+            new = [ShareCase(f"errors {at}", own, r)] if config.quick or setpoints is not None or r == middle else []
             new += [] if config.quick else [spread, slow]
             cases += new
             drawn += [case.name for case in new] if (b, r) == (round(full, 9), middle) else []
             late |= {case.name: limits.late_slow if case.slow else limits.late for case in new}
-    cases.append(ShareCase(f"watched errors at setpoint {middle:g}", watched, middle))
-    late[cases[-1].name] = limits.late
+    for r in [middle] if setpoints is None else at_setpoints:
+        cases.append(ShareCase(f"watched errors at setpoint {r:g}", watched, r))
+        late[cases[-1].name] = limits.late
     judged = {case.name: limits.excess_share for case in cases} | {"nominal": limits.excess_nominal}
     loop = ShareLoop(actions(policy), config.start_od, (lowest, highest), *_strips(low, high, config.strip), clip)
     seen = loop.seen(cases[-1])

@@ -126,8 +126,8 @@ class ShareLoop:
 
         At 1, e and s are shown as low as they can be, doses give least and s is the strip's highest, of which the
         policy may still be shown the lowest; at -1 the other way round; in between all of it is so much less.
-        Args: state: e (N,). second: [lowest, highest] s of the strips, (N, 2). push: in [-1, 1], of what is shown and of
-          what acts, (N, 2).
+        Args: state: e (N,). second: [lowest, highest] s of the strips, (N, 2). push: in [-1, 1], of what is shown and
+          of what acts, (N, 2).
         """
         b, (shows, acts) = case.bounds, push.T
         side, size = np.sign(shows), np.abs(shows)

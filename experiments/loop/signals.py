@@ -38,7 +38,6 @@ __all__ = [
 FEED, THERMOSTAT = "feed pump", "thermostat"
 TRUE = ("true_error", "true_growth_share")
 ESTIMATED = ("error", "growth_share")
-ALARM = "filter_alarm: readings do not fit what the estimator believes; the law on a second filter decides; reported"
 TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "composition", "journal_row")
 
 
@@ -172,7 +171,10 @@ class Density:
         if self.truth is not None and "growth_share" in why:
             why = {**why, **dict(zip(TRUE, self.truth(sample.setpoint), strict=True))}
         alarm = why.get("alarm", np.zeros(sample.rows.size)) * (sample.believed & (sample.phase >= 0))
-        return Findings(why=why, warnings=[ALARM if a else None for a in alarm] if alarm.any() else ())
+        said = (
+            "filter_alarm: readings do not fit the estimate; reported; the law on a second filter decides"
+        )
+        return Findings(why=why, warnings=[said if a else None for a in alarm] if alarm.any() else ())
 
     def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
         """See `Signal.dosed`."""

@@ -84,14 +84,21 @@ SHARES = (0.05, 0.97)
 
 
 def share_law(
-    gain: float = 1.0, share: float = 1.0, add: tuple[int, int, float] | None = None, order: int = 1
+    gain: float = 1.0,
+    share: float = 1.0,
+    add: tuple[int, int, float] | None = None,
+    order: int = 1,
+    offset: float = 0.0,
+    levels: int = 1,
+    sharp: float = 1e6,
 ) -> Policy:
-    """The one-line law of (error, growth share), exactly: argmax_a 2 z v_a - v_a^2 with z = gain e + share s.
+    """The one-line law of (error, growth share), exactly: argmax_a 2 z v_a - v_a^2 with z = gain e + share s + offset.
 
     Hidden units +-z, relu(-50 - 50 (e + s)) and a bump 2e-6 wide in s, far from any grid: relu(1 - 1e6 |s - SPIKE|
-    - 30 |e + 0.5|). add: (unit, action, weight) adds a unit to an action's Q.
+    - 30 |e + 0.5|). add: (unit, action, weight) adds a unit to an action's Q. levels: every so-manyth level is chosen.
+    sharp: in place of 1e6, at which single precision itself is unsure of the bump's height.
     """
-    k = 1e6
+    k = sharp
     w1 = np.array([[gain, -gain, -50, 0, 0, 30, -30], [share, -share, -50, k, -k, 0, 0]])
     b1 = np.array([0, 0, -25, -k * SPIKE, k * SPIKE, 15, -15])
     w2 = np.zeros((7, 4))
@@ -103,7 +110,31 @@ def share_law(
     if add is not None:
         unit, action, weight = add
         w3[unit, action] += weight
-    layers = [(w1, b1), (w2, np.array([0, 0, 0, 1])), (w3, -(v**2))]
+    b3 = 2 * offset * v - v**2 - 10.0 * (np.arange(17) % levels != 0)
+    return _relative([(w1, b1), (w2, np.array([0, 0, 0, 1])), (w3, b3)])
+
+
+HOLE = (3 / 16, 0.5)  # e and s
+
+
+def share_law_with_a_hole(too_low: int) -> Policy:
+    """The law, but so many levels lower within 0.05 of `HOLE` in e and s together, |e - ..| + |s - ..|.
+
+    There z is less by too_low / 16 times a plateau of 1, relu(h) - relu(h - 1), h = 100 (0.06 - |e - ..| - |s - ..|).
+    """
+    e, s = HOLE
+    w1 = np.array([[1.0, -1.0, 100, -100, 0, 0], [1.0, -1.0, 0, 0, 100, -100]])
+    b1 = np.array([0, 0, -100 * e, 100 * e, -100 * s, 100 * s])
+    w2 = np.zeros((6, 4))
+    w2[0, 0] = w2[1, 1] = 1.0
+    w2[2:, 2:] = -1.0
+    v = np.linspace(0.0, 1.0, 17)
+    deep = 2 * too_low / 16 * v
+    return _relative([(w1, b1), (w2, np.array([0, 0, 6, 5])), (np.stack([2 * v, -2 * v, -deep, deep]), -(v**2))])
+
+
+def _relative(layers: list[tuple[np.ndarray, np.ndarray]]) -> Policy:
+    """Layers as (weight, bias), weight (in, out), of a policy that sees (error, growth share)."""
     metadata = {"format": FORMAT, "observation": list(RELATIVE), "model": {"growth_shares": list(SHARES)}}
     return Policy(
         tuple(np.asarray(w, np.float32) for w, _ in layers), tuple(np.asarray(b, np.float32) for _, b in layers),

@@ -1,9 +1,11 @@
 """The file of a certificate, the command that writes it, and the device that asks for it."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +13,27 @@ import numpy as np
 import pytest
 
 from dqn import policy
-from dqn.policy import fingerprint
+from dqn.policy import fingerprints
+from envs.bench import Bench
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments import certify as command
+from experiments import deploy
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
 from experiments.certification.judge import certify
+from experiments.certification.question import question
+from experiments.certification.verdict import attacked
 from experiments.cli import files
 from experiments.cli.frame import UserError
 from experiments.control import assemble
 from experiments.control.config import DeployConfig
-from experiments.control.policies import find_policy
+from experiments.control.policies import SHIPPED, Wanted, admit, find_policy
+from experiments.laws.density import estimator as filters
+from experiments.laws.density import learned
+from experiments.laws.density.estimator import EstimatorConfig
+from experiments.laws.density.learned import LearnedConfig, settings
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.simulated import SimulatedConfig
 from tests.experiments import laws
@@ -37,15 +47,15 @@ def written(path: Path, given: policy.Policy, of: policy.Policy | None = None, *
     """A policy file with the certificate of a policy (its own by itself), some of it changed."""
     of = given if of is None else of
     policy.save(path, given)
-    content = certificate.content(of, ASKED, certify(of, ASKED))
-    files.write_json(certificate.beside(path), {**content, **changes})
+    found = certify(of, ASKED)
+    files.write_json(certificate.beside(path), {**certificate.content(of, settings(of), ASKED, found), **changes})
     return path
 
 
-def unpacked(path: Path, folder: Path, **changes: Any) -> None:
+def unpacked(path: Path, folder: Path, **changes: Any) -> assemble.Setup:
     config = DeployConfig(**{"backend": ChiBioConfig(), "scenario": SCENARIO, "policy": str(path), **changes})
     folder.mkdir(exist_ok=True)
-    assemble.unpack(config, folder)
+    return assemble.unpack(config, folder)
 
 
 def nudged(given: policy.Policy) -> policy.Policy:
@@ -60,7 +70,7 @@ def test_a_certified_policy_runs_on_a_device_and_its_run_keeps_both(tmp_path: Pa
     unpacked(source, tmp_path / "run")
     kept = tmp_path / "run" / "certificate.json"
     assert kept.read_bytes() == (tmp_path / "certificate.json").read_bytes()
-    assert json.loads(kept.read_text())["fingerprint"] == fingerprint(policy.load(tmp_path / "run" / "policy.npz"))
+    assert json.loads(kept.read_text())["of"] == fingerprints(policy.load(tmp_path / "run" / "policy.npz"))
 
 
 def test_another_name_has_another_certificate(tmp_path: Path) -> None:
@@ -70,21 +80,26 @@ def test_another_name_has_another_certificate(tmp_path: Path) -> None:
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "changed by one bit": ({"given": nudged(laws.law()), "of": laws.law()}, "is of another policy: one of them was"),
+    "changed by one bit": (
+        {"given": nudged(laws.law()), "of": laws.law()},
+        r"certificate.json is of another: its weights \(put it back, or",
+    ),
     "failed": (
         {"given": laws.law(gain=-laws.GAIN)},
         r"its certificate fails 15 requirements, the first: nominal: strips without",
     ),
     "said to have passed": (
         {"given": laws.low_corner(), "passed": True},
-        r"proven anew, it fails: nominal: strips in which a low culture may be washed out: 1, .*\(setpoint 0.45\)",
+        r"proven anew for this bench and scenario, it fails: nominal: strips in which a low culture may be washed out: "
+        r"1, .*\(setpoint 0.45\)",
     ),
     "elsewhere": (
         {"given": laws.law(), "setpoints": [0.5, 0.8]},
         r"certified for setpoints 0.5 to 0.8, .* asks for 0.45",
     ),
     "damaged": ({"given": laws.law(), "setpoints": None}, r"certificate.json is damaged \(TypeError"),
-    "of another format": ({"given": laws.law(), "format": 0}, r"is damaged \(format 0, allowed 1"),
+    "of another format": ({"given": laws.law(), "format": 0}, r"is damaged \(format 0, allowed 2"),
+    "of the first format": ({"given": laws.law(), "format": 1}, r"is damaged \(format 1, allowed 2"),
 }
 
 
@@ -120,14 +135,207 @@ def test_a_policy_without_certificate_is_refused_on_a_device_alone(
     assert all("it has no certificate" in line for line in warned)
 
 
-def test_the_fingerprint_is_of_what_decides_and_nothing_else() -> None:
+def test_the_fingerprints_are_of_what_decides_and_nothing_else() -> None:
     given = laws.law()
-    own = fingerprint(given)
-    assert fingerprint(laws.law()) == own
-    assert fingerprint(replace(given, metadata={**given.metadata, "regret_pct": 3.0})) == own
-    assert fingerprint(nudged(given)) != own
-    assert fingerprint(replace(given, metadata={**given.metadata, "control_min": 2.0})) != own
-    assert fingerprint(replace(given, biases=(given.biases[0].astype(np.float64), *given.biases[1:]))) != own
+    own = fingerprints(given)
+    assert set(own) == {"observation or model", "weights", "map of the inputs", "actions", "limits"}
+    assert fingerprints(laws.law()) == own
+    assert fingerprints(replace(given, metadata={**given.metadata, "regret_pct": 3.0})) == own
+    for name, (_, other) in PARTS.items():
+        found = fingerprints(other)
+        assert [part for part in own if found[part] != own[part]] == [name]
+    assert fingerprints(replace(given, biases=(given.biases[0].astype(np.float64), *given.biases[1:]))) != own
+
+
+def bent(name: str, change: float, given: policy.Policy) -> policy.Policy:
+    """The same with one number of an array that is no layer changed."""
+    array = np.array(getattr(given, name))
+    array.flat[-1] += change
+    return replace(given, **{name: array})
+
+
+PARTS: dict[str, tuple[policy.Policy, policy.Policy]] = {
+    "weights": (laws.law(), nudged(laws.law())),
+    "map of the inputs": (laws.law(), bent("input_offset", 1e-3, laws.law())),
+    "actions": (laws.law(), bent("actions", -1e-6, laws.law())),
+    "limits": (laws.law(), replace(laws.law(), high=np.array([np.inf, 0.8], np.float32))),
+    "observation or model": (
+        laws.law(), replace(laws.law(), metadata={**laws.law().metadata, "model": {**laws.MODEL, "mu": 0.031}}),
+    ),
+}  # fmt: skip
+"""Part of a policy -> a policy, and one of which that part alone is another."""
+
+
+@pytest.mark.parametrize(("own", "other"), PARTS.values(), ids=list(PARTS))
+def test_a_device_names_the_part_of_a_policy_that_is_another(
+    tmp_path: Path, own: policy.Policy, other: policy.Policy, request: pytest.FixtureRequest
+) -> None:
+    part = request.node.callspec.id
+    source = written(tmp_path / "policy.npz", other, of=own)
+    with pytest.raises(
+        UserError, match=rf"policy refused: its certificate \S+ is of another: its {part} \(put it back"
+    ):
+        unpacked(source, tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def relative(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The law of (error, growth share) as a policy file, with its certificate."""
+    return written(tmp_path_factory.mktemp("relative") / "policy.npz", laws.share_law())
+
+
+def beside(relative: Path, given: policy.Policy, folder: Path) -> Path:
+    """A policy file with the certificate that another one has."""
+    policy.save(folder / "policy.npz", given)
+    shutil.copy(certificate.beside(relative), certificate.beside(folder / "policy.npz"))
+    return folder / "policy.npz"
+
+
+CHANGED: dict[str, tuple[dict[str, Any], str]] = {
+    "gate": ({"gate_sigma": 20.0}, r"estimator\.gate_sigma = 20\.0, certified 5\.0"),
+    "whole number": ({"gate_max": 20}, r"estimator\.gate_max = 20, certified 6"),
+    "switch": ({"told": False}, r"estimator\.told = False, certified True"),
+    "four": (
+        {"pulse_cv": 0.0, "growth_cv": 0.0, "gate_od": 0.0, "noise_memory": 0.0},
+        r"estimator\.gate_od = 0\.0, certified 0\.025; estimator\.growth_cv = 0\.0, certified 0\.05; "
+        r"estimator\.noise_memory = 0\.0, certified 40\.0 and others",
+    ),
+}
+changed = pytest.mark.parametrize(("changes", "named"), CHANGED.values(), ids=list(CHANGED))
+
+
+@changed
+def test_a_setting_of_the_estimator_on_the_command_line_is_another_policy(
+    relative: Path, tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
+    """And what was not certified gets no bounds: surprises alone supervise it where it is forced."""
+    given = [f"+controller.estimator.{key}={value}" for key, value in changes.items()]
+    config = deploy.main.config([f"policy={relative}", "controller=dqn", "backend=chibio", *given])
+    config = replace(config, scenario=SCENARIO)
+    assert isinstance(config.controller, LearnedConfig)
+    with pytest.raises(UserError, match=rf"policy refused: .* is of another: {named} \(put it back, or python -m"):
+        assemble.unpack(config, tmp_path)
+    forced = assemble.unpack(replace(config, force_policy=True), tmp_path)
+    assert forced.bounds is None
+    sound = assemble.unpack(replace(config, controller=LearnedConfig()), tmp_path)
+    assert sound.bounds is not None
+    assert sound.bounds.full_pump == pytest.approx(0.02 * 1.0 / (20.0 / 60.0))
+
+
+@changed
+def test_a_setting_of_the_estimator_in_the_policy_file_is_another_policy(
+    relative: Path, tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
+    """The network is the same."""
+    given = policy.load(relative)
+    other = replace(given, metadata={**given.metadata, "estimator": changes})
+    assert fingerprints(other) == fingerprints(given)
+    with pytest.raises(UserError, match=rf"policy refused: .* is of another: {named} \(put it back, or python -m"):
+        unpacked(beside(relative, other, tmp_path), tmp_path / "run")
+
+
+def test_settings_that_are_given_as_they_are_change_nothing(relative: Path, tmp_path: Path) -> None:
+    """In file and on the command line; the command line replaces the file."""
+    given, own = policy.load(relative), asdict(EstimatorConfig())
+    source = beside(relative, replace(given, metadata={**given.metadata, "estimator": own}), tmp_path)
+    unpacked(source, tmp_path / "run", controller=LearnedConfig(estimator={"gate_sigma": 5.0}))
+    other = replace(given, metadata={**given.metadata, "estimator": {**own, "gate_sigma": 20.0}})
+    policy.save(source, other)
+    unpacked(source, tmp_path / "run", controller=LearnedConfig(estimator={"gate_sigma": 5.0}))
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "value", "said"),
+    [
+        (filters, "LOUD", 30.0, r"filter\.loud = 30\.0, certified 21\.0"),
+        (filters, "QUIET", 0.0, r"filter\.quiet = 0\.0, certified 0\.15"),
+        (filters, "GAIN_RANGE", (0.2, 9.0), r"filter\.gain_range = \[0\.2, 9\.0\], certified \[0\.2, 3\.0\]"),
+        (learned, "WATCHED", 1.0, r"fallback\.watched_sd = 1\.0, certified 2\.0"),
+    ],
+)
+def test_a_program_with_another_supervisor_is_another_policy(
+    relative: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any, name: str, value: Any, said: str
+) -> None:
+    unpacked(relative, tmp_path / "run")
+    monkeypatch.setattr(module, name, value)
+    with pytest.raises(UserError, match=rf"is of another: {said} \(put"):
+        unpacked(relative, tmp_path / "run")
+
+
+def test_the_second_filter_is_part_of_what_is_certified(
+    relative: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file's own settings are the old ones, so the first filter is the certified one."""
+    given = policy.load(relative)
+    own = replace(given, metadata={**given.metadata, "estimator": asdict(EstimatorConfig())})
+    source = beside(relative, own, tmp_path)
+    monkeypatch.setattr(learned, "EstimatorConfig", partial(EstimatorConfig, gate_sigma=6.0))
+    with pytest.raises(UserError, match=r"is of another: fallback\.estimator\.gate_sigma = 6\.0, certified 5\.0 \(put"):
+        unpacked(source, tmp_path / "run")
+
+
+def test_a_policy_of_the_od_has_no_settings_beside_it() -> None:
+    assert settings(laws.law()) == {}
+    assert set(settings(laws.share_law())) == {
+        *(f"{prefix}estimator.{key}" for prefix in ("", "fallback.") for key in asdict(EstimatorConfig())),
+        *(f"fallback.{key}" for key in ("law", "watched_sd")),
+        *(f"filter.{key.lower()}" for key in learned.FIXED),
+    }
+
+
+def test_a_policy_of_error_and_growth_share_is_proven_anew_for_another_bench(
+    relative: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Full pump takes 0.05 * 5 / (20/60) = 0.75 off ln x instead of 0.06, which is no reason by itself.
+
+    Asked are that B alone, errors, spread doses, slow errors and watched errors at the run's two setpoints, and the two
+    of any setpoint.
+    A Chi.Bio samples every 60 s: a whole run of one is in 12 mL, 0.02 / (12/60) = 0.1.
+    """
+    given, bench = policy.load(relative), Bench(period_s=300.0, max_rate=0.05)
+    model = EnvConfig(tau=bench.tau, control_min=5.0, max_pump_rate=0.05)
+    admit(given, relative, Wanted("name", bench, model, {}, SCENARIO.setpoints, 10.0, True, False), resumed=False)
+    bounds = certificate.bounds(given, settings(given), relative, model)
+    assert bounds is not None
+    assert bounds.full_pump == pytest.approx(0.75)
+    asked = certificate.on_bench(given, ASKED, bench, model)
+    cases = question(given, asked, SCENARIO.setpoints).cases
+    assert [case.bounds.full_pump for case in cases] == pytest.approx([0.75] * 10)
+    assert [case.setpoint for case in cases if case.bounds.gain] == [0.45, 0.45, 0.65, 0.65]
+    setup = unpacked(relative, tmp_path / "run", bench=Bench(volume_ml=12.0))
+    assert setup.bounds is not None
+    assert setup.bounds.full_pump == pytest.approx(0.1)
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+
+
+def test_a_policy_of_the_od_that_holds_another_volume_worse_is_refused_on_that_bench(tmp_path: Path) -> None:
+    """In 12 mL a culture at rest needs mu tau / u_max = 0.3 of the pump; this one gives 0.5 at the setpoint."""
+    source = written(tmp_path / "policy.npz", laws.law())
+    unpacked(source, tmp_path / "run")
+    with pytest.raises(
+        UserError, match=r"policy refused: proven anew for this bench and scenario, it fails: noise and "
+    ):
+        unpacked(source, tmp_path / "run", bench=Bench(volume_ml=12.0))
+    unpacked(source, tmp_path / "run", bench=Bench(volume_ml=24.0))
+
+
+def test_a_quick_certificate_is_refused_by_name(tmp_path: Path) -> None:
+    """Of a policy of the OD, which has no case less then, it is as good as any."""
+    policy.save(tmp_path / "policy.npz", laws.share_law())
+    config = command.main.config([f"policy={tmp_path}", "quick=true", "trajectories=0", "setpoints=[0.4,0.8]"])
+    (tmp_path / "run").mkdir()
+    command.body(config, tmp_path / "run")
+    assert certificate.load(tmp_path / "certificate.json").passed
+    with pytest.raises(
+        UserError, match=r"policy refused: its certificate is a quick one, without errors of the gain \("
+    ):
+        unpacked(tmp_path / "policy.npz", tmp_path / "run")
+    quick = unpacked(tmp_path / "policy.npz", tmp_path / "forced", force_policy=True)
+    assert quick.bounds is None
+    policy.save(tmp_path / "policy.npz", laws.law())
+    (tmp_path / "again").mkdir()
+    command.body(config, tmp_path / "again")
+    unpacked(tmp_path / "policy.npz", tmp_path / "run")
 
 
 def test_the_command_leaves_a_certificate_a_figure_and_a_page(tmp_path: Path) -> None:
@@ -138,7 +346,7 @@ def test_the_command_leaves_a_certificate_a_figure_and_a_page(tmp_path: Path) ->
     command.body(config, folder)
     stored = certificate.load(tmp_path / "certificate.json")
     assert stored.passed
-    assert (stored.fingerprint, stored.setpoints) == (fingerprint(laws.law()), (0.4, 0.8))
+    assert (stored.of, stored.setpoints) == (fingerprints(laws.law()), (0.4, 0.8))
     assert stored.config.env is not None
     assert (stored.config.env.mu, stored.config.env.tau) == (0.03, 1 / 3)
     assert (folder / "figures" / "certificate.svg").is_file()
@@ -192,15 +400,49 @@ def test_bounds_of_an_estimator_depend_on_the_od_and_return_from_a_file() -> Non
 
 
 def test_the_shipped_policy_has_its_certificate() -> None:
+    """Proven again, and attacked: by few in every case, by as many as it takes to reach the ends of bands in six."""
     shipped = find_policy("shipped")
     given = policy.load(shipped)
     stored = certificate.load(certificate.beside(shipped))
-    assert stored.fingerprint == fingerprint(given)
+    assert stored.of == {**fingerprints(given), **settings(given)}
     assert stored.passed
-    assert certify(given, replace(stored.config, trajectories=1000)).passed
+    assert not stored.config.quick
+    found = certify(given, replace(stored.config, trajectories=0))
+    assert found.passed
+    assert [attacked(given, found.question.loop, proof, 1000)[0] for proof in found.proofs] == [0] * len(found.proofs)
+    assert certify(given, replace(stored.config, quick=True)).passed
+    assert stored.config.trajectories == CertifyConfig().trajectories == 20_000
     assert stored.bounds is not None
     assert stored.bounds.proven == (0.05, 0.97)
     assert (stored.bounds.error, stored.bounds.od, stored.bounds.growth_share) == (0.1, 0.04, 0.5)  # what is watched
+
+
+@pytest.mark.parametrize("name", ["shipped", str(SHIPPED)], ids=["by name", "by path"])
+def test_what_ships_is_certified_without_a_file_of_the_program_being_written(
+    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    def program() -> dict[str, tuple[bytes, int]]:
+        return {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in SHIPPED.parent.iterdir()}
+
+    before, to = program(), tmp_path / "elsewhere" / "mine.json"
+    to.parent.mkdir()
+    quick = [f"policy={name}", "quick=true", "trajectories=0"]
+    for folder, given in (("first", []), ("second", [f"to={to}"])):
+        (tmp_path / folder).mkdir()
+        with caplog.at_level("INFO"):
+            command.body(command.main.config([*quick, *given]), tmp_path / folder)
+        assert program() == before
+        assert certificate.load(tmp_path / folder / "certificate.json").config.quick
+        assert to.is_file() is bool(given)
+    assert caplog.text.count("is part of the program, whose certificate stays as it is; to=FILE writes elsewhere") == 1
+    assert to.read_bytes() == (tmp_path / "second" / "certificate.json").read_bytes()
+
+
+def test_a_certificate_goes_where_it_is_sent_and_not_beside_the_policy(tmp_path: Path) -> None:
+    policy.save(tmp_path / "policy.npz", laws.law())
+    command.body(command.main.config([f"policy={tmp_path}", "trajectories=0", f"to={tmp_path / 'to.json'}"]), tmp_path)
+    (tmp_path / "certificate.json").unlink()  # the run folder's own, which is the same folder here
+    assert certificate.load(tmp_path / "to.json").passed
 
 
 def test_the_shipped_policy_runs_on_a_device(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -217,4 +459,4 @@ def test_a_file_of_the_first_format_is_the_same_policy_and_so_is_its_copy(tmp_pa
     arrays["metadata"] = np.array(json.dumps({**given.metadata, "format": 1}))
     np.savez(tmp_path / "policy.npz", **arrays)
     unpacked(tmp_path / "policy.npz", tmp_path / "run")
-    assert fingerprint(policy.load(tmp_path / "run" / "policy.npz")) == fingerprint(given)
+    assert fingerprints(policy.load(tmp_path / "run" / "policy.npz")) == fingerprints(given)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from dqn import policy
+from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
 from envs.scenario import Scenario
@@ -288,7 +289,7 @@ def test_a_training_that_ends_while_the_latest_policy_is_taken_swaps_nothing(tmp
         return found
 
     monkeypatch.setattr(policy, "load", read_while_a_training_ends)
-    wanted = policies.Wanted("latest", 1.0, 0.02, (), 10.0, at_stake=False, forced=False)
+    wanted = policies.Wanted("latest", Bench(), EnvConfig(), {}, (), 10.0, at_stake=False, forced=False)
     flown = policies.run_policy(wanted, tmp_path, resumed=False)
     monkeypatch.setattr(policy, "load", read)
     assert policies.find_policy("latest") == Path("runs/train/new/policy.npz")

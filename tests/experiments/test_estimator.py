@@ -211,7 +211,7 @@ def next_readings(e: Estimator) -> list[float]:
     found = list[float]()
     for k in range(9):
         shown(e, 1.4 * np.exp(0.045 * k), 35.0 + k, 0.3)
-        found += [*e.mean[0].tolist(), *e.cov[0].ravel().tolist()]
+        found += [*e.mean[0].tolist(), *e.cov[0].ravel().tolist(), float(e.loudness[0])]
     return found
 
 

@@ -22,6 +22,7 @@ from experiments.control import assemble
 from experiments.control.config import DeployConfig
 from experiments.control.policies import find_policy
 from experiments.laws import registry
+from experiments.laws.density.learned import settings
 from experiments.training.config import TrainConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.emulator.process import EmulatorProcess
@@ -45,7 +46,8 @@ def certified(path: Path, given: policy.Policy) -> None:
     policy.save(path, given)
     anything = Limits(excess=1.0, excess_uncertain=1.0, entry=100.0, low_dose=100.0)
     asked = CertifyConfig(env=EnvConfig(), setpoints=(0.2, 1.0), strip=0.1, trajectories=0, limits=anything)
-    files.write_json(certificate.beside(path), certificate.content(given, asked, certify(given, asked)))
+    content = certificate.content(given, settings(given), asked, certify(given, asked))
+    files.write_json(certificate.beside(path), content)
 
 
 def deployed(tmp_path: Path, metadata: dict[str, Any], **changes: Any) -> DeployConfig:

@@ -19,6 +19,7 @@ from experiments.cli import files
 from experiments.control.policies import find_policy, load_policy
 from experiments.laws import registry
 from experiments.laws.base import Array, Controller, Mask
+from experiments.laws.density.learned import settings
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.record.recovery import load_state
 from hardware import memory
@@ -47,7 +48,8 @@ def controller(kind: str) -> Controller:
     if kind == "threshold":
         config = type(config)(hysteresis=0.05)
     policy = load_policy("shipped", 1.0, 0.02)
-    bounds = certificate.bounds(policy, find_policy("shipped"))
+    bounds = certificate.bounds(policy, settings(policy), find_policy("shipped"), EnvConfig())
+    assert bounds is not None
     return registry.build(config, model=EnvConfig(), policy=policy, bounds=bounds)
 
 

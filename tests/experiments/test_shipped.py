@@ -12,10 +12,13 @@ import pytest
 
 from dqn import policy as policies
 from dqn.policy import RELATIVE, Policy
+from envs.bench import Bench
 from envs.relative import nearest_level
+from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.control.policies import SHIPPED, find_policy
 from experiments.laws.density.estimator import EstimatorConfig
+from experiments.laws.density.learned import settings
 from experiments.train import main
 from experiments.training.run import fingerprint
 
@@ -79,5 +82,8 @@ def test_it_is_what_its_command_trains() -> None:
 
 def test_it_has_the_certificate_that_a_device_asks_for() -> None:
     shipped = policies.load(SHIPPED)
-    assert certificate.doubts(shipped, SHIPPED, [0.2, 0.5, 1.0], "shipped") == []
-    assert certificate.bounds(shipped, SHIPPED) is not None
+    run = [0.2, 0.5, 1.0], Bench(), EnvConfig(), "shipped"
+    assert certificate.doubts(shipped, settings(shipped), SHIPPED, *run) == []
+    bounds = certificate.bounds(shipped, settings(shipped), SHIPPED, EnvConfig())
+    assert bounds is not None
+    assert bounds.full_pump == pytest.approx(0.02 * 1.0 / (1 / 3))

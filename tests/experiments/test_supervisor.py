@@ -1,26 +1,39 @@
 """The policy that ships under its supervisor: which law acts, what the journal and the console say of it."""
 
 import logging
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from conf import presets
+from conf.schema import build
+from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification import certificate
+from experiments.certification.bounds import EstimateBounds
 from experiments.control.policies import find_policy, load_policy
-from experiments.laws.density.estimator import LOG_OD, EstimatorConfig
-from experiments.laws.density.learned import RelativeController
+from experiments.laws.density.estimator import LOG_OD, Estimator, EstimatorConfig
+from experiments.laws.density.inverse import Inverse, InverseConfig
+from experiments.laws.density.learned import RelativeController, settings
+from experiments.loop.loop import ClosedLoop
 from experiments.record.summary import ChangeLog
 from hardware.emulator.device import DeviceOptions, plant_preset
+from hardware.safety.interlock import Interlock
+from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
 
 MODEL = EnvConfig(mu=0.025, tau=1 / 3)
 SHIPPED = find_policy("shipped")
 POLICY = load_policy("shipped", 1.0, 0.02)
-BOUNDS = certificate.bounds(POLICY, SHIPPED)
+BOUNDS = certificate.bounds(POLICY, settings(POLICY), SHIPPED, MODEL)
+BLIND = EstimatorConfig(
+    noise_floor=1e-4, noise_relative=0.0, noise_memory=0.0, gate_max=20, gate_od=0.0, pulse_cv=0.0, growth_cv=0.0
+)
+"""It takes its model for exact and every reading for exact, so that it leaves most readings out."""
 
 
 def supervised(n: int = 3) -> RelativeController:
@@ -35,52 +48,137 @@ def in_doubt(law: RelativeController, row: int, sd_od: float) -> None:
     law.estimator.cov[row, LOG_OD, LOG_OD] = sd_od**2
 
 
-def test_inside_the_bounds_the_policy_acts_outside_the_law_on_the_nominal_model() -> None:
-    """Row 1 is in doubt. The law by hand: u = tau (mu + ln(x/r)/h), h = 1 min, between 0 and 0.02 mL/s."""
+def test_inside_the_bounds_the_policy_acts_outside_the_law_on_a_second_filter() -> None:
+    """Row 1 is in doubt. There acts what `inverse` with its default settings decides of the same readings and doses."""
     assert BOUNDS is not None
-    law, n = supervised(), 3
+    law, other, n = supervised(), Inverse(InverseConfig(), MODEL), 3
+    other.reset(n)
     rows, setpoint = np.ones(n, dtype=bool), np.full(n, 0.5)
+
+    def shown(od: float, minute: float) -> tuple[np.ndarray, np.ndarray]:
+        given = np.full(n, od), setpoint, np.full(n, minute), rows
+        decided = law.act(*given), other.act(*given)
+        for each in (law, other):
+            each.dosed(np.full(n, 0.5))
+        return decided
+
     for minute in range(30):
-        law.act(np.full(n, 0.5), setpoint, np.full(n, float(minute)), rows)
-        law.dosed(np.full(n, 0.5))
+        shown(0.5, float(minute))
     assert not law.explain()["supervised"].any()
     for k, od in enumerate((0.51, 0.5, 0.49, 0.47, 0.6)):
         in_doubt(law, 1, 1e3)
         law.estimator.config = EstimatorConfig(noise_floor=0.1, noise_relative=0.1)  # nothing is learned of a reading
         law.estimator._noise[1] = 1e6
-        rate = law.act(np.full(n, od), setpoint, np.full(n, 30.0 + k), rows)
-        law.dosed(np.full(n, 0.5))
+        rate, by_inverse = shown(od, 30.0 + k)
         said = law.explain()
         np.testing.assert_array_equal(said["supervised"], [0.0, 1.0, 0.0])
-        by_hand = np.clip((0.025 + np.log(od / 0.5)) / 3.0, 0.0, 0.02)
-        assert rate[1] == pytest.approx(by_hand, rel=1e-9)
+        np.testing.assert_array_equal(said["alarm"], np.zeros(n))
+        assert rate[1] == pytest.approx(by_inverse[1], rel=1e-9)
         observation = np.stack([said["error"], said["growth_share"]], axis=1)
         of_policy = 0.02 * POLICY.actions[POLICY.q_values(observation).argmax(axis=1)]
         np.testing.assert_allclose(rate[[0, 2]], of_policy[[0, 2]])
 
 
-@pytest.mark.parametrize(("od", "allowed"), [(0.5, 0.04 / 0.5), (0.25, 0.04 / 0.25), (0.9, 0.04 / 0.9)])
-def test_the_bound_is_that_of_the_certificate(od: float, allowed: float) -> None:
-    """0.04 OD, as ln(1 + 0.04 / OD): twice the filter's own sd may reach it and not pass it."""
+@pytest.mark.parametrize("od", [0.5, 0.25, 0.9])
+@pytest.mark.parametrize("over", [1.0, 2.0, 0.8])
+def test_the_bound_is_that_of_the_certificate_at_the_od_that_is_estimated(od: float, over: float) -> None:
+    """0.04 OD, as ln(1 + 0.04 / OD): twice the filter's own sd may reach it and not pass it, whatever the setpoint."""
     assert BOUNDS is not None
     assert BOUNDS.od == 0.04
-    law = supervised(1)
+    law, setpoint = supervised(1), np.array([od / over])
     for minute in range(30):
-        law.act(np.array([od]), np.array([od]), np.array([float(minute)]), np.ones(1, dtype=bool))
+        law.act(np.array([od]), setpoint, np.array([float(minute)]), np.ones(1, dtype=bool))
         law.dosed(np.array([0.5]))
-    observation = np.stack(law.estimator.relative(np.array([od])), axis=1)
-    for share, outside in ((0.98, False), (1.02, True)):
-        in_doubt(law, 0, 0.5 * share * np.log1p(allowed) * float(law.estimator.full_pump[0]) / BOUNDS.full_pump)
-        assert law._outside(np.array([od]), observation).tolist() == [outside]
+    assert law.explain()["od_estimate"][0] == pytest.approx(od, rel=2e-3)
+    allowed = np.log1p(0.04 / od)
+    observation = np.stack(law.estimator.relative(setpoint), axis=1)
+    for share, outside in ((0.96, False), (1.04, True)):
+        in_doubt(law, 0, 0.5 * share * allowed * float(law.estimator.full_pump[0]) / BOUNDS.full_pump)
+        assert law._outside(setpoint, observation).tolist() == [outside]
 
 
-def test_without_a_certificate_nobody_supervises() -> None:
+def test_without_a_certificate_no_bounds_supervise_and_surprises_do() -> None:
     law = RelativeController(POLICY, EstimatorConfig(), MODEL, None)
     law.reset(1)
     law.act(np.array([0.5]), np.array([0.5]), np.zeros(1), np.ones(1, dtype=bool))
     in_doubt(law, 0, 1e3)
     law.act(np.array([np.nan]), np.array([0.5]), np.ones(1), np.ones(1, dtype=bool))
     assert law.explain()["supervised"].tolist() == [0.0]
+    for minute, od in enumerate((0.5, 0.9, 0.5, 0.9, 0.5, 0.9), 2):  # the doubt is gone with the first of them
+        law.act(np.array([od]), np.array([0.5]), np.array([float(minute)]), np.ones(1, dtype=bool))
+    assert law.estimator.loudness[0] > 21.0
+    assert [law.explain()[key].tolist() for key in ("supervised", "alarm")] == [[1.0], [1.0]]
+
+
+def surprised(filter_: Estimator, squares: list[float]) -> None:
+    """A filter of one row whose newest surprises, in units of their sd, had these squares."""
+    filter_._squares[0, len(filter_._squares[0]) - len(squares) :] = squares
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "alarm"),
+    [
+        ([0.8] * 40, [0.8] * 40, False),
+        ([0.8] * 37 + [7.5] * 3, [0.8] * 40, True),  # 7 * 0.8 + 3 * 7.5 = 28.1 > 21
+        ([7.5] * 3 + [0.8] * 37, [0.8] * 40, False),  # as large, and 37 readings ago
+        ([0.8] * 30 + [2.0] * 10, [0.8] * 40, False),  # 20 < 21
+        ([0.8] * 30 + [2.2] * 10, [0.8] * 40, True),
+        ([0.1] * 40, [0.8] * 40, True),  # mean 0.1 < 6 / 40
+        ([0.1] * 40, [0.1] * 40, False),  # the readings are as quiet to the second filter: so is the sensor
+        ([0.2] * 40, [0.8] * 40, False),
+        ([0.1] * 39, [0.8] * 40, False),  # not yet long
+        ([0.8] * 40, [0.1] * 40, False),
+        ([0.8] * 40, [9.0] * 40, False),  # what the second one thinks of itself alarms nobody
+    ],
+)
+def test_surprises_that_do_not_fit_raise_the_alarm(first: list[float], second: list[float], alarm: bool) -> None:
+    """And the law of the second filter decides, which knows another OD here; a missing reading changes nothing."""
+    law, one = supervised(1), np.ones(1, dtype=bool)
+    for minute in range(3):
+        law.act(np.full(1, 0.5), np.full(1, 0.5), np.array([float(minute)]), one)
+        law.dosed(np.full(1, 0.5))
+    law.second.mean[0, LOG_OD] = np.log(0.52)
+    for filter_, squares in ((law.estimator, first), (law.second, second)):
+        filter_._squares[:] = np.nan
+        surprised(filter_, squares)
+    rate = law.act(np.full(1, 0.5), np.full(1, 0.5), np.full(1, 2.0), one)  # known already: no surprise in it
+    said = law.explain()
+    assert (said["alarm"][0], said["supervised"][0]) == (alarm, alarm)
+    error, share = law.second.relative(np.full(1, 0.5))
+    by_policy = 0.02 * POLICY.chosen(np.stack(law.estimator.relative(np.full(1, 0.5)), axis=1))
+    by_law = 0.02 * np.clip(error + share, 0.0, 1.0)
+    assert by_law[0] > by_policy[0] + 0.002
+    assert rate == pytest.approx(by_law if alarm else by_policy, rel=1e-9)
+    law.act(np.full(1, np.nan), np.full(1, 0.5), np.full(1, 3.0), one)
+    assert law.explain()["alarm"][0] == alarm
+
+
+def watched(config: EstimatorConfig, bounds: EstimateBounds | None) -> tuple[np.ndarray, np.ndarray]:
+    """Alarms and true |x - r| of 16 vials with a real sensor and pump through four setpoints, (decisions, vials)."""
+    plant = Plant(build(PlantConfig(), presets.load("plant/nominal_noise"), "plant"), 16, np.random.default_rng(7))
+    vials = SimulatedReactors(plant, SimulatedConfig(reactors=tuple(f"V{k}" for k in range(16))))
+    law = RelativeController(POLICY, config, EnvConfig(), bounds)
+    loop = ClosedLoop(vials, law, Interlock(16), Scenario((0.5, 0.8, 0.35, 0.6), (60.0,) * 4, (37.0,) * 4))
+    alarms, off = [], []
+    for _ in range(240):
+        step = loop.step()
+        assert step.rows.all()
+        alarms.append(step.explanation["alarm"])
+        off.append(np.abs(plant.culture.od - step.setpoint))
+    return np.array(alarms), np.array(off)
+
+
+def test_a_filter_that_is_blind_is_found_out_and_costs_nothing() -> None:
+    """It alarms as soon as its ten watched readings are there; its policy has no certificate and so no bounds."""
+    assert certificate.bounds(POLICY, settings(POLICY, asdict(BLIND)), SHIPPED, EnvConfig()) is None
+    sound, off_sound = watched(EstimatorConfig(), certificate.bounds(POLICY, settings(POLICY), SHIPPED, EnvConfig()))
+    blind, off_blind = watched(BLIND, None)
+    assert sound.mean() < 0.01
+    assert blind[10:].mean() >= 0.99
+    assert off_blind.mean() == pytest.approx(off_sound.mean(), rel=0.1)
+    at_rest = np.arange(240) % 60 >= 30
+    assert off_blind[at_rest].mean() == pytest.approx(off_sound[at_rest].mean(), rel=0.1)
+    assert off_sound[at_rest].mean() < 0.005
 
 
 def test_the_console_says_once_when_the_supervisor_begins_and_ends_and_the_journal_every_time(

@@ -18,7 +18,10 @@ from experiments.laws.density.estimator import Estimator, EstimatorConfig
 __all__ = ["LearnedConfig", "LearnedController", "RelativeController", "learned", "settings"]
 
 WATCHED = 2.0  # sd of an estimate that count as its error
-SUPERVISOR = {"law": "clip(e + s, 0, 1)", "watched_sd": WATCHED, "loud": filters.LOUD, "quiet": filters.QUIET}
+FIXED = (
+    "LOWEST_OD", "GAIN_RANGE", "NOISE_RANGE", "TREND_WEIGHT", "CALM", "FARTHEST", "LAST", "LONG", "LOUD", "QUIET",
+)  # fmt: skip
+"""What no setting of a filter changes, and decides as well."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,11 @@ def settings(policy: Policy, changes: Mapping[str, Any] = MappingProxyType({})) 
         return {}
     own = {f"estimator.{key}": value for key, value in asdict(_estimator(policy, changes)).items()}
     second = {f"fallback.estimator.{key}": value for key, value in asdict(EstimatorConfig()).items()}
-    return own | second | {f"fallback.{key}": value for key, value in SUPERVISOR.items()}
+    law = {"fallback.law": "clip(e + s, 0, 1)", "fallback.watched_sd": WATCHED}
+    fixed = {name: getattr(filters, name) for name in FIXED}
+    return (
+        own | second | law | {f"filter.{n.lower()}": list(v) if isinstance(v, tuple) else v for n, v in fixed.items()}
+    )
 
 
 class LearnedController:
