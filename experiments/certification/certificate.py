@@ -52,9 +52,9 @@ class Stored:
         return [f"its {name}" if name in parts else shown[name] for name in names]
 
 
-def _outward(value: Array, digits: float = 1e6) -> Array:
-    """Rounded away from zero: what is written down holds, too."""
-    return np.asarray(np.sign(value) * np.ceil(np.abs(value) * digits) / digits)
+def _up(value: Array, digits: float = 1e6) -> Array:
+    """Rounded up: what is written down holds, too."""
+    return np.asarray(np.ceil(value * digits) / digits)
 
 
 def _case(proof: Proof) -> dict[str, Any]:
@@ -63,8 +63,8 @@ def _case(proof: Proof) -> dict[str, Any]:
         **asdict(proof.case),
         "holdable": proof.holdable,
         "proven": proof.band.invariant,
-        "band": np.stack([_outward(proof.band.low), _outward(proof.band.high)], axis=1),
-        "half_width": _outward(proof.half_width),
+        "band": np.stack([-_up(-proof.band.low), _up(proof.band.high)], axis=1),
+        "half_width": _up(proof.half_width),
         "law_half_width": np.round(proof.law_half_width, 6),
         "entry_periods": proof.band.periods,
         "entry_over_physics": np.round(proof.entry, 4),
@@ -92,7 +92,7 @@ def content(policy: Policy, settings: Mapping[str, Any], config: CertifyConfig, 
         "strips": [float(asked.loop.low[0]), float(asked.loop.high[-1]), int(asked.loop.low.size)],
         "bounds": asdict(asked.bounds) if asked.bounds else None,
         "cannot_hold": found.cannot_hold(),
-        "dose_below": dict(zip(map(str, found.levels), _outward(found.doses, 1e3), strict=True)),
+        "dose_below": dict(zip(map(str, found.levels), _up(found.doses, 1e3), strict=True)),
         "not_monotone": [dict(zip(("first", "second", "from", "to"), drop, strict=True)) for drop in found.drops],
         "cases": [_case(proof) for proof in found.proofs if proof.case.name in asked.drawn],
         "config": asdict(replace(config, policy="", to=None, env_file=None)),

@@ -160,7 +160,7 @@ class RelativeController:
         estimate, (low, high) = observation[:, 1], self.bounds.proven
         shown = np.clip(estimate, low, high)
         largest, least = np.minimum(estimate + doubt, high), np.maximum(estimate - doubt, 0.0)
-        od = setpoint * np.exp(observation[:, 0] * self.bounds.full_pump)
+        od = setpoint * np.exp(observation[:, 0] * self.estimator.full_pump)
         return ~self.bounds.hold(od, error, shown, np.maximum(largest - shown, shown - least))
 
     def dosed(self, volume_ml: Array) -> None:
