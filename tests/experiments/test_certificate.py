@@ -460,3 +460,13 @@ def test_a_file_of_the_first_format_is_the_same_policy_and_so_is_its_copy(tmp_pa
     np.savez(tmp_path / "policy.npz", **arrays)
     unpacked(tmp_path / "policy.npz", tmp_path / "run")
     assert fingerprints(policy.load(tmp_path / "run" / "policy.npz")) == fingerprints(given)
+
+
+def test_a_calibrated_pump_stays_calibrated_on_another_bench() -> None:
+    """tau 0.3 was found where the bench says 20 mL: the pump gives 10 % more; with 12 mL it is 0.3 * 12 / 20."""
+    asked = replace(ASKED, env=EnvConfig(tau=0.3))
+    for ml, tau in ((20.0, 0.3), (12.0, 0.18)):
+        bench = Bench(volume_ml=ml)
+        found = certificate.on_bench(laws.law(), asked, bench, EnvConfig(tau=bench.tau)).env
+        assert found is not None
+        assert found.tau == pytest.approx(tau)

@@ -150,6 +150,13 @@ def test_bands_of_the_one_line_law_by_hand() -> None:
     assert bands[2].low[0] == pytest.approx(switch + 0.021 - 0.06 * 14 / 16 / 0.7, abs=1e-9)
 
 
+def test_the_law_of_another_period_divides_it_out() -> None:
+    """u = tau (mu + ln(x/r)/h): at h = 2 min half a level is h (0.02/32) / tau = 0.00375 of d, and mu is at level 8."""
+    one = replace(loop(1.0, 1.0), control_min=2.0)
+    found = images(one.law(OdCase("", 0, 0)), one.shift(OdCase("", 0, 0)), one.range(OdCase("", 0, 0)))
+    assert one.half_width(found.low, found.high)[0] == pytest.approx(np.expm1(0.00375), abs=1e-9)
+
+
 def test_the_band_is_that_of_the_worst_simulated_culture() -> None:
     """Extremes of mu, tau and noise in every combination of two alternating values, 400 periods from far off."""
     policy, r, share, noise = laws.law(), 0.6, 0.3, 0.0108

@@ -438,3 +438,14 @@ def test_what_the_pump_cannot_hold_with_weaker_doses_is_said() -> None:
         f"{first} and 14 others: from growth share 0.895 to 0.97 no pump rate holds the culture"
     ]
     assert all(proof.holdable.all() for proof in found.proofs if not proof.case.name.startswith("spread"))
+
+
+def test_a_device_asks_the_same_as_the_command() -> None:
+    """With limits that nothing meets, every case of one B at the three setpoints has the same worst value in both."""
+    strict = replace(FAST.limits, excess_share=1e-9, excess_nominal=1e-9, late=0, late_slow=0)
+    config = replace(FAST, full_pumps=(), limits=strict)
+    policy = laws.share_law(offset=0.03)
+    wanted = {c.name: c.value for c in certify(policy, config).checks if "half-width" in c.name and not c.holds}
+    found = {c.name: c.value for c in recheck(policy, config, (0.2, 0.6, 1.0)) if "half-width" in c.name}
+    assert len(wanted) > 8
+    assert {name: found[name] for name in wanted} == pytest.approx(wanted, abs=1e-9)

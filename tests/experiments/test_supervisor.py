@@ -153,6 +153,16 @@ def test_surprises_that_do_not_fit_raise_the_alarm(first: list[float], second: l
     assert law.explain()["alarm"][0] == alarm
 
 
+def test_vials_are_judged_alone() -> None:
+    """Both first filters are too quiet; the second one of row 1 is as well, so there the sensor is quiet."""
+    law, both = supervised(2), np.ones(2, dtype=bool)
+    law.act(np.full(2, 0.5), np.full(2, 0.5), np.zeros(2), both)
+    law.estimator._squares[:] = 0.1
+    law.second._squares[:] = [[0.8], [0.1]]
+    law.act(np.full(2, 0.5), np.full(2, 0.5), np.zeros(2), both)
+    np.testing.assert_array_equal(law.explain()["alarm"], [1.0, 0.0])
+
+
 def watched(config: EstimatorConfig, bounds: EstimateBounds | None) -> tuple[np.ndarray, np.ndarray]:
     """Alarms and true |x - r| of 16 vials with a real sensor and pump through four setpoints, (decisions, vials)."""
     plant = Plant(build(PlantConfig(), presets.load("plant/nominal_noise"), "plant"), 16, np.random.default_rng(7))
