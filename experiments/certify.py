@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from dqn import policy as policies
-from dqn.policy import Policy
 from experiments.certification import certificate
 from experiments.certification.config import CertifyConfig
 from experiments.certification.judge import Certificate, certify
@@ -31,10 +30,13 @@ def body(config: CertifyConfig, folder: Path) -> None:
     source = find_policy(config.policy)
     if config.env_file is not None:
         config = replace(config, env=read_env_file(config.env_file), env_file=None)
+    to = _place(config, source)
     began = time.perf_counter()
     log.info("proving the closed loop of %s, for every reading, setpoint and case; a minute or less", source)
     with frame.refusing(policies.PolicyError):
         policy = policies.load(source)
+    with frame.refusing(ValueError, about=f"policy {source}: "):
+        beside = settings(policy)
     with frame.refusing(CertificationError, about=f"policy {source}: "):
         config = replace(config, env=model_of(policy, config))
         found = certify(policy, config)
@@ -43,23 +45,22 @@ def body(config: CertifyConfig, folder: Path) -> None:
         log.info("%s", line)
     for line in found.cannot_hold():
         log.info("said, not judged: %s", line)
-    _write(folder, source, policy, config, found)
+    _write(folder, source, certificate.content(policy, beside, config, found), to, found)
     if failed := [check for check in found.checks if not check.holds]:
         of = f"{len(failed)} of {len(found.checks)} requirements fail"
         raise frame.UserError(f"policy {source}: not certified, {of}, the first: {failed[0]}")
 
 
-def _write(folder: Path, source: Path, policy: Policy, config: CertifyConfig, found: Certificate) -> None:
-    """The certificate, here and beside the policy; summary, figure and page."""
+def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None, found: Certificate) -> None:
+    """The certificate, here and where else it goes; summary, figure and page."""
     from experiments.certification.figure import figure
     from experiments.reporting import charts, page
     from experiments.reporting.tensorboard import Events
 
-    content = certificate.content(policy, settings(policy), config, found)
     files.write_json(folder / "certificate.json", content, indent=None)
-    to = _place(config, source)
     if to is None:
-        log.info("%s is part of the program, whose certificate stays as it is; to=FILE writes elsewhere, too", source)
+        why = "a quick one stands nowhere else" if found.quick else f"{source} is part of the program, whose own stays"
+        log.info("the certificate is in the run folder alone: %s; to=FILE writes it elsewhere, too", why)
     else:
         try:
             files.write_json(to, content, indent=None)
@@ -77,10 +78,14 @@ def _write(folder: Path, source: Path, policy: Policy, config: CertifyConfig, fo
 
 
 def _place(config: CertifyConfig, source: Path) -> Path | None:
-    """Where the certificate goes beside the run folder, if anywhere."""
-    if config.to is not None:
-        return Path(config.to)
-    return None if source.resolve().parent == SHIPPED.resolve().parent else certificate.beside(source)
+    """Where the certificate goes beside the run folder, if anywhere. Raises: frame.UserError."""
+    if config.to is None:
+        own = source.resolve().parent == SHIPPED.resolve().parent
+        return None if own or config.quick else certificate.beside(source)
+    to = Path(config.to)
+    if to.suffix != ".json" or to.is_dir() or not to.parent.is_dir():
+        raise frame.UserError(f"to = {to}: allowed a file NAME.json in a folder that is there")
+    return to
 
 
 def _summary(source: Path, content: dict[str, Any], found: Certificate) -> dict[str, Any]:

@@ -70,4 +70,8 @@ class EstimateBounds:
         """From a certificate. Raises: KeyError, TypeError, ValueError for damaged ones."""
         numbers = (float(values[key]) for key in ("full_pump", "error", "od", "growth_share", "gain"))
         pairs = ((float(low), float(high)) for low, high in (values["proven"], values["setpoints"]))
-        return cls(*numbers, *pairs)  # type: ignore[arg-type]
+        found = cls(*numbers, *pairs)  # type: ignore[arg-type]
+        sizes = found.full_pump, found.error, found.od, found.growth_share, found.gain, *found.proven, *found.setpoints
+        if not (all(0.0 <= size < np.inf for size in sizes) and found.proven[0] < found.proven[1]):
+            raise ValueError(f"bounds {sizes}: allowed numbers of 0 and more, ranges from low to high")
+        return found

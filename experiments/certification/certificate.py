@@ -104,11 +104,11 @@ def load(path: Path) -> Stored:
     try:
         given = json.loads(path.read_text(encoding="utf-8"))
         if given["format"] != FORMAT:
-            raise ValueError(f"format {given['format']}, allowed {FORMAT}")
+            raise ValueError(f"of format {given['format']}, this version reads {FORMAT}")
         low, high = given["setpoints"]
         return Stored(
             dict(given["of"]),
-            given["passed"] is True,
+            given["passed"] is True and all(check["holds"] is True for check in given["checks"]),
             tuple(str(check["name"]) for check in given["checks"] if not check["holds"]),
             build(CertifyConfig(), given["config"]),
             (float(low), float(high)),
@@ -151,6 +151,8 @@ def doubts(
     policy.
     """
     path, remedy = beside(file), f"python -m experiments.certify policy={name}"
+    if name == "shipped":
+        remedy = "copy dqn/shipped/policy.npz and run that: python -m experiments.certify policy=COPY"
     try:
         stored = load(path)
     except FileNotFoundError:
@@ -159,11 +161,12 @@ def doubts(
         why = getattr(error, "strerror", None) or error
         return [f"its certificate {path} is damaged ({why}; {remedy})"]
     if different := stored.differs(policy, settings):
-        what = f"{'; '.join(different[:3])}{' and others' if len(different) > 3 else ''}"
-        return [f"its certificate {path} is of another: {what} (put it back, or {remedy})"]
+        return [f"its certificate {path} is of another: {'; '.join(different)} (put it back, or {remedy})"]
     if not stored.passed:
-        failing = f"{len(stored.failed)} requirements, the first: {'; '.join(stored.failed[:1])}"
+        failing = f"{len(stored.failed)} of its requirements, the first: {'; '.join(stored.failed[:1]) or 'not said'}"
         return [f"its certificate fails {failing} (train with another seed, then {remedy})"]
+    if laxer := stored.config.laxer():
+        return [f"its certificate asks for less than it should: {'; '.join(laxer)} ({remedy})"]
     if stored.config.quick and stored.bounds is not None:
         return [f"its certificate is a quick one, without errors of the gain ({remedy})"]
     low, high = stored.setpoints
@@ -176,7 +179,8 @@ def doubts(
         failed = recheck(policy, on_bench(policy, stored.config, bench, model), sorted(set(setpoints)))
     except CertificationError as error:
         return [f"its certificate {path} asks for something else: {error} ({remedy})"]
-    return [f"proven anew for this bench and scenario, it fails: {check} ({remedy})" for check in failed[:1]]
+    other = "choose another bench or scenario, or train for this one"
+    return [f"proven anew for this bench and scenario, it fails: {check} ({other})" for check in failed[:1]]
 
 
 def on_bench(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> CertifyConfig:

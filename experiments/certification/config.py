@@ -1,12 +1,15 @@
 """What a certificate is asked to prove."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from conf.schema import check, part, require, setting
 from envs.bench import Bench
 from envs.task import EnvConfig
 
 __all__ = ["CertifyConfig", "Limits"]
+
+
+ASKED = ("uncertainty", "noise", "error", "error_od", "error_share", "error_gain")  # the larger, the more is asked
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,20 @@ class CertifyConfig:
         within=(0, 10_000_000),
     )
     limits: Limits = part(Limits, "what is required")
+
+    def laxer(self) -> list[str]:
+        """Every value by which less is asked than by itself."""
+        usual = CertifyConfig()
+        less = [(n, getattr(self, n), getattr(usual, n)) for n in ASKED]
+        more = [("strip", self.strip, usual.strip)]
+        for f in fields(Limits):
+            found = f"limits.{f.name}", getattr(self.limits, f.name), getattr(usual.limits, f.name)
+            (less if f.name.startswith("reached") else more).append(found)
+        named = [(n, own, by) for n, own, by in less if own < by] + [(n, own, by) for n, own, by in more if own > by]
+        for name in ("start_od", "growth_shares"):
+            own, by = getattr(self, name), getattr(usual, name)
+            named += [(name, list(own), list(by))] if own[0] > by[0] or own[1] < by[1] else []
+        return [f"{name} = {own}, by itself {by}" for name, own, by in named]
 
     def __post_init__(self) -> None:
         check(self)

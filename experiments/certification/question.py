@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from conf.schema import build
-from dqn.policy import RELATIVE, Policy
+from dqn.policy import ABSOLUTE, RELATIVE, Policy
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
@@ -66,6 +66,9 @@ def model_of(policy: Policy, config: CertifyConfig) -> EnvConfig:
     A policy of (error, growth share) serves any; that of the bench turns OD into e where bounds depend on the OD.
     Raises: CertificationError where the policy does not say it, or has another control period.
     """
+    if policy.observation not in (ABSOLUTE, RELATIVE):
+        seen = ", ".join(policy.observation)
+        raise CertificationError(f"it sees ({seen}); what is proven is how a density is held")
     said = policy.metadata.get("model", {})
     model = config.env
     if policy.observation == RELATIVE:

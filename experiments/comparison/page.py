@@ -293,9 +293,14 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
         ranking = key if ranked else None
         table = matrix(f"{scenario}_{key}", title, totals, partial(_scaled, key=key), f"Mean, n = {n}.", ranking)
         out.table(table, folded=f"{title}: {scenario}")
-    estimating = [e for e in totals if ESTIMATES[0][0] in e]
-    for key, title in ESTIMATES if estimating else ():
-        out.table(matrix(f"{scenario}_{key}", title, estimating, partial(_scaled, key=key), f"Mean, n = {n}."))
+
+
+def estimates(out: Page, summary: Row, scenario: str) -> None:
+    """How sure laws that estimate were, and how often they were right, on every plant of a scenario."""
+    totals = [e for e in summary["totals"] if e["scenario"] == scenario and ESTIMATES[0][0] in e]
+    for key, title in ESTIMATES if totals else ():
+        note = f"{scenario}; mean, n = {totals[0]['n']}."
+        out.table(matrix(f"{scenario}_{key}", title, totals, partial(_scaled, key=key), note))
 
 
 def all_rows(summary: Row) -> Table:
@@ -438,6 +443,11 @@ def _density(out: Page, summary: Row, run: Path) -> None:
         )
         for scenario in wide:
             every_plant(out, summary, scenario)
+    estimated = dict.fromkeys(e["scenario"] for e in summary["totals"] if ESTIMATES[0][0] in e)
+    if estimated:
+        out.section("How sure the estimates were, and what the supervisor did")
+        for scenario in estimated:
+            estimates(out, summary, scenario)
 
 
 def _lower(pair: Row) -> str:

@@ -148,7 +148,9 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     if wanted is not None and not config.preflight_only:
         policy = run_policy(wanted, folder, resumed)
         admit(policy, folder / "policy.npz", wanted, resumed)
-        bounds = certificate.bounds(policy, settings(policy, changes), folder / "policy.npz", model)
+        with frame.refusing(ValueError):
+            own = settings(policy, changes)
+        bounds = certificate.bounds(policy, own, folder / "policy.npz", model)
     return Setup(
         family, backend, bench, safety, scenarios, ends, config.roles(), plant, model, config.controller, wanted,
         policy, bounds, further, config.fsync, *_named(config, family, folder), resumed,

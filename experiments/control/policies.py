@@ -191,7 +191,8 @@ def _doubts(policy: Policy, file: Path, wanted: Wanted) -> list[str]:
     doubts = Training.of(policy).doubts(wanted.setpoints, wanted.poor_regret_pct)
     if not wanted.at_stake:
         return doubts
-    own = settings(policy, wanted.estimator)
+    with frame.refusing(ValueError):
+        own = settings(policy, wanted.estimator)
     run = wanted.setpoints, wanted.bench, wanted.model, wanted.name
     return doubts + certificate.doubts(policy, own, file, *run)
 

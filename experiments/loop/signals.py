@@ -171,9 +171,7 @@ class Density:
         if self.truth is not None and "growth_share" in why:
             why = {**why, **dict(zip(TRUE, self.truth(sample.setpoint), strict=True))}
         alarm = why.get("alarm", np.zeros(sample.rows.size)) * (sample.believed & (sample.phase >= 0))
-        said = (
-            "filter_alarm: readings do not fit the estimate; reported; the law on a second filter decides"
-        )
+        said = "filter_alarm: readings do not fit the estimate; reported; the law on a second filter decides"
         return Findings(why=why, warnings=[said if a else None for a in alarm] if alarm.any() else ())
 
     def dosed(self, volume_ml: Array, kept_ml: Array) -> None:

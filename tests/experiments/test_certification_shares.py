@@ -449,3 +449,10 @@ def test_a_device_asks_the_same_as_the_command() -> None:
     found = {c.name: c.value for c in recheck(policy, config, (0.2, 0.6, 1.0)) if "half-width" in c.name}
     assert len(wanted) > 8
     assert {name: found[name] for name in wanted} == pytest.approx(wanted, abs=1e-9)
+
+
+def test_strips_cover_the_range_where_their_width_does_not_divide_it() -> None:
+    asked = question(laws.share_law(), replace(FAST, strip=0.03)).loop
+    assert (asked.low[0], asked.high[-1]) == (0.05, 0.97)
+    np.testing.assert_array_equal(asked.low[1:], asked.high[:-1])
+    assert (asked.high - asked.low).max() <= 0.03 + 1e-12

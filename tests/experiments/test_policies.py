@@ -14,7 +14,7 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments import demo
 from experiments.certification import certificate
-from experiments.certification.config import CertifyConfig, Limits
+from experiments.certification.config import CertifyConfig
 from experiments.certification.judge import certify
 from experiments.cli import files, frame
 from experiments.cli.frame import UserError
@@ -27,7 +27,7 @@ from experiments.training.config import TrainConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.emulator.process import EmulatorProcess
 from hardware.simulated import SimulatedConfig
-from tests.experiments.test_deploy import inverse_policy
+from tests.experiments import laws
 
 TRAINED = {"updates": 36_000, "regret_pct": 0.1, "model": {"setpoints": [0.2, 0.6, 1.0]}}
 DOUBTFUL = {
@@ -42,17 +42,16 @@ doubtful = pytest.mark.parametrize(("metadata", "message"), DOUBTFUL.values(), i
 
 
 def certified(path: Path, given: policy.Policy) -> None:
-    """Save a policy with a certificate of whatever its band is."""
+    """Save a policy with its certificate."""
     policy.save(path, given)
-    anything = Limits(excess=1.0, excess_uncertain=1.0, entry=100.0, low_dose=100.0)
-    asked = CertifyConfig(env=EnvConfig(), setpoints=(0.2, 1.0), strip=0.1, trajectories=0, limits=anything)
+    asked = CertifyConfig(env=EnvConfig(), setpoints=(0.4, 0.8), trajectories=0)
     content = certificate.content(given, settings(given), asked, certify(given, asked))
     files.write_json(certificate.beside(path), content)
 
 
 def deployed(tmp_path: Path, metadata: dict[str, Any], **changes: Any) -> DeployConfig:
     """The config of a run at 0.8, 0.65 and 0.5 with a certified policy of this training."""
-    given = inverse_policy()
+    given = laws.law()
     certified(tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, **metadata}))
     scenario = Scenario((0.8, 0.65, 0.5), (30.0,) * 3, (37.0,) * 3)
     return DeployConfig(**{"scenario": scenario, "policy": str(tmp_path / "given.npz"), **changes})
@@ -98,7 +97,10 @@ def test_a_sound_policy_and_a_limit_of_ones_own(tmp_path: Path, caplog: pytest.L
 def test_a_file_of_an_earlier_version_runs_and_says_what_is_not_known(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    certified(tmp_path / "given.npz", inverse_policy())  # says its regret and its control period
+    given = laws.law()
+    model = {key: value for key, value in given.metadata["model"].items() if key != "setpoints"}
+    said = {**given.metadata, "model": model, "regret_pct": 0.1}  # its regret and its control period
+    certified(tmp_path / "given.npz", replace(given, metadata=said))
     config = DeployConfig(backend=ChiBioConfig(), policy=str(tmp_path / "given.npz"))
     with caplog.at_level("INFO"):
         assemble.unpack(config, tmp_path)
@@ -123,7 +125,7 @@ def test_latest_is_what_train_or_demo_wrote_last(tmp_path: Path, monkeypatch: py
     copies = [flown, Path("runs/deploy/later/policy.npz"), Path("runs/benchmark/later/training/paper/policy.npz")]
     for age, path in enumerate([swept, learned, *copies]):
         path.parent.mkdir(parents=True)
-        policy.save(path, inverse_policy())
+        policy.save(path, laws.law())
         os.utime(path, (1e9 + age, 1e9 + age))
     assert find_policy("latest") == learned
     os.utime(swept, (2e9, 2e9))
