@@ -35,6 +35,8 @@ def figure(found: Certificate) -> Figure:
     doses.set(xlabel=asked.what, ylabel="periods of growth", ylim=(0, None))
     doses.set_title("How far below the setpoint a dose may still be given")
     doses.legend()
+    if failed := [check for check in found.checks if not check.holds]:
+        made.suptitle(f"Not certified: {len(failed)} of {len(found.checks)} requirements fail, first {failed[0].name}")
     return made
 
 
