@@ -23,6 +23,7 @@ from hardware.safety.interlock import Interlock
 __all__ = [
     "ESTIMATED",
     "FEED",
+    "FILTER_ALARM",
     "THERMOSTAT",
     "TRUE",
     "Density",
@@ -38,6 +39,7 @@ __all__ = [
 FEED, THERMOSTAT = "feed pump", "thermostat"
 TRUE = ("true_error", "true_growth_share")
 ESTIMATED = ("error", "growth_share")
+FILTER_ALARM = "filter_alarm"  # in a row; on the screen the supervisor's beginning and end are said
 TAKEN = ("began", "done", "stopped", "interlock", "steps", "supply", "controller", "composition", "journal_row")
 
 

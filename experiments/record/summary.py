@@ -13,6 +13,7 @@ from envs.scenario import Scenario
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.progress import Progress
+from experiments.loop.signals import FILTER_ALARM
 from experiments.record.record import Table
 from experiments.record.recovery import Rows
 from experiments.reporting import charts
@@ -80,7 +81,8 @@ class ChangeLog:
             reason = step.reasons[n] or ""
             if not step.rows[n] and (not reason or reason.endswith("earlier in this run")):
                 continue  # what a sample was refused for is not over because there is no new one yet
-            kinds = " ".join(kinds_of(reason)) or reason
+            named = kinds_of(reason)
+            kinds = " ".join(k for k in named if k != FILTER_ALARM) if named else reason
             if kinds != (self._reason[n] or ""):
                 self._reason[n] = kinds
                 said = step.reasons[n] or "interlock: all well again"

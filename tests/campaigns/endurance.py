@@ -18,9 +18,11 @@ from envs.scenario import Scenario
 from experiments.laws.base import Mask
 from experiments.laws.registry import on_device
 from experiments.loop.loop import Step
+from experiments.loop.signals import FILTER_ALARM
 from hardware.chibio.protocol import POSITIONS
 from hardware.emulator.vial import Dose
 from hardware.safety.config import SafetyConfig
+from hardware.safety.interlock import kinds_of
 from hardware.storage.journal import read_journal
 from tests.campaigns.audit import Served, audit_doses, audit_rows
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
@@ -107,7 +109,7 @@ class _Meter:
     def step(self, step: Step, settled: Mask) -> None:
         """Take a pass of the loop. Args: settled: reactors whose phase is so old that they must be at its setpoint."""
         self.samples += int(step.rows.sum())
-        self.alarms += sum(reason is not None for reason in step.reasons)
+        self.alarms += sum(bool(set(kinds_of(reason or "")) - {FILTER_ALARM}) for reason in step.reasons)
         vials = self.r.device.vials.values()
         od = np.array([vial.plant.culture.od[0] for vial in vials], dtype=np.float64)
         for n in np.flatnonzero(step.rows & settled):

@@ -222,6 +222,33 @@ def test_the_console_says_once_when_the_supervisor_begins_and_ends_and_the_journ
     assert not any(r["why"]["supervised"] for r in rows if r["reactor"] == "M1")
 
 
+def test_surprises_stand_in_the_row_and_the_screen_says_who_decides_alone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Some readings of M0 are made surprising; its rows say so."""
+    run = Rehearsal(tmp_path, rehearsed(("M0", "M1"), Scenario((0.5,), (600.0,), (37.0,))), od=0.5)
+    run.begin()
+    law, log_changes, spoilt = run.loop.density.law, ChangeLog(run.loop), 0
+    assert isinstance(law, RelativeController)
+    with caplog.at_level(logging.INFO):
+        for step in run.run(1500.0):
+            log_changes(step)
+            law.estimator._squares[0, -4:] = 9.0 if step.minute[0] > 15.0 and spoilt < 2 else 0.5
+            spoilt += int(step.rows[0] and step.minute[0] > 15.0)
+    run.close()
+    rows = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "decision"]
+    alarmed = [
+        (r["reactor"], r["row"]["interlock"])
+        for r in rows
+        if "filter_alarm: readings do not fit" in r["row"]["interlock"]
+    ]
+    assert {name for name, _ in alarmed} == {"M0"}
+    assert len(alarmed) == sum(r["why"]["alarm"] for r in rows) >= 1
+    said = [r.getMessage() for r in caplog.records if "M0" in r.getMessage()]
+    assert not [line for line in said if "filter_alarm" in line or "all well again" in line]
+    assert sum("the supervisor's law acts" in line for line in said) == 1
+
+
 def test_three_strains_on_three_pumps_are_held_without_a_calibration(tmp_path: Path) -> None:
     """True OD, from the emulator, against the setpoint in the last ten minutes of each phase."""
     schedule = Scenario((0.5, 0.4), (25.0, 25.0), (37.0, 37.0), recovery_od=0.45)
