@@ -194,7 +194,7 @@ def run_trial(
     fields = ("od", "clean", "rate", "temperature", "media_ml")
     stored: dict[str, Any] = {key: np.full((replicates, minute.size), np.nan) for key in fields}
     held = np.zeros(replicates)
-    told: dict[str, list[Array]] = {}
+    told: dict[str, Array] = {}  # sum and number of what is told in the schedule, (2, N) each
     for step in loop.run():
         row = np.flatnonzero(step.rows & (step.phase >= 0))
         column = np.rint(step.elapsed[row] / model.control_min).astype(np.intp)
@@ -211,8 +211,11 @@ def run_trial(
         why = step.explanation
         beside = {key: why[key] for key in SUPERVISED if key in why} | within_2sd(why)
         for key, value in beside.items():
-            told.setdefault(key, []).append(np.where(step.rows & (step.phase >= 0), value, np.nan))
-    parts = {key: np.nanmean(values, axis=0) for key, values in told.items()}
+            known = step.rows & (step.phase >= 0) & np.isfinite(value)
+            told.setdefault(key, np.zeros((2, replicates)))[:, known] += np.stack([value, np.ones(replicates)])[
+                :, known
+            ]
+    parts = {key: np.divide(s, n, out=np.full(replicates, np.nan), where=n > 0) for key, (s, n) in told.items()}
     return DensityTrial(cell, schedule, minute, **stored, held=held, overflowed=plant.vessel.overflowed, told=parts)
 
 

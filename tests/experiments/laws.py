@@ -114,6 +114,44 @@ def share_law(
     return _relative([(w1, b1), (w2, np.array([0, 0, 0, 1])), (w3, b3)])
 
 
+Ramp = tuple[float, float, float, float]
+"""(a, b, c, k): from 0 to 1 as k (a e + b s + c) goes from 0 to 1."""
+
+
+def bent_share_law(
+    *bends: tuple[float, *tuple[Ramp, ...]],
+    gain: float = 1.0,
+    share: float = 1.0,
+    offset: float = 0.0,
+    never: tuple[int, ...] = (),
+    swapped: tuple[int, int] = (0, 0),
+) -> Policy:
+    """The one-line law of z = gain e + share s + offset + the sum of the bends.
+
+    bends: (amount, ramp, ...): the amount where all ramps are 1, nothing where one is 0. never: levels that are not
+    chosen. swapped: two levels that are given for one another.
+    """
+    ramps = [ramp for _, *of in bends for ramp in of]
+    w1 = np.array([[gain, -gain, *(k * a for a, _, _, k in ramps for _ in range(2))],
+                   [share, -share, *(k * b for _, b, _, k in ramps for _ in range(2))]])  # fmt: skip
+    b1 = np.array([0.0, 0.0, *(k * c - above for _, _, c, k in ramps for above in (0.0, 1.0))])
+    w2, b2 = np.zeros((w1.shape[1], 2 + len(bends))), np.zeros(2 + len(bends))
+    w2[0, 0] = w2[1, 1] = 1.0
+    unit = 2
+    for n, (_, *of) in enumerate(bends, 2):
+        b2[n] = 1.0 - len(of)
+        for _ in of:
+            w2[unit, n], w2[unit + 1, n] = 1.0, -1.0
+            unit += 2
+    v = np.linspace(0.0, 1.0, 17)
+    w3 = 2.0 * np.outer([1.0, -1.0, *(amount for amount, *_ in bends)], v)
+    b3 = 2.0 * offset * v - v**2
+    b3[list(never)] -= 10.0
+    here, there = list(swapped), list(swapped)[::-1]
+    w3[:, here], b3[here] = w3[:, there], b3[there]
+    return _relative([(w1, b1), (w2, b2), (w3, b3)])
+
+
 HOLE = (3 / 16, 0.5)  # e and s
 
 

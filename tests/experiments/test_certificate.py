@@ -238,10 +238,10 @@ def test_settings_that_are_given_as_they_are_change_nothing(relative: Path, tmp_
     """In file and on the command line; the command line replaces the file."""
     given, own = policy.load(relative), asdict(EstimatorConfig())
     source = beside(relative, replace(given, metadata={**given.metadata, "estimator": own}), tmp_path)
-    unpacked(source, tmp_path / "run", controller=LearnedConfig(estimator={"gate_sigma": 5.0}))
+    assert unpacked(source, tmp_path / "run", controller=LearnedConfig(estimator={"gate_sigma": 5.0})).bounds
     other = replace(given, metadata={**given.metadata, "estimator": {**own, "gate_sigma": 20.0}})
     policy.save(source, other)
-    unpacked(source, tmp_path / "run", controller=LearnedConfig(estimator={"gate_sigma": 5.0}))
+    assert unpacked(source, tmp_path / "run", controller=LearnedConfig(estimator={"gate_sigma": 5.0})).bounds
 
 
 @pytest.mark.parametrize(

@@ -345,6 +345,57 @@ def test_the_hole_is_the_law_beside_it_and_a_policy_without_depth_passes() -> No
     assert certify(laws.share_law_with_a_hole(0), FAST).passed
 
 
+def e_above(where: float, k: float = 1e3) -> laws.Ramp:
+    return (1.0, 0.0, -where, k)
+
+
+def e_below(where: float, k: float = 1e3) -> laws.Ramp:
+    return (-1.0, 0.0, where, k)
+
+
+def s_above(where: float, k: float = 1e3) -> laws.Ramp:
+    return (0.0, 1.0, -where, k)
+
+
+def s_below(where: float, k: float = 1e3) -> laws.Ramp:
+    return (0.0, -1.0, where, k)
+
+
+NINETEEN: dict[str, Policy] = {
+    "no dose near rest in a thin range of s": laws.bent_share_law(
+        (-5.0, s_above(0.61), s_below(0.616), e_above(-0.1), e_below(0.1))
+    ),
+    "three levels too low in a thinner one": laws.bent_share_law((-3 / 16, s_above(0.3), s_below(0.304, 2e3))),
+    "offset where s is low": laws.bent_share_law((0.04, s_below(0.2))),
+    "level 5 is never given": laws.bent_share_law(never=(5,)),
+    "even levels alone": laws.bent_share_law(never=tuple(range(1, 17, 2))),
+    "levels 8 and 9 for one another": laws.bent_share_law(swapped=(8, 9)),
+    "never the full pump": laws.bent_share_law(never=(16,)),
+    "never no dose": laws.bent_share_law(never=(0,)),
+    "gain 0.7": laws.bent_share_law(gain=0.7),
+    "gain 1.5": laws.bent_share_law(gain=1.5),
+    "s above 0.9 taken for 0.9": laws.bent_share_law((-1.0, s_above(0.9, 1.0))),
+    "s 3 per cent low": laws.bent_share_law(share=0.97),
+    "no dose from a third of a period below": laws.bent_share_law((-5.0, e_below(-0.35))),
+    "no dose in a thin range of e, far above": laws.bent_share_law((-5.0, e_above(0.8), e_below(0.82))),
+    "a dead zone": laws.bent_share_law((-0.06, e_above(-0.03, 1 / 0.06)), offset=0.03),
+    "one level too low far above": laws.bent_share_law((-2 / 16, e_above(0.6))),
+    "a dose far below where growth is slow": laws.bent_share_law((2.0, e_below(-0.9), s_below(0.06))),
+    "always rounded down": laws.bent_share_law(offset=-1 / 32),
+    "full pump in a very thin range of s": laws.bent_share_law((3.0, s_above(0.45), s_below(0.452, 4e3))),
+}
+"""Written by somebody who had seen neither this code nor its tests."""
+
+
+def test_the_law_that_is_not_bent_passes() -> None:
+    assert certify(laws.bent_share_law(), FAST).passed
+
+
+@pytest.mark.parametrize("policy", NINETEEN.values(), ids=list(NINETEEN))
+def test_a_fault_by_another_hand_fails(policy: Policy) -> None:
+    assert not certify(policy, replace(FAST, full_pumps=())).passed
+
+
 WORSE: dict[str, tuple[Policy, float, tuple[float, float]]] = {
     "offset of the error": (laws.share_law(offset=0.04), 0.04, laws.SHARES),
     "even levels alone": (laws.share_law(levels=2), 1 / 16 - 1 / 32, laws.SHARES),

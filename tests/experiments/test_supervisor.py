@@ -191,14 +191,21 @@ def test_a_filter_that_is_blind_is_found_out_and_costs_nothing() -> None:
     assert off_sound[at_rest].mean() < 0.005
 
 
+def begun(folder: Path) -> tuple[Rehearsal, RelativeController, ChangeLog]:
+    """Two reactors at 0.5 under the policy that ships, what decides there, and what the screen says."""
+    run = Rehearsal(folder, rehearsed(("M0", "M1"), Scenario((0.5,), (600.0,), (37.0,))), od=0.5)
+    run.begin()
+    law = run.loop.density.law
+    assert isinstance(law, RelativeController)
+    return run, law, ChangeLog(run.loop)
+
+
 def test_the_console_says_once_when_the_supervisor_begins_and_ends_and_the_journal_every_time(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """M0's estimate is spoilt for five samples; M1's never is."""
-    run = Rehearsal(tmp_path, rehearsed(("M0", "M1"), Scenario((0.5,), (600.0,), (37.0,))), od=0.5)
-    run.begin()
-    law, log_changes, spoilt = run.loop.density.law, ChangeLog(run.loop), 0
-    assert isinstance(law, RelativeController)
+    run, law, log_changes = begun(tmp_path)
+    spoilt = 0
     with caplog.at_level(logging.INFO):
         for step in run.run(1860.0):
             log_changes(step)
@@ -226,10 +233,8 @@ def test_surprises_stand_in_the_row_and_the_screen_says_who_decides_alone(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Some readings of M0 are made surprising; its rows say so."""
-    run = Rehearsal(tmp_path, rehearsed(("M0", "M1"), Scenario((0.5,), (600.0,), (37.0,))), od=0.5)
-    run.begin()
-    law, log_changes, spoilt = run.loop.density.law, ChangeLog(run.loop), 0
-    assert isinstance(law, RelativeController)
+    run, law, log_changes = begun(tmp_path)
+    spoilt = 0
     with caplog.at_level(logging.INFO):
         for step in run.run(1500.0):
             log_changes(step)
