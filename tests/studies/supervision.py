@@ -50,7 +50,7 @@ Make = Callable[[], Controller]
 class SupervisionConfig:
     """How many vials, for how long, on which plants."""
 
-    vials: int = setting(128, "of each run", within=(2, 4096))
+    vials: int = setting(256, "of each run", within=(2, 4096))
     hours: float = setting(
         26.0, "for which false alarms are counted on nominal_noise, held at 0.5", "h", within=(1, 1000)
     )
