@@ -330,7 +330,7 @@ class AgentLab:
         self.log = folder / "log"
         with self.log.open("w") as log:
             self.agent = subprocess.Popen(command, stderr=log, cwd=folder)
-        self.until(lambda: "ready" in self.log.read_text() and (not tty_line or "open" in self.log.read_text()))
+        self.until(lambda: "ready" in self.log.read_text() and (not tty_line or " open\n" in self.log.read_text()))
 
     def plug(self) -> None:
         """A new line under the same name."""
@@ -483,9 +483,9 @@ def test_line_pulled_and_plugged_again(lab: AgentLab) -> None:
     for _ in range(2):
         lab.unplug()
         time.sleep(0.3)
-        seen = lab.log.read_text().count("open")
+        seen = lab.log.read_text().count(" open\n")
         lab.plug()
-        lab.until(lambda n=seen: lab.log.read_text().count("open") > n)  # type: ignore[misc]
+        lab.until(lambda n=seen: lab.log.read_text().count(" open\n") > n)  # type: ignore[misc]
         assert lab.ask("HELLO", "/")[0] == 200
         assert json.loads(lab.ask("GET", "/getSysdata/")[1])["UIDevice"] == "M0"
 

@@ -76,7 +76,7 @@ class Link:
         log = folder / "log"
         with log.open("w") as stderr:
             self.agent = subprocess.Popen([*command, "--url", f"http://127.0.0.1:{self.emulator.port}"], stderr=stderr)
-        AgentLab.until(lambda: "open" in log.read_text())
+        AgentLab.until(lambda: " open\n" in log.read_text())
         config = TransportConfig(kind="serial", port=str(folder / "pc"), connect_s=0.5, read_s=1.5, floor_s=0.1)
         self.transport = SerialTransport(str(folder / "pc"), 1.0, config, attempts=8)
 

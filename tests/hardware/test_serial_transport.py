@@ -227,7 +227,7 @@ def wired(folder: Path, *words: str) -> Iterator[tuple[Cable, EmulatorProcess]]:
         )
         try:
             deadline = time.monotonic() + 5.0
-            while "open" not in (folder / "log").read_text() and time.monotonic() < deadline:
+            while " open\n" not in (folder / "log").read_text() and time.monotonic() < deadline:
                 time.sleep(0.02)
             yield line, emulator
         finally:
