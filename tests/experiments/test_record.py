@@ -72,7 +72,8 @@ def test_state_that_cannot_be_written_ends_the_run_with_the_remedy(tmp_path: Pat
     record = Record(tmp_path, ("M0",), fsync=False)
     record.save({"began": [1.0, float("nan")]})
     assert json.loads((tmp_path / "state.json").read_text())["began"] == [1.0, None]
-    (tmp_path / "state.json.part").mkdir()
+    (tmp_path / "state.json").unlink()
+    (tmp_path / "state.json").mkdir()
     with pytest.raises(OSError, match="state.json"):
         record.save({})
     record.close()

@@ -4,6 +4,7 @@ A power cut keeps what was synced, and a new name only if its folder was synced 
 
 import json
 import os
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -30,12 +31,12 @@ def tape(monkeypatch: pytest.MonkeyPatch) -> Tape:
 
     def of(fd: int) -> str:
         path = Path(f"/proc/self/fd/{fd}").resolve()
-        return "." if path.is_dir() else path.name
+        return "." if path.is_dir() else re.sub(r"\.\w{8}\.part$", ".part", path.name)
 
     record("write", lambda fd, data: (of(fd), data.count(b"\n")))
     record("ftruncate", lambda fd, size: (of(fd), size))
     record("fsync", lambda fd: (of(fd), *([] if of(fd) == "." else [os.fstat(fd).st_size])))
-    record("replace", lambda old, new: (old.name, new.name))
+    record("replace", lambda old, new: (re.sub(r"\.\w{8}\.part$", ".part", old.name), new.name))
     return calls
 
 
@@ -52,6 +53,29 @@ def test_an_atomic_file_is_synced_before_it_takes_its_place_and_its_name_after(t
     tape.clear()
     atomic.write(tmp_path / "s", "µm")
     assert tape == [("fsync", "s.part", 3), ("replace", "s.part", "s"), ("fsync", ".")]
+
+
+def test_a_file_that_two_write_at_once_is_whole_and_nothing_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second writer comes and goes between the data of the first and its name; then one whose disk refuses."""
+    real = os.replace
+
+    def meanwhile(old: Path, new: Path) -> None:
+        monkeypatch.setattr(os, "replace", real)
+        atomic.write(new, "second", fsync=False)
+        assert new.read_text() == "second"
+        real(old, new)
+
+    def full(old: Path, new: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", meanwhile)
+    atomic.write(tmp_path / "s", "first", fsync=False)
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OSError, match="No space"):
+        atomic.write(tmp_path / "s", "third", fsync=False)
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("s", "first")]
 
 
 def test_a_journal_is_synced_row_by_row(tmp_path: Path, tape: Tape) -> None:
