@@ -7,7 +7,10 @@ from contextlib import closing
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
 from envs.identification.calibration import Calibration, calibrate
+from envs.identification.prediction_error import FEWEST_READINGS
 from envs.identification.screening import Series
 from envs.identification.twin import Twin, twin
 from experiments.calibration.config import CalibrateConfig
@@ -52,8 +55,11 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     raw = Series(recording.time_min, recording.od, recording.pump_rate, recording.row)
     hours = (raw.time[-1] - raw.time[0]) / 60
     print(f"{recording.source}: rows {raw.row[0]}-{raw.row[-1]}, {hours:.1f} h; fitting", flush=True)
-    with frame.refusing(ValueError, about=f"{source}: "):
+    try:
         result = calibrate(raw, config.identify)
+    except ValueError as error:
+        why = "; ".join([*_slow(raw, config), str(error), *recording.notes])
+        raise frame.UserError(f"{source}: {why}") from None
     name = Path(source).name
     environment = folder / f"{config.name}.yaml"
     content = summary(result, recording, raw)
@@ -68,6 +74,17 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     print(report(result, recording, content))
     print(f"\n  files       {environment}\n              {written}\n              {folder}/{{summary.json, figures/}}")
     return result.pmse_pct
+
+
+def _slow(raw: Series, config: CalibrateConfig) -> list[str]:
+    """What to do where segments hold too few rows for an estimate of their own."""
+    apart, length = float(np.median(np.diff(raw.time))), config.identify.segment_min
+    if length >= FEWEST_READINGS * apart:
+        return []
+    return [
+        f"a segment of identify.segment_min = {length:g} min holds {int(length / apart)} rows {apart:.3g} min apart, "
+        f"allowed at least {FEWEST_READINGS}: say identify.segment_min={2 * FEWEST_READINGS * apart:.0f}"
+    ]
 
 
 def _write_twin(path: Path, behind: Twin, source: str) -> str:

@@ -170,6 +170,37 @@ def test_refusals_are_one_line(
     assert str(path) in done.stderr
 
 
+def test_a_refusal_of_the_fit_carries_what_the_reader_noted(
+    cli: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> None:
+    path = tmp_path / "third.csv"
+    rows = "".join(f"{60 * t},{y},0,{u}\n" for t, y, u in zip(*map(np.ndarray.tolist, recording), strict=True))
+    path.write_text("exp_time,od_measured,pump_1_rate,pump_3_rate\n" + rows)
+    done = cli(f"data={path}")
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    for part in ("the pump never runs", "pump 3 ran and is not counted", "say pumps=[3]"):
+        assert part in done.stderr
+    assert cli(f"data={path}", "pumps=[3]", "pump_ml_s=1").returncode == 0
+
+
+def test_rows_too_far_apart_for_the_segments_are_told_as_that(cli: Cli, tmp_path: Path) -> None:
+    time = 15.0 * np.arange(60)
+    pump_rate = np.where(time % 120 < 60, 0.018, 0.0)
+    volume = np.concatenate([[0.0], np.cumsum(15.0 * pump_rate[:-1])])
+    noise = np.random.default_rng(2).normal(0.0, 0.005, len(time))
+    data = tidy(tmp_path / "slow.csv", 0.3 * np.exp(0.028 * time - volume / 0.31 + noise), time, pump_rate)
+    done = cli(data)
+    assert done.returncode == 1
+    told = "a segment of identify.segment_min = 120 min holds 8 rows 15 min apart, allowed at least 10: say "
+    assert f"slow.csv: {told}identify.segment_min=300; " in done.stderr
+    assert "rows are 15 min apart (median)" in done.stderr
+    assert done.stderr.count("\n") == 1
+    done = cli(data, "identify.segment_min=300")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["tau"]["value"] == pytest.approx(0.31, rel=0.05)
+
+
 def test_flaws_are_excluded_and_reported(
     cli: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> None:

@@ -1,10 +1,13 @@
 """The recording format: written so that a crash costs one row, read so that nothing bad passes in silence."""
 
+import gzip
+import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,7 @@ import pytest
 
 from hardware.errors import RecordingError
 from hardware.storage.recorder import Recorder
-from hardware.storage.recording_reader import read_recording
+from hardware.storage.recording_reader import Recording, read_recording
 from tests.real_recording import DITHER, needs_dither
 
 COLUMNS = ("time_min", "od", "pump_rate_ml_s")
@@ -359,3 +362,219 @@ def test_the_device_s_own_file_gives_base_times_emission(read: Callable[..., obj
     base = changed(np.full(len(T), 20000.0), 3, 0.0)  # switched off in the fourth cycle
     found = read(chibio(FP1_base=base, FP1_emit1=changed(np.full(len(T), 0.1), 3, 0.0))).fluorescence  # type: ignore[attr-defined]
     np.testing.assert_allclose(found, changed(np.full(len(T), 2000.0), 3, np.nan))
+
+
+# ---------------------------------------------------------------- one recording in many clothes
+
+SLOW_T = 2.0 * np.arange(60.0)  # a row every two minutes
+KNOWN_OD = 0.2 + 0.003 * SLOW_T + 0.01 * np.sin(SLOW_T)
+KNOWN_U = 0.7 * np.where(SLOW_T % 34 < 12, 0.02, 0.0)  # mL/s of a pump that gives 0.7 at full power
+START = datetime(2024, 4, 10, 23, 58, 30, tzinfo=UTC)  # runs over midnight
+
+
+def known(times: Iterable[object] = SLOW_T.tolist(), header: str = "time_min,od,pump_rate_ml_s") -> str:
+    rows = zip(times, KNOWN_OD.tolist(), KNOWN_U.tolist(), strict=True)
+    return "".join(f"{line}\n" for line in [*filter(None, [header]), *(f"{t},{y!r},{u!r}" for t, y, u in rows)])
+
+
+def moments(form: Callable[[datetime], object]) -> list[object]:
+    return [form(START + timedelta(minutes=t)) for t in SLOW_T.tolist()]
+
+
+IN_SECONDS = moments(lambda m: m.timestamp())
+IN_MS = moments(lambda m: round(1000 * m.timestamp()))
+EAST = timezone(timedelta(hours=5, minutes=30))
+DATE = "time is a date or counts s since 1970"
+MS = "time counts ms since 1970"
+COMMAS = "commas are read as decimal points"
+
+
+@pytest.mark.parametrize(
+    ("content", "note"),
+    [
+        pytest.param(known(IN_SECONDS, "time,od,pump_rate"), DATE, id="epoch-s"),
+        pytest.param(known(IN_SECONDS, "time_min,od,pump_rate"), DATE, id="epoch-s-called-minutes"),
+        pytest.param(known(IN_MS, "timestamp,od,pump_rate"), MS, id="epoch-ms"),
+        pytest.param(known(IN_MS, "exp_time,od,pump_rate"), MS, id="epoch-ms-called-seconds"),
+        pytest.param(known(IN_MS, ""), MS, id="epoch-ms-no-header"),
+        pytest.param(known(moments(lambda m: f"{m:%Y-%m-%dT%H:%M:%S}"), "time,od,pump_rate"), DATE, id="iso"),
+        pytest.param(known(moments(lambda m: f"{m:%Y-%m-%d %H:%M:%S}"), ""), DATE, id="iso-blank-no-header"),
+        pytest.param(known(moments(lambda m: f"{m:%Y-%m-%dT%H:%M:%S.%fZ}"), "time_s,od,pump_rate"), DATE, id="iso-z"),
+        pytest.param(
+            known(moments(lambda m: f'"{m.astimezone(EAST).isoformat()}"'), "Time,OD,pump_rate"), DATE, id="iso-offset"
+        ),
+        pytest.param(known().replace(",", ";").replace(".", ","), COMMAS, id="semicolon-decimal-comma"),
+        pytest.param(known(header="").replace(",", ";").replace(".", ","), COMMAS, id="decimal-comma-no-header"),
+        pytest.param(known().replace(",", "\t").replace(".", ","), COMMAS, id="tab-decimal-comma"),
+        pytest.param("time, min;od;pump_rate\n" + known(header="").replace(",", ";"), None, id="comma-in-a-name"),
+        pytest.param(gzip.compress(known().encode()), None, id="gz"),
+        pytest.param(known().replace("\n", "\r\n").encode("utf-16"), None, id="utf-16"),
+        pytest.param(b"\xfe\xff" + known().encode("utf-16-be"), None, id="utf-16-big"),
+        pytest.param(
+            gzip.compress(known().replace(",", ";").replace(".", ",").encode("utf-16")), COMMAS, id="gz-utf-16-commas"
+        ),
+    ],
+)
+def test_one_recording_in_many_clothes(read: Callable[..., Recording], content: str | bytes, note: str | None) -> None:
+    r = read(content)
+    np.testing.assert_allclose(r.time_min, SLOW_T, atol=1e-6)
+    np.testing.assert_array_equal(r.od, KNOWN_OD)
+    np.testing.assert_array_equal(r.pump_rate, KNOWN_U)
+    assert [n.split(":")[0] for n in r.notes] == [n for n in [note] if n]
+
+
+def test_a_time_without_unit_is_refused(read: Callable[..., Recording]) -> None:
+    with pytest.raises(RecordingError, match="column time holds 0 to 118, neither dates nor .*time_min, time_s or"):
+        read(known(header="time,od,pump_rate"))
+
+
+def test_a_clock_that_was_not_yet_set_costs_its_rows(read: Callable[..., Recording]) -> None:
+    """Single rows that count from 1970 among dates, or that hold a date among minutes, do not part the recording."""
+    unset = read(known([*IN_MS[:2], 5000, *IN_MS[3:]], "time,od,pump_rate"))
+    np.testing.assert_allclose(unset.time_min, np.delete(SLOW_T, 2), atol=1e-6)
+    assert unset.notes[-1].startswith("row 2: time or pump rate is not a finite number")
+    dated = read(known([*SLOW_T[:7].tolist(), "2024-04-10 12:00", *SLOW_T[8:].tolist()]))
+    np.testing.assert_array_equal(dated.time_min, np.delete(SLOW_T, 7))
+    assert len(dated.runs) == 1
+
+
+def test_a_quoted_cell_may_hold_the_separator_and_a_stray_quote_costs_one_row(read: Callable[..., Recording]) -> None:
+    lines = known(header="").splitlines()
+    quoted = ["note,time_min,od,pump_rate", *(f'"fed, then ""rested""",{line}' for line in lines)]
+    np.testing.assert_array_equal(read("\n".join(quoted) + "\n").od, KNOWN_OD)
+    quoted[4] = f'"torn,{lines[3]}'
+    stray = read("\n".join(quoted) + "\n")
+    assert stray.row.tolist() == [i for i in range(60) if i != 3]
+    assert stray.notes == ("row 3: fewer than 4 columns: dropped",)
+
+
+@pytest.mark.parametrize("lost", [3, 4, 29])
+@pytest.mark.parametrize("how", ["nan", "empty", "cut off", "cut off behind"])
+def test_rows_without_a_pump_rate_are_dropped_if_few(read: Callable[..., Recording], lost: int, how: str) -> None:
+    """Of 60 rows three are 5 %."""
+    lines = [line + ",0.5" * (how == "cut off behind") for line in known().splitlines()]
+    for i in range(1, 2 * lost, 2):
+        lines[i + 1] = lines[i + 1].rsplit(",", 1)[0] + {"nan": ",nan", "empty": ","}.get(how, "")
+    content = "\n".join(lines) + "\n"
+    if lost == 3:
+        r = read(content)
+        assert sorted(set(range(60)) - set(r.row.tolist())) == [1, 3, 5]
+        assert len(r.notes) == 1
+        assert r.notes[0].startswith("3 rows: 1, 3, 5: ")
+    else:
+        share = {4: "6.67", 29: "48.3"}[lost]
+        with pytest.raises(RecordingError, match=rf"{lost} rows: 1, 3, 5, 7.*{share} % .*allowed 5 %; write the rate"):
+            read(content)
+
+
+def test_what_was_read_and_noted_stands_beside_a_refusal(read: Callable[..., Recording]) -> None:
+    lines = chibio(pump_3_rate=U, od_measured=np.full(len(T), np.nan)).splitlines()
+    with pytest.raises(RecordingError, match=r"only 0 of 39 rows.*\(line 41: has no line end.*pump 3 ran.*pumps=\[3\]"):
+        read("\n".join(lines))
+
+
+@pytest.mark.parametrize(
+    ("rates", "note"),
+    [
+        pytest.param({1: 1.0, 3: 0.3}, "pump 3 ran and is not counted.*wrong: say pumps=[1,3]", id="a-second-feed"),
+        pytest.param({1: 1.0, 2: 0.6}, "pump 2 ran and is not counted.*wrong: say pumps=[1,2]", id="no-waste"),
+        pytest.param({1: 1.0, 2: 1.1}, None, id="waste"),
+        pytest.param({2: 1.1}, "pump 2 ran and is not counted.*say pumps=[2]", id="no-feed"),
+        pytest.param({1: 1.0, 4: np.nan}, None, id="a-pump-that-is-not-there"),
+    ],
+)
+def test_two_pumps_that_feed_are_told_from_feed_and_waste(
+    read: Callable[..., Recording], rates: dict[int, float], note: str | None
+) -> None:
+    r = read(chibio(**{f"pump_{pump}_rate": share * U for pump, share in rates.items()}))
+    assert len(r.notes) == bool(note)
+    assert not note or re.search(note.replace("[", r"\[").replace("]", r"\]"), r.notes[0])
+
+
+@pytest.mark.parametrize("apart", [2.0, 15.0])
+def test_rows_far_apart_are_noted(read: Callable[..., Recording], apart: float) -> None:
+    noted = [n for n in read(known((0.5 * apart * SLOW_T).tolist())).notes if n.startswith("rows are 15 min apart")]
+    assert len(noted) == (apart == 15.0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ((0, None), r"recording.csv: only 7 data rows; at least 10"),
+        ((2, None), "rows = 2:: 5 rows lie there; the file has rows 0:7"),
+        ((0, 5), "rows = 0:5: 5 rows"),
+    ],
+)
+def test_a_short_file_names_the_rows_that_were_asked_for(
+    read: Callable[..., Recording], rows: tuple[int, int | None], message: str
+) -> None:
+    with pytest.raises(RecordingError, match=message):
+        read(tidy(OD[:7], T[:7], U[:7]), rows=rows)
+
+
+def test_dates_without_an_offset_know_no_summer_time(
+    read: Callable[..., Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+    time.tzset()
+    try:
+        march = [datetime(2024, 3, 31, 1, 20) + timedelta(minutes=t) for t in SLOW_T.tolist()]
+        r = read(known(march, "time,od,pump_rate"))
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    np.testing.assert_allclose(r.time_min, SLOW_T, atol=1e-6)
+
+
+def test_of_many_runs_the_first_are_listed(read: Callable[..., Recording]) -> None:
+    r = read("".join(tidy(OD[:12], T[:12], U[:12], "") for _ in range(23)))
+    assert len(r.runs) == 23
+    assert "19: rows 228-239 and 3 more); run 0 is used" in r.notes[0]
+
+
+def test_a_header_begins_a_run_however_short(read: Callable[..., Recording]) -> None:
+    r = read(tidy() + tidy(OD[:3], T[:3], U[:3]) + ",".join(COLUMNS) + "\n")
+    assert r.runs == ((0, 39), (40, 42))
+
+
+def test_a_row_cut_off_before_its_reactor_is_noted(read: Callable[..., Recording]) -> None:
+    lines = [f"{line},{'reactor' if not i else f'M{i % 2}'}" for i, line in enumerate(known().splitlines())]
+    lines[5] = lines[5].rsplit(",", 2)[0]
+    r = read("\n".join(lines) + "\n", reactor="M1")
+    assert r.row.tolist() == [i for i in range(0, 60, 2) if i != 4]
+    assert r.notes[:2] == ("reactor M1 taken; the file also holds M0", "row 4: fewer than 4 columns: dropped")
+
+
+def test_a_reactor_that_is_not_there_is_named(read: Callable[..., Recording]) -> None:
+    content = "reactor," + known().replace("\n", "\nM4,").removesuffix("M4,")
+    with pytest.raises(RecordingError, match="reactor = M5: allowed is one of M4, which the file holds"):
+        read(content, reactor="M5")
+
+
+def test_a_broken_gz_is_named(read: Callable[..., Recording]) -> None:
+    whole = gzip.compress(known().encode())
+    with pytest.raises(RecordingError, match="cannot be read: Compressed file ended"):
+        read(whole[: len(whole) // 2])
+    with pytest.raises(RecordingError, match="cannot be read"):
+        read(whole[:20] + bytes(30) + whole[50:])
+
+
+def test_a_clock_that_restarts_parts_a_recording_whatever_stood_behind_it_before(
+    read: Callable[..., Recording],
+) -> None:
+    """Dense reference: rows that do not pass the latest time are stale, until five rise without passing it."""
+    rng = np.random.default_rng(7)
+    for _ in range(300):
+        time = np.cumsum(rng.choice([-9.0, -1.0, 0.0, 1.0, 2.0], 50, p=[0.08, 0.05, 0.05, 0.6, 0.22]))
+        runs: list[list[int]] = [[0]]
+        for i in range(1, 50):
+            latest, coming = time[runs[-1][-1]], time[i : i + 5]
+            if time[i] > latest:
+                runs[-1].append(i)
+            elif len(coming) == 5 and (np.diff(coming) > 0).all() and coming[-1] <= latest:
+                runs.append([i])
+        longest = max(runs, key=len)
+        if len(longest) >= 10:
+            r = read(tidy(np.linspace(0.2, 0.3, 50), time, np.zeros(50)))
+            assert r.row.tolist() == longest
+            assert r.runs == tuple((run[0], run[-1]) for run in runs)
