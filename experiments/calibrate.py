@@ -4,17 +4,20 @@ Also the generator of the paper's open-loop protocol (generate=true) and the cov
 """
 
 from contextlib import closing
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
 from envs.identification.calibration import Calibration, calibrate
+from envs.identification.model import NotIdentifiable
 from envs.identification.prediction_error import FEWEST_READINGS
-from envs.identification.screening import Series
+from envs.identification.refusal import growth_alone
+from envs.identification.screening import Series, merged
 from envs.identification.twin import Twin, twin
 from experiments.calibration.config import CalibrateConfig
-from experiments.calibration.result import environment_yaml, report, summary
+from experiments.calibration.result import environment_yaml, refusal, report, summary
 from experiments.calibration.study import coverage, simulated
 from experiments.calibration.twin_file import twin_yaml
 from experiments.cli import files, frame
@@ -52,14 +55,21 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
             reactor=config.reactor,
             rows=_rows(config.rows),
         )
-    raw = Series(recording.time_min, recording.od, recording.pump_rate, recording.row)
+    read = Series(recording.time_min, recording.od, recording.pump_rate, recording.row)
+    raw = merged(read)
+    if raw is not read:
+        merging = f"{len(read.time)} rows merged into {len(raw.time)} of a minute or more"
+        recording = replace(recording, notes=(*recording.notes, merging))
     hours = (raw.time[-1] - raw.time[0]) / 60
     print(f"{recording.source}: rows {raw.row[0]}-{raw.row[-1]}, {hours:.1f} h; fitting", flush=True)
     try:
         result = calibrate(raw, config.identify)
+    except NotIdentifiable as error:
+        line, content = refusal("; ".join([*_slow(raw, config), error.why]), error.remedy, growth_alone(raw), recording)
+        files.write_json(folder / "summary.json", {**content, "data": source})
+        raise frame.UserError(f"{source}: {line}") from None
     except ValueError as error:
-        why = "; ".join([*_slow(raw, config), str(error), *recording.notes])
-        raise frame.UserError(f"{source}: {why}") from None
+        raise frame.UserError("; ".join([f"{source}: {error}", *recording.notes])) from None
     name = Path(source).name
     environment = folder / f"{config.name}.yaml"
     content = summary(result, recording, raw)

@@ -134,7 +134,7 @@ def agreement(raw: Series, mu: float, tau: float) -> Agreement:
     """
     screened = screen(raw)
     clean = screened.series
-    along = segments(screened, SEGMENT_MIN, "prediction_error")
+    along = segments(screened, SEGMENT_MIN)
     used = np.flatnonzero(np.isfinite(clean.od))
     log_change, error = _one_ahead(clean, screened, mu, tau)
     predicted = np.full(len(clean.od), np.nan)

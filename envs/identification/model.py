@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from envs.identification.screening import Series, pumped_volume
 
-__all__ = ["NotIdentifiable", "Parameter", "check_excitation", "pmse", "start_level", "trajectory"]
+__all__ = ["REMEDY", "NotIdentifiable", "Parameter", "check_excitation", "pmse", "start_level", "trajectory"]
 
 Array = NDArray[np.float64]
 
@@ -22,8 +22,18 @@ MIN_READINGS = 20
 MIN_STEPS = 3  # rows at a low and at a high pump rate that a fit of tau needs
 
 
+REMEDY = (
+    "record with the pump stopped for 10 min every hour (which tells both within about 5 %), or in open loop as "
+    "generate=true does"
+)
+
+
 class NotIdentifiable(ValueError):
-    """The rows cannot tell the parameters; the message says which, why, and what recording could."""
+    """The rows cannot tell the parameters: why, and what recording could."""
+
+    def __init__(self, why: str, remedy: str = REMEDY) -> None:
+        super().__init__(f"{why}; {remedy}")
+        self.why, self.remedy = why, remedy
 
 
 @dataclass(frozen=True)
@@ -73,25 +83,24 @@ def check_excitation(series: Series) -> None:
     used = np.flatnonzero(np.isfinite(series.od))
     where = f"rows {series.row[0]}-{series.row[-1]}"
     if len(used) < MIN_READINGS:
-        raise NotIdentifiable(f"{where}: {len(used)} usable readings; at least {MIN_READINGS} are needed")
-    rate = series.pump_rate[used[0] : used[-1]]
-    if rate.max() == 0.0:
         raise NotIdentifiable(
-            f"{where}: the pump never runs, so tau cannot be determined (mu alone could); use a recording with "
-            "dilutions, e.g. the open-loop protocol of generate=true"
+            f"{where}: {len(used)} usable readings; at least {MIN_READINGS} are needed", "record for longer"
         )
+    rate = series.pump_rate[used[0] : used[-1]]
     low, high = float(rate.min()), float(rate.max())
+    if high == 0.0:
+        raise NotIdentifiable(f"{where}: the pump never runs, so nothing tells tau")
     middle = 0.5 * (low + high)
     if high - low < 1e-3 * high:
         raise NotIdentifiable(
             f"{where}: the pump never stops nor changes its rate (always {high:g} mL/s), so growth and dilution cannot "
-            "be told apart (only mu - u/tau could); use a recording in which the pump rests for a while"
+            "be told apart"
         )
     on, off = int((rate > middle).sum()), int((rate <= middle).sum())
     if min(on, off) < MIN_STEPS:
         raise NotIdentifiable(
             f"{where}: the pump is above {middle:g} mL/s in {on} rows and below in {off}; at least {MIN_STEPS} of each "
-            "are needed to tell dilution from growth; use a longer recording"
+            "are needed to tell dilution from growth"
         )
 
 

@@ -15,7 +15,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-__all__ = ["Rejection", "Screened", "Series", "noise_sd", "pumped_volume", "row_spans", "screen"]
+__all__ = [
+    "Rejection", "Screened", "Series", "merged", "noise_sd", "pumped_volume", "row_spans", "running_median", "runs",
+    "screen",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,6 +35,7 @@ SHORT_ROWS = 10  # between two jumps; what is shorter is a burst, not a regime
 FROZEN_ROWS = 10
 MIN_LEFT = 10
 NOISY_FACTOR = 6.0
+MOST_ROWS = 10080  # a week of minutes
 GAP_MIN = 5.0  # and five times the usual spacing: what the pump did meanwhile is unknown
 
 
@@ -94,6 +98,32 @@ def pumped_volume(time: Array, pump_rate: Array) -> Array:
     steps = pump_rate[..., :-1] * np.diff(time, axis=-1)
     start = np.zeros((*steps.shape[:-1], 1))
     return np.concatenate([start, np.cumsum(steps, axis=-1)], axis=-1)
+
+
+def runs(mask: Mask) -> list[tuple[int, int]]:
+    """Positions [first, end) of the stretches in which a mask, shape (n,), is True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def merged(series: Series) -> Series:
+    """The same with rows shorter than a minute merged, where there are more than a week of minutes has.
+
+    A merged row stands at the middle one of its rows, with the median of its readings; the pump's volume is kept.
+    """
+    if len(series.time) <= MOST_ROWS:
+        return series
+    minute = np.floor(series.time - series.time[0]).astype(np.int64)
+    first = np.flatnonzero(np.diff(minute, prepend=-1))
+    count = np.diff(first, append=len(minute))
+    order = np.lexsort((series.od, minute))  # nan last
+    readings = np.add.reduceat(np.isfinite(series.od), first, dtype=np.int64)
+    od = series.od[order[first + np.maximum(readings - 1, 0) // 2]]
+    middle = first + (count - 1) // 2
+    time = series.time[middle]
+    volume = pumped_volume(series.time, series.pump_rate)[middle]
+    rate = np.append(np.diff(volume) / np.diff(time), series.pump_rate[middle[-1]])
+    return Series(time, od, np.maximum(rate, 0.0), series.row[middle])
 
 
 def row_spans(rows: NDArray[np.int64]) -> str:
@@ -206,10 +236,8 @@ def _check_left(series: Series) -> None:
 
 def _frozen(od: Array) -> Mask:
     """True for the repeats (not the first) in a stretch of equal readings of at least FROZEN_ROWS."""
-    same = np.concatenate([[False], od[1:] == od[:-1]])
     frozen = np.zeros(len(od), dtype=np.bool_)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
+    for a, b in runs(np.concatenate([[False], od[1:] == od[:-1]])):
         if b - a + 1 >= FROZEN_ROWS:
             frozen[a:b] = True
     return frozen
@@ -236,9 +264,8 @@ def _jumps(series: Series, slow: Array) -> list[int]:
     size = np.maximum(level, OD_FLOOR) * np.expm1(np.abs(step))  # the jump in OD, free of growth and dilution
     smallest = max(JUMP_SHARE * float(np.percentile(y, 95)), OUTLIER_SD * noise_sd(series))
     big = (np.abs(step) > JUMP_LOG) & (size > smallest)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], big.astype(np.int8), [0]])))
     found = []
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
+    for a, b in runs(big):
         first, end = a + JUMP_ROWS - 2, min(b + JUMP_ROWS + 1, len(r))
         within = np.arange(max(first, 1), end)
         found.append(int(valid[within[np.argmax(np.abs(r[within] - r[within - 1]))]]))

@@ -9,7 +9,7 @@ from envs.identification.open_loop import OpenLoop
 
 __all__ = ["CalibrateConfig"]
 
-LAWS = ("open_loop", "pi", "threshold", "proportional")
+LAWS = ("open_loop", "pi", "pi_tuned", "threshold", "proportional")
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class CalibrateConfig:
     )
     law: str = setting(
         "open_loop",
-        "what moves the pump of a simulated recording: the paper's protocol, the device's PI, an on-off threshold, or "
-        "a proportional answer to each reading, which hides tau",
+        "what moves the pump of a simulated recording: the paper's protocol, the device's PI, a tuned one, an on-off "
+        "threshold, or a proportional answer to each reading, which hides tau",
         choices=LAWS,
     )
     setpoints: tuple[float, ...] = setting(

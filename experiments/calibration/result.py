@@ -9,12 +9,14 @@ from conf.schema import entries
 from envs.identification.calibration import Calibration
 from envs.identification.drift import Drift
 from envs.identification.model import Parameter
+from envs.identification.refusal import GrowthAlone
 from envs.identification.screening import Series, row_spans
+from envs.identification.verdict import Verdict
 from envs.task import EnvConfig
 from experiments.calibration.twin_file import yaml_line
 from hardware.storage.recording_reader import Recording
 
-__all__ = ["environment_yaml", "report", "summary"]
+__all__ = ["environment_yaml", "refusal", "report", "summary"]
 
 PMSE_FORMULA = "100 * sum (od - model)^2 / sum od^2 over the window, least-squares fit run freely from its start"
 
@@ -23,6 +25,7 @@ def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str,
     """What summary.json holds; rows are [first, end), counted from 0; n_rejected counts readings within `rows`."""
     row = result.screened.series.row
     return {
+        "verdict": asdict(result.verdict),
         "mu": _interval(result.mu),
         "tau": _interval(result.tau),
         "method": result.method,
@@ -59,12 +62,32 @@ def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str,
     }
 
 
+def refusal(why: str, remedy: str, alone: GrowthAlone | None, recording: Recording) -> tuple[str, dict[str, Any]]:
+    """The line that ends a refused calibration, and what summary.json holds of it."""
+    verdict = Verdict("record again", why, remedy)
+    known = [] if alone is None else [alone.words()]
+    content: dict[str, Any] = {
+        "verdict": asdict(verdict),
+        "mu": None,
+        "tau": None,
+        "mu_alone": None,
+        "net_growth": None,
+    }
+    if alone is not None:
+        content["net_growth"] = {**_interval(alone.net), "rows": list(alone.net_rows)}
+        if alone.mu is not None and alone.mu_rows is not None:
+            content["mu_alone"] = {**_interval(alone.mu), "rows": list(alone.mu_rows)}
+    content |= {"notes": list(recording.notes), "source": recording.source}
+    return "; ".join([verdict.line(), *known, *recording.notes]), content
+
+
 def _prediction_error(result: Calibration) -> dict[str, Any] | None:
     found = result.estimate
     if found is None or found.tau is None:
         return None
-    innovations = asdict(found.quality)
-    return {"mu": _interval(found.mu), "tau": _interval(found.tau), "innovations": innovations}
+    q = found.quality
+    spreads = {"dose_spread": _interval(q.dose_spread), "growth_spread": _interval(q.growth_spread)}
+    return {"mu": _interval(found.mu), "tau": _interval(found.tau), "innovations": asdict(q) | spreads}
 
 
 def _free_run(result: Calibration) -> dict[str, Any] | None:
@@ -99,26 +122,30 @@ def environment_yaml(result: Calibration, source: str) -> str:
         f"# Recording {source}, rows {first}:{end}, {result.n_used} readings, method {result.method}, "
         f"PMSE {result.pmse_pct:.3g} %.",
         f"# 95 % intervals: mu {mu.low:.6g} to {mu.high:.6g} 1/min, tau {tau.low:.6g} to {tau.high:.6g}.",
-        *(f"# Warning: {w}." for w in result.warnings),
+        f"# {result.verdict.line()}.",
+        *(f"# Against it: {w}." for w in result.warnings),
     ]
     lines += map(yaml_line, entries(model))
     return "\n".join(lines) + "\n"
 
 
 def report(result: Calibration, recording: Recording, content: dict[str, Any]) -> str:
-    """The result for a human, a dozen lines."""
+    """The result for a human, a dozen lines, the verdict first."""
     mu, tau, v = result.mu, result.tau, result.validation
     first, end = result.window_rows
     lines = [
+        "",
+        result.verdict.line(),
         "",
         f"  mu          {mu.value:.5f} 1/min   95 % {mu.low:.5f} to {mu.high:.5f}   "
         f"(doubling time {content['doubling_min']:.1f} min)",
         f"  tau         {tau.value:.4f}          95 % {tau.low:.4f} to {tau.high:.4f}   "
         f"(dilution {0.02 / tau.value:.4f} 1/min at 0.02 mL/s)",
-        f"  method      {result.method}; window rows {first}:{end} - {result.window_reason}",
+        f"  window      rows {first}:{end}, {result.window_reason}",
+        *_disturbances(result),
+        *_beside(result),
         f"  PMSE        {result.pmse_pct:.3g} %   (100 sum e^2 / sum OD^2 of the free-running least-squares fit, as in "
         f"the paper; {result.pair_pmse_pct:.3g} % with the returned pair)",
-        *_beside(result),
     ]
     if v.holdout_pct is not None and v.early_pct is not None:
         lines.append(
@@ -130,37 +157,43 @@ def report(result: Calibration, recording: Recording, content: dict[str, Any]) -
             f"              PMSE {v.outside_pct:.3g} % on {v.outside_n} readings outside the window, started afresh"
         )
     for name, drift in (("mu", result.drift_mu), ("tau", result.drift_tau)):
-        if drift is not None:
-            sure = "" if drift.significant else ", within its uncertainty"
+        if drift is not None and drift.significant:
             lines.append(
                 f"  drift       {name} {drift.first:.3g} to {drift.last:.3g} along the recording "
-                f"({drift.change_pct:+.0f} %{sure})"
+                f"({drift.change_pct:+.0f} %)"
             )
     lines += [f"  rejected    rows {row_spans(r.rows)} ({len(r.rows)}): {r.reason}" for r in result.screened.rejections]
     lines += [f"  note        {note}" for note in recording.notes]
-    lines += [f"  warning     {warning}" for warning in result.warnings]
+    lines += [f"  against     {warning}" for warning in result.warnings]
     return "\n".join(lines)
 
 
+def _disturbances(result: Calibration) -> list[str]:
+    """What the bench adds to the model, from the estimate."""
+    if result.estimate is None:
+        return []
+    q = result.estimate.quality
+    doses, growth = (
+        f"{100 * p.value:.0f} % ({100 * p.low:.0f} to {100 * p.high:.0f})" for p in (q.dose_spread, q.growth_spread)
+    )
+    return [
+        f"  bench       doses spread by {doses}, {100 * q.late_share:.0f} % of one is not seen by the next reading; "
+        f"readings by {100 * q.noise:.1f} %",
+        f"  culture     growth wanders by {growth} from hour to hour",
+    ]
+
+
 def _beside(result: Calibration) -> list[str]:
-    """The other method's pair, and what the disturbances are."""
-    lines = []
+    """The other method's pair."""
     free, found = result.free_run, result.estimate
     if result.method == "free_run":
         other = None if found is None or found.tau is None else (found.mu, found.tau, "prediction_error")
     else:
         other = None if free is None or free.tau is None else (free.mu, free.tau, "free_run")
-    if other is not None:
-        mu, tau, name = other
-        lines.append(
-            f"  beside      {name}: mu {mu.value:.5f} ({mu.low:.5f} to {mu.high:.5f}), "
-            f"tau {tau.value:.4f} ({tau.low:.4f} to {tau.high:.4f})"
-        )
-    if found is not None:
-        q = found.quality
-        lines.append(
-            f"  innovations variance {q.variance:.2f}, correlation {q.autocorrelation:+.2f}, kurtosis "
-            f"{q.kurtosis:.1f}; doses spread {100 * q.dose_spread:.0f} % and are seen one row late by "
-            f"{100 * q.late_share:.0f} %, growth wanders {100 * q.growth_spread:.0f} %"
-        )
-    return lines
+    if other is None:
+        return []
+    mu, tau, name = other
+    return [
+        f"  beside      {name}: mu {mu.value:.5f} ({mu.low:.5f} to {mu.high:.5f}), "
+        f"tau {tau.value:.4f} ({tau.low:.4f} to {tau.high:.4f})"
+    ]

@@ -1,5 +1,6 @@
 """Simulated recordings under any law, and how often the intervals of their calibrations hold the truth."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -7,18 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from envs.identification.calibration import calibrate
+from envs.identification.calibration import Calibration, IdentifyConfig, calibrate
 from envs.identification.open_loop import Decide, OpenLoopLaw, recordings
 from envs.identification.screening import Series
-from envs.task import MAX_PUMP_RATE
+from envs.task import MAX_PUMP_RATE, EnvConfig
 from experiments.calibration.config import CalibrateConfig
 from experiments.cli import files
+from experiments.laws.base import Controller
 from experiments.laws.density.baselines import Threshold, ThresholdConfig
-from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig
+from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 
-__all__ = ["coverage", "simulated"]
+__all__ = ["against_truth", "coverage", "fitted", "simulated"]
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Fitted = Calibration | str
 
 
 def simulated(config: CalibrateConfig, n: int) -> tuple[Array, Array, Array, Array]:
@@ -37,7 +41,12 @@ def _regulation(config: CalibrateConfig, n: int) -> Decide:
     if config.law == "proportional":
         middle = 0.5 * MAX_PUMP_RATE
         return lambda t, od: np.clip(middle + config.gain * (od - _setpoint(config, times, t)), 0.0, MAX_PUMP_RATE)
-    controller = ChiBioPI(ChiBioPIConfig()) if config.law == "pi" else Threshold(ThresholdConfig())
+    laws: dict[str, Callable[[], Controller]] = {
+        "pi": lambda: ChiBioPI(ChiBioPIConfig()),
+        "pi_tuned": lambda: TunedPI(TunedPIConfig(), EnvConfig(control_min=config.protocol.control_min)),
+        "threshold": lambda: Threshold(ThresholdConfig()),
+    }
+    controller = laws[config.law]()
     controller.reset(n)
     return lambda t, od: controller.act(od, np.full(n, _setpoint(config, times, t)), np.full(n, t), everyone)
 
@@ -46,54 +55,79 @@ def _setpoint(config: CalibrateConfig, times: Array, t: float) -> float:
     return config.setpoints[int(np.searchsorted(times, t, side="right"))]
 
 
-def coverage(config: CalibrateConfig, folder: Path) -> float:
-    """Share of simulated recordings whose 95 % intervals hold the truth; returns the smaller of the two, in %.
+def fitted(time: Array, od: Array, pump_rate: Array, config: IdentifyConfig, bar: bool = False) -> list[Fitted]:
+    """Calibrate each of N recordings, (T,) and (N, T); a refusal in words where there is no pair."""
+    found: list[Fitted] = []
+    for i in tqdm(range(len(od)), disable=None if bar else True):
+        try:
+            found.append(calibrate(Series(time, od[i], pump_rate[i], np.arange(len(time))), config))
+        except ValueError as error:
+            found.append(str(error))
+    return found
+
+
+def against_truth(found: list[Fitted], growth: Array, tau: Array) -> dict[str, Any]:
+    """How N calibrations do against their truth, (N,) each: what is accepted, and of that the share held, in %.
 
     mu is compared with the mean growth rate over the recording's rows, which differs from draw to draw where growth
-    wanders.
+    wanders. wrong_pct: accepted with an interval that does not hold the truth, of all.
     """
+    kept = [i for i, c in enumerate(found) if isinstance(c, Calibration)]
+    refusals = sorted({c for c in found if isinstance(c, str)})
+    numbers = {"recordings": len(found), "refused": len(found) - len(kept), "refusals": refusals[:5], "wrong_pct": 0.0}
+    if kept:
+        mu, tau_found = _intervals(found, "mu"), _intervals(found, "tau")
+        study = {"mu": _judged(mu, growth[kept]), "tau": _judged(tau_found, tau[kept])}
+        numbers |= {key: {name: part[key] for name, part in study.items()} for key in study["mu"]}
+        wrong = ~(_holds(mu, growth[kept]) & _holds(tau_found, tau[kept]))
+        numbers["wrong_pct"] = 100.0 * float(wrong.sum()) / len(found)
+    return numbers
+
+
+def coverage(config: CalibrateConfig, folder: Path) -> float:
+    """Share of simulated recordings whose 95 % intervals hold the truth; returns the smaller of the two, in %."""
     protocol, n = config.protocol, config.coverage
     title = f"{n} simulated recordings of {protocol.hours:g} h under {config.law}, {100 * protocol.noise:g} % noise"
     print(title, flush=True)
     time, od, pump_rate, growth = simulated(config, n)
-    rows = np.arange(len(time))
-    found, refused, kept = [], [], []
-    for i in tqdm(range(n), disable=None):
-        try:
-            found.append(calibrate(Series(time, od[i], pump_rate[i], rows), config.identify))
-            kept.append(i)
-        except ValueError as error:
-            refused.append(str(error))
-    numbers: dict[str, Any] = {"recordings": n, "refused": len(refused), "refusals": sorted(set(refused))[:5]}
+    found, tau = fitted(time, od, pump_rate, config.identify, bar=True), np.full(n, protocol.tau)
+    numbers = against_truth(found, growth, tau)
     worst = 100.0
-    if found:
-        mu, tau = (
-            np.array([(p.value, p.low, p.high) for p in column])
-            for column in ([c.mu for c in found], [c.tau for c in found])
-        )
-        truth = (growth[kept], np.full(len(kept), protocol.tau))
-        study = {"mu": _judged(mu, truth[0]), "tau": _judged(tau, truth[1])}
-        numbers |= {key: {name: part[key] for name, part in study.items()} for key in study["mu"]}
-        worst = min(part["coverage_pct"] for part in study.values())
+    if numbers["refused"] < n:
+        kept = [i for i, c in enumerate(found) if isinstance(c, Calibration)]
+        worst = min(numbers["coverage_pct"].values())
         from experiments.reporting.calibration_charts import coverage_figure
         from experiments.reporting.charts import save
 
-        save(coverage_figure(mu, tau, truth, f"{title} (seed {protocol.seed})"), folder / "figures", "coverage")
-        for name, part in study.items():
+        intervals, truth = (_intervals(found, "mu"), _intervals(found, "tau")), (growth[kept], tau[kept])
+        save(coverage_figure(*intervals, truth, f"{title} (seed {protocol.seed})"), folder / "figures", "coverage")
+        for name in ("mu", "tau"):
             print(
-                f"{name}: 95 % intervals hold the truth in {part['coverage_pct']:.1f} %, median bias "
-                f"{part['median_bias_pct']:+.2f} %, half width {part['relative_half_width_pct']:.1f} %"
+                f"{name}: 95 % intervals hold the truth in {numbers['coverage_pct'][name]:.1f} %, median bias "
+                f"{numbers['median_bias_pct'][name]:+.2f} %, half width "
+                f"{numbers['relative_half_width_pct'][name]:.1f} %"
             )
     files.write_json(folder / "summary.json", numbers)
-    print(f"refused: {len(refused)} of {n}" + (f"; the first: {refused[0]}" if refused else ""))
+    first = f"; the first: {numbers['refusals'][0]}" if numbers["refusals"] else ""
+    print(f"refused: {numbers['refused']} of {n}{first}")
     print(f"figure and summary in {folder}")
     return worst
 
 
+def _intervals(found: list[Fitted], name: str) -> Array:
+    """(value, low, high) of each that was accepted, shape (n, 3)."""
+    chosen = [getattr(c, name) for c in found if isinstance(c, Calibration)]
+    return np.array([(p.value, p.low, p.high) for p in chosen])
+
+
+def _holds(values: Array, truth: Array) -> Mask:
+    return np.asarray((values[:, 1] <= truth) & (truth <= values[:, 2]))
+
+
 def _judged(values: Array, truth: Array) -> dict[str, float]:
-    """(value, low, high) of each draw, shape (N, 3), against its truth, shape (N,)."""
+    """(value, low, high) of each draw, shape (n, 3), against its truth, shape (n,)."""
     return {
-        "coverage_pct": 100.0 * float(np.mean((values[:, 1] <= truth) & (truth <= values[:, 2]))),
+        "coverage_pct": 100.0 * float(np.mean(_holds(values, truth))),
         "median_bias_pct": 100.0 * float(np.median(values[:, 0] / truth) - 1.0),
         "relative_half_width_pct": 50.0 * float(np.median((values[:, 2] - values[:, 1]) / values[:, 0])),
     }

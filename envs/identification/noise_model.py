@@ -1,0 +1,147 @@
+"""The noise model of a recording, and its average: adaptive multiple importance sampling over what nobody measured.
+
+A point of the noise model is drawn from seven independent standard normals z, so that the prior of each number is a
+function of its z and no number has an edge:
+
+    p      0 or 1, the sign of z      reading noise alike at every OD, or in proportion to it
+    dose   0.3 exp(1.7 z)             sd of a mean dose's effect, in sd of a reading
+    wander 0.1 exp(1.5 z)             sd of growth that wanders, in sd of a reading per minute
+    memory 5 + 35 exp(z) min          after which it has forgotten 63 %
+    phi    0.9 F(z)                   correlation of reading noise from row to row, F the normal distribution function
+    late   clip(1.5 F(z) - 0.25)      share of a dose that the next reading does not see yet: one in six each at 0 and 1
+    mixing late clip(1.5 F(z) - 0.25) share of what a reading did not see that the one after does not see either: late
+                                      itself where a stirred vial mixes in first order
+
+`average` weighs points by their likelihood: first some of the prior, then rounds of them from a Student t with five
+degrees of freedom, fitted to all points before it. Weights for that fit are tempered where few points carry them all.
+Every point is weighed against the mixture of all proposals (Cornuet et al. 2012, Scand. J. Stat. 39:798).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["FULL", "QUICK", "NoiseModel", "average", "effective"]
+
+Array = NDArray[np.float64]
+
+DIMENSIONS = 7
+FULL = 12 * (128,)  # points of each round
+QUICK = (128, 64, 64)  # where many short series are estimated and an interval decides nothing alone
+TAIL = 5  # degrees of freedom of a proposal
+ENOUGH = 150  # effective points, after which no further round is needed
+FEWEST_EFFECTIVE = 24  # points that a proposal is fitted to
+LEAST_SPREAD = 0.01  # sd of a proposal in each direction, of the prior's
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """Points of the noise model, each number of shape (M, G); see the module's docstring."""
+
+    p: Array
+    dose: Array
+    wander: Array
+    memory: Array
+    phi: Array
+    late: Array
+    mixing: Array
+
+    @classmethod
+    def at(cls, z: Array) -> "NoiseModel":
+        """The points of z, shape (M, G, 7)."""
+        from scipy.special import ndtr
+
+        sign, dose, wander, memory, *shares = np.moveaxis(z, -1, 0)
+        phi, late, again = (ndtr(s) for s in shares)
+        late, again = (np.clip(1.5 * share - 0.25, 0.0, 1.0) for share in (late, again))
+        return cls(
+            p=(sign > 0.0).astype(np.float64),
+            dose=0.3 * np.exp(1.7 * dose),
+            wander=0.1 * np.exp(1.5 * wander),
+            memory=5.0 + 35.0 * np.exp(memory),
+            phi=0.9 * phi,
+            late=late,
+            mixing=late * again,
+        )
+
+
+def average(score: Callable[[Array], Array], series: int, rounds: tuple[int, ...], seed: int) -> tuple[Array, Array]:
+    """Points of the noise model and their weights for each of M series.
+
+    Args: score: logarithm of the likelihood at z, (M, g, 7) -> (M, g). series: M. rounds: points of each; the first are
+      drawn from the prior. seed: of the draws, the same for every series, so that none depends on those beside it.
+    Returns: z (M, G, 7) and weights (M, G) that sum to 1.
+    """
+    rng = np.random.default_rng(seed)
+    proposals = [_Student(np.zeros((series, DIMENSIONS)), np.tile(np.eye(DIMENSIONS), (series, 1, 1)), np.inf)]
+    z, scores = np.empty((series, 0, DIMENSIONS)), np.empty((series, 0))
+    for i, points in enumerate(rounds):
+        fresh = proposals[i].draw(rng, points)
+        z = np.concatenate([z, fresh], axis=1)
+        scores = np.concatenate([scores, score(fresh)], axis=1)
+        density = [np.log(n) + q.log_density(z) for n, q in zip(rounds, proposals, strict=False)]
+        log_weight = scores + proposals[0].log_density(z) - np.logaddexp.reduce(density, axis=0)
+        if (effective(_normalised(log_weight)) >= ENOUGH).all():
+            break
+        proposals.append(_fitted(z, _tempered(log_weight)))
+    return z, _normalised(log_weight)
+
+
+@dataclass(frozen=True, eq=False)
+class _Student:
+    """A Student t distribution for each series: centre (M, 7), root of the spread (M, 7, 7), degrees of freedom."""
+
+    centre: Array
+    root: Array
+    degrees: float
+
+    def draw(self, rng: np.random.Generator, points: int) -> Array:
+        """Shape (M, points, 7)."""
+        step = rng.standard_normal((points, DIMENSIONS))
+        if np.isfinite(self.degrees):
+            step *= np.sqrt(self.degrees / rng.chisquare(self.degrees, (points, 1)))
+        return np.asarray(self.centre[:, None] + step @ self.root.swapaxes(-1, -2))
+
+    def log_density(self, z: Array) -> Array:
+        """Up to a constant that all of one kind share, of z (M, G, 7): shape (M, G)."""
+        from scipy.special import gammaln
+
+        away = np.linalg.solve(self.root, (z - self.centre[:, None]).swapaxes(-1, -2))
+        square = np.sum(away**2, axis=1)
+        size = np.log(np.einsum("mii->mi", self.root)).sum(axis=1)[:, None]
+        if not np.isfinite(self.degrees):
+            return np.asarray(-0.5 * square - size - 0.5 * DIMENSIONS * np.log(2.0 * np.pi))
+        half, nu = 0.5 * (self.degrees + DIMENSIONS), self.degrees
+        constant = gammaln(half) - gammaln(0.5 * nu) - 0.5 * DIMENSIONS * np.log(nu * np.pi)
+        return np.asarray(constant - size - half * np.log1p(square / nu))
+
+
+def _fitted(z: Array, weight: Array) -> _Student:
+    """The proposal with the mean and the covariance of weighted points."""
+    centre = np.sum(weight[..., None] * z, axis=1)
+    away = z - centre[:, None]
+    spread = (weight[..., None] * away).swapaxes(-1, -2) @ away + LEAST_SPREAD**2 * np.eye(DIMENSIONS)
+    return _Student(centre, np.linalg.cholesky(spread), TAIL)
+
+
+def _normalised(log_weight: Array) -> Array:
+    weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+
+
+def effective(weight: Array) -> Array:
+    """How many points of equal weight are worth the same, 1 / sum w^2 (Kish 1965), shape (M,)."""
+    return np.asarray(1.0 / np.sum(weight**2, axis=1))
+
+
+def _tempered(log_weight: Array) -> Array:
+    """Weights to the largest power up to 1 that leaves FEWEST_EFFECTIVE effective points."""
+    chosen = _normalised(log_weight)
+    for power in np.geomspace(0.8, 1e-6, 60):
+        thin = effective(chosen) < FEWEST_EFFECTIVE
+        if not thin.any():
+            break
+        chosen = np.where(thin[:, None], _normalised(power * log_weight), chosen)
+    return chosen

@@ -1,0 +1,111 @@
+"""When an estimate of tau is not to be believed, and what its rows tell all the same."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from envs.identification.model import MIN_READINGS, NotIdentifiable, Parameter
+from envs.identification.prediction_error import WORST_CONDITION, Estimate, enough, estimate
+from envs.identification.screening import Series, runs, screen
+from envs.identification.window import longest
+
+__all__ = ["GrowthAlone", "check_estimate", "growth_alone"]
+
+PLAUSIBLE_MU = (0.001, 0.06)  # 1/min, doubling in 11 h to 12 min
+WIDEST_TAU = 0.3  # half width of 1/tau over its value
+STEEPEST_HILLS = 3.0  # spread of 1/tau between points of the noise model over that within one
+NARROW_TAU = 0.1  # half width of 1/tau over its value, below which hills do not matter
+SETTLED_ROWS = 2  # after a dose, which the readings may show late
+
+
+def check_estimate(found: Estimate, series: Series) -> None:
+    """Refuse an estimate that is not to be believed.
+
+    A law that answers each reading in proportion (u = u0 + c (x - r)) hides the dose's effect behind the correlation of
+    readings: mu comes out many times too high, with an interval that looks fine. What tells it is a wide tau, a 1/tau
+    that may be zero, an impossible mu, or a 1/tau that each noise model of those likely puts elsewhere.
+
+    Raises: NotIdentifiable.
+    """
+    rows = f"rows {series.row[0]}-{series.row[-1]}"
+    k, mu = found.inverse_tau, found.mu
+    if found.condition > WORST_CONDITION:
+        raise NotIdentifiable(f"{rows}: the pump's rate hardly changes, so growth and dilution cannot be told apart")
+    if k.low <= 0.0 or k.half_width > WIDEST_TAU * k.value:
+        raise NotIdentifiable(
+            f"{rows}: 1/tau = {k.value:.3g} with the 95 % interval {k.low:.3g} to {k.high:.3g}; allowed within "
+            f"+-{100 * WIDEST_TAU:.0f} %: they do not determine tau: too little dilution that is not an answer to the "
+            "readings, too much noise, or a culture that drifts"
+        )
+    if found.quality.hills > STEEPEST_HILLS and k.half_width > NARROW_TAU * k.value:
+        raise NotIdentifiable(
+            f"{rows}: 1/tau = {k.value:.3g} (95 % {k.low:.3g} to {k.high:.3g}) hangs on what is taken for noise: it "
+            f"spreads {found.quality.hills:.1f} times as far between noise models as within one; allowed "
+            f"{STEEPEST_HILLS:g} times: the pump only answers the readings"
+        )
+    if found.quality.answers and not PLAUSIBLE_MU[0] <= mu.value <= PLAUSIBLE_MU[1]:
+        raise NotIdentifiable(
+            f"{rows}: mu = {mu.value:.3g} 1/min, allowed {PLAUSIBLE_MU[0]:g} to {PLAUSIBLE_MU[1]:g} where the pump "
+            "answers the readings: growth and dilution cannot be told apart"
+        )
+
+
+@dataclass(frozen=True)
+class GrowthAlone:
+    """What rows tell that cannot tell tau, 1/min; rows are [first, end).
+
+    net: mean of mu - u/tau over the longest trustworthy stretch. mu: of the longest stretch in which the pump rested,
+    None where that is too short.
+    """
+
+    net: Parameter
+    net_rows: tuple[int, int]
+    mu: Parameter | None
+    mu_rows: tuple[int, int] | None
+
+    def words(self) -> str:
+        """One sentence."""
+        net = f"the net growth mu - u/tau is {_value(self.net)} 1/min over rows {_rows(self.net_rows)}"
+        if self.mu is None or self.mu_rows is None:
+            return net
+        if self.mu_rows == self.net_rows:
+            return f"mu alone is {_value(self.mu)} 1/min over rows {_rows(self.mu_rows)}"
+        return f"mu alone is {_value(self.mu)} 1/min over rows {_rows(self.mu_rows)}, where the pump rested; {net}"
+
+
+def _value(p: Parameter) -> str:
+    return f"{p.value:.5f} (95 % {p.low:.5f} to {p.high:.5f})"
+
+
+def _rows(rows: tuple[int, int]) -> str:
+    return f"{rows[0]}-{rows[1] - 1}"
+
+
+def growth_alone(raw: Series) -> GrowthAlone | None:
+    """mu and the net growth of a recording that cannot tell tau; None without the readings for either.
+
+    Raises: ValueError when no trustworthy readings are left.
+    """
+    screened = screen(raw)
+    whole = screened.series.part(*longest(screened))
+    if not enough(whole):
+        return None
+    rests = [(a if a == 0 else a + SETTLED_ROWS, b) for a, b in runs(whole.pump_rate == 0.0)]
+    parts = [whole.part(a, b) for a, b in rests if int((whole.od[a:b] > 0.0).sum()) >= MIN_READINGS]
+    parts = [max(parts, key=lambda part: len(part.od))] if parts else []
+    net, *mu = estimate([_unfed(whole), *parts])
+    return GrowthAlone(
+        net=net.mu,
+        net_rows=_span(whole),
+        mu=mu[0].mu if mu else None,
+        mu_rows=_span(parts[0]) if parts else None,
+    )
+
+
+def _unfed(series: Series) -> Series:
+    """Without its doses: what is left of growth is the net growth."""
+    return Series(series.time, series.od, np.zeros_like(series.pump_rate), series.row)
+
+
+def _span(series: Series) -> tuple[int, int]:
+    return int(series.row[0]), int(series.row[-1]) + 1

@@ -1,0 +1,104 @@
+"""What to do with a calibration, in one line: use it, use it with care, or record again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from envs.identification.model import REMEDY
+from envs.identification.refusal import PLAUSIBLE_MU
+from envs.identification.window import SHORTEST_WINDOW_MIN
+
+if TYPE_CHECKING:
+    from envs.identification.calibration import Calibration
+
+__all__ = ["Verdict", "judged"]
+
+PLAUSIBLE_TAU = (0.05, 2.0)
+WIDE_PCT = 10.0  # half width of an interval over its value
+UNEVEN = 0.25  # sd of a dose over its size
+UNSEEN = 0.5  # share of a dose that the next reading does not see
+CORRELATED = 0.2  # of innovations from row to row
+AGAIN = "calibrate again shortly before the run, or fly the policy that ships (policy=shipped), which needs no pair"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """word: use, use with care or record again. why: one clause. then: what to do next, "" where it is to train."""
+
+    word: str
+    why: str
+    then: str
+
+    def line(self) -> str:
+        """As it stands on the screen."""
+        return f"{self.word}: {self.why}" + (f"; {self.then}" if self.then else "")
+
+
+def judged(result: Calibration, limit: float) -> tuple[Verdict, tuple[str, ...]]:
+    """The verdict on a fit, and all that speaks against it, the gravest first. limit: of predictions, PMSE in %."""
+    against = list(_against(result, limit))
+    mu, tau = (100.0 * p.half_width / p.value for p in (result.mu, result.tau))
+    known = f"mu is known within +-{mu:.2g} % and tau within +-{tau:.2g} %"
+    if not against:
+        return Verdict("use", f"{known}, and nothing speaks against them", ""), ()
+    what, then = against[0]
+    more = f" ({len(against) - 1} more below)" if len(against) > 1 else ""
+    return Verdict("use with care", f"{known}; {what}{more}", then), tuple("; ".join(a) for a in against)
+
+
+def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
+    """(what is wrong, what to do about it)."""
+    mu, tau = result.mu, result.tau
+    for name, value, (low, high) in (("mu", mu.value, PLAUSIBLE_MU), ("tau", tau.value, PLAUSIBLE_TAU)):
+        if not low <= value <= high:
+            said = f"{name} = {value:.3g} lies outside the usual {low:g} to {high:g}"
+            yield said, "check the units of time and pump rate"
+    found = result.estimate
+    if result.method == "free_run":
+        if found is None or found.quality.answers:
+            yield (
+                "the pump answers the readings, and a free run then shrinks mu and 1/tau without a sign",
+                "use identify.method=prediction_error",
+            )
+        if result.pmse_pct > limit:
+            yield (
+                f"PMSE {result.pmse_pct:.2g} % exceeds {limit:.2g} %: one pair does not describe these rows",
+                "choose a shorter window by rows=FIRST:END",
+            )
+    inside = result.inside.time
+    if inside[-1] - inside[0] < SHORTEST_WINDOW_MIN:
+        said = f"the window lasts {inside[-1] - inside[0]:.0f} min"
+        yield said, f"record for {SHORTEST_WINDOW_MIN:.0f} min at least"
+    for name, line in (("mu", result.drift_mu), ("tau", result.drift_tau)):
+        if line is not None and line.notable:
+            yield (
+                f"{name} drifts from {line.first:.3g} to {line.last:.3g} ({line.change_pct:+.0f} %) on the way",
+                AGAIN,
+            )
+    v = result.validation
+    worst = max(2.0 * (v.early_pct or 0.0), limit)
+    for where, missed in (("the window's last 30 %", v.holdout_pct), ("the rows outside the window", v.outside_pct)):
+        if missed is not None and missed > worst:
+            yield f"{where} are predicted with a PMSE of {missed:.2g} %, allowed {worst:.2g} %", AGAIN
+    for name, p in (("mu", mu), ("tau", tau)):
+        if 100.0 * p.half_width > WIDE_PCT * p.value:
+            yield f"{name} is known within +-{100.0 * p.half_width / p.value:.0f} % only", REMEDY
+    if found is not None:
+        yield from _about_the_bench(result, found.quality.dose_spread.low, found.quality.late_share)
+        if abs(found.quality.autocorrelation) > CORRELATED:
+            yield (
+                f"what each reading adds correlates with the one before ({found.quality.autocorrelation:.2f}), so that "
+                "the intervals may be too narrow",
+                "look at figures/fit.png for what the culture does there",
+            )
+
+
+def _about_the_bench(result: Calibration, uneven: float, unseen: float) -> Iterator[tuple[str, str]]:
+    if uneven > UNEVEN:
+        said = f"doses spread by {100.0 * uneven:.0f} % at least"
+        yield said, "look at the feed's tube and needle, and measure the pump (python -m experiments.calibrate_pump)"
+    if unseen > UNSEEN:
+        said = f"the next reading does not see {100.0 * unseen:.0f} % of a dose"
+        yield said, "stir faster, or feed earlier before a reading"
