@@ -61,9 +61,10 @@ class IdentifyConfig:
 class Calibration:
     """Everything `calibrate` found. Positions refer to `screened.series`; window is [first, end).
 
-    mu, tau: the returned pair, by `method`. estimate, free_run: of the window by either method, None where that one
-    refuses. model: free run of the returned pair over the window from the start that fits best, OD, shape (n,).
-    pair_pmse_pct: its PMSE. pmse_pct: of the free-run fit, the paper's figure; of the pair where there is no such fit.
+    mu, tau: the returned pair, by `method`. estimate, free_run: of the window by either method, None where there is no
+    such fit; sound: whether the estimate tells tau. model: free run of the returned pair over the window from the start
+    that fits best, OD, shape (n,). pair_pmse_pct: its PMSE. pmse_pct: of the free-run fit, the paper's figure; of the
+    pair where there is no such fit.
     warnings: what speaks against the pair, the gravest first.
     """
 
@@ -73,7 +74,8 @@ class Calibration:
     method: str
     mu: Parameter
     tau: Parameter
-    estimate: Estimate | None
+    estimate: Estimate
+    sound: bool
     free_run: Fit | None
     model: Array
     pair_pmse_pct: float
@@ -120,16 +122,15 @@ def calibrate(series: Series, config: IdentifyConfig = IdentifyConfig()) -> Cali
             f"rows {inside.row[0]}-{inside.row[-1]}: too few readings above zero for a fit", "check the blank"
         )
     free_run = _free_run(inside, config.method)
-    whole: Estimate | None = estimate([inside], seed=config.seed)[0]
-    assert whole is not None
+    whole = estimate([inside], seed=config.seed)[0]
     try:
         check_estimate(whole, inside)
+        sound = True
     except NotIdentifiable:
+        sound = False
         if config.method == "prediction_error":
             raise
-        whole = None
-    returned = whole if config.method == "prediction_error" else free_run
-    assert returned is not None
+    returned = whole if free_run is None or config.method == "prediction_error" else free_run
     assert returned.tau is not None
     mu, tau = returned.mu, returned.tau
     model = _from_best_start(inside, mu.value, tau.value)
@@ -141,6 +142,7 @@ def calibrate(series: Series, config: IdentifyConfig = IdentifyConfig()) -> Cali
         mu=mu,
         tau=tau,
         estimate=whole,
+        sound=sound,
         free_run=free_run,
         model=model,
         pair_pmse_pct=pmse(inside.od, model),
@@ -172,11 +174,12 @@ def _without_outliers(screened: Screened, config: IdentifyConfig) -> Screened:
 
 
 def _limit(result: Calibration, config: IdentifyConfig) -> float:
-    """PMSE that a prediction may have, %: three times what the sensor's noise and the disturbances make."""
+    """PMSE that a prediction may have, %: three times what the noise makes, and disturbances where the fit has them."""
     clean = result.screened.series
     noise = 100.0 * noise_sd(clean) ** 2 / float(np.nanmean(clean.od**2))
-    disturbed = attainable_pct(result.estimate, result.inside, config.horizon_min) if result.estimate else 0.0
-    return max(config.pmse_limit, FLOOR_FACTOR * (noise + disturbed))
+    if config.method == "prediction_error":
+        noise += attainable_pct(result.estimate, result.inside, config.horizon_min)
+    return max(config.pmse_limit, FLOOR_FACTOR * noise)
 
 
 def _free_run(inside: Series, method: str) -> Fit | None:

@@ -19,7 +19,7 @@ Pair = tuple[Parameter | None, Parameter | None]
 NOTABLE_DRIFT_PCT = 10.0
 WANDERING_PCT = 33.0
 SUSPICION = 0.65  # of a 95 % half width: the 80 % interval
-WIDEST = 1.0  # half width of an estimate over its value; what is wider tells nothing of a drift
+WIDEST = 0.5  # half width of an estimate over its value; what is wider tells nothing of a drift
 
 
 @dataclass(frozen=True, eq=False)

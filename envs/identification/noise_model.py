@@ -8,9 +8,10 @@ function of its z and no number has an edge:
     wander 0.1 exp(1.5 z)             sd of growth that wanders, in sd of a reading per minute
     memory 5 + 35 exp(z) min          after which it has forgotten 63 %
     phi    0.9 F(z)                   correlation of reading noise from row to row, F the normal distribution function
-    late   clip(1.5 F(z) - 0.25)      share of a dose that the next reading does not see yet: one in six each at 0 and 1
+    late   clip(1.5 F(z) - 0.25)^2    share of a dose that the next reading does not see yet: one in six each at 0 and 1
     mixing late clip(1.5 F(z) - 0.25) share of what a reading did not see that the one after does not see either: late
-                                      itself where a stirred vial mixes in first order
+                                      itself where a stirred vial mixes in first order; 0.7 at most, as a dose that
+                                      is never seen would tell nothing of tau
 
 `average` weighs points by their likelihood: first some of the prior, then rounds of them from a Student t with five
 degrees of freedom, fitted to all points before it. Weights for that fit are tempered where few points carry them all.
@@ -28,10 +29,9 @@ __all__ = ["FULL", "QUICK", "NoiseModel", "average", "effective"]
 Array = NDArray[np.float64]
 
 DIMENSIONS = 7
-FULL = 12 * (128,)  # points of each round
+FULL = 10 * (128,)  # points of each round
 QUICK = (128, 64, 64)  # where many short series are estimated and an interval decides nothing alone
 TAIL = 5  # degrees of freedom of a proposal
-ENOUGH = 150  # effective points, after which no further round is needed
 FEWEST_EFFECTIVE = 24  # points that a proposal is fitted to
 LEAST_SPREAD = 0.01  # sd of a proposal in each direction, of the prior's
 
@@ -56,6 +56,7 @@ class NoiseModel:
         sign, dose, wander, memory, *shares = np.moveaxis(z, -1, 0)
         phi, late, again = (ndtr(s) for s in shares)
         late, again = (np.clip(1.5 * share - 0.25, 0.0, 1.0) for share in (late, again))
+        late = late**2  # small shares are drawn often enough to be found between the atom and the rest
         return cls(
             p=(sign > 0.0).astype(np.float64),
             dose=0.3 * np.exp(1.7 * dose),
@@ -63,7 +64,7 @@ class NoiseModel:
             memory=5.0 + 35.0 * np.exp(memory),
             phi=0.9 * phi,
             late=late,
-            mixing=late * again,
+            mixing=np.minimum(late * again, 0.7),
         )
 
 
@@ -83,8 +84,6 @@ def average(score: Callable[[Array], Array], series: int, rounds: tuple[int, ...
         scores = np.concatenate([scores, score(fresh)], axis=1)
         density = [np.log(n) + q.log_density(z) for n, q in zip(rounds, proposals, strict=False)]
         log_weight = scores + proposals[0].log_density(z) - np.logaddexp.reduce(density, axis=0)
-        if (effective(_normalised(log_weight)) >= ENOUGH).all():
-            break
         proposals.append(_fitted(z, _tempered(log_weight)))
     return z, _normalised(log_weight)
 

@@ -54,7 +54,7 @@ class _Batch:
 
     reading: True where there is one. dt: min to the next row, 0 in the padding. each: c. rms: c_rms, (M,). level:
     x / x_mean. columns: ln y, 1 and t. volume: C. scale: (M, 3), by which each regressor is divided. span: min between
-    first and last row, (M,).
+    first and last row, (M,). mean_od: of the running median, (M,).
     """
 
     reading: Mask
@@ -66,6 +66,7 @@ class _Batch:
     volume: Array
     scale: Array
     span: Array
+    mean_od: Array
 
     @property
     def degrees(self) -> Array:
@@ -86,7 +87,7 @@ def _batch(parts: list[Series]) -> _Batch:
     m, n = len(parts), max(len(part.od) for part in parts)
     reading = np.zeros((m, n), dtype=np.bool_)
     dt, each, volume, level = np.zeros((m, n)), np.zeros((m, n)), np.zeros((m, n)), np.ones((m, n))
-    columns, span = np.zeros((m, n, 3)), np.ones(m)
+    columns, span, mean_od = np.zeros((m, n, 3)), np.ones(m), np.ones(m)
     for i, part in enumerate(parts):
         rows = len(part.od)
         usable = part.od > OD_FLOOR
@@ -96,7 +97,8 @@ def _batch(parts: list[Series]) -> _Batch:
         each[i, : rows - 1] = np.diff(volume[i, :rows])
         smooth = running_median(np.where(usable, part.od, np.nan), LEVEL_ROWS)
         smooth = np.where(np.isfinite(smooth), smooth, np.nanmean(smooth))
-        level[i, :rows] = np.maximum(smooth, OD_FLOOR) / max(float(np.mean(smooth)), OD_FLOOR)
+        mean_od[i] = max(float(np.mean(smooth)), OD_FLOOR)
+        level[i, :rows] = np.maximum(smooth, OD_FLOOR) / mean_od[i]
         log_od = np.log(np.where(usable, part.od, 1.0))
         columns[i, :rows, 0] = np.where(usable, log_od - log_od[usable].mean(), 0.0)
         columns[i, :rows, 1] = 1.0
@@ -105,7 +107,7 @@ def _batch(parts: list[Series]) -> _Batch:
     pumped = volume.max(axis=1)
     scale = np.stack([np.ones(m), span, np.where(pumped > 0.0, pumped, 1.0)], axis=1)
     rms = np.sqrt(np.sum(each**2, axis=1) / np.array([len(part.od) for part in parts]))
-    return _Batch(reading, dt, each, np.where(rms > 0.0, rms, 1.0), level, columns, volume, scale, span)
+    return _Batch(reading, dt, each, np.where(rms > 0.0, rms, 1.0), level, columns, volume, scale, span, mean_od)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +245,8 @@ class Quality:
 
     variance, autocorrelation: of the one-step innovations in units of their own predicted sd, at the mean noise model.
     late_share: of a dose, not seen by the next reading. dose_spread: sd of a dose over its mean size. growth_spread: sd
-    of the mean growth over an hour, over mu. noise: sd of a reading relative to its OD at the mean OD. feedback:
+    of the mean growth over an hour, over mu. noise: sd of a reading relative to its OD at the mean OD; it is
+    hypot(noise_floor, noise_relative * OD) in OD, with the correlation noise_lag1 from row to row. feedback:
     correlation of an innovation with the change of the pump rate made on it; answers: it is beyond chance, 2/sqrt(n).
     effective: points of the noise model that carry the average. hills: 95 % of 1/tau's between points over that within.
     """
@@ -254,6 +257,9 @@ class Quality:
     dose_spread: Parameter
     growth_spread: Parameter
     noise: float
+    noise_floor: float
+    noise_relative: float
+    noise_lag1: float
     feedback: float
     answers: bool
     effective: float
@@ -319,6 +325,9 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
             dose_spread=_weighted(cells.dose[m] * sigma[m] / diluted, w),
             growth_spread=_weighted(hourly[m] * cells.wander[m] * sigma[m] / max(abs(mu.value), TINY), w),
             noise=own,
+            noise_floor=float(np.sqrt(w @ ((1.0 - cells.p[m]) * sigma[m] ** 2)) * batch.mean_od[m]),
+            noise_relative=float(np.sqrt(w @ (cells.p[m] * sigma[m] ** 2))),
+            noise_lag1=float(w @ cells.phi[m]),
             feedback=feedback,
             answers=abs(feedback) > 2.0 / float(np.sqrt(len(z))),
             effective=float(effective(w[None])[0]),

@@ -5,8 +5,8 @@ what is left of the readings is growth alone,
 
     g_i = ln y_i + sum over j < i of k(t_j) c_j = b + integral of mu + s_i + v_i,     c_j = u_j dt_j
 
-where doses that spread make s a random walk and v is the noise of the readings. Both are taken from the fast motion of
-g, and mu(t) is a smooth curve as k(t) is: a line plus a random walk, as large as the recording makes likely.
+where doses that spread make s a random walk and v is the noise of the readings, both as the window's estimate has them.
+mu(t) is a smooth curve as k(t) is: a line plus a random walk, as large as the recording makes likely.
 """
 
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from envs.identification.calibration import Calibration
 from envs.identification.model import Parameter
 from envs.identification.screening import OD_FLOOR, Series
+from envs.identification.validation import START_READINGS
 
 __all__ = ["Course", "Noise", "Twin", "twin"]
 
@@ -27,12 +28,6 @@ WANDER = np.concatenate([[0.0], np.geomspace(0.005, 0.3, 12)])  # of a curve abo
 FLAT = 25.0  # variance of levels, and of a line's two coefficients over the mean: far beyond what a recording leaves
 BLOCKS = 400  # of rows at most, whose means are compared with mu(t)
 EXACT = 1e-8  # variance of ln y that is left to a reading without noise: 0.01 % of the OD
-BANDS = 200  # of frequencies at most
-PHI = np.linspace(0.0, 0.95, 39)  # a plant's `lag1` goes so far
-RATIO = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 60)])  # variance of a row's dose over that of a reading
-LONGEST_PERIOD = 20.0  # rows; slower motion of g is growth that wanders and an error of k
-CLIP_SD = 4.5
-START_READINGS = 5
 OUTLIER_OD = 0.04  # least deviation of an outlier (docs/biology.md, Sensor)
 
 
@@ -89,7 +84,9 @@ def twin(raw: Series, result: Calibration, knot_every_min: float) -> Twin:
     knots = np.linspace(0.0, minutes, max(2, round(minutes / knot_every_min) + 1))
     k, k_cov, drifts = _inverse_tau(result, knots + part.time[0])
     rows = _Rows(part, [a - first for a, _ in edges], knots)
-    noise = _noise(rows, k, _outliers(rows, k, raw.part(first, end)))
+    q = result.estimate.quality
+    outliers = _outliers(rows, k, raw.part(first, end))
+    noise = Noise(q.noise_floor, q.noise_relative, q.noise_lag1, q.dose_spread.value, outliers)
     mu, mu_cov = _growth(rows, k, k_cov, noise, result.mu.value)
     mu_sd, k_sd = (1.96 * np.sqrt(np.maximum(np.diag(c), 0.0)) for c in (mu_cov, k_cov))
     started = (rows.grown(k) - rows.elapsed @ mu)[rows.seen][:START_READINGS]
@@ -219,46 +216,3 @@ def _outliers(rows: _Rows, k: Array, raw: Series) -> float:
     rejected = np.isfinite(raw.od) & ~np.isfinite(rows.part.od)
     far = np.abs(raw.od - np.exp(rows.grown(k) - rows.pumped @ k)) >= OUTLIER_OD
     return float((rejected & far).sum() / np.isfinite(raw.od).sum())
-
-
-def _noise(rows: _Rows, k: Array, outlier_rate: float) -> Noise:
-    """Noise of the readings and spread of the doses from the fast motion of g.
-
-    Steps of g have the spectrum q + v |1 - z|^2 (1 - phi^2) / |1 - phi z|^2, z = exp(-i omega): q by doses that spread,
-    v and phi by the readings. They are averaged over a grid by their Whittle likelihood, of periods up to 20 rows.
-    """
-    steps = np.diff(rows.grown(k))
-    steps -= np.median(steps)
-    limit = CLIP_SD * 1.4826 * float(np.median(np.abs(steps)))
-    steps = np.clip(steps, -limit, limit)
-    power = np.abs(np.fft.rfft(steps)) ** 2 / len(steps) + EXACT
-    omega = 2.0 * np.pi * np.fft.rfftfreq(len(steps))
-    kept = np.flatnonzero(omega > 2.0 * np.pi / LONGEST_PERIOD)
-    bands = np.array_split(kept, min(BANDS, len(kept)))
-    power, omega = (np.array([values[band].mean() for band in bands]) for values in (power, omega))
-    z, phi = np.exp(-1j * omega), PHI[:, None]
-    reading = np.abs(1.0 - z) ** 2 * (1.0 - phi**2) / np.abs(1.0 - phi * z) ** 2
-    shape = RATIO[:, None, None] + reading  # (ratios, phis, bands)
-    variance = np.mean(power / shape, axis=-1)
-    score = len(kept) * (-np.log(shape).mean(axis=-1) - np.log(variance))
-    share = np.exp(score - score.max())
-    share /= share.sum()
-    v, q = float(np.sum(share * variance)), float(np.sum(share * variance * RATIO[:, None]))
-    floor, relative = _split(rows, steps, v)
-    dose = float(np.mean(rows.doses(k)[:-1] ** 2))
-    cv = float(np.sqrt(q / dose)) if dose > 0.0 else 0.0
-    return Noise(floor, relative, float(np.sum(share * PHI)), cv, outlier_rate)
-
-
-def _split(rows: _Rows, steps: Array, v: float) -> tuple[float, float]:
-    """Floor (OD) and relative part of a noise whose mean variance in ln y is v.
-
-    Second differences of g, in which the noise prevails, follow floor^2 / y^2 + relative^2.
-    """
-    from scipy.optimize import nnls
-
-    level = np.interp(np.arange(len(rows.seen)), np.flatnonzero(rows.seen), rows.part.od[rows.seen])[1:-1]
-    columns = np.stack([level**-2.0, np.ones_like(level)], axis=1)
-    shares, _ = nnls(columns * level[:, None] ** 2, np.diff(steps) ** 2 * level**2)
-    scale = v / float(np.mean(columns @ shares)) if shares.any() else 0.0
-    return float(np.sqrt(scale * shares[0])), float(np.sqrt(scale * shares[1]))

@@ -57,7 +57,7 @@ def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
             yield said, "check the units of time and pump rate"
     found = result.estimate
     if result.method == "free_run":
-        if found is None or found.quality.answers:
+        if not result.sound or found.quality.answers:
             yield (
                 "the pump answers the readings, and a free run then shrinks mu and 1/tau without a sign",
                 "use identify.method=prediction_error",
@@ -85,7 +85,7 @@ def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
     for name, p in (("mu", mu), ("tau", tau)):
         if 100.0 * p.half_width > WIDE_PCT * p.value:
             yield f"{name} is known within +-{100.0 * p.half_width / p.value:.0f} % only", REMEDY
-    if found is not None:
+    if result.sound:
         yield from _about_the_bench(result, found.quality.dose_spread.low, found.quality.late_share)
         if abs(found.quality.autocorrelation) > CORRELATED:
             yield (

@@ -83,7 +83,7 @@ def refusal(why: str, remedy: str, alone: GrowthAlone | None, recording: Recordi
 
 def _prediction_error(result: Calibration) -> dict[str, Any] | None:
     found = result.estimate
-    if found is None or found.tau is None:
+    if not result.sound or found.tau is None:
         return None
     q = found.quality
     spreads = {"dose_spread": _interval(q.dose_spread), "growth_spread": _interval(q.growth_spread)}
@@ -170,7 +170,7 @@ def report(result: Calibration, recording: Recording, content: dict[str, Any]) -
 
 def _disturbances(result: Calibration) -> list[str]:
     """What the bench adds to the model, from the estimate."""
-    if result.estimate is None:
+    if not result.sound:
         return []
     q = result.estimate.quality
     doses, growth = (
@@ -187,7 +187,7 @@ def _beside(result: Calibration) -> list[str]:
     """The other method's pair."""
     free, found = result.free_run, result.estimate
     if result.method == "free_run":
-        other = None if found is None or found.tau is None else (found.mu, found.tau, "prediction_error")
+        other = None if not result.sound or found.tau is None else (found.mu, found.tau, "prediction_error")
     else:
         other = None if free is None or free.tau is None else (free.mu, free.tau, "free_run")
     if other is None:

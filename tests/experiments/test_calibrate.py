@@ -193,7 +193,7 @@ def test_rows_too_far_apart_for_the_segments_are_told_as_that(cli: Cli, tmp_path
     done = cli(data)
     assert done.returncode == 1
     told = "a segment of identify.segment_min = 120 min holds 8 rows 15 min apart, allowed at least 10: say "
-    assert f"slow.csv: {told}identify.segment_min=300; " in done.stderr
+    assert f"slow.csv: record again: {told}identify.segment_min=300; " in done.stderr
     assert "rows are 15 min apart (median)" in done.stderr
     assert done.stderr.count("\n") == 1
     done = cli(data, "identify.segment_min=300")
