@@ -16,8 +16,9 @@ from itertools import takewhile
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.identification.calibration import IdentifyConfig
 from envs.identification.drift import NOTABLE_DRIFT_PCT, Drift, Segment, cuts, drift, segments
-from envs.identification.model import Parameter
+from envs.identification.model import MIN_READINGS, Parameter
 from envs.identification.screening import OD_FLOOR, Screened, Series, screen
 from envs.identification.window import SHORTEST_WINDOW_MIN
 
@@ -25,9 +26,7 @@ __all__ = ["Agreement", "Compared", "agreement"]
 
 Array = NDArray[np.float64]
 
-SEGMENT_MIN = 120.0
 LAGS = 10  # rows over which errors are correlated: noise of a reading is in two of them
-FEWEST_ERRORS = 20
 
 
 @dataclass(frozen=True)
@@ -132,14 +131,14 @@ def agreement(raw: Series, mu: float, tau: float) -> Agreement:
 
     Raises: ValueError when no trustworthy readings are left.
     """
-    screened = screen(raw)
+    screened, every = screen(raw), IdentifyConfig().segment_min
     clean = screened.series
-    along = segments(screened, SEGMENT_MIN)
+    along = segments(screened, every)
     used = np.flatnonzero(np.isfinite(clean.od))
     log_change, error = _one_ahead(clean, screened, mu, tau)
     predicted = np.full(len(clean.od), np.nan)
     predicted[1:] = clean.od[:-1] * np.exp(log_change)
-    pieces = [p for first, end in screened.stretches for p in cuts(clean, first, end, SEGMENT_MIN)]
+    pieces = [p for first, end in screened.stretches for p in cuts(clean, first, end, every)]
     means, left = [], np.full(len(error), np.nan)
     for a, b in pieces:
         means.append(_mean(error[a : b - 1], clean.time[a:b]))
@@ -173,7 +172,7 @@ def _mean(error: Array, time: Array) -> Parameter | None:
     """Mean of e per minute with its 95 % interval (Newey and West 1987, Econometrica 55:703), None for too few."""
     seen = np.isfinite(error)
     n = int(seen.sum())
-    if n < FEWEST_ERRORS:
+    if n < MIN_READINGS:
         return None
     rate = float(np.mean(np.diff(time)))
     mean = float(error[seen].mean())

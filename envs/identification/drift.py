@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.identification.model import Parameter
+from envs.identification.model import WIDEST, WORST_CONDITION, Parameter
 from envs.identification.noise_model import QUICK
-from envs.identification.prediction_error import WORST_CONDITION, enough, estimate
+from envs.identification.prediction_error import enough, estimate
 from envs.identification.screening import Screened, Series
 
 __all__ = ["Drift", "Segment", "cuts", "drift", "drifts", "pairs", "segments"]
@@ -19,7 +19,6 @@ Pair = tuple[Parameter | None, Parameter | None]
 NOTABLE_DRIFT_PCT = 10.0
 WANDERING_PCT = 33.0
 SUSPICION = 0.65  # of a 95 % half width: the 80 % interval
-WIDEST = 0.5  # half width of an estimate over its value; what is wider tells nothing of a drift
 
 
 @dataclass(frozen=True, eq=False)

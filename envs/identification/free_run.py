@@ -10,18 +10,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.identification.model import NotIdentifiable, Parameter, pmse, trajectory
+from envs.identification.model import (
+    CONFIDENCE,
+    WIDEST,
+    WORST_CONDITION,
+    NotIdentifiable,
+    Parameter,
+    pmse,
+    trajectory,
+)  # fmt: skip
 from envs.identification.screening import OD_FLOOR, Series, pumped_volume
 
 __all__ = ["Fit", "fit"]
 
 Array = NDArray[np.float64]
 
-CONFIDENCE = 0.95
 HUBER_SD = 3.0
 MAX_REWEIGHTINGS = 20
-WORST_CONDITION = 1e12
-WIDEST_TAU = 0.5  # an interval wider than +-50 % is no measurement of tau
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +144,10 @@ def fit(series: Series, robust: bool = True) -> Fit:
 
 def _turned_over(series: Series, inverse: tuple[float, float, float]) -> Parameter:
     value, low, high = inverse
-    if low <= 0.0 or (high - low) / 2 > WIDEST_TAU * value:
+    if low <= 0.0 or (high - low) / 2 > WIDEST * value:
         raise NotIdentifiable(
             f"rows {series.row[0]}-{series.row[-1]}: 1/tau = {value:.3g} with the 95 % interval {low:.3g} to "
-            f"{high:.3g}; allowed within +-{100 * WIDEST_TAU:.0f} %: they do not determine tau: too little "
+            f"{high:.3g}; allowed within +-{100 * WIDEST:.0f} %: they do not determine tau: too little "
             "dilution, too much noise, or a culture that drifts; choose other rows"
         )
     return Parameter(1.0 / value, 1.0 / high, 1.0 / low)

@@ -19,6 +19,9 @@ __all__ = ["REMEDY", "NotIdentifiable", "Parameter", "check_excitation", "pmse",
 Array = NDArray[np.float64]
 
 MIN_READINGS = 20
+CONFIDENCE = 0.95
+WORST_CONDITION = 1e8  # of scaled normal equations
+WIDEST = 0.5  # half width of an interval over its value; what is wider is no measurement
 MIN_STEPS = 3  # rows at a low and at a high pump rate that a fit of tau needs
 
 

@@ -19,7 +19,7 @@ Every point is weighed against the mixture of all proposals (Cornuet et al. 2012
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,6 @@ __all__ = ["FULL", "QUICK", "NoiseModel", "average", "effective"]
 
 Array = NDArray[np.float64]
 
-DIMENSIONS = 7
 FULL = 10 * (128,)  # points of each round
 QUICK = (128, 64, 64)  # where many short series are estimated and an interval decides nothing alone
 TAIL = 5  # degrees of freedom of a proposal
@@ -75,9 +74,9 @@ def average(score: Callable[[Array], Array], series: int, rounds: tuple[int, ...
       drawn from the prior. seed: of the draws, the same for every series, so that none depends on those beside it.
     Returns: z (M, G, 7) and weights (M, G) that sum to 1.
     """
-    rng = np.random.default_rng(seed)
-    proposals = [_Student(np.zeros((series, DIMENSIONS)), np.tile(np.eye(DIMENSIONS), (series, 1, 1)), np.inf)]
-    z, scores = np.empty((series, 0, DIMENSIONS)), np.empty((series, 0))
+    rng, d = np.random.default_rng(seed), len(fields(NoiseModel))
+    proposals = [_Student(np.zeros((series, d)), np.tile(np.eye(d), (series, 1, 1)), np.inf)]
+    z, scores = np.empty((series, 0, d)), np.empty((series, 0))
     for i, points in enumerate(rounds):
         fresh = proposals[i].draw(rng, points)
         z = np.concatenate([z, fresh], axis=1)
@@ -98,7 +97,7 @@ class _Student:
 
     def draw(self, rng: np.random.Generator, points: int) -> Array:
         """Shape (M, points, 7)."""
-        step = rng.standard_normal((points, DIMENSIONS))
+        step = rng.standard_normal((points, self.centre.shape[1]))
         if np.isfinite(self.degrees):
             step *= np.sqrt(self.degrees / rng.chisquare(self.degrees, (points, 1)))
         return np.asarray(self.centre[:, None] + step @ self.root.swapaxes(-1, -2))
@@ -110,10 +109,11 @@ class _Student:
         away = np.linalg.solve(self.root, (z - self.centre[:, None]).swapaxes(-1, -2))
         square = np.sum(away**2, axis=1)
         size = np.log(np.einsum("mii->mi", self.root)).sum(axis=1)[:, None]
-        if not np.isfinite(self.degrees):
-            return np.asarray(-0.5 * square - size - 0.5 * DIMENSIONS * np.log(2.0 * np.pi))
-        half, nu = 0.5 * (self.degrees + DIMENSIONS), self.degrees
-        constant = gammaln(half) - gammaln(0.5 * nu) - 0.5 * DIMENSIONS * np.log(nu * np.pi)
+        d, nu = z.shape[-1], self.degrees
+        if not np.isfinite(nu):
+            return np.asarray(-0.5 * square - size - 0.5 * d * np.log(2.0 * np.pi))
+        half = 0.5 * (nu + d)
+        constant = gammaln(half) - gammaln(0.5 * nu) - 0.5 * d * np.log(nu * np.pi)
         return np.asarray(constant - size - half * np.log1p(square / nu))
 
 
@@ -121,7 +121,7 @@ def _fitted(z: Array, weight: Array) -> _Student:
     """The proposal with the mean and the covariance of weighted points."""
     centre = np.sum(weight[..., None] * z, axis=1)
     away = z - centre[:, None]
-    spread = (weight[..., None] * away).swapaxes(-1, -2) @ away + LEAST_SPREAD**2 * np.eye(DIMENSIONS)
+    spread = (weight[..., None] * away).swapaxes(-1, -2) @ away + LEAST_SPREAD**2 * np.eye(z.shape[-1])
     return _Student(centre, np.linalg.cholesky(spread), TAIL)
 
 

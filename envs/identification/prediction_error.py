@@ -24,11 +24,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.identification.model import Parameter
+from envs.identification.model import CONFIDENCE, Parameter
 from envs.identification.noise_model import FULL, QUICK, NoiseModel, average, effective
 from envs.identification.screening import OD_FLOOR, Series, pumped_volume, running_median
 
-__all__ = ["WORST_CONDITION", "Estimate", "Quality", "enough", "estimate", "outliers"]
+__all__ = ["FEWEST_READINGS", "Estimate", "Quality", "enough", "estimate", "outliers"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,13 +38,9 @@ COLUMNS = 4  # ln y, 1, t, -C
 MU, K = 1, 2  # positions among the three regressors
 TINY = 1e-300
 FEWEST_READINGS = 10
-CONFIDENCE = 0.95
 STRATA = 64  # of each point's Student t
-LEAST_WEIGHT = 1e-6  # of a point in the intervals, of the largest one's
-WORST_CONDITION = 1e8  # of the scaled normal equations
 
 OUTLIER_SD = 4.5
-OUTLIER_PASSES = 3
 OUTLIER_NEIGHBOURS = 2  # on each side: an outlier makes its neighbours look wrong as well
 
 
@@ -376,10 +372,9 @@ def _quantiles(centre: Array, sd: Array, weight: Array, degrees: float) -> Param
     """Median and central 95 % of a mixture of Student t distributions, each cut into STRATA of equal probability."""
     from scipy.special import stdtrit
 
-    kept = weight > LEAST_WEIGHT * weight.max()
     places = stdtrit(degrees, (np.arange(STRATA) + 0.5) / STRATA)
-    values = centre[kept][:, None] + sd[kept][:, None] * places
-    return _weighted(values.ravel(), np.repeat(weight[kept], STRATA))
+    values = centre[:, None] + sd[:, None] * places
+    return _weighted(values.ravel(), np.repeat(weight, STRATA))
 
 
 def _weighted(values: Array, weight: Array) -> Parameter:
@@ -429,7 +424,7 @@ def outliers(parts: list[Series], seed: int = 0) -> list[Mask]:
     Returns: for each series True at its outliers, shape (n,).
     """
     marked = [np.zeros(len(part.od), dtype=np.bool_) for part in parts]
-    for _ in range(OUTLIER_PASSES):
+    for _ in range(3):
         batch = _batch([part.rejecting(bad) for part, bad in zip(parts, marked, strict=True)])
         *_, cells = _averaged(batch, QUICK, seed)
         residual = _deletion_residuals(batch, cells, _solve(batch, cells).best[:, 0])

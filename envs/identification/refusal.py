@@ -4,17 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envs.identification.model import MIN_READINGS, NotIdentifiable, Parameter
-from envs.identification.prediction_error import WORST_CONDITION, Estimate, enough, estimate
+from envs.identification.model import MIN_READINGS, WORST_CONDITION, NotIdentifiable, Parameter
+from envs.identification.prediction_error import Estimate, enough, estimate
 from envs.identification.screening import Series, runs, screen
 from envs.identification.window import longest
 
 __all__ = ["GrowthAlone", "check_estimate", "growth_alone"]
 
 PLAUSIBLE_MU = (0.001, 0.06)  # 1/min, doubling in 11 h to 12 min
-WIDEST_TAU = 0.3  # half width of 1/tau over its value
+WIDEST_TAU = 0.3  # half width of 1/tau over its value, of a pair that is returned
 STEEPEST_HILLS = 3.0  # spread of 1/tau between points of the noise model over that within one
-NARROW_TAU = 0.1  # half width of 1/tau over its value, below which hills do not matter
+NARROW = 0.1  # half width of an interval over its value, below which hills do not matter
 SETTLED_ROWS = 2  # after a dose, which the readings may show late
 
 
@@ -37,7 +37,7 @@ def check_estimate(found: Estimate, series: Series) -> None:
             f"+-{100 * WIDEST_TAU:.0f} %: they do not determine tau: too little dilution that is not an answer to the "
             "readings, too much noise, or a culture that drifts"
         )
-    if found.quality.hills > STEEPEST_HILLS and k.half_width > NARROW_TAU * k.value:
+    if found.quality.hills > STEEPEST_HILLS and k.half_width > NARROW * k.value:
         raise NotIdentifiable(
             f"{rows}: 1/tau = {k.value:.3g} (95 % {k.low:.3g} to {k.high:.3g}) hangs on what is taken for noise: it "
             f"spreads {found.quality.hills:.1f} times as far between noise models as within one; allowed "

@@ -33,9 +33,8 @@ JUMP_SHARE = 0.1  # of the recording's 95th OD percentile; smaller steps carry n
 JUMP_ROWS = 5
 SHORT_ROWS = 10  # between two jumps; what is shorter is a burst, not a regime
 FROZEN_ROWS = 10
-MIN_LEFT = 10
 NOISY_FACTOR = 6.0
-MOST_ROWS = 10080  # a week of minutes
+WEEK_MIN = 10080
 GAP_MIN = 5.0  # and five times the usual spacing: what the pump did meanwhile is unknown
 
 
@@ -111,7 +110,7 @@ def merged(series: Series) -> Series:
 
     A merged row stands at the middle one of its rows, with the median of its readings; the pump's volume is kept.
     """
-    if len(series.time) <= MOST_ROWS:
+    if len(series.time) <= WEEK_MIN:
         return series
     minute = np.floor(series.time - series.time[0]).astype(np.int64)
     first = np.flatnonzero(np.diff(minute, prepend=-1))
@@ -227,10 +226,10 @@ def screen(series: Series) -> Screened:
 
 def _check_left(series: Series) -> None:
     left = int((series.od > 0.0).sum())
-    if left < MIN_LEFT:
+    if left < FROZEN_ROWS:
         raise ValueError(
-            f"{left} trustworthy readings above zero are left, at least {MIN_LEFT} are needed: the sensor was frozen, "
-            "dark or erratic throughout"
+            f"{left} trustworthy readings above zero are left, at least {FROZEN_ROWS} are needed: the sensor was "
+            "frozen, dark or erratic throughout"
         )
 
 

@@ -15,7 +15,6 @@ __all__ = ["Validation", "attainable_pct", "validate"]
 Array = NDArray[np.float64]
 
 START_READINGS = 5  # that set the start of a prediction and are not scored
-EARLY_SHARE = 0.7  # of the window, which predicts the rest of it
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Validation:
 def validate(screened: Screened, window: tuple[int, int], pair: tuple[float, float], horizon_min: float) -> Validation:
     """Score a pair (mu in 1/min, tau), and the one that the window's first part gives."""
     clean, (a, b) = screened.series, window
-    cut = a + int(EARLY_SHARE * (b - a))
+    cut = a + int(0.7 * (b - a))
     before = clean.part(a, cut)
     mu, tau = pairs([before])[0] if enough(before) else (None, None)
     late = early = _Scored(np.empty(0), np.empty(0))

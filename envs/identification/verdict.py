@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from envs.identification.model import REMEDY
-from envs.identification.refusal import PLAUSIBLE_MU
+from envs.identification.refusal import NARROW, PLAUSIBLE_MU
 from envs.identification.window import SHORTEST_WINDOW_MIN
 
 if TYPE_CHECKING:
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 __all__ = ["Verdict", "judged"]
 
 PLAUSIBLE_TAU = (0.05, 2.0)
-WIDE_PCT = 10.0  # half width of an interval over its value
 UNEVEN = 0.25  # sd of a dose over its size
 UNSEEN = 0.5  # share of a dose that the next reading does not see
 CORRELATED = 0.2  # of innovations from row to row
@@ -83,7 +82,7 @@ def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
         if missed is not None and missed > worst:
             yield f"{where} are predicted with a PMSE of {missed:.2g} %, allowed {worst:.2g} %", AGAIN
     for name, p in (("mu", mu), ("tau", tau)):
-        if 100.0 * p.half_width > WIDE_PCT * p.value:
+        if p.half_width > NARROW * p.value:
             yield f"{name} is known within +-{100.0 * p.half_width / p.value:.0f} % only", REMEDY
     if result.sound:
         yield from _about_the_bench(result, found.quality.dose_spread.low, found.quality.late_share)

@@ -4,14 +4,13 @@ import numpy as np
 
 from envs.identification.drift import Segment, drifts
 from envs.identification.model import NotIdentifiable
-from envs.identification.screening import Screened, Series
+from envs.identification.screening import WEEK_MIN, Screened, Series
 
 __all__ = ["SHORTEST_WINDOW_MIN", "choose_window", "longest"]
 
 Window = tuple[int, int]
 
 SHORTEST_WINDOW_MIN = 60.0
-LONGEST_WINDOW_MIN = 10080.0  # a week: no pair describes a culture for longer
 
 
 def choose_window(screened: Screened, along: tuple[Segment, ...]) -> tuple[Window, str]:
@@ -29,7 +28,7 @@ def choose_window(screened: Screened, along: tuple[Segment, ...]) -> tuple[Windo
             for j in range(len(inside), i, -1):
                 a, b = inside[i].first, inside[j - 1].end
                 longer = best is None or count[b] - count[a] > count[best[1]] - count[best[0]]
-                lasts = SHORTEST_WINDOW_MIN <= _minutes(clean, a, b) <= LONGEST_WINDOW_MIN
+                lasts = SHORTEST_WINDOW_MIN <= _minutes(clean, a, b) <= WEEK_MIN
                 if longer and lasts and not drifts(inside[i:j]):
                     best = (a, b)
     if best is None:
