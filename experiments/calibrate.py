@@ -8,11 +8,8 @@ from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
-import numpy as np
-
 from envs.identification.calibration import Calibration, calibrate
 from envs.identification.model import NotIdentifiable
-from envs.identification.prediction_error import FEWEST_READINGS
 from envs.identification.refusal import growth_alone
 from envs.identification.screening import Series, merged
 from envs.identification.twin import Twin, twin
@@ -63,9 +60,10 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     hours = (raw.time[-1] - raw.time[0]) / 60
     print(f"{recording.source}: rows {raw.row[0]}-{raw.row[-1]}, {hours:.1f} h; fitting", flush=True)
     try:
-        result = calibrate(raw, config.identify)
+        result = calibrate(raw, config.identify, recording.doubts)
     except NotIdentifiable as error:
-        line, content = refusal("; ".join([*_slow(raw, config), error.why]), error.remedy, growth_alone(raw), recording)
+        alone = None if recording.doubts else growth_alone(raw)
+        line, content = refusal(error, alone, recording)
         files.write_json(folder / "summary.json", {**content, "data": source})
         raise frame.UserError(f"{source}: {line}") from None
     except ValueError as error:
@@ -86,23 +84,12 @@ def _calibrate(config: CalibrateConfig, folder: Path) -> float:
     return result.pmse_pct
 
 
-def _slow(raw: Series, config: CalibrateConfig) -> list[str]:
-    """What to do where segments hold too few rows for an estimate of their own."""
-    apart, length = float(np.median(np.diff(raw.time))), config.identify.segment_min
-    if length >= FEWEST_READINGS * apart:
-        return []
-    return [
-        f"a segment of identify.segment_min = {length:g} min holds {int(length / apart)} rows {apart:.3g} min apart, "
-        f"allowed at least {FEWEST_READINGS}: say identify.segment_min={2 * FEWEST_READINGS * apart:.0f}"
-    ]
-
-
 def _write_twin(path: Path, behind: Twin, source: str) -> str:
     """Write the plant; returns what to say of it. A recording may show what no plant here can do."""
     try:
         text = twin_yaml(behind, source)
     except ValueError as error:
-        return f"no {path.name}: {error}"
+        return f"no {path.name}: {str(error)[-200:]}"
     path.write_text(text, encoding="utf-8")
     return str(path)
 

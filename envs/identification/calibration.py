@@ -104,17 +104,20 @@ class Calibration:
         return int(np.isfinite(self.inside.od).sum())
 
 
-def calibrate(series: Series, config: IdentifyConfig = IdentifyConfig()) -> Calibration:
+def calibrate(
+    series: Series, config: IdentifyConfig = IdentifyConfig(), doubts: tuple[tuple[str, str], ...] = ()
+) -> Calibration:
     """Fit (mu, tau) to the best window of a recording and report how far that pair can be trusted.
 
-    Args: series: raw recording.
+    Args: series: raw recording, `merged` where it has more rows than a week has minutes. doubts: about it, each with
+      what to do, for the verdict.
     Raises: NotIdentifiable when the trustworthy rows cannot give tau; ValueError when none are left.
     """
     screened = _without_outliers(screen(series), config)
     along = segments(screened, config.segment_min)
     window, reason = longest(screened), "all trustworthy rows, as asked (identify.window=all)"
     if config.window == "auto":
-        window, reason = choose_window(screened, along)
+        window, reason = choose_window(screened, along, config.segment_min)
     inside = screened.series.part(*window)
     check_excitation(inside)
     if not enough(inside):
@@ -154,7 +157,7 @@ def calibrate(series: Series, config: IdentifyConfig = IdentifyConfig()) -> Cali
         verdict=Verdict("", "", ""),
         warnings=(),
     )
-    verdict, warnings = judged(result, _limit(result, config))
+    verdict, warnings = judged(result, _limit(result, config), doubts)
     return replace(result, verdict=verdict, warnings=warnings)
 
 

@@ -94,18 +94,33 @@ def segments(screened: Screened, length: float) -> tuple[Segment, ...]:
 
 
 def drifts(along: tuple[Segment, ...]) -> bool:
-    """True when tau of the segments moves by 10 %, or mu by a third, beyond their 80 % interval.
+    """True when tau of the segments moves by 10 %, or mu by a third, beyond their 80 % interval, or mu steps so far.
 
     Growth that wanders is part of the model and mu its mean. Less certainty than for a warning: a window that may drift
     is not to be trusted (docs/calibration.md, Method, shows what either rule brings).
     """
     mu, tau = drift(along, [s.mu for s in along]), drift(along, [s.tau for s in along])
-    return any(
+    return _steps([s.mu for s in along if s.mu is not None]) or any(
         line is not None
         and abs(line.change_pct) >= most
         and abs(line.slope_per_h.value) > SUSPICION * line.slope_per_h.half_width
         for line, most in ((mu, WANDERING_PCT), (tau, NOTABLE_DRIFT_PCT))
     )
+
+
+def _steps(found: list[Parameter]) -> bool:
+    """Whether the estimates before some place differ by a third from those after it, beyond what scatters."""
+    value = np.array([p.value for p in found])
+    weight = np.array([max(p.half_width / 1.96, 1e-3 * abs(p.value)) for p in found]) ** -2.0
+    for j in range(1, len(found)):
+        parts = slice(0, j), slice(j, None)
+        before, after = (float(np.average(value[p], weights=weight[p])) for p in parts)
+        misfit = sum(float(weight[p] @ (value[p] - m) ** 2) for p, m in zip(parts, (before, after), strict=True))
+        spread = max(misfit / max(len(found) - 2, 1), 1.0) * sum(1.0 / float(weight[p].sum()) for p in parts)
+        notable = WANDERING_PCT / 100.0 * 0.5 * abs(before + after)
+        if abs(after - before) > max(notable, 1.96 * np.sqrt(spread)):
+            return True
+    return False
 
 
 def drift(along: tuple[Segment, ...], values: list[Parameter | None]) -> Drift | None:

@@ -92,7 +92,9 @@ def check_excitation(series: Series) -> None:
     rate = series.pump_rate[used[0] : used[-1]]
     low, high = float(rate.min()), float(rate.max())
     if high == 0.0:
-        raise NotIdentifiable(f"{where}: the pump never runs, so nothing tells tau")
+        raise NotIdentifiable(
+            f"{where}: the pump never runs, so nothing tells tau", "record with a pump that runs and rests"
+        )
     middle = 0.5 * (low + high)
     if high - low < 1e-3 * high:
         raise NotIdentifiable(

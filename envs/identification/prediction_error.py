@@ -249,7 +249,7 @@ class Quality:
 
     variance: float
     autocorrelation: float
-    late_share: float
+    late_share: Parameter
     dose_spread: Parameter
     growth_spread: Parameter
     noise: float
@@ -317,7 +317,7 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
         quality = Quality(
             variance=spread,
             autocorrelation=float(np.mean(z[1:] * z[:-1])) / spread,
-            late_share=float(w @ cells.late[m]),
+            late_share=_weighted(cells.late[m], w),
             dose_spread=_weighted(cells.dose[m] * sigma[m] / diluted, w),
             growth_spread=_weighted(hourly[m] * cells.wander[m] * sigma[m] / max(abs(mu.value), TINY), w),
             noise=own,

@@ -6,7 +6,8 @@ import numpy as np
 
 from envs.identification.model import MIN_READINGS, WORST_CONDITION, NotIdentifiable, Parameter
 from envs.identification.prediction_error import Estimate, enough, estimate
-from envs.identification.screening import Series, runs, screen
+from envs.identification.screening import OD_FLOOR, Series, noise_sd, runs, screen
+from envs.identification.validation import START_READINGS
 from envs.identification.window import longest
 
 __all__ = ["GrowthAlone", "check_estimate", "growth_alone"]
@@ -31,6 +32,8 @@ def check_estimate(found: Estimate, series: Series) -> None:
     k, mu = found.inverse_tau, found.mu
     if found.condition > WORST_CONDITION:
         raise NotIdentifiable(f"{rows}: the pump's rate hardly changes, so growth and dilution cannot be told apart")
+    if k.half_width > 10.0 * abs(k.value):
+        raise NotIdentifiable(f"{rows}: 1/tau may be anything: they hold too little dilution to tell it from growth")
     if k.low <= 0.0 or k.half_width > WIDEST_TAU * k.value:
         raise NotIdentifiable(
             f"{rows}: 1/tau = {k.value:.3g} with the 95 % interval {k.low:.3g} to {k.high:.3g}; allowed within "
@@ -54,8 +57,8 @@ def check_estimate(found: Estimate, series: Series) -> None:
 class GrowthAlone:
     """What rows tell that cannot tell tau, 1/min; rows are [first, end).
 
-    net: mean of mu - u/tau over the longest trustworthy stretch. mu: of the longest stretch in which the pump rested,
-    None where that is too short.
+    net: by which ln x really grew over the longest trustworthy stretch. mu: of the longest stretch in which the pump
+    rested, None where that is too short.
     """
 
     net: Parameter
@@ -65,7 +68,7 @@ class GrowthAlone:
 
     def words(self) -> str:
         """One sentence."""
-        net = f"the net growth mu - u/tau is {_value(self.net)} 1/min over rows {_rows(self.net_rows)}"
+        net = f"the culture's net growth is {_value(self.net)} 1/min over rows {_rows(self.net_rows)}"
         if self.mu is None or self.mu_rows is None:
             return net
         if self.mu_rows == self.net_rows:
@@ -93,18 +96,27 @@ def growth_alone(raw: Series) -> GrowthAlone | None:
     rests = [(a if a == 0 else a + SETTLED_ROWS, b) for a, b in runs(whole.pump_rate == 0.0)]
     parts = [whole.part(a, b) for a, b in rests if int((whole.od[a:b] > 0.0).sum()) >= MIN_READINGS]
     parts = [max(parts, key=lambda part: len(part.od))] if parts else []
-    net, *mu = estimate([_unfed(whole), *parts])
+    mu = [e.mu for e in estimate(parts)] if parts else []
     return GrowthAlone(
-        net=net.mu,
+        net=_mean_slope(whole),
         net_rows=_span(whole),
-        mu=mu[0].mu if mu else None,
+        mu=mu[0] if mu else None,
         mu_rows=_span(parts[0]) if parts else None,
     )
 
 
-def _unfed(series: Series) -> Series:
-    """Without its doses: what is left of growth is the net growth."""
-    return Series(series.time, series.od, np.zeros_like(series.pump_rate), series.row)
+def _mean_slope(series: Series) -> Parameter:
+    """(ln y_end - ln y_start) per minute, the ends medians of five readings whose errors are those of the noise."""
+    seen = np.flatnonzero(series.od > OD_FLOOR)
+    ends = seen[:START_READINGS], seen[-START_READINGS:]
+    (first, last), (began, ended) = (
+        [float(f(values[end])) for end in ends]
+        for f, values in ((np.median, np.log(np.maximum(series.od, OD_FLOOR))), (np.mean, series.time))
+    )
+    noise = noise_sd(series) / float(np.nanmean(series.od))
+    half = 1.96 * noise * float(np.sqrt(np.pi / START_READINGS)) / (ended - began)  # sd of a median: sqrt(pi/2n)
+    slope = (last - first) / (ended - began)
+    return Parameter(slope, slope - half, slope + half)
 
 
 def _span(series: Series) -> tuple[int, int]:

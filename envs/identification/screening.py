@@ -106,7 +106,7 @@ def runs(mask: Mask) -> list[tuple[int, int]]:
 
 
 def merged(series: Series) -> Series:
-    """The same with rows shorter than a minute merged, where there are more than a week of minutes has.
+    """The same with rows of half a minute and less merged, where there are more than a week of minutes has.
 
     A merged row stands at the middle one of its rows, with the median of its readings; the pump's volume is kept.
     """
@@ -114,6 +114,8 @@ def merged(series: Series) -> Series:
         return series
     minute = np.floor(series.time - series.time[0]).astype(np.int64)
     first = np.flatnonzero(np.diff(minute, prepend=-1))
+    if 2 * len(first) > len(minute):
+        return series
     count = np.diff(first, append=len(minute))
     order = np.lexsort((series.od, minute))  # nan last
     readings = np.add.reduceat(np.isfinite(series.od), first, dtype=np.int64)
@@ -122,7 +124,7 @@ def merged(series: Series) -> Series:
     time = series.time[middle]
     volume = pumped_volume(series.time, series.pump_rate)[middle]
     rate = np.append(np.diff(volume) / np.diff(time), series.pump_rate[middle[-1]])
-    return Series(time, od, np.maximum(rate, 0.0), series.row[middle])
+    return Series(time, od, np.maximum(rate, 0.0), series.row[first])
 
 
 def row_spans(rows: NDArray[np.int64]) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from envs.identification.calibration import Calibration
 from envs.identification.model import Parameter
-from envs.identification.screening import OD_FLOOR, Series
+from envs.identification.screening import OD_FLOOR, WEEK_MIN, Series
 from envs.identification.validation import START_READINGS
 
 __all__ = ["Course", "Noise", "Twin", "twin"]
@@ -75,10 +75,15 @@ class Twin:
 def twin(raw: Series, result: Calibration, knot_every_min: float) -> Twin:
     """The plant behind all trustworthy rows of a calibrated recording, with a knot about every `knot_every_min` min.
 
+    Of a recording of more than a week it is that of the window.
+
     Args: raw: the recording before screening, at the same positions as `result`'s.
     """
     edges = result.screened.stretches
     first, end = edges[0][0], edges[-1][1]
+    if np.ptp(result.screened.series.time[[first, end - 1]]) > WEEK_MIN:
+        first, end = result.window
+        edges = tuple((max(a, first), min(b, end)) for a, b in edges if a < end and b > first)
     part = result.screened.series.part(first, end)
     minutes = float(part.time[-1] - part.time[0])
     knots = np.linspace(0.0, minutes, max(2, round(minutes / knot_every_min) + 1))

@@ -6,7 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from envs.identification.model import REMEDY
+from envs.identification.prediction_error import Quality
 from envs.identification.refusal import NARROW, PLAUSIBLE_MU
 from envs.identification.window import SHORTEST_WINDOW_MIN
 
@@ -17,6 +20,8 @@ __all__ = ["Verdict", "judged"]
 
 PLAUSIBLE_TAU = (0.05, 2.0)
 UNEVEN = 0.25  # sd of a dose over its size
+SLOW_ROWS_MIN = 2.0  # a pump that changes between rows misleads the estimate
+UNSTEADY = 0.15  # sd of the mean growth over an hour, over mu
 UNSEEN = 0.5  # share of a dose that the next reading does not see
 CORRELATED = 0.2  # of innovations from row to row
 AGAIN = "calibrate again shortly before the run, or fly the policy that ships (policy=shipped), which needs no pair"
@@ -35,9 +40,14 @@ class Verdict:
         return f"{self.word}: {self.why}" + (f"; {self.then}" if self.then else "")
 
 
-def judged(result: Calibration, limit: float) -> tuple[Verdict, tuple[str, ...]]:
-    """The verdict on a fit, and all that speaks against it, the gravest first. limit: of predictions, PMSE in %."""
-    against = list(_against(result, limit))
+def judged(
+    result: Calibration, limit: float, doubts: tuple[tuple[str, str], ...] = ()
+) -> tuple[Verdict, tuple[str, ...]]:
+    """The verdict on a fit, and all that speaks against it, the gravest first.
+
+    Args: limit: of predictions, PMSE in %. doubts: about the recording, each with what to do.
+    """
+    against = [*doubts, *_against(result, limit)]
     mu, tau = (100.0 * p.half_width / p.value for p in (result.mu, result.tau))
     known = f"mu is known within +-{mu:.2g} % and tau within +-{tau:.2g} %"
     if not against:
@@ -67,6 +77,9 @@ def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
                 "choose a shorter window by rows=FIRST:END",
             )
     inside = result.inside.time
+    apart = float(np.median(np.diff(inside)))
+    if apart > SLOW_ROWS_MIN:
+        yield f"rows are {apart:.3g} min apart", "record every minute, or every change of the pump's rate"
     if inside[-1] - inside[0] < SHORTEST_WINDOW_MIN:
         said = f"the window lasts {inside[-1] - inside[0]:.0f} min"
         yield said, f"record for {SHORTEST_WINDOW_MIN:.0f} min at least"
@@ -81,11 +94,10 @@ def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
     for where, missed in (("the window's last 30 %", v.holdout_pct), ("the rows outside the window", v.outside_pct)):
         if missed is not None and missed > worst:
             yield f"{where} are predicted with a PMSE of {missed:.2g} %, allowed {worst:.2g} %", AGAIN
-    for name, p in (("mu", mu), ("tau", tau)):
-        if p.half_width > NARROW * p.value:
-            yield f"{name} is known within +-{100.0 * p.half_width / p.value:.0f} % only", REMEDY
+    if any(p.half_width > NARROW * p.value for p in (mu, tau)):
+        yield f"that is wider than +-{100.0 * NARROW:.0f} %", REMEDY
     if result.sound:
-        yield from _about_the_bench(result, found.quality.dose_spread.low, found.quality.late_share)
+        yield from _about_bench_and_culture(found.quality)
         if abs(found.quality.autocorrelation) > CORRELATED:
             yield (
                 f"what each reading adds correlates with the one before ({found.quality.autocorrelation:.2f}), so that "
@@ -94,10 +106,13 @@ def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
             )
 
 
-def _about_the_bench(result: Calibration, uneven: float, unseen: float) -> Iterator[tuple[str, str]]:
-    if uneven > UNEVEN:
-        said = f"doses spread by {100.0 * uneven:.0f} % at least"
+def _about_bench_and_culture(q: Quality) -> Iterator[tuple[str, str]]:
+    """By the lower end of each interval."""
+    if q.growth_spread.low > UNSTEADY:
+        yield f"growth wanders by {100.0 * q.growth_spread.low:.0f} % at least from hour to hour", AGAIN
+    if q.dose_spread.low > UNEVEN:
+        said = f"doses spread by {100.0 * q.dose_spread.low:.0f} % at least"
         yield said, "look at the feed's tube and needle, and measure the pump (python -m experiments.calibrate_pump)"
-    if unseen > UNSEEN:
-        said = f"the next reading does not see {100.0 * unseen:.0f} % of a dose"
+    if q.late_share.low > UNSEEN:
+        said = f"the next reading does not see {100.0 * q.late_share.low:.0f} % of a dose at least"
         yield said, "stir faster, or feed earlier before a reading"

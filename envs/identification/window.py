@@ -4,6 +4,7 @@ import numpy as np
 
 from envs.identification.drift import Segment, drifts
 from envs.identification.model import NotIdentifiable
+from envs.identification.prediction_error import FEWEST_READINGS
 from envs.identification.screening import WEEK_MIN, Screened, Series
 
 __all__ = ["SHORTEST_WINDOW_MIN", "choose_window", "longest"]
@@ -13,13 +14,20 @@ Window = tuple[int, int]
 SHORTEST_WINDOW_MIN = 60.0
 
 
-def choose_window(screened: Screened, along: tuple[Segment, ...]) -> tuple[Window, str]:
+def choose_window(screened: Screened, along: tuple[Segment, ...], segment_min: float) -> tuple[Window, str]:
     """Positions [first, end) of the window with most readings, and the reason in words.
 
     Consecutive segments of one stretch whose estimates do not drift, of a week at most.
     Raises: NotIdentifiable when there is none of an hour at least.
     """
     clean = screened.series
+    apart = float(np.median(np.diff(clean.time)))
+    if segment_min < FEWEST_READINGS * apart:
+        raise NotIdentifiable(
+            f"rows are {apart:.3g} min apart, and a segment of {segment_min:g} min holds {segment_min / apart:.0f}; "
+            f"allowed at least {FEWEST_READINGS}",
+            f"check the unit of time, or say identify.segment_min={2 * FEWEST_READINGS * apart:.0f}",
+        )
     count = np.concatenate([[0], np.cumsum(np.isfinite(clean.od))])
     best: Window | None = None
     for first, end in screened.stretches:
@@ -38,8 +46,11 @@ def choose_window(screened: Screened, along: tuple[Segment, ...]) -> tuple[Windo
             f"{_minutes(clean, a, b):.0f} min; allowed at least {SHORTEST_WINDOW_MIN:.0f} min",
             "record for longer",
         )
-    whole = len(screened.stretches) == 1 and best == screened.stretches[0]
-    return best, ("all trustworthy rows" if whole else "the longest stretch without drift")
+    if best in screened.stretches:
+        return best, "all trustworthy rows" if len(screened.stretches) == 1 else "the longest stretch without a pause"
+    follows = [s for s in along if s.first == best[1]]
+    capped = any(_minutes(clean, best[0], s.end) > WEEK_MIN for s in follows)
+    return best, "the longest stretch without drift" + (", of a week at most" if capped else "")
 
 
 def longest(screened: Screened) -> Window:

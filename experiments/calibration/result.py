@@ -8,7 +8,7 @@ import numpy as np
 from conf.schema import entries
 from envs.identification.calibration import Calibration
 from envs.identification.drift import Drift
-from envs.identification.model import Parameter
+from envs.identification.model import NotIdentifiable, Parameter
 from envs.identification.refusal import GrowthAlone
 from envs.identification.screening import Series, row_spans
 from envs.identification.verdict import Verdict
@@ -62,9 +62,13 @@ def summary(result: Calibration, recording: Recording, raw: Series) -> dict[str,
     }
 
 
-def refusal(why: str, remedy: str, alone: GrowthAlone | None, recording: Recording) -> tuple[str, dict[str, Any]]:
-    """The line that ends a refused calibration, and what summary.json holds of it."""
-    verdict = Verdict("record again", why, remedy)
+def refusal(error: NotIdentifiable, alone: GrowthAlone | None, recording: Recording) -> tuple[str, dict[str, Any]]:
+    """The line that ends a refused calibration, and what summary.json holds of it.
+
+    A doubt about the recording comes first: who counts the wrong pump has nothing else to record.
+    """
+    what, then = recording.doubts[0] if recording.doubts else ("", error.remedy)
+    verdict = Verdict("record again" if not what else "read again", "; ".join(filter(None, (what, error.why))), then)
     known = [] if alone is None else [alone.words()]
     content: dict[str, Any] = {
         "verdict": asdict(verdict),
@@ -86,7 +90,7 @@ def _prediction_error(result: Calibration) -> dict[str, Any] | None:
     if not result.sound or found.tau is None:
         return None
     q = found.quality
-    spreads = {"dose_spread": _interval(q.dose_spread), "growth_spread": _interval(q.growth_spread)}
+    spreads = {name: _interval(getattr(q, name)) for name in ("dose_spread", "growth_spread", "late_share")}
     return {"mu": _interval(found.mu), "tau": _interval(found.tau), "innovations": asdict(q) | spreads}
 
 
@@ -173,11 +177,12 @@ def _disturbances(result: Calibration) -> list[str]:
     if not result.sound:
         return []
     q = result.estimate.quality
-    doses, growth = (
-        f"{100 * p.value:.0f} % ({100 * p.low:.0f} to {100 * p.high:.0f})" for p in (q.dose_spread, q.growth_spread)
+    doses, growth, late = (
+        f"{100 * p.value:.0f} % ({100 * p.low:.0f} to {100 * p.high:.0f})"
+        for p in (q.dose_spread, q.growth_spread, q.late_share)
     )
     return [
-        f"  bench       doses spread by {doses}, {100 * q.late_share:.0f} % of one is not seen by the next reading; "
+        f"  bench       doses spread by {doses}, {late} of one is not seen by the next reading; "
         f"readings by {100 * q.noise:.1f} %",
         f"  culture     growth wanders by {growth} from hour to hour",
     ]

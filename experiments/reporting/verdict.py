@@ -94,9 +94,19 @@ def _deployment(summary: Summary, config: Mapping[str, Any]) -> Verdict:
 
 
 def _calibration(summary: Summary, config: Mapping[str, Any]) -> Verdict:
-    mu, tau = ((p["value"], *p["ci95"]) for p in (summary["mu"], summary["tau"]))
     data = Path(config["data"]).name if config.get("data") else "the shipped recording"
-    claim = f"Calibration: growth and pump of {data}."
+    said = summary["verdict"]
+    claim = f"Calibration of {data}: " + "; ".join(filter(None, (f"{said['word']}: {said['why']}", said["then"]))) + "."
+    if summary["mu"] is None:
+        alone = ((name, summary[name]) for name in ("mu_alone", "net_growth"))
+        told = [
+            f"{name.replace('_', ' ')} {number(p['value'])} 1/min, 95 % interval {number(p['ci95'][0])} to "
+            f"{number(p['ci95'][1])}, rows {p['rows'][0]} to {p['rows'][1] - 1}"
+            for name, p in alone
+            if p is not None
+        ]
+        return Verdict(claim, told, "; ".join(summary["notes"]))
+    mu, tau = ((p["value"], *p["ci95"]) for p in (summary["mu"], summary["tau"]))
     items = [
         f"mu {number(mu[0])} 1/min, 95 % interval {number(mu[1])} to {number(mu[2])}; doubling time "
         f"{number(summary['doubling_min'])} min",
@@ -104,8 +114,8 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Verdict:
         f"PMSE {number(summary['pmse_pct'])} % of the squared OD; {summary['n_used']} readings used, "
         f"{summary['n_rejected']} rejected",
     ]
-    warnings = "; ".join(summary["warnings"])
-    return Verdict(claim, items, f"Warnings: {warnings}." if warnings else "Good: nothing to warn of.")
+    against = "; ".join(summary["warnings"])
+    return Verdict(claim, items, f"Against it: {against}." if against else "Good: nothing speaks against it.")
 
 
 def _certificate(summary: Summary, config: Mapping[str, Any]) -> Verdict:
@@ -118,6 +128,7 @@ def _certificate(summary: Summary, config: Mapping[str, Any]) -> Verdict:
 KINDS = {
     "train_seconds": _training,
     "windows": _deployment,
+    "net_growth": _calibration,
     "pmse_pct": _calibration,
     "cannot_hold": _certificate,
 }

@@ -31,7 +31,9 @@ HIGHEST_PUMP_RATE = 1.0  # mL/s, the Chi.Bio's pump at full power
 RESTART_ROWS = 5  # so many rows in a row behind the clock are a new run, fewer are a glitch
 LISTED_RUNS = 20
 LOST_SHARE = 0.05  # more rows without a pump rate, or with one that runs backwards, are another way of working
-SLOW_ROWS_MIN = 2.0  # a log that is slower may hide what the pump did between its rows
+
+
+Doubts = tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +46,7 @@ class Recording:
     temperature: degC, nan where there is none, shape (n,).
     row: number of each row in the file, counting data rows from 0, shape (n,).
     notes: what was excluded, assumed or repaired, one sentence each.
+    doubts: what makes mu and tau wrong if it is as it looks, and what to do then.
     source: which layout was recognised.
     runs: first and last row number of every run in the file.
     fluorescence: counts, nan where there are none, shape (n,).
@@ -58,6 +61,7 @@ class Recording:
     source: str
     runs: tuple[tuple[int, int], ...]
     fluorescence: Array
+    doubts: Doubts = ()
 
 
 def read_recording(
@@ -94,14 +98,14 @@ def read_recording(
     try:
         with np.errstate(all="ignore"):  # what overflows is not finite, and is dropped as that
             layout, table = read_table(path, pump_ml_s, pumps, reactor, rows, notes)
-            _note_idle_pumps(layout, table, pumps, notes)
+            doubts = _idle_pumps(layout, table, pumps, notes)
             table = _with_times_and_rates(path, table, notes)
-            return _judged(path, layout.source, table, run, notes)
+            return _judged(path, layout.source, table, run, notes, doubts)
     except RecordingError as error:
         raise RecordingError(f"{error} ({'; '.join(notes)})" if notes else str(error)) from None
 
 
-def _judged(path: Path, source: str, table: Table, run: int | None, notes: list[str]) -> Recording:
+def _judged(path: Path, source: str, table: Table, run: int | None, notes: list[str], doubts: Doubts) -> Recording:
     """The recording that rows with finite times and rates make, without what cannot be used."""
     backward = _backward(path, table.pump_rate, table.number)
     _note(notes, table.number[backward], "pump runs backwards: dropped, the rate before it is taken to go on")
@@ -111,7 +115,6 @@ def _judged(path: Path, source: str, table: Table, run: int | None, notes: list[
     _note(notes, table.number[stale], "time does not advance (repeated or backward): dropped")
     ends = tuple((int(table.number[r.rows[0]]), int(table.number[r.rows[-1]])) for r in runs)
     table = table.only(keep)
-    _note_slow_rows(table.time_min, notes)
     return Recording(
         time_min=table.time_min,
         od=_usable_od(path, table.od, table.number, notes),
@@ -122,6 +125,7 @@ def _judged(path: Path, source: str, table: Table, run: int | None, notes: list[
         source=source,
         runs=ends,
         fluorescence=table.fluorescence,
+        doubts=doubts,
     )
 
 
@@ -146,23 +150,23 @@ def _with_times_and_rates(path: Path, table: Table, notes: list[str]) -> Table:
     return table.only(good)
 
 
-def _note_idle_pumps(layout: Layout, table: Table, pumps: Sequence[int], notes: list[str]) -> None:
-    """Say which other pump ran. The waste pump moves at least what the feed brings, and dilutes nothing."""
+def _idle_pumps(layout: Layout, table: Table, pumps: Sequence[int], notes: list[str]) -> Doubts:
+    """Pumps that ran and are not counted. The waste pump moves at least what all others bring, and dilutes nothing."""
     fed = float(np.nansum(table.pump_rate))
+    moved = {pump: abs(float(np.nansum(rate))) for pump, rate in zip(layout.idle, table.idle.T, strict=True)}
+    ran = [pump for pump, rate in zip(layout.idle, table.idle.T, strict=True) if (np.abs(rate) > 0.0).any()]
+    feeds = [pump for pump in ran if pump != WASTE_PUMP]
+    brought = fed + sum(moved[pump] for pump in feeds)
+    if WASTE_PUMP in ran and not 0.0 < brought <= moved[WASTE_PUMP]:
+        feeds = [*feeds, WASTE_PUMP]
+    if not feeds:
+        return ()
+    counted = ",".join(map(str, sorted({*pumps, *feeds} if fed > 0.0 else feeds)))
     for pump, rate in zip(layout.idle, table.idle.T, strict=True):
-        if pump == WASTE_PUMP and 0.0 < fed <= np.nansum(rate):
-            continue
-        counted = ",".join(map(str, sorted({*pumps, pump}) if fed > 0.0 else [pump]))
-        what = f"pump {pump} ran and is not counted; if it feeds the vial, mu and tau are wrong: say pumps=[{counted}]"
-        _note(notes, table.number[np.abs(rate) > 0.0], what)
-
-
-def _note_slow_rows(time: Array, notes: list[str]) -> None:
-    apart = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if apart > SLOW_ROWS_MIN:
-        notes.append(
-            f"rows are {apart:.3g} min apart (median): mu and tau are wrong if the pump changed its rate between rows"
-        )
+        if pump in feeds:
+            _note(notes, table.number[np.abs(rate) > 0.0], f"pump {pump} ran and is not counted")
+    names = " and ".join(map(str, feeds))
+    return ((f"pump {names} ran and {'is' if len(feeds) == 1 else 'are'} not counted", f"say pumps=[{counted}]"),)
 
 
 class _Run(NamedTuple):
@@ -221,7 +225,7 @@ def _backward(path: Path, pump_rate: Array, number: Numbers) -> Mask:
         i = int(np.argmax(wrong))
         raise RecordingError(
             f"{path}: row {number[i]}: pump rate {pump_rate[i]:g} mL/s: allowed 0 to {HIGHEST_PUMP_RATE:g} mL/s; "
-            "a pump run backwards, or another unit such as mL/min?"
+            "a pump run backwards, or another unit such as mL/min (divide by 60)?"
         )
     return backward
 

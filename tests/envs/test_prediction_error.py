@@ -229,7 +229,7 @@ def test_a_regulated_culture_of_a_real_pump_gives_its_parameters(
 def test_a_dose_seen_one_row_late_moves_nothing(share: float) -> None:
     found = estimate(regulated(10, late_share=share, growth_cv=0.05))
     assert ratios(found) == pytest.approx((1.0, 1.0), abs=0.06)
-    assert np.median([e.quality.late_share for e in found]) == pytest.approx(share, abs=0.15)
+    assert np.median([e.quality.late_share.value for e in found]) == pytest.approx(share, abs=0.15)
 
 
 def test_outliers_are_found_and_nothing_else() -> None:

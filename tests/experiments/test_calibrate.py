@@ -21,6 +21,7 @@ from experiments.calibration.config import CalibrateConfig
 from experiments.calibration.result import environment_yaml
 from experiments.cli import frame
 from experiments.cli.calibrated import read_plant_file
+from experiments.reporting.verdict import verdict
 from hardware.storage.recording_reader import read_recording
 from tests.real_recording import DITHER, needs_dither
 
@@ -74,7 +75,8 @@ def test_shipped_recording_from_the_command_line(cli: Cli, tmp_path: Path) -> No
     assert content["rows_used"] == [0, 361]
     assert (content["n_used"], content["n_rejected"], content["warnings"]) == (361, 0, [])
     assert content["pmse_pct"] < 0.05
-    for word in ("mu ", "tau ", "PMSE", "window", "held out", "doubling", "calibrated.yaml"):
+    assert content["verdict"]["word"] == "use"
+    for word in ("use: ", "mu ", "tau ", "PMSE", "window", "held out", "doubling", "calibrated.yaml"):
         assert word in done.stdout
     for figure in ("figures/fit.png", "figures/drift.png", "figures/twin.png"):
         assert (run / figure).read_bytes().startswith(b"\x89PNG")
@@ -184,6 +186,50 @@ def test_a_refusal_of_the_fit_carries_what_the_reader_noted(
     assert cli(f"data={path}", "pumps=[3]", "pump_ml_s=1").returncode == 0
 
 
+def test_a_second_feed_is_told_in_the_first_line_and_on_the_page(
+    cli: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> None:
+    """Pumps 1 and 3 share the feed, 7 to 3: with one of them alone tau is wrong by 30 %."""
+    path, columns = tmp_path / "shared.csv", zip(*map(np.ndarray.tolist, recording), strict=True)
+    rows = "".join(f"{60 * t},{y},{0.7 * u},{0.3 * u}\n" for t, y, u in columns)
+    path.write_text("exp_time,od_measured,pump_1_rate,pump_3_rate\n" + rows)
+    done = cli(f"data={path}")
+    assert done.returncode == 0, done.stderr
+    first = next(line for line in done.stdout.splitlines() if line.startswith("use"))
+    assert first.startswith("use with care: ")
+    assert first.endswith("; pump 3 ran and is not counted; say pumps=[1,3]")
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert next(iter(summary)) == "verdict"
+    assert summary["verdict"]["word"] == "use with care"
+    assert summary["tau"]["value"] == pytest.approx(0.7 * 0.31, rel=0.05)
+    said = verdict(summary, {"data": str(path)})
+    assert said is not None
+    assert said.claim.startswith("Calibration of shared.csv: use with care: ")
+    assert cli(f"data={path}", "pumps=[1,3]").returncode == 0
+    again = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert again["verdict"]["word"] == "use"
+    assert again["tau"]["value"] == pytest.approx(0.31, rel=0.05)
+
+
+def test_a_recording_without_tau_leaves_mu_and_what_to_do(cli: Cli, tmp_path: Path) -> None:
+    time = np.arange(0.0, 240.0)
+    od = 0.1 * np.exp(0.009 * time) * (1.0 + 0.01 * np.random.default_rng(3).standard_normal(240))
+    done = cli(tidy(tmp_path / "batch.csv", od, time, 0.0 * time))
+    assert done.returncode == 1
+    assert "batch.csv: record again: rows 0-239: the pump never runs" in done.stderr
+    assert "record with a pump that runs and rests; mu alone is 0.00" in done.stderr
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["verdict"]["word"] == "record again"
+    assert summary["verdict"]["then"] == "record with a pump that runs and rests"
+    assert (summary["mu"], summary["tau"]) == (None, None)
+    assert summary["mu_alone"]["ci95"][0] <= 0.009 <= summary["mu_alone"]["ci95"][1]
+    assert summary["mu_alone"]["rows"] == [0, 240]
+    said = verdict(summary, {"data": "batch.csv"})
+    assert said is not None
+    assert "record again: rows 0-239: the pump never runs" in said.claim
+    assert said.items[0].startswith("mu alone 0.00")
+
+
 def test_rows_too_far_apart_for_the_segments_are_told_as_that(cli: Cli, tmp_path: Path) -> None:
     time = 15.0 * np.arange(60)
     pump_rate = np.where(time % 120 < 60, 0.018, 0.0)
@@ -192,12 +238,13 @@ def test_rows_too_far_apart_for_the_segments_are_told_as_that(cli: Cli, tmp_path
     data = tidy(tmp_path / "slow.csv", 0.3 * np.exp(0.028 * time - volume / 0.31 + noise), time, pump_rate)
     done = cli(data)
     assert done.returncode == 1
-    told = "a segment of identify.segment_min = 120 min holds 8 rows 15 min apart, allowed at least 10: say "
-    assert f"slow.csv: record again: {told}identify.segment_min=300; " in done.stderr
-    assert "rows are 15 min apart (median)" in done.stderr
+    told = "rows are 15 min apart, and a segment of 120 min holds 8; allowed at least 10; check the unit of time, or"
+    assert f"slow.csv: record again: {told} say identify.segment_min=300; " in done.stderr
     assert done.stderr.count("\n") == 1
     done = cli(data, "identify.segment_min=300")
     assert done.returncode == 0, done.stderr
+    assert "use with care" in done.stdout
+    assert "rows are 15 min apart; record every minute, or every change of the pump's rate" in done.stdout
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["tau"]["value"] == pytest.approx(0.31, rel=0.05)
 
 
