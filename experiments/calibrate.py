@@ -8,7 +8,8 @@ from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
-from envs.identification.calibration import Calibration, calibrate
+from envs.identification.calibration import calibrate
+from envs.identification.found import Calibration
 from envs.identification.model import NotIdentifiable
 from envs.identification.refusal import growth_alone
 from envs.identification.screening import Series, merged

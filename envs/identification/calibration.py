@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
-from envs.identification.drift import Drift, Segment, cuts, drift, segments
+from envs.identification.drift import cuts, drift, segments
+from envs.identification.found import Calibration, Verdict
 from envs.identification.free_run import Fit, fit
-from envs.identification.model import NotIdentifiable, Parameter, check_excitation, pmse, trajectory
-from envs.identification.prediction_error import Estimate, enough, estimate, outliers
+from envs.identification.model import NotIdentifiable, check_excitation, pmse, trajectory
+from envs.identification.prediction_error import enough, estimate, outliers
 from envs.identification.refusal import check_estimate
 from envs.identification.screening import Rejection, Screened, Series, noise_sd, screen
-from envs.identification.validation import Validation, attainable_pct, validate
-from envs.identification.verdict import Verdict, judged
+from envs.identification.validation import attainable_pct, validate
+from envs.identification.verdict import judged
 from envs.identification.window import choose_window, longest
 
 __all__ = ["Calibration", "IdentifyConfig", "calibrate"]
@@ -55,53 +56,6 @@ class IdentifyConfig:
 
     def __post_init__(self) -> None:
         check(self, "identify")
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """Everything `calibrate` found. Positions refer to `screened.series`; window is [first, end).
-
-    mu, tau: the returned pair, by `method`. estimate, free_run: of the window by either method, None where there is no
-    such fit; sound: whether the estimate tells tau. model: free run of the returned pair over the window from the start
-    that fits best, OD, shape (n,). pair_pmse_pct: its PMSE. pmse_pct: of the free-run fit, the paper's figure; of the
-    pair where there is no such fit.
-    warnings: what speaks against the pair, the gravest first.
-    """
-
-    screened: Screened
-    window: tuple[int, int]
-    window_reason: str
-    method: str
-    mu: Parameter
-    tau: Parameter
-    estimate: Estimate
-    sound: bool
-    free_run: Fit | None
-    model: Array
-    pair_pmse_pct: float
-    pmse_pct: float
-    validation: Validation
-    segments: tuple[Segment, ...]
-    drift_mu: Drift | None
-    drift_tau: Drift | None
-    verdict: Verdict
-    warnings: tuple[str, ...]
-
-    @property
-    def inside(self) -> Series:
-        """The window's rows."""
-        return self.screened.series.part(*self.window)
-
-    @property
-    def window_rows(self) -> tuple[int, int]:
-        """Row numbers [first, end) of the window."""
-        row = self.screened.series.row
-        return int(row[self.window[0]]), int(row[self.window[1] - 1]) + 1
-
-    @property
-    def n_used(self) -> int:
-        """Readings in the window."""
-        return int(np.isfinite(self.inside.od).sum())
 
 
 def calibrate(

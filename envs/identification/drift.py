@@ -109,7 +109,12 @@ def drifts(along: tuple[Segment, ...]) -> bool:
 
 
 def _steps(found: list[Parameter]) -> bool:
-    """Whether the estimates before some place differ by a third from those after it, beyond what scatters."""
+    """Whether the estimates before some place differ by a third from those after it, beyond what scatters.
+
+    One that is not known within a third counts for nothing: in a culture that is held at one OD such ones all err to
+    one side.
+    """
+    found = [p for p in found if p.half_width < WANDERING_PCT / 100.0 * p.value]
     value = np.array([p.value for p in found])
     weight = np.array([max(p.half_width / 1.96, 1e-3 * abs(p.value)) for p in found]) ** -2.0
     for j in range(1, len(found)):

@@ -1,22 +1,16 @@
 """What to do with a calibration, in one line: use it, use it with care, or record again."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from envs.identification.found import Calibration, Verdict
 from envs.identification.model import REMEDY
 from envs.identification.prediction_error import Quality
 from envs.identification.refusal import NARROW, PLAUSIBLE_MU
 from envs.identification.window import SHORTEST_WINDOW_MIN
 
-if TYPE_CHECKING:
-    from envs.identification.calibration import Calibration
-
-__all__ = ["Verdict", "judged"]
+__all__ = ["judged"]
 
 PLAUSIBLE_TAU = (0.05, 2.0)
 UNEVEN = 0.25  # sd of a dose over its size
@@ -25,19 +19,6 @@ UNSTEADY = 0.15  # sd of the mean growth over an hour, over mu
 UNSEEN = 0.5  # share of a dose that the next reading does not see
 CORRELATED = 0.2  # of innovations from row to row
 AGAIN = "calibrate again shortly before the run, or fly the policy that ships (policy=shipped), which needs no pair"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """word: use, use with care or record again. why: one clause. then: what to do next, "" where it is to train."""
-
-    word: str
-    why: str
-    then: str
-
-    def line(self) -> str:
-        """As it stands on the screen."""
-        return f"{self.word}: {self.why}" + (f"; {self.then}" if self.then else "")
 
 
 def judged(

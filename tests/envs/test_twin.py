@@ -9,7 +9,8 @@ import yaml
 from numpy.typing import NDArray
 
 from conf.schema import build
-from envs.identification.calibration import Calibration, calibrate
+from envs.identification.calibration import calibrate
+from envs.identification.found import Calibration
 from envs.identification.model import pmse
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
