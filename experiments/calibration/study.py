@@ -70,7 +70,7 @@ def against_truth(found: list[Fitted], growth: Array, tau: Array) -> dict[str, A
     """How N calibrations do against their truth, (N,) each: what is accepted, and of that the share held, in %.
 
     mu is compared with the mean growth rate over the recording's rows, which differs from draw to draw where growth
-    wanders. wrong_pct: accepted with an interval that does not hold the truth, of all.
+    wanders. wrong_pct: accepted, and the truth is not even within twice the interval, of all.
     """
     kept = [i for i, c in enumerate(found) if isinstance(c, Calibration)]
     refusals = sorted({c for c in found if isinstance(c, str)})
@@ -79,7 +79,7 @@ def against_truth(found: list[Fitted], growth: Array, tau: Array) -> dict[str, A
         mu, tau_found = _intervals(found, "mu"), _intervals(found, "tau")
         study = {"mu": _judged(mu, growth[kept]), "tau": _judged(tau_found, tau[kept])}
         numbers |= {key: {name: part[key] for name, part in study.items()} for key in study["mu"]}
-        wrong = ~(_holds(mu, growth[kept]) & _holds(tau_found, tau[kept]))
+        wrong = ~(_holds(mu, growth[kept], 2.0) & _holds(tau_found, tau[kept], 2.0))
         numbers["wrong_pct"] = 100.0 * float(wrong.sum()) / len(found)
     return numbers
 
@@ -120,8 +120,10 @@ def _intervals(found: list[Fitted], name: str) -> Array:
     return np.array([(p.value, p.low, p.high) for p in chosen])
 
 
-def _holds(values: Array, truth: Array) -> Mask:
-    return np.asarray((values[:, 1] <= truth) & (truth <= values[:, 2]))
+def _holds(values: Array, truth: Array, times: float = 1.0) -> Mask:
+    """Whether intervals, each end so many times as far from its value, hold the truth."""
+    value, low, high = values.T
+    return np.asarray((value - times * (value - low) <= truth) & (truth <= value + times * (high - value)))
 
 
 def _judged(values: Array, truth: Array) -> dict[str, float]:

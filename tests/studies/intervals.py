@@ -32,7 +32,7 @@ WORDS = dict(
     zip(LAWS, ("device's PI", "tuned PI", "threshold", "proportional", "setpoint steps", "open loop"), strict=True)
 )
 LONG_H = 72.0  # from which on fewer recordings are drawn
-COLUMNS = ("law", "h", "wander", "accepted", "hold, %", "bias, %", "half width, %", "wrong of all, %")
+COLUMNS = ("law", "h", "wander", "accepted", "hold, %", "bias, %", "half width, %", "wrong, %")
 
 
 @dataclass(frozen=True)
