@@ -3,11 +3,12 @@
 A point of the noise model is drawn from seven independent standard normals z, so that the prior of each number is a
 function of its z and no number has an edge:
 
-    p      0 or 1, the sign of z      reading noise alike at every OD, or in proportion to it
+    p      clip(1.5 F(z) - 0.25)      share of a reading's variance that is in proportion to the OD, not alike at every
+                                      OD; F is the normal distribution function
     dose   0.3 exp(1.7 z)             sd of a mean dose's effect, in sd of a reading
     wander 0.1 exp(1.5 z)             sd of growth that wanders, in sd of a reading per minute
     memory 5 + 35 exp(z) min          after which it has forgotten 63 %
-    phi    0.9 F(z)                   correlation of reading noise from row to row, F the normal distribution function
+    phi    0.9 F(z)                   correlation of reading noise from row to row
     late   clip(1.5 F(z) - 0.25)^2    share of a dose that the next reading does not see yet: one in six each at 0 and 1
     mixing late clip(1.5 F(z) - 0.25) share of what a reading did not see that the one after does not see either: late
                                       itself where a stirred vial mixes in first order; 0.7 at most, as a dose that
@@ -52,16 +53,15 @@ class NoiseModel:
         """The points of z, shape (M, G, 7)."""
         from scipy.special import ndtr
 
-        sign, dose, wander, memory, *shares = np.moveaxis(z, -1, 0)
-        phi, late, again = (ndtr(s) for s in shares)
-        late, again = (np.clip(1.5 * share - 0.25, 0.0, 1.0) for share in (late, again))
+        p, dose, wander, memory, phi, late, again = np.moveaxis(z, -1, 0)
+        p, late, again = (np.clip(1.5 * ndtr(share) - 0.25, 0.0, 1.0) for share in (p, late, again))
         late = late**2  # small shares are drawn often enough to be found between the atom and the rest
         return cls(
-            p=(sign > 0.0).astype(np.float64),
+            p=p,
             dose=0.3 * np.exp(1.7 * dose),
             wander=0.1 * np.exp(1.5 * wander),
             memory=5.0 + 35.0 * np.exp(memory),
-            phi=0.9 * phi,
+            phi=0.9 * ndtr(phi),
             late=late,
             mixing=np.minimum(late * again, 0.7),
         )

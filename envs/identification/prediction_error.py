@@ -10,8 +10,8 @@ in it, and each reading is compared with what all readings before it say about i
     w_{i+1} = a w_i + sqrt(1 - a^2) sigma om eta_i,  a = exp(-dt/T)   growth that wanders
     v_{i+1} = phi v_i + sqrt(1 - phi^2) nu_i                          reading noise, correlated from row to row
 
-with xi, eta, nu independent standard normal, r = (x/x_mean)^(p-1) (p = 1: noise in proportion to the OD, p = 0: the
-same at every OD; x is a running median, never the reading itself). A rate chosen from reading i acts from row i on. For
+with xi, eta, nu independent standard normal, r^2 = p + (1 - p)(x_mean/x)^2 (p = 1: noise in proportion to the OD, 0:
+the same at every OD; x is a running median, never the reading itself). A rate chosen from reading i acts from row i on. For
 given (p, d, om, T, phi, q, h) this is generalised least squares: one Kalman filter over the columns ln y, 1, t and
 -(C - q l) with shared gains; its likelihood is the restricted one, sigma, b, mu and k integrated out (Harville 1974,
 Biometrika 61:383). Points of the noise model are filtered at once and averaged by it (`noise_model`): there is no
@@ -128,7 +128,7 @@ class _Filter:
         self._both = np.zeros((4, 4 + COLUMNS, *self.shape))  # the covariance, and minus the state beside it
         self.covariance = self._both[:, :4]
         self.covariance[1, 1], self.covariance[2, 2] = cells.wander**2, 1.0
-        self._level, self._alike = 1.0 / batch.level, 1.0 - cells.p
+        self._level, self._alike = batch.level**-2.0, 1.0 - cells.p
         self._dose, self._each = (cells.dose / batch.rms[:, None]) ** 2, batch.each**2
         self._late, self._volume = cells.late / batch.scale[:, K, None], batch.volume / batch.scale[:, K, None]
         self._changed = np.any(np.diff(batch.dt, axis=1, prepend=np.nan) != 0.0, axis=0)  # or the first row
@@ -160,7 +160,7 @@ class _Filter:
 
     def ratio(self, i: int) -> Array:
         """r of row i, shape (M, G)."""
-        return np.asarray(self.cells.p + self._alike * self._level[:, i, None])
+        return np.asarray(np.sqrt(self.cells.p + self._alike * self._level[:, i, None]))
 
     def decay(self, i: int) -> Array:
         """a of row i, shape (M, G)."""

@@ -52,7 +52,7 @@ def dense(series: Series, z: NoiseModel, g: int) -> tuple[np.ndarray, np.ndarray
     slow = total @ (np.outer(dt, dt) * wander + np.diag((d * share) ** 2)) @ total.T
     padded = np.concatenate([[np.nan] * 2, series.od, [np.nan] * 2])
     level = np.array([np.nanmedian(padded[i : i + 5]) for i in range(n)])
-    ratio = (level / level.mean()) ** (p - 1.0)
+    ratio = np.sqrt(p + (1.0 - p) * (level.mean() / level) ** 2)
     lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     covariance = slow + np.outer(ratio, ratio) * phi**lag
     unseen = [sum(late * mixing**j * dose[i - 1 - j] for j in range(i)) for i in range(n)]
@@ -62,9 +62,9 @@ def dense(series: Series, z: NoiseModel, g: int) -> tuple[np.ndarray, np.ndarray
 CELLS = NoiseModel.at(
     np.array(
         [
-            [-1.0, 0.3, 0.5, -0.4, 0.2, -2.0, 0.0],  # noise alike at every OD, every dose seen at once
-            [1.0, -0.8, -1.5, 0.7, -0.6, 0.3, -1.5],  # noise in proportion, late by one row
-            [1.0, 1.1, 0.9, -1.2, 1.0, 0.6, 0.8],  # late, and mixing for longer
+            [-2.0, 0.3, 0.5, -0.4, 0.2, -2.0, 0.0],  # noise alike at every OD, every dose seen at once
+            [2.0, -0.8, -1.5, 0.7, -0.6, 0.3, -1.5],  # noise in proportion, late by one row
+            [0.3, 1.1, 0.9, -1.2, 1.0, 0.6, 0.8],  # both noises, late, and mixing for longer
             [-1.0, -2.0, 1.4, 0.1, -1.3, 1.9, 0.1],
         ]
     )[None]
@@ -143,9 +143,9 @@ def test_noise_model_of_the_prior() -> None:
     z = NoiseModel.at(np.random.default_rng(5).standard_normal((1, 40000, 7)))
     for atom in (0.0, 1.0):
         assert np.mean(z.late == atom) == pytest.approx(1 / 6, abs=0.01)
+        assert np.mean(z.p == atom) == pytest.approx(1 / 6, abs=0.01)
     medians = [float(np.median(v)) for v in (z.dose, z.wander, z.memory, z.phi)]
     assert medians == pytest.approx([0.3, 0.1, 40.0, 0.45], rel=0.03)
-    assert np.mean(z.p) == pytest.approx(0.5, abs=0.01)
     assert (z.mixing <= np.minimum(z.late, 0.7)).all()
 
 
