@@ -10,12 +10,12 @@ in it, and each reading is compared with what all readings before it say about i
     w_{i+1} = a w_i + sqrt(1 - a^2) sigma om eta_i,  a = exp(-dt/T)   growth that wanders
     v_{i+1} = phi v_i + sqrt(1 - phi^2) nu_i                          reading noise, correlated from row to row
 
-with xi, eta, nu independent standard normal, r^2 = p + (1 - p)(x_mean/x)^2 (p = 1: noise in proportion to the OD, 0: as
-large at every OD; x is a running median, never the reading itself). A rate chosen from reading i acts from row i
-on. For given (p, d, om, T, phi, q, h) this is generalised least squares: one Kalman filter over the columns ln y, 1, t
-and -(C - q l) with shared gains; its likelihood is the restricted one, sigma, b, mu and k integrated out (Harville 1974,
-Biometrika 61:383). Points of the noise model are filtered at once and averaged by it (`noise_model`): there is no
-optimiser and no local minimum (docs/calibration.md, Method).
+with xi, eta, nu independent standard normal, r^2 = p + (1 - p)(x_mean/x)^2 (p = 1: noise in proportion to the OD, 0:
+as large at every OD; x is a running median, never the reading itself). A rate chosen from reading i acts from row i
+on. For given (p, d, om, T, phi, q, h) this is generalised least squares: one Kalman filter over the columns ln y, 1,
+t and -(C - q l) with shared gains; its likelihood is the restricted one, sigma, b, mu and k integrated out (Harville
+1974, Biometrika 61:383). Points of the noise model are filtered at once and averaged by it (`noise_model`): there is
+no optimiser and no local minimum (docs/calibration.md, Method).
 """
 
 from collections.abc import Iterator
