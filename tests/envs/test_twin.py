@@ -167,3 +167,11 @@ def test_a_recording_without_noise_has_the_truth_as_its_twin() -> None:
     np.testing.assert_allclose(own.tau.value, 0.31, rtol=1e-3)
     assert own.start_od == pytest.approx(0.12, rel=1e-3)
     assert np.hypot(own.noise.floor, own.noise.relative) < 2e-4
+
+
+def test_a_clock_that_does_not_begin_at_zero_changes_nothing() -> None:
+    time, od, rate = record(TRUTH, "threshold", 3)
+    _, own = found(time, od[0], rate[0])
+    _, late = found(time + 1234.0, od[0], rate[0])
+    np.testing.assert_allclose(late.tau.value, own.tau.value, rtol=1e-6)
+    np.testing.assert_allclose(late.mu.value, own.mu.value, rtol=1e-6)

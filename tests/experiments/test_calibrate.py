@@ -230,6 +230,22 @@ def test_a_recording_without_tau_leaves_mu_and_what_to_do(cli: Cli, tmp_path: Pa
     assert said is not None
     assert "record again: rows 0-239: the pump never runs" in said.claim
     assert said.items[0].startswith("mu alone 0.00")
+    assert said.items[0].endswith(", rows 0 to 239")
+
+
+def test_merged_rows_are_told_beside_what_the_reader_noted(cli: Cli, tmp_path: Path) -> None:
+    """Sixty hours of rows of 20 s, one of them without a reading."""
+    time, od, rate = open_loop(OpenLoop(hours=60.0), np.random.default_rng(3))
+    fine = np.arange(0.0, 3600.0, 1.0 / 3.0)
+    held = rate[0][np.floor(fine).astype(int)]
+    smooth = np.exp(np.interp(fine, time, np.log(od[0])))
+    smooth[500] = np.nan
+    done = cli(tidy(tmp_path / "fine.csv", smooth, fine, held))
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert [n.split(":")[0] for n in content["notes"][:1]] == ["row 500"]
+    assert content["notes"][-1] == "10800 rows merged into 3600 of a minute or more"
+    assert content["tau"]["value"] == pytest.approx(0.31, rel=0.05)
 
 
 def test_rows_too_far_apart_for_the_segments_are_told_as_that(cli: Cli, tmp_path: Path) -> None:
