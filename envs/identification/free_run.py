@@ -26,7 +26,6 @@ __all__ = ["Fit", "fit"]
 Array = NDArray[np.float64]
 
 HUBER_SD = 3.0
-MAX_REWEIGHTINGS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +72,7 @@ def _solve(y: Array, basis: Array, robust: bool) -> tuple[Array, Array, Array, N
     def simulated(p: Array) -> Array:
         return np.exp(np.clip(basis @ p, -50.0, 50.0))
 
-    for _ in range(MAX_REWEIGHTINGS):
+    for _ in range(20):
         previous, root = best, np.sqrt(weight)
 
         def residual(p: Array, root: Array = root) -> Array:

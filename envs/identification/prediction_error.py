@@ -36,12 +36,10 @@ Mask = NDArray[np.bool_]
 LEVEL_ROWS = 5  # of the running median that stands for the OD level
 COLUMNS = 4  # ln y, 1, t, -C
 MU, K = 1, 2  # positions among the three regressors
-TINY = 1e-300
 FEWEST_READINGS = 10
 STRATA = 64  # of each point's Student t
 
 OUTLIER_SD = 4.5
-OUTLIER_NEIGHBOURS = 2  # on each side: an outlier makes its neighbours look wrong as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,16 +308,16 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
         seen = batch.reading[m, :rows]
         innovation = np.where(seen, error / (own * np.sqrt(traces.variance[:rows, m])), np.nan)
         pumped = bool((part.pump_rate[:-1] > 0.0).any())
-        diluted = np.maximum(np.abs(k[m]) * batch.rms[m], TINY)
+        diluted = np.maximum(np.abs(k[m]) * batch.rms[m], 1e-300)
         feedback = _feedback(part, innovation)
         z = innovation[seen] - innovation[seen].mean()
-        spread = max(float(np.mean(z**2)), TINY)
+        spread = max(float(np.mean(z**2)), 1e-300)
         quality = Quality(
             variance=spread,
             autocorrelation=float(np.mean(z[1:] * z[:-1])) / spread,
             late_share=_weighted(cells.late[m], w),
             dose_spread=_weighted(cells.dose[m] * sigma[m] / diluted, w),
-            growth_spread=_weighted(hourly[m] * cells.wander[m] * sigma[m] / max(abs(mu.value), TINY), w),
+            growth_spread=_weighted(hourly[m] * cells.wander[m] * sigma[m] / max(abs(mu.value), 1e-300), w),
             noise=own,
             noise_floor=float(np.sqrt(w @ ((1.0 - cells.p[m]) * sigma[m] ** 2)) * batch.mean_od[m]),
             noise_relative=float(np.sqrt(w @ (cells.p[m] * sigma[m] ** 2))),
@@ -327,7 +325,7 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
             feedback=feedback,
             answers=abs(feedback) > 2.0 / float(np.sqrt(len(z))),
             effective=float(effective(w[None])[0]),
-            hills=_weighted(k[m], w).half_width / max(1.96 * _weighted(k_sd[m], w).value, TINY),
+            hills=_weighted(k[m], w).half_width / max(1.96 * _weighted(k_sd[m], w).value, 1e-300),
         )
         tau = Parameter(1.0 / inverse.value, 1.0 / inverse.high, 1.0 / inverse.low) if inverse.low > 0.0 else None
         found.append(
@@ -475,6 +473,6 @@ def _peaks(residual: Array) -> Mask:
     size = np.where(np.isfinite(residual), np.abs(residual), 0.0)
     known = size[np.isfinite(residual)]
     limit = OUTLIER_SD * 1.4826 * float(np.median(known)) if len(known) else np.inf
-    padded = np.pad(size, OUTLIER_NEIGHBOURS)
-    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * OUTLIER_NEIGHBOURS + 1).max(axis=1)
+    # an outlier makes its two neighbours on each side look wrong as well
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(size, 2), 5).max(axis=1)
     return np.asarray((size > limit) & (size == around))
