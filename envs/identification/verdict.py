@@ -76,7 +76,7 @@ def _against(result: Calibration, limit: float) -> Iterator[tuple[str, str]]:
         if missed is not None and missed > worst:
             yield f"{where} are predicted with a PMSE of {missed:.2g} %, allowed {worst:.2g} %", AGAIN
     if any(p.half_width > NARROW * p.value for p in (mu, tau)):
-        yield f"that is wider than +-{100.0 * NARROW:.0f} %", REMEDY
+        yield f"an interval wider than +-{100.0 * NARROW:.0f} % decides little", REMEDY
     if result.sound:
         yield from _about_bench_and_culture(found.quality)
         if abs(found.quality.autocorrelation) > CORRELATED:

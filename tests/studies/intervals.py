@@ -87,7 +87,7 @@ def intervals(config: IntervalsConfig, folder: Path) -> None:
         name: [row(kind[:3], numbers) for kind, numbers in zip(kinds, found, strict=True) if kind[5] == second]
         for name, second in (("intervals", False), ("second_simulator", True))
     }
-    for name, rows in tables.items():
+    for name, rows in list(tables.items())[: 1 + config.second]:
         (folder / f"{name}.md").write_text(markdown(COLUMNS, rows), encoding="utf-8")
     files.write_json(
         folder / "summary.json",
