@@ -31,6 +31,7 @@ LAWS = ("pi", "tuned_pi", "threshold", "proportional", "setpoint_steps", "open_l
 WORDS = dict(
     zip(LAWS, ("device's PI", "tuned PI", "threshold", "proportional", "setpoint steps", "open loop"), strict=True)
 )
+SIMULATORS = ("own", "second")
 LONG_H = 72.0  # from which on fewer recordings are drawn
 COLUMNS = ("law", "h", "wander", "accepted", "hold, %", "bias, %", "half width, %", "wrong, %")
 
@@ -44,7 +45,7 @@ class IntervalsConfig:
     laws: tuple[str, ...] = setting(LAWS, "what moves the pump", choices=LAWS)
     hours: tuple[float, ...] = setting((6.0, 24.0, 72.0), "lengths", "h", within=(1, 100), some=True)
     wander: tuple[float, ...] = setting((0.05, 0.1), "sd of growth over mu", within=(0, 0.5), some=True)
-    second: bool = setting(True, "simulate by the second simulator, too")
+    simulators: tuple[str, ...] = setting(SIMULATORS, "whose recordings", choices=SIMULATORS, some=True)
     workers: int = setting(0, "processes; 0 for one per core", within=(0, 256))
     seed: int = setting(1, "of the recordings", at_least=0)
 
@@ -52,9 +53,9 @@ class IntervalsConfig:
         check(self)
 
 
-def one(law: str, hours: float, wander: float, n: int, seed: int, second: bool) -> dict[str, Any]:
+def one(law: str, hours: float, wander: float, n: int, seed: int, simulator: str) -> dict[str, Any]:
     """n recordings of one kind against their truth."""
-    if second:
+    if simulator == "second":
         r = simulate(Conditions(law=law, hours=hours, wander=wander), n, seed)
         return against_truth(fitted(r.time, r.od, r.pump_rate, IdentifyConfig()), r.growth, r.tau)
     truth = OpenLoop(mu=0.03, tau=1.0 / 3.0, hours=hours, growth_cv=wander, dose_cv=0.1, seed=seed)
@@ -69,30 +70,24 @@ def one(law: str, hours: float, wander: float, n: int, seed: int, second: bool) 
 
 
 def intervals(config: IntervalsConfig, folder: Path) -> None:
-    """All of them, in processes; a table for each simulator."""
+    """All of them, in processes; a table for each simulator, as soon as it is complete."""
     kinds = [
-        (law, hours, wander, config.few if hours >= LONG_H else config.recordings, config.seed, second)
-        for second in (False, True)[: 1 + config.second]
+        (law, hours, wander, config.few if hours >= LONG_H else config.recordings, config.seed, simulator)
+        for simulator in config.simulators
         for law in config.laws
         for hours in config.hours
         for wander in config.wander
     ]
     with Workers(config.workers) as pool:
         waiting: list[Future[dict[str, Any]]] = [pool.submit(one, *kind) for kind in kinds]
-        found = []
+        found: list[dict[str, Any]] = []
+        rows: dict[str, list[tuple[str, ...]]] = {simulator: [] for simulator in config.simulators}
         for kind, future in zip(kinds, waiting, strict=True):
             found.append(future.result())
-            log.info("%s: %s", ", ".join(map(str, kind[:4])), " | ".join(row(kind[:3], found[-1])[3:]))
-    tables = {
-        name: [row(kind[:3], numbers) for kind, numbers in zip(kinds, found, strict=True) if kind[5] == second]
-        for name, second in (("intervals", False), ("second_simulator", True))
-    }
-    for name, rows in list(tables.items())[: 1 + config.second]:
-        (folder / f"{name}.md").write_text(markdown(COLUMNS, rows), encoding="utf-8")
-    files.write_json(
-        folder / "summary.json",
-        {"kinds": [[*map(str, kind)] for kind in kinds], "found": found, "tables": tables},
-    )
+            rows[kind[5]].append(row(kind[:3], found[-1]))
+            log.info("%s, %s: %s", kind[5], ", ".join(map(str, kind[:4])), " | ".join(rows[kind[5]][-1][3:]))
+            (folder / f"{kind[5]}.md").write_text(markdown(COLUMNS, rows[kind[5]]), encoding="utf-8")
+    files.write_json(folder / "summary.json", {"kinds": kinds, "found": found})
 
 
 def row(kind: tuple[str, float, float], numbers: dict[str, Any]) -> tuple[str, ...]:

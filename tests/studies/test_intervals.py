@@ -12,7 +12,7 @@ def test_a_table_for_each_simulator_with_a_row_for_each_kind(tmp_path: Path) -> 
     config = IntervalsConfig(3, 2, ("threshold", "proportional"), (2.0, 3.0), (0.05,), workers=2)
     intervals(config, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    for name in ("intervals", "second_simulator"):
+    for name in ("own", "second"):
         cells = [
             [c.strip() for c in line.split("|")[1:-1]] for line in (tmp_path / f"{name}.md").read_text().splitlines()
         ]
@@ -23,7 +23,7 @@ def test_a_table_for_each_simulator_with_a_row_for_each_kind(tmp_path: Path) -> 
         assert cells[4][3:7] == cells[5][3:7] == ["0 of 3", "–", "–", "–"]
     own, second = summary["found"][:4], summary["found"][4:]
     assert own[1]["median_bias_pct"] != second[1]["median_bias_pct"]  # no draw is shared
-    assert own[1] == one("threshold", 3.0, 0.05, 3, 1, False)
+    assert own[1] == one("threshold", 3.0, 0.05, 3, 1, "own")
     for each in (own[1], second[1]):
         assert abs(each["median_bias_pct"]["mu"]) < 3 * each["relative_half_width_pct"]["mu"]
 
@@ -33,15 +33,17 @@ def none(*kind: object) -> dict[str, object]:
     return {"recordings": kind[3], "refused": kind[3], "wrong_pct": 0.0, "kind": kind}
 
 
-@pytest.mark.parametrize("second", [False, True])
-def test_long_recordings_are_fewer(second: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize("simulators", [("own",), ("second",), ("own", "second")])
+def test_long_recordings_are_fewer(
+    simulators: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr("tests.studies.intervals.one", none)
-    intervals(IntervalsConfig(7, 3, hours=(6.0, 71.0, 72.0), second=second, workers=1, seed=4), tmp_path)
+    intervals(IntervalsConfig(7, 3, hours=(6.0, 71.0, 72.0), simulators=simulators, workers=1, seed=4), tmp_path)
     asked = [each["kind"] for each in json.loads((tmp_path / "summary.json").read_text())["found"]]
-    assert len(asked) == 6 * 3 * 2 * (1 + second)
+    assert len(asked) == 6 * 3 * 2 * len(simulators)
     assert {(kind[1], kind[3]) for kind in asked} == {(6.0, 7), (71.0, 7), (72.0, 3)}
     assert {kind[4] for kind in asked} == {4}
-    assert (tmp_path / "second_simulator.md").exists() == second
+    assert {path.stem for path in tmp_path.glob("*.md")} == {kind[5] for kind in asked} == set(simulators)
 
 
 def test_a_row_names_mu_before_tau() -> None:
