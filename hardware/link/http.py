@@ -1,10 +1,12 @@
 """HTTP, straight to the device's server."""
 
 import contextlib
+import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -19,31 +21,58 @@ __all__ = ["HttpTransport", "fetch"]
 
 AGENT = "board_agent/"  # how the server's name begins where an agent stands before the device
 REFUSED = (401, 403, 409)  # by which the agent says that it did not carry a request out, and why
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE_S = 0.2  # the client's own time-out says more, and comes first where nothing comes at all
 TOKEN = "give backend.transport.token_file a copy of the board's (docs/board_agent.md, The token)"
 
 
 @contextlib.contextmanager
 def _cut_after(wait_s: float) -> Iterator[Callable[[str, dict[str, Any]], None]]:
-    """A trace for a request that is cut off after `wait_s`: a time-out of httpx begins anew with each byte."""
+    """A trace for a request that is cut off after `wait_s`, or by a stop; httpx's own time-out begins anew per byte.
+
+    What a signal's handler raises comes after the request. In the middle it would leave a lock or the place of the
+    connection taken for good, and no pump could be switched off.
+    """
     opened: list[socket.socket] = []
+    came: list[BaseException] = []
+    under_way = True
 
     def trace(event: str, info: dict[str, Any]) -> None:
         if event.endswith(("connect_tcp.complete", "start_tls.complete")):
             opened[:] = [info["return_value"].get_extra_info("socket")]
+            if came:
+                cut()
 
     def cut() -> None:
         for one in opened:
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
 
+    def stop(number: int, stack: FrameType | None) -> None:
+        try:
+            before[number](number, stack)
+        except BaseException as raised:
+            if not under_way:  # it came while the handlers were put back
+                raise
+            came.append(raised)
+            cut()
+
+    main = threading.current_thread() is threading.main_thread()
+    before = {int(n): old for n in STOPS if main and callable(old := signal.getsignal(n))}
     late = threading.Timer(wait_s, cut)
     late.daemon = True
-    late.start()
     try:
+        for number in before:
+            signal.signal(number, stop)
+        late.start()
         yield trace
     finally:
+        under_way = False
         late.cancel()
+        for number, old in before.items():
+            signal.signal(number, old)
+        if came:
+            raise came[0]
 
 
 def fetch(
@@ -109,7 +138,7 @@ class HttpTransport(Transport):
         authority = {"Authorization": f"Bearer {self._token}", "X-Session": str(session or new_session())}
         self._client = httpx.Client(
             timeout=httpx.Timeout(self._read_s, connect=config.timeout(config.connect_s, self._clock)),
-            limits=httpx.Limits(max_connections=1, max_keepalive_connections=0),
+            limits=httpx.Limits(max_keepalive_connections=0),
             headers={"X-Requested-With": "XMLHttpRequest", "Accept-Encoding": "identity", "Connection": "close"}
             | (authority if self._token else {}),
             trust_env=False,
