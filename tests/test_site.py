@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.xdist_group("site")  # one worker makes what its tests look at
+# one worker makes what its tests look at, which takes minutes where the machine is busy
+pytestmark = [pytest.mark.xdist_group("site"), pytest.mark.timeout(1200)]
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
 NEEDED = ("sphinx", "myst_parser", "furo", "sphinx_copybutton", "sphinxcontrib.mermaid")

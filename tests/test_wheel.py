@@ -1,6 +1,7 @@
 """What a user installs: every file the program reads is in the wheel, and the commands run from another folder."""
 
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -19,9 +20,13 @@ READ = {
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
+    folder, source = tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("source") / "tree"
+    others = shutil.ignore_patterns(
+        ".*", "runs", "multirun", "build", "dist", "*.egg-info", "__pycache__", "tests", "docs"
+    )
+    shutil.copytree(ROOT, source, ignore=others)  # a build leaves its own things in the tree
     words = ["-m", "pip", "wheel", "--quiet", "--disable-pip-version-check", "--no-deps", "--wheel-dir", str(folder)]
-    done = subprocess.run([sys.executable, *words, str(ROOT)], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, *words, str(source)], capture_output=True, text=True)
     if done.returncode and "setuptools" in done.stderr:
         pytest.skip("setuptools, which builds the wheel, cannot be fetched here")
     assert done.returncode == 0, done.stderr

@@ -330,7 +330,8 @@ class AgentLab:
         self.log = folder / "log"
         with self.log.open("w") as log:
             self.agent = subprocess.Popen(command, stderr=log, cwd=folder)
-        self.until(lambda: "ready" in self.log.read_text() and (not tty_line or " open\n" in self.log.read_text()))
+        words = ["ready", *([" open\n"] if tty_line else [])]
+        self.until(lambda: all(word in self.log.read_text() for word in words), timeout=60.0)
 
     def plug(self) -> None:
         """A new line under the same name."""
@@ -467,7 +468,7 @@ def test_what_became_of_a_request_without_answer(lab: AgentLab) -> None:
     lab.emulator.fault("lost_reply/all/1")
     began = time.monotonic()
     assert lab.ask("POST", "/changeDevice/M1")[0] == 11
-    assert time.monotonic() - began == pytest.approx(2.0, abs=0.5)
+    assert 1.9 < time.monotonic() - began < 5.0  # its own time-out of 2 s
     lab.emulator.fault("malformed/all/1")
     status, body = lab.ask("GET", "/getSysdata/")
     assert status == 200  # passed on as it is: judging is the client's task

@@ -128,6 +128,7 @@ def test_a_recording_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pytest.
                 m.setattr(os, "write", write)
                 with pytest.raises(RecordingError, match=words):
                     recorder.write({"time_min": 1.0, "od": 0.5})
+            assert (tmp_path / "r").read_bytes() == b"time_min,od\n"  # no half of a row before the next one
 
 
 def test_a_file_that_is_refused_is_closed(tmp_path: Path) -> None:
@@ -201,5 +202,6 @@ def test_a_long_journal_keeps_what_a_naive_reader_keeps(tmp_path: Path, monkeypa
         assert [row["k"] for row in reader.rows] == kept
         assert (reader.cut, reader.next_row) == (0, 12)
     assert all(
-        json.loads(b"{" + mark + b"}")["kind"] in ("device", "temperature", "regulate", "level") for mark in LANDMARKS
+        json.loads(b"{" + mark + b"}")["kind"] in ("device", "temperature", "regulate", "level", "share")
+        for mark in LANDMARKS
     )

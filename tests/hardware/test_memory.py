@@ -21,6 +21,7 @@ from experiments.cli import files
 from experiments.control.policies import load_policy
 from experiments.laws import registry
 from experiments.laws.share.estimator import CompositionEstimator
+from experiments.laws.share.recall import Recall
 from experiments.loop.loop import ClosedLoop
 from experiments.loop.share import Share
 from hardware.memory import Remembers
@@ -60,7 +61,7 @@ def unused(kind: str) -> ClosedLoop:
     """A loop in which everything that can remember does."""
     law = registry.build(registry.config(kind), model=EnvConfig(), policy=policy())
     config = registry.config(LAWS[kind], registry.SHARE)
-    share = Share(CompositionEstimator(config.estimator), registry.build(config, registry.SHARE), SCHEDULES)
+    share = Share(Recall(CompositionEstimator(config.estimator)), registry.build(config, registry.SHARE), SCHEDULES)
     reactors: Any = SimpleNamespace(names=("M0", "M1"))
     return ClosedLoop(reactors, law, Interlock(2), SCHEDULES, further=[share])
 
