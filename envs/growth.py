@@ -10,7 +10,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Arrhenius", "Cardinal", "DilutedCulture", "Exponential", "GrowthLaw", "Monod", "relative_to_37"]
+__all__ = [
+    "REFERENCE_TEMPERATURE", "Arrhenius", "Cardinal", "DilutedCulture", "Exponential", "GrowthLaw", "Monod",
+    "relative_to_37",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """What a culture is asked to do over time: phases with a setpoint and a temperature each, and maybe a composition."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,9 @@ class Scenario:
 
     setpoints: tuple[float, ...] = setting((0.5,), "one of each phase", "OD", above=0.0, at_most=1.5)
     minutes: tuple[float, ...] = setting((60.0,), "length of each phase", "min", above=0.0, at_most=100_000.0)
-    temperatures: tuple[float, ...] = setting((37.0,), "thermostat in each phase", "degC", within=(15, 42))
+    temperatures: tuple[float | None, ...] = setting(
+        (37.0,), "thermostat in each phase; null, with two species: where both grow alike", "degC", within=(15, 42)
+    )
     recovery_od: float = setting(
         0.0, "before the first phase the culture grows undiluted to here; 0: no recovery", "OD", within=(0, 1.5)
     )
@@ -73,6 +75,8 @@ class Scenario:
         object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
         object.__setattr__(self, "outputs", tuple(None if o is None or o != o else str(o) for o in self.outputs))
         check(self, "scenario")
+        alone = self.composed or None not in self.temperatures
+        require(alone, "scenario.temperatures", self.temperatures, "numbers where no share is asked for")
         for name in ("until", "outputs", "ratios"):
             given, phases = getattr(self, name), len(self.setpoints)
             allowed = f"none or one for each of the {phases} phases"
@@ -106,6 +110,10 @@ class Scenario:
     def composed(self) -> bool:
         """Whether a share is asked for at any time."""
         return bool(self.ratio_sine) or any(r is not None for r in self.ratios)
+
+    def resting(self, even_c: float) -> "Scenario":
+        """With a temperature in every phase: where none is given, that at which both species grow alike, degC."""
+        return replace(self, temperatures=tuple(even_c if t is None else t for t in self.temperatures))
 
     @property
     def supplied(self) -> frozenset[int]:

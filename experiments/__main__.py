@@ -11,7 +11,7 @@ from experiments.cli import completion
 
 KINDS = {
     "From a recording to a reactor": ("demo", "calibrate", "train", "certify", "deploy", "report"),
-    "At the device": ("calibrate_pump", "blank", "mark"),
+    "At the device": ("calibrate_pump", "blank", "mark", "calibrate_pair"),
     "Side by side": ("benchmark",),
 }
 DEMO = "The whole way in one command: calibrate, train, deploy, report."

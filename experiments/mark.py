@@ -1,6 +1,7 @@
 """Note in a run's folder what was done at the bench: `python -m experiments.mark run=RUN text=inoculated`.
 
-A level that was read off a vial is more: the run under way sets its ledger to it.
+A level that was read off a vial is more: the run under way sets its ledger to it. So is a share of two species that was
+counted in a sample: the run under way estimates with it.
 """
 
 import time
@@ -19,6 +20,9 @@ from hardware.storage.marks import Mark, add_mark
 
 __all__ = ["MarkConfig", "main", "mark"]
 
+LONGEST = 80  # characters of a text
+USUAL_SD = 0.03
+
 
 @dataclass(frozen=True)
 class MarkConfig:
@@ -31,20 +35,32 @@ class MarkConfig:
         None, "volume read off the vial: the ledger of a run under way is set to it, and the unit's own", "mL",
         within=(0, 40),
     )  # fmt: skip
+    share: float | None = setting(
+        None, "of the second species, counted in a sample: a run under way estimates with it", above=0.0, below=1.0
+    )
+    sd: float | None = setting(None, "of that share; null: 0.03", within=(0.001, 0.5))
     minute: float | None = setting(
-        None, "of the run at which it happened; null: now", "min", within=(-1440.0, 1_000_000.0)
+        None,
+        "of the run at which it happened, or the sample was drawn; null: now",
+        "min",
+        within=(-1440.0, 1_000_000.0),
     )
 
     def __post_init__(self) -> None:
         check(self)
         require(
-            0 < len(self.text) <= 80 and self.text.isprintable(),
+            0 < len(self.text) <= LONGEST and self.text.isprintable(),
             "text",
             repr(self.text),
             "1 to 80 characters, one line",
         )
+        require(self.sd is None or self.share is not None, "sd", self.sd, "null, or beside share=SHARE")
+        if self.level_ml is not None or self.share is not None:
+            require(
+                bool(self.reactor), "reactor", repr(self.reactor), "the one in which level_ml or share was measured"
+            )
         if self.level_ml is not None:
-            require(bool(self.reactor), "reactor", repr(self.reactor), "the one whose level_ml was read")
+            require(self.share is None, "share", self.share, "null beside level_ml: mark them one after the other")
             require(self.minute is None, "minute", self.minute, "null with level_ml: a level is of now")
 
 
@@ -65,6 +81,16 @@ def _minute_now(folder: Path, stored: Any) -> float:
     return DeviceClock(speed).of_real(time.time() - float(rows[0]["wall"])) / 60.0
 
 
+def _latest(folder: Path, stored: Any) -> float:
+    """The minute up to which a run has come."""
+    try:
+        return _minute_now(folder, stored)
+    except frame.UserError:
+        last = [path.read_text(encoding="utf-8").splitlines()[-1] for path in (folder / "recordings").glob("*.csv")]
+        begun = [line.split(",")[0] for line in last if line[:1].isdigit()]
+        return max(map(float, begun), default=0.0)
+
+
 def mark(config: MarkConfig) -> str:
     """Append a mark; returns what was done, in one line. Raises: UserError naming what to give."""
     folder = Path(config.run)
@@ -75,13 +101,20 @@ def mark(config: MarkConfig) -> str:
         raise frame.UserError(f"reactor={config.reactor}: not in this run; allowed {', '.join(known)}")
     try:
         minute = config.minute
+        stored = files.load_yaml(folder / "config.yaml")
         if minute is None:
-            minute = _minute_now(folder, files.load_yaml(folder / "config.yaml"))
-        text = config.text if config.level_ml is None else f"level {config.level_ml:g} mL"
-        path = add_mark(folder, Mark(minute, config.reactor, text, config.level_ml))
+            minute = _minute_now(folder, stored)
+        elif config.share is not None and minute > (now := _latest(folder, stored)):
+            raise frame.UserError(f"minute={minute:g}: allowed up to {now:.0f}, now; nobody has drawn that sample yet")
+        said = [f"level {config.level_ml:g} mL"] if config.level_ml is not None else []
+        sd = None if config.share is None else USUAL_SD if config.sd is None else config.sd
+        said += [f"share {config.share:g} +- {sd:g}"] if config.share is not None else []
+        own = [config.text] if config.text != MarkConfig.text or not said else []
+        text = ", ".join([*said, *own])[:LONGEST]
+        path = add_mark(folder, Mark(minute, config.reactor, text, config.level_ml, config.share, sd))
     except (OSError, RecordingError) as error:
         raise frame.UserError(f"run={folder}: {error}") from None
-    taken = "" if config.level_ml is None else "; the run takes it over with its next sample, and says so"
+    taken = "; a run under way takes it over with its next sample, and says so" if said else ""
     return f"{config.reactor or 'all reactors'}: {text} at minute {minute:.1f}, in {path}{taken}"
 
 

@@ -134,7 +134,7 @@ class Family:
                 f"scenario.ratios: {where} measures no fluorescence, by which a share is known; drop them or use a "
                 "Chi.Bio"
             )
-        asked = sorted({t for s in scenarios for t in s.temperatures if math.isfinite(t)})
+        asked = sorted({t for s in scenarios for t in s.temperatures if t is not None and math.isfinite(t)})
         if len(asked) > 1 and (lack := self.no_thermostat(backend)) is not None:
             degrees = f"{asked[0]:g} to {asked[-1]:g} degC"
             raise UnfitError(f"scenario.temperatures ask for {degrees}: {where} controls none{lack}")
@@ -167,13 +167,17 @@ class Family:
     def tubes(self, backend: Any, scenarios: Sequence[Scenario], most_ml: float) -> None:
         """Whether each spare pump that a scenario gives by has a tube, and can give `most_ml`. Raises: UnfitError."""
 
-    def coculture(self, backend: Any) -> Any:
-        """The config with vials of two species, where it simulates vials that were left as they are."""
+    def coculture(self, backend: Any, pair: str) -> Any:
+        """The config with vials of two species, where it simulates vials that were left as they are. pair: which."""
         return backend
 
     def vials(self, backend: Any, plant: PlantConfig) -> tuple[str, PlantConfig] | None:
         """Of cultures in software the config key that chooses them, and what they are. Args: plant: deploy's own."""
         return None
+
+    def sees_fluorescence(self, backend: Any) -> bool:
+        """Whether a device is told to measure fluorescence."""
+        return False
 
     def seeing_fluorescence(self, backend: Any) -> Any:
         """The config by which fluorescence is measured."""

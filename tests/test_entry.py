@@ -85,7 +85,7 @@ def test_every_command_can_be_completed() -> None:
 @pytest.mark.parametrize(
     ("typed", "reply"),
     [
-        ("turbidostat cali", ["calibrate ", "calibrate_pump "]),
+        ("turbidostat cali", ["calibrate ", "calibrate_pump ", "calibrate_pair "]),
         ("turbidostat train agent=tu", ["tuned "]),  # bash's new word begins behind the =
         ("turbidostat deploy plant.growth.mu_", ["plant.growth.mu_cv="]),
     ],

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.coculture.rates import T_MAX, p_putida_rate
 from envs.coculture.task import CocultureConfig, advance, share
 
 if TYPE_CHECKING:
@@ -38,9 +37,9 @@ class Grid:
 
     def axes(self, config: CocultureConfig) -> tuple[Array, Array, Array]:
         """Points of T, m, x, in the order of a value's axes."""
-        rate = config.scale_p * p_putida_rate(np.linspace(*config.temperatures, 71))
+        rate = config.scale_p * config.pair.rates(np.linspace(*config.span, 71))[:, 1]
         return (
-            np.linspace(config.temperatures[0], T_MAX, self.temperatures),
+            np.linspace(config.span[0], config.pair.temperatures[1], self.temperatures),
             np.linspace(rate.min(), rate.max(), self.rates),
             np.linspace(-self.logit_span, self.logit_span, self.logits),
         )
@@ -121,14 +120,20 @@ def cost_to_go(model: Transitions, setpoints: Array) -> Array:
 
 
 def best_action(
-    config: CocultureConfig, model: Transitions | None, value: Array | None, state: Array, setpoint: Array
+    config: CocultureConfig,
+    model: Transitions | None,
+    value: Array | None,
+    state: Array,
+    setpoint: Array,
+    errors: Array | None = None,
 ) -> NDArray[np.intp]:
     """Index of the action with the least cost of this decision and, given a value, of those after it.
 
     Args: state: (N, 3). setpoint: share in force, (N,). value: V after this decision, (G,) or one per state, (G, N);
-      None: nothing after it counts, which is the myopic law.
+      None: nothing after it counts, which is the myopic law. errors: of both growth curves, relative, (N, 2).
     """
-    after = advance(config, state[:, None, :], config.targets(), config.control_min)  # (N, A, 3)
+    own = None if errors is None else errors[:, None, :]
+    after = advance(config, state[:, None, :], config.targets(), config.control_min, own)  # (N, A, 3)
     cost = np.square(share(after[..., 0]) - np.asarray(setpoint)[:, None])
     if value is not None:
         assert model is not None

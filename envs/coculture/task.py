@@ -4,9 +4,9 @@ Dilution removes both alike, so that with r the share of P. putida in e + p only
 
   d logit(r)/dt = m_p - mu_e(T),     m_p' = (mu_p(T) - m_p) / 1 h,     T heats by 2 degC/min and cools passively
 
-E. coli follows the temperature within 2 min, which is taken as at once. The share's logit is an integrator of limited
-rate, +.30 per hour at 29 degC and -.63 at 36, and what it needs hours for is worth beginning before it is asked for.
-Sources of the rates: envs/coculture/rates.py.
+The first species, E. coli, follows the temperature within 2 min, which is taken as at once. The share's logit is an
+integrator of limited rate, +.30 per hour at 29 degC and -.63 at 36, and what it needs hours for is worth beginning
+before it is asked for. The two species: envs/coculture/pair.py.
 """
 
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from conf.schema import check, require, setting
-from envs.coculture.rates import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
+from conf.schema import check, part, require, setting
+from envs.coculture.pair import PairConfig
 from envs.gym_adapter import EpisodeEnv
 from envs.vector_env import EpisodeVectorEnv
 
@@ -40,9 +40,10 @@ class CocultureConfig:
 
     kind: str = setting("coculture", "which task")
     n_actions: int = setting(17, "temperatures, equally spaced", within=(2, 1001))
-    temperatures: tuple[float, float] = setting(
-        (T_MIN, T_MAX), "coldest and warmest", "degC", within=(T_MIN, T_MAX), interval=True
+    temperatures: tuple[float, float] | None = setting(
+        None, "coldest and warmest; null: the range of the pair's curves", "degC", within=(4, 60), interval=True
     )
+    pair: PairConfig = part(PairConfig, "the two species")
     control_min: float = setting(10.0, "between decisions, whole minutes", "min", within=(1, 240))
     episode_steps: int = setting(72, "decisions per episode, ended by truncation", at_least=1)
     preview_min: float = setting(
@@ -54,21 +55,30 @@ class CocultureConfig:
     start_share: tuple[float, float] = setting(
         (0.05, 0.95), "range of the share at the start", above=0.0, below=1.0, interval=True
     )
-    scale_e: float = setting(1.0, "of E. coli's growth curve", within=(0.5, 2))
-    scale_p: float = setting(1.0, "of P. putida's", within=(0.5, 2))
+    scale_e: float = setting(1.0, "of the first species' growth curve", within=(0.5, 2))
+    scale_p: float = setting(1.0, "of the second's", within=(0.5, 2))
     heating_c_per_min: float = setting(2.0, "fastest rise of a heated vial", "degC/min", within=(0.1, 10))
     cooling_min: float = setting(39.0, "time constant of passive cooling", "min", within=(1, 600))
-    ambient_c: float = setting(24.0, "temperature an unheated vial cools to", "degC", within=(0, 28.9))
+    ambient_c: float = setting(24.0, "temperature an unheated vial cools to", "degC", within=(0, 40))
 
     def __post_init__(self) -> None:
         check(self, "env")
         require(self.control_min % 1.0 == 0.0, "env.control_min", self.control_min, "whole minutes")
         even = self.preview_min % self.control_min == 0.0
         require(even, "env.preview_min", self.preview_min, f"a multiple of env.control_min = {self.control_min:g}")
+        (low, high), (coldest, warmest) = self.span, self.pair.temperatures
+        within = f"{coldest:g} to {warmest:g} degC, where the curves of the pair hold"
+        require(coldest <= low and high <= warmest, "env.temperatures", self.span, within)
+        require(self.ambient_c < low, "env.ambient_c", self.ambient_c, f"less than the coldest target, {low:g} degC")
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Coldest and warmest target, degC."""
+        return self.pair.temperatures if self.temperatures is None else self.temperatures
 
     def targets(self) -> Array:
         """The temperatures one can choose, degC, shape (A,)."""
-        return np.linspace(*self.temperatures, self.n_actions)
+        return np.linspace(*self.span, self.n_actions)
 
     @property
     def columns(self) -> int:
@@ -86,19 +96,23 @@ def share(x: Any) -> Any:
     return 1.0 / (1.0 + np.exp(-np.asarray(x)))
 
 
-def advance(config: CocultureConfig, state: Array, target: Array, minutes: float) -> Array:
+def advance(config: CocultureConfig, state: Array, target: Array, minutes: float, errors: Array | None = None) -> Array:
     """State (..., 3) - logit of the share, degC, m_p in 1/h - after `minutes` (whole) at a thermostat target.
 
-    One step a minute, rates at the mean temperature of the step. Args: target: degC, broadcastable to (...).
+    One step a minute, rates at the mean temperature of the step. Args: target: degC, broadcastable to (...). errors:
+    of both growth curves beside the config's scales, relative, (..., 2).
     """
+    off = np.zeros(2) if errors is None else errors
+    scale_e, scale_p = config.scale_e * (1.0 + off[..., 0]), config.scale_p * (1.0 + off[..., 1])
     x, temperature, rate = (state[..., k] for k in range(3))
-    kept, follow = np.exp(-1.0 / config.cooling_min), -np.expm1(-1.0 / LAG_P_MIN)
+    kept, follow = np.exp(-1.0 / config.cooling_min), -np.expm1(-1.0 / config.pair.second.lag_min)
     for _ in range(round(minutes)):
         cooled = config.ambient_c + (temperature - config.ambient_c) * kept
         reached = np.maximum(cooled, np.minimum(target, cooled + config.heating_c_per_min))
         mean = 0.5 * (temperature + reached)
-        faster = rate + (config.scale_p * p_putida_rate(mean) - rate) * follow
-        x = x + (0.5 * (rate + faster) - config.scale_e * e_coli_rate(mean)) / 60.0
+        first, second = np.moveaxis(config.pair.rates(mean), -1, 0)
+        faster = rate + (scale_p * second - rate) * follow
+        x = x + (0.5 * (rate + faster) - scale_e * first) / 60.0
         temperature, rate = reached, faster
     return np.stack(np.broadcast_arrays(x, temperature, rate), axis=-1)
 
@@ -115,17 +129,20 @@ def passed(config: CocultureConfig, goal: Array) -> Array:
     return np.stack([np.where(left > 0.0, now, following), following, left], axis=-1)
 
 
-def at_rest(config: CocultureConfig, x: Array, temperature: Array | float = EQUAL_RATES_C) -> Array:
-    """State (..., 3) of a culture that has been at one temperature for long."""
-    t = np.broadcast_to(np.asarray(temperature, dtype=np.float64), np.shape(x))
-    return np.stack([x, t, config.scale_p * p_putida_rate(t)], axis=-1)
+def at_rest(config: CocultureConfig, x: Array, temperature: Array | float | None = None) -> Array:
+    """State (..., 3) of a culture that has been at one temperature for long; None: where both grow alike."""
+    warm = config.pair.even_c if temperature is None else temperature
+    t = np.broadcast_to(np.asarray(warm, dtype=np.float64), np.shape(x))
+    return np.stack([x, t, config.scale_p * config.pair.rates(t)[..., 1]], axis=-1)
 
 
 def limits(config: CocultureConfig) -> tuple[Array, Array]:
     """Lowest and highest of every number of an observation, each (O,)."""
     goal = logit(np.array(config.setpoints))
-    low = np.array([-LARGEST, config.ambient_c, 0.4 * config.scale_p, goal[0], goal[0], 0.0])
-    high = np.array([LARGEST, T_MAX, 1.0 * config.scale_p, goal[1], goal[1], config.preview_min])
+    rates = 10.0 * config.pair.rates(np.linspace(*config.pair.temperatures, 71))[:, 1]
+    slow, fast = np.floor(rates.min()) / 10.0 * config.scale_p, np.ceil(rates.max()) / 10.0 * config.scale_p
+    low = np.array([-LARGEST, config.ambient_c, slow, goal[0], goal[0], 0.0])
+    high = np.array([LARGEST, config.pair.temperatures[1], fast, goal[1], goal[1], config.preview_min])
     return low[: config.columns], high[: config.columns]
 
 
@@ -161,7 +178,7 @@ class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
 
     def _begun(self, numbers: Array) -> Array:
         c = self.config
-        spans = np.array([c.start_share, c.temperatures, c.setpoints, c.setpoints])
+        spans = np.array([c.start_share, c.span, c.setpoints, c.setpoints])
         drawn = spans[:, 0] + (spans[:, 1] - spans[:, 0]) * numbers[:, :4]
         state = at_rest(c, logit(drawn[:, 0]), drawn[:, 1])
         goal = logit(drawn[:, 2:])

@@ -51,7 +51,6 @@ class IdentifyConfig:
     horizon_min: float = setting(
         60.0, "of the predictions of unseen readings, each from a fresh start", "min", within=(20, 1440)
     )
-
     seed: int = setting(0, "of the noise models that the estimate is averaged over", at_least=0)
 
     def __post_init__(self) -> None:

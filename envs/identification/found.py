@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Verdict:
-    """word: use, use with care or record again. why: one clause. then: what to do next, "" where it is to train."""
+    """word: use, use with care, record again or read again. why: one clause. then: what to do next, "" for training."""
 
     word: str
     why: str

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from envs.identification.model import CONFIDENCE, Parameter
 from envs.identification.noise_model import FULL, QUICK, NoiseModel, average, effective
-from envs.identification.screening import OD_FLOOR, Series, pumped_volume, running_median
+from envs.identification.screening import FEWEST_READINGS, OD_FLOOR, Series, pumped_volume, running_median
 
-__all__ = ["FEWEST_READINGS", "Estimate", "Quality", "enough", "estimate", "outliers"]
+__all__ = ["Estimate", "Quality", "enough", "estimate", "outliers"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,7 +36,6 @@ Mask = NDArray[np.bool_]
 LEVEL_ROWS = 5  # of the running median that stands for the OD level
 COLUMNS = 4  # ln y, 1, t, -C
 MU, K = 1, 2  # positions among the three regressors
-FEWEST_READINGS = 10
 STRATA = 64  # of each point's Student t
 
 OUTLIER_SD = 4.5
@@ -286,7 +285,7 @@ def estimate(parts: list[Series], rounds: tuple[int, ...] = FULL, seed: int = 0)
 
     Args: parts: screened series; readings may be nan, time and pump count throughout. rounds: points of the noise
       model; QUICK where many short parts are estimated and an interval decides nothing alone. seed: of the points.
-    Returns: one `Estimate` each, which need not be worth anything: see `calibration.refusal`.
+    Returns: one `Estimate` each, which need not be worth anything: see `refusal.check_estimate`.
     Raises: ValueError for a series with fewer than ten readings above zero.
     """
     batch = _batch(parts)

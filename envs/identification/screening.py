@@ -16,8 +16,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 __all__ = [
-    "Rejection", "Screened", "Series", "merged", "noise_sd", "pumped_volume", "row_spans", "running_median", "runs",
-    "screen",
+    "FEWEST_READINGS", "Rejection", "Screened", "Series", "merged", "noise_sd", "pumped_volume", "row_spans",
+    "running_median", "runs", "screen",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -33,6 +33,7 @@ JUMP_SHARE = 0.1  # of the recording's 95th OD percentile; smaller steps carry n
 JUMP_ROWS = 5
 SHORT_ROWS = 10  # between two jumps; what is shorter is a burst, not a regime
 FROZEN_ROWS = 10
+FEWEST_READINGS = 10  # that anything is estimated from
 NOISY_FACTOR = 6.0
 WEEK_MIN = 10080
 GAP_MIN = 5.0  # and five times the usual spacing: what the pump did meanwhile is unknown
@@ -228,9 +229,9 @@ def screen(series: Series) -> Screened:
 
 def _check_left(series: Series) -> None:
     left = int((series.od > 0.0).sum())
-    if left < FROZEN_ROWS:
+    if left < FEWEST_READINGS:
         raise ValueError(
-            f"{left} trustworthy readings above zero are left, at least {FROZEN_ROWS} are needed: the sensor was "
+            f"{left} trustworthy readings above zero are left, at least {FEWEST_READINGS} are needed: the sensor was "
             "frozen, dark or erratic throughout"
         )
 

@@ -1,4 +1,4 @@
-"""What to do with a calibration, in one line: use it, use it with care, or record again."""
+"""What to do with a pair, in one line: use it, or use it with care. Without a pair: `refusal`."""
 
 from collections.abc import Iterator
 

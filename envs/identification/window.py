@@ -4,8 +4,7 @@ import numpy as np
 
 from envs.identification.drift import Segment, drifts
 from envs.identification.model import NotIdentifiable
-from envs.identification.prediction_error import FEWEST_READINGS
-from envs.identification.screening import WEEK_MIN, Screened, Series
+from envs.identification.screening import FEWEST_READINGS, WEEK_MIN, Screened, Series
 
 __all__ = ["SHORTEST_WINDOW_MIN", "choose_window", "longest"]
 

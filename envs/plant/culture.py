@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, require, setting
+from envs.coculture.pair import PairConfig
 from envs.growth import Exponential, GrowthLaw, Monod
 from envs.integrators import Integrator
 from envs.plant.course import along, check_knots
@@ -81,6 +82,7 @@ class Culture:
       config: how cells grow; rngs: one stream per vial, for its growth rate.
       integrate: integrator.
       second: another species beside that of `config`, S = 2; second_rngs: one stream per vial, for its draws.
+      pair: curves of both, where their temperature law is `pair`.
     State: `biomass` (true, suspended), shape (N, S); `substrate`, shape (N,). Fault switches, shape (N,): `mu_factor`,
     and `stir_factor` (1 turning, 0 stopped; for a stirrer that fails, not for the still phase of each cycle).
     """
@@ -92,6 +94,7 @@ class Culture:
         integrate: Integrator,
         second: SecondSpeciesConfig,
         second_rngs: Streams,
+        pair: PairConfig,
     ) -> None:
         self.config, self._n = config, len(rngs)
         self._integrate = integrate
@@ -106,7 +109,9 @@ class Culture:
         # Quoted for fresh medium: Monod's rate at s = 1 is mu_max / (1 + k_s).
         endless = np.isinf(config.yield_od)
         self._law: GrowthLaw = Exponential(mu) if endless else Monod(mu * (1.0 + config.k_s), config.k_s)
-        self._responses = [response(a.temperature_law, a.activation_kj_mol) for a in species]
+        self._responses = [
+            response(a.temperature_law, a.activation_kj_mol, pair.curve(k)) for k, a in enumerate(species)
+        ]
         self._lags_min = [a.adaptation_min for a in species]
         self.mu_factor, self.stir_factor = np.ones(self._n), np.ones(self._n)
 

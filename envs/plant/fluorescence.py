@@ -1,4 +1,4 @@
-"""Pyoverdine, the fluorescent pigment of P. putida, and the sensor that counts its light.
+"""The fluorescent pigment of the second of two species, as pyoverdine of P. putida, and the sensor of its light.
 
 Source of the equations and numbers: Lee, Morlock, Allan, Steel, Cell Reports Methods 5:101009 (2025); its public model
 Janmorlock/CompEst3000 (MIT). Light is counted as the device's base times its first emission: counts of one band.
@@ -10,31 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
-from envs.coculture.rates import T_MAX, T_MIN
+from envs.coculture.pair import PairConfig
 from envs.plant.noise import Streams, Tape, uniform
 from envs.plant.sensor import FULL_SCALE
 
-__all__ = ["Fluorescence", "FluorescenceConfig", "steady_production"]
+__all__ = ["DAY_MIN", "Fluorescence", "FluorescenceConfig"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Highest power first: the other order would reach 900 000 at 29 and at 36 degC and a valley of 100 between.
-POLYNOMIAL = (44.49572512791427, 31.820479677943325, -917.5864128224449, -886.6854718162117, 6318.711894680335)
-CENTRE_C = 32.5  # degC
-LEAST = 20.0  # counts per OD and hour
-FOLLOW_PER_H = 1.6  # 1/h
-DELAY_MIN = 30
 DAY_MIN = 1440.0
-
-
-def steady_production(temperature: Array | float) -> Array:
-    """g_ss(T) = max(20, sum_k c_k (T - 32.5)^k), counts per hour and OD of P. putida; shape of `temperature`.
-
-    T is cut to [29, 36] degC: 3495 at 29, a peak of 6531 near 32, 5270 at 33.2, 602 at 35, 20 at 36.
-    """
-    t = np.clip(temperature, T_MIN, T_MAX)
-    return np.maximum(np.polyval(np.array(POLYNOMIAL), t - CENTRE_C), LEAST)
 
 
 @dataclass(frozen=True)
@@ -67,19 +52,20 @@ class FluorescenceConfig:
 class Fluorescence:
     """N vials' pigment and sensors.
 
-      f' = g p - D f                        pigment; p is the OD of P. putida, D the dilution rate
-      g' = 1.6 / h (g_ss(T) - g(t - 30 min)),  g >= 20      its production rate, a damped oscillation about g_ss
+      f' = g p - D f          pigment; p is the OD of the second species, D the dilution rate
+      g' = follow (g_ss(T) - g(t - delay)),  g >= least    its production rate, a damped oscillation about g_ss
 
     g takes one step per minute. f is exact for constant p and D over the interval.
 
     Args:
       config: the sensor; rngs: one stream per vial, for what is drawn once and for the readings.
+      pair: whose pigment it is.
     State, shape (N,): `pigment` (counts), `production` (counts per hour and OD). Fault switches, bool, shape (N,), in
     rising precedence: `dead` (reads 0), `saturated`, `frozen`.
     """
 
-    def __init__(self, config: FluorescenceConfig, rngs: Streams) -> None:
-        self.config, n = config, len(rngs)
+    def __init__(self, config: FluorescenceConfig, rngs: Streams, pair: PairConfig) -> None:
+        self.config, self._pair, n = config, pair, len(rngs)
         parts = [r.spawn(2) for r in rngs]
         once, reading = ([p[k] for p in parts] for k in range(2))
         self.draws: dict[str, Array] = {
@@ -95,17 +81,19 @@ class Fluorescence:
 
         Args: producers: OD of P. putida; growth: its rate, 1/min (none: no pigment); temperature: degC; shape (N,).
         """
-        self.production: Array = steady_production(temperature)
-        self._past = np.tile(self.production, (DELAY_MIN, 1))
+        self.production: Array = self._pair.production(temperature)
+        self._past = np.tile(self.production, (self._pair.pigment.delay_min, 1))
         made = self.production / 60.0 * producers
         self.pigment: Array = np.divide(made, growth, out=np.zeros_like(made), where=growth > 0.0)
         self._last = np.full(producers.size, np.nan)
 
     def new_minute(self, temperature: Array) -> None:
         """A minute begins at `temperature`, degC, shape (N,): production takes its step."""
-        wanted = self.production + FOLLOW_PER_H / 60.0 * (steady_production(temperature) - self._past[0])
+        pigment = self._pair.pigment
+        steady = self._pair.production(temperature)
+        wanted = self.production + pigment.follow_per_h / 60.0 * (steady - self._past[0])
         self._past = np.concatenate([self._past[1:], self.production[None]])
-        self.production = np.maximum(wanted, LEAST)
+        self.production = np.maximum(wanted, pigment.least)
 
     def advance(self, minutes: float, producers: Array, kept: Array, dilution: Array, concentrated: Array) -> None:
         """Dilute, make and wash out pigment over an interval.

@@ -4,13 +4,15 @@ It is not the training model. It shares the growth-law interface with it and not
 everything real is switched off (the defaults of `PlantConfig`). Units: min, mL, mL/s, degC, 1/min; OD has none.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, part, setting
 from envs.bench import Bench
+from envs.coculture.pair import PairConfig
+from envs.growth import REFERENCE_TEMPERATURE
 from envs.integrators import INTEGRATORS
 from envs.plant.culture import Culture, GrowthConfig
 from envs.plant.disturbance import named
@@ -35,6 +37,7 @@ class PlantConfig:
     pump: PumpConfig = part(PumpConfig, "how a pump turns on-time into volume")
     sensor: SensorConfig = part(SensorConfig, "what an averaged OD reading adds to the truth")
     vessel: VesselConfig = part(VesselConfig, "the vial and its bottle")
+    pair: PairConfig = part(PairConfig, "curves and pigment of two species, where temperature_law is pair")
     thermal: ThermalConfig = part(ThermalConfig, "heater and surroundings")
     second: SecondSpeciesConfig = part(SecondSpeciesConfig, "a second species in the vial")
     fluorescence: FluorescenceConfig = part(FluorescenceConfig, "light that the second species gives, and its sensor")
@@ -60,6 +63,16 @@ class PlantConfig:
         check(self, "plant")
         for name in self.disturbances:
             named(name)
+
+
+def of_pair(config: PlantConfig, pair: PairConfig) -> PlantConfig:
+    """A plant whose species are of another pair: each grows in proportion to its new curve as it did to its old one."""
+    if pair == config.pair:
+        return config
+    by = pair.rates(REFERENCE_TEMPERATURE) / config.pair.rates(REFERENCE_TEMPERATURE)
+    first = replace(config.growth, mu=config.growth.mu * float(by[0]), adaptation_min=pair.first.lag_min)
+    second = replace(config.second, mu=config.second.mu * float(by[1]), adaptation_min=pair.second.lag_min)
+    return replace(config, pair=pair, growth=first, second=second, start_temperature=pair.even_c)
 
 
 class Plant:
@@ -95,18 +108,18 @@ class Plant:
         if n < 1:
             raise ValueError(f"number of vials = {n}: allowed >= 1")
         self.config, self.n = config, n
-        parts = [r.spawn(6) for r in streams(rng, n)]
-        once, process, reading, start, second, light = ([p[k] for p in parts] for k in range(6))
+        parts = [r.spawn(7) for r in streams(rng, n)]
+        once, process, reading, start, second, light, thermometer = ([p[k] for p in parts] for k in range(7))
         # The parts draw from the same streams: their order belongs to what a seed means.
         integrate = INTEGRATORS[config.integrator]
-        self.culture = Culture(config.growth, once, integrate, config.second, second)
+        self.culture = Culture(config.growth, once, integrate, config.second, second, config.pair)
         self.vessel = Vessel(config.vessel, config.pump, once, np.full(n, volume_ml, dtype=np.float64))
         self.feed = FeedPump(config.pump, once)
         self.sensor = OdSensor(config.sensor, once, reading)
-        self.thermal = Thermal(config.thermal, n)
+        self.thermal = Thermal(config.thermal, thermometer)
         self.feed.media_left_ml[:] = config.vessel.media_ml
-        self.draws = self.culture.draws | self.vessel.draws | self.feed.draws | self.sensor.draws
-        self.fluorescence = Fluorescence(config.fluorescence, light) if config.second.present else None
+        self.draws = self.culture.draws | self.vessel.draws | self.feed.draws | self.sensor.draws | self.thermal.draws
+        self.fluorescence = Fluorescence(config.fluorescence, light, config.pair) if config.second.present else None
         if self.fluorescence is not None:
             self.draws |= self.fluorescence.draws
         self.draws["start_min"] = uniform(start, config.start_min, config.start_min + config.start_spread_min)

@@ -7,29 +7,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
-from envs.coculture.rates import e_coli_rate, p_putida_rate
 from envs.growth import Arrhenius, Cardinal, relative_to_37
 
 __all__ = ["TEMPERATURE_LAWS", "SecondSpeciesConfig", "response"]
 
 Array = NDArray[np.float64]
 
-TEMPERATURE_LAWS = ("none", "arrhenius", "cardinal", "e_coli", "p_putida")
+TEMPERATURE_LAWS = ("none", "arrhenius", "cardinal", "pair")
 
 
-def response(law: str, activation_kj_mol: float) -> Callable[[Array], Array]:
+def response(law: str, activation_kj_mol: float, curve: Callable[[Array], Array]) -> Callable[[Array], Array]:
     """phi(T) / phi(37 degC) of a temperature law, one of `TEMPERATURE_LAWS`.
 
-    `e_coli` and `p_putida` are the curves of envs/coculture/rates.py, which stay at their value of 36 degC above it: a
-    `mu` quoted at 37 degC is the curve's rate at 36.
-    Args: activation_kj_mol: of `arrhenius`, kJ/mol.
+    `pair` is the species' own curve (envs/coculture/pair.py), which stays beyond its range at the value of the nearer
+    end: a `mu` quoted at 37 degC is that of the default pair at 36.
+    Args: activation_kj_mol: of `arrhenius`, kJ/mol. curve: of `pair`.
     """
     laws: dict[str, Callable[[Array], Array]] = {
         "none": np.ones_like,
         "arrhenius": Arrhenius(activation_kj_mol),
         "cardinal": Cardinal(),
-        "e_coli": e_coli_rate,
-        "p_putida": p_putida_rate,
+        "pair": curve,
     }
     return relative_to_37(laws[law])
 

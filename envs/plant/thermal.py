@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
+from envs.plant.noise import Streams, uniform
 
 __all__ = ["Thermal", "ThermalConfig"]
 
@@ -24,24 +25,30 @@ class ThermalConfig:
     heating_c_per_min: float = setting(2.0, "fastest rise of a heated vial", "degC/min", within=(0.1, 10))
     medium_c: float = setting(24.0, "temperature of fresh medium", "degC", within=(0, 45))
     ripple_c: float = setting(0.0, "sd of the temperature reading", "degC", within=(0, 2))
+    offset_c: tuple[float, float] = setting(
+        (0.0, 0.0), "measured less true temperature, drawn once per vial between these", "degC", within=(-3, 3),
+        interval=True,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check(self, "plant.thermal")
 
 
 class Thermal:
-    """N heated vials.
+    """N heated vials. The thermostat goes by its thermometer, whose `offset` a vial keeps; cells feel the truth.
 
-    Args: config: heater and surroundings; n: number of vials.
+    Args: config: heater and surroundings; rngs: one stream per vial, for its thermometer.
     State, shape (N,), degC: `temperature`, `target` of the thermostat (0 = off), `mean` of the last interval.
     """
 
-    def __init__(self, config: ThermalConfig, n: int) -> None:
-        self.config, self._n = config, n
+    def __init__(self, config: ThermalConfig, rngs: Streams) -> None:
+        self.config, self._n = config, len(rngs)
+        self.draws: dict[str, Array] = {"thermometer_offset": uniform(rngs, *config.offset_c)}
+        self.offset = self.draws["thermometer_offset"]
 
     def reset(self, temperature: float) -> None:
-        """Vial and thermostat at `temperature`, degC."""
-        self.temperature: Array = np.full(self._n, float(temperature))
+        """Vial and thermostat where the thermometer shows `temperature`, degC."""
+        self.temperature: Array = float(temperature) - self.offset
         self.target: Array = np.full(self._n, float(temperature))
         self.mean: Array = self.temperature
         self._ripple = np.zeros(self._n)
@@ -63,7 +70,7 @@ class Thermal:
         t = self.config
         mixed = t.medium_c + (self.temperature - t.medium_c) * kept
         cooled = t.ambient_c + (mixed - t.ambient_c) * np.exp(-minutes / t.cooling_min)
-        heated = np.minimum(self.target, cooled + t.heating_c_per_min * minutes)
+        heated = np.minimum(self.target - self.offset, cooled + t.heating_c_per_min * minutes)
         self.temperature = np.maximum(cooled, heated)
         # A vial that reaches its target early in the interval spends only that share of it on the way.
         rise = self.temperature - mixed
@@ -72,4 +79,4 @@ class Thermal:
 
     def read(self) -> Array:
         """The thermometer's value, degC, shape (N,); its ripple changes every minute."""
-        return self.temperature + self.config.ripple_c * self._ripple
+        return np.asarray(self.temperature + self.offset + self.config.ripple_c * self._ripple)

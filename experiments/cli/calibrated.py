@@ -1,14 +1,15 @@
-"""What a calibration leaves for other commands: the growth model and the plant behind a recording, from their files."""
+"""What a calibration leaves for other commands, from its files: growth model, plant behind a recording, two species."""
 
 from typing import TypeVar
 
 from omegaconf import DictConfig
 
+from envs.coculture.pair import PairConfig, named_pair
 from envs.plant.plant import PlantConfig
 from envs.task import EnvConfig
 from experiments.cli import files, frame
 
-__all__ = ["read_env_file", "read_plant_file"]
+__all__ = ["read_env_file", "read_pair", "read_plant_file"]
 
 T = TypeVar("T")
 
@@ -21,6 +22,15 @@ def read_env_file(path: str) -> EnvConfig:
 def read_plant_file(path: str) -> PlantConfig:
     """The plant of a twin.yaml. Raises: UserError naming the file and what is wrong with it."""
     return _read("plant_file", path, "twin.yaml", PlantConfig(), "plant")
+
+
+def read_pair(name: str) -> PairConfig:
+    """A pair of species: a preset of conf/strains, or the pair.yaml of a calibration.
+
+    Raises: UserError naming the presets, or the file and what is wrong with it.
+    """
+    with frame.refusing(ValueError):
+        return named_pair(name)
 
 
 def _read(key: str, path: str, usual: str, default: T, prefix: str) -> T:

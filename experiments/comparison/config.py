@@ -55,6 +55,9 @@ class BenchmarkConfig:
     )
     calibration: bool = setting(False, "simulate the open-loop protocol and fit it (Fig. 2a)")
     training: bool = setting(False, "train all agents even if no study needs them (Fig. 2b)")
+    pair: str = setting(
+        "ecoli_pputida", "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
+    )
     plants: dict[str, PlantConfig] = setting({}, "plants by name")
     plant_file: str | None = setting(
         None, "a twin.yaml of calibrate, as plant `twin`; each vial begins at an hour of its own, drawn over its knots"

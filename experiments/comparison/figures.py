@@ -244,7 +244,7 @@ def shares(trials: Sequence[ShareTrial]) -> Figure:
         top.plot(hours, trial.setpoint[::STEP], color="black", linewidth=1.0, linestyle="--")
         top.set_title(law_of({"controller": trial.cell.controller, "preview": trial.foresight}))
         bottom.set_xlabel("hours")
-    axes[0].set(ylabel="share of P. putida", ylim=(0.0, 1.0))
+    axes[0].set(ylabel="share of the second species", ylim=(0.0, 1.0))
     axes[columns].set_ylabel("vial, °C")
     return figure
 

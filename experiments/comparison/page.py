@@ -48,7 +48,8 @@ ESTIMATES = (
     ("alarm_pct", "Decisions by it because of surprises, %"),
 )
 SHARE = {
-    "error": "mean over the scenario of |r - setpoint|, r the true share of P. putida, wherever a share is asked for.",
+    "error": "mean over the scenario of |r - setpoint|, r the true share of the second species, wherever one is asked "
+    "for.",
     "told ahead": "changes of the setpoint are announced, as early as the scenario's announce_min; `optimum` knows the "
     "whole program in either case.",
     "calibrated": "the estimator knows each reactor's factor and offset of the light sensor, with errors of 2 % and "

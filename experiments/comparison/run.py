@@ -10,20 +10,21 @@ from typing import Any
 import numpy as np
 
 from dqn import policy as policies
-from envs.plant.plant import PlantConfig
+from envs.plant.plant import PlantConfig, of_pair
 from experiments.certification import certificate
 from experiments.cli import files, frame
-from experiments.cli.calibrated import read_plant_file
+from experiments.cli.calibrated import read_pair, read_plant_file
 from experiments.comparison import page as pages
 from experiments.comparison import studies
 from experiments.comparison.config import TWIN, BenchmarkConfig
 from experiments.comparison.trials import DensityTrial, Followed, Loops, cells
 from experiments.control.policies import composition_policy, find_policy, load_policy
+from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from experiments.reporting import charts, page
 from experiments.training.config import TrainConfig
 
-__all__ = ["benchmark", "policies_of", "with_seeds", "with_twin"]
+__all__ = ["benchmark", "policies_of", "with_pair", "with_seeds", "with_twin"]
 
 log = logging.getLogger(__name__)
 
@@ -110,6 +111,14 @@ def with_seeds(config: BenchmarkConfig) -> BenchmarkConfig:
     return config
 
 
+def with_pair(config: BenchmarkConfig) -> BenchmarkConfig:
+    """Vials of the two species, and a temperature in every phase: by default that at which they grow alike."""
+    pair = read_pair(config.pair)
+    scenarios = {name: s.resting(pair.resting_c) for name, s in config.scenarios.items()}
+    plants = {name: of_pair(p, pair) if p.second.present else p for name, p in config.plants.items()}
+    return replace(config, scenarios=scenarios, plants=plants)
+
+
 def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> dict[str, Followed | None]:
     """What each law of a share follows, if anything; the run folder keeps copies. Raises: UserError naming the file."""
     found: dict[str, Followed | None] = {}
@@ -118,13 +127,19 @@ def policies_of(config: BenchmarkConfig, names: Iterable[str], folder: Path) -> 
         kept.mkdir(parents=True, exist_ok=True)
         where = config.composition_policies.get(name, "shipped")
         policy = composition_policy(config.compositions[name].kind, where, kept, resumed=False)
+        if policy is not None:
+            try:
+                registry.build(config.compositions[name], registry.SHARE, policy=policy, pair=read_pair(config.pair))
+            except ValueError as error:
+                remedy = f"give composition_policies.{name}=RUN, or studies.NAME.compositions without {name}"
+                raise frame.UserError(f"{error}; {remedy}") from None
         found[name] = None if policy is None else (policy, None)
     return found
 
 
 def benchmark(config: BenchmarkConfig, folder: Path) -> None:
     """Calibrate, train, run every closed loop, compare, draw, report."""
-    config = with_seeds(with_twin(config))
+    config = with_seeds(with_twin(with_pair(config)))
     wanted = cells(config)
     if not (wanted or config.training or config.calibration):
         raise frame.UserError("nothing to run: choose a recipe, e.g. +experiment=paper or +experiment=setpoint_steps")

@@ -22,11 +22,11 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from dqn.policy import Policy
 from envs.bench import Bench
-from envs.coculture.rates import T_MAX, T_MIN
 from envs.plant.plant import Plant, PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
+from experiments.cli.calibrated import read_pair
 from experiments.cli.stop import Workers
 from experiments.comparison.config import BenchmarkConfig
 from experiments.control.policies import load_policy
@@ -249,12 +249,13 @@ def _density(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> 
 
 def _share(config: BenchmarkConfig, cell: Cell, followed: Followed | None) -> ShareTrial:
     """A law holds the share, and a controller the density beside it."""
-    scenario, kind = config.scenarios[cell.scenario], config.compositions[cell.controller].kind
+    pair, kind = read_pair(config.pair), config.compositions[cell.controller].kind
+    scenario = config.scenarios[cell.scenario]
     program = program_of(scenario)
     plant = Plant(config.plants[cell.plant], config.replicates, np.random.default_rng(config.seed))
     composition, policy = config.compositions[cell.controller], followed[0] if followed else None
-    law = registry.build(composition, registry.SHARE, policy=policy, program=program)
-    estimator = CompositionEstimator(composition.estimator)
+    law = registry.build(composition, registry.SHARE, policy=policy, program=program, pair=pair)
+    estimator = CompositionEstimator(composition.estimator, pair=pair)
     estimator.reset(plant.n)
     law.reset(plant.n)
     if cell.calibrated:
@@ -313,7 +314,9 @@ def run_share(
         now = (plant.culture.share, found["ratio"], found["ratio_low"], found["ratio_high"], warm, plant.culture.od)
         for key, values in zip(fields, now, strict=True):
             stored[key][:, k] = values
-        plant.advance(1.0, 60.0 * rate, temperature_target=np.where(asked, np.clip(target, T_MIN, T_MAX), target))
+        plant.advance(
+            1.0, 60.0 * rate, temperature_target=np.where(asked, np.clip(target, *estimator.pair.temperatures), target)
+        )
         estimator.dosed(60.0 * rate)
         if isinstance(density, Accounts):
             density.dosed(60.0 * rate)

@@ -6,33 +6,38 @@ A rehearsal is assembled here too, with a clock and a transport of its own.
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml  # type: ignore[import-untyped]
 
+from conf import presets
 from conf.presets import load
 from conf.schema import build
 from dqn.policy import Policy
 from envs.bench import Bench
-from envs.plant.plant import PlantConfig
+from envs.coculture.pair import FILE, PairConfig
+from envs.plant.plant import PlantConfig, of_pair
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
-from experiments.cli import frame
-from experiments.cli.calibrated import read_env_file, read_plant_file
+from experiments.cli import files, frame
+from experiments.cli.calibrated import read_env_file, read_pair, read_plant_file
 from experiments.cli.choices import choices
 from experiments.control.config import DeployConfig
 from experiments.control.policies import Wanted, admit, composition_policy, policy_check, run_policy
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from experiments.laws.share.estimator import CompositionEstimator
+from experiments.laws.share.program import Program
+from experiments.laws.share.recall import Recall
 from experiments.loop import signals
 from experiments.loop.loop import ClosedLoop
-from experiments.loop.share import Share, program_of
+from experiments.loop.share import Light, Share, program_of
 from experiments.loop.signals import Signal
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, continue_loop
@@ -42,12 +47,13 @@ from hardware.family import Family, Opening, family_of
 from hardware.reactor import Reactor
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock
+from hardware.storage import atomic
 
-__all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack"]
+__all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpack", "with_pair"]
 
 log = logging.getLogger(__name__)
 
-COMPOSITION, VIALS, USUAL_VIALS = "dqn_preview", "coculture", "nominal_noise"  # presets
+COMPOSITION, VIALS, USUAL_VIALS = "midpoint", "coculture", "nominal_noise"  # presets
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +67,7 @@ class Setup:
     law: config of what decides the pump rate. wanted: the policy that controller=dqn asks for, None for another.
     policy: as read, None for a preflight. bounds: of its certificate.
     further: signals that are held beside the density, which have seen nothing yet.
+    species: of two the second one, whose share may be held.
     fsync: of the record. title: who controls what. row: of the run in TensorBoard's table, but its results.
     resumed: an earlier life of the run is continued.
     """
@@ -79,6 +86,7 @@ class Setup:
     policy: Policy | None
     bounds: EstimateBounds | None
     further: list[Signal]
+    species: str
     fsync: bool
     title: str
     row: dict[str, float | str]
@@ -90,30 +98,79 @@ class Setup:
         return (*COLUMNS, *(column for signal in self.further for column in signal.columns))
 
 
-def completed(config: DeployConfig) -> DeployConfig:
-    """Of a scenario that asks for a share, what was left as it is for one species: who controls it, and the vials.
+def with_pair(config: DeployConfig, folder: Path) -> DeployConfig:
+    """A run goes by its own copy of the two species from a file, `pair.yaml`, also when it is resumed."""
+    kept, given = folder / FILE, read_pair(config.pair) if config.resume is None else None
+    if given is not None and config.pair not in presets.groups()["strains"]:
+        text = yaml.safe_dump(files.plain(asdict(given)), sort_keys=False, allow_unicode=True)
+        atomic.write(kept, f"# The two species of this run, from {config.pair}.\n{text}")
+    return replace(config, pair=str(kept)) if kept.is_file() else config
 
-    Raises: UserError for a schedule that is not allowed.
+
+def completed(config: DeployConfig) -> DeployConfig:
+    """What was left as it is for one species, where a scenario asks for a share: who controls it, and the vials.
+
+    And of all simulated vials, the two species of the run. Raises: UserError for a schedule that is not allowed.
     """
     with frame.refusing(ValueError):
         composed = any(s.composed for s in config.schedules())
-    if not composed:
-        return config
-    backend, chosen = config.backend, []
+    pair = read_pair(config.pair)
+    if composed:
+        config = _composed(config, pair)
+    if family_of(config.backend).simulated and config.plant.pair == PairConfig():  # another one differs on purpose
+        config = replace(config, plant=of_pair(config.plant, pair))
+    return config
+
+
+def _composed(config: DeployConfig, pair: PairConfig) -> DeployConfig:
+    config, backend, chosen = _rested(config, pair), config.backend, []
     if config.composition is None:
         law = build(registry.config(COMPOSITION, registry.SHARE), load(f"composition/{COMPOSITION}"), "composition")
         config = replace(config, composition=law)
         chosen.append(f"composition={COMPOSITION}")
-    if (two := family_of(backend).coculture(backend)) != backend:
+    if (two := family_of(backend).coculture(backend, config.pair)) != backend:
         config = replace(config, backend=two)
-        chosen.append(f"backend.plant={two.plant}")
+        chosen.append(f"backend.plant={two.plant} backend.pair={two.pair}")
     usual = build(PlantConfig(), load(f"plant/{USUAL_VIALS}"), "plant")
     if family_of(backend).simulated and config.plant == usual and not (config.plant_file or config.env_file):
         config = replace(config, plant=build(PlantConfig(), load(f"plant/{VIALS}"), "plant"))
         chosen.append(f"plant={VIALS}")
+    config = replace(config, safety=_within(config.safety, pair))
     if chosen:
         log.info("the scenario asks for a share: %s", " ".join(chosen))
+    species, (low, high) = f"{pair.first.name} and {pair.second.name}", pair.temperatures
+    log.info("%s, %g to %g degC; both grow alike at %.2f degC", species, low, high, pair.even_c)
     return config
+
+
+def _rested(config: DeployConfig, pair: PairConfig) -> DeployConfig:
+    """Every phase without a temperature gets that at which both grow alike."""
+    each = {
+        name: own | {"temperatures": [pair.resting_c if t is None else t for t in own["temperatures"]]}
+        if isinstance(own, dict) and isinstance(own.get("temperatures"), list)
+        else own
+        for name, own in config.each.items()
+    }
+    return replace(config, scenario=config.scenario.resting(pair.resting_c), each=each)
+
+
+def _within(safety: SafetyConfig, pair: PairConfig) -> SafetyConfig:
+    """Limits of the thermostat's target: those of the pair where nothing else is asked for. Raises: UserError."""
+    usual, given = SafetyConfig(), (safety.composition_low, safety.composition_high)
+    low, high = (
+        end if asked == left else asked
+        for asked, left, end in zip(
+            given, (usual.composition_low, usual.composition_high), pair.temperatures, strict=True
+        )
+    )
+    if not low < pair.even_c < high:
+        allowed = (
+            f"a range that holds {pair.even_c:.2f} degC, where {pair.first.name} and {pair.second.name} grow alike"
+        )
+        raise frame.UserError(
+            f"safety.composition_low to composition_high = {low:g} to {high:g} degC: allowed {allowed}"
+        )
+    return replace(safety, composition_low=low, composition_high=high)
 
 
 def unpack(config: DeployConfig, folder: Path) -> Setup:
@@ -133,9 +190,12 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     if family.simulated and (other_ml := plant.vessel.volume_ml) is not None and (volumes_ml != other_ml).any():
         of_bench = f"bench.volume_ml = {bench.volume_ml:g} mL or bench.volumes_ml, which everything else goes by"
         log.info("plant.vessel.volume_ml = %g mL differs from %s: on purpose?", other_ml, of_bench)
+    usual = PlantConfig(), build(PlantConfig(), load(f"plant/{USUAL_VIALS}"), "plant")
+    if not family.simulated and config.plant not in usual:
+        log.warning("plant: backend=%s has vials of its own, plant.* changes nothing there", config.backend.kind)
     _check_fit(config, family, scenarios, ends)
     further = _further(config, plant, folder, scenarios)
-    if further:  # the device has to measure what an estimate may need
+    if any(not isinstance(signal, Light) for signal in further):  # the device has to measure what an estimate may need
         backend = family.seeing_fluorescence(backend)
     fastest = min(model.max_pump_rate, bench.max_rate)
     model = replace(model, control_min=bench.control_min, max_pump_rate=fastest)
@@ -153,7 +213,8 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         bounds = certificate.bounds(policy, own, folder / "policy.npz", model)
     return Setup(
         family, backend, bench, safety, scenarios, ends, config.roles(), plant, model, config.controller, wanted,
-        policy, bounds, further, config.fsync, *_named(config, family, folder), resumed,
+        policy, bounds, further, read_pair(config.pair).second.name, config.fsync, *_named(config, family, folder),
+        resumed,
     )  # fmt: skip
 
 
@@ -206,6 +267,8 @@ def _named(config: DeployConfig, family: Family, folder: Path) -> tuple[str, dic
     chosen, decides, controlled = choices(folder), str(config.controller.kind), str(config.backend.kind)
     if family.simulated:
         controlled = "plant_file" if config.plant_file else chosen.get("plant", "given")
+        if config.composition is not None and controlled == USUAL_VIALS:  # replaced by `completed`
+            controlled = VIALS
     law = "" if config.composition is None else f" and {config.composition.kind}"
     row: dict[str, float | str] = {"command": "deploy", "decides": decides, "on": controlled}
     row["scenario"] = chosen.get("scenario", "given")
@@ -221,7 +284,10 @@ def _further(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: 
     with frame.refusing(ValueError):
         share = [] if config.composition is None else [_share(config, plant, folder, scenarios)]
         own = [signals.made(name, law, scenarios) for name, law in config.signals.items()]
-        return signals.one_each([*share, *own])
+        vials = family_of(config.backend).vials(config.backend, plant)
+        lit = family_of(config.backend).sees_fluorescence(config.backend) or (vials and vials[1].second.present)
+        light = [Light()] if lit and not share and not own else []
+        return signals.one_each([*share, *light, *own])
 
 
 def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: list[Scenario]) -> Signal:
@@ -240,10 +306,30 @@ def _share(config: DeployConfig, plant: PlantConfig, folder: Path, scenarios: li
         raise frame.UserError("composition=optimum plans one program: give all reactors the same shares and minutes")
     policy = composition_policy(kind, config.composition_policy, folder, config.resume is not None)
     program, volumes_ml = program_of(one), config.bench.volumes(config.backend.reactors)
-    law = registry.build(config.composition, registry.SHARE, policy=policy, program=program)
-    estimator = CompositionEstimator(config.composition.estimator, volumes_ml)
+    pair = read_pair(config.pair)
+    law = registry.build(config.composition, registry.SHARE, policy=policy, program=program, pair=pair)
+    if policy is not None:
+        _check_shares(policy, kind, [program_of(s) for s in scenarios if s.composed], config.force_policy)
+    estimator = Recall(CompositionEstimator(config.composition.estimator, volumes_ml, pair))
     simulated = family_of(config.backend).simulated
     return Share(estimator, law, scenarios, config.share_warnings, simulated=simulated)
+
+
+def _check_shares(policy: Policy, kind: str, programs: list[Program], forced: bool) -> None:
+    """Whether a policy was trained for what is asked for; a share beyond that it holds at the end of its range.
+
+    Raises: UserError; forced: it is only said.
+    """
+    low, high = policy.metadata["model"]["setpoints"]
+    outside = sorted({s for p in programs for s in p.extremes if not low - 1e-9 <= s <= high + 1e-9})
+    if not outside:
+        return
+    what = f"composition={kind}: its policy was trained for shares of {low:g} to {high:g}, the scenario asks for "
+    what += ", ".join(f"{s:g}" for s in outside)
+    if not forced:
+        remedy = "give composition=midpoint, a policy trained with env.setpoints that reach there, or force_policy=true"
+        raise frame.UserError(f"{what}; {remedy}")
+    log.warning("%s; it runs all the same: force_policy=true", what)
 
 
 def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
@@ -269,7 +355,7 @@ def close_loop(setup: Setup, reactors: Reactor, record: Record) -> ClosedLoop:
     if plant is not None:
         loop.density.known(plant, flow, setup.bench)
     if setup.resumed:
-        continue_loop(loop, record.journal, record.state_path)
+        continue_loop(loop, record.journal, record.state_path, record.rows)
     return loop
 
 

@@ -67,6 +67,9 @@ class DeployConfig:
     signals: dict[str, Any] = setting(
         {}, "further signals that are held, brought by extend=FILE.py: signals.NAME.kind=LAW signals.NAME.KEY=VALUE"
     )
+    pair: str = setting(
+        "ecoli_pputida", "the two species: a preset of conf/strains, a pair.yaml of calibrate_pair, or its run folder"
+    )
     env_file: str | None = setting(None, "a calibrated.yaml, or `latest`, whose model the simulated plant takes")
     plant_file: str | None = setting(None, "a twin.yaml of calibrate, or `latest`, in place of `plant`; backend=sim")
     notify: str = setting(

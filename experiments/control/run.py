@@ -14,8 +14,8 @@ from experiments.cli.frame import swept
 from experiments.cli.stop import one_interrupt
 from experiments.control import assemble, notify
 from experiments.control.assemble import Setup
+from experiments.control.bench_marks import BenchMarks
 from experiments.control.config import DeployConfig
-from experiments.control.levels import Levels
 from experiments.control.notify import Notifier
 from experiments.loop.loop import ClosedLoop
 from experiments.record.record import Record
@@ -46,7 +46,7 @@ def _began(setup: Setup, folder: Path) -> None:
 
 def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
     """The loop until its end or trouble; returns the outcome. Pumps are verified off, whatever happens."""
-    log_changes, levels, reactors = ChangeLog(loop, tell), Levels(record), loop.reactors
+    log_changes, marks, reactors = ChangeLog(loop, tell), BenchMarks(record), loop.reactors
     outcome = "failed: see the log"
     record.journal.append("start", {"time_s": round(reactors.elapsed(), 3), "pid": os.getpid()})
     try:
@@ -54,7 +54,7 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
             for step in loop.run():
                 record.done(step, loop.state())
                 log_changes(step)
-                levels.take(loop)
+                marks.take(loop)
                 bar.update(int(step.rows.sum()))
         given_up = [name for name, s in zip(reactors.names, loop.stopped, strict=True) if s]
         outcome = f"stopped by the interlock: {', '.join(given_up)}" if given_up else "completed"
@@ -86,7 +86,7 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
         table = record.table()
         figures = {"closed_loop": figure_of(table, setup.scenarios, title)}
         if "ratio" in table.columns:
-            figures["composition"] = composition_figure_of(table, title)
+            figures["composition"] = composition_figure_of(table, setup.scenarios, setup.species, title)
         pictures = {name: charts.save(figure, folder / "figures", name) for name, figure in figures.items()}
         summary = {
             **summarise(table, setup.scenarios, setup.roles, outcome, loop.progress),
@@ -112,7 +112,7 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str
 
 def deploy(config: DeployConfig, folder: Path) -> None:
     """One closed loop over the scenario."""
-    if (whole := assemble.completed(config)) != config:
+    if (whole := assemble.completed(assemble.with_pair(config, folder))) != config:
         config = whole
         frame.save_config(config, folder)
     setup = assemble.unpack(config, folder)

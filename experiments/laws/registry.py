@@ -7,6 +7,7 @@ from typing import Any
 from conf import presets
 from dqn.policy import Policy
 from envs.bench import Bench
+from envs.coculture.pair import PairConfig
 from envs.plant.plant import Plant
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
@@ -39,7 +40,7 @@ __all__ = ["DENSITY", "FORESIGHT", "KINDS", "SHARE", "Kind", "add", "build", "co
 
 DENSITY, SHARE = "density", "share"
 GROUPS = {DENSITY: "controller", SHARE: "composition"}  # of presets, and key of the config
-PARTS = ("model", "policy", "plant", "bounds", "flow_ml_s", "program", "volume_ml")
+PARTS = ("model", "policy", "plant", "bounds", "flow_ml_s", "program", "volume_ml", "pair")
 MISSING = {
     (DENSITY, "policy"): "needs a policy; give policy=RUN/policy.npz",
     (DENSITY, "plant"): "knows a simulated plant; allowed with backend=sim only",
@@ -72,16 +73,16 @@ KINDS: dict[str, dict[str, Kind]] = {
         "oracle": Kind(OracleConfig, Oracle, ("plant", "model", "flow_ml_s")),
     },
     SHARE: {
-        "dqn": Kind(LearnedLawConfig, LearnedLaw, ("policy",)),
-        "dqn_preview": Kind(PreviewLawConfig, LearnedLaw, ("policy",)),
-        "pi": Kind(PIConfig, PI),
-        "proportional": Kind(ProportionalConfig, Proportional),
-        "inverse_dynamics": Kind(InverseDynamicsConfig, InverseDynamics),
-        "bang_bang": Kind(BangBangConfig, BangBang),
-        "myopic": Kind(MyopicConfig, Myopic),
-        "midpoint": Kind(MidpointConfig, Midpoint),
-        "receding": Kind(RecedingConfig, Receding),
-        "optimum": Kind(OptimumConfig, Optimum, ("program",)),
+        "dqn": Kind(LearnedLawConfig, LearnedLaw, ("policy", "pair")),
+        "dqn_preview": Kind(PreviewLawConfig, LearnedLaw, ("policy", "pair")),
+        "pi": Kind(PIConfig, PI, ("pair",)),
+        "proportional": Kind(ProportionalConfig, Proportional, ("pair",)),
+        "inverse_dynamics": Kind(InverseDynamicsConfig, InverseDynamics, ("pair",)),
+        "bang_bang": Kind(BangBangConfig, BangBang, ("pair",)),
+        "myopic": Kind(MyopicConfig, Myopic, ("pair",)),
+        "midpoint": Kind(MidpointConfig, Midpoint, ("pair",)),
+        "receding": Kind(RecedingConfig, Receding, ("pair",)),
+        "optimum": Kind(OptimumConfig, Optimum, ("program", "pair")),
     },
 }
 
@@ -146,6 +147,7 @@ def build(
     bounds: EstimateBounds | None = None,
     program: Program | None = None,
     volume_ml: Array | float = Bench.volume_ml,
+    pair: PairConfig | None = None,
 ) -> Any:
     """The law that a config describes, a `Controller` of the density or a `Law` of the share.
 
@@ -157,10 +159,11 @@ def build(
         deliver (the oracle must know what a rate becomes).
       bounds: within which the certificate of `policy` lets it act; None where it has none, and nobody supervises.
       volume_ml: of the cultures, as the bench says, (N,) or one for all.
+      pair: the two species whose share a law holds; None: the default one.
     Raises: ValueError naming what is missing for this law.
     """
     law = _kind(config.kind, signal)
-    given = dict(zip(PARTS, (model, policy, plant, bounds, flow_ml_s, program, volume_ml), strict=True))
+    given = dict(zip(PARTS, (model, policy, plant, bounds, flow_ml_s, program, volume_ml, pair), strict=True))
     for part in law.parts:
         if given[part] is None and (signal, part) in MISSING:
             raise ValueError(f"{GROUPS[signal]} = {config.kind}: {MISSING[signal, part]}")

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from envs.scenario import Scenario
 from experiments.laws.base import Array, Controller, Mask
 from experiments.loop.progress import Progress
-from experiments.loop.signals import Density, Sample, Signal, one_each
+from experiments.loop.signals import Answer, Count, Counted, Density, Sample, Signal, one_each
 from experiments.loop.supply import Supply
 from hardware import memory
 from hardware.memory import Remembers
 from hardware.reactor import Command, KeepsLevels, Reactor, Receipt
-from hardware.safety.config import Response
+from hardware.safety.config import RAW_MAX, Response
 from hardware.safety.interlock import Interlock, Verdict
 
 __all__ = ["ClosedLoop", "Step"]
@@ -209,6 +209,19 @@ class ClosedLoop:
         if isinstance(self.reactors, KeepsLevels):
             self.reactors.set_level(n, level_ml)
         return before
+
+    def counted(self, name: str, share: float, sd: float, minute: float) -> Answer:
+        """A share that was counted in a sample of a reactor, drawn at a minute of the run; what came of it."""
+        for signal in self.signals:
+            if isinstance(signal, Counted):
+                return signal.counted(self.reactors.names.index(name), share, sd, minute)
+        return "left out: nothing here estimates it", True
+
+    def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count]) -> None:
+        """Recordings of the run's earlier lives, and the shares that were counted, to whoever estimates with them."""
+        for signal in self.signals:
+            if isinstance(signal, Counted):
+                signal.retell(rows, counted, (self.interlock.config.light_min, RAW_MAX))
 
     def _respond(self, verdict: Verdict, left: Mask) -> list[str]:
         """Carry out what the interlock demands beyond not dosing; returns what failed, to be tried again.

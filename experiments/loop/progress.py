@@ -1,5 +1,6 @@
 """Where each reactor stands in its own schedule, whose steps may end before their longest time."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -36,7 +37,7 @@ class Progress:
         self._counts = np.array([len(s.setpoints) for s in schedules])
         self._minutes = _padded([s.minutes for s in schedules])
         self._setpoints = _padded([s.setpoints for s in schedules])
-        self._temperatures = _padded([s.temperatures for s in schedules])
+        self._temperatures = _padded([[math.nan if t is None else t for t in s.temperatures] for s in schedules])
         width = int(self._counts.max())
         self.conditions = Conditions([[*s.until, *[None] * (width - len(s.until))] for s in schedules])
         self.conditional = self.conditions.any

@@ -1,25 +1,29 @@
 """The share of two species as a signal: held by the thermostat, within limits, with lasting warnings."""
 
+import bisect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from conf.schema import check, setting
+from envs.coculture.task import logit
 from envs.scenario import Scenario
 from experiments.laws.share.base import Array, Law, Mask, ShareEstimator, Wanted
 from experiments.laws.share.program import Program
-from experiments.loop.signals import THERMOSTAT, Findings, Sample
+from experiments.loop.signals import THERMOSTAT, Answer, Count, Findings, Sample, Span
 from hardware.memory import Remembers
 
-__all__ = ["COLUMNS", "TRUE", "Share", "ShareWarnings", "program_of"]
+__all__ = ["COLUMNS", "TRUE", "Light", "Share", "ShareWarnings", "program_of"]
 
 ESTIMATE = ("ratio", "ratio_low", "ratio_high")  # of what the estimator explains, the columns of a recording
 COLUMNS = ("fluorescence", "ratio_setpoint", *ESTIMATE, "temperature_target_degc")
 TRUE = "true_ratio"
 EDGE_C = 0.05  # a target so near a limit is at it
-NEARER = 0.02  # a share that has moved so far towards its goal comes nearer; a goal that jumps by more is another one
+NEARER = 0.1  # of the logit: a share that has moved so far towards its goal comes nearer; 0.025 at one half
+OTHER = 0.02  # a goal that jumps by more is another one
+SURPRISING = 4.0  # sds
 STUCK = "check that the vial follows the thermostat and that both species grow; the program may ask for too much"
 UNCERTAIN = "check the fluorescence and calibrate its sensor (docs/coculture.md, Calibration of the sensor)"
 
@@ -49,6 +53,24 @@ def program_of(schedule: Scenario) -> Program:
         return Program((), schedule.minutes, (mean, amplitude, period))
     ratios = schedule.ratios or (None,) * len(schedule.minutes)
     return Program(tuple(math.nan if r is None else r for r in ratios), schedule.minutes)
+
+
+class Light:
+    """The fluorescence of reactors whose share nobody holds: recorded, and nothing done about it."""
+
+    name, actuator, columns, memory = "fluorescence", "nothing", COLUMNS[:1], None
+
+    def decide(self, sample: Sample) -> Array:
+        """See `Signal.decide`: it asks for no temperature."""
+        return np.full(sample.rows.shape, np.nan)
+
+    def find(self, sample: Sample, given: Array) -> Findings:
+        """See `Signal.find`."""
+        light = sample.measured.fluorescence
+        return Findings({"fluorescence": np.full(sample.rows.shape, np.nan) if light is None else light})
+
+    def dosed(self, volume_ml: Array, kept_ml: Array) -> None:
+        """See `Signal.dosed`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +110,8 @@ class Share:
         self.truth: Callable[[], Array] = lambda: np.full(n, np.nan)
         n = len(schedules)
         self._programs = [program_of(s) for s in schedules]
-        self._goal, self._best = np.full(n, np.nan), np.full(n, np.nan)  # the nearest share to it so far
-        self._nearer_min, self._narrow_min = np.full(n, np.nan), np.full(n, np.nan)
+        self._goal, self._best = np.full((2, n), np.nan), np.full((2, n), np.nan)  # the nearest share to it so far
+        self._nearer_min, self._narrow_min = np.full((2, n), np.nan), np.full(n, np.nan)
         estimator.reset(n)
         law.reset(n)
 
@@ -137,9 +159,9 @@ class Share:
 
         Args: goal: the share that is announced, else the one asked for, (N,). inside: targets that are at no limit.
         """
-        stuck = self._stuck(found["ratio"], goal, inside, minute, believed)
+        stuck = self._stuck(found["ratio"], np.stack([found["ratio_setpoint"], goal]), inside, minute, believed)
         uncertain = self._uncertain(found, minute, believed)
-        hours, c = (minute - self._nearer_min) / 60.0, found
+        hours, c = (minute - self._nearer_min).min(axis=0) / 60.0, found
         lines: list[str | None] = []
         for i in range(minute.size):
             said = []
@@ -154,20 +176,56 @@ class Share:
         return lines
 
     def _stuck(self, share: Array, goal: Array, inside: Mask, minute: Array, believed: Mask) -> Mask:
+        """Which come nearer to neither of two goals, (2, N), the share asked for and the one announced."""
         rows, away = believed & np.isfinite(goal), goal - share
-        same = np.abs(goal - self._goal) <= NEARER
+        same = np.abs(goal - self._goal) <= OTHER
         well = rows & (inside | ~(np.abs(away) > self.warnings.far) | ~same)
-        nearer = well | (rows & (np.sign(away) * (share - self._best) > NEARER))
+        nearer = well | (rows & (np.sign(away) * (logit(share) - logit(self._best)) > NEARER))
         self._best = np.where(nearer, share, self._best)
         self._nearer_min = np.where(nearer, minute, self._nearer_min)
         self._goal = np.where(believed, goal, self._goal)
-        return np.asarray(rows & ~well & (minute - self._nearer_min >= 60.0 * self.warnings.stuck_h))
+        return np.asarray((rows & ~well & (minute - self._nearer_min >= 60.0 * self.warnings.stuck_h)).all(axis=0))
 
     def _uncertain(self, found: dict[str, Array], minute: Array, believed: Mask) -> Mask:
         narrow = believed & (found["ratio_high"] - found["ratio_low"] <= self.warnings.wide)
         first = believed & np.isnan(self._narrow_min)
         self._narrow_min = np.where(narrow | first, minute, self._narrow_min)
         return np.asarray(believed & ~narrow & (minute - self._narrow_min >= 60.0 * self.warnings.wide_h))
+
+    def counted(self, n: int, share: float, sd: float, minute: float) -> Answer:
+        """See `Counted.counted`."""
+        mine = np.arange(len(self.schedules)) == n
+        told = self.estimator.explain()
+        before, band = told["ratio"][n], told["ratio_high"][n] - told["ratio_low"][n]
+        if not self.estimator.sample(np.where(mine, share, np.nan), np.full(mine.size, sd), minute, mine):
+            return "left out: longer ago than the two days that the estimate goes back", True
+        off = abs(share - before) / math.hypot(sd, band / 3.92)
+        doubt = f"; {off:.0f} sds from it, if the share has not moved since: right reactor, right species?"
+        after = "its day is taken again, some hours with each reading"
+        if not self.estimator.behind:
+            after = f"{self.estimator.explain()['ratio'][n]:.3f} after it"
+        surprising = off > SURPRISING
+        return f"estimated {before:.3f} before it; {after}{doubt if surprising else ''}", surprising
+
+    def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
+        """See `Counted.retell`."""
+        known, told = self.estimator.known + 1e-3, []  # minutes are recorded to 1e-4
+        mine = np.eye(len(rows), dtype=np.bool_)
+        for n, c in enumerate(rows):
+            for k in range(bisect.bisect_right(c["time_min"], known[n]), len(c["time_min"])):
+                minute, counts = c["time_min"][k], c["fluorescence"][k]
+                seen = counts if light[0] <= counts <= light[1] else np.nan
+                read = (c["od"][k], seen, c["temperature_degc"][k], minute)
+                if c["believed"][k]:
+                    told.append((minute, 0, "watch", (*(np.where(mine[n], v, np.nan) for v in read), mine[n])))
+                if (volume := c["volume_ml"][k]) > 0.0:
+                    told.append((minute, 2, "dosed", (np.where(mine[n], volume, 0.0),)))
+        for n, share, sd, minute in counted:
+            sample = (np.where(mine[n], share, np.nan), np.full(len(rows), sd), mine[n])
+            if minute > known[n]:
+                told.append((minute, 1, "sample", sample))
+        told.sort(key=lambda event: event[:2])
+        self.estimator.retell((minute, method, arguments) for minute, _, method, arguments in told)
 
     @property
     def memory(self) -> Remembers:

@@ -7,7 +7,7 @@ is another (`experiments/loop/share.py`). One of one's own is made known by `add
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ __all__ = [
     "FILTER_ALARM",
     "THERMOSTAT",
     "TRUE",
+    "Counted",
     "Density",
     "Findings",
     "Sample",
@@ -124,6 +125,29 @@ class Signal(Protocol):
     @property
     def memory(self) -> Remembers | None:
         """What a resumed run continues, the signal itself as a rule; None where there is nothing to remember."""
+        ...
+
+
+Count = tuple[int, float, float, float]
+"""A share that was counted: number of the reactor, share, its sd, minute of the run at which it was drawn."""
+Span = tuple[float, float]
+Answer = tuple[str, bool]
+"""What came of a sample, in words, and whether that is worth a warning."""
+
+
+@runtime_checkable
+class Counted(Protocol):
+    """A signal that learns from samples which somebody counted."""
+
+    def counted(self, n: int, share: float, sd: float, minute: float) -> Answer:
+        """A share of reactor n at a minute of the run, with its sd; what came of it."""
+        ...
+
+    def retell(self, rows: Sequence[Mapping[str, Sequence[float]]], counted: Sequence[Count], light: Span) -> None:
+        """What earlier lives of the run recorded: columns of each reactor, and every sample.
+
+        Args: light: lowest and highest believed counts of fluorescence.
+        """
         ...
 
 

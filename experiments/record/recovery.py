@@ -229,12 +229,12 @@ def _no_state(path: Path, why: str) -> RecordingError:
     return RecordingError(f"{path}: no state to resume from ({why}); {remedy}")
 
 
-def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
+def continue_loop(loop: ClosedLoop, journal: Journal, path: Path, rows: Sequence[Rows] = ()) -> None:
     """Put the loop where its state was saved, and book the doses and hand-overs begun after that.
 
     Those doses are told to the controller too, and what the driver has put off to the next dose since then.
 
-    Args: journal: of the run. path: of state.json.
+    Args: journal: of the run. path: of state.json. rows: of the recordings.
     Raises: RecordingError for a state that is damaged or does not fit.
     """
     state = load_state(path)
@@ -250,12 +250,12 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
         )
     loop.interlock.latch(Response.REGULATE, loop.reactors.handed_over)
     decided = {row["reactor"]: row["n"] for row in journal.rows if row["kind"] == "decision"}
-    levels = [row for row in journal.rows if row["kind"] == "level" and row["n"] >= state["journal_row"]]
+    marked = [row for row in journal.rows if row["kind"] == "level" and row["n"] >= state["journal_row"]]
     for dose in [*doses, None]:
-        while levels and (dose is None or levels[0]["n"] < dose.n):
-            level = levels.pop(0)
-            if level["reactor"] in loop.reactors.names:
-                loop.set_level(level["reactor"], float(level["level_ml"]))
+        while marked and (dose is None or marked[0]["n"] < dose.n):
+            told = marked.pop(0)
+            if told["reactor"] in loop.reactors.names:
+                loop.set_level(told["reactor"], float(told["level_ml"]))
         if dose is None:
             break
         mine = np.array([name == dose.reactor for name in loop.reactors.names])
@@ -268,6 +268,10 @@ def continue_loop(loop: ClosedLoop, journal: Journal, path: Path) -> None:
     kept_ml = _put_off(journal.rows, loop) - _put_off(before, loop)
     for signal in loop.signals:
         signal.dosed(np.zeros(kept_ml.size), kept_ml)
+    names = list(loop.reactors.names)
+    shares = [row for row in journal.rows if row["kind"] == "share" and row["reactor"] in names]
+    counted = [(names.index(s["reactor"]), float(s["share"]), float(s["sd"]), float(s["minute"])) for s in shares]
+    loop.retell([r.columns for r in rows], counted)
     minute = loop.reactors.elapsed() / 60.0
     log.info("resumed at minute %.1f; %d dose(s) booked from the journal", minute, len(doses))
 

@@ -13,6 +13,7 @@ from envs.scenario import Scenario
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.metrics import mean_errors, window_metrics
 from experiments.loop.progress import Progress
+from experiments.loop.share import program_of
 from experiments.loop.signals import FILTER_ALARM
 from experiments.record.record import Table
 from experiments.record.recovery import Rows
@@ -236,10 +237,17 @@ def figure_of(table: Table, scenarios: Sequence[Scenario], title: str) -> Figure
     switched = any(len(set(s.temperatures)) > 1 for s in scenarios)
     temperature = c["temperature_degc"].T if switched else None
     series = (c["time_min"].T, table.od().T, setpoint.T, c["pump_rate_ml_s"].T)
-    marks = [(m.time_min, f"{m.reactor} {m.text}".strip()) for m in table.marks]
+    marks = [(m.time_min, f"{m.reactor} {m.text}".strip()) for m in table.marks if m.share is None]
     return charts.closed_loop(*series, table.names, temperature, title, marks, table.od(refused=True).T)
 
 
-def composition_figure_of(table: Table, title: str) -> Figure:
-    """Share, temperature, OD and fluorescence of all reactors, of a run that controlled a composition."""
-    return composition_figure({**table.columns, "od": table.od()}, table.names, title)
+def composition_figure_of(table: Table, scenarios: Sequence[Scenario], species: str, title: str) -> Figure:
+    """Share of a species, temperature, OD, pump and light of all reactors, of a run that controlled a composition."""
+    announced, counted = [], []
+    for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
+        began = np.nanmin(table.columns["time_min"][n] - table.columns["elapsed_min"][n], initial=np.inf)
+        minute, share = program_of(scenario).announcements(scenario.announce_min)
+        announced.append((minute + began, share))
+        mine = [(m.time_min, m.share, m.sd) for m in table.marks if m.reactor == name and m.share is not None]
+        counted.append(tuple(np.array(mine, dtype=np.float64).reshape(-1, 3).T))
+    return composition_figure({**table.columns, "od": table.od()}, table.names, species, title, announced, counted)

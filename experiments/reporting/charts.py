@@ -231,7 +231,7 @@ def closed_loop(
         for ax in axes:
             ax.axvline(minute, color="#7f7f7f", linewidth=0.9, linestyle=":")
         place: dict[str, Any] = {"rotation": 90, "fontsize": 7, "va": "bottom", "ha": "right", "color": "#4d4d4d"}
-        axes[0].text(minute, 0.02, text, transform=axes[0].get_xaxis_transform(), **place)
+        axes[0].text(minute, 0.02, text, transform=axes[0].get_xaxis_transform(), **place).set_in_layout(False)
     if refused is not None and np.isfinite(refused).any():
         low, high = axes[0].get_ylim()
         axes[0].plot(

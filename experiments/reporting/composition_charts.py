@@ -13,14 +13,22 @@ __all__ = ["composition_figure", "episodes"]
 
 Array = NDArray[np.float64]
 Columns = Mapping[str, Array]
+Points = Sequence[Array]
 
 
 def episodes(
-    hours: Array, wanted: Array, learned: Array, best: Array, temperature: Array, best_temperature: Array
+    hours: Array,
+    wanted: Array,
+    learned: Array,
+    best: Array,
+    temperature: Array,
+    best_temperature: Array,
+    species: str,
 ) -> Figure:
     """Noise-free episodes, a column each: share with setpoint and optimum, temperatures chosen.
 
     Args: hours: (K,). wanted, learned, best: shares, (K, G). temperature, best_temperature: targets, degC, (K, G).
+      species: whose share it is.
     """
     columns = wanted.shape[1]
     figure, axes = new_figure(2.6 * columns, 4.6, 2, columns, sharex=True, sharey="row", height_ratios=[2, 1])
@@ -32,22 +40,31 @@ def episodes(
         bottom.step(hours, temperature[:, g], where="pre", color=COLOURS[0], linewidth=1.2)
         bottom.step(hours, best_temperature[:, g], where="pre", color=COLOURS[1], linewidth=0.8)
         bottom.set_xlabel("hours")
-    axes[0].set(ylabel="share of P. putida", ylim=(0.0, 1.0))
+    axes[0].set(ylabel=f"share of {species}", ylim=(0.0, 1.0))
     axes[0].legend()
     axes[columns].set_ylabel("thermostat, \N{DEGREE SIGN}C")
     return figure
 
 
-def composition_figure(columns: Columns, names: Sequence[str], title: str = "") -> Figure:
-    """Share with its setpoint and the estimate's 95 % band, temperature with its target, OD, fluorescence.
+def composition_figure(
+    columns: Columns,
+    names: Sequence[str],
+    species: str,
+    title: str = "",
+    announced: Sequence[Points] = (),
+    counted: Sequence[Points] = (),
+) -> Figure:
+    """Share with its setpoint and the estimate's 95 % band, temperature with its target, OD, pump rate, fluorescence.
 
     Args:
       columns: of the recordings, (N, K) each, nan where a reactor has no sample: time_min, ratio, ratio_low,
-        ratio_high, ratio_setpoint, temperature_degc, temperature_target_degc, od, setpoint, fluorescence; true_ratio
-        where it is known. names: N labels.
+        ratio_high, ratio_setpoint, temperature_degc, temperature_target_degc, od, setpoint, pump_rate_ml_s,
+        fluorescence; true_ratio where it is known. names: N labels. species: whose share it is.
+      announced: of each reactor, minutes at which a change was made known, and to which share. counted: minutes, shares
+        that somebody counted in a sample, and their sds.
     """
-    figure, axes = new_figure(8.0, 8.0, 4, 1, sharex=True, height_ratios=[2.2, 1.2, 1.0, 1.0])
-    share, heat, density, light = axes
+    figure, axes = new_figure(8.0, 9.0, 5, 1, sharex=True, height_ratios=[2.4, 1.2, 1.0, 0.8, 1.0])
+    share, heat, density, pump, light = axes
     for n, name in enumerate(names):
         own, colour = {key: values[n] for key, values in columns.items()}, COLOURS[n % len(COLOURS)]
         hours = own["time_min"] / 60.0
@@ -58,17 +75,28 @@ def composition_figure(columns: Columns, names: Sequence[str], title: str = "") 
             label = "truth" if n == 0 else None
             share.plot(hours, own["true_ratio"], color="black", linewidth=0.9, linestyle=":", label=label)
         share.step(hours, own["ratio_setpoint"], where="post", label="setpoint" if n == 0 else None, **dashed)
+        for at, to in announced[n : n + 1]:
+            label = "next setpoint, when announced" if at.size and n == 0 else None
+            share.plot(at / 60.0, to, linestyle="", marker=">", markersize=6.0, color=dashed["color"], label=label)
+        for at, found, sd in counted[n : n + 1]:
+            label = "counted, 95 %" if at.size and not any(c[0].size for c in counted[:n]) else None
+            share.errorbar(
+                at / 60.0, found, 1.96 * sd, linestyle="", marker="s", markersize=4.0, capsize=3.0, color=colour,
+                markeredgecolor="black", ecolor="black", label=label,
+            )  # fmt: skip
         heat.plot(hours, own["temperature_degc"], color=colour, linewidth=1.0, label="vial" if n == 0 else None)
         target = own["temperature_target_degc"]
         heat.step(hours, target, where="post", label="thermostat" if n == 0 else None, **dashed)
         density.plot(hours, own["od"], color=colour, linewidth=0.8)
         density.step(hours, own["setpoint"], where="post", **dashed)
+        pump.step(hours, 1000.0 * own["pump_rate_ml_s"], where="post", color=colour, linewidth=0.8)
         light.plot(hours, own["fluorescence"], color=colour, linewidth=0.8)
-    share.set(ylabel="share of the second species", ylim=(0.0, 1.0))
+    share.set(ylabel=f"share of {species}", ylim=(0.0, 1.0))
     share.set_title(title)
     share.legend(ncols=2)
     heat.set_ylabel("temperature, °C")
     heat.legend(ncols=2)
     density.set_ylabel("OD")
-    light.set(ylabel="fluorescence, counts", xlabel="time, h")
+    pump.set_ylabel("pump rate,\nµL/s")
+    light.set(ylabel="fluorescence,\ncounts", xlabel="time, h")
     return figure

@@ -79,6 +79,8 @@ CURVES = {
     "controller/i2": Curve("mL/s", "second integral part of the device's PI"),
     "controller/bias_e": Curve("", "relative error of the first species' growth curve, as estimated"),
     "controller/bias_p": Curve("", "relative error of the second species' growth curve, as estimated"),
+    "controller/thermometer_error": Curve("degC", "true less measured temperature, as estimated"),
+    "controller/dose_spread": Curve("", "sd of a dose over its size, as estimated, at least as configured"),
     "controller/dose_gain": Curve("", "dose over the dose that was asked for, as estimated"),
     "controller/composition_od": Curve("OD", "density as the estimate of the share believes it"),
     "controller/pigment": Curve("counts", "fluorescence of the pigment as estimated"),

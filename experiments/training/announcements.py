@@ -64,8 +64,13 @@ def _verdict(score: Score, task: Task) -> str:
     return f"{words[0]} the limit of {limits[0]}, {words[1]} that of {limits[1]}"
 
 
-def ended(folder: Path, task: Task, kept: Score, myopic: Score, spent: str, path: Path) -> None:
-    """Say what was reached, against what, and what to do with it. Args: spent: steps, updates and time, in words."""
+def ended(
+    folder: Path, task: Task, kept: Score, myopic: Score, spent: str, path: Path, pair: str | None = None
+) -> None:
+    """Say what was reached, against what, and what to do with it.
+
+    Args: spent: steps, updates and time, in words. pair: of two species, as it was asked for.
+    """
     many = kept.regret_pct.size > 1
     worst = f"; the worst of {kept.regret_pct.size}: {kept.regret_pct.max():.2f} %, {kept.steady_abs_error.max():.4f}"
     reached = _pair(kept.regret_pct, kept.steady_abs_error, task.unit)
@@ -78,8 +83,10 @@ def ended(folder: Path, task: Task, kept: Score, myopic: Score, spent: str, path
     log.info("policy %s; figures %s", path, folder / "figures")
     if task.tried:
         file = shlex.quote(str(path))
-        log.info("next, prove its closed loop: python -m experiments.certify policy=%s", file)
-        log.info("next, try it: python -m experiments.deploy %s", task.tried.format(file))
+        if task.provable:
+            log.info("next, prove its closed loop: python -m experiments.certify policy=%s", file)
+        pair_words = "" if pair is None else f"pair={shlex.quote(pair)} "
+        log.info("next, try it: python -m experiments.deploy %s%s", pair_words, task.tried.format(file))
 
 
 def show(writer: PopulationWriter, config: TrainConfig, task: Task, seeds: Sequence[int], folder: Path) -> None:

@@ -43,6 +43,7 @@ class Coculture:
 
     unit = "of the share"
     arrived = 0.02
+    provable = False
     scalars: Mapping[str, float] = {}
     steady_unit = 0.02
     """Twice what an estimate is good for: the regret decides, unless a share rests clearly beside its setpoint."""
@@ -61,7 +62,7 @@ class Coculture:
         self.observation: tuple[str, ...] = COCULTURE_PREVIEW if config.preview_min else COCULTURE
         self.actions = config.targets()
         self.limits = limits(config)
-        for end, span, temperature in zip(self.limits, (-SPAN, SPAN), config.temperatures, strict=True):
+        for end, span, temperature in zip(self.limits, (-SPAN, SPAN), config.span, strict=True):
             end[LOGIT], end[TEMPERATURE] = span, temperature  # beyond what is trained a policy sees the end of it
 
     def copies(self, seeds: Sequence[np.random.SeedSequence]) -> CocultureVectorEnv:
@@ -158,6 +159,11 @@ class Coculture:
         wanted = np.where(hours[:, None] <= change, share(picked[:, SETPOINT]), last)
         temperatures = (self.actions[ours.action[:, 0]], self.actions[theirs.action[:, 0]])
         figure = composition_charts.episodes(
-            hours, wanted, share(ours.state[:, 0]), share(theirs.state[:, 0]), *temperatures
+            hours,
+            wanted,
+            share(ours.state[:, 0]),
+            share(theirs.state[:, 0]),
+            *temperatures,
+            self.config.pair.second.name,
         )
         return {"trajectories": figure}

@@ -28,6 +28,10 @@ class TrainConfig:
 
     env: Any = part(EnvConfig, "the training model and its episodes")
     agent: DQNConfig = part(DQNConfig, "the agent's hyper-parameters")
+    pair: str | None = setting(
+        None,
+        "species of env=coculture: a preset of conf/strains, a pair.yaml of calibrate_pair, its run; null: env.pair",
+    )
     env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: what calibrate wrote last; replaces env")
     seed: int = setting(0, "of the first agent", at_least=0)
     n_agents: int = setting(1, "with seeds seed, seed + 1, ... in one process", within=(1, 100_000))

@@ -30,6 +30,7 @@ class Density:
     observation: tuple[str, ...] = ABSOLUTE
     unit = "OD"
     arrived = 0.01  # OD
+    provable = True
     steady_steps = 30
     regret_unit, steady_unit = 0.5, 0.003
     """Half a per cent of cost is not seen in a recording, and 0.003 OD is the noise of the sensor."""

@@ -28,6 +28,7 @@ class Relative:
     observation: tuple[str, ...] = RELATIVE
     unit = "periods of full pump"
     arrived = 0.1  # periods of full pump
+    provable = True
     regret_unit, steady_unit = 0.01, 0.1
     """Its own steady error is half the spacing of the levels and hardly tells policies apart: regret does."""
 

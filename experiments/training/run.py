@@ -13,9 +13,10 @@ from dqn import policy
 from dqn.checkpoint import CheckpointError
 from dqn.export import export
 from dqn.policy import Policy
+from envs.coculture.task import CocultureConfig
 from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
-from experiments.cli.calibrated import read_env_file
+from experiments.cli.calibrated import read_env_file, read_pair
 from experiments.laws.density.estimator import EstimatorConfig
 from experiments.reporting import charts
 from experiments.training import announcements, tasks
@@ -36,6 +37,12 @@ def train(config: TrainConfig, folder: Path) -> float:
     """
     if config.env_file is not None:
         config = replace(config, env=read_env_file(config.env_file), env_file=None)
+        frame.save_config(config, folder)
+    if config.pair is not None:
+        if not isinstance(config.env, CocultureConfig):
+            raise frame.UserError(f"pair={config.pair}: a task of one species; give env=coculture_preview beside it")
+        with frame.refusing(ValueError):
+            config = replace(config, env=replace(config.env, pair=read_pair(config.pair)))
         frame.save_config(config, folder)
     if config.device == "cuda" and not torch.cuda.is_available():
         raise frame.UserError("device=cuda: this machine's torch finds no GPU; use device=cpu")
@@ -110,7 +117,7 @@ def _finish(session: Session) -> None:
     files.write_json(session.folder / "summary.json", summary)
     announcements.results(session.writer, agents.steps, kept, session.task, session.seeds)
     spent = f"{agents.steps} steps and {agents.updates} updates of each agent in {session.seconds:.1f} s"
-    announcements.ended(session.folder, session.task, kept, myopic, spent, path)
+    announcements.ended(session.folder, session.task, kept, myopic, spent, path, session.config.pair)
 
 
 def fingerprint(config: TrainConfig) -> str:

@@ -33,6 +33,7 @@ class Task(Evaluated, Protocol):
     limits: of the observation in the policy file, low and high, each (O,). regret_unit, steady_unit: per cent of cost
     and steady error that weigh alike when policies are compared. episode_steps: of a training episode.
     description: numbers that say which model it is, for the log. scalars: the same for TensorBoard's table of runs.
+    provable: whether `certify` can prove its closed loop.
     tried: the words with which `deploy` runs a policy of this task, {} for its file; "" where it cannot.
     """
 
@@ -40,6 +41,7 @@ class Task(Evaluated, Protocol):
     episode_steps: int
     description: str
     scalars: Mapping[str, float]
+    provable: bool
     tried: str
     observation: tuple[str, ...]
     actions: Array

@@ -85,4 +85,5 @@ class EmulatorConfig(ChiBioConfig):
     plant: str = setting(
         "healthy", "preset of the cultures and pumps; bench: each vial has its own", choices=tuple(groups()["plant"])
     )
+    pair: str = setting("ecoli_pputida", "of two species: a preset of conf/strains, or a pair.yaml")
     seed: int = setting(0, "of all noise", at_least=0)

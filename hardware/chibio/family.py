@@ -109,6 +109,10 @@ class ChiBioFamily(Family):
         """Of the glass vial."""
         return VIAL_ML
 
+    def sees_fluorescence(self, backend: ChiBioConfig) -> bool:
+        """Whether its slot is on."""
+        return backend.fluorescence.measure
+
     def seeing_fluorescence(self, backend: ChiBioConfig) -> ChiBioConfig:
         """With its slot on."""
         return replace(backend, fluorescence=replace(backend.fluorescence, measure=True))

@@ -6,7 +6,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from envs.bench import Bench
-from envs.plant.plant import PlantConfig
+from envs.coculture.pair import named_pair
+from envs.plant.plant import PlantConfig, of_pair
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.chibio.family import ChiBioFamily, Link, linked
 from hardware.emulator.device import plant_preset
@@ -15,7 +16,7 @@ from hardware.emulator.process import EmulatorProcess
 __all__ = ["FAMILY", "EmulatorFamily"]
 
 log = logging.getLogger(__name__)
-EMULATED = ("speed", "seed", "od", "plant")  # values of backend=emulator that its process is started with
+EMULATED = ("speed", "seed", "od", "plant", "pair")  # values of backend=emulator that its process is started with
 TWO = "coculture"  # preset of vials with two species
 
 
@@ -46,13 +47,14 @@ class EmulatorFamily(ChiBioFamily):
             with linked(backend, url) as link:
                 yield link
 
-    def coculture(self, backend: EmulatorConfig) -> EmulatorConfig:
-        """Of the preset with two species, where another was not chosen."""
-        return replace(backend, plant=TWO) if backend.plant == EmulatorConfig().plant else backend
+    def coculture(self, backend: EmulatorConfig, pair: str) -> EmulatorConfig:
+        """Of the preset with two species, where another was not chosen, of the pair that the run is for."""
+        plant = TWO if backend.plant == EmulatorConfig().plant else backend.plant
+        return replace(backend, plant=plant, pair=pair)
 
     def vials(self, backend: EmulatorConfig, plant: PlantConfig) -> tuple[str, PlantConfig]:
         """Of the preset `backend.plant`."""
-        return "backend.plant", plant_preset(backend.plant)
+        return "backend.plant", of_pair(plant_preset(backend.plant), named_pair(backend.pair))
 
     def address(self, backend: ChiBioConfig) -> str:
         """In a process of this computer."""

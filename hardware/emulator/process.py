@@ -16,7 +16,7 @@ START_S = 60.0
 
 
 class EmulatorProcess:
-    """Starts the emulator and ends it again; use as a context manager.
+    """Starts the emulator and ends it again; use as a context manager. If this process is killed, it ends as well.
 
     Args:
       arguments: of `python -m hardware.emulator`, without --port.
@@ -25,9 +25,11 @@ class EmulatorProcess:
     """
 
     def __init__(self, arguments: Sequence[str]) -> None:
-        command = [sys.executable, "-m", "hardware.emulator", "--port", "0", *arguments]
+        command = [sys.executable, "-m", "hardware.emulator", "--port", "0", "--until-eof", *arguments]
         # a session of its own: Ctrl-C reaches the client first, which then still has a device to switch off
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
         self.pid = self._process.pid
         assert self._process.stdout is not None
         late = threading.Timer(START_S, self._process.kill)
@@ -48,8 +50,9 @@ class EmulatorProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
 
     def __enter__(self) -> EmulatorProcess:
         return self

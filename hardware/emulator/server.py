@@ -28,6 +28,8 @@ from typing import Any
 import numpy as np
 
 from conf.presets import groups
+from envs.coculture.pair import named_pair
+from envs.plant.plant import of_pair
 from hardware.clock import DeviceClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions, plant_preset
 from hardware.emulator.faults import FAULTS, inject
@@ -227,6 +229,8 @@ def parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="of all noise (default %(default)s)")
     add("--od", default="0.3", help="initial OD, one for all or one per reactor (default %(default)s)")
     add("--volume", default="20", help="culture, mL, one for all or one per reactor (default %(default)s)")
+    add("--pair", default="ecoli_pputida", help="of two species: a preset or a pair.yaml (default %(default)s)")
+    add("--until-eof", action="store_true", help="end when standard input ends: with the process that holds it")
     add("--temperature", type=float, help="initial, degC (default: the preset's, 37 as a rule)")
     plants = groups()["plant"]
     add("--plant", choices=plants, default="healthy", help="preset of cultures and pumps (default %(default)s)")
@@ -269,7 +273,7 @@ def build(arguments: argparse.Namespace) -> ChiBioDevice:
         overflow_pump=arguments.overflow_pump, pump_start_low_s=low, pump_start_high_s=high,
         pump3_ml_s=arguments.pump3_flow, pump4_ml_s=arguments.pump4_flow,
     )  # fmt: skip
-    plant = plant_preset(arguments.plant)
+    plant = of_pair(plant_preset(arguments.plant), named_pair(arguments.pair))
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=arguments.overflow_flow))
     return ChiBioDevice(
         tuple(arguments.reactors.split(",")),
@@ -305,8 +309,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     def end(number: int, frame: FrameType | None) -> None:
         server.stop()
 
+    def orphaned() -> None:
+        while os.read(0, 4096):  # nothing, when the process that holds the other end is gone, however it went
+            pass
+        server.stop()
+
     signal.signal(signal.SIGINT, end)
     signal.signal(signal.SIGTERM, end)
+    if arguments.until_eof:
+        threading.Thread(target=orphaned, daemon=True).start()
     print(
         f"emulator ready: http://{arguments.host}:{server.port} reactors {arguments.reactors} "
         f"speed {arguments.speed:g} control http://{arguments.host}:{server.control_port}",

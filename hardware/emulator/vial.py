@@ -289,9 +289,8 @@ class Vial:
         cooled = thermal.ambient_c + (plant.thermal.temperature - thermal.ambient_c) * kept
         still = self.stir == 0.0 and self._at + seconds - self._stirred_at > STIR_STOPPED_S
         plant.culture.stir_factor[:] = 0.0 if still else 1.0
-        plant.advance(
-            minutes, feed, waste, cooled + heat * thermal.heating_c_per_min * minutes, overflow, self._supply(seconds)
-        )
+        heated = cooled + heat * thermal.heating_c_per_min * minutes + plant.thermal.offset  # as thermometers show it
+        plant.advance(minutes, feed, waste, heated, overflow, self._supply(seconds))
         self._at += seconds
         self.peak_ml = max(self.peak_ml, float(plant.vessel.volume_ml[0]))
 

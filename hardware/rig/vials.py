@@ -177,7 +177,8 @@ class VialServer:
             vial.drive(int(asked["pin"]), float(asked["dc"]), int(asked["pid"]), now)
             return {"ok": True}
         if asked.get("ask") == "temperature":
-            return {"temperature": float(vial.plant.thermal.temperature[0]) + vial.plate_c}
+            shown = vial.plant.thermal.temperature[0] + vial.plant.thermal.offset[0]
+            return {"temperature": float(shown) + vial.plate_c}
         return {"volts": VOLTS_PER_OD * vial.seen_od}
 
     def power_cut(self, unit: str) -> None:

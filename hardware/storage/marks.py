@@ -1,6 +1,11 @@
 """Marks of a run: what somebody did at the bench and when, beside the recordings of the run."""
 
 import csv
+import fcntl
+import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -11,30 +16,51 @@ from hardware.storage.recorder import Recorder
 __all__ = ["NAME", "Mark", "add_mark", "read_marks"]
 
 NAME = "marks.csv"
-COLUMNS = ("time_min", "reactor", "text", "written", "level_ml")
+MEASURED = ("level_ml", "share", "sd")
+COLUMNS = ("time_min", "reactor", "text", "written", *MEASURED)
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What happened at minute `time_min` of a run to `reactor`; "" is all of them. level_ml: volume in its vial then,
-    None if nobody read it."""
+    """What happened at minute `time_min` of a run to `reactor`; "" is all of them.
+
+    level_ml: volume in its vial then. share, sd: of the second species, counted in a sample of then. None: nobody did.
+    """
 
     time_min: float
     reactor: str
     text: str
     level_ml: float | None = None
+    share: float | None = None
+    sd: float | None = None
+
+    @property
+    def measured(self) -> bool:
+        """Whether the run takes something over."""
+        return self.level_ml is not None or self.share is not None
 
 
 def add_mark(folder: Path, mark: Mark) -> Path:
-    """Append a mark to a run folder, on the disk when this returns; of the running program a level is taken over.
+    """Append a mark to a run folder, on the disk when this returns; the running program takes over what was measured.
 
     Raises: RecordingError if the disk refuses or the file is another one.
     """
     written = datetime.now().astimezone().isoformat(timespec="seconds")
-    with Recorder(folder / NAME, COLUMNS) as file:
-        cells = (round(mark.time_min, 3), mark.reactor, mark.text, written, mark.level_ml)
+    with _alone(folder), Recorder(folder / NAME, COLUMNS) as file:
+        cells = (round(mark.time_min, 3), mark.reactor, mark.text, written, mark.level_ml, mark.share, mark.sd)
         file.write(dict(zip(COLUMNS, cells, strict=True)))
     return folder / NAME
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Nobody else adds a mark to this folder meanwhile."""
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(held)
 
 
 def read_marks(folder: Path) -> list[Mark]:
@@ -43,10 +69,14 @@ def read_marks(folder: Path) -> list[Mark]:
     if not path.is_file():
         return []
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return [
-                Mark(float(r["time_min"]), r["reactor"], r["text"], float(r["level_ml"]) if r.get("level_ml") else None)
-                for r in csv.DictReader(file)
-            ]
+        text = path.read_text(encoding="utf-8")
+        whole = io.StringIO(text[: text.rfind("\n") + 1], newline="")  # what is torn is not there, and comes again
+        found = [
+            Mark(float(r["time_min"]), r["reactor"], r["text"], *(float(r[c]) if r.get(c) else None for c in MEASURED))
+            for r in csv.DictReader(whole)
+        ]
+        if wrong := [m for m in found if m.share is not None and not (m.sd is not None and m.sd > 0.0)]:
+            raise ValueError(f"share {wrong[0].share:g} at minute {wrong[0].time_min:g} has no sd above 0")
+        return found
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise RecordingError(f"{path}: damaged ({type(error).__name__}: {error}); mend it or move it away") from None

@@ -107,8 +107,10 @@ class Recorder:
         if self._fd < 0:
             raise RecordingError(f"{self.path}: is closed")
         try:
+            before = os.fstat(self._fd).st_size
             written = os.write(self._fd, line)
             if written != len(line):
+                os.ftruncate(self._fd, before)
                 raise RecordingError(f"{self.path}: only {written} of {len(line)} bytes written; is the disk full?")
             if self._fsync:
                 os.fsync(self._fd)

@@ -8,10 +8,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
-from envs.coculture.rates import EQUAL_RATES_C, e_coli_rate, p_putida_rate
 from envs.coculture.task import CocultureConfig, CocultureVectorEnv, advance, at_rest, logit, passed, share
 from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Evaluation
+from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
 
 PREVIEW = CocultureConfig(control_min=30.0, episode_steps=24, preview_min=360.0)
 

@@ -156,6 +156,23 @@ def test_cooling_is_passive_and_heating_fast() -> None:
     assert p.thermal.temperature[0] == pytest.approx(24.0, abs=1e-3)
 
 
+def test_the_thermostat_goes_by_its_thermometer_and_cells_by_the_truth() -> None:
+    warm = GrowthConfig(temperature_law="arrhenius")
+    p = plant(PlantConfig(growth=warm, thermal=ThermalConfig(offset_c=(-0.5, 0.7))), n=8)
+    offset = p.draws["thermometer_offset"]
+    assert -0.5 <= offset.min() < -0.1
+    assert 0.1 < offset.max() <= 0.7
+    np.testing.assert_allclose(p.thermal.read(), 37.0)
+    for target, minutes in ((35.0, 30.0), (36.0, 1.0)):
+        p.advance(minutes, np.zeros(8), temperature_target=target)
+        np.testing.assert_allclose(p.thermal.read(), target, atol=1e-9)
+        np.testing.assert_allclose(p.thermal.temperature, target - offset, atol=1e-9)
+    before = p.culture.od.copy()
+    p.advance(1.0, np.zeros(8))
+    faster = np.log(p.culture.od / before)
+    assert (np.diff(faster[np.argsort(offset)]) < 0.0).all()  # who shows more is colder than it seems
+
+
 def test_feed_halves_the_time_of_cooling() -> None:
     p = Plant(PlantConfig(), 3, np.random.default_rng(0))
     minutes = np.zeros(3)

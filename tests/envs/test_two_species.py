@@ -7,13 +7,13 @@ import pytest
 
 from conf.presets import load
 from conf.schema import build
-from envs.coculture.rates import EQUAL_RATES_C, e_coli_rate, p_putida_rate
 from envs.plant.culture import GrowthConfig
-from envs.plant.fluorescence import FluorescenceConfig, steady_production
+from envs.plant.fluorescence import FluorescenceConfig
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.species import SecondSpeciesConfig
 from envs.plant.thermal import ThermalConfig
 from envs.plant.vessel import VesselConfig
+from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate, steady_production
 
 QUIET = FluorescenceConfig(noise_sd=0.0)
 STEADY = ThermalConfig(medium_c=37.0, heating_c_per_min=10.0)
@@ -262,7 +262,7 @@ def test_the_published_presets_start_where_they_say() -> None:
     p = plant(build(PlantConfig(), load("plant/coculture_mixed")), 50)
     share = p.culture.share
     assert 0.2 <= share.min() < 0.3 < 0.7 < share.max() <= 0.8
-    assert p.thermal.temperature[0] == EQUAL_RATES_C
+    np.testing.assert_allclose(p.thermal.read(), 33.2)
     assert 0.75 <= p.draws["fluorescence_factor"].min() <= p.draws["fluorescence_factor"].max() <= 1.19
     nominal = load("plant/coculture")
     both = load("plant/coculture_growth_both")

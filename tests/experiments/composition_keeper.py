@@ -1,10 +1,13 @@
 """Estimator and law in one, for tests of the loop: it reckons the share from the temperatures it is shown."""
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 
-from envs.coculture.rates import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
 from envs.coculture.task import logit, share
 from experiments.laws.share.base import Array, Estimate, Mask, Wanted
+from tests.two_species import EQUAL_RATES_C, LAG_P_MIN, T_MAX, T_MIN, e_coli_rate, p_putida_rate
 
 
 class Reckoning:
@@ -38,8 +41,21 @@ class Reckoning:
     def begun(self) -> Mask:
         return np.isfinite(self._x)
 
+    @property
+    def known(self) -> Array:
+        return np.where(np.isfinite(self._minute), self._minute, -np.inf)
+
+    def retell(self, shown: Iterable[tuple[float, str, tuple[Any, ...]]]) -> None:
+        """It forgets nothing."""
+
     def estimate(self) -> Estimate:
-        return Estimate(self._x, np.zeros(self._x.size), np.full(self._x.size, EQUAL_RATES_C), self._rate)
+        return Estimate(
+            self._x,
+            np.zeros(self._x.size),
+            np.full(self._x.size, EQUAL_RATES_C),
+            self._rate,
+            *np.zeros((3, self._x.size)),
+        )
 
     def act(self, estimate: Estimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
         with np.errstate(invalid="ignore"):

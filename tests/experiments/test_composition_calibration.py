@@ -60,7 +60,7 @@ def test_what_is_not_known_of_the_culture_widens_the_factor():
         ({"light": [900.0, np.nan]}, "light readings = nan or inf"),
         ({"light": [900.0, 910.0, 920.0]}, "as many as of OD, 2"),
         ({"od": [0.5, 0.0]}, "smallest od"),
-        ({"share": 0.0}, "without P. putida nothing fluoresces"),
+        ({"share": 0.0}, "without the second species nothing fluoresces"),
         ({"temperature": 37.0}, "29 to 36 degC"),
         ({"growth": 0.0}, "growth = 0.0"),
         ({"light": [100.0, 110.0]}, "light over the blank"),

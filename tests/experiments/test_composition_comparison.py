@@ -13,7 +13,7 @@ from experiments.benchmark import _schema, benchmark
 from experiments.cli import frame
 from experiments.comparison import statistics
 from experiments.comparison.config import BenchmarkConfig
-from experiments.comparison.run import policies_of
+from experiments.comparison.run import policies_of, with_pair
 from experiments.comparison.trials import Cell, ShareTrial, cells, run_cell
 
 SHORT = (
@@ -29,7 +29,7 @@ def load(*overrides: str) -> BenchmarkConfig:
 
 @cache
 def config() -> BenchmarkConfig:
-    return load(*SHORT)
+    return with_pair(load(*SHORT))
 
 
 def cell(law, plant="coculture", announced=True, calibrated=True):
@@ -110,6 +110,33 @@ def test_the_recipe_asks_for_every_law_on_every_plant():
     found = cells(recipe)
     assert len(found) == len(set(found)) == 80 + 4 + 40 + 3
     assert {c.controller for c in found} == set(recipe.compositions)
+
+
+def test_a_policy_of_another_pair_is_refused_before_anything_runs(tmp_path):
+    c = load("+experiment=coculture", "replicates=2", "pair=ecoli_psyringae")
+    with pytest.raises(frame.UserError, match=r"policy's pair = .*; give composition_policies\.dqn=RUN, or studies"):
+        benchmark(c, tmp_path)
+
+
+def test_another_pair_grows_in_all_vials_of_two_species_and_in_no_other():
+    """Its rate by hand at 33 degC, where its range ends: cardinal temperatures 0, 28 and 36 degC, .546 1/h at best."""
+    over, under = (33.0 - 36.0) * 33.0**2, 28.0 * (28.0 * (33.0 - 28.0) - (28.0 - 36.0) * (28.0 - 2.0 * 33.0))
+    rate = 0.546 / 60.0 * over / under
+    given, own = load("+experiment=coculture", "pair=ecoli_psyringae"), load("+experiment=coculture")
+    plants, usual = with_pair(given).plants, with_pair(own).plants
+    for name, plant in plants.items():
+        if plant.second.present:
+            assert plant.pair.second.name == "P. syringae"
+            assert plant.pair != usual[name].pair
+            assert plant.start_temperature == pytest.approx(plant.pair.even_c)
+            slower = usual[name].second.mu / usual["coculture"].second.mu
+            assert plant.second.mu == pytest.approx(rate * slower)
+        else:
+            assert plant == usual[name]
+    assert {plant.second.present for plant in plants.values()} == {True, False}
+    t = with_pair(given).scenarios["ratio_steps"].temperatures[0]  # both grow alike there, to .1 degC
+    over, under = (t - 36.0) * t**2, 28.0 * (28.0 * (t - 28.0) + 8.0 * (28.0 - 2.0 * t))
+    assert 0.07727 * t - 1.66954 == pytest.approx(0.546 * over / under, rel=0.01)
 
 
 def test_the_command_leaves_numbers_figures_and_a_page(tmp_path):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ import yaml
 
 from experiments import report
 from experiments.cli import frame
-from experiments.control import policies, run
+from experiments.cli.calibrated import read_pair
+from experiments.control import assemble, policies, run
 from experiments.deploy import main
 from experiments.loop.metrics import mean_errors
 from experiments.loop.share import COLUMNS
@@ -90,7 +92,7 @@ def test_the_share_goes_where_it_is_asked_to(deployed: Path) -> None:
 
 def test_figure_curves_and_page_show_it(deployed: Path, tmp_path: Path) -> None:
     picture = (deployed / "figures" / "composition.svg").read_text()
-    for word in ("share of the second species", "truth", "thermostat", "fluorescence, counts", "M1, estimate"):
+    for word in ("share of P. putida", "truth", "thermostat", "fluorescence,", "M1, estimate"):
         assert word in picture
     (events,) = (deployed / "reactors" / "M0").glob("events*")
     written = events.read_bytes()
@@ -105,7 +107,7 @@ def test_figure_curves_and_page_show_it(deployed: Path, tmp_path: Path) -> None:
 
 def test_without_a_composition_nothing_of_it_is_left(tmp_path: Path) -> None:
     folder = deploy(tmp_path / "run", "plant=coculture", "scenario=regulation", "fsync=false")
-    assert tuple(rows(folder)[0]) == USUAL
+    assert tuple(rows(folder)[0]) == (*USUAL, "fluorescence")  # the light of its vials
     summary, state = ((folder / f"{name}.json").read_text() for name in ("summary", "state"))
     assert "ratio" not in summary
     assert "composition" not in state
@@ -136,13 +138,13 @@ def test_the_error_of_a_share_by_hand() -> None:
 
 
 def test_a_scenario_alone_is_completed(tmp_path: Path) -> None:
-    """`scenario=ratio_steps` and nothing else: the shipped policy with preview, two species in the vial."""
+    """`scenario=ratio_steps` and nothing else: the best law there is, two species in the vial."""
     words = ["scenario=ratio_steps", "scenario.minutes=[10,20,20,20]", "fsync=false"]
     folder = deploy(tmp_path / "run", *words)
     summary = json.loads((folder / "summary.json").read_text())
     assert {row["ratio_setpoint"] for row in summary["windows"]} == {None, 0.3, 0.7}
     stored = yaml.safe_load((folder / "config.yaml").read_text())
-    assert stored["composition"]["kind"] == "dqn_preview"
+    assert stored["composition"]["kind"] == "midpoint"
     assert stored["plant"]["second"]["start_share"] == [0.5, 0.5]
 
 
@@ -174,6 +176,21 @@ def test_a_scenario_alone_is_completed(tmp_path: Path) -> None:
             "composition=optimum plans one program: give all reactors the same shares and minutes",
         ),
         (
+            (*WORDS[:2], "composition=dqn_preview", "scenario.ratios=[null,0.95,0.5,0.03]"),
+            "composition=dqn_preview: its policy was trained for shares of 0.1 to 0.9, the scenario asks for 0.03, "
+            "0.95; give composition=midpoint",
+        ),
+        (
+            (*WORDS[:2], "composition=dqn_preview", "pair=ecoli_psyringae"),
+            "policy's pair = of E. coli and P. putida, for a run with E. coli and P. syringae; growth differs by up to "
+            "0.5. 1/h: allowed the run's own: train one with pair=",
+        ),
+        ((*WORDS[:2], "pair=yeasts"), "pair = yeasts: allowed ecoli_pputida, ecoli_psyringae, a pair.yaml, or"),
+        (
+            (*WORDS[:2], "composition=pi", "safety.composition_high=31"),
+            "safety.composition_low to composition_high = 29 to 31 degC: allowed a range that holds 33.20 degC, where",
+        ),
+        (
             ("scenario=ratio_steps", "composition=pi", "+each.M0.ratios=[0.5]", "plant=coculture"),
             "each.M0: scenario.ratios",
         ),
@@ -191,3 +208,51 @@ def test_a_learned_controller_without_a_policy_that_ships_says_what_to_give(
     monkeypatch.setitem(policies.SHIPPED_COMPOSITION, "dqn", tmp_path / "none.npz")
     with pytest.raises(frame.UserError, match="composition=dqn: no policy for it comes with this version; give compos"):
         deploy(tmp_path / "run", *WORDS[:2], "composition=dqn")
+
+
+def test_a_share_beyond_training_runs_where_it_is_forced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    words = (*WORDS[:2], "composition=dqn_preview", "scenario.ratios=[null,0.95,0.5,0.5]", "scenario.minutes=[1,2,1,1]")
+    deploy(tmp_path / "run", *words, "force_policy=true")
+    assert "trained for shares of 0.1 to 0.9, the scenario asks for 0.95; it runs all the same" in caplog.text
+
+
+def test_the_light_of_a_culture_whose_share_nobody_holds_is_recorded(tmp_path: Path) -> None:
+    """Of one species alone, for its curve; a plant of one species has no such column."""
+    alone = ("plant=coculture", "plant.second.start_share=[1,1]", "controller=threshold", "scenario.setpoints=[0.5]")
+    timed = ("scenario.minutes=[10]", "scenario.temperatures=[30]")
+    folder = deploy(tmp_path / "lit", *alone, *timed)
+    light = column(folder, "fluorescence")
+    assert (light > 1000.0).all()
+    assert "ratio" not in rows(folder)[0]
+    folder = deploy(tmp_path / "dark", *alone, *timed, "plant.second.start_share=[0,0]")
+    assert "fluorescence" not in rows(folder)[0]
+
+
+def test_another_pair_lives_in_the_vials_and_within_its_own_limits(tmp_path: Path) -> None:
+    pair = tmp_path / "pair.yaml"
+    pair.write_text(
+        "first: {name: alpha, polynomial: [0.06, -1.1]}\nsecond: {name: beta, polynomial: [-0.01, 0.6, -8.1]}\n"
+        "pigment: {}\ntemperatures: [26.0, 34.0]\n"
+    )
+    folder = deploy(
+        tmp_path / "run", "scenario=ratio_steps", f"pair={pair}", "scenario.ratios=[null,0.3,0.7,0.3]",
+        "scenario.minutes=[30,240,420,60]", "scenario.announce_min=0",
+    )  # fmt: skip
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    pair.unlink()  # a run keeps its own, also for a resume
+    again = assemble.with_pair(replace(main.config([f"pair={pair}"]), resume=str(folder)), folder)
+    assert again.pair == str(folder / "pair.yaml")
+    kept = read_pair(again.pair)
+    assert config["plant"]["pair"]["second"]["name"] == kept.second.name == "beta"
+    assert set(column(folder, "temperature_target_degc")[:25]) == {kept.resting_c}
+    assert abs(kept.resting_c - 33.2) > 0.5
+    assert "share of beta" in (folder / "figures" / "composition.svg").read_text()
+    one = main.config(["scenario=ratio_steps", f"pair={folder}", "safety.composition_low=27"])
+    one_side = assemble.completed(one)
+    assert (one_side.safety.composition_low, one_side.safety.composition_high) == (27.0, 34.0)
+    assert (config["safety"]["composition_low"], config["safety"]["composition_high"]) == (26.0, 34.0)
+    target, truth = column(folder, "temperature_target_degc"), column(folder, "true_ratio")
+    elapsed = column(folder, "elapsed_min")
+    assert 26.0 <= np.nanmin(target) < 26.5  # what the thermometer has to show, by its estimated error
+    assert truth[elapsed == 269.0][0] == pytest.approx(0.3, abs=0.05)
+    assert truth[elapsed == 689.0][0] > 0.45

@@ -18,6 +18,7 @@ from conf import presets
 from conf.schema import build
 from envs.scenario import Scenario
 from experiments.control import assemble
+from experiments.control.bench_marks import BenchMarks
 from experiments.laws import registry
 from experiments.loop.share import Share
 from experiments.record.recovery import COLUMNS as USUAL
@@ -25,11 +26,13 @@ from hardware.chibio.calibrations import save_calibration
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.vial import VialConfig
 from hardware.storage.journal import read_journal
+from hardware.storage.marks import Mark, add_mark
 from tests.campaigns.audit import audit_doses, audit_rows
 from tests.campaigns.killed_run import KillConfig, killed_run
 from tests.campaigns.rehearsal import SOUND, Killed, Rehearsal, rehearsed
 from tests.experiments.composition_keeper import Reckoning
 from tests.experiments.test_composition_deploy import column, rows
+from tests.hardware.emulator_lab import quiet
 from tests.hardware.test_serial_transport import Cable, wired
 
 ROOT = Path(__file__).parents[2]
@@ -216,3 +219,42 @@ def test_over_the_serial_line(two_species: Cable, tmp_path: Path) -> None:
     assert tuple(rows(folder)[0])[: len(USUAL)] == USUAL
     assert (column(folder, "fluorescence") > 100.0).all()
     assert np.isfinite(column(folder, "ratio")[1:]).all()
+
+
+def test_a_share_that_was_counted_is_taken_over_once_also_over_a_kill(tmp_path: Path) -> None:
+    """Marked at minute 60 for minute 40; the program is killed before its state is saved, and resumed."""
+    run = rehearsal(tmp_path, SHORT, ("M0", "M1"))
+    run.begin()
+    for step in run.run():
+        if float(step.minute[0]) > 60.0:
+            break
+    held = next(each for each in run.loop.signals if isinstance(each, Share))
+    before = held.estimator.estimate()
+    for text, share_, minute in (("taken", None, 20.0), ("counted", 0.6, 40.0)):
+        add_mark(tmp_path, Mark(minute, "M1", text, None, share_, share_ and 0.02))
+    marks = BenchMarks(run.record)
+    marks.take(run.loop)
+    marks.take(run.loop)
+    after = held.estimator.estimate()
+    assert after.logit[0] == pytest.approx(before.logit[0], abs=1e-12)
+    assert 0.0 < after.sd[1] < 0.5 * before.sd[1]
+    (row,) = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "share"]
+    assert (row["reactor"], row["share"], row["sd"], row["minute"]) == ("M1", 0.6, 0.02, 40.0)
+    run.close()  # as a kill leaves it: the state is of before the mark
+    run.wait(30.0)
+    run.begin()
+    again = next(each for each in run.loop.signals if isinstance(each, Share))
+    BenchMarks(run.record).take(run.loop)
+    assert len([1 for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "share"]) == 1
+    for step in run.run():
+        if float(step.minute[0]) > 62.0:
+            break
+    assert np.isfinite(again.estimator.estimate().logit).all()
+    run.close()
+
+
+def test_a_sample_without_an_estimate_changes_nothing(tmp_path: Path) -> None:
+    run = Rehearsal(tmp_path, rehearsed(("M0",), Scenario((0.5,), (20.0,), (37.0,))), quiet(mu=0.02), od=0.5)
+    run.begin()
+    assert run.loop.counted("M0", 0.3, 0.03, 1.0) == ("left out: nothing here estimates it", True)
+    run.close()

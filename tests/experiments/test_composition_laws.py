@@ -1,19 +1,20 @@
 """Laws of the composition by hand, against the model, and at the door."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
-from envs.coculture.rates import e_coli_rate, p_putida_rate
+from envs.coculture.pair import PairConfig
 from envs.coculture.task import CocultureConfig, advance, at_rest, logit, share
 from experiments.laws import registry
 from experiments.laws.registry import SHARE
 from experiments.laws.share.base import Estimate, Wanted
 from experiments.laws.share.program import Program
 from hardware import memory
+from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
 
 NAN = float("nan")
 STEPS = Program((NAN, 0.3, 0.7, 0.3), (60.0, 360.0, 600.0, 600.0))
@@ -28,7 +29,13 @@ def law(kind, program=STEPS, policy=None, **values):
 def seen(x, temperature=33.2, rate=None):
     x = np.atleast_1d(np.asarray(x, dtype=float))
     warm = np.broadcast_to(float(temperature), x.shape)
-    return Estimate(x, np.full(x.shape, 0.1), warm, p_putida_rate(warm) if rate is None else np.full(x.shape, rate))
+    return Estimate(
+        x,
+        np.full(x.shape, 0.1),
+        warm,
+        p_putida_rate(warm) if rate is None else np.full(x.shape, rate),
+        *np.zeros((3, x.size)),
+    )
 
 
 def asked(s, following=None, minutes=0.0, n=1):
@@ -47,7 +54,7 @@ def on_the_model(kind, program, announce_min=360.0, start=0.5, policy=None, **va
     state, shares = at_rest(config, logit(np.array([start]))), [start]
     for minute in range(int(program.total_min)):
         wanted = program.wanted(np.array([float(minute)]), announce_min)
-        known = Estimate(state[:, 0], np.zeros(1), state[:, 1], state[:, 2])
+        known = Estimate(state[:, 0], np.zeros(1), state[:, 1], state[:, 2], *np.zeros((3, 1)))
         target = controller.act(known, wanted, np.array([float(minute)]), np.isfinite(wanted.setpoint))
         state = advance(config, state, np.where(np.isfinite(wanted.setpoint), target, 33.2), 1.0)
         shares.append(float(share(state[0, 0])))
@@ -64,21 +71,20 @@ def test_the_vendors_pi_is_its_formula():
     for minute, r in enumerate((0.45, 0.47, 0.52)):
         integral += 0.01 * (0.5 - r)
         target = pi.act(seen(logit(r)), asked(0.5), *at(minute))
-        assert target[0] == pytest.approx(33.2 - 15.0 * (0.5 - r) - integral, abs=1e-9)
+        assert target[0] == pytest.approx(EQUAL_RATES_C - 15.0 * (0.5 - r) - integral, abs=1e-9)
 
 
 def test_the_vendors_integrator_rests_at_the_limit_it_pushes_against():
     pi = law("pi")
     for minute in range(50):
         assert pi.act(seen(logit(0.1)), asked(0.9), *at(minute))[0] == 29.0
-    assert pi.act(seen(logit(0.9)), asked(0.9), *at(50))[0] == pytest.approx(33.2)
+    assert pi.act(seen(logit(0.9)), asked(0.9), *at(50))[0] == pytest.approx(EQUAL_RATES_C)
 
 
 def test_proportional_bang_bang_and_inverse_dynamics_by_hand():
     x, goal = np.log(0.4 / 0.6), np.log(0.45 / 0.55)
-    assert law("proportional").act(seen(x), asked(0.45), *at(0))[0] == pytest.approx(
-        max(33.2 - 20.0 * (goal - x), 29.0)
-    )
+    even = np.roots([-0.02208, 1.3796 - 0.07727, -20.56996 + 1.66954]).max()  # where the curves cross: 33.197 degC
+    assert law("proportional").act(seen(x), asked(0.45), *at(0))[0] == pytest.approx(even - 20.0 * (goal - x), abs=2e-3)
     assert law("bang_bang").act(seen(x), asked(0.45), *at(0))[0] == 29.0
     assert law("bang_bang").act(seen(x), asked(0.35), *at(0))[0] == 36.0
     cold = law("inverse_dynamics").act(seen(x, rate=0.8), asked(0.41), *at(0))[0]
@@ -133,9 +139,24 @@ def test_the_midpoint_law_is_half_way_at_the_change(now, following):
     assert abs(shares[-1] - following) < 0.01
 
 
-def test_the_midpoint_law_is_proportional_where_nothing_is_announced():
+def test_errors_of_curves_and_thermometer_reach_the_laws():
+    """A culture that is on its setpoint with its rates in balance stays there, whatever is off by how much."""
+    off = replace(seen(np.zeros(1)), error_e=np.array([0.2]), error_p=np.array([-0.1]), thermometer=np.array([0.5]))
+    t = np.linspace(29.0, 36.0, 70001)
+    even = t[np.argmin(np.abs(1.2 * e_coli_rate(t) - 0.9 * p_putida_rate(t)))]
+    rest = replace(off, rate=0.9 * p_putida_rate(np.array([even])))
+    for kind in ("proportional", "inverse_dynamics", "midpoint"):
+        assert law(kind).act(rest, asked(0.5), *at(0))[0] == pytest.approx(even - 0.5, abs=5e-3), kind
+    assert law("pi").act(rest, asked(0.5), *at(0))[0] == pytest.approx(EQUAL_RATES_C)  # the vendor's knows of neither
+    ahead = Wanted(np.array([0.5]), np.array([0.7]), np.array([150.0]))
+    faster = replace(off, error_e=np.array([-0.3]), error_p=np.array([0.3]))
+    assert law("midpoint").act(faster, ahead, *at(0))[0] > 29.0  # it gets there sooner than the curves say
+    assert law("midpoint").act(off, ahead, *at(0))[0] == 29.0
+
+
+def test_the_midpoint_law_is_inverse_dynamics_where_nothing_is_announced():
     shares = on_the_model("midpoint", STEPS, announce_min=0.0)
-    other = on_the_model("proportional", STEPS, control_min=10.0)
+    other = on_the_model("inverse_dynamics", STEPS, control_min=5.0)
     np.testing.assert_allclose(shares, other)
 
 
@@ -224,3 +245,47 @@ def test_what_cannot_be_built_is_said_in_one_line():
         law("dqn", policy=linear_policy(COCULTURE_PREVIEW, "rate"))
     with pytest.raises(ValueError, match=r"^composition.gain = 0.0 degC"):
         law("proportional", gain=0.0)
+
+
+@pytest.mark.parametrize("kind", [*BLIND, "midpoint"])
+def test_reactors_with_other_programs_and_clocks_are_as_if_alone(kind):
+    """Samples every 1, 2 and 3 min; another program each; the third begins later."""
+    programs = [Program((0.4, 0.7), (200.0, 200.0)), Program((0.6, 0.3), (90.0, 310.0)), STEPS]
+    periods, begins = np.array([1, 2, 3]), np.array([0, 0, 70])
+    together, each = law(kind), [law(kind) for _ in programs]
+    together.reset(3)
+    for k in range(150):
+        rows = (k >= begins) & ((k - begins) % periods == 0)
+        minute = np.maximum(k - begins, 0).astype(float)
+        wanted = [p.wanted(minute[n : n + 1], 360.0) for n, p in enumerate(programs)]
+        joined = Wanted(
+            *(np.concatenate([getattr(w, a) for w in wanted]) for a in ("setpoint", "following", "minutes"))
+        )
+        rows &= np.isfinite(joined.setpoint)
+        known = seen(0.3 * np.sin(k / 20.0 + np.arange(3)))
+        target = together.act(known, joined, minute, rows)
+        for n in np.flatnonzero(rows):
+            mine = each[n].act(known.of(np.array([n])), wanted[n], minute[n : n + 1], np.ones(1, dtype=bool))
+            assert target[n] == mine[0], (k, n)
+
+
+MIRRORED = PairConfig(  # the default pair with T for 65 - T: warmth makes the second species gain
+    first=replace(PairConfig().first, polynomial=(-0.07727, 65.0 * 0.07727 - 1.66954)),
+    second=replace(
+        PairConfig().second,
+        polynomial=(-0.02208, 2.0 * 65.0 * 0.02208 - 1.3796, -0.02208 * 65.0**2 + 1.3796 * 65.0 - 20.56996),
+    ),
+)
+
+
+@pytest.mark.parametrize("kind", ["pi", "proportional", "inverse_dynamics", "bang_bang"])
+def test_where_warmth_makes_the_second_gain_every_target_is_mirrored(kind):
+    """Long at a limit, so that an integrator which does not rest there is seen when the sign turns."""
+    here = law(kind)
+    there = registry.build(type(registry.config(kind, SHARE))(), SHARE, program=STEPS, pair=MIRRORED)
+    for minute in range(300):
+        s = (0.9, 0.1, 0.48)[minute // 100]
+        known = seen(0.1 * np.sin(minute / 9.0))
+        ours = here.act(known, asked(s), *at(minute))[0]
+        theirs = there.act(replace(known, temperature=65.0 - known.temperature), asked(s), *at(minute))[0]
+        assert theirs == pytest.approx(65.0 - ours, abs=2e-3), (kind, minute)

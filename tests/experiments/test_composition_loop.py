@@ -16,11 +16,14 @@ from experiments.laws.share.estimator import CompositionEstimator
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.share import COLUMNS, Share, ShareWarnings, program_of
 from experiments.loop.signals import Sample, Signal
+from experiments.record.record import Table
+from experiments.record.summary import composition_figure_of
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Measurement
 from hardware.safety.config import SafetyConfig
 from hardware.safety.interlock import Interlock, kinds_of
 from hardware.simulated import SimulatedConfig, SimulatedReactors
+from hardware.storage.marks import Mark
 from tests.experiments.composition_keeper import Reckoning
 
 HOLD = Scenario((0.5,), (10_000.0,), (33.2,), ratios=(0.7,))
@@ -195,6 +198,16 @@ def test_a_share_on_its_way_to_one_that_is_announced_is_not_stuck() -> None:
     assert next(minute for minute in np.arange(700.0, 1000.0, 10.0) if warned(composition, minute)) == 870.0
 
 
+def test_a_share_that_comes_nearer_to_what_is_asked_for_is_not_stuck_before_the_one_announced() -> None:
+    """A law that follows the setpoint in force moves away from the next one, at full authority."""
+    schedule = Scenario((0.5, 0.5), (400.0, 400.0), (33.2, 33.2), ratios=(0.9, 0.3), announce_min=360.0)
+    keeper = Scripted(ratio=0.5)
+    composition = held(keeper, [schedule])
+    for minute in np.arange(0.0, 400.0, 10.0):
+        keeper.ratio = 0.5 + 0.0008 * minute
+        assert not warned(composition, minute)
+
+
 @pytest.mark.parametrize(("per_h", "stuck"), [(0.01, False), (0.0, True)])
 def test_a_share_that_lags_behind_a_sine_is_stuck_only_if_it_stands_still(per_h: float, stuck: bool) -> None:
     keeper = Scripted(ratio=0.2)
@@ -339,3 +352,67 @@ class Recorded(Reckoning):
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         self.light.append(fluorescence)
         super().watch(od, fluorescence, temperature, minute, rows)
+
+
+def test_the_same_share_after_a_pause_without_one_begins_anew() -> None:
+    timed = {"setpoints": (0.5,) * 3, "minutes": (200.0, 100.0, 400.0), "temperatures": (33.2,) * 3}
+    composition = held(Scripted(ratio=0.5), [Scenario(**timed, ratios=(0.7, None, 0.7))])
+    told = [minute for minute in np.arange(0.0, 600.0, 10.0) if warned(composition, minute)]
+    assert told == [180.0, 190.0, *np.arange(480.0, 600.0, 10.0)]
+
+
+def test_what_is_said_of_a_counted_share_is_that_reactors() -> None:
+    class Told(Scripted):
+        behind = False
+
+        """Moves the share of the reactor that was sampled to what was counted."""
+
+        def explain(self) -> dict[str, Array]:
+            return {"ratio": self.shares, "ratio_low": self.shares - 0.1, "ratio_high": self.shares + 0.1}
+
+        def sample(self, share: Array, sd: Array, minute: float, rows: Mask) -> bool:
+            self.shares = np.where(rows, share, self.shares)
+            return True
+
+    keeper = Told()
+    composition = held(keeper, [HOLD, HOLD])
+    keeper.shares = np.array([0.11, 0.52])
+    assert composition.counted(1, 0.44, 0.03, 7.0) == ("estimated 0.520 before it; 0.440 after it", False)
+    np.testing.assert_allclose(keeper.shares, [0.11, 0.44])
+    said, doubtful = composition.counted(0, 0.44, 0.03, 7.0)  # .33 off, sds .03 and .051
+    assert said.endswith("; 6 sds from it, if the share has not moved since: right reactor, right species?")
+    assert doubtful
+
+
+def test_the_figure_shows_of_each_reactor_its_own_announcements_and_counts_at_their_time() -> None:
+    """Two programs that begin 40 and 25 min into the run; counts with their 95 %; hours, and µL/s."""
+    minutes = np.arange(0.0, 200.0, 2.0)
+    began, rest = np.array([[40.0], [25.0]]), np.full((2, minutes.size), 0.4)
+    elapsed = np.where(minutes >= began, minutes - began, np.nan)
+    columns = {"time_min": np.tile(minutes, (2, 1)), "elapsed_min": elapsed, "believed": np.ones_like(rest)}
+    columns |= dict.fromkeys(("ratio", "ratio_low", "ratio_high", "ratio_setpoint", "od", "setpoint"), rest)
+    columns |= {"temperature_degc": 80.0 * rest, "temperature_target_degc": 81.0 * rest, "fluorescence": 900.0 * rest}
+    columns["pump_rate_ml_s"] = 0.01 * rest
+    marks = [Mark(60.0, "M1", "", None, 0.6, 0.05), Mark(90.0, "M0", "", 12.0), Mark(150.0, "M1", "", None, 0.3, 0.02)]
+    marks.append(Mark(20.0, "M0", "", None, 0.8, 0.01))
+    table = Table(("M0", "M1"), columns, [[], []], [], marks)
+    phases = {"setpoints": (0.5, 0.5), "temperatures": (33.2, 33.2)}
+    scenarios = [
+        Scenario(**phases, minutes=(100.0, 60.0), ratios=(0.3, 0.7), announce_min=30.0),
+        Scenario(**phases, minutes=(90.0, 60.0), ratios=(0.2, 0.5), announce_min=50.0),
+    ]
+    share, heat, _, pump, light = composition_figure_of(table, scenarios, "B. subtilis", "title").axes
+    assert share.get_ylabel() == "share of B. subtilis"
+    told = [line.get_xydata().tolist() for line in share.lines if line.get_marker() == ">"]
+    assert told == [[[(70.0 + 40.0) / 60.0, 0.7]], [[(40.0 + 25.0) / 60.0, 0.5]]]
+    drawn = [bar for bar in share.containers if len(bar.lines[0].get_xdata())]
+    assert [bar.lines[0].get_xydata().tolist() for bar in drawn] == [[[20 / 60, 0.8]], [[1.0, 0.6], [2.5, 0.3]]]
+    (segments,) = (line.get_segments() for line in drawn[1].lines[2])
+    np.testing.assert_allclose([s[1, 1] - s[0, 1] for s in segments], [3.92 * 0.05, 3.92 * 0.02])
+    labels = ["temperature, °C", "pump rate,\nµL/s", "fluorescence,\ncounts"]
+    assert [ax.get_ylabel() for ax in (heat, pump, light)] == labels
+    assert light.get_xlabel() == "time, h"
+    assert pump.lines[0].get_ydata().max() == pytest.approx(4.0)  # of 0.004 mL/s
+    assert heat.lines[0].get_ydata()[0] == 32.0
+    assert heat.lines[1].get_ydata()[0] == pytest.approx(32.4)
+    assert light.lines[0].get_xdata().max() == pytest.approx(198.0 / 60.0)

@@ -60,3 +60,17 @@ def test_a_sine_falls_first_and_is_announced_as_a_step():
 def test_a_program_that_cannot_be_is_refused(values, says):
     with pytest.raises(ValueError, match=says):
         Program(*values)
+
+
+def test_when_changes_are_announced() -> None:
+    """Each as long before it as asked for, but not before its phase begins; phases of one share are one."""
+    program = Program((NAN, 0.3, 0.3, 0.7, NAN, 0.5, 0.2), (60.0, 100.0, 200.0, 30.0, 10.0, 500.0, 20.0))
+    minute, share = program.announcements(150.0)
+    assert minute.tolist() == [210.0, 750.0]  # .3 to .7 at 360, .5 to .2 at 900
+    assert share.tolist() == [0.7, 0.2]
+    minute, _ = program.announcements(1000.0)
+    assert minute.tolist() == [60.0, 400.0]
+    assert program.announcements(0.0)[0].size == 0
+    assert Program((), (60.0,), (0.5, 0.2, 100.0)).announcements(60.0)[0].size == 0
+    assert program.extremes == (0.3, 0.3, 0.7, 0.5, 0.2)
+    assert Program((), (60.0,), (0.5, -0.2, 100.0)).extremes == (0.3, 0.7)

@@ -25,7 +25,9 @@ def cost(law: Law, config: CocultureConfig, start: Array) -> float:
         following = share(goal[:, 1]) if config.preview_min else wanted
         left = goal[:, 2] if config.preview_min else np.zeros(len(start))
         for minute in range(round(config.control_min)):  # laws with a period of a minute act within the decision, too
-            estimate = Estimate(state[:, 0], np.full(len(start), 0.01), state[:, 1], state[:, 2])
+            estimate = Estimate(
+                state[:, 0], np.full(len(start), 0.01), state[:, 1], state[:, 2], *np.zeros((3, len(start)))
+            )
             at = np.full(len(start), k * config.control_min + minute)
             told = Wanted(wanted, following, np.maximum(left - minute, 0.0) * (left > 0.0))
             target = law.act(estimate, told, at, np.ones(len(start), dtype=np.bool_))

@@ -1,10 +1,12 @@
 """What was done at the bench, and the counts behind every OD: in the run folder, the figure and after a resume."""
 
+import fcntl
 import json
 import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +16,7 @@ import pytest
 from envs.plant.sensor import counts_from_od, od_from_counts
 from envs.scenario import Scenario
 from experiments.cli import frame
-from experiments.control.levels import Levels
+from experiments.control.bench_marks import BenchMarks
 from experiments.mark import MarkConfig, mark
 from experiments.mark import main as command
 from experiments.record.record import Record
@@ -154,7 +156,7 @@ def test_a_level_that_was_read_off_a_vial_is_the_ledger_from_then_on_also_after_
     config = replace(rehearsed(("M0", "M1"), Scenario((0.4,), (12.0,), (37.0,))), fsync=False)
     made = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.5)
     made.begin()
-    steps, levels = made.run(), Levels(made.record)
+    steps, levels = made.run(), BenchMarks(made.record)
     next(steps)
     ledger = made.loop.interlock.budget
     add_mark(tmp_path, Mark(1.0, "M0", "inoculated"))
@@ -167,7 +169,7 @@ def test_a_level_that_was_read_off_a_vial_is_the_ledger_from_then_on_also_after_
         made.kill()
     made.close()
     made.begin()
-    levels = Levels(made.record)
+    levels = BenchMarks(made.record)
     levels.take(made.loop)
     assert made.loop.interlock.budget.volume_ml[1] == 23.5
     (tmp_path / "marks.csv").write_text("damaged\n")
@@ -179,7 +181,7 @@ def test_a_level_that_was_read_off_a_vial_is_the_ledger_from_then_on_also_after_
     (tmp_path / "marks.csv").unlink()
     add_mark(tmp_path, Mark(1.0, "M1", "level", 23.5))
     made.begin()  # once more: the level was taken over in a life before
-    Levels(made.record).take(made.loop)
+    BenchMarks(made.record).take(made.loop)
     assert made.loop.interlock.budget.volume_ml[1] == 20.0
     made.close()
 
@@ -189,7 +191,7 @@ def test_a_level_and_the_doses_after_it_are_replayed_in_their_order(tmp_path: Pa
     config = replace(rehearsed(("M0",), Scenario((0.4,), (20.0,), (37.0,))), fsync=False)
     made = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.5)
     made.begin()
-    steps, levels = made.run(), Levels(made.record)
+    steps, levels = made.run(), BenchMarks(made.record)
     next(steps)
     before = (tmp_path / "state.json").read_bytes()
     add_mark(tmp_path, Mark(1.0, "M0", "level", 23.5))
@@ -212,7 +214,7 @@ def test_a_level_that_the_saved_state_knows_is_not_restored_again_and_0_ml_is_on
     config = replace(rehearsed(("M0", "M1"), Scenario((0.4,), (12.0,), (37.0,))), fsync=False)
     made = Rehearsal(tmp_path, config, quiet(mu=0.03), od=0.5)
     made.begin()
-    steps, levels = made.run(), Levels(made.record)
+    steps, levels = made.run(), BenchMarks(made.record)
     next(steps)
     add_mark(tmp_path, Mark(1.0, "M1", "level", 23.5))
     levels.take(made.loop)
@@ -224,7 +226,7 @@ def test_a_level_that_the_saved_state_knows_is_not_restored_again_and_0_ml_is_on
     made.begin()
     assert made.loop.interlock.budget.volume_ml.tolist() == [20.0, 20.0]
     add_mark(tmp_path, Mark(2.0, "M0", "level", 0.0))
-    Levels(made.record).take(made.loop)
+    BenchMarks(made.record).take(made.loop)
     assert made.loop.interlock.budget.volume_ml.tolist() == [0.0, 20.0]
     made.close()
 
@@ -281,6 +283,60 @@ def test_now_is_the_minute_of_the_run(tmp_path: Path) -> None:
     (second, first) = read_marks(folder)
     assert first == Mark(1.25, "", "bottle")
     assert second.time_min == pytest.approx(20.0, abs=2.0)
+
+
+def test_a_share_is_of_a_sample_that_somebody_has_drawn(tmp_path: Path) -> None:
+    folder = _under_way(tmp_path / "run")
+    with pytest.raises(frame.UserError, match=r"minute=40: allowed up to (19|20|21|22), now; nobody has drawn"):
+        mark(MarkConfig(str(folder), "M0", share=0.4, minute=40.0))
+    said = mark(MarkConfig(str(folder), "M0", "plate 7", share=0.4, minute=12.0))
+    assert said.startswith("M0: share 0.4 +- 0.03, plate 7 at minute 12.0, in ")
+    assert read_marks(folder) == [Mark(12.0, "M0", "share 0.4 +- 0.03, plate 7", None, 0.4, 0.03)]
+    over = _under_way(tmp_path / "over", "sim")
+    (over / "recordings" / "M0.csv").write_text("time_min,od\n7.0,0.4\n93.5,0.5\n")
+    with pytest.raises(frame.UserError, match="minute=93.6: allowed up to 94"):
+        mark(MarkConfig(str(over), "M0", share=0.4, minute=93.6))
+    mark(MarkConfig(str(over), "M0", share=0.4, sd=0.01, minute=93.0))
+    with pytest.raises(ValueError, match="sd = 0.05: allowed null, or beside share"):
+        MarkConfig(str(folder), "M0", sd=0.05)
+
+
+def test_a_mark_that_was_torn_is_not_there_and_comes_again(tmp_path: Path) -> None:
+    """A full disk took half of a row; whoever reads meanwhile sees none, and the next mark is whole."""
+    first, second = Mark(1.0, "M0", "a", None, 0.4, 0.03), Mark(2.0, "M0", "b", None, 0.35, 0.04)
+    path = add_mark(tmp_path, first)
+    size = path.stat().st_size
+    add_mark(tmp_path, second)
+    whole = path.read_bytes()
+    for cut in range(size + 1, len(whole)):
+        path.write_bytes(whole[:cut])
+        assert read_marks(tmp_path) == [first]
+    add_mark(tmp_path, second)
+    assert read_marks(tmp_path) == [first, second]
+    path.write_bytes(whole[:-5] + b"0.0\n")
+    with pytest.raises(RecordingError, match=r"share 0\.35 at minute 2 has no sd above 0"):
+        read_marks(tmp_path)
+
+
+def test_many_who_mark_at_once_leave_every_mark(tmp_path: Path) -> None:
+    marks = [Mark(float(k), "M0", f"mark {k}") for k in range(40)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda one: add_mark(tmp_path, one), marks))
+    assert sorted(read_marks(tmp_path), key=lambda m: m.time_min) == marks
+
+
+def test_whoever_marks_waits_for_another_one(tmp_path: Path) -> None:
+    """Two files begun at once would have two headers."""
+    held = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(add_mark, tmp_path, Mark(1.0, "M0", "second"))
+        with pytest.raises(TimeoutError):
+            waiting.result(0.5)
+        assert not (tmp_path / "marks.csv").exists()
+        os.close(held)
+        waiting.result(30.0)
+    assert [mark.text for mark in read_marks(tmp_path)] == ["second"]
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,14 @@
 """The experiment cycle: timing, records, start and stop races (docs/device.md, Cycle, Records and Start races)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from envs.bench import Bench
+from envs.plant.plant import PlantConfig
+from hardware.chibio.config import EmulatorConfig
+from hardware.emulator import family
 from hardware.emulator.faults import inject
 from hardware.emulator.sysdata import append_records, fresh_sysdata, thin_records
 from tests.hardware.emulator_lab import Lab, quiet
@@ -282,3 +288,35 @@ def test_two_reactors_cycle_independently() -> None:
     lab.wait(300.0)
     assert lab.state("M0")["Experiment"]["cycles"] == 6
     assert lab.state("M1")["Experiment"]["cycles"] == 5
+
+
+def test_a_pair_that_a_run_is_for_is_its_devices() -> None:
+    words = family._words(EmulatorConfig(plant="coculture", pair="ecoli_psyringae"), Bench())
+    assert words[words.index("--pair") + 1] == "ecoli_psyringae"
+    _, plant = family.EmulatorFamily().vials(EmulatorConfig(plant="coculture", pair="ecoli_psyringae"), PlantConfig())
+    assert plant.pair.second.name == "P. syringae"
+
+
+def test_the_thermostat_holds_what_its_thermometer_shows() -> None:
+    options = quiet(mu=0.01)
+    off = replace(options.plant, thermal=replace(options.plant.thermal, offset_c=(0.6, 0.6)))
+    lab = Lab(options=replace(options, plant=off))
+    lab.post("/Experiment/1/M0")
+    lab.post("/SetOutputTarget/Thermostat/M0/35")
+    lab.wait(3600.0)
+    shown = float(lab.state()["ThermometerIR"]["current"])
+    assert shown == pytest.approx(35.0, abs=0.35)
+    assert lab.device.truth("M0")["temperature"] == pytest.approx(shown - 0.6, abs=0.2)
+
+
+@pytest.mark.parametrize("offset_c", [-0.6, 0.6])
+def test_a_heater_warms_alike_whatever_the_thermometer_shows(offset_c: float) -> None:
+    options = quiet(mu=0.0)
+    thermal = replace(options.plant.thermal, offset_c=(offset_c, offset_c))
+    lab = Lab(options=replace(options, plant=replace(options.plant, thermal=thermal)))
+    begun = lab.device.truth("M0")["temperature"]
+    inject(lab.device, "heater_runaway", "M0")
+    lab.wait(120.0)
+    cooled = 2.0 * (begun - thermal.ambient_c) / thermal.cooling_min
+    risen = lab.device.truth("M0")["temperature"] - begun
+    assert risen == pytest.approx(2.0 * thermal.heating_c_per_min - cooled, abs=0.1)

@@ -1,6 +1,7 @@
 """The emulator as a separate process: real sockets, scaled real time, faults, clean end."""
 
 import json
+import os
 import re
 import signal
 import socket
@@ -103,6 +104,8 @@ def test_requests_are_served_one_at_a_time(emulator: Process) -> None:
         thread.join()
     assert max(spans) >= 4 * 3.0 / 60.0
     assert sorted(spans) == pytest.approx([0.05, 0.1, 0.15, 0.2], abs=0.15)
+    for k, span in enumerate(sorted(spans), start=1):
+        assert span >= k * 3.0 / 60.0 - 0.01
 
 
 def test_socket_faults(emulator: Process) -> None:
@@ -182,6 +185,30 @@ def test_garbage_on_the_socket_does_not_end_it(emulator: Process) -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_it_cleanly(number: int) -> None:
     assert Process().end(number) == (0, "")
+
+
+def test_it_ends_with_the_process_that_started_it_however_that_ends() -> None:
+    """A client that is killed by -9 leaves no device behind."""
+    client = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            "import time; from hardware.emulator.process import EmulatorProcess; d = EmulatorProcess([]);"
+            "print(d.pid, flush=True); time.sleep(600)",
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert client.stdout is not None
+    device = int(client.stdout.readline())
+    os.kill(device, 0)
+    client.kill()
+    client.wait()
+    client.stdout.close()
+    deadline = time.monotonic() + 30.0
+    while Path(f"/proc/{device}").exists() and "\nState:\tZ" not in Path(f"/proc/{device}/status").read_text():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 @pytest.mark.parametrize(

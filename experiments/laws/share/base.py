@@ -1,9 +1,11 @@
 """What a law of the composition is told and what it answers: N cultures in, N thermostat targets out."""
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from experiments.laws.base import Array, Mask
 from hardware.memory import Remembers
@@ -16,13 +18,26 @@ class Estimate:
     """What is believed of N cultures.
 
     logit: of the share r of the second species. sd: of that logit. temperature: of the vial, degC. rate: lagged growth
-    rate m_p of the second species, 1/h. Each of shape (N,). Source: docs/coculture.md, Estimate.
+    rate m_p of the second species, 1/h. error_e, error_p: relative, of the growth curves. thermometer: true less
+    measured temperature, degC. Each of shape (N,). Source: docs/coculture.md, Estimate.
     """
 
     logit: Array
     sd: Array
     temperature: Array
     rate: Array
+    error_e: Array
+    error_p: Array
+    thermometer: Array
+
+    def of(self, idx: NDArray[np.intp]) -> "Estimate":
+        """What is believed of some of the cultures."""
+        return Estimate(*(getattr(self, f.name)[idx] for f in fields(self)))
+
+    @property
+    def errors(self) -> Array:
+        """Of both growth curves, (N, 2)."""
+        return np.stack([self.error_e, self.error_p], axis=-1)
 
     @property
     def share(self) -> Array:
@@ -66,6 +81,24 @@ class ShareEstimator(Remembers, Protocol):
 
     def dosed(self, volume_ml: Array) -> None:
         """Fresh medium that went in since this was last called, mL."""
+        ...
+
+    def sample(self, share: Array, sd: Array, minute: float, rows: Mask) -> bool:
+        """Shares counted in samples drawn at a minute since the run began; False where that is too long ago."""
+        ...
+
+    @property
+    def behind(self) -> bool:
+        """Whether samples are still on their way into the estimate."""
+        ...
+
+    @property
+    def known(self) -> Array:
+        """Up to which minute `retell` needs nothing of each culture; -inf where it needs all."""
+        ...
+
+    def retell(self, shown: Iterable[tuple[float, str, tuple[Any, ...]]]) -> None:
+        """Minute, method and arguments of what was called in earlier lives of a run, in order, behind `known`."""
         ...
 
     def estimate(self) -> Estimate:

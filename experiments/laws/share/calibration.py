@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from conf.schema import require
-from envs.coculture.rates import T_MAX, T_MIN, p_putida_rate
-from envs.plant.fluorescence import steady_production
+from envs.coculture.pair import PairConfig
 from experiments.laws.share.base import Array
 from experiments.laws.share.estimator import CompositionEstimatorConfig
 
@@ -34,6 +33,7 @@ def calibrate_sensor(
     growth: float | None = None,
     share_sd: float = 0.0,
     growth_cv: float = 0.05,
+    pair: PairConfig | None = None,
 ) -> SensorCalibration:
     """Calibrate on medium alone, and on a culture held at one temperature and density until its pigment is in balance.
 
@@ -46,7 +46,7 @@ def calibrate_sensor(
       blank: readings of sterile medium, counts, (B,), two or more.
       light, od: readings of the culture, counts and OD, (K,) each, two or more.
       temperature: that of the culture, degC, since three hours or more.
-      share: of P. putida, 1 for a pure culture, with its sd. growth: 1/h, as dosed; None: the curve's at that
+      share: of the second species, 1 for a pure culture, with its sd. growth: 1/h, as dosed; None: the curve's at that
         temperature; growth_cv: its relative sd.
     Raises: ValueError naming what is wrong, its value and what is allowed.
     """
@@ -58,11 +58,12 @@ def calibrate_sensor(
         )
     require(bright.size == dense.size, "light readings", bright.size, f"as many as of OD, {dense.size}")
     require(bool((dense > 0.0).all()), "smallest od", float(dense.min()), "greater than 0")
-    require(T_MIN <= temperature <= T_MAX, "temperature", temperature, f"{T_MIN:g} to {T_MAX:g} degC")
-    require(0.0 < share <= 1.0, "share", share, "0 < share <= 1; without P. putida nothing fluoresces")
-    rate = float(p_putida_rate(temperature)) if growth is None else growth
+    low, high = (pair := pair or PairConfig()).temperatures
+    require(low <= temperature <= high, "temperature", temperature, f"{low:g} to {high:g} degC")
+    require(0.0 < share <= 1.0, "share", share, "0 < share <= 1; without the second species nothing fluoresces")
+    rate = float(pair.rates(temperature)[1]) if growth is None else growth
     require(rate > 0.0, "growth", rate, "greater than 0 1/h")
-    pigment = share * float(steady_production(temperature)) / rate  # per OD
+    pigment = share * float(pair.production(temperature)) / rate  # per OD
     glow = pigment + OD_TERM
     offset, offset_sd = float(dark.mean()), float(dark.std(ddof=1)) / dark.size**0.5
     each = (bright - offset) / dense

@@ -7,16 +7,22 @@ from numpy.typing import NDArray
 
 from conf.schema import check, setting
 from envs.bench import Bench
-from envs.coculture.rates import EQUAL_RATES_C, LAG_E_MIN, LAG_P_MIN, e_coli_rate, p_putida_rate
-from envs.plant.fluorescence import DELAY_MIN, FOLLOW_PER_H, LEAST, steady_production
+from envs.coculture.pair import PairConfig
+from envs.plant.fluorescence import DAY_MIN
 from experiments.laws.share.base import Array, Estimate, Mask
 
 __all__ = ["CompositionEstimator", "CompositionEstimatorConfig"]
 
-LOGIT, LOG_OD, LOG_F, BIAS_E, BIAS_P, GAIN, FACTOR, OFFSET = range(8)
-STATES = 8
-CONSIDERED = (FACTOR, OFFSET)
-DILUTED = slice(LOG_OD, BIAS_E)
+Rows = NDArray[np.intp]
+
+LOGIT, LOG_OD, LOG_F, LOG_Q, BIAS_E, BIAS_P, GAIN, FACTOR, OFFSET, THERMOMETER = range(10)
+STATES = 10
+OD, LIGHT, SAMPLE = range(3)  # kinds of readings
+DILUTED = slice(LOG_OD, LOG_Q)
+ERRORS_C = np.linspace(-1.0, 1.0, 5)  # of the thermometer, for which rates and production are followed side by side
+FORGET_MIN = 63.0  # production forgets where it began: s = -1.6 exp(-s/2) per hour has Re s = -.946
+LAGRANGE = np.linalg.inv(np.vander(ERRORS_C, increasing=True))
+DOSES = 60.0  # over which the spread of doses is judged
 LOWEST_OD = 0.005  # below it a first reading says nothing
 LOWEST_LIGHT = 1.0  # counts; what the logarithm of the pigment begins from at least
 ITERATIONS = 3  # of an update, about the newest estimate
@@ -33,14 +39,20 @@ class CompositionEstimatorConfig:
     """
 
     share: float = setting(0.5, "first guess of the share of P. putida", above=0.0, below=1.0)
-    share_sd: float = setting(1.0, "sd of its logit: 0.12 to 0.88 in 95 %", above=0.0, at_most=5.0)
-    bias_sd: float = setting(0.07, "sd of a growth curve's relative error", within=(0, 0.5))
+    share_sd: float = setting(1.8, "sd of its logit: 0.03 to 0.97 in 95 %", above=0.0, at_most=5.0)
+    starts: int = setting(5, "first guesses within that range, followed side by side", within=(1, 9))
+    bias_sd: float = setting(0.1, "sd of a growth curve's relative error", within=(0, 0.5))
     bias_walk: float = setting(2e-4, "its random walk", "1/sqrt(min)", within=(0, 0.05))
     growth_sd: float = setting(3e-4, "spread of either species' growth within a minute", "1/sqrt(min)", within=(0, 0.1))
     pigment_sd: float = setting(1e-3, "spread of ln pigment within a minute", "1/sqrt(min)", within=(0, 0.1))
     pigment_first_sd: float = setting(0.5, "sd of the first guess of ln (pigment over its balance)", within=(0.01, 5))
+    production_first_sd: float = setting(
+        0.5, "sd of the first guess of ln (production of pigment over what the temperature asks for)", within=(0, 5)
+    )
+    thermometer_sd: float = setting(0.25, "sd of the true temperature less the measured one", "degC", within=(0, 1))
     gain_sd: float = setting(0.05, "sd of the pump's true flow over the calibrated one", within=(0, 1))
-    dose_cv: float = setting(0.1, "spread of a dose", within=(0, 1))
+    gain_h: float = setting(24.0, "for so long the flow is estimated, then only its doubt counts", "h", at_least=0.0)
+    dose_cv: float = setting(0.1, "spread of a dose, at least", within=(0, 1))
     od_sd: float = setting(0.005, "of an OD reading", "OD", within=(1e-4, 0.1))
     fluorescence_sd: float = setting(30.0, "of a fluorescence reading", "counts", within=(0.1, 10_000))
     od_term: float = setting(150.0, "light that cells of any kind scatter into the band", "counts/OD", within=(0, 5000))
@@ -57,62 +69,90 @@ class CompositionEstimatorConfig:
 
 
 class CompositionEstimator:
-    """State z = [x, ln S, ln f, b_e, b_p, g, k, o]: logit of the share of P. putida, OD of both species, pigment,
-    errors of the two growth curves, true over calibrated flow of the pump, factor and offset of the light sensor. With
-    e = S/(1 + exp x) and p = S - e, and over h hours in which v of V mL were replaced
+    """State z = [x, ln S, ln f, d, b_e, b_p, g, k, o, c]: logit of the share of P. putida, OD of both species, pigment,
+    error of its production, errors of the two growth curves, true over calibrated flow of the pump, factor and offset
+    of the light sensor, true less measured temperature. With e = S/(1 + exp x) and p = S - e, and over h hours in which
+    v of V mL were replaced
 
       x <- x + h (1 + b_p) m_p - h (1 + b_e) m_e      b_e, b_p, k random walks
       ln S <- ln(e exp(h (1 + b_e) m_e) + p exp(h (1 + b_p) m_p)) - g v/V
-      ln f <- ln(f + h q p) - g v/V
+      ln f <- ln(f + h q exp(d) p) - g v/V            d <- d exp(-h / 63 min)
       OD = S + noise                                  FL = k (f + 150 S) + o + noise
 
-    with m_e, m_p the curves' rates, 1/h, lagging the measured temperature by 2 and 60 min, and q the production of
-    pigment, whose delayed answer to temperature is known (docs/plant.md, Two species). In these coordinates the OD says
+    with m_e, m_p the curves' rates, 1/h, lagging the temperature by 2 and 60 min, and q the production of pigment,
+    whose delayed answer to temperature is known (docs/plant.md, Two species). All three are followed for five errors
+    of the thermometer side by side; at c they are the polynomial through these. In these coordinates the OD says
     nothing of the share at once, however unsure that is; in ln e and ln p a linearised filter soon believes too much.
 
     An extended Kalman filter, iterated about the newest estimate (Bell, Cathey 1993), in Joseph's form. k and o are
-    considered and not estimated (Schmidt 1966): how unsure they are counts in every gain, but no reading changes them,
-    because in a week at one temperature nothing tells a sensor that drifts from a culture that does.
+    considered and not estimated (Schmidt 1966): how unsure they are counts in every gain, but neither OD nor light
+    changes them, because in a week at one temperature nothing tells a sensor that drifts from a culture that does. So
+    is g after a day, for the same reason. A share that was counted (`sample`) changes all of them.
+    So wide a guess of the first share is too wide for one linearisation: `starts` filters begin within it, each weighs
+    as likely as it found the readings, and what is told is mean and variance of the mixture (Alspach, Sorenson 1972).
     A reading further off than `gate_sigma` is left out, and with an OD the light beside it. Where it stays, the density
-    with the pigment, or the pigment alone, is set anew, and the share learns nothing from it. Doses must be told.
+    with the pigment, or the pigment alone, is set anew, and the share learns nothing from it. Doses must be told; if
+    the OD shows that they spread more than `dose_cv`, so it is believed of those to come.
 
-    State: mean (N, 8), cov (N, 8, 8). Args: config: first guesses and noise. volume_ml: V, (N,) or one for all.
+    State: mean (N, K, 10), cov (N, K, 10, 10) and log_weight (N, K) of K starts of each of N cultures.
+    Args: config: first guesses and noise. volume_ml: V, (N,) or one for all. pair: the two species.
     """
 
-    remembers = ("mean", "cov", "minute", "temperature", "lagged", "production", "past", "given_ml", "far")
+    remembers = (
+        "mean", "cov", "log_weight", "far", "doses", "began", "minute", "temperature", "lagged", "production", "past",
+        "given_ml", "dose",
+    )  # fmt: skip
 
-    def __init__(self, config: CompositionEstimatorConfig, volume_ml: Array | float = Bench.volume_ml) -> None:
-        self.config, self._volume_ml = config, volume_ml
+    def __init__(
+        self,
+        config: CompositionEstimatorConfig,
+        volume_ml: Array | float = Bench.volume_ml,
+        pair: PairConfig | None = None,
+    ) -> None:
+        self.config, self._volume_ml, self.pair = config, volume_ml, pair or PairConfig()
         self.reset(1)
 
     def reset(self, n: int) -> None:
         """Forget everything; N cultures that have not been seen yet."""
-        c = self.config
-        self.mean = np.zeros((n, STATES))
-        self.mean[:, GAIN] = 1.0
-        self.mean[:, FACTOR], self.mean[:, OFFSET] = c.factor, c.offset
-        self.cov = np.tile(
-            np.diag(np.square([0.0, 0.0, 0.0, c.bias_sd, c.bias_sd, c.gain_sd, c.factor_sd, c.offset_sd])), (n, 1, 1)
-        )
-        self._minute, self._given_ml = np.full(n, np.nan), np.zeros(n)
-        self._temperature = np.full(n, EQUAL_RATES_C)
-        self._lagged, self._production = np.zeros((n, 2)), np.zeros(n)
-        self._past = np.zeros((n, DELAY_MIN))
-        self._far = np.zeros((n, 2), dtype=np.int64)
+        c, shape = self.config, (n, self.config.starts)
+        self.mean, self.log_weight = np.zeros((*shape, STATES)), np.zeros(shape)
+        self.mean[..., GAIN], self.mean[..., FACTOR], self.mean[..., OFFSET] = 1.0, c.factor, c.offset
+        doubts = (c.production_first_sd, c.bias_sd, c.bias_sd, c.gain_sd, c.factor_sd, c.offset_sd, c.thermometer_sd)
+        self.cov = np.tile(np.diag(np.square([0.0, 0.0, 0.0, *doubts])), (*shape, 1, 1))
+        self._far = np.zeros((*shape, 2), dtype=np.int64)
+        self._doses = np.zeros((*shape, 2))  # see `_judge_dose`
+        self._began, self._minute, self._given_ml = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n)
+        self._temperature, self._dose = np.full(n, self.pair.even_c), np.zeros(n)  # measured; v/V of the last dose
+        self._lagged, self._production = np.zeros((n, 2, ERRORS_C.size)), np.zeros((n, ERRORS_C.size))
+        self._past = np.zeros((n, self.pair.pigment.delay_min, ERRORS_C.size))
 
     def calibrate(self, factor: Array, factor_sd: Array, offset: Array, offset_sd: float) -> None:
         """Each culture's own sensor, before its first reading: factor, its sd and offset, (N,) each; in counts."""
-        self.mean[:, FACTOR], self.mean[:, OFFSET] = factor, offset
-        self.cov[:, FACTOR, FACTOR], self.cov[:, OFFSET, OFFSET] = factor_sd**2, offset_sd**2
+        self.mean[..., FACTOR], self.mean[..., OFFSET] = factor[:, None], offset[:, None]
+        self.cov[..., FACTOR, FACTOR], self.cov[..., OFFSET, OFFSET] = factor_sd[:, None] ** 2, offset_sd**2
 
     @property
     def begun(self) -> Mask:
         """Which cultures have been seen, (N,)."""
         return np.asarray(np.isfinite(self._minute))
 
+    @property
+    def since(self) -> Array:
+        """Minute of the newest readings, -inf before there are any, (N,)."""
+        return np.where(self.begun, self._minute, -np.inf)
+
     def dosed(self, volume_ml: Array) -> None:
         """Fresh medium that went in since this was last called, mL, (N,)."""
         self._given_ml = self._given_ml + volume_ml
+
+    @property
+    def given_ml(self) -> Array:
+        """Fresh medium since the newest readings, mL, (N,)."""
+        return self._given_ml
+
+    def gave(self, volume_ml: Array, rows: Mask) -> None:
+        """That it was so much since the newest readings of `rows`, mL, (N,), whatever was told of these."""
+        self._given_ml = np.where(rows, volume_ml, self._given_ml)
 
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         """Take the readings of `rows` that were not taken yet, each (N,).
@@ -125,30 +165,49 @@ class CompositionEstimator:
         going = np.flatnonzero(new & np.isfinite(self._minute))
         if first.size:
             self._begin(first, od[first], temperature[first])
+            self._began[first] = self._minute[first] = minute[first]
         if going.size:
             self._elapse(going, minute[going] - self._minute[going], temperature[going])
-            self._take(going, 0, od[going])
+            self._minute[going] = minute[going]
+            self._take(going, OD, od[going])
         seen = np.concatenate([first, going])
-        self._take(seen, 1, np.where(self._far[seen, 0] > 0, np.nan, fluorescence[seen]))
-        self._minute[seen] = minute[seen]
+        self._take(seen, LIGHT, fluorescence[seen])
         self._given_ml[seen] = 0.0
 
-    def _begin(self, idx: NDArray[np.intp], od: Array, temperature: Array) -> None:
-        """First reading: its OD, the share as guessed, everything in balance with the temperature."""
-        c, warm = self.config, np.where(np.isfinite(temperature), temperature, EQUAL_RATES_C)
-        self._temperature[idx] = warm
-        self._lagged[idx] = np.stack([e_coli_rate(warm), p_putida_rate(warm)], axis=1)
-        self._production[idx] = steady_production(warm)
-        self._past[idx] = self._production[idx, None]
-        made = np.maximum(self._production[idx] * c.share * od / self._lagged[idx, 1], LOWEST_LIGHT)
-        self.mean[idx, LOGIT] = np.log(c.share / (1.0 - c.share))
-        self.mean[idx, LOG_OD], self.mean[idx, LOG_F] = np.log(od), np.log(made)
-        by_share = c.share_sd * np.array([1.0, 0.0, 1.0 - c.share])
-        by_od = (c.od_sd / od)[:, None] * np.array([0.0, 1.0, 1.0])
-        self.cov[idx, :3, :3] = np.outer(by_share, by_share) + by_od[:, :, None] * by_od[:, None, :]
-        self.cov[idx, LOG_F, LOG_F] += c.pigment_first_sd**2
+    def sample(self, share: Array, sd: Array, rows: Mask) -> None:
+        """Shares of P. putida that were counted just now, by plates or a cytometer, with their sds; each (N,).
 
-    def _elapse(self, idx: NDArray[np.intp], minutes: Array, temperature: Array) -> None:
+        What is known of the share is updated by r = 1 / (1 + exp(-x)) + noise, and through what x shares with them
+        the sensor, the flow and the growth curves. There is no gate: whoever counts says how well. Cultures that have
+        not been seen are left out.
+        """
+        idx = np.flatnonzero(rows & self.begun & np.isfinite(share))
+        reading, noise = share[idx], np.square(sd[idx])
+        expected, slope = self._seen(self.mean[idx], SAMPLE)
+        spread = np.einsum("nki,nkij,nkj->nk", slope, self.cov[idx], slope) + noise[:, None]
+        self.log_weight[idx] -= 0.5 * (np.square(reading[:, None] - expected) / spread + np.log(spread))
+        self._update(idx, SAMPLE, reading, noise)
+
+    def _begin(self, idx: Rows, od: Array, temperature: Array) -> None:
+        """First reading: its OD, the share as guessed, everything in balance with the temperature."""
+        c, warm = self.config, np.where(np.isfinite(temperature), temperature, self.pair.even_c)
+        self._temperature[idx] = warm
+        each = warm[:, None] + ERRORS_C
+        self._lagged[idx] = self.pair.rates(each).swapaxes(1, 2)
+        self._production[idx] = self.pair.production(each)
+        self._past[idx] = self._production[idx][:, None]
+        away, within = _starts(c.starts)
+        guess = np.log(c.share / (1.0 - c.share)) + c.share_sd * away
+        share = 1.0 / (1.0 + np.exp(-guess))
+        made = (self.pair.production(warm) / self.pair.rates(warm)[:, 1] * od)[:, None] * share
+        self.mean[idx, :, LOGIT], self.mean[idx, :, LOG_OD] = guess, np.log(od)[:, None]
+        self.mean[idx, :, LOG_F] = np.log(np.maximum(made, LOWEST_LIGHT))
+        by_share = c.share_sd * within * np.stack([np.ones_like(share), np.zeros_like(share), 1.0 - share], axis=1)
+        by_od = (c.od_sd / od)[:, None] * np.array([0.0, 1.0, 1.0])
+        self.cov[idx, :, :3, :3] = _square(by_share) + _square(by_od)[:, None]
+        self.cov[idx, :, LOG_F, LOG_F] += c.pigment_first_sd**2
+
+    def _elapse(self, idx: Rows, minutes: Array, temperature: Array) -> None:
         """Time passes in steps of at most a minute, temperature changes along a line, doses come at the beginning."""
         before = self._temperature[idx]
         after = np.where(np.isfinite(temperature), temperature, before)
@@ -159,126 +218,226 @@ class CompositionEstimator:
             length, slope = (minutes / steps)[on], ((after - before) / steps)[on]
             mean = before[on] + (k + 0.5) * slope
             self._step(idx[on], length, mean, mean + 0.5 * slope, dose[on] if k == 0 else np.zeros(length.size))
-        self._temperature[idx] = after
+        self._temperature[idx], self._dose[idx] = after, dose
 
-    def _step(self, idx: NDArray[np.intp], minutes: Array, mean: Array, last: Array, dose: Array) -> None:
+    def _step(self, idx: Rows, minutes: Array, mean: Array, last: Array, dose: Array) -> None:
         """One step. Args: mean, last: temperature in it and at its end, degC; dose: v/V."""
-        c, z, hours = self.config, self.mean[idx], minutes / 60.0
-        before, lag = self._lagged[idx], np.array([LAG_E_MIN, LAG_P_MIN])
-        steady = np.stack([e_coli_rate(mean), p_putida_rate(mean)], axis=1)
-        self._lagged[idx] = before + (steady - before) * -np.expm1(-minutes[:, None] / lag)
-        grown = 0.5 * hours[:, None] * (before + self._lagged[idx])  # of each curve itself, (N, 2)
-        growth = grown * (1.0 + z[:, BIAS_E:GAIN])
-        share = 1.0 / (1.0 + np.exp(-z[:, LOGIT]))
-        parts = np.stack([1.0 - share, share], axis=1) * np.exp(growth)
-        total = parts.sum(axis=1)
-        later = parts / total[:, None]  # both species' shares at the end
-        made = hours * self._production[idx] * share * np.exp(z[:, LOG_OD] + 0.5 * growth[:, 1] - z[:, LOG_F])
+        c, z, hours, dose = self.config, self.mean[idx], minutes / 60.0, dose[:, None]
+        weight, change = _through(z[..., THERMOMETER])  # (n, K, errors of the thermometer)
+        before, lag = self._lagged[idx], np.array([[self.pair.first.lag_min], [self.pair.second.lag_min]])
+        each = mean[:, None] + ERRORS_C
+        steady = self.pair.rates(each).swapaxes(1, 2)
+        self._lagged[idx] = before + (steady - before) * -np.expm1(-minutes[:, None, None] / lag)
+        curves = 0.5 * hours[:, None, None] * (before + self._lagged[idx])
+        grown, by_c = (np.einsum("nsc,nkc->nks", curves, w) for w in (weight, change))  # by the curves, and its slope
+        errors = 1.0 + z[..., BIAS_E:GAIN]
+        growth, by_c = grown * errors, by_c * errors
+        share = 1.0 / (1.0 + np.exp(-z[..., LOGIT]))
+        parts = np.stack([1.0 - share, share], axis=-1) * np.exp(growth)
+        total = parts.sum(axis=-1)
+        later = parts / total[..., None]  # both species' shares at the end
+        made_at, of_c = (np.einsum("nc,nkc->nk", self._production[idx], w) for w in (weight, change))
+        made_at = np.maximum(made_at, self.pair.pigment.least)
+        made = np.exp(z[..., LOG_OD] + 0.5 * growth[..., 1] - z[..., LOG_F] + z[..., LOG_Q])
+        made *= hours[:, None] * made_at * share
         new = made / (1.0 + made)  # share of the pigment that is of this step
-        z[:, LOGIT] += growth[:, 1] - growth[:, 0]
-        z[:, LOG_OD] += np.log(total) - z[:, GAIN] * dose
-        z[:, LOG_F] += np.log1p(made) - z[:, GAIN] * dose
+        fades = np.exp(-minutes / FORGET_MIN)[:, None]
+        z[..., LOGIT] += growth[..., 1] - growth[..., 0]
+        z[..., LOG_OD] += np.log(total) - z[..., GAIN] * dose
+        z[..., LOG_F] += np.log1p(made) - z[..., GAIN] * dose
+        z[..., LOG_Q] *= fades
         self.mean[idx] = z
-        step = np.tile(np.eye(STATES), (idx.size, 1, 1))
-        step[:, LOGIT, BIAS_E], step[:, LOGIT, BIAS_P] = -grown[:, 0], grown[:, 1]
-        step[:, LOG_OD, LOGIT] = later[:, 1] - share
-        step[:, LOG_OD, BIAS_E:GAIN] = later * grown
-        step[:, LOG_F, LOGIT], step[:, LOG_F, LOG_OD] = new * (1.0 - share), new
-        step[:, LOG_F, LOG_F], step[:, LOG_F, BIAS_P] = 1.0 - new, 0.5 * new * grown[:, 1]
-        step[:, LOG_OD, GAIN] = step[:, LOG_F, GAIN] = -dose
-        cov = step @ self.cov[idx] @ step.swapaxes(1, 2)
-        cov[:, DILUTED, DILUTED] += ((c.dose_cv * dose) ** 2)[:, None, None]
-        cov[:, FACTOR, FACTOR] += (c.factor * c.factor_walk) ** 2 * minutes / 1440.0
-        for k, sd in enumerate((2.0**0.5 * c.growth_sd, c.growth_sd, c.pigment_sd, c.bias_walk, c.bias_walk)):
-            cov[:, k, k] += sd**2 * minutes
+        step = np.tile(np.eye(STATES), (*share.shape, 1, 1))
+        step[..., LOGIT, BIAS_E], step[..., LOGIT, BIAS_P] = -grown[..., 0], grown[..., 1]
+        step[..., LOGIT, THERMOMETER] = by_c[..., 1] - by_c[..., 0]
+        step[..., LOG_OD, LOGIT] = later[..., 1] - share
+        step[..., LOG_OD, BIAS_E:GAIN] = later * grown
+        step[..., LOG_OD, THERMOMETER] = (later * by_c).sum(axis=-1)
+        step[..., LOG_F, LOGIT], step[..., LOG_F, LOG_OD] = new * (1.0 - share), new
+        step[..., LOG_F, LOG_F], step[..., LOG_F, BIAS_P] = 1.0 - new, 0.5 * new * grown[..., 1]
+        step[..., LOG_F, LOG_Q], step[..., LOG_Q, LOG_Q] = new, fades
+        step[..., LOG_F, THERMOMETER] = new * (of_c / made_at + 0.5 * by_c[..., 1])
+        step[..., LOG_OD, GAIN] = step[..., LOG_F, GAIN] = -dose
+        cov = step @ self.cov[idx] @ step.swapaxes(-1, -2)
+        cov[..., DILUTED, DILUTED] += (self._dose_variance(idx) * dose**2)[..., None, None]
+        cov[..., FACTOR, FACTOR] += ((c.factor * c.factor_walk) ** 2 * minutes / DAY_MIN)[:, None]
+        walks = (2.0**0.5 * c.growth_sd, c.growth_sd, c.pigment_sd, 0.0, c.bias_walk, c.bias_walk)
+        for k, sd in enumerate(walks):
+            cov[..., k, k] += sd**2 * minutes[:, None]
         self.cov[idx] = cov
         self._produce(idx, minutes, last)
 
-    def _produce(self, idx: NDArray[np.intp], minutes: Array, temperature: Array) -> None:
+    def _produce(self, idx: Rows, minutes: Array, temperature: Array) -> None:
         """Production of pigment follows what the temperature asks for, less its own value half an hour ago."""
         now, past = self._production[idx], self._past[idx]
-        wanted = now + FOLLOW_PER_H / 60.0 * minutes * (steady_production(temperature) - past[:, 0])
+        pigment, steady = self.pair.pigment, self.pair.production(temperature[:, None] + ERRORS_C)
+        wanted = now + pigment.follow_per_h / 60.0 * minutes[:, None] * (steady - past[:, 0])
         self._past[idx] = np.concatenate([past[:, 1:], now[:, None]], axis=1)
-        self._production[idx] = np.maximum(wanted, LEAST)
+        self._production[idx] = np.maximum(wanted, pigment.least)
 
     def _seen(self, z: Array, which: int) -> tuple[Array, Array]:
-        """Expected reading of states (N, 8) and its slope, (N,) and (N, 8). Args: which: 0 OD, 1 fluorescence."""
-        od, f, k = np.exp(z[:, LOG_OD]), np.exp(z[:, LOG_F]), z[:, FACTOR]
+        """Expected reading of states (..., 10) and its slope, (...) and (..., 10). Args: which: OD, LIGHT or SAMPLE."""
+        od, f, k = np.exp(z[..., LOG_OD]), np.exp(z[..., LOG_F]), z[..., FACTOR]
         slope = np.zeros_like(z)
-        if which == 0:
-            slope[:, LOG_OD] = od
+        if which == OD:
+            slope[..., LOG_OD] = od
             return od, slope
+        if which == SAMPLE:
+            share = 1.0 / (1.0 + np.exp(-z[..., LOGIT]))
+            slope[..., LOGIT] = share * (1.0 - share)
+            return share, slope
         light = f + self.config.od_term * od
-        slope[:, LOG_OD], slope[:, LOG_F] = k * self.config.od_term * od, k * f
-        slope[:, FACTOR], slope[:, OFFSET] = light, 1.0
-        return k * light + z[:, OFFSET], slope
+        slope[..., LOG_OD], slope[..., LOG_F] = k * self.config.od_term * od, k * f
+        slope[..., FACTOR], slope[..., OFFSET] = light, 1.0
+        return k * light + z[..., OFFSET], slope
 
-    def _take(self, idx: NDArray[np.intp], which: int, reading: Array) -> None:
-        """Update with one kind of reading; nan is skipped. Args: which: 0 OD, 1 fluorescence."""
+    def _take(self, idx: Rows, which: int, reading: Array) -> None:
+        """Update with an OD or light; nan is skipped, and light beside an OD that was."""
         there = np.isfinite(reading)
         idx, reading = idx[there], reading[there]
         noise = (self.config.od_sd, self.config.fluorescence_sd)[which] ** 2
-        prior, cov = self.mean[idx], self.cov[idx]
-        expected, slope = self._seen(prior, which)
-        spread = np.einsum("ni,nij,nj->n", slope, cov, slope) + noise
-        far = np.square(reading - expected) > self.config.gate_sigma**2 * spread
-        self._far[idx, which] = np.where(far, self._far[idx, which] + 1, 0)
-        stays = self._far[idx, which] >= self.config.gate_max
-        (self._density_anew, self._pigment_anew)[which](idx[stays], reading[stays])
-        self._far[idx[stays], which] = 0
-        self._update(idx[~far], which, reading[~far], noise)
+        expected, slope = self._seen(self.mean[idx], which)
+        spread = np.einsum("nki,nkij,nkj->nk", slope, self.cov[idx], slope) + noise
+        squared = np.square(reading[:, None] - expected)
+        on = np.ones(squared.shape, dtype=np.bool_) if which == OD else self._far[idx, :, OD] == 0
+        far = on & (squared > self.config.gate_sigma**2 * spread)
+        if which == OD:
+            self._judge_dose(idx, squared, spread, expected, ~far)
+        times = self._far[idx, :, which]
+        times = np.where(far, times + 1, np.where(on, 0, times))
+        stays = times >= self.config.gate_max
+        of, start = np.nonzero(stays)
+        (self._density_anew, self._pigment_anew)[which](idx[of], start, reading[of])
+        self._far[idx, :, which] = np.where(stays, 0, times)
+        usual = (self._weights()[idx] * (on & ~far)).sum(axis=1) > 0.5  # else the reading tells the starts nothing
+        least = np.minimum(squared / spread, self.config.gate_sigma**2)
+        self.log_weight[idx] -= 0.5 * usual[:, None] * (least + np.log(spread))
+        self._update(idx, which, reading, np.full(idx.size, noise), on & ~far)
 
-    def _density_anew(self, idx: NDArray[np.intp], od: Array) -> None:
+    def _weights(self) -> Array:
+        """Of the starts of each culture, (N, K), rows add up to 1."""
+        weight = np.exp(self.log_weight - self.log_weight.max(axis=1, keepdims=True))
+        return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+
+    def _dose_variance(self, idx: Rows) -> Array:
+        """(sd of a dose over its size)^2, (n, K): as configured, or more if the ODs say so."""
+        least = self.config.dose_cv**2
+        known, sum_of = self._doses[idx, :, 0], self._doses[idx, :, 1]
+        if least == 0.0:
+            return np.zeros(known.shape)
+        return np.maximum(least, (least**-1 + sum_of) / (least**-2 + known))
+
+    def _judge_dose(self, idx: Rows, squared: Array, spread: Array, od: Array, believed: Mask) -> None:
+        """What an OD after a dose says of how doses spread.
+
+        A squared error e^2 beyond what else explains it, over D = (OD v/V)^2, is an estimate of the squared spread with
+        variance 2 (E e^2)^2 / D^2. These are averaged by their precision, over some sixty doses, together with the
+        configured value, which counts as one whose sd is itself.
+        """
+        size = np.square(od * self._dose[idx][:, None])
+        precision = np.square(size / spread) / 2.0
+        sum_of = precision * self._dose_variance(idx) + size * (squared - spread) / np.square(spread) / 2.0
+        given = (believed & (size > 0.0))[..., None]
+        self._doses[idx] += given * (np.stack([precision, sum_of], axis=-1) - self._doses[idx] / DOSES)
+
+    def _density_anew(self, idx: Rows, start: Rows, od: Array) -> None:
         """A density that jumped and stays is believed; maybe the pigment went with it, as by a dose nobody told."""
         found = np.log(np.maximum(od, LOWEST_OD))
-        jump = found - self.mean[idx, LOG_OD]
-        self.mean[idx, LOG_OD], self.mean[idx, LOG_F] = found, self.mean[idx, LOG_F] + jump
-        self.cov[idx, LOG_F, LOG_F] += np.square(jump)
-        self.cov[idx, LOG_OD, :], self.cov[idx, :, LOG_OD] = 0.0, 0.0
-        self.cov[idx, LOG_OD, LOG_OD] = np.square(self.config.od_sd / np.exp(found))
+        jump = found - self.mean[idx, start, LOG_OD]
+        self.mean[idx, start, LOG_OD], self.mean[idx, start, LOG_F] = found, self.mean[idx, start, LOG_F] + jump
+        self.cov[idx, start, LOG_F, LOG_F] += np.square(jump)
+        self.cov[idx, start, LOG_OD, :], self.cov[idx, start, :, LOG_OD] = 0.0, 0.0
+        self.cov[idx, start, LOG_OD, LOG_OD] = np.square(self.config.od_sd / np.exp(found))
 
-    def _pigment_anew(self, idx: NDArray[np.intp], light: Array) -> None:
+    def _pigment_anew(self, idx: Rows, start: Rows, light: Array) -> None:
         """Light that jumped and stays is believed to be the pigment's."""
-        z = self.mean[idx]
+        z, cov = self.mean[idx, start], self.cov[idx, start]
         k, scattered = z[:, FACTOR], self.config.od_term * np.exp(z[:, LOG_OD])
         f = np.maximum((light - z[:, OFFSET]) / k - scattered, LOWEST_LIGHT)
-        sensor = np.square(f + scattered) * self.cov[idx, FACTOR, FACTOR] + self.cov[idx, OFFSET, OFFSET]
-        self.mean[idx, LOG_F] = np.log(f)
-        self.cov[idx, LOG_F, :], self.cov[idx, :, LOG_F] = 0.0, 0.0
-        self.cov[idx, LOG_F, LOG_F] = (sensor + self.config.fluorescence_sd**2) / np.square(k * f)
+        sensor = np.square(f + scattered) * cov[:, FACTOR, FACTOR] + cov[:, OFFSET, OFFSET]
+        self.mean[idx, start, LOG_F] = np.log(f)
+        self.cov[idx, start, LOG_F, :], self.cov[idx, start, :, LOG_F] = 0.0, 0.0
+        self.cov[idx, start, LOG_F, LOG_F] = (sensor + self.config.fluorescence_sd**2) / np.square(k * f)
 
-    def _update(self, idx: NDArray[np.intp], which: int, reading: Array, noise: float) -> None:
-        """Iterated update in Joseph's form, which holds for any gain; that of what is considered is zero."""
-        prior, cov = self.mean[idx], self.cov[idx]
+    def _update(self, idx: Rows, which: int, reading: Array, noise: Array, on: Mask | None = None) -> None:
+        """Iterated update in Joseph's form, which holds for any gain; that of what is only considered is zero.
+
+        Args: reading and variance of its noise, (n,). on: starts that learn from it, (n, K); None: all.
+        """
+        prior, cov, noise = self.mean[idx], self.cov[idx], noise[:, None]
+        estimated = np.ones((idx.size, 1, STATES), dtype=np.bool_)
+        if which != SAMPLE:
+            estimated[..., [FACTOR, OFFSET]] = False
+            estimated[..., 0, GAIN] = self._minute[idx] - self._began[idx] < 60.0 * self.config.gain_h
+        if on is not None:
+            estimated = estimated & on[..., None]
         z = prior
         for _ in range(ITERATIONS):
             expected, slope = self._seen(z, which)
-            towards = np.einsum("nij,nj->ni", cov, slope)
-            gain = towards / (np.einsum("ni,ni->n", slope, towards) + noise)[:, None]
-            gain[:, CONSIDERED] = 0.0
-            surprise = reading - expected - np.einsum("ni,ni->n", slope, prior - z)
-            z = prior + gain * surprise[:, None]
-        kept = np.eye(STATES) - gain[:, :, None] * slope[:, None, :]
+            towards = np.einsum("nkij,nkj->nki", cov, slope)
+            gain = estimated * towards / (np.einsum("nki,nki->nk", slope, towards) + noise)[..., None]
+            surprise = reading[:, None] - expected - np.einsum("nki,nki->nk", slope, prior - z)
+            z = prior + gain * surprise[..., None]
+        kept = np.eye(STATES) - gain[..., :, None] * slope[..., None, :]
         self.mean[idx] = z
-        self.cov[idx] = kept @ cov @ kept.swapaxes(1, 2) + noise * gain[:, :, None] * gain[:, None, :]
+        self.cov[idx] = kept @ cov @ kept.swapaxes(-1, -2) + noise[..., None, None] * _square(gain)
+
+    def _mixed(self, of_starts: Array) -> Array:
+        """Mean over the starts of each culture, (N,), of values (N, K)."""
+        return np.asarray((self._weights() * of_starts).sum(axis=1))
 
     def estimate(self) -> Estimate:
-        """Share, temperature and rate as they are believed; before the first reading the first guess."""
-        sd = np.sqrt(np.maximum(self.cov[:, LOGIT, LOGIT], 0.0))
-        rate = self._lagged[:, 1] * (1.0 + self.mean[:, BIAS_P])
-        return Estimate(self.mean[:, LOGIT].copy(), sd, self._temperature.copy(), rate)
+        """Share, temperature and rates as they are believed; before the first reading the first guess."""
+        z, mixed = self.mean, self._mixed
+        logit, error = mixed(z[..., LOGIT]), mixed(z[..., THERMOMETER])
+        variance = mixed(self.cov[..., LOGIT, LOGIT] + np.square(z[..., LOGIT] - logit[:, None]))
+        weight, _ = _through(z[..., THERMOMETER])
+        rate = mixed(np.einsum("nc,nkc->nk", self._lagged[:, 1], weight) * (1.0 + z[..., BIAS_P]))
+        errors = mixed(z[..., BIAS_E]), mixed(z[..., BIAS_P])
+        return Estimate(logit, np.sqrt(np.maximum(variance, 0.0)), self._temperature + error, rate, *errors, error)
+
+    def growth_errors(self) -> tuple[Array, Array]:
+        """Relative errors of both growth curves and their sds, (N, 2) each."""
+        both = self.mean[..., BIAS_E:GAIN]
+        mean = np.stack([self._mixed(both[..., k]) for k in range(2)], axis=-1)
+        inside = self.cov[..., [BIAS_E, BIAS_P], [BIAS_E, BIAS_P]] + np.square(both - mean[:, None])
+        return mean, np.sqrt(np.stack([self._mixed(inside[..., k]) for k in range(2)], axis=-1))
 
     def explain(self) -> dict[str, Array]:
-        """Share with its 95 % band, relative errors of the growth curves, density, pigment in counts, each (N,)."""
+        """Share with its 95 % band, errors of growth curves and thermometer, flow, density, pigment; each (N,)."""
         now = self.estimate()
         low, high = (1.0 / (1.0 + np.exp(-now.logit - side * 1.96 * now.sd)) for side in (-1.0, 1.0))
         return {
             "ratio": now.share,
             "ratio_low": low,
             "ratio_high": high,
-            "bias_e": self.mean[:, BIAS_E].copy(),
-            "bias_p": self.mean[:, BIAS_P].copy(),
-            "dose_gain": self.mean[:, GAIN].copy(),
-            "composition_od": np.exp(self.mean[:, LOG_OD]),
-            "pigment": np.exp(self.mean[:, LOG_F]),
+            "bias_e": now.error_e,
+            "bias_p": now.error_p,
+            "thermometer_error": now.thermometer,
+            "dose_gain": self._mixed(self.mean[..., GAIN]),
+            "dose_spread": self._mixed(np.sqrt(self._dose_variance(np.arange(len(self.mean))))),
+            "composition_od": self._mixed(np.exp(self.mean[..., LOG_OD])),
+            "pigment": self._mixed(np.exp(self.mean[..., LOG_F])),
         }
+
+
+def _square(a: Array) -> Array:
+    """a a', (..., S, S) of (..., S)."""
+    return np.asarray(a[..., :, None] * a[..., None, :])
+
+
+def _starts(k: int) -> tuple[Array, float]:
+    """Where K starts stand and how wide each is, in sds of the guess that they make up together."""
+    if k == 1:
+        return np.zeros(1), 1.0
+    away = np.linspace(-1.0, 1.0, k)
+    within = float(np.sqrt(1.0 - np.mean(away**2)))
+    return away, within
+
+
+def _through(error: Array) -> tuple[Array, Array]:
+    """Weights of values at `ERRORS_C` in the polynomial through them at `error`, degC, (...), and in its slope."""
+    at = np.clip(error, ERRORS_C[0], ERRORS_C[-1])[..., None]
+    powers = np.arange(ERRORS_C.size)
+    slope = powers * at ** np.maximum(powers - 1, 0)
+    return at**powers @ LAGRANGE, slope @ LAGRANGE

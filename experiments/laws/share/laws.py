@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from conf.schema import check, part, setting
 from envs.coculture.optimum import best_action
-from envs.coculture.rates import E_SLOPE, E_ZERO, EQUAL_RATES_C, T_MAX, T_MIN
+from envs.coculture.pair import PairConfig
 from envs.coculture.task import CocultureConfig, advance, logit
 from experiments.laws.share.base import Array, Estimate, Mask, Wanted
 from experiments.laws.share.estimator import CompositionEstimatorConfig
@@ -38,31 +38,37 @@ Config = TypeVar("Config", bound=LawConfig)
 
 
 class Periodic(ABC, Generic[Config]):
-    """A law that decides at whole multiples of its period since the program began, and keeps its target in between."""
+    """A law that decides at whole multiples of its period since the program began, and keeps its target in between.
+
+    Args: pair: the two species. What stands here as colder is warmer where warmth makes the second species gain.
+    """
 
     remembers: tuple[str, ...] = ("target", "next")
 
-    def __init__(self, config: Config) -> None:
-        self.config, self.control_min = config, config.control_min
+    def __init__(self, config: Config, pair: PairConfig | None = None) -> None:
+        self.config, self.control_min, self.pair = config, config.control_min, pair or PairConfig()
+        self.model = CocultureConfig(control_min=self.control_min, pair=self.pair)
+        self._even_c, self._colder = self.pair.even_c, 1.0 if self.pair.raising < self.pair.lowering else -1.0
         self.reset(1)
 
     def reset(self, n: int) -> None:
         """See `Law.reset`."""
-        self._target, self._next = np.full(n, EQUAL_RATES_C), np.zeros(n)
+        self._target, self._next = np.full(n, self._even_c), np.zeros(n)
 
     def act(self, estimate: Estimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
         """See `Law.act`."""
         idx = np.flatnonzero(rows & (minute >= self._next - 1e-6))
         if idx.size:
-            now = Estimate(*(a[idx] for a in (estimate.logit, estimate.sd, estimate.temperature, estimate.rate)))
+            now = estimate.of(idx)
             asked = Wanted(*(a[idx] for a in (wanted.setpoint, wanted.following, wanted.minutes)))
-            self._target[idx] = np.clip(self._decide(now, asked, minute[idx], idx), T_MIN, T_MAX)
+            shown = self._decide(now, asked, minute[idx], idx) - now.thermometer  # what the thermostat goes by
+            self._target[idx] = np.clip(shown, *self.pair.temperatures)
             self._next[idx] = (np.floor(minute[idx] / self.control_min + 1e-6) + 1.0) * self.control_min
         return self._target.copy()
 
     @abstractmethod
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
-        """Targets of the rows `idx`, whose estimates and wishes are given, degC; clipped by the caller."""
+        """True temperatures for the rows `idx`, whose estimates and wishes are given, degC; clipped by the caller."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +79,14 @@ class ProportionalConfig(LawConfig):
 
 
 class Proportional(Periodic[ProportionalConfig]):
-    """T = 33.2 - gain (logit s - logit r): at equal rates on the setpoint s, colder where the share r is too small."""
+    """T = T_0 - gain (logit s - logit r): at equal rates, T_0, on the setpoint s, colder where the share is too small.
+
+    T_0 is where the estimated growth curves cross: 33.2 degC, were they without error.
+    """
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
-        return np.asarray(EQUAL_RATES_C - self.config.gain * (logit(wanted.setpoint) - estimate.logit))
+        error = logit(wanted.setpoint) - estimate.logit
+        return np.asarray(self.pair.even(estimate.errors) - self._colder * self.config.gain * error)
 
 
 @dataclass(frozen=True)
@@ -91,6 +101,7 @@ class PIConfig(LawConfig):
 class PI(Periodic[PIConfig]):
     """T = 33.2 - 15 (s - r) - I, I <- I + 0.01 (s - r) each minute; I rests while T is at the limit it pushes against.
 
+    T is the measured temperature: the vendor's law knows of no error of the thermometer.
     Source: program `CustomCompControl` of Janmorlock/ChiBio, the device's code for Lee et al. (2025).
     """
 
@@ -104,10 +115,14 @@ class PI(Periodic[PIConfig]):
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         error = wanted.setpoint - estimate.share
         further = self._integral[idx] + self.config.integral * error
-        target = EQUAL_RATES_C - self.config.gain * error - further
-        pushes = ((target > T_MAX) & (error < 0.0)) | ((target < T_MIN) & (error > 0.0))
+        target, (low, high) = self._law(error, further), self.pair.temperatures
+        pushes = ((target > high) & (self._colder * error < 0.0)) | ((target < low) & (self._colder * error > 0.0))
         self._integral[idx] = np.where(pushes, self._integral[idx], further)
-        return np.asarray(EQUAL_RATES_C - self.config.gain * error - self._integral[idx])
+        measured = self._law(error, self._integral[idx])
+        return np.asarray(measured + estimate.thermometer)
+
+    def _law(self, error: Array, integral: Array) -> Array:
+        return np.asarray(self._even_c - self._colder * (self.config.gain * error + integral))
 
 
 @dataclass(frozen=True)
@@ -121,7 +136,7 @@ class BangBang(Periodic[BangBangConfig]):
     """T = 29 while the share is too small, else 36."""
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
-        return np.where(logit(wanted.setpoint) > estimate.logit, T_MIN, T_MAX)
+        return np.where(logit(wanted.setpoint) > estimate.logit, self.pair.raising, self.pair.lowering)
 
 
 @dataclass(frozen=True)
@@ -133,15 +148,15 @@ class InverseDynamicsConfig(LawConfig):
 
 
 class InverseDynamics(Periodic[InverseDynamicsConfig]):
-    """The temperature at which E. coli, which answers at once, makes the error vanish like exp(-t / reach):
+    """The temperature at which the first species, which answers at once, makes the error vanish like exp(-t / reach):
 
-    mu_e(T) = m_p - (logit s - logit r) / reach
+    (1 + b_e) mu_e(T) = m_p - (logit s - logit r) / reach
     """
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         reach_h = self.config.reach_min / 60.0
         rate = estimate.rate - (logit(wanted.setpoint) - estimate.logit) / reach_h
-        return np.asarray((rate + E_ZERO) / E_SLOPE)
+        return self.pair.first_at(rate / (1.0 + estimate.error_e))
 
 
 @dataclass(frozen=True)
@@ -155,35 +170,27 @@ class MyopicConfig(LawConfig):
 class Myopic(Periodic[MyopicConfig]):
     """The one of 17 temperatures after which, by the model, the share is nearest to the setpoint."""
 
-    def __init__(self, config: MyopicConfig) -> None:
-        self.model = CocultureConfig(control_min=config.control_min)
-        super().__init__(config)
-
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
-        return self.model.targets()[best_action(self.model, None, None, estimate.state, wanted.setpoint)]
+        state, errors = estimate.state, estimate.errors
+        return self.model.targets()[best_action(self.model, None, None, state, wanted.setpoint, errors)]
 
 
 @dataclass(frozen=True)
-class MidpointConfig(LawConfig):
-    """When to begin, and the gain until then."""
+class MidpointConfig(InverseDynamicsConfig):
+    """When to begin, and what holds until then."""
 
     kind: str = setting("midpoint", "which law of the composition")
-    control_min: float = setting(10.0, "between decisions; the target is kept in between", "min", within=(1, 240))
-    gain: float = setting(20.0, "colder per logit that the share is too small", "degC", within=(0.1, 1000))
+    control_min: float = setting(5.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
-class Midpoint(Periodic[MidpointConfig]):
+class Midpoint(InverseDynamics):
     """Half-way, in logit, when an announced change comes: full authority from so early that the model is there then.
 
     The error is convex in the share, so being early by as much as late costs least. Before that, and where nothing is
-    announced, as `Proportional`. Once begun it goes on until the change comes.
+    announced, as `InverseDynamics`. Once begun it goes on until the change comes.
     """
 
     remembers = ("target", "next", "towards")
-
-    def __init__(self, config: MidpointConfig) -> None:
-        self.model = CocultureConfig(control_min=config.control_min)
-        super().__init__(config)
 
     def reset(self, n: int) -> None:
         """See `Law.reset`."""
@@ -194,17 +201,18 @@ class Midpoint(Periodic[MidpointConfig]):
         now, following = logit(wanted.setpoint), logit(wanted.following)
         change = np.sign(following - now)
         known = (wanted.minutes > 0.0) & (change != 0.0)
-        full = np.where(change > 0.0, T_MIN, T_MAX)
-        late = change * (self._reached(estimate.state, full, wanted.minutes) - 0.5 * (now + following)) <= 0.0
+        full = np.where(change > 0.0, self.pair.raising, self.pair.lowering)
+        late = change * (self._reached(estimate, full, wanted.minutes) - 0.5 * (now + following)) <= 0.0
         begun = self._towards[idx] == wanted.following
         moving = known & (late | begun)
         self._towards[idx] = np.where(moving, wanted.following, np.nan)
-        return np.where(moving, full, EQUAL_RATES_C - self.config.gain * (now - estimate.logit))
+        return np.where(moving, full, super()._decide(estimate, wanted, minute, idx))
 
-    def _reached(self, state: Array, target: Array, minutes: Array) -> Array:
-        """Logit after `minutes`, (N,), at targets (N,), from states (N, 3); to the nearest period."""
-        steps, reached = np.rint(minutes / self.control_min), state[:, 0].copy()
+    def _reached(self, estimate: Estimate, target: Array, minutes: Array) -> Array:
+        """Logit after `minutes`, (N,), at targets (N,), by the estimated curves; to the nearest period."""
+        state, steps = estimate.state, np.rint(minutes / self.control_min)
+        reached = state[:, 0].copy()
         for k in range(int(steps.max(initial=0.0))):
-            state = advance(self.model, state, target, self.control_min)
+            state = advance(self.model, state, target, self.control_min, estimate.errors)
             reached = np.where(steps == k + 1, state[:, 0], reached)
         return reached

@@ -1,11 +1,12 @@
 """A learned policy as a law of the composition."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from conf.schema import require, setting
+from conf.schema import build, require, setting
 from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
+from envs.coculture.pair import PairConfig
 from envs.coculture.task import logit
 from experiments.laws.share.base import Array, Estimate, Wanted
 from experiments.laws.share.laws import Index, LawConfig, Periodic
@@ -30,28 +31,42 @@ class PreviewLawConfig(LearnedLawConfig):
     kind: str = setting("dqn_preview", "which law of the composition")
 
 
+def _unnamed(pair: PairConfig) -> PairConfig:
+    """A pair whose species are called by numbers."""
+    return replace(pair, first=replace(pair.first, name="1"), second=replace(pair.second, name="2"))
+
+
 class LearnedLaw(Periodic[LearnedLawConfig]):
     """T = actions[argmax_a Q(o, a)] with o = [logit r, T, m_p, logit s], and with preview [..., logit of the next
     setpoint, minutes until then].
 
-    A change further ahead than the policy was trained for is not shown to it yet. It decides as often as in training.
+    Shown in place of m_p is m_p - b_e mu_e(33.2): an error b_e of the other curve moves the share as much as that of
+    m_p does. A change further ahead than the policy was trained for is not shown to it yet. It decides as often as in
+    training.
     Args: policy: with one of these observations. preview: whether it must be the longer one.
     Raises: ValueError for a policy of another task.
     """
 
-    def __init__(self, config: LearnedLawConfig, policy: Policy) -> None:
+    def __init__(self, config: LearnedLawConfig, policy: Policy, pair: PairConfig | None = None) -> None:
         preview = config.kind == "dqn_preview"
         task, expected = ("coculture_preview", COCULTURE_PREVIEW) if preview else ("coculture", COCULTURE)
         remedy = f"one with observation {list(expected)}, as env={task} trains"
         require(policy.observation == expected, "policy", list(policy.observation), remedy)
         self.policy, self._expected = policy, expected
         self.preview_min = float(policy.metadata["model"]["preview_min"])
-        super().__init__(config)
+        super().__init__(config, pair)
+        known = build(PairConfig(), policy.metadata["model"].get("pair", {}), "pair")
+        here, there = (f"{p.first.name} and {p.second.name}" for p in (self.pair, known))
+        off = np.abs(known.rates(grid := np.linspace(*self.pair.temperatures, 71)) - self.pair.rates(grid)).max()
+        said = f"of {there}, for a run with {here}; growth differs by up to {off:.2g} 1/h"
+        allowed = "the run's own: train one with pair=... of the run, or give a law without a policy"
+        require(_unnamed(known) == _unnamed(self.pair), "policy's pair", said, allowed)
         self.control_min = float(policy.metadata["control_min"])
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         now = logit(wanted.setpoint)
-        columns = [estimate.logit, estimate.temperature, estimate.rate, now]
+        rate = estimate.rate - estimate.error_e * self.pair.rates(self._even_c)[0]
+        columns = [estimate.logit, estimate.temperature, rate, now]
         if self._expected == COCULTURE_PREVIEW:
             shown = wanted.minutes <= self.preview_min
             columns += [np.where(shown, logit(wanted.following), now), np.where(shown, wanted.minutes, 0.0)]

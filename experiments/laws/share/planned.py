@@ -7,6 +7,7 @@ import numpy as np
 
 from conf.schema import setting
 from envs.coculture.optimum import best_action, cost_to_go, transitions
+from envs.coculture.pair import PairConfig
 from envs.coculture.task import CocultureConfig
 from experiments.laws.share.base import Array, Estimate, Wanted
 from experiments.laws.share.laws import Index, LawConfig, Periodic
@@ -19,6 +20,12 @@ __all__ = ["Optimum", "OptimumConfig", "Receding", "RecedingConfig"]
 def _ahead(model: CocultureConfig, setpoints: tuple[float, ...]) -> Array:
     """Least cost of decisions with these setpoints in force, on the grid, (G,)."""
     return np.asarray(cost_to_go(transitions(model), np.array(setpoints)[:, None])[0, :, 0])
+
+
+def _best(model: CocultureConfig, value: Array | None, estimate: Estimate, setpoint: Array) -> Array:
+    """The temperature that is best now, by the estimated curves; what comes after it by the model's."""
+    chosen = best_action(model, transitions(model), value, estimate.state, setpoint, estimate.errors)
+    return np.asarray(model.targets()[chosen])
 
 
 @dataclass(frozen=True)
@@ -36,10 +43,9 @@ class Receding(Periodic[RecedingConfig]):
     The setpoint is that in force until the announced change, then the next one. Programs are planned once and kept.
     """
 
-    def __init__(self, config: RecedingConfig) -> None:
-        self.model = CocultureConfig(control_min=config.control_min)
+    def __init__(self, config: RecedingConfig, pair: PairConfig | None = None) -> None:
         self.steps = max(round(config.horizon_min / config.control_min), 1)
-        super().__init__(config)
+        super().__init__(config, pair)
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         until = np.where(wanted.minutes > 0.0, np.ceil(wanted.minutes / self.control_min - 1e-6), self.steps)
@@ -49,8 +55,7 @@ class Receding(Periodic[RecedingConfig]):
             row = np.flatnonzero((kinds == (now, following, left)).all(axis=1))
             later = tuple(now if k < left else following for k in range(1, self.steps))
             value = _ahead(self.model, later) if later else None
-            chosen = best_action(self.model, transitions(self.model), value, estimate.state[row], wanted.setpoint[row])
-            target[row] = self.model.targets()[chosen]
+            target[row] = _best(self.model, value, estimate.of(row), wanted.setpoint[row])
         return target
 
 
@@ -69,15 +74,14 @@ class Optimum(Periodic[OptimumConfig]):
     Args: program: what will be asked for.
     """
 
-    def __init__(self, config: OptimumConfig, program: Program) -> None:
-        self.model = CocultureConfig(control_min=config.control_min)
+    def __init__(self, config: OptimumConfig, program: Program, pair: PairConfig | None = None) -> None:
         steps = max(int(np.ceil(program.total_min / config.control_min)), 1)
         asked = program.setpoint(config.control_min * (np.arange(steps, dtype=np.float64) + 0.5))
         known = np.flatnonzero(np.isfinite(asked))
         following = known[np.minimum(np.searchsorted(known, np.arange(steps)), known.size - 1)]
         self._asked = asked[following]
         self._value: Array | None = None
-        super().__init__(config)
+        super().__init__(config, pair)
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         if self._value is None:
@@ -86,8 +90,5 @@ class Optimum(Periodic[OptimumConfig]):
         target = np.empty(idx.size)
         for k in np.unique(step):
             row = np.flatnonzero(step == k)
-            chosen = best_action(
-                self.model, transitions(self.model), self._value[k + 1], estimate.state[row], wanted.setpoint[row]
-            )
-            target[row] = self.model.targets()[chosen]
+            target[row] = _best(self.model, self._value[k + 1], estimate.of(row), wanted.setpoint[row])
         return target

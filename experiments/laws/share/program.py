@@ -89,6 +89,24 @@ class Program:
         announced = following[self._phase(np.maximum(at, 0.0))]
         return Wanted(now, np.where(known, announced, now), np.where(known, left, 0.0))
 
+    @property
+    def extremes(self) -> tuple[float, ...]:
+        """Every share of the phases, or the least and the largest of the sine."""
+        if self.sine is not None:
+            mean, amplitude, _ = self.sine
+            return mean - abs(amplitude), mean + abs(amplitude)
+        return tuple(r for r in self.ratios if not math.isnan(r))
+
+    def announcements(self, preview_min: float) -> tuple[Array, Array]:
+        """When a change is made known, min since the program began, and the share to come; none of a sine."""
+        if self.sine is not None or preview_min <= 0.0:
+            return np.empty(0), np.empty(0)
+        when, which = self._changes()
+        known = np.isfinite(self.ratios) & np.isfinite(when)
+        first = known & np.append(True, when[1:] != when[:-1])  # of phases that follow each other with one share
+        start = self.edges[:-1]
+        return np.maximum(when - preview_min, start)[first], which[first]
+
     def _changes(self) -> tuple[Array, Array]:
         """Of each phase: when another share is asked for next, inf where never, and which."""
         n = len(self.minutes)

@@ -1,0 +1,131 @@
+"""Growth and pigment of one species against temperature, from what recordings show at temperatures that were held."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.identification.model import Parameter
+from envs.identification.screening import Series, screen
+
+__all__ = ["Curve", "Plateau", "fit", "plateaus"]
+
+Array = NDArray[np.float64]
+
+HELD_C = 0.5  # a temperature that stays within this of its running value is held
+WIDEST, LEAST_WIDTH = 0.2, 0.03  # half width of a growth rate over its value, or in 1/h; more says nothing of a curve
+WORTH_A_WORD_MIN = 30.0  # a stretch that is longer and left out
+SATURATED = 65535.0  # counts
+LIGHT_MIN = 60.0  # at the end of a plateau, over which light is averaged
+BLOCKS = 4  # of a plateau, whose growth rates tell how well their mean is known
+EDGE_ROWS = 5  # whose median is the OD at the edge of a block
+
+
+@dataclass(frozen=True)
+class Plateau:
+    """A stretch at one temperature: degC, growth rate in 1/h and light per OD in counts (None: no light there).
+
+    first, end: positions of its rows in the recording.
+    """
+
+    temperature: float
+    growth: Parameter
+    light: Parameter | None
+    first: int
+    end: int
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A polynomial, coefficients highest power first, of T - centre.
+
+    off: of each point from it, in sds.
+    """
+
+    coefficients: tuple[float, ...]
+    off: Array
+
+
+def plateaus(
+    series: Series,
+    temperature: Array,
+    light: Array,
+    tau: float,
+    settle_min: float,
+    least_min: float,
+    offset: float = 0.0,
+) -> tuple[list[Plateau], list[str]]:
+    """Every stretch of a recording in which the temperature was held, behind the time in which growth settles.
+
+    Growth is what the OD gained and the pump removed, mu = (ln y_end - ln y_start + sum u dt / tau) / minutes, the mean
+    of four blocks, with the interval that their scatter leaves. So the curves are as right as the pump's flow; where
+    they cross does not depend on it. Light per OD is the mean over the last hour, less the offset. What is shorter than
+    `least_min`, or tells growth to less than 20 % and .03 1/h, is left out; the second list says of each such stretch
+    that took half an hour or more what it lacked.
+    Args: temperature: degC; light: counts; nan where there is none, (n,). tau: V/60 of the calibrated flow.
+    """
+    found: list[Plateau] = []
+    left: list[str] = []
+    for first, end in _held(series.time, temperature):
+        start = int(np.searchsorted(series.time, series.time[first] + settle_min))
+        held = series.time[end - 1] - series.time[first] + np.median(np.diff(series.time))
+        here = f"{np.nanmean(temperature[first:end]):.1f} degC from minute {series.time[first]:.0f} on"
+        if held < settle_min + least_min:
+            if held >= WORTH_A_WORD_MIN:
+                left.append(f"{here}: held for {held:.0f} min, it takes {settle_min + least_min:.0f}")
+            continue
+        growth = _growth(screen(series.part(start, end)).series, tau)
+        if growth is None or growth.half_width > max(WIDEST * growth.value, LEAST_WIDTH):
+            why = "no growth" if growth is None else f"growth of {growth.value:.3f} +- {growth.half_width:.3f} 1/h"
+            left.append(f"{here}: {why} says nothing of a curve")
+            continue
+        late = slice(max(int(np.searchsorted(series.time, series.time[end - 1] - LIGHT_MIN)), start), end)
+        seen = np.where(light[late] < SATURATED, light[late], np.nan)
+        per_od = (seen - offset) / np.where(series.od[late] > 0.0, series.od[late], np.nan)
+        per_od = per_od[np.isfinite(per_od)]
+        glow = None
+        if per_od.size > 2:
+            mean, half = float(per_od.mean()), 1.96 * float(per_od.std(ddof=1)) / per_od.size**0.5
+            glow = Parameter(mean, mean - half, mean + half)
+        found.append(Plateau(float(np.nanmean(temperature[start:end])), growth, glow, start, end))
+    return found, left
+
+
+def _growth(part: Series, tau: float) -> Parameter | None:
+    """Growth rate of a stretch, 1/h; None where it has too few readings, or did not grow."""
+    seen = np.flatnonzero(part.od > 0.0)
+    if seen.size < BLOCKS * 2 * EDGE_ROWS:
+        return None
+    removed = np.concatenate([[0.0], np.cumsum(part.pump_rate[:-1] * np.diff(part.time))]) / tau
+    gained = np.log(part.od[seen]) + removed[seen]
+    edges = np.linspace(0, seen.size - EDGE_ROWS, BLOCKS + 1).astype(int)
+    at = [slice(k, k + EDGE_ROWS) for k in edges]
+    level = np.array([np.median(gained[k]) for k in at])
+    when = np.array([np.mean(part.time[seen[k]]) for k in at])
+    each = 60.0 * np.diff(level) / np.diff(when)
+    mean = 60.0 * float((level[-1] - level[0]) / (when[-1] - when[0]))
+    from scipy.special import stdtrit
+
+    half = float(stdtrit(BLOCKS - 1, 0.975) * each.std(ddof=1)) / BLOCKS**0.5
+    return Parameter(mean, mean - half, mean + half) if mean > 0.0 else None
+
+
+def _held(time: Array, temperature: Array) -> list[tuple[int, int]]:
+    """[first, end) of every stretch in which the temperature stays within `HELD_C` of its mean so far."""
+    found, first, total, count = [], 0, 0.0, 0
+    for k, t in enumerate(temperature):
+        if np.isnan(t):
+            continue
+        if count and abs(t - total / count) > HELD_C:
+            found.append((first, k))
+            first, total, count = k, 0.0, 0
+        total, count = total + t, count + 1
+    return [(a, b) for a, b in [*found, (first, len(time))] if b - a > 1]
+
+
+def fit(temperature: Array, value: Array, sd: Array, degree: int, centre: float = 0.0) -> Curve:
+    """The weighted least-squares polynomial through points (K,), of a degree less than their number."""
+    powers = np.vander(temperature - centre, degree + 1)
+    weighted = powers / sd[:, None]
+    coefficients, *_ = np.linalg.lstsq(weighted, value / sd, rcond=None)
+    return Curve(tuple(map(float, coefficients)), (value - powers @ coefficients) / sd)

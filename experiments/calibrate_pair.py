@@ -1,0 +1,246 @@
+"""Fit growth curves and pigment of two species: `python -m experiments.calibrate_pair first=[A.csv] second=[B.csv]`.
+
+Each species is recorded alone, at three temperatures or more. A mixed run with counted shares corrects both curves.
+"""
+
+import logging
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml  # type: ignore[import-untyped]
+
+from conf.schema import check, require, setting
+from envs.bench import Bench
+from envs.coculture.pair import PairConfig, PigmentConfig, SpeciesConfig
+from envs.identification import curves
+from envs.identification.curves import Curve, Plateau
+from envs.identification.screening import Series
+from experiments.cli import files, frame
+from experiments.laws.share.estimator import CompositionEstimator, CompositionEstimatorConfig
+from hardware.errors import RecordingError
+from hardware.storage.atomic import write
+from hardware.storage.marks import read_marks
+from hardware.storage.recording_reader import Recording, read_recording
+
+__all__ = ["CalibratePairConfig", "calibrate_pair", "main"]
+
+log = logging.getLogger(__name__)
+
+FEWEST = 3  # temperatures of a curve
+LAGS = 4.0  # of a species' own after a change of temperature: 2 % of it are left
+STRAY = 0.02  # sd of a growth rate over its value, beyond that of its recording: cultures differ
+
+
+@dataclass(frozen=True)
+class CalibratePairConfig:
+    """Which recordings. Raises: ValueError naming key, value and allowed range."""
+
+    first: tuple[str, ...] = setting((), "recordings of the first species alone, at several temperatures")
+    second: tuple[str, ...] = setting((), "recordings of the second, whose pigment is counted")
+    names: tuple[str, ...] = setting(("first", "second"), "what figures call the two species")
+    mixed: str | None = setting(
+        None, "recording of a deployment with both: shares that were marked in its run correct both curves"
+    )
+    pump_ml_s: float = setting(0.02, "mL/s of a pump rate of 1 in a Chi.Bio's own CSV", "mL/s", above=0.0, at_most=1.0)
+    volume_ml: float = setting(Bench.volume_ml, "of all these cultures", "mL", within=(1, 2000))
+    degree: int = setting(2, "of both curves, less where there are fewer temperatures", within=(1, 4))
+    settle_min: float = setting(
+        120.0, "after a change of temperature, which is left out; or four of a species' lags", "min", within=(0, 600)
+    )
+    least_min: float = setting(60.0, "behind that, at one temperature", "min", within=(30, 2000))
+    lags_min: tuple[float, ...] = setting((2.0, 60.0), "with which growth follows temperature, of both", "min")
+    factor: float = setting(0.99, "k of the light k (pigment + od_term OD) + offset", within=(0.05, 20))
+    offset: float = setting(214.0, "of the light", "counts", within=(0, 20_000))
+    od_term: float = setting(150.0, "light that cells of any kind scatter", "counts/OD", within=(0, 5000))
+
+    def __post_init__(self) -> None:
+        check(self)
+        for key in ("names", "lags_min"):
+            require(
+                len(getattr(self, key)) == 2, key, getattr(self, key), "two, of the first and of the second species"
+            )
+        require(self.names[0] != self.names[1], "names", self.names, "two that differ")
+        first, second = self.lags_min
+        require(0.0 <= first <= second <= 600.0, "lags_min", self.lags_min, "two of 0 to 600 min, the first not longer")
+
+
+def _read(path: str, pump_ml_s: float) -> Recording:
+    with frame.refusing(ValueError, RecordingError):
+        return read_recording(path, pump_ml_s=pump_ml_s)
+
+
+def _plateaus(paths: tuple[str, ...], lag_min: float, config: CalibratePairConfig) -> list[Plateau]:
+    """Of all recordings of a species, in order of temperature. Raises: UserError for one without temperatures."""
+    settle_min = max(config.settle_min, LAGS * lag_min)
+    found: list[Plateau] = []
+    for path in paths:
+        r = _read(path, config.pump_ml_s)
+        if not np.isfinite(r.temperature).any():
+            raise frame.UserError(f"{path}: no temperature in it; give a recording with a column temperature_degc")
+        low, high = np.nanmin(r.temperature), np.nanmax(r.temperature)
+        if not 4.0 <= low <= high <= 60.0:
+            raise frame.UserError(
+                f"{path}: temperatures of {low:g} to {high:g}: allowed 4 to 60 degC; are they in degC?"
+            )
+        series = Series(r.time_min, r.od, r.pump_rate, r.row)
+        mine, left = curves.plateaus(
+            series, r.temperature, r.fluorescence, config.volume_ml / 60.0, settle_min, config.least_min, config.offset
+        )
+        log.info("%s: %d temperature(s) held long enough", path, len(mine))
+        for line in left:
+            log.warning("%s: left out: %s", path, line)
+        found += mine
+    return sorted(found, key=lambda p: p.temperature)
+
+
+def _growth(name: str, points: list[Plateau], lag_min: float, config: CalibratePairConfig) -> Curve:
+    """The curve of a species. Raises: UserError for too few temperatures."""
+    t = np.array([p.temperature for p in points])
+    apart = np.unique(np.round(t)).size
+    if apart < FEWEST:
+        minutes = max(config.settle_min, LAGS * lag_min) + config.least_min
+        raise frame.UserError(
+            f"{name}: growth at {apart} temperature(s); record {FEWEST} at least, each held for {minutes:g} min behind "
+            "the change, or lower settle_min or least_min"
+        )
+    if apart <= config.degree + 1:
+        log.warning("%s: a curve through all of its %d points: nothing tells how good it is; record more", name, apart)
+    value = np.array([p.growth.value for p in points])
+    sd = np.hypot([p.growth.half_width / 1.96 for p in points], STRAY * value)
+    return curves.fit(t, value, sd, min(config.degree, apart - 1))
+
+
+def _pigment(points: list[Plateau], config: CalibratePairConfig) -> PigmentConfig:
+    """Production of pigment in balance with dilution: g_ss = mu ((light - offset) / (k OD) - od_term).
+
+    Raises: UserError where no recording of the second species has light.
+    """
+    lit = [p for p in points if p.light is not None]
+    if not lit:
+        where = ", ".join(config.second)
+        raise frame.UserError(f"second={where}: no light in it; record with backend.fluorescence, which measures it")
+    if dark := [p for p in lit if p.light is not None and p.light.value <= 0.0]:
+        at = f"second: light at {dark[0].temperature:.1f} degC is no more than offset={config.offset:g} counts"
+        raise frame.UserError(
+            f"{at}; are these recordings of the second species, and is that the offset of this sensor?"
+        )
+    t = np.array([p.temperature for p in lit])
+    glow = np.array([p.light.value for p in lit if p.light is not None]) / config.factor - config.od_term
+    made = np.maximum(glow, 0.0) * np.array([p.growth.value for p in lit])
+    usual = PigmentConfig()
+    degree, centre = min(4, np.unique(np.round(t)).size - 1), float(np.round(t.mean(), 1))
+    found = curves.fit(t, made, np.maximum(0.03 * made, 30.0), degree, centre)
+    return replace(usual, polynomial=found.coefficients, centre_c=centre)
+
+
+def _corrected(pair: PairConfig, config: CalibratePairConfig) -> tuple[PairConfig, dict[str, float]]:
+    """Both curves times what a mixed run says of them, and these two factors less 1 with their sds.
+
+    The estimator takes the run from its beginning, with every share that was marked. Raises: UserError for a run
+    without any.
+    """
+    assert config.mixed is not None
+    path = Path(config.mixed)
+    r, name = _read(config.mixed, config.pump_ml_s), path.stem
+    with frame.refusing(RecordingError):
+        every = read_marks(path.parent.parent)
+    marks = [m for m in every if m.reactor == name and m.share is not None and m.sd is not None]
+    if not marks:
+        run = path.parent.parent
+        how = f"python -m experiments.mark run={run} reactor={name} share=SHARE sd=SD minute=MINUTE"
+        raise frame.UserError(f"mixed={path}: no share was marked for {name} in {run}; mark some: {how}")
+    guess = CompositionEstimatorConfig(  # the curves are those of this bench: of its thermometer, and of its pump
+        factor=config.factor, offset=config.offset, od_term=config.od_term, thermometer_sd=0.0, gain_sd=0.01
+    )
+    estimator = CompositionEstimator(guess, config.volume_ml, pair)
+    yes, waiting = np.ones(1, dtype=np.bool_), sorted(marks, key=lambda m: m.time_min)
+    for k, minute in enumerate(r.time_min):
+        od, light, warm, now = (np.array([v]) for v in (r.od[k], r.fluorescence[k], r.temperature[k], minute))
+        estimator.watch(od, light, warm, now, yes)
+        while waiting and waiting[0].time_min <= minute:
+            m = waiting.pop(0)
+            estimator.sample(np.array([m.share]), np.array([m.sd]), yes)
+        if k + 1 < len(r.time_min):
+            estimator.dosed(np.array([r.pump_rate[k] * 60.0 * (r.time_min[k + 1] - minute)]))
+    off, sd = estimator.growth_errors()
+    scaled = [
+        replace(s, polynomial=tuple(c * (1.0 + float(e)) for c in s.polynomial))
+        for s, e in zip((pair.first, pair.second), off[0], strict=True)
+    ]
+    told = {
+        "first": float(off[0, 0]),
+        "first_sd": float(sd[0, 0]),
+        "second": float(off[0, 1]),
+        "second_sd": float(sd[0, 1]),
+    }
+    return replace(pair, first=scaled[0], second=scaled[1]), told
+
+
+def calibrate_pair(config: CalibratePairConfig, folder: Path) -> None:
+    """Write pair.yaml, the figure and the summary. Raises: UserError where the recordings cannot tell a pair."""
+    for key in ("first", "second"):
+        if not getattr(config, key):
+            raise frame.UserError(f"{key}=[]: allowed one or more recordings of that species alone, {key}=[FILE.csv]")
+    lags = config.lags_min
+    points = [_plateaus(paths, lag, config) for paths, lag in zip((config.first, config.second), lags, strict=True)]
+    found = [_growth(name, mine, lag, config) for name, mine, lag in zip(config.names, points, lags, strict=True)]
+    every = [[p.temperature for p in mine] for mine in points]
+    span = float(np.ceil(10.0 * max(map(min, every))) / 10.0), float(np.floor(10.0 * min(map(max, every))) / 10.0)
+    if not span[0] < span[1]:
+        each = " and ".join(
+            f"{n} at {min(t):.1f} to {max(t):.1f} degC" for n, t in zip(config.names, every, strict=True)
+        )
+        raise frame.UserError(f"recorded: {each}; allowed ranges that overlap: record both at the same temperatures")
+    with frame.refusing(ValueError):
+        species = [
+            SpeciesConfig(name, curve.coefficients, (), lag)
+            for name, curve, lag in zip(config.names, found, lags, strict=True)
+        ]
+        pair = alone = PairConfig(species[0], species[1], _pigment(points[1], config), span)
+        told = None
+        if config.mixed is not None:
+            pair, told = _corrected(alone, config)
+            told["even_c_alone"] = alone.even_c
+    head = "# Two species, written by calibrate_pair; for pair=FILE of train, deploy and benchmark.\n"
+    plain = yaml.safe_dump(files.plain(asdict(pair)), sort_keys=False, allow_unicode=True)
+    write(folder / "pair.yaml", head + plain)
+    from experiments.reporting import charts
+    from experiments.reporting.pair_charts import pair_figure
+
+    charts.save(pair_figure(pair, points), folder / "figures", "pair")
+    rows = [[asdict(p) for p in mine] for mine in points]
+    off = [curve.off.tolist() for curve in found]
+    files.write_json(
+        folder / "summary.json",
+        {"pair": asdict(pair), "even_c": pair.even_c, "plateaus": rows, "off_sd": off, "mixed": told},
+    )
+    _say(config, pair, points, found, told, folder)
+
+
+def _say(
+    config: CalibratePairConfig, pair: PairConfig, points: list[list[Plateau]], found: list[Curve],
+    told: dict[str, float] | None, folder: Path,
+) -> None:  # fmt: skip
+    for name, mine, curve in zip(config.names, points, found, strict=True):
+        print(f"{name}: 1/h at degC, and its distance from the curve in sds")
+        for p, off in zip(mine, curve.off, strict=True):
+            light = "" if p.light is None else f"   light per OD {p.light.value:.0f}"
+            between = f"{p.growth.low:.4f} to {p.growth.high:.4f}"
+            print(f"  {p.temperature:6.2f}  {p.growth.value:.4f} ({between})  {off:+.1f}{light}")
+    if told is not None:
+        off = [f"{told[key]:+.3f} +- {told[f'{key}_sd']:.3f}" for key in ("first", "second")]
+        print(f"mixed: curves off by {' and '.join(off)}, corrected; they crossed at {told['even_c_alone']:.2f} degC")
+    low, high = pair.temperatures
+    ends = pair.faster(np.array([low, high]))
+    print(f"both grow alike at {pair.even_c:.2f} degC; {pair.second.name} gains {ends[0]:+.3f} 1/h at {low:g} degC "
+          f"and {ends[1]:+.3f} at {high:g}")  # fmt: skip
+    print(f"files {folder / 'pair.yaml'}, {folder / 'figures' / 'pair.png'}")
+    print(f"next: python -m experiments.deploy scenario=ratio_steps pair={folder / 'pair.yaml'}")
+
+
+main = frame.Command("calibrate_pair", CalibratePairConfig(), calibrate_pair)
+
+
+if __name__ == "__main__":
+    main()

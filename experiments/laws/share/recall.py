@@ -1,0 +1,179 @@
+"""An estimator that can be told of the past: it goes back, and takes again what it has been shown since."""
+
+import copy
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from experiments.laws.share.base import Array, Estimate, Mask
+from experiments.laws.share.estimator import CompositionEstimator
+
+__all__ = ["Recall"]
+
+KEPT_MIN, EVERY_MIN = 2880.0, 60.0  # a plate is counted a day after it was spread; from each copy on all is replayed
+AT_ONCE = 480  # readings and doses that are taken again with each new reading: some .2 s
+
+Shown = tuple[float, str, tuple[Any, ...]]
+
+
+@dataclass
+class Chapter:
+    """An estimator as it was at a minute, and what it was shown from then on: (minute, method, arguments)."""
+
+    minute: float
+    then: CompositionEstimator
+    shown: list[Shown] = field(default_factory=list)
+
+
+@dataclass
+class Again:
+    """An estimator that takes the past again: it stands before entry `entry` of chapter `chapter`."""
+
+    chapter: int
+    estimator: CompositionEstimator
+    entry: int = 0
+
+
+class Recall:
+    """An estimator, and its last two days.
+
+    A share that was counted belongs to the minute at which the sample was drawn, which may be a day ago. Then a copy of
+    the estimator goes back to the full hour before that, and takes again all readings, doses and samples in their
+    order, as many with each new reading as the loop can wait for; once it has caught up it stands in for the estimator.
+    The result is that of a filter that was told at once. A resumed run is told its last two days anew (`retell`).
+    """
+
+    remembers = ("estimator", "earliest")
+    added = ("earliest",)
+
+    def __init__(self, estimator: CompositionEstimator) -> None:
+        self.estimator, self.earliest = estimator, copy.deepcopy(estimator)  # the latter: of the first chapter
+        self._chapters: list[Chapter] = []
+        self._again: Again | None = None
+
+    def reset(self, n: int) -> None:
+        """Forget everything; n cultures from here on."""
+        self.estimator.reset(n)
+        self._forget()
+        self.earliest = copy.deepcopy(self.estimator)
+
+    def _forget(self) -> None:
+        self._chapters, self._again = [], None
+
+    def calibrate(self, factor: Array, factor_sd: Array, offset: Array, offset_sd: float) -> None:
+        """See `CompositionEstimator.calibrate`."""
+        self.estimator.calibrate(factor, factor_sd, offset, offset_sd)
+
+    @property
+    def begun(self) -> Mask:
+        """Which cultures have been seen."""
+        return self.estimator.begun
+
+    @property
+    def known(self) -> Array:
+        """Up to which minute `retell` needs nothing of each culture; -inf where it needs all, (N,)."""
+        return self.earliest.since
+
+    @property
+    def behind(self) -> bool:
+        """Whether samples are on their way into the estimate."""
+        return self._again is not None
+
+    def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
+        """See `CompositionEstimator.watch`."""
+        if not rows.any():
+            return
+        now = float(minute[rows].max())
+        if not self._chapters or now - self._chapters[-1].minute >= EVERY_MIN:
+            self._begin(now)
+        self._show(now, "watch", tuple(np.array(a) for a in (od, fluorescence, temperature, minute, rows)))
+        self._catch_up()
+
+    def _begin(self, now: float) -> None:
+        """A new chapter; what is older than two days is forgotten, but for what is just taken again."""
+        self._chapters.append(Chapter(now, copy.deepcopy(self.estimator)))
+        while now - self._chapters[0].minute > KEPT_MIN and (self._again is None or self._again.chapter > 0):
+            self._chapters.pop(0)
+            if self._again is not None:
+                self._again.chapter -= 1
+        self.earliest = self._chapters[0].then
+
+    def dosed(self, volume_ml: Array) -> None:
+        """See `CompositionEstimator.dosed`."""
+        if self._chapters:
+            self._show(self._last(), "dosed", (np.array(volume_ml),))
+        else:
+            self.estimator.dosed(volume_ml)
+
+    def sample(self, share: Array, sd: Array, minute: float, rows: Mask) -> bool:
+        """Shares that were counted in samples drawn at a minute, with their sds, (N,); False: longer ago than is known.
+
+        It is taken behind the readings of that minute. See `behind`.
+        """
+        if self._chapters and not self.earliest.begun.any():
+            minute = max(minute, self._chapters[0].minute)  # of the inoculum: as if drawn with the first reading
+        at = next((k for k in reversed(range(len(self._chapters))) if self._chapters[k].minute <= minute), None)
+        if at is None:
+            return False
+        shown = self._chapters[at].shown
+        place = next((k for k, (when, _, _) in enumerate(shown) if when > minute), len(shown))
+        shown.insert(place, (minute, "sample", (np.array(share), np.array(sd), np.array(rows))))
+        if self._again is None or at <= self._again.chapter:  # else it is met on the way
+            self._again = Again(at, copy.deepcopy(self._chapters[at].then))
+        self._catch_up()
+        return True
+
+    def retell(self, shown: Iterable[Shown]) -> None:
+        """What a resumed run was shown in its earlier lives, in order, behind what is `known`: it is taken again.
+
+        Until it has caught up the estimate is that which was saved.
+        """
+        self._forget()
+        last = self.known
+        for minute, method, arguments in shown:
+            if method == "watch":
+                last = np.where(arguments[-1], minute, last)
+            if not self._chapters or minute - self._chapters[-1].minute >= EVERY_MIN:
+                self._chapters.append(Chapter(minute, copy.deepcopy(self.earliest)))
+            self._chapters[-1].shown.append((minute, method, arguments))
+        if self._chapters:
+            same = self.estimator.since >= last - 1e-3  # of these it is known what the device dosed since then, too
+            self._chapters[-1].shown.append((self._last(), "gave", (self.estimator.given_ml.copy(), same)))
+            self._again = Again(0, copy.deepcopy(self.earliest))
+
+    def _last(self) -> float:
+        shown = self._chapters[-1].shown
+        return shown[-1][0] if shown else self._chapters[-1].minute
+
+    def _show(self, minute: float, method: str, arguments: tuple[Any, ...]) -> None:
+        self._chapters[-1].shown.append((minute, method, arguments))
+        act: Callable[..., None] = getattr(self.estimator, method)
+        act(*arguments)
+
+    def _catch_up(self) -> None:
+        """Some more of the past; where all of it has been taken, the copy is the estimator."""
+        again = self._again
+        for _ in range(AT_ONCE):
+            if again is None:
+                return
+            shown = self._chapters[again.chapter].shown
+            if again.entry < len(shown):
+                _, method, arguments = shown[again.entry]
+                getattr(again.estimator, method)(*arguments)
+                again.entry += 1
+            if again.entry == len(shown):
+                again.chapter, again.entry = again.chapter + 1, 0
+                if again.chapter == len(self._chapters):
+                    self.estimator, self._again = again.estimator, None
+                    return
+                self._chapters[again.chapter].then = copy.deepcopy(again.estimator)
+
+    def estimate(self) -> Estimate:
+        """What is believed now."""
+        return self.estimator.estimate()
+
+    def explain(self) -> dict[str, Array]:
+        """See `CompositionEstimator.explain`."""
+        return self.estimator.explain()

@@ -1,0 +1,228 @@
+"""Two species from recordings of each alone, against plants whose curves are known."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from envs.coculture.pair import PairConfig, PigmentConfig, SpeciesConfig, named_pair
+from envs.identification import curves
+from envs.identification.model import Parameter
+from envs.identification.screening import Series
+from envs.plant.plant import Plant, of_pair
+from experiments.calibrate_pair import CalibratePairConfig, _pigment, calibrate_pair
+from experiments.cli import frame
+from hardware.storage.marks import Mark, add_mark
+from tests.envs.test_plant import preset
+
+TRUE = PairConfig(
+    SpeciesConfig("alpha", (0.06, -1.1)), SpeciesConfig("beta", (-0.01, 0.6, -8.1), (), 60.0),
+    PigmentConfig((-100.0, 4000.0), 31.0), (27.0, 35.0),
+)  # fmt: skip
+HOURS = {27.5: 6.5, 30.0: 6.0, 32.5: 5.5, 35.0: 7.0}
+
+
+def recorded(
+    path: Path, share: float, program: dict[float, float] = HOURS, *, pair: PairConfig = TRUE, seed: int = 0,
+    gain: float = 1.0, factor: float = 1.0, volume_ml: float = 20.0, every: int = 1,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """A culture that is thinned from .55 to .45, at each temperature for some hours: minutes and true shares.
+
+    A row, and a dose, every so many minutes.
+    """
+    config = of_pair(preset("coculture"), pair)
+    config = replace(config, second=replace(config.second, start_share=(share, share)))
+    config = replace(config, pump=replace(config.pump, gain_ml_s=gain, pulse_cv=0.1))
+    config = replace(config, fluorescence=replace(config.fluorescence, factor=(factor, factor)))
+    plant = Plant(config, 1, np.random.default_rng(seed), volume_ml)
+    plant.reset(0.5, temperature=next(iter(program)))
+    on, lines, minute, shares = False, ["time_min,od,pump_rate_ml_s,temperature_degc,fluorescence"], 0, []
+    for target, hours in program.items():
+        for _ in range(round(60 * hours / every)):
+            od = float(plant.read_od()[0])
+            on = od > 0.55 or (on and od > 0.45)
+            light = float(plant.read_fluorescence()[0]) if plant.fluorescence is not None else float("nan")
+            warm, rate = float(plant.thermal.read()[0]), 0.001 * volume_ml * on
+            lines.append(f"{minute},{od:.5f},{rate},{warm:.3f},{'' if np.isnan(light) else f'{light:.1f}'}")
+            shares.append((minute, plant.culture.share[0]))
+            plant.advance(float(every), np.array([60.0 * every * rate]), temperature_target=target)
+            minute += every
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n")
+    found = np.array(shares)
+    return found[:, 0], found[:, 1]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    folder = tmp_path_factory.mktemp("alone")
+    recorded(folder / "a.csv", 0.0)
+    recorded(folder / "b.csv", 1.0, seed=1)
+    return str(folder / "a.csv"), str(folder / "b.csv")
+
+
+def test_curves_pigment_and_crossing_are_found(alone: tuple[str, str], tmp_path: Path) -> None:
+    config = CalibratePairConfig((alone[0],), (alone[1],), ("alpha", "beta"), factor=1.0)
+    calibrate_pair(config, tmp_path)
+    pair = named_pair(str(tmp_path / "pair.yaml"))
+    assert (pair.first.name, pair.second.name) == ("alpha", "beta")
+    assert pair.even_c == pytest.approx(TRUE.even_c, abs=0.25)
+    t = np.linspace(27.5, 35.0, 7)
+    np.testing.assert_allclose(pair.rates(t), TRUE.rates(t), rtol=0.05)
+    np.testing.assert_allclose(pair.production(t), TRUE.production(t), rtol=0.15)
+    assert pair.temperatures == pytest.approx((27.5, 35.0), abs=0.11)
+    assert (tmp_path / "figures" / "pair.png").is_file()
+    found = json.loads((tmp_path / "summary.json").read_text())
+    assert [len(mine) for mine in found["plateaus"]] == [4, 4]
+    assert np.abs(found["off_sd"]).max() < 3.0
+
+
+def test_a_pump_that_gives_more_scales_both_curves_and_leaves_the_crossing(tmp_path: Path) -> None:
+    recorded(tmp_path / "a.csv", 0.0, gain=1.1)
+    recorded(tmp_path / "b.csv", 1.0, gain=1.1, seed=1)
+    calibrate_pair(CalibratePairConfig((f"{tmp_path}/a.csv",), (f"{tmp_path}/b.csv",)), tmp_path)
+    pair = named_pair(str(tmp_path / "pair.yaml"))
+    assert pair.even_c == pytest.approx(TRUE.even_c, abs=0.25)
+    np.testing.assert_allclose(pair.rates(31.0) / TRUE.rates(31.0), 1.0 / 1.1, rtol=0.04)
+
+
+def test_shares_that_were_counted_in_a_mixed_run_correct_the_curves(tmp_path: Path) -> None:
+    """The mixed culture grows by other rates than each alone: the second by a tenth less. A row every 2 min, 12 mL."""
+    true = replace(TRUE, second=replace(TRUE.second, polynomial=tuple(0.9 * c for c in TRUE.second.polynomial)))
+    run, volume = tmp_path / "run", 12.0
+    program = {29.0: 8.0, 34.0: 6.0, 29.5: 10.0}
+    minutes, shares = recorded(
+        run / "recordings" / "M0.csv", 0.6, program, pair=true, seed=3, volume_ml=volume, every=2
+    )
+    recorded(tmp_path / "a.csv", 0.0, volume_ml=volume)
+    recorded(tmp_path / "b.csv", 1.0, seed=1, volume_ml=volume)
+    plain = CalibratePairConfig(
+        (f"{tmp_path}/a.csv",), (f"{tmp_path}/b.csv",), factor=1.0, volume_ml=volume, mixed=f"{run}/recordings/M0.csv"
+    )
+    with pytest.raises(frame.UserError, match="no share was marked for M0"):
+        calibrate_pair(plain, tmp_path)
+    (run / "marks.csv").write_text("time_min,reactor,text,written,level_ml,share,sd\n7,M0,counted,,,0.4,0\n")
+    with pytest.raises(frame.UserError, match="share 0.4 at minute 7 has no sd above 0"):
+        calibrate_pair(plain, tmp_path)
+    (run / "marks.csv").unlink()
+    rng = np.random.default_rng(0)
+    for minute, share in list(zip(minutes, shares, strict=True))[100::120]:
+        add_mark(run, Mark(minute, "M0", "counted", None, float(share + 0.02 * rng.standard_normal()), 0.02))
+    calibrate_pair(plain, tmp_path)
+    told = json.loads((tmp_path / "summary.json").read_text())["mixed"]
+    less = (1.0 + told["second"]) / (1.0 + told["first"])
+    assert less == pytest.approx(0.9, abs=0.04)
+    for which, true_error in (("first", 0.0), ("second", -0.1)):
+        assert told[which] == pytest.approx(true_error, abs=3.0 * told[f"{which}_sd"])
+    assert told["first_sd"] != told["second_sd"]
+    pair = named_pair(str(tmp_path / "pair.yaml"))
+    assert pair.even_c == pytest.approx(true.even_c, abs=0.25)
+
+
+def test_a_mixed_run_leaves_curves_alone_that_are_right(alone: tuple[str, str], tmp_path: Path) -> None:
+    """A thermometer that is as it was, and counts with noise: the crossing stays."""
+    minutes, shares = recorded(
+        tmp_path / "run" / "recordings" / "M0.csv", 0.4, {29.0: 8.0, 34.0: 6.0, 29.5: 10.0}, seed=5
+    )
+    rng = np.random.default_rng(1)
+    for minute, share in list(zip(minutes, shares, strict=True))[100::150]:
+        add_mark(tmp_path / "run", Mark(minute, "M0", "", None, float(share + 0.02 * rng.standard_normal()), 0.02))
+    even: dict[bool, float] = {}
+    for mixed in (None, f"{tmp_path}/run/recordings/M0.csv"):
+        calibrate_pair(CalibratePairConfig((alone[0],), (alone[1],), factor=1.0, mixed=mixed), tmp_path)
+        told = json.loads((tmp_path / "summary.json").read_text())
+        even[mixed is None] = told["even_c"]
+    assert told["mixed"]["first_sd"] < 0.0095  # a thermometer that might be off as well leaves .011
+    assert even[False] == pytest.approx(even[True], abs=0.08)
+    assert even[False] == pytest.approx(TRUE.even_c, abs=0.15)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_lag_of_growth_biases_nothing_whichever_way_the_temperature_goes(order: int, tmp_path: Path) -> None:
+    steps = dict(list({27.5: 6.0, 31.0: 5.5, 34.5: 5.5}.items())[::order])
+    for name, share, seed in (("a", 0.0, 0), ("b", 1.0, 1)):
+        recorded(tmp_path / f"{name}.csv", share, steps, seed=seed)
+    calibrate_pair(CalibratePairConfig((f"{tmp_path}/a.csv",), (f"{tmp_path}/b.csv",), factor=1.0), tmp_path)
+    pair = named_pair(str(tmp_path / "pair.yaml"))
+    assert pair.even_c == pytest.approx(TRUE.even_c, abs=0.1)
+    t = np.array([28.0, 31.0, 34.0])
+    np.testing.assert_allclose(pair.rates(t)[:, 1], TRUE.rates(t)[:, 1], rtol=0.03)
+
+
+def test_what_is_left_out_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    recorded(tmp_path / "a.csv", 0.0, {27.5: 4.0, 29.0: 2.5, 31.0: 3.6, 34.5: 3.6})
+    with pytest.raises(frame.UserError, match=r"none\.csv"):
+        calibrate_pair(CalibratePairConfig((f"{tmp_path}/a.csv",), ("none.csv",)), tmp_path)
+    assert "a.csv: left out: 29.0 degC from minute" in caplog.text
+    assert "it takes 180" in caplog.text
+
+
+def test_other_sensor_other_period_other_temperatures(tmp_path: Path) -> None:
+    """A factor of .7, rows every 2 min, and the second species over a narrower range than the first."""
+    recorded(tmp_path / "a.csv", 0.0, every=2)
+    narrow = {28.5: 5.5, 31.0: 6.0, 34.0: 6.5}
+    recorded(tmp_path / "b.csv", 1.0, narrow, seed=1, factor=0.7, every=2)
+    calibrate_pair(CalibratePairConfig((f"{tmp_path}/a.csv",), (f"{tmp_path}/b.csv",), factor=0.7), tmp_path)
+    pair = named_pair(str(tmp_path / "pair.yaml"))
+    assert pair.temperatures == pytest.approx((28.5, 34.0), abs=0.11)
+    t = np.array([29.0, 31.0, 33.5])
+    np.testing.assert_allclose(pair.rates(t), TRUE.rates(t), rtol=0.05)
+    np.testing.assert_allclose(pair.production(t), TRUE.production(t), rtol=0.06)
+    plateaus = json.loads((tmp_path / "summary.json").read_text())["plateaus"]
+    assert len(plateaus[1]) == 3
+
+
+def test_light_is_that_of_the_last_hour_whatever_the_period() -> None:
+    """Four hours at one temperature, a row every 3 min; the light per OD rises by 1 a minute."""
+    minutes = np.arange(0.0, 360.0, 3.0)
+    od, none = 0.5 * np.exp(0.001 * minutes), np.zeros(minutes.size)
+    series = Series(minutes, od, none, np.arange(minutes.size))
+    light = 50.0 + od * (1000.0 + minutes)
+    (found,), _ = curves.plateaus(series, np.full(minutes.size, 31.0), light, 1.0 / 3.0, 120.0, 90.0, 50.0)
+    assert found.light is not None
+    assert found.light.value == pytest.approx(1000.0 + 357.0 - 30.0, abs=2.0)
+    assert found.growth.value == pytest.approx(0.06, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        (CalibratePairConfig(), r"first=\[\]: allowed one or more recordings"),
+        (CalibratePairConfig(("none.csv",), ("none.csv",)), "none.csv"),
+        (CalibratePairConfig(("none.csv",), ("none.csv",), mixed="x.csv"), "none.csv"),
+    ],
+)
+def test_what_cannot_be_calibrated_is_one_line(config: CalibratePairConfig, words: str, tmp_path: Path) -> None:
+    with pytest.raises(frame.UserError, match=words):
+        calibrate_pair(config, tmp_path)
+
+
+def test_one_temperature_makes_no_curve(tmp_path: Path) -> None:
+    recorded(tmp_path / "a.csv", 0.0, {30.0: 5.0})
+    with pytest.raises(
+        frame.UserError, match=r"first: growth at 1 temperature\(s\); record 3 at least, each .* 180 min"
+    ):
+        calibrate_pair(CalibratePairConfig((f"{tmp_path}/a.csv",), (f"{tmp_path}/a.csv",)), tmp_path)
+
+
+def test_a_weighted_polynomial_goes_through_what_is_known_best() -> None:
+    t, value = np.array([28.0, 30.0, 32.0, 34.0]), np.array([0.4, 0.5, 0.9, 0.7])
+    found = curves.fit(t, value, np.array([0.01, 0.01, 10.0, 0.01]), 1)
+    np.testing.assert_allclose(found.coefficients, [0.05, -1.0], atol=1e-4)
+    assert found.off[2] == pytest.approx(0.03, abs=1e-3)
+    exact = curves.fit(t, value, np.full(4, 0.1), 3, 31.0)
+    np.testing.assert_allclose(np.polyval(exact.coefficients, t - 31.0), value, atol=1e-9)
+
+
+def test_production_is_what_balances_dilution_by_hand() -> None:
+    """g = mu ((light per OD) / k - light that any cell scatters), with a factor k of .7 and much scattered light."""
+    t, growth, light = np.array([28.0, 31.0, 34.0]), np.array([0.5, 0.8, 0.6]), np.array([4000.0, 3000.0, 2000.0])
+    points = [
+        curves.Plateau(float(c), Parameter(m, m, m), Parameter(y, y, y), 0, 1)
+        for c, m, y in zip(t, growth, light, strict=True)
+    ]
+    found = _pigment(points, CalibratePairConfig(factor=0.7, od_term=900.0))
+    np.testing.assert_allclose(found.steady(t), growth * (light / 0.7 - 900.0), rtol=1e-9)
