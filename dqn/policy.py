@@ -13,6 +13,7 @@ is read, too: it has `pump_rates` for `actions` and no limits of the observation
 """
 
 import hashlib
+import io
 import json
 import zipfile
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "ABSOLUTE", "COCULTURE", "COCULTURE_PREVIEW", "FORMAT", "RELATIVE", "Policy", "PolicyError", "fingerprints", "load",
-    "save",
+    "packed", "save",
 ]  # fmt: skip
 
 FORMAT = 2
@@ -113,10 +114,17 @@ def fingerprints(policy: Policy) -> dict[str, str]:
 
 def save(path: Path, policy: Policy) -> None:
     """Write policy.npz atomically."""
-    arrays = {**_arrays(policy), "metadata": np.array(json.dumps(policy.metadata, sort_keys=True))}
     temporary = path.with_suffix(".part.npz")
-    np.savez(temporary, **arrays)  # type: ignore[arg-type]
+    temporary.write_bytes(packed(policy))
     temporary.replace(path)
+
+
+def packed(policy: Policy) -> bytes:
+    """The content of policy.npz."""
+    arrays = {**_arrays(policy), "metadata": np.array(json.dumps(policy.metadata, sort_keys=True))}
+    content = io.BytesIO()
+    np.savez(content, **arrays)  # type: ignore[arg-type]
+    return content.getvalue()
 
 
 def load(path: Path) -> Policy:

@@ -22,8 +22,8 @@ from envs.gym_adapter import EpisodeEnv
 from envs.vector_env import EpisodeVectorEnv
 
 __all__ = [
-    "LOGIT", "NEXT", "RATE", "SETPOINT", "TEMPERATURE", "TIME", "CocultureConfig", "CocultureEnv", "CocultureVectorEnv",
-    "advance", "at_rest", "limits", "logit", "passed", "share",
+    "LOGIT", "NEXT", "RATE", "SCALES", "SETPOINT", "TEMPERATURE", "TIME", "CocultureConfig", "CocultureEnv",
+    "CocultureVectorEnv", "advance", "at_rest", "limits", "logit", "passed", "share",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 LOGIT, TEMPERATURE, RATE, SETPOINT, NEXT, TIME = range(6)
 """Columns of an observation; the last two where changes are announced."""
 
+SCALES = (0.5, 2.0)  # of a growth curve
 LARGEST = 20.0  # of a logit: one species is all but gone
 
 
@@ -55,8 +56,8 @@ class CocultureConfig:
     start_share: tuple[float, float] = setting(
         (0.05, 0.95), "range of the share at the start", above=0.0, below=1.0, interval=True
     )
-    scale_e: float = setting(1.0, "of the first species' growth curve", within=(0.5, 2))
-    scale_p: float = setting(1.0, "of the second's", within=(0.5, 2))
+    scale_e: float = setting(1.0, "of the first species' growth curve", within=SCALES)
+    scale_p: float = setting(1.0, "of the second's", within=SCALES)
     heating_c_per_min: float = setting(2.0, "fastest rise of a heated vial", "degC/min", within=(0.1, 10))
     cooling_min: float = setting(39.0, "time constant of passive cooling", "min", within=(1, 600))
     ambient_c: float = setting(24.0, "temperature an unheated vial cools to", "degC", within=(0, 40))

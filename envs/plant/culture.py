@@ -76,7 +76,8 @@ class Culture:
 
       x_i' = (m_i - D) x_i - ka x_i + kd w_i        s' = D (1 - s) - sum_i m_i x_i / Y
       w_i' = ka x_i + r m_i w_i (1 - sum_i w_i / W) - kd w_i
-      m_i  = mu_i(s) phi_i(T), times drift, stirring and `mu_factor`; D = fresh medium per minute / volume
+      m_i  = mu_i(s) phi_i(T), times drift, stirring, `mu_factor` and its own `species_factor`
+      D    = fresh medium per minute / volume
 
     Args:
       config: how cells grow; rngs: one stream per vial, for its growth rate.
@@ -84,7 +85,8 @@ class Culture:
       second: another species beside that of `config`, S = 2; second_rngs: one stream per vial, for its draws.
       pair: curves of both, where their temperature law is `pair`.
     State: `biomass` (true, suspended), shape (N, S); `substrate`, shape (N,). Fault switches, shape (N,): `mu_factor`,
-    and `stir_factor` (1 turning, 0 stopped; for a stirrer that fails, not for the still phase of each cycle).
+    and `stir_factor` (1 turning, 0 stopped; for a stirrer that fails, not for the still phase of each cycle); and
+    `species_factor`, (N, S).
     """
 
     def __init__(
@@ -114,6 +116,7 @@ class Culture:
         ]
         self._lags_min = [a.adaptation_min for a in species]
         self.mu_factor, self.stir_factor = np.ones(self._n), np.ones(self._n)
+        self.species_factor = np.ones((self._n, len(species)))
 
     def reset(self, od: Array, temperature: Array, share: Array | float | None = None) -> None:
         """A new culture in balance with the medium it grew from.
@@ -130,6 +133,10 @@ class Culture:
         self._wall = np.zeros_like(self.biomass)
         self._adapted = self._phi(np.broadcast_to(temperature, (self._n,)))
         self._log_drift, self._settled = np.zeros(self._n), np.zeros(self._n)
+
+    def adapted_to(self, relative: Array) -> None:
+        """Growth that is behind the temperature stands so, relative to 37 degC and before any factor, (N, S)."""
+        self._adapted = relative.copy()
 
     @property
     def od(self) -> Array:
@@ -204,12 +211,13 @@ class Culture:
         return np.stack([phi(temperature) for phi in self._responses], axis=1)
 
     def _relative_rate(self, age_min: Array) -> Array:
-        """What temperature, drift, stirring and `mu_factor` now make of the growth laws' rates, shape (N, S)."""
+        """What temperature, drift, stirring and both factors now make of the growth laws' rates, shape (N, S)."""
         g = self.config
         course = along(g.knots_min, g.knots_mu, g.mu, age_min)
         drift = np.exp(self._log_drift) * np.maximum(1.0 + g.ramp_per_h * age_min / 60.0, 0.0) * course
         stirred = UNSTIRRED_GROWTH + (1.0 - UNSTIRRED_GROWTH) * self.stir_factor
-        return np.asarray(self._adapted * drift[:, None] * stirred[:, None] * self.mu_factor[:, None])
+        factors = self.mu_factor[:, None] * self.species_factor
+        return np.asarray(self._adapted * drift[:, None] * stirred[:, None] * factors)
 
     def settle(self, minutes: float) -> None:
         """Cells sink where the stirrer stands still, and rise again where it turns."""

@@ -130,14 +130,14 @@ class Plant:
     def reset(
         self,
         od: Array | float | None = None,
-        temperature: float | None = None,
+        temperature: Array | float | None = None,
         share: Array | float | None = None,
     ) -> None:
         """A new culture at the waste tube's level, in balance with the medium it grew from.
 
         Args:
           od: suspended biomass, OD, scalar or shape (N,), >= 0; None = `start_od` of the config.
-          temperature: of vial and thermostat, degC; None = `start_temperature` of the config.
+          temperature: of vial and thermostat, degC, as `od`; None = `start_temperature` of the config.
           share: of the second species, if there is one, scalar or shape (N,), 0 to 1; None = as drawn.
         Fault switches, what the bottle holds and the drawn parameters stay. Raises: ValueError for an OD below
         0 or a share outside 0 to 1.

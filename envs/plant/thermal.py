@@ -46,10 +46,11 @@ class Thermal:
         self.draws: dict[str, Array] = {"thermometer_offset": uniform(rngs, *config.offset_c)}
         self.offset = self.draws["thermometer_offset"]
 
-    def reset(self, temperature: float) -> None:
-        """Vial and thermostat where the thermometer shows `temperature`, degC."""
-        self.temperature: Array = float(temperature) - self.offset
-        self.target: Array = np.full(self._n, float(temperature))
+    def reset(self, temperature: Array | float) -> None:
+        """Vial and thermostat where the thermometer shows `temperature`, degC, scalar or shape (N,)."""
+        shown = np.full(self._n, temperature, dtype=np.float64)
+        self.temperature: Array = shown - self.offset
+        self.target: Array = shown
         self.mean: Array = self.temperature
         self._ripple = np.zeros(self._n)
 

@@ -30,6 +30,7 @@ from experiments.cli.calibrated import read_env_file, read_pair, read_plant_file
 from experiments.cli.choices import choices
 from experiments.control.config import DeployConfig
 from experiments.control.policies import Wanted, admit, composition_policy, policy_check, run_policy
+from experiments.control.question import Relearn
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from experiments.laws.share.estimator import CompositionEstimator
@@ -67,6 +68,7 @@ class Setup:
     law: config of what decides the pump rate. wanted: the policy that controller=dqn asks for, None for another.
     policy: as read, None for a preflight. bounds: of its certificate.
     further: signals that are held beside the density, which have seen nothing yet.
+    relearn: when the policy of a share is learned anew during the run.
     species: of two the second one, whose share may be held.
     fsync: of the record. title: who controls what. row: of the run in TensorBoard's table, but its results.
     resumed: an earlier life of the run is continued.
@@ -86,6 +88,7 @@ class Setup:
     policy: Policy | None
     bounds: EstimateBounds | None
     further: list[Signal]
+    relearn: Relearn
     species: str
     fsync: bool
     title: str
@@ -194,6 +197,7 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     if not family.simulated and config.plant not in usual:
         log.warning("plant: backend=%s has vials of its own, plant.* changes nothing there", config.backend.kind)
     _check_fit(config, family, scenarios, ends)
+    _check_learning(config, family)
     further = _further(config, plant, folder, scenarios)
     if any(not isinstance(signal, Light) for signal in further):  # the device has to measure what an estimate may need
         backend = family.seeing_fluorescence(backend)
@@ -213,8 +217,8 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         bounds = certificate.bounds(policy, own, folder / "policy.npz", model)
     return Setup(
         family, backend, bench, safety, scenarios, ends, config.roles(), plant, model, config.controller, wanted,
-        policy, bounds, further, read_pair(config.pair).second.name, config.fsync, *_named(config, family, folder),
-        resumed,
+        policy, bounds, further, config.relearn, read_pair(config.pair).second.name, config.fsync,
+        *_named(config, family, folder), resumed,
     )  # fmt: skip
 
 
@@ -244,6 +248,19 @@ def _check_fit(config: DeployConfig, family: Family, scenarios: list[Scenario], 
     with frame.refusing(ReactorError):
         family.fits(config.backend, config.bench, scenarios, ends)
         _check_room(config, family)
+
+
+def _check_learning(config: DeployConfig, family: Family) -> None:
+    """Whether this run can learn. Raises: UserError."""
+    said = f"relearn.every_h = {config.relearn.every_h:g}"
+    if not config.relearn.every_h:
+        return
+    if config.composition is None or not registry.takes(config.composition.kind, "policy", registry.SHARE):
+        found = "no share is held" if config.composition is None else f"composition={config.composition.kind}"
+        raise frame.UserError(f"{said}: {found}, which follows no policy; give composition=dqn_preview, or 0")
+    if family.simulated:
+        why = f"backend={config.backend.kind} is over in seconds, a training takes minutes"
+        raise frame.UserError(f"{said}: {why}; give 0, or backend=emulator")
 
 
 def _check_room(config: DeployConfig, family: Family) -> None:

@@ -8,6 +8,7 @@ from conf.schema import check, part, require, setting
 from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
+from experiments.control.question import Relearn
 from experiments.laws import registry
 from experiments.laws.density.learned import LearnedConfig
 from experiments.loop.share import ShareWarnings
@@ -61,8 +62,11 @@ class DeployConfig:
         "what decides the temperature where the scenario asks for a share: a preset of `composition`; null: nothing",
     )
     composition_policy: str = setting(
-        "shipped", "of composition=dqn and dqn_preview: `shipped`, a policy.npz, or a run folder"
+        "shipped",
+        "of composition=dqn and dqn_preview: `shipped`, a policy.npz, or a run folder: of a deployment the policy that "
+        "flew last",
     )
+    relearn: Relearn = part(Relearn, "when composition=dqn or dqn_preview learns during the run, from the run")
     share_warnings: ShareWarnings = part(ShareWarnings, "when a share is said to be out of control")
     signals: dict[str, Any] = setting(
         {}, "further signals that are held, brought by extend=FILE.py: signals.NAME.kind=LAW signals.NAME.KEY=VALUE"
@@ -74,7 +78,8 @@ class DeployConfig:
     plant_file: str | None = setting(None, "a twin.yaml of calibrate, or `latest`, in place of `plant`; backend=sim")
     notify: str = setting(
         "",
-        "who is told of start, alarms, hand-overs and end: a command that reads lines of JSON, or env:NAME, a variable "
+        "who is told of start, alarms, hand-overs, learned policies and end: a command that reads lines of JSON, or "
+        "env:NAME, a variable "
         "with a command or an address; an address on the command line goes on as env:DEPLOY_HOOK; empty: nobody",
     )
     fsync: bool = setting(True, "every row on the disk before the next command")

@@ -131,7 +131,7 @@ class Notifier:
             self._thread.start()
 
     def __call__(self, event: str, text: str, reactor: str = "") -> None:
-        """Queue a message. Args: event: start, alarm, hand_over or end. reactor: "" for all."""
+        """Queue a message. Args: event: start, alarm, hand_over, policy or end. reactor: "" for all."""
         if self._thread is None:
             return
         at = datetime.now().astimezone().isoformat(timespec="seconds")

@@ -32,7 +32,11 @@ class TrainConfig:
         None,
         "species of env=coculture: a preset of conf/strains, a pair.yaml of calibrate_pair, its run; null: env.pair",
     )
-    env_file: str | None = setting(None, "a calibrated.yaml, or `latest`: what calibrate wrote last; replaces env")
+    env_file: str | None = setting(
+        None,
+        "a calibrated.yaml, or `latest`: what calibrate wrote last; replaces env. Of env=coculture and "
+        "coculture_preview a run that held a share: its growth curves",
+    )
     seed: int = setting(0, "of the first agent", at_least=0)
     n_agents: int = setting(1, "with seeds seed, seed + 1, ... in one process", within=(1, 100_000))
     device: str = setting("cpu", "where networks are trained", choices=("cpu", "cuda"))

@@ -16,7 +16,7 @@ from dqn.policy import Policy
 from envs.coculture.task import CocultureConfig
 from envs.task import EnvConfig, step_factors
 from experiments.cli import files, frame
-from experiments.cli.calibrated import read_env_file, read_pair
+from experiments.cli.calibrated import read_curves, read_env_file, read_pair
 from experiments.laws.density.estimator import EstimatorConfig
 from experiments.reporting import charts
 from experiments.training import announcements, tasks
@@ -36,7 +36,9 @@ def train(config: TrainConfig, folder: Path) -> float:
     grid stays unseen by whoever chooses hyper-parameters.
     """
     if config.env_file is not None:
-        config = replace(config, env=read_env_file(config.env_file), env_file=None)
+        composed = isinstance(config.env, CocultureConfig)
+        env = read_curves(config.env_file, config.env) if composed else read_env_file(config.env_file)
+        config = replace(config, env=env, env_file=None)
         frame.save_config(config, folder)
     if config.pair is not None:
         if not isinstance(config.env, CocultureConfig):

@@ -34,7 +34,7 @@ RUNS = {
     "dqn": [*TEN, "backend.seed=5"],
     "pi": [*TEN, "controller=pi", "backend.reactors=[M0,M1]"],
     "pi_tuned": [*TEN, "controller=pi_tuned"],
-    "shares": [*TEN, "plant=coculture", "composition=proportional", "scenario.ratios=[0.4]"],
+    "shares": [*TEN, "plant=coculture", "composition=dqn_preview", "scenario.ratios=[0.4]"],
 }
 pytestmark = pytest.mark.xdist_group("curves")  # its tests share these runs
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from experiments.laws.base import Array, Mask
 from hardware.memory import Remembers
 
-__all__ = ["Array", "Estimate", "Law", "Mask", "ShareEstimator", "Wanted"]
+__all__ = ["Acts", "Array", "Estimate", "Law", "Mask", "ShareEstimator", "Wanted"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,12 +110,8 @@ class ShareEstimator(Remembers, Protocol):
         ...
 
 
-class Law(Remembers, Protocol):
+class Acts(Protocol):
     """Chooses thermostat targets from an estimate. Rows are independent."""
-
-    def reset(self, n: int) -> None:
-        """Forget everything; n cultures from here on."""
-        ...
 
     def act(self, estimate: Estimate, wanted: Wanted, minute: Array, rows: Mask) -> Array:
         """Thermostat targets, degC, (N,), called once per control period of the density.
@@ -123,4 +119,12 @@ class Law(Remembers, Protocol):
         A law with a longer period of its own keeps its target until that is over. Args: minute: since the program
         began, (N,). rows: True where the estimate is new and a setpoint is in force; only these rows' state advances.
         """
+        ...
+
+
+class Law(Acts, Remembers, Protocol):
+    """What a run goes on with when it is resumed."""
+
+    def reset(self, n: int) -> None:
+        """Forget everything; n cultures from here on."""
         ...

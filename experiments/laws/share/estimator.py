@@ -141,6 +141,31 @@ class CompositionEstimator:
         """Minute of the newest readings, -inf before there are any, (N,)."""
         return np.where(self.begun, self._minute, -np.inf)
 
+    @property
+    def measured(self) -> Array:
+        """Newest temperature by the thermometer, degC, (N,)."""
+        return self._temperature
+
+    def lagging(self, thermometer: Array) -> tuple[Array, Array, Array]:
+        """What is behind the temperature, for errors of the thermometer (N,): rates of both species by their curves,
+        1/h, (N, 2); production of pigment, (N,), and of each minute that it still feels, (N, delay), counts/OD/h."""
+        weight, _ = _through(thermometer)
+        rates, made = np.einsum("nsc,nc->ns", self._lagged, weight), np.einsum("nc,nc->n", self._production, weight)
+        return rates, made, np.einsum("ndc,nc->nd", self._past, weight)
+
+    def of(self, idx: Rows) -> "CompositionEstimator":
+        """A copy that knows these cultures, each as often as it is named."""
+        other = CompositionEstimator(self.config, self.volumes_ml[idx], self.pair)
+        for key in self.remembers:
+            name = f"_{key}" if hasattr(self, f"_{key}") else key
+            setattr(other, name, getattr(self, name)[idx].copy())
+        return other
+
+    @property
+    def volumes_ml(self) -> Array:
+        """V of each culture, mL, (N,)."""
+        return np.broadcast_to(np.asarray(self._volume_ml, dtype=np.float64), self._given_ml.shape)
+
     def dosed(self, volume_ml: Array) -> None:
         """Fresh medium that went in since this was last called, mL, (N,)."""
         self._given_ml = self._given_ml + volume_ml
@@ -212,7 +237,7 @@ class CompositionEstimator:
         before = self._temperature[idx]
         after = np.where(np.isfinite(temperature), temperature, before)
         steps = np.maximum(np.ceil(minutes / LONGEST_STEP_MIN - 1e-6), 1.0)
-        dose = self._given_ml[idx] / np.broadcast_to(self._volume_ml, self._given_ml.shape)[idx]
+        dose = self._given_ml[idx] / self.volumes_ml[idx]
         for k in range(int(steps.max())):
             on = k < steps
             length, slope = (minutes / steps)[on], ((after - before) / steps)[on]
@@ -405,7 +430,7 @@ class CompositionEstimator:
 
     def explain(self) -> dict[str, Array]:
         """Share with its 95 % band, errors of growth curves and thermometer, flow, density, pigment; each (N,)."""
-        now = self.estimate()
+        now, (_, error_sds) = self.estimate(), self.growth_errors()
         low, high = (1.0 / (1.0 + np.exp(-now.logit - side * 1.96 * now.sd)) for side in (-1.0, 1.0))
         return {
             "ratio": now.share,
@@ -413,6 +438,8 @@ class CompositionEstimator:
             "ratio_high": high,
             "bias_e": now.error_e,
             "bias_p": now.error_p,
+            "bias_e_sd": error_sds[:, 0],
+            "bias_p_sd": error_sds[:, 1],
             "thermometer_error": now.thermometer,
             "dose_gain": self._mixed(self.mean[..., GAIN]),
             "dose_spread": self._mixed(np.sqrt(self._dose_variance(np.arange(len(self.mean))))),

@@ -40,34 +40,61 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
     """T = actions[argmax_a Q(o, a)] with o = [logit r, T, m_p, logit s], and with preview [..., logit of the next
     setpoint, minutes until then].
 
-    Shown in place of m_p is m_p - b_e mu_e(33.2): an error b_e of the other curve moves the share as much as that of
-    m_p does. A change further ahead than the policy was trained for is not shown to it yet. It decides as often as in
-    training.
-    Args: policy: with one of these observations. preview: whether it must be the longer one.
+    Shown in place of m_p is m_p - (b_e - b) mu_e(33.2): an error b_e of the other curve, beyond the b that it was
+    trained with, moves the share as much as that of m_p does. A change further ahead than the policy was trained for is
+    not shown to it yet. It decides as often as in training.
+    Args: policy: with one of these observations, which all cultures follow until `follow` gives one another.
+    Attributes: number, of the policy that each culture follows, 0 for that, (N,).
     Raises: ValueError for a policy of another task.
     """
 
     def __init__(self, config: LearnedLawConfig, policy: Policy, pair: PairConfig | None = None) -> None:
-        preview = config.kind == "dqn_preview"
+        self._policies: dict[int, Policy] = {}
+        super().__init__(config, pair)
+        self._check(policy)
+        self.policy = self._policies[0] = policy
+        self.preview_min = float(policy.metadata["model"]["preview_min"])
+        self.control_min = float(policy.metadata["control_min"])
+
+    def _check(self, policy: Policy) -> None:
+        preview = self.config.kind == "dqn_preview"
         task, expected = ("coculture_preview", COCULTURE_PREVIEW) if preview else ("coculture", COCULTURE)
         remedy = f"one with observation {list(expected)}, as env={task} trains"
         require(policy.observation == expected, "policy", list(policy.observation), remedy)
-        self.policy, self._expected = policy, expected
-        self.preview_min = float(policy.metadata["model"]["preview_min"])
-        super().__init__(config, pair)
         known = build(PairConfig(), policy.metadata["model"].get("pair", {}), "pair")
         here, there = (f"{p.first.name} and {p.second.name}" for p in (self.pair, known))
         off = np.abs(known.rates(grid := np.linspace(*self.pair.temperatures, 71)) - self.pair.rates(grid)).max()
         said = f"of {there}, for a run with {here}; growth differs by up to {off:.2g} 1/h"
         allowed = "the run's own: train one with pair=... of the run, or give a law without a policy"
         require(_unnamed(known) == _unnamed(self.pair), "policy's pair", said, allowed)
-        self.control_min = float(policy.metadata["control_min"])
+
+    def reset(self, n: int) -> None:
+        """See `Law.reset`; every culture follows the first policy."""
+        super().reset(n)
+        self.number = np.zeros(n, dtype=np.int64)
+
+    def follow(self, n: int, number: int, policy: Policy) -> None:
+        """From now on culture n follows a policy of its own, of a number > 0, like the first one in task and timing.
+
+        Raises: ValueError for a policy that is not.
+        """
+        self._check(policy)
+        for key, mine in (("control_min", self.control_min), ("preview_min", self.preview_min)):
+            found = float({**policy.metadata["model"], **policy.metadata}[key])
+            require(found == mine, f"policy's {key}", found, f"{mine:g}, as of the policy before it")
+        self._policies[number], self.number[n] = policy, number
 
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         now = logit(wanted.setpoint)
-        rate = estimate.rate - estimate.error_e * self.pair.rates(self._even_c)[0]
+        following = self.number[idx]
+        known = np.array([self._policies[k].metadata["model"].get("scale_e", 1.0) for k in following])
+        rate = estimate.rate - (1.0 + estimate.error_e - known) * self.pair.rates(self._even_c)[0]
         columns = [estimate.logit, estimate.temperature, rate, now]
-        if self._expected == COCULTURE_PREVIEW:
+        if self.policy.observation == COCULTURE_PREVIEW:
             shown = wanted.minutes <= self.preview_min
             columns += [np.where(shown, logit(wanted.following), now), np.where(shown, wanted.minutes, 0.0)]
-        return self.policy.chosen(np.stack(columns, axis=1))
+        observation, chosen = np.stack(columns, axis=1), np.empty(idx.size)
+        for k in np.unique(following):
+            rows = following == k
+            chosen[rows] = self._policies[int(k)].chosen(observation[rows])
+        return chosen
