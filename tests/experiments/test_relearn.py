@@ -39,7 +39,7 @@ from experiments.loop.share import program_of
 from experiments.record.record import Record
 from experiments.record.summary import composition_figure_of
 from hardware import memory
-from hardware.storage.journal import read_journal
+from hardware.storage.journal import Journal, read_journal
 
 SHIPPED = SHIPPED_COMPOSITION["dqn_preview"]
 BIAS_E, BIAS_P, GAIN, FACTOR, THERMOMETER = 4, 5, 6, 7, 9
@@ -143,6 +143,7 @@ def test_the_vials_are_what_is_believed_of_the_culture() -> None:
         assert found.mean() == pytest.approx(middle, abs=4.0 * sd / 3000**0.5), k
         assert found.std() == pytest.approx(sd, rel=0.1), k
     np.testing.assert_allclose(plant.thermal.read(), 33.2)
+    np.testing.assert_allclose(plant.thermal.target, 33.2)
     np.testing.assert_allclose(plant.vessel.volume_ml, 16.0)
 
 
@@ -215,6 +216,42 @@ def test_vials_go_on_where_a_culture_is_that_has_just_changed_its_temperature() 
         assert abs((run["estimate"][:, k] - run["share"][:, k]).mean()) < 0.01, k
 
 
+def test_what_is_compared_is_the_program_that_is_still_to_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    run_share = lesson.run_share
+    monkeypatch.setattr(lesson, "run_share", lambda *given: (seen.append(run_share(*given)), seen[-1])[1])
+    shipped, asked = policies.load(SHIPPED), question()
+    schedule = {**asked.schedule, "setpoints": [0.3, 0.4, 0.5, 0.6]}
+    asked = replace(asked, elapsed_min=1000.0, schedule=schedule)  # twenty minutes before the last change
+    assert asked.hours == pytest.approx((1000.0 / 60.0, 1000.0 / 60.0 + 2.0))
+    found = lesson.judged(asked, shipped, shipped)
+    (run,) = seen
+    wanted = np.where(np.arange(1000, 1121) < 1020, 0.7, 0.3)
+    np.testing.assert_allclose(
+        np.abs(run["share"] - wanted).mean(axis=1), np.concatenate(list(found.values())), rtol=1e-6
+    )
+    assert run["od"][:, 100:].mean() == pytest.approx(0.6, abs=0.02)
+    assert replace(asked, elapsed_min=1590.0).hours == pytest.approx((26.5, 27.0))
+
+
+def test_the_policy_in_force_is_the_one_that_is_named(tmp_path: Path) -> None:
+    (tmp_path / "policies").mkdir()
+    policies.save(tmp_path / FIRST, policies.load(SHIPPED))
+    (tmp_path / "policies" / "009.json").write_text(replace(question(), in_force=named(7)).text())
+    done = lesson_of(tmp_path / "policies" / "009.json")
+    assert done.returncode == 1
+    assert "007.npz: no such file" in done.stderr
+
+
+def test_curves_on_which_the_starts_disagree_are_not_known() -> None:
+    one = estimator(sds=0.001)
+    one.mean[0, :, BIAS_E] = np.linspace(-0.1, 0.1, one.mean.shape[1])
+    one.log_weight[:] = 0.0
+    errors, sds = one.growth_errors()
+    assert errors[0] == pytest.approx([0.0, 0.0])
+    assert sds[0] == pytest.approx([np.linspace(-0.1, 0.1, 5).std(), 0.001], rel=1e-3)
+
+
 # -- the law -----------------------------------------------------------------------------------------------------------
 
 
@@ -236,6 +273,11 @@ def test_each_culture_follows_its_own_policy_and_is_shown_what_that_does_not_kno
         return float(policy.chosen(np.array([[0.0, 33.2, 0.9 - beyond * growth, *logit, 300.0]]))[0])
 
     assert chosen == pytest.approx([by_hand(law.policy, -0.2), by_hand(law.policy, 0.0), by_hand(own, 0.0)])
+    wanted = Wanted(x + 0.55, x + 0.7, x + 270.0)
+    later = law.act(estimate, wanted, x + 30.0, np.array([False, False, True]))
+    logit = [np.log(s / (1.0 - s)) for s in (0.55, 0.7)]
+    assert later[:2] == pytest.approx(chosen[:2])
+    assert later[2] == pytest.approx(own.chosen(np.array([[0.0, 33.2, 0.9, *logit, 270.0]]))[0])
     slower = replace(own, metadata={**own.metadata, "control_min": 20.0})
     with pytest.raises(ValueError, match=r"control_min = 20.*30"):
         law.follow(1, 5, slower)
@@ -366,7 +408,8 @@ def test_a_better_policy_flies_with_its_origin_and_is_named_before_it_does(tmp_p
         assert flight.told[0][0] == "policy"
         assert "flies from now on" in flight.told[0][1]
         (row,) = learning.learned
-        figure = composition_figure_of(record.table(), flight.setup.scenarios, "P. putida", "", [row])
+        other = {**row, "number": 2, "flies": False}
+        figure = composition_figure_of(record.table(), flight.setup.scenarios, "P. putida", "", [row, other])
         assert [text.get_text().strip() for text in figure.axes[0].texts] == ["policy 001"]
         go(loop, learning, record, 1.0)
     with flight.life() as (_, learning, _):
@@ -376,6 +419,65 @@ def test_a_better_policy_flies_with_its_origin_and_is_named_before_it_does(tmp_p
     (flight.folder / named(1)).unlink()
     with pytest.raises(frame.UserError, match=r"001\.npz.*in force by the journal"), flight.life():
         pass
+
+
+def test_two_reactors_that_differ_learn_each_its_own(tmp_path: Path) -> None:
+    words = ("backend.reactors=[M0,M1]", "+bench.volumes_ml.M1=14", "scenario.recovery_od=0.6")
+    flight = Flight(tmp_path / "run", QUICK, *words)
+    with flight.life() as (loop, learning, record):
+        learning._rests = np.inf
+        step = go(loop, learning, record, 130.0)
+        assert (step.elapsed < step.minute - 3.0).all(), "the schedule begins behind the recovery"
+        learning._last_min[:], learning._rests = (60.0, 0.0), 0.0
+        step = go(loop, learning, record, 1.0)
+    asked = Question.read(flight.folder / "policies" / "001.json")
+    assert (asked.reactor, asked.volume_ml, asked.in_force) == ("M1", 14.0, FIRST)
+    assert asked.elapsed_min == pytest.approx(step.elapsed[1])
+    assert asked.rests_on_min[1] == pytest.approx(step.minute[1])
+    judge(flight, 1, flies=True)
+    with flight.life() as (loop, learning, record):
+        assert learning._law.number.tolist() == [0, 1]
+        assert flight.rows("judged")[0]["minute"] == pytest.approx(0.0, abs=0.1)
+        learning._rests = np.inf
+        go(loop, learning, record, 130.0)
+        learning._last_min[:], learning._rests = (60.0, 0.0), 0.0
+        go(loop, learning, record, 1.0)
+        assert [row["number"] for row in flight.rows("learn")] == [1, 2]
+        assert Question.read(flight.folder / "policies" / "002.json").in_force == named(1)
+        learning.close()
+        minute = loop.reactors.elapsed() / 60.0
+        learning._judged(2, "M1", None, "by hand")
+        assert flight.rows("judged")[-1]["minute"] == pytest.approx(minute)
+    with pytest.raises(frame.UserError, match=r"composition_policy\.npz of M0, .*001\.npz of M1"):
+        composition_policy("dqn_preview", str(flight.folder), tmp_path, False)
+
+
+def test_the_policy_in_force_is_the_newest_that_flew_also_behind_a_long_journal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = Journal(tmp_path / "journal.jsonl", fsync=False)
+    for number, name, flies in ((1, "M0", True), (2, "M1", True), (3, "M0", True), (4, "M0", False)):
+        journal.append("learn", {"number": number, "reactor": name})
+        journal.append("judged", {"number": number, "reactor": name, "flies": flies})
+    for _ in range(20):
+        journal.append("sample", {"pad": "x" * 100})
+    journal.close()
+    monkeypatch.setattr("hardware.storage.journal.TAIL", 500)
+    again = Journal(tmp_path / "journal.jsonl", fsync=False)
+    again.close()
+    assert flown(again.rows) == {"M0": 3, "M1": 2}
+    assert [row["number"] for row in again.rows if row["kind"] == "learn"] == [1, 2, 3, 4]
+
+
+def test_a_resumed_run_goes_on_with_the_policy_it_began_with(tmp_path: Path) -> None:
+    policies.save(tmp_path / "own.npz", claiming(0.8))
+    (tmp_path / "run").mkdir()
+    first = composition_policy("dqn_preview", str(tmp_path / "own.npz"), tmp_path / "run", False)
+    (tmp_path / "own.npz").unlink()
+    again = composition_policy("dqn_preview", str(tmp_path / "own.npz"), tmp_path / "run", True)
+    assert first is not None
+    assert again is not None
+    assert again.metadata["model"] == first.metadata["model"] == claiming(0.8).metadata["model"]
 
 
 def test_a_worse_policy_does_not_fly_and_the_run_does_not_ask_again_at_once(tmp_path: Path) -> None:
