@@ -5,6 +5,7 @@ BOARD_PYTHON=python3.7 runs the agent under the interpreter of the board.
 
 import json
 import os
+import select
 import socket
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -324,22 +326,28 @@ def test_names_and_addresses_of_the_board(door: tuple[Proxy, Recorder]) -> None:
 def test_who_dribbles_is_sent_away_and_keeps_nobody_out(
     door: tuple[Proxy, Recorder], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(board_agent, "HEAD_S", 0.3)
     port = door[0].server_address[1]
-    slow = [socket.create_connection(("127.0.0.1", port), timeout=10.0) for _ in range(board_agent.CONNECTIONS)]
-    for line in slow:
-        line.sendall(b"G")
-    assert ask(port, "GET", "/x", BEARER)[0] == 204  # in the place of the first of them
-    with slow.pop(0) as oldest:
+
+    def dribbling(count: int, head_s: float) -> list[socket.socket]:
+        monkeypatch.setattr(board_agent, "HEAD_S", head_s)
+        lines = [open_.enter_context(socket.create_connection(("127.0.0.1", port), timeout=30.0)) for _ in range(count)]
+        for line in lines:
+            line.sendall(b"G")
+        return lines
+
+    with ExitStack() as open_:
+        oldest = dribbling(board_agent.CONNECTIONS, 120.0)[0]
+        assert ask(port, "GET", "/x", BEARER)[0] == 204  # in the place of the first of them
         assert oldest.recv(65536) == b""
-    began = time.monotonic()
-    while time.monotonic() < began + 0.4:  # no pause between two bytes is as long as the time for all of them
-        for line in slow[:4]:
-            line.sendall(b"E")
-        time.sleep(0.05)
-    for line in slow:
-        assert line.recv(65536).startswith(b"HTTP/1.1 408 ")
-        line.close()
+    with ExitStack() as open_:
+        slow, until = dribbling(4, 1.0), time.monotonic() + 60.0
+        while slow:  # no pause between two bytes is as long as the time for all of them
+            assert time.monotonic() < until
+            for line in select.select(slow, [], [], 0.05)[0]:
+                assert line.recv(65536).startswith(b"HTTP/1.1 408 ")
+                slow.remove(line)
+            for line in slow:
+                line.sendall(b"E")
     AgentLab.until(lambda: ask(port, "GET", "/x", BEARER)[0] == 204)
 
 
