@@ -252,7 +252,8 @@ def composition_figure_of(
     for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
         began = np.nanmin(table.columns["time_min"][n] - table.columns["elapsed_min"][n], initial=np.inf)
         minute, share = program_of(scenario).announcements(scenario.announce_min)
-        announced.append((minute + began, share))
+        known = minute + began <= np.nanmax(table.columns["time_min"][n], initial=-np.inf)  # a run may end before
+        announced.append((minute[known] + began, share[known]))
         mine = [(m.time_min, m.share, m.sd) for m in table.marks if m.reactor == name and m.share is not None]
         counted.append(tuple(np.array(mine, dtype=np.float64).reshape(-1, 3).T))
     flew = [(table.names.index(r["reactor"]), r["minute"], f"policy {r['number']:03d}") for r in learned if r["flies"]]

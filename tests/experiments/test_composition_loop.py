@@ -405,6 +405,10 @@ def test_the_figure_shows_of_each_reactor_its_own_announcements_and_counts_at_th
     assert share.get_ylabel() == "share of B. subtilis"
     told = [line.get_xydata().tolist() for line in share.lines if line.get_marker() == ">"]
     assert told == [[[(70.0 + 40.0) / 60.0, 0.7]], [[(40.0 + 25.0) / 60.0, 0.5]]]
+    ended = {key: values[:, :34] for key, values in columns.items()}  # at minute 66, before the first one's
+    early = composition_figure_of(Table(("M0", "M1"), ended, [[], []], [], []), scenarios, "B. subtilis", "").axes[0]
+    told = [line.get_xydata().tolist() for line in early.lines if line.get_marker() == ">"]
+    assert told == [[], [[(40.0 + 25.0) / 60.0, 0.5]]]
     drawn = [bar for bar in share.containers if len(bar.lines[0].get_xdata())]
     assert [bar.lines[0].get_xydata().tolist() for bar in drawn] == [[[20 / 60, 0.8]], [[1.0, 0.6], [2.5, 0.3]]]
     (segments,) = (line.get_segments() for line in drawn[1].lines[2])
