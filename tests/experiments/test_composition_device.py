@@ -174,7 +174,7 @@ def test_a_sample_that_was_not_decided_on_keeps_its_light(tmp_path: Path) -> Non
 def test_processes_killed_and_resumed_lose_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     words = ("scenario.ratios=[0.3]", "scenario.temperatures=[33.2]", "composition=proportional")
-    pace = {"speed": 30.0, "longest_s": 4.0, "answer_s": 2.0}
+    pace = {"speed": 15.0, "longest_s": 8.0, "answer_s": 4.0}  # a sample stands 4 s before the next one replaces it
     config = KillConfig(kills=3, runs=1, workers=1, reactors=("M0", "M1"), overrides=words, plant="coculture", **pace)
     for name in config.reactors:
         for part, pump in (("feed", SOUND.feed), ("waste", SOUND.waste)):
