@@ -448,6 +448,10 @@ def test_two_reactors_that_differ_learn_each_its_own(tmp_path: Path) -> None:
         minute = loop.reactors.elapsed() / 60.0
         learning._judged(2, "M1", None, "by hand")
         assert flight.rows("judged")[-1]["minute"] == pytest.approx(minute)
+        learning._last_min[:] = (minute, 0.0)
+        go(loop, learning, record, 1.0)
+        third = Question.read(flight.folder / "policies" / "003.json")
+        assert (third.reactor, third.in_force) == ("M1", named(1)), "the second one did not fly"
     with pytest.raises(frame.UserError, match=r"composition_policy\.npz of M0, .*001\.npz of M1"):
         composition_policy("dqn_preview", str(flight.folder), tmp_path, False)
 
