@@ -227,11 +227,12 @@ def test_a_policy_sees_what_it_was_trained_on(column, x, wanted, expected):
         assert law("dqn", policy=linear_policy(COCULTURE, column)).act(seen(x), wanted, *at(0))[0] == expected
 
 
-def test_a_policy_decides_as_often_as_in_training():
-    found = law("dqn", policy=linear_policy(COCULTURE, "logit_share", control_min=30.0))
+@pytest.mark.parametrize(("kind", "sees", "every"), [("dqn", COCULTURE, 10), ("dqn_preview", COCULTURE_PREVIEW, 5)])
+def test_a_policy_decides_as_often_as_the_law_says_not_as_in_training(kind, sees, every):
+    found = law(kind, policy=linear_policy(sees, "logit_share", control_min=30.0))
     assert found.act(seen(1.0), asked(0.5), *at(0))[0] == 35.0
-    assert found.act(seen(-1.0), asked(0.5), *at(29))[0] == 35.0
-    assert found.act(seen(-1.0), asked(0.5), *at(30))[0] == 30.0
+    assert found.act(seen(-1.0), asked(0.5), *at(every - 1))[0] == 35.0
+    assert found.act(seen(-1.0), asked(0.5), *at(every))[0] == 30.0
 
 
 def test_what_cannot_be_built_is_said_in_one_line():

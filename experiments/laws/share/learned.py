@@ -19,9 +19,7 @@ class LearnedLawConfig(LawConfig):
     """The policy that sees no change before it comes."""
 
     kind: str = setting("dqn", "which law of the composition")
-    control_min: float = setting(
-        10.0, "between decisions; the target is kept in between", "min", within=(1, 240), note="the policy's own counts"
-    )
+    control_min: float = setting(10.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
 @dataclass(frozen=True)
@@ -29,6 +27,7 @@ class PreviewLawConfig(LearnedLawConfig):
     """The policy to which changes are announced."""
 
     kind: str = setting("dqn_preview", "which law of the composition")
+    control_min: float = setting(5.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
 def _unnamed(pair: PairConfig) -> PairConfig:
@@ -42,7 +41,8 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
 
     Shown in place of m_p is m_p - (b_e - b) mu_e(33.2): an error b_e of the other curve, beyond the b that it was
     trained with, moves the share as much as that of m_p does. A change further ahead than the policy was trained for is
-    not shown to it yet. It decides as often as in training.
+    not shown to it yet. It may decide more often than in training, as a receding horizon does: an action is worth what
+    it is worth for a whole period, and is thought over before.
     Args: policy: with one of these observations, which all cultures follow until `follow` gives one another.
     Attributes: number, of the policy that each culture follows, 0 for that, (N,).
     Raises: ValueError for a policy of another task.
@@ -54,7 +54,6 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
         self._check(policy)
         self.policy = self._policies[0] = policy
         self.preview_min = float(policy.metadata["model"]["preview_min"])
-        self.control_min = float(policy.metadata["control_min"])
 
     def _check(self, policy: Policy) -> None:
         preview = self.config.kind == "dqn_preview"
@@ -79,8 +78,8 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
         Raises: ValueError for a policy that is not.
         """
         self._check(policy)
-        for key, mine in (("control_min", self.control_min), ("preview_min", self.preview_min)):
-            found = float({**policy.metadata["model"], **policy.metadata}[key])
+        for key in ("control_min", "preview_min"):
+            found, mine = (float(p.metadata["model"][key]) for p in (policy, self.policy))
             require(found == mine, f"policy's {key}", found, f"{mine:g}, as of the policy before it")
         self._policies[number], self.number[n] = policy, number
 
