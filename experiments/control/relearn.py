@@ -215,9 +215,9 @@ class Relearning:
         try:
             out.mkdir(exist_ok=True)
             with (out / "lesson.log").open("ab") as told:
-                self._child = subprocess.Popen(
+                self._child = subprocess.Popen(  # Ctrl-C is not for it; in another session nice would count for nothing
                     ["nice", "-n", str(self.config.nice), *lesson], stdin=subprocess.PIPE, stdout=told, stderr=told,
-                    start_new_session=True, env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
+                    process_group=0, env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
                 )  # fmt: skip
             self._began, self._ended = self._clock(), np.inf
         except OSError as error:

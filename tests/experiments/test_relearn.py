@@ -273,12 +273,12 @@ def test_each_culture_follows_its_own_policy_and_is_shown_what_that_does_not_kno
         return float(policy.chosen(np.array([[0.0, 33.2, 0.9 - beyond * growth, *logit, 300.0]]))[0])
 
     assert chosen == pytest.approx([by_hand(law.policy, -0.2), by_hand(law.policy, 0.0), by_hand(own, 0.0)])
-    wanted = Wanted(x + 0.55, x + 0.7, x + 270.0)
-    later = law.act(estimate, wanted, x + 30.0, np.array([False, False, True]))
+    wanted = Wanted(x + 0.55, x + 0.7, x + 295.0)
+    later = law.act(estimate, wanted, x + 5.0, np.array([False, False, True]))
     logit = [np.log(s / (1.0 - s)) for s in (0.55, 0.7)]
     assert later[:2] == pytest.approx(chosen[:2])
-    assert later[2] == pytest.approx(own.chosen(np.array([[0.0, 33.2, 0.9, *logit, 270.0]]))[0])
-    slower = replace(own, metadata={**own.metadata, "control_min": 20.0})
+    assert later[2] == pytest.approx(own.chosen(np.array([[0.0, 33.2, 0.9, *logit, 295.0]]))[0])
+    slower = replace(own, metadata={**own.metadata, "model": {**own.metadata["model"], "control_min": 20.0}})
     with pytest.raises(ValueError, match=r"control_min = 20.*30"):
         law.follow(1, 5, slower)
 
@@ -389,6 +389,8 @@ def begun(folder: Path, plan: Relearn = QUICK, *words: str) -> Flight:
         go(loop, learning, record, 62.0 + 60.0 * plan.every_h)
         assert learning._child is not None
         child = learning._child
+        assert os.getsid(child.pid) == os.getsid(0), "Linux weighs sessions against each other, and nice within one"
+        assert os.getpgid(child.pid) == child.pid, "Ctrl-C is not for it"
     assert child.poll() is not None, "no training outlives the run"
     assert flight.rows("judged") == []
     return flight
