@@ -9,6 +9,7 @@ import copy
 import json
 import logging
 import os
+import time
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -60,6 +61,14 @@ class RelearnedConfig:
     special: int = setting(2, "more in each row in which one thing is not as the pair says", within=(0, 64))
     steps: int = setting(Relearn.steps, "of each training", within=(1000, 1_000_000))
     hours: float = setting(24.0, "of the judge, and of the second day", "h", within=(2, 48))
+    judgements: int = setting(
+        200,
+        "on vials of their own, of both policies of the first nominal vial: how often does the worse one fly?",
+        within=(0, 10_000),
+    )
+    limit_min: float = setting(
+        0.0, "no training begins later, rows are of what is trained by then; 0: none", "min", at_least=0
+    )
     workers: int = setting(0, "processes; 0 for one per core", within=(0, 256))
     seed: int = setting(2, "of vials and noise", at_least=0)
 
@@ -92,12 +101,19 @@ class Second:
 
 
 class Seen(Recall):
-    """An estimator of which a copy is kept as it was after a day."""
+    """An estimator of which a copy is kept as it was after a day.
+
+    known_h: since when both growth curves have been known well enough for a training, h, (N,); nan: not yet.
+    """
 
     after_a_day: CompositionEstimator | None = None
+    known_h: Array = np.empty(0)
 
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         super().watch(od, fluorescence, temperature, minute, rows)
+        doubt = self.estimator.growth_errors()[1].max(axis=1)
+        before = self.known_h if self.known_h.size else np.full(len(doubt), np.nan)
+        self.known_h = np.where(doubt > Relearn.sd, np.nan, np.where(np.isnan(before), minute / 60.0, before))
         if float(minute.max()) == DAY_MIN - 1:
             self.after_a_day = copy.deepcopy(self.estimator)
 
@@ -141,17 +157,29 @@ def flown(conditions: Conditions, config: RelearnedConfig, law_of: Second) -> tu
     return estimator, np.abs(trace.share - trace.setpoint)[DAY_MIN:].mean(axis=0)
 
 
-def answered(file: Path) -> None:
-    """A training and its verdict, unless an earlier life of the study has them."""
+def answered(file: Path, until: float) -> bool:
+    """Whether there is a training and its verdict, of an earlier life of the study or one that began until then."""
     os.environ["OMP_NUM_THREADS"] = "1"
-    if not (file.with_suffix("") / "verdict.json").is_file():
+    if not (there := (file.with_suffix("") / "verdict.json").is_file()) and time.time() < until:
         logging.disable(logging.WARNING)
         lesson.answer(file)
+        return True
+    return there
 
 
 def verdict(place: Path) -> Verdict:
     """Of one vial."""
     return Verdict(**json.loads((place / "policies" / "001" / "verdict.json").read_text(encoding="utf-8")))
+
+
+def misjudged(pool: Workers, question: Question, one: Policy, other: Policy, times: int) -> dict[str, float]:
+    """How often the worse of two policies flies, judged for 6 h on other vials each time; all say which one it is."""
+    asked = [replace(question, number=k, relearn={**question.relearn, "hours": 6.0}) for k in range(1, times + 1)]
+    found = [job.result() for job in [pool.submit(lesson.judged, each, one, other) for each in asked]]
+    less = float(np.mean([np.subtract(errors["new"], errors["old"]) for errors in found]))
+    worse, better = ("new", "old") if less > 0.0 else ("old", "new")
+    flew = sum(Verdict({"new": errors[worse], "old": errors[better]}, np.nan).flies for errors in found)
+    return {"judgements": times, "worse_by": abs(less), "worse_flew": flew}
 
 
 def compared(less: Array) -> str:
@@ -168,31 +196,43 @@ def relearned(config: RelearnedConfig, folder: Path) -> None:
     after = estimator.after_a_day
     assert after is not None
     found: dict[str, Array] = {"shipped": errors}
+    known_h = [float(np.nanquantile(estimator.known_h, q)) for q in (0.05, 0.5, 0.95)]
+    log.info("growth is known to %g after %.1f h (5 %%: %.1f, 95 %%: %.1f)", Relearn.sd, *np.take(known_h, [1, 0, 2]))
+    until, new = time.time() + 60.0 * config.limit_min if config.limit_min else np.inf, {}
     with Workers(config.workers) as pool:
         jobs = {}
-        for k, place in enumerate(places):
+        for k, place in reversed(list(enumerate(places))):  # every kind is there soon
             (place / "policies").mkdir(parents=True, exist_ok=True)
             policies.save(place / FIRST, shipped)
             file = place / "policies" / "001.json"
             file.write_text(asked(after.of(np.array([k])), config, k).text(), encoding="utf-8")
-            jobs[pool.submit(answered, file)] = k
-        for done, job in enumerate(as_completed(jobs), 1):
-            job.result()
-            log.info("%d of %d, %s: %s", done, len(jobs), rows[jobs[job]], verdict(places[jobs[job]]).why)
-    new = {k: policies.load(place / "policies" / "001" / "policy.npz") for k, place in enumerate(places)}
-    flies = np.array([verdict(place).flies for place in places])
+            jobs[pool.submit(answered, file, until)] = k
+        for job in as_completed(jobs):
+            if job.result():
+                place = places[k := jobs[job]]
+                new[k] = policies.load(place / "policies" / "001" / "policy.npz")
+                log.info("%d of %d, %s: %s", len(new), len(jobs), rows[k], verdict(place).why)
+        judge = {}
+        if config.judgements:
+            k = next((k for k in sorted(new) if rows[k] == "nominal"), max(new))
+            question = Question.read(places[k] / "policies" / "001.json")
+            judge = misjudged(pool, question, shipped, new[k], config.judgements)
+            log.info("the worse policy, by %(worse_by).4f, flies %(worse_flew)d times of %(judgements)d", judge)
+    flies = np.array([k in new and verdict(place).flies for k, place in enumerate(places)])
     found["trained"] = flown(conditions, config, Second(law(LAW, shipped), learned=new))[1]
     found["with learning"] = np.where(flies, found["trained"], found["shipped"])
     found |= {kind: flown(conditions, config, Second(law(LAW, shipped), law(kind)))[1] for kind in BESIDE}
     table = []
-    for row in dict.fromkeys(rows):
-        own = np.array([one == row for one in rows])
+    for row in dict.fromkeys(rows[k] for k in sorted(new)):
+        own = np.array([k in new and one == row for k, one in enumerate(rows)])
         cells = [row, f"{flies[own].sum()} of {own.sum()}", *(f"{error[own].mean():.4f}" for error in found.values())]
         table.append([*cells, *(compared(found["with learning"][own] - found[than][own]) for than in THAN)])
     head = ["vials", "flew", *found, *(f"less {than}" for than in THAN)]
     (folder / "table.md").write_text(markdown(head, table), encoding="utf-8")
-    verdicts = [verdict(place).row() for place in places]
-    files.write_json(folder / "summary.json", {"rows": rows, "errors": found, "verdicts": verdicts, "table": table})
+    verdicts = [verdict(place).row() if k in new else None for k, place in enumerate(places)]
+    content = {"rows": rows, "errors": found, "verdicts": verdicts, "table": table, "judge": judge}
+    content["known_h"] = known_h
+    files.write_json(folder / "summary.json", content)
 
 
 main = command(__file__, RelearnedConfig(), relearned)

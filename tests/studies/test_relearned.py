@@ -1,5 +1,6 @@
 """The study of learning during a run: which vials fly, when a law is changed, and how a difference is told."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from tests.studies.relearned import (
     asked,
     compared,
     law,
+    misjudged,
     vials,
 )
 from tests.studies.second_vials import draw
@@ -62,6 +64,20 @@ def test_after_a_day_each_vial_flies_its_own() -> None:
 )
 def test_a_difference_in_words(less: list[float], told: str) -> None:
     assert compared(np.array(less)) == told
+
+
+def test_how_often_the_worse_policy_flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    luck = iter([[-0.02] * 3 + [-0.021], [0.04] * 4, [-0.05, 0.05, 0.0, 0.0], [0.05] * 4])  # less than the better one's
+
+    def judged(question: Question, old: str, new: str) -> dict[str, list[float]]:
+        assert (question.hours[1] - question.hours[0], old, new) == (pytest.approx(6.0), "shipped", "own")
+        return {"old": [0.1] * 4, "new": [0.1 + less for less in next(luck)]}
+
+    monkeypatch.setattr("tests.studies.relearned.lesson.judged", judged)
+    one = CompositionEstimator(CompositionEstimatorConfig())
+    with ThreadPoolExecutor(1) as pool:
+        found = misjudged(pool, asked(one, SMALL, 0), "shipped", "own", 4)  # type: ignore[arg-type]
+    assert found == {"judgements": 4, "worse_by": pytest.approx((0.04 + 0.05 - 0.02025) / 4), "worse_flew": 1}
 
 
 def test_the_question_is_of_the_day_that_comes(tmp_path: Path) -> None:
