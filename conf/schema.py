@@ -9,8 +9,9 @@ docs/configuration.md are written from the same fields.
 import copy
 import math
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from difflib import get_close_matches
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 __all__ = ["Entry", "build", "check", "entries", "part", "require", "setting"]
@@ -152,17 +153,54 @@ def build(default: T, values: Mapping[str, Any], prefix: str = "") -> T:
     Args:
       default: an instance; what `values` leaves out stays as it is there.
       prefix: where the config stands, for messages.
-    Raises: ValueError naming a key that does not exist, or key, value and what is allowed.
+    Raises: ValueError naming a key that does not exist, and the one that is most like it; or key, value and what is
+      allowed.
     """
+    try:
+        return _built(default, values, prefix)
+    except _NoSuchKey as error:
+        key, of = error.args
+        above, _, name = key.rpartition(".")
+        moved = "; it is said under bench" if name in ON_BENCH else ""
+        meant = "" if moved else _meant(name, default, prefix)
+        where = f"under {above}" if above else "here"
+        raise ValueError(f"{key}: no such key{moved}{meant}; allowed {where}: {', '.join(of)}") from None
+
+
+class _NoSuchKey(Exception):
+    """With the whole key, and the names that there are in its place."""
+
+
+def _keys(config: Any, prefix: str) -> Iterator[str]:
+    """Every key below a config dataclass, whole."""
+    for f in fields(config):
+        key, value = f"{prefix}.{f.name}" if prefix else f.name, getattr(config, f.name)
+        yield key
+        if is_dataclass(value):
+            yield from _keys(value, key)
+
+
+def _meant(name: str, config: Any, prefix: str) -> str:
+    """The key of the whole tree that is most like a name, as the end of a sentence; "" if none is."""
+    keys: dict[str, str] = {}
+    for key in sorted(_keys(config, prefix), key=lambda key: key.count(".")):
+        last = key.rpartition(".")[2]
+        initials = "".join(word[0] for word in last.split("_")) if "_" in last else last
+        for called in (last, initials):
+            keys.setdefault(called, key)
+    near = get_close_matches(name, keys, 1, 0.75)
+    return f"; did you mean {keys[near[0]]}?" if near else ""
+
+
+def _built(default: T, values: Mapping[str, Any], prefix: str) -> T:
+    """See `build`. Raises: _NoSuchKey."""
     of = {f.name: f for f in fields(cast(Any, default))}
     hints = get_type_hints(type(default))
     given = {}
     for name, entry in values.items():
         key = f"{prefix}.{name}" if prefix else str(name)
         if name not in of:
-            where = f"under {prefix}" if prefix else "here"
-            moved = "; it is said under bench" if name in ON_BENCH else ""
-            raise ValueError(f"{key}: no such key{moved}; allowed {where}: {', '.join(of)}")
+            raise _NoSuchKey(key, list(of))
         given[name] = _converted(entry, hints[name], getattr(default, name), key)
     return replace(cast(Any, default), **given)  # type: ignore[no-any-return]
 
@@ -178,7 +216,7 @@ def _converted(given: Any, hint: Any, default: Any, key: str) -> Any:
     if holds_part or origin is dict:
         require(isinstance(given, Mapping), key, given, f"keys and values, as {key}.NAME=VALUE")
     if holds_part:
-        return build(default if is_dataclass(default) else hint(), given, key)
+        return _built(default if is_dataclass(default) else hint(), given, key)
     if origin is dict:
         of, own = (inner[1] if inner else Any), default or {}
         return own | {str(k): _converted(v, of, own.get(k), f"{key}.{k}") for k, v in given.items()}

@@ -287,6 +287,8 @@ def test_every_argument_has_the_form_that_hydra_takes(given, understood):
         ("env.nois=1", ["env.nois", "no such key", "mu, tau"]),
         ("+env.nois=1", ["env.nois", "no such key", "mu, tau"]),
         ("foo=1", ["foo", "no such key", "n_agents"]),
+        ("lr=1", ["lr: no such key; did you mean agent.learning_rate?; allowed here: env, agent"]),
+        ("total_steps=9", ["did you mean agent.total_steps?"]),
         ("+foo=1", ["foo", "no such key", "n_agents"]),
         ("env=simm", ["env=simm", "no such option", "sim"]),
         ("+experiment=nope", ["experiment=nope", "no such option", "smoke"]),

@@ -48,6 +48,9 @@ def test_fields_keep_their_defaults_and_mutable_ones_are_not_shared():
     assert Outer().named is not Outer().named
 
 
+INNER, OUTER = "rate, law, spare, span", "inner, share, goals, count, on, budget, named, free, whatever"
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -61,7 +64,9 @@ def test_fields_keep_their_defaults_and_mutable_ones_are_not_shared():
         ({"inner": {"span": [2]}}, "outer.inner.span = [2.0]: allowed [low, high] with 0 < low <= high <= 4"),
         ({"inner": {"law": None}}, "inner.law = None: allowed text"),
         ({"inner": 3}, "inner = 3: allowed keys and values, as inner.NAME=VALUE"),
-        ({"inner": {"ratte": 1}}, "inner.ratte: no such key; allowed under inner: rate, law, spare, span"),
+        ({"inner": {"ratte": 1}}, "inner.ratte: no such key; did you mean inner.rate?; allowed under inner: " + INNER),
+        ({"law": "cubic"}, "law: no such key; did you mean inner.law?; allowed here: " + OUTER),
+        ({"lhh": 3}, "lhh: no such key; allowed here: " + OUTER),
         ({"share": 2}, "share = 2.0: allowed 0 to 1"),
         ({"goals": [0.5, 2]}, "goals = [0.5, 2.0]: allowed one or more, each 0 < OD <= 1.5"),
         ({"goals": []}, "goals = []: allowed one or more, each 0 < OD <= 1.5"),
@@ -72,7 +77,7 @@ def test_fields_keep_their_defaults_and_mutable_ones_are_not_shared():
         ({"on": "perhaps"}, "on = perhaps: allowed true or false"),
         ({"budget": "inf"}, "budget = inf mL: allowed a finite number greater than 0"),
         ({"named": {"a": {"rate": 2}}}, "outer.inner.rate = 2.0 mL/s: allowed 0 < rate <= 1"),
-        ({"nois": 1}, "nois: no such key; allowed here: inner, share, goals, count, on, budget, named, free, whatever"),
+        ({"nois": 1}, "nois: no such key; allowed here: " + OUTER),
     ],
 )
 def test_what_is_wrong_is_one_line_with_key_value_and_range(values, message):

@@ -177,6 +177,8 @@ class Command(Generic[T]):
             sys.exit(stop.STATUS)
         except Exception as error:
             line = _refusal(error)
+            if isinstance(error, FileNotFoundError):  # no folder can be made there, as under /proc
+                line = f"{error.filename}: {error.strerror}; {PLACE}"
             if line is None and isinstance(error, UserError | ValueError | HydraException | OmegaConfBaseException):
                 line = _one_line(error)  # a ValueError is the schema's own word on a value
             inside = any(stack.f_code is Command._job.__code__ for stack, _ in walk_tb(error.__traceback__))

@@ -59,8 +59,9 @@ def test_a_full_disk_is_one_line(limit: int, words: list[str], tmp_path: Path) -
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    done = run("experiments.calibrate", "hydra.run.dir=file/run", cwd=tmp_path)
-    refused(done, "error: file/run: Not a directory; choose a folder that can be written, with hydra.run.dir=FOLDER")
+    for place, why in (("file/run", "Not a directory"), ("/proc/run", "No such file or directory")):
+        done = run("experiments.calibrate", f"hydra.run.dir={place}", cwd=tmp_path)
+        refused(done, f"error: {place}: {why}; choose a folder that can be written, with hydra.run.dir=FOLDER")
 
 
 def test_a_standard_output_that_is_full_is_one_line(tmp_path: Path) -> None:
