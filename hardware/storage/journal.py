@@ -16,9 +16,11 @@ __all__ = ["REMEDY", "Journal", "read_journal"]
 TAIL = 20_000_000  # bytes; about 16 h of eight reactors
 REMEDY = "the file was changed by hand: put it back as the run wrote it, or start a new run"
 LANDMARKS = tuple(
-    f'"kind":"{kind}"'.encode() for kind in ("device", "temperature", "regulate", "level", "share", "learn", "judged")
+    f'"kind":"{kind}"'.encode()
+    for kind in ("device", "temperature", "regulate", "guard", "level", "share", "learn", "judged")
 )
-"""Identities, blanks, thermostat targets, hand-overs, levels, counted shares and trainings: valid for days."""
+"""Identities, blanks, thermostat targets, hand-overs, overflow pumps, levels, counted shares and trainings: valid for
+days."""
 
 
 def _plain(value: Any) -> Any:

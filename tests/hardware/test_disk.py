@@ -203,6 +203,6 @@ def test_a_long_journal_keeps_what_a_naive_reader_keeps(tmp_path: Path, monkeypa
         assert (reader.cut, reader.next_row) == (0, 12)
     assert all(
         json.loads(b"{" + mark + b"}")["kind"]
-        in ("device", "temperature", "regulate", "level", "share", "learn", "judged")
+        in ("device", "temperature", "regulate", "guard", "level", "share", "learn", "judged")
         for mark in LANDMARKS
     )

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from hardware.chibio.resume import replay
 from hardware.errors import RecordingError
 from hardware.storage.journal import Journal, read_journal
 
@@ -153,3 +154,32 @@ def test_a_long_journal_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.Mo
     assert [row["k"] for row in rows] == list(range(501))
     assert torn == 0
     assert (tmp_path / "j").stat().st_size > whole
+
+
+def test_what_was_said_once_days_ago_is_known_behind_20_mb_of_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A resumed run doses no reactor that the device regulates, heats as it was asked to, and takes no mark twice."""
+    journal = Journal(tmp_path / "j", fsync=False)
+    for kind, fields in (
+        ("start", {}),
+        ("device", {"reactor": "M0", "device_id": "28-0516", "blank": 21500.0}),
+        ("temperature", {"reactor": "M1", "temperature": 30.0}),
+        ("regulate", {"reactor": "M0", "setpoint": 0.6}),
+        ("guard", {"reactor": "M2", "pump": "Pump3", "duty": 0.1, "found": "off"}),
+        *((kind, {"reactor": "M1"}) for kind in ("level", "share", "learn", "judged")),
+        *(("sample", {"reactor": "M0", "od": 0.6}) for _ in range(300)),
+    ):
+        journal.append(kind, fields)
+    journal.close()
+    monkeypatch.setattr("hardware.storage.journal.TAIL", 4000)
+    again = Journal(tmp_path / "j", fsync=False)
+    again.close()
+    assert len(again.rows) < 100
+    known = replay(again.rows)
+    assert (known["M0"].device_id, known["M0"].blank, known["M0"].handed_over) == ("28-0516", 21500.0, 0.6)
+    assert known["M1"].temperature == 30.0
+    assert known["M2"].overflow_pump_on
+    assert [row["kind"] for row in again.rows if row["kind"] in ("level", "share", "learn", "judged")] == [
+        "level", "share", "learn", "judged",
+    ]  # fmt: skip
