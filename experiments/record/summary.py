@@ -16,7 +16,7 @@ from experiments.loop.progress import Progress
 from experiments.loop.share import program_of
 from experiments.loop.signals import FILTER_ALARM
 from experiments.record.record import Table
-from experiments.record.recovery import Rows
+from experiments.record.recovery import Array, Rows
 from experiments.reporting import charts
 from experiments.reporting.composition_charts import composition_figure
 from hardware.safety.interlock import kinds_of
@@ -230,13 +230,17 @@ def shares_table(windows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines) if kept else ""
 
 
+def _setpoint(table: Table) -> Array:
+    """What was asked of the OD, nan in a recovery, which asks for nothing; (N, K)."""
+    return np.where(table.columns["phase"] >= 0, table.columns["setpoint"], np.nan)
+
+
 def figure_of(table: Table, scenarios: Sequence[Scenario], title: str) -> Figure:
     """OD over setpoint, pump rate and, where a scenario changes it, temperature of all reactors."""
     c = table.columns
-    setpoint = np.where(c["phase"] >= 0, c["setpoint"], np.nan)
     switched = any(len(set(s.temperatures)) > 1 for s in scenarios)
     temperature = c["temperature_degc"].T if switched else None
-    series = (c["time_min"].T, table.od().T, setpoint.T, c["pump_rate_ml_s"].T)
+    series = (c["time_min"].T, table.od().T, _setpoint(table).T, c["pump_rate_ml_s"].T)
     marks = [(m.time_min, f"{m.reactor} {m.text}".strip()) for m in table.marks if m.share is None]
     return charts.closed_loop(*series, table.names, temperature, title, marks, table.od(refused=True).T)
 
@@ -257,6 +261,5 @@ def composition_figure_of(
         mine = [(m.time_min, m.share, m.sd) for m in table.marks if m.reactor == name and m.share is not None]
         counted.append(tuple(np.array(mine, dtype=np.float64).reshape(-1, 3).T))
     flew = [(table.names.index(r["reactor"]), r["minute"], f"policy {r['number']:03d}") for r in learned if r["flies"]]
-    return composition_figure(
-        {**table.columns, "od": table.od()}, table.names, species, title, announced, counted, flew
-    )
+    columns = {**table.columns, "od": table.od(), "setpoint": _setpoint(table)}
+    return composition_figure(columns, table.names, species, title, announced, counted, flew)

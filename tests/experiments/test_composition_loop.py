@@ -17,7 +17,7 @@ from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.share import COLUMNS, Share, ShareWarnings, program_of
 from experiments.loop.signals import Sample, Signal
 from experiments.record.record import Table
-from experiments.record.summary import composition_figure_of
+from experiments.record.summary import composition_figure_of, figure_of
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Measurement
 from hardware.safety.config import SafetyConfig
@@ -130,8 +130,9 @@ def test_each_reactor_has_its_own_program_and_is_told_its_changes_as_far_ahead_a
     phases = {"setpoints": (0.5, 0.5), "minutes": (100.0, 100.0), "temperatures": (33.2, 33.2)}
     steps = [Scenario(**phases, ratios=(0.3, 0.7), announce_min=ahead) for ahead in (60.0, 20.0)]
     keeper = Scripted()
-    step(held(keeper, [*steps, replace(HOLD, ratios=(0.4,))]), 500.0, elapsed=50.0)
+    composed = step(held(keeper, [*steps, replace(HOLD, ratios=(0.4,))]), 500.0, elapsed=50.0)
     wanted, minute, _ = keeper.asked
+    assert composed.columns["ratio_setpoint"].tolist() == [0.3, 0.3, 0.4]
     assert wanted.setpoint.tolist() == [0.3, 0.3, 0.4]
     assert wanted.following.tolist() == [0.7, 0.3, 0.4]
     assert wanted.minutes.tolist() == [50.0, 0.0, 0.0]
@@ -392,7 +393,7 @@ def test_the_figure_shows_of_each_reactor_its_own_announcements_and_counts_at_th
     columns = {"time_min": np.tile(minutes, (2, 1)), "elapsed_min": elapsed, "believed": np.ones_like(rest)}
     columns |= dict.fromkeys(("ratio", "ratio_low", "ratio_high", "ratio_setpoint", "od", "setpoint"), rest)
     columns |= {"temperature_degc": 80.0 * rest, "temperature_target_degc": 81.0 * rest, "fluorescence": 900.0 * rest}
-    columns["pump_rate_ml_s"] = 0.01 * rest
+    columns["pump_rate_ml_s"], columns["phase"] = 0.01 * rest, np.where(np.isnan(elapsed), -1.0, 0.0)
     marks = [Mark(60.0, "M1", "", None, 0.6, 0.05), Mark(90.0, "M0", "", 12.0), Mark(150.0, "M1", "", None, 0.3, 0.02)]
     marks.append(Mark(20.0, "M0", "", None, 0.8, 0.01))
     table = Table(("M0", "M1"), columns, [[], []], [], marks)
@@ -401,10 +402,14 @@ def test_the_figure_shows_of_each_reactor_its_own_announcements_and_counts_at_th
         Scenario(**phases, minutes=(100.0, 60.0), ratios=(0.3, 0.7), announce_min=30.0),
         Scenario(**phases, minutes=(90.0, 60.0), ratios=(0.2, 0.5), announce_min=50.0),
     ]
-    share, heat, _, pump, light = composition_figure_of(table, scenarios, "B. subtilis", "title").axes
+    share, heat, density, pump, light = composition_figure_of(table, scenarios, "B. subtilis", "title").axes
     assert share.get_ylabel() == "share of B. subtilis"
     told = [line.get_xydata().tolist() for line in share.lines if line.get_marker() == ">"]
     assert told == [[[(70.0 + 40.0) / 60.0, 0.7]], [[(40.0 + 25.0) / 60.0, 0.5]]]
+    alone = figure_of(table, scenarios, "").axes[0]
+    for ax, unit in ((density, 60.0), (alone, 1.0)):  # while a culture recovers it has no setpoint
+        asked = [line.get_xydata() for line in ax.lines if line.get_linestyle() == "--"]
+        assert [xy[np.isfinite(xy[:, 1]), 0].min() * unit for xy in asked] == pytest.approx([40.0, 26.0])
     ended = {key: values[:, :34] for key, values in columns.items()}  # at minute 66, before the first one's
     early = composition_figure_of(Table(("M0", "M1"), ended, [[], []], [], []), scenarios, "B. subtilis", "").axes[0]
     told = [line.get_xydata().tolist() for line in early.lines if line.get_marker() == ">"]

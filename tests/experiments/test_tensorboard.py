@@ -32,7 +32,7 @@ RUNS = {
     "learning": [*SHORT, "seed=3"],
     "population": [*SHORT, "n_agents=2"],
     "dqn": [*TEN, "backend.seed=5"],
-    "pi": [*TEN, "controller=pi", "backend.reactors=[M0,M1]"],
+    "pi": [*TEN, "controller=pi", "backend.reactors=[M0,M1]", "plant.start_od=0.4", "scenario.recovery_od=0.44"],
     "pi_tuned": [*TEN, "controller=pi_tuned"],
     "shares": [*TEN, "plant=coculture", "composition=dqn_preview", "scenario.ratios=[0.4]"],
 }
@@ -100,7 +100,9 @@ def test_the_curves_of_a_deployment_are_its_recording_over_minutes(runs: Path) -
         np.testing.assert_array_equal(step, recorded.time_min.round())
         np.testing.assert_allclose(curve(events, "pump/rate_ml_s")[:, 1], recorded.pump_rate, rtol=1e-6)
         for edge, factor in (("low", 0.95), ("high", 1.05)):
-            assert set(curve(events, f"culture/setpoint_{edge}")[:, 1]) == {np.float32(0.45 * factor)}
+            asked = curve(events, f"culture/setpoint_{edge}")
+            assert set(asked[:, 1]) == {np.float32(0.45 * factor)}
+            assert asked[0, 0] == step[od >= 0.44][0] > 1  # from the end of the recovery on
     (events,) = parts(runs / "dqn")
     assert len(curve(events, "culture/od")) == len(read_recording(runs / "dqn" / "recordings" / "M0.csv").od)
 
