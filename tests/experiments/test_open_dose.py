@@ -124,10 +124,29 @@ def test_they_are_booked_once_however_often_the_program_dies(tmp_path: Path) -> 
     run.begin()  # dies again before its first sample
     run.close()
     run.wait(100.0)
-    run.resumed()
+    steps = run.resumed()
+    assert "overflow" not in reasons(steps)  # what the waste pump took out with each of them is booked too
+    assert run.loop.interlock.budget.volume_ml[0] < 20.0 + 1.3
+    assert run.loop.interlock.budget._hour[0].max() < 2.5  # each in the minute in which it was given
     assert abs(run.off_by_ml()) < 1.0
     assert "left open" in run.note()
     assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
+
+
+def test_a_repeat_that_stands_in_a_row_already_is_in_no_second_one(tmp_path: Path) -> None:
+    """The second life decides with the repeats booked, and dies before it can save that it has."""
+    run = Cut(tmp_path, FEED_ON)
+    run.wait(500.0)
+    run.begin()
+    run._request, run.device.submit = TARGET, run._cut  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        for _ in run.run(run.clock.now() + 300.0):
+            pass
+    run.close()
+    run.wait(100.0)
+    run.resumed()
+    assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
+    assert abs(run.off_by_ml()) < 1.0
 
 
 @pytest.mark.parametrize("how", ["worker_wipe", "power_cut"])

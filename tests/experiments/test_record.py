@@ -9,6 +9,7 @@ import pytest
 from experiments.record.record import Record
 from experiments.record.recovery import COLUMNS, load_state
 from hardware.errors import RecordingError
+from hardware.storage.doses import Ending
 
 
 def decision(minute: float) -> dict[str, object]:
@@ -66,6 +67,20 @@ def test_a_sample_that_was_not_decided_on_becomes_a_row_without_a_dose(tmp_path:
     killed_after(tmp_path, ("sample", sample(9.0)), ("decision", decision(9.0)))
     Record(tmp_path, ("M0",), fsync=False).close()
     assert [float(r["time_min"]) for r in rows(tmp_path)] == [2.0, 3.0, 9.0]
+
+
+def test_what_the_device_repeated_while_nobody_watched_stands_in_the_row_after_it(tmp_path: Path) -> None:
+    """0.7 mL at minute 2 and once more before minute 5, where 0.4 mL are given; and the vial beside it has its own."""
+    other = {"reactor": "M1"}
+    ended = ("dose_end", {"reactor": "M0", **Ending(131.0, 0.7, 9.0, 1, 1).row()})
+    events = [("sample", sample(2.0)), ("decision", decision(2.0)), ("intent", intent(0.7)), FED]
+    events += [("sample", sample(2.1) | other), ("decision", decision(2.1) | other), ended]
+    events += [("intent", intent(0.2) | other), ("feed_on", {**FED[1], **other})]
+    events += [("sample", sample(5.0)), ("decision", decision(5.0)), ("intent", intent(0.4)), FED]
+    killed_after(tmp_path, *events)
+    record = Record(tmp_path, ("M0", "M1"), fsync=False)
+    record.close()
+    assert [list(own.columns["volume_ml"]) for own in record.rows] == [[0.7, pytest.approx(1.1)], [0.2]]
 
 
 def test_state_that_cannot_be_written_ends_the_run_with_the_remedy(tmp_path: Path) -> None:

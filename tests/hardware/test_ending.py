@@ -8,6 +8,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hardware.chibio.dosing import PumpCalibration
@@ -152,6 +153,26 @@ def test_a_look_says_nothing_of_a_pump_whose_end_was_answered_nor_without_an_ope
     assert found(ReactorHistory(), read(True, True), 1000.0, 101.0, SILENCE_S, {}) == {}
 
 
+@pytest.mark.parametrize(
+    ("stopped", "repeats"),
+    [
+        # feed on for 122.5 s, waste for 129 s: two periods of 63 s and 3 s of a third
+        ({"Pump1": 222.5, "Pump2": 228.0}, [(163.0, 1.2, 6.3), (226.0, 0.0, 2.1)]),
+        # an agent that keeps no record: at most 130 s after the last answer, feed for 132 s, waste for 133
+        (None, [(163.0, 1.2, 6.3), (226.0, 1.2, 4.9)]),
+    ],
+)
+def test_the_waste_pump_s_repeats_end_when_an_agent_stopped_it_and_have_its_own_flow(
+    stopped: dict[str, float] | None, repeats: list[tuple[float, float, float]]
+) -> None:
+    """The vial's ledger is lower by them; forgotten, a sound vial would be said to overflow."""
+    row = found(OPEN, read(False, False), 1500.0, 102.0, SILENCE_S, stopped)
+    ending, _ = conclude(OPEN.after({"kind": "found", **row}), 1500.0, PUMP, PumpCalibration(flow_ml_s=0.7))
+    np.testing.assert_allclose(ending.repeats(), repeats)
+    booked = [(one.at_s, one.feed_ml, one.waste_ml) for one in ending.beyond(1.2)]
+    np.testing.assert_allclose(booked[-2:], repeats)
+
+
 def test_a_spare_pump_s_dose_is_told_as_its_own() -> None:
     known = replace(OPEN, feed_pump="Pump3")
     ending, _ = after(known, replace(read(False, False), pumps_on=(False, False, True, False)), 170.0)
@@ -180,10 +201,10 @@ def test_repetitions_are_told_one_by_one_and_survive_the_journal() -> None:
 
 
 def test_every_dose_of_a_journal_in_the_order_of_time() -> None:
-    def intent(n: int, name: str, on_s: float) -> dict[str, object]:
+    def intent(n: int, name: str, on_s: float, **pump: str) -> dict[str, object]:
         return {
             "n": n, "kind": "intent", "reactor": name, "on_s": on_s, "feed_ml": 1.2, "waste_ml": 9.0,
-            "sample": [0, 1], "feed_duty": 0.019, "waste_duty": 0.143,
+            "sample": [0, 1], "feed_duty": 0.019, "waste_duty": 0.143, **pump,
         }  # fmt: skip
 
     rows = [
@@ -192,11 +213,14 @@ def test_every_dose_of_a_journal_in_the_order_of_time() -> None:
         {"n": 3, "kind": "dose_end", "reactor": "M0", **Ending(11.0, 0.7, 9.0).row()},
         intent(4, "M0", 70.0), {"n": 5, "kind": "feed_on", "reactor": "M0", "on_s": 71.0},
         intent(6, "M1", 72.0), {"n": 7, "kind": "feed_on", "reactor": "M1", "on_s": 73.0},
-        {"n": 8, "kind": "dose_end", "reactor": "M0", **Ending(71.0, 1.2, 9.0, 2, 2).row()},
+        {"n": 8, "kind": "dose_end", "reactor": "M0", **Ending(71.0, 1.2, 9.0, 1, 2, waste_last_ml=3.0).row()},
+        intent(9, "M0", 300.0, feed_pump="Pump3"), {"n": 10, "kind": "feed_on", "reactor": "M0", "on_s": 301.0},
+        {"n": 11, "kind": "dose_end", "reactor": "M0", **Ending(301.0, 1.2, 9.0, 1, 1, pump=3).row()},
     ]  # fmt: skip
-    assert [(d.n, d.reactor, d.at_s, d.feed_ml, d.again) for d in dosed(rows)] == [
-        (0, "M0", 11.0, 0.7, False), (4, "M0", 71.0, 1.2, False), (6, "M1", 72.0, 1.2, False),
-        (8, "M0", 134.0, 1.2, True), (8, "M0", 197.0, 1.2, True),
+    assert [(d.n, d.reactor, d.at_s, d.feed_ml, d.waste_ml, d.again, d.pump) for d in dosed(rows)] == [
+        (0, "M0", 11.0, 0.7, 9.0, False, 1), (4, "M0", 71.0, 1.2, 9.0, False, 1), (6, "M1", 72.0, 1.2, 9.0, False, 1),
+        (8, "M0", 134.0, 1.2, 9.0, True, 1), (8, "M0", 197.0, 0.0, 3.0, True, 1),
+        (9, "M0", 301.0, 1.2, 9.0, False, 3), (11, "M0", 364.0, 1.2, 9.0, True, 3),
     ]  # fmt: skip
     assert replay(rows)["M1"].fed
     assert not replay(rows[:3])["M1"].fed
