@@ -3,10 +3,12 @@
 import threading
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from hardware.board import board_agent
 from hardware.board.board_agent import Agent, Device
+from hardware.link.serial import encode_request
 
 
 class Wait(threading.Event):
@@ -26,6 +28,40 @@ class Wait(threading.Event):
         return self.now >= self._end_s
 
 
+class Asked(Device):
+    """A device that carries out what it is asked, and remembers it."""
+
+    def __init__(self) -> None:
+        super().__init__("http://127.0.0.1:1", 1.0)
+        self.paths: list[str] = []
+
+    def request(self, method: str, path: str, timeout_s: float | None = None) -> tuple[int, bytes, str]:
+        self.paths.append(path)
+        return 204, b"", "text/html"
+
+
+class Watched:
+    """An agent and its clock. unverified: of the passes, which one by one cannot be verified; all others are.
+
+    Attributes: seen, when it made a pass.
+    """
+
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, end_s: float, meanwhile: dict[float, str], unverified: str = ""
+    ) -> None:
+        clock = SimpleNamespace(monotonic=lambda: 0.0, strftime=lambda form: "")
+        monkeypatch.setattr(board_agent, "time", clock)
+        self.agent, self.seen = Agent(Asked(), 120.0), list[float]()
+        wait = Wait(end_s, meanwhile, self.agent)
+        self.agent._stop, clock.monotonic = wait, lambda: wait.now
+
+        def sweep(beats: int) -> list[str]:
+            self.seen.append(wait.now)
+            return ["M0: still on: Pump1"] if unverified[len(self.seen) - 1 :][:1] == "x" else []
+
+        monkeypatch.setattr(self.agent, "sweep", sweep)
+
+
 @pytest.mark.parametrize(
     ("meanwhile", "trips"),
     [
@@ -40,22 +76,45 @@ class Wait(threading.Event):
 def test_it_trips_after_two_minutes_without_a_request_and_once_for_each_silence(
     meanwhile: dict[float, str], trips: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock = SimpleNamespace(monotonic=lambda: 0.0, strftime=lambda form: "")
-    monkeypatch.setattr(board_agent, "time", clock)
-    agent = Agent(Device("http://127.0.0.1:1", 1.0), 120.0)
-    wait = Wait(600.0, meanwhile, agent)
-    agent._stop, clock.monotonic = wait, lambda: wait.now
-    seen: list[float] = []
+    watched = Watched(monkeypatch, 600.0, meanwhile)
+    watched.agent._watch()
+    assert len(watched.seen) == len(trips)
+    assert all(due < at <= due + 0.5 for at, due in zip(watched.seen, trips, strict=True))
+    assert watched.agent.trips == len(trips)
 
-    def sweep(beats: int) -> list[str]:
-        seen.append(wait.now)
-        return []
 
-    monkeypatch.setattr(agent, "sweep", sweep)
-    agent._watch()
-    assert len(seen) == len(trips)
-    assert all(due < at <= due + 0.5 for at, due in zip(seen, trips, strict=True))
-    assert agent.trips == len(trips)
+def test_what_is_not_verified_off_is_tried_after_2_s_and_ever_later_up_to_a_minute_in_each_silence_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A pump that runs on empties a bottle in minutes: the first tries follow at once, and it is never given up."""
+    watched = Watched(monkeypatch, 900.0, {700.0: "request"}, "xxxxxxxxx.xx.")
+    watched.agent._watch()
+    first, second = watched.seen[:10], watched.seen[10:]
+    assert np.diff(first).tolist() == [2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0, 60.0, 60.0]
+    assert np.diff(second).tolist() == [2.0, 4.0]
+    assert watched.agent.trips == 2
+
+
+def test_a_client_that_comes_back_ends_the_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    watched = Watched(monkeypatch, 240.0, {125.0: "request"}, "xxxxxx")
+    watched.agent._watch()
+    assert len(watched.seen) == 3  # at 120, 122 and 126 s; the last one finds it back
+    assert watched.agent.trips == 1
+
+
+def test_the_same_request_is_carried_out_again_after_a_trip_which_undid_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An answer from memory would tell a client that a pump runs which the switch has switched off."""
+    watched = Watched(monkeypatch, 130.0, {})
+    device = watched.agent.device
+    assert isinstance(device, Asked)
+    line = encode_request(1 << 16 | 5, "POST", "/SetOutputOn/Pump1/1/M0")[:-1]
+    answers = [watched.agent.answer_line(line) for _ in range(2)]
+    assert len(device.paths) == 1  # a client that heard no answer asks the same again
+    watched.agent._watch()
+    assert watched.agent.trips == 1
+    answers.append(watched.agent.answer_line(line))
+    assert len(device.paths) == 2
+    assert len(set(answers)) == 1
 
 
 def test_the_allowed_silence_is_two_minutes_unless_said_otherwise() -> None:

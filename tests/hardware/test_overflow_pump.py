@@ -199,6 +199,29 @@ def test_a_start_that_fails_at_one_reactor_leaves_no_guard_on_at_another() -> No
     assert lab.motors_off()
 
 
+@pytest.mark.parametrize("moment", ["/SetOutputOn/Pump3/1/M0", "/Experiment/1/M1", "/SetOutputOn/Pump3/1/M1"])
+def test_ctrl_c_in_the_midst_of_a_start_leaves_it_on_nowhere(moment: str) -> None:
+    """Nobody looks at the bench any more, and it would suck air, or more, for days."""
+    lab = DriverLab(("M0", "M1"), options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3")), overflow_pump=PUMP)
+    inner = lab.wire.inner
+    real = inner.post
+
+    def interrupted(path: str) -> Any:
+        reply = real(path)
+        if path == moment:
+            raise KeyboardInterrupt
+        return reply
+
+    inner.post = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        lab.reactors.begin()
+    assert lab.device.apps["M0"].data["Pump3"]["target"] == 0.5  # it had been on
+    assert lab.motors_off()
+    lab.clock.sleep(200.0)
+    assert lab.motors_off()
+    assert not any(lab.device.apps[name].data["Pump3"]["ON"] for name in lab.names)
+
+
 def test_a_start_that_fails_and_cannot_switch_it_off_again_says_so() -> None:
     lab = plumbed()
     lab.device.handle("POST", "/Experiment/1/M0")
@@ -236,6 +259,34 @@ def test_a_stopped_experiment_keeps_it() -> None:
     lab.run(5)  # its last cycle ends with everything off
     assert "stopped" in lab.kinds()
     assert runs(lab)
+
+
+def test_a_start_of_its_own_that_switches_it_off_is_no_change_by_somebody_else() -> None:
+    """A cycle thread that died: the experiment is ended and started again, which switches every pump off."""
+    lab = plumbed()
+    lab.reactors.begin()
+    lab.run(5)
+    before = len(posts(lab))
+    lab.fault("cycle_dead")
+    lab.run(20)
+    assert any("restarted after: stalled" in row["note"] for row in lab.of("note"))
+    assert "/SetOutputOn/Pump3/1/M0" in posts(lab)[before:]
+    assert runs(lab)
+    assert not [row["note"] for row in lab.of("note") if "overflow pump" in row["note"]]
+
+
+def test_one_that_a_new_run_found_on_is_told_of_too_when_somebody_switches_it_off() -> None:
+    lab = plumbed()
+    lab.reactors.begin()
+    lab.run(3)
+    lab.client()
+    lab.reactors.begin()
+    lab.run(3)
+    assert not [row for row in lab.of("note") if "overflow pump" in row["note"]]
+    lab.device.handle("POST", "/SetOutputOn/Pump3/0/M0")
+    lab.run(2)
+    assert runs(lab)
+    assert len([row for row in lab.of("note") if "overflow pump was found off" in row["note"]]) == 1
 
 
 def test_a_reactor_handed_over_to_its_own_regulation_keeps_it_beyond_the_end_of_the_run() -> None:

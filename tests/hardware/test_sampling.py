@@ -146,3 +146,39 @@ def test_a_step_of_the_boards_clock_is_noted_and_forgotten() -> None:
     clock.sleep(60.0)
     assert take(sampling, clock, sample(360.0, 2)) == "the board's clock moved by 300 s against this computer's"
     assert sampling.appeared_s == -math.inf
+
+
+def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_time() -> None:
+    """By the time before a step a sample would be minutes late, and no dose would be given any more."""
+    clock, zero_s = VirtualClock(1000.0), 1000.0 + FIRST_SAMPLE_S
+    sampling = Sampling(CONFIG, clock)
+    sampling.expect_first()
+    late: list[float] = []
+    for k, (set_s, waited, seen_s) in enumerate(
+        [
+            (0.0, True, 0.0), (0.0, False, 4.0),
+            (-400.0, False, 0.0), (-400.0, True, 0.0), (-400.0, False, 9.0),  # put back by a time server ...
+            (-90.0, False, 0.0), (-90.0, True, 0.0), (-90.0, False, 5.0),  # ... and put right later
+            (700.0, False, 0.0), (700.0, True, 1.0), (700.0, False, 3.0),
+        ]
+    ):  # fmt: skip
+        clock.sleep(zero_s + 60.0 * k + seen_s - clock.now())
+        if waited:
+            sampling.not_taken(is_new=False)
+        told = take(sampling, clock, sample(60.0 * k + set_s, k + 1))
+        assert bool(told) == (k in (2, 5, 8))
+        late.append(sampling.late_s)
+    assert late == [0.0, 4.0, math.inf, 0.0, 9.0, math.inf, 0.0, 5.0, math.inf, 0.0, 2.0]
+
+
+def test_what_was_known_of_the_clocks_before_a_restart_says_nothing_of_a_sample_after_it() -> None:
+    """Its records begin anew: by the time before, this one would be 20 s old, and a dose fall into a measurement."""
+    clock = VirtualClock(1000.0)
+    sampling = Sampling(CONFIG, clock)
+    sampling.expect_first()
+    clock.sleep(FIRST_SAMPLE_S)
+    take(sampling, clock, sample(0.0, 1))
+    sampling.pass_over(sample(math.nan, 1))
+    clock.sleep(80.0)
+    take(sampling, clock, sample(60.0, 2))
+    assert sampling.late_s == math.inf
