@@ -40,6 +40,8 @@ def test_starts_cover_the_range_and_depend_on_the_seed_of_their_copy_alone() -> 
     for k, (least, most) in enumerate([(-1.2, 1.2), (low, high)]):
         quarters = np.quantile(start[:, k], [0.25, 0.5, 0.75])
         np.testing.assert_allclose(quarters, np.linspace(least, most, 5)[1:4], atol=0.07)
+    thirds = [np.histogram2d(*start.T, 3)[0] / len(start)]  # every error with every share, none is left untrained
+    np.testing.assert_allclose(thirds, 1.0 / 9.0, atol=0.025)
     np.testing.assert_array_equal(one.reset(seed=3 + 41)[0][0], start[41])
 
 

@@ -55,6 +55,9 @@ def test_a_drifting_run_is_told_to_calibrate_again(copy):
     assert "Predicted and measured" in text
     assert "growth 0.03 1/min, tau 0.3333 (nominal)" in text
     assert len(re.findall(r"Recalibrate: .*?the predicted net growth is off by 10 % or more since hour", text)) == 2
+    # in the first two hours growth is off by 6 % in the mean, in the next two by 18 %
+    hours = re.findall(r"10 % or more since hour ([\d.]+)|which no longer holds from hour ([\d.]+) on", text)
+    assert [float(since or on) for since, on in hours] == pytest.approx([2.0] * 4, abs=0.2)
     assert "The interlock spoke in 0 of" in text
     assert "A supervisor acted on 0 rows." in text
     for name in ("M0", "M1"):

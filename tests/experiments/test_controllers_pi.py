@@ -84,17 +84,21 @@ def test_tuned_pi_by_hand() -> None:
     np.testing.assert_allclose(play(TunedPI(TunedPIConfig(), model), [0.51, 0.505], 0.5), expected)
 
 
-def test_tuned_pi_has_the_poles_it_claims() -> None:
-    """Closed around z <- z + mu - u/tau with another mu, z obeys z'' - 1.5 z' + 0.5625 z = 0: double pole 0.75."""
-    model = EnvConfig(mu=0.03, tau=1.0 / 3.0)
-    pi = TunedPI(TunedPIConfig(), model)
+@pytest.mark.parametrize("period", [1.0, 2.0])
+def test_tuned_pi_has_the_poles_it_claims(period: float) -> None:
+    """Closed around z <- z + h (mu - u/tau) with another mu, z obeys z'' - 1.5 z' + 0.5625 z = 0: double pole 0.75.
+
+    With both times of the rule equal to the period h; a reactor that is asked every two minutes is held as well.
+    """
+    model = EnvConfig(mu=0.03, tau=1.0 / 3.0, control_min=period)
+    pi = TunedPI(TunedPIConfig(delay_min=period, closed_loop_min=period), model)
     pi.reset(1)
     z, path = 0.01, []
     for k in range(25):
-        u = pi.act(np.array([0.5 * np.exp(z)]), np.array([0.5]), np.array([float(k)]), np.array([True]))[0]
+        u = pi.act(np.array([0.5 * np.exp(z)]), np.array([0.5]), np.array([period * k]), np.array([True]))[0]
         assert 0.0 < u < 0.02
         path.append(z)
-        z += 0.025 - u / model.tau
+        z += period * (0.025 - u / model.tau)
     p = np.array(path)
     np.testing.assert_allclose(p[2:] - 1.5 * p[1:-1] + 0.5625 * p[:-2], 0.0, atol=1e-14)
     assert abs(p[-1]) < 1e-3

@@ -54,6 +54,16 @@ def test_steps_clock_and_bottle_are_told() -> None:
     assert "may not last" in longer
 
 
+def test_each_step_begins_where_the_one_before_it_is_expected_to_end() -> None:
+    """0.4 to 0.8 takes 10 ln 2 / 0.3 = 23 min; the clock counts from noon, or from the end of a recovery."""
+    words = "setpoints=[0.8,0.8,0.8]", "minutes=[600,90,45]", "until=['od >= 0.8',null,null]", "recovery_od=0.4"
+    text = told("scenario=grow_hold_dilute", "plant.start_od=0.3", *(f"scenario.{word}" for word in words))
+    assert [line.split()[3:7:3] for line in text.splitlines() if line.split()[1:2] == ["Mon"]] == [
+        ["12:00", "12:23"], ["12:23", "13:53"], ["13:53", "14:38"],
+    ]  # fmt: skip
+    assert "the times below count from its end" in text
+
+
 def test_what_the_run_would_refuse_is_refused() -> None:
     with pytest.raises(frame.UserError, match="nowhere"):
         told("policy=nowhere.npz")

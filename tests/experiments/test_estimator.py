@@ -162,6 +162,42 @@ def test_its_doubt_is_that_of_many_vials_drawn_from_its_beliefs() -> None:
     assert np.isfinite(seen_e).all()
 
 
+@pytest.mark.parametrize(("gain", "period"), [(1.0, 1.0), (0.7, 1.0), (0.7, 2.0), (1.4, 5.0)])
+def test_its_doubt_of_a_pump_that_is_not_sound_is_the_scatter_of_vials_as_it_believes_them(
+    gain: float, period: float
+) -> None:
+    """e = ln(x/r)/B and s = mu h/B with B = g u_max h/tau. Too small a doubt of a worn pump keeps a supervisor away."""
+    e, r = Estimator(BARE, replace(MODEL, control_min=period)), np.full(1, 0.4)
+    e.reset(1)
+    e.mean[0] = [np.log(0.6), 0.021, gain, 0.0]
+    sd, alike = np.array([0.006, 0.0006, 0.03 * gain, 1e-6]), np.eye(4)
+    for i, k, how in ((LOG_OD, MU, 0.3), (MU, GAIN, 0.6)):
+        alike[i, k] = alike[k, i] = how
+    e.cov[0] = alike * np.outer(sd, sd)
+    log_od, mu, flow, _ = np.random.default_rng(3).multivariate_normal(e.mean[0], e.cov[0], 100_000).T
+    sound = 0.02 * period / (1 / 3)  # B of a pump as calibrated
+    error, share = (log_od - np.log(0.4)) / (flow * sound), mu * period / (flow * sound)
+    by_hand = np.log(1.5) / (gain * sound), 0.021 * period / (gain * sound)
+    assert [float(v[0]) for v in e.relative(r)] == pytest.approx(by_hand)
+    doubt_e, doubt_s = (float(v[0]) for v in e.doubt(r))
+    assert doubt_s == pytest.approx(np.std(share), rel=0.02)
+    assert doubt_e == pytest.approx(0.006 / (gain * sound))  # B taken as known
+    told_e, told_s = (float(v[0]) for v in e.sd(r))
+    assert told_e == pytest.approx(np.std(error), rel=0.02)
+    assert told_s == pytest.approx(np.hypot(np.std(share), 0.02), rel=0.02)
+
+
+def test_as_long_as_nobody_tells_a_rate_that_was_decided_counts_for_its_whole_period() -> None:
+    """0.01 mL/s for two minutes are 1.2 mL."""
+    told, untold = (Estimator(DEFAULT, replace(MODEL, control_min=2.0)) for _ in range(2))
+    for minute, od in enumerate([0.5, 0.51, 0.52, 0.51, 0.5]):
+        for e in (told, untold):
+            e.see(np.full(1, od), np.full(1, 2.0 * minute), ONE)
+        told.dosed(np.full(1, 1.2))
+        untold.decided(np.full(1, 0.01))
+    np.testing.assert_allclose(untold.mean, told.mean)
+
+
 def test_a_batch_of_64_is_64_singles_with_temperatures_doses_and_rows_that_are_missing() -> None:
     n, steps = 64, 30
     rng = np.random.default_rng(7)

@@ -1,7 +1,7 @@
 """The policy that ships under its supervisor: which law acts, what the journal and the console say of it."""
 
 import logging
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +151,21 @@ def test_surprises_that_do_not_fit_raise_the_alarm(first: list[float], second: l
     assert rate == pytest.approx(by_law if alarm else by_policy, rel=1e-9)
     law.act(np.full(1, np.nan), np.full(1, 0.5), np.full(1, 3.0), one)
     assert law.explain()["alarm"][0] == alarm
+
+
+@pytest.mark.parametrize("period", [1.0, 2.0, 5.0])
+def test_the_law_of_the_supervisor_puts_the_next_sample_on_the_setpoint_whenever_that_is(period: float) -> None:
+    """u = tau (mu + ln(x/r) / h): a dose of a minute every two would let the culture go."""
+    law, one = RelativeController(POLICY, EstimatorConfig(), replace(MODEL, control_min=period), None), np.ones(1, bool)
+    law.reset(1)
+    for k in range(20):
+        law.act(np.full(1, 0.5), np.full(1, 0.5), np.full(1, period * k), one)
+        law.dosed(np.full(1, 20.0 * 0.025 * period))  # as much as grows
+    surprised(law.estimator, [2.2] * 10)
+    law.second.mean[0, LOG_OD] = np.log(0.506)
+    rate = law.act(np.full(1, 0.5), np.full(1, 0.5), np.full(1, period * 19), one)
+    assert law.explain()["supervised"].tolist() == [1.0]
+    assert rate[0] == pytest.approx((0.025 + np.log(0.506 / 0.5) / period) / 3.0, rel=1e-6)
 
 
 def test_vials_are_judged_alone() -> None:
