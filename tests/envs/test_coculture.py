@@ -65,6 +65,14 @@ def test_an_announced_change_comes_nearer_and_is_then_the_setpoint() -> None:
     np.testing.assert_array_equal(passed(PREVIEW, second), second)
 
 
+def test_starts_are_drawn_one_by_one() -> None:
+    """Share, temperature, setpoint, the next one and when it comes: none is known from another."""
+    env = CocultureVectorEnv(4000, PREVIEW)
+    env.reset(seed=1)
+    alike = np.corrcoef(env.state[:, [0, 1, 3, 4, 5]].T)
+    assert np.abs(alike - np.eye(5)).max() < 0.06
+
+
 def test_the_reward_is_that_of_the_setpoint_in_force() -> None:
     env = CocultureVectorEnv(2, PREVIEW)
     env.reset(seed=0)

@@ -193,6 +193,7 @@ def test_starts_cover_their_ranges_evenly():
     chi2 = ((counts - 4000 / 9) ** 2 / (4000 / 9)).sum()
     assert chi2 < 26.1  # 99.9 % quantile, 8 degrees of freedom
     assert abs(env.od.mean() - 0.6) < 0.02
+    assert abs(np.corrcoef(env.od, env.setpoint)[0, 1]) < 0.06  # every OD with every setpoint
 
 
 def test_state_continues_to_the_bit():

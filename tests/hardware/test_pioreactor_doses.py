@@ -181,6 +181,19 @@ def test_a_job_that_ends_its_pump_late_is_counted_by_the_pin(lab):
     assert end["feed_ml"] == pytest.approx(lab.world.truth["add_media"], abs=0.02) == pytest.approx(1.2, abs=0.02)
 
 
+def test_a_waste_pump_that_ends_late_is_counted_by_its_own_pin_from_this_dose_on(lab):
+    lab.dose(0.3)
+    lab.wait(6.0)
+    lab.sample()
+    lab.dose(0.5)
+    lab.until(lambda: WASTE_PIN in lab.world.since, 10.0)
+    lab.world.late_s = 1.0
+    lab.wait(10.0)
+    _, end = lab.of("dose_end")
+    assert lab.world.truth["remove_waste"] == pytest.approx(0.6 + 1.0 + 1.6, abs=0.02)
+    assert (end["waste_ml"], end["waste_high_ml"]) == pytest.approx((1.0, 2.6), abs=0.02)
+
+
 # -- what others do ----------------------------------------------------------------------------------------------------
 
 
@@ -289,12 +302,43 @@ def test_stop_ends_jobs_and_is_verified(lab):
     assert low <= lab.world.truth["add_media"] <= high
 
 
+def test_stop_in_the_waste_of_a_dose_tells_how_much_was_taken(lab):
+    lab.dose(1.0)
+    lab.until(lambda: WASTE_PIN in lab.world.since, 10.0)
+    lab.wait(0.4)
+    lab.reactors.stop()
+    assert not lab.world.since
+    (end,), taken = lab.of("dose_end"), lab.world.truth["remove_waste"]
+    assert 0.5 < taken < 1.5, "of 2 mL"
+    assert end["waste_ml"] <= taken <= end["waste_high_ml"] + 0.02
+    assert end["waste_high_ml"] == pytest.approx(taken, abs=0.2)
+
+
 def test_stop_that_cannot_be_verified_says_which_plug(lab):
     lab.world.kill_after_s = 0.2
     lab.dose(0.5)
-    lab.wait(3.0)
+    lab.wait(1.0)
     with pytest.raises(DeviceStateError, match="pull the plug"):
         lab.reactors.stop()
+    assert not lab.asked("remove_waste"), "no pump is started by a stop, and none goes on after it"
+
+
+@pytest.mark.parametrize("stops", [False, True])
+def test_what_a_media_pump_gave_too_much_is_drained_also_while_pumps_are_off_and_not_after_a_stop(lab, stops):
+    """It stood still for 2.5 s in a dose of .7 mL. The interlock says pumps off meanwhile, or the run is ended."""
+    lab.world.freeze_after_s, lab.world.frozen_s = 0.6, 2.5
+    lab.dose(0.7)
+    lab.until(lambda: bool(lab.world.since), 5.0)
+    lab.wait(0.8)
+    if stops:
+        lab.reactors.stop()
+    else:
+        assert lab.reactors.pumps_off(np.array([True])) == []
+    assert not lab.world.since
+    assert lab.world.truth["add_media"] > 1.5
+    least = 0.0 if stops else lab.world.truth["add_media"]
+    assert lab.world.truth["remove_waste"] >= least - 0.1, "back at its tube"
+    assert bool(lab.asked("remove_waste")) is not stops
 
 
 def test_a_process_that_starts_late_is_waited_for(lab):
