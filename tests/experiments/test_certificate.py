@@ -222,6 +222,25 @@ def test_a_setting_of_the_estimator_on_the_command_line_is_another_policy(
     assert sound.bounds.full_pump == pytest.approx(0.02 * 1.0 / (20.0 / 60.0))
 
 
+@pytest.mark.parametrize(
+    "failure",
+    [{"passed": False}, {"checks": [{"name": "entry", "value": 3.0, "limit": 1.0, "where": "", "holds": False}]}],
+    ids=["said", "by a requirement"],
+)
+@pytest.mark.parametrize("backend", [ChiBioConfig(), SimulatedConfig()], ids=["forced", "simulated"])
+def test_bounds_of_a_certificate_that_failed_let_nobody_act(
+    relative: Path, tmp_path: Path, failure: dict[str, Any], backend: Any
+) -> None:
+    """Where its policy flies all the same, surprises alone supervise it."""
+    content = json.loads(certificate.beside(relative).read_text())
+    assert content["passed"]
+    assert content["bounds"]
+    source = beside(relative, policy.load(relative), tmp_path)
+    assert unpacked(source, tmp_path / "sound", backend=backend, force_policy=True).bounds is not None
+    certificate.beside(source).write_text(json.dumps({**content, **failure}))
+    assert unpacked(source, tmp_path / "run", backend=backend, force_policy=True).bounds is None
+
+
 @changed
 def test_a_setting_of_the_estimator_in_the_policy_file_is_another_policy(
     relative: Path, tmp_path: Path, changes: dict[str, Any], named: str

@@ -281,6 +281,27 @@ def test_what_is_asked_of_a_policy_of_error_and_growth_share() -> None:
     assert not any(case.bounds.gain for case in quick.cases)
 
 
+def test_the_setpoints_that_are_named_are_those_that_are_asked_about() -> None:
+    """`certify setpoints=[0.3,0.7]`: both and their middle, entered from ln(0.05 / 0.7) / B. A run at 0.25 and 0.8 asks
+    for every error there and nowhere else."""
+    command = question(laws.share_law(), replace(FAST, setpoints=(0.3, 0.7)))
+    assert {case.setpoint for case in command.cases} == {None, 0.3, 0.5, 0.7}
+    assert command.setpoints == (0.3, 0.7)
+    assert command.bounds is not None
+    assert command.bounds.setpoints == (0.3, 0.7)
+    np.testing.assert_allclose(command.loop.range(command.cases[0])[0], np.log([0.05 / 0.7, 1.5 / 0.3]) / B)
+    run = question(laws.share_law(), replace(FAST, full_pumps=()), (0.25, 0.8))
+    own = [
+        f"{kind} at setpoint {r}, B = 0.06"
+        for r in (0.25, 0.8)
+        for kind in ("errors", "spread doses", "slow gain error")
+    ]
+    assert [(case.name, case.setpoint) for case in run.cases] == [
+        ("nominal", None), ("errors", None), *zip(own, [0.25] * 3 + [0.8] * 3, strict=True),
+        ("watched errors at setpoint 0.25", 0.25), ("watched errors at setpoint 0.8", 0.8),
+    ]  # fmt: skip
+
+
 def failing(policy: Policy, monkeypatch: pytest.MonkeyPatch, bent: Callable[[str, Band], Band]) -> list[str]:
     """What fails of a quick certificate in which the bands of cases are others than were proven."""
 
@@ -492,13 +513,18 @@ def test_what_the_pump_cannot_hold_with_weaker_doses_is_said() -> None:
 
 
 def test_a_device_asks_the_same_as_the_command() -> None:
-    """With limits that nothing meets, every case of one B at the three setpoints has the same worst value in both."""
+    """With limits that nothing meets, every case of one B at the three setpoints has the same worst value in both.
+
+    The device asks at the setpoints of its run, whatever those of the certificate are.
+    """
     strict = replace(FAST.limits, excess_share=1e-9, excess_nominal=1e-9, late=0, late_slow=0)
     config = replace(FAST, full_pumps=(), limits=strict)
     policy = laws.share_law(offset=0.03)
-    wanted = {c.name: c.value for c in certify(policy, config).checks if "half-width" in c.name and not c.holds}
-    found = {c.name: c.value for c in recheck(policy, config, (0.2, 0.6, 1.0)) if "half-width" in c.name}
+    proven = certify(policy, replace(config, setpoints=(0.3, 0.7)))
+    wanted = {c.name: c.value for c in proven.checks if "half-width" in c.name and not c.holds}
+    found = {c.name: c.value for c in recheck(policy, config, (0.3, 0.5, 0.7)) if "half-width" in c.name}
     assert len(wanted) > 8
+    assert {name.split("setpoint ")[1][:3] for name in found if "setpoint" in name} == {"0.3", "0.5", "0.7"}
     assert {name: found[name] for name in wanted} == pytest.approx(wanted, abs=1e-9)
 
 
