@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -149,6 +150,24 @@ def test_a_batch_is_its_replicates_and_seeds_decide():
     many, few = (trial("mpc", "bench", "temperature_switch", n) for n in (6, 2))
     np.testing.assert_allclose(many.od[:2], few.od, rtol=1e-12)
     assert not np.allclose(few.od, trial("mpc", "bench", "temperature_switch", 2, seed=1).od)
+
+
+def test_samples_without_a_dose_are_counted_for_each_vial():
+    """One reading in ten is an exact zero, and the law asks for 0.01 mL/s whatever is read: who gives none is held."""
+    c = config()
+    plant = replace(c.plants["nominal_noise"], sensor=replace(c.plants["nominal_noise"].sensor, zero_rate=0.1))
+
+    def constant(vials):
+        return registry.build(c.controllers["hold"], model=c.env, plant=vials)
+
+    cell = Cell("hold", "zeros", "setpoint_steps")
+    t = run_trial(cell, plant, c.scenarios["setpoint_steps"], constant, c.env, 8, 0)
+    assert set(np.unique(t.rate)) == {0.0, c.env.mu * c.env.tau}
+    none = (t.rate[:, :-1] == 0.0).sum(axis=1) + (t.od[:, -1] == 0.0)  # no dose follows the last sample anyway
+    np.testing.assert_array_equal(t.held, none)
+    assert (t.held >= (t.od == 0.0).sum(axis=1)).all()
+    assert len(set(t.held)) > 3
+    assert comparison.totals([t])[0]["held"] == pytest.approx(none.mean())
 
 
 def test_windows_are_named_by_what_tells_them_apart():

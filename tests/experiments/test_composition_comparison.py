@@ -67,14 +67,24 @@ def test_errors_by_hand():
 
 
 def test_the_last_two_hours_are_those_of_every_window():
-    minute = np.arange(601.0)
-    setpoint = np.where(minute < 300, 0.3, 0.7)
-    share = np.where((minute >= 180) & (minute < 300), setpoint + 0.01, setpoint + 0.2)
-    share = np.where((minute >= 480) & (minute < 600), setpoint + 0.03, share)[None]
-    t = replace(made_up([[0.0]]), schedule=phases(300.0, 300.0), minute=minute, setpoint=setpoint, share=share)
-    assert statistics.last_hours(t)[0] == pytest.approx(0.02)
+    """Of 300 min, of 300 min in which the setpoint waves, of 90 min, which are all of them, and of 300 min."""
+    minute = np.arange(991.0)
+    setpoint = np.select([minute < 300, minute < 600, minute < 690], [0.3, 0.4 + 0.1 * np.sin(minute), 0.5], 0.7)
+    late = [(180, 300), (600, 690), (870, 990)]
+    share = setpoint + np.select([(minute >= a) & (minute < b) for a, b in late], [0.01, 0.03, 0.05], 0.2)
+    t = replace(made_up([[0.0]]), schedule=phases(300.0, 300.0, 90.0, 300.0), minute=minute, setpoint=setpoint)
+    t = replace(t, share=share[None])
+    assert statistics.last_hours(t)[0] == pytest.approx((120 * 0.01 + 90 * 0.03 + 120 * 0.05) / 330)
     wave = replace(t, setpoint=0.5 + 0.1 * np.sin(minute))
     assert math.isnan(statistics.last_hours(wave)[0])
+
+
+def test_the_last_day_is_that_of_a_run_of_two_days_or_more():
+    minute = np.arange(3000.0)
+    share = np.where(minute >= 3000 - 1440, 0.51, 0.7)[None]
+    t = made_up([[0.0]], setpoint=np.full(3000, 0.5))
+    t = replace(t, schedule=phases(3000.0), minute=minute, share=share, estimate=share, low=share, high=share)
+    assert statistics.share_row(t)["ratio_abs_error_last_day"] == pytest.approx(0.01)
 
 
 def test_a_law_is_paired_with_the_vendors_reactor_by_reactor():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.loop.metrics import window_metrics
+from experiments.loop.metrics import mean_errors, window_metrics
 
 
 def test_decaying_error_has_ise_one_half_and_itae_one():
@@ -72,3 +72,13 @@ def test_a_run_without_a_sample_has_no_metrics():
     metrics = window_metrics(np.empty((2, 0)), np.empty((2, 0)), 0.5, 0.0, 30.0)
     for key in ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error"):
         np.testing.assert_array_equal(getattr(metrics, key), [np.nan, np.nan])
+
+
+def test_the_last_two_hours_begin_no_earlier_than_the_window():
+    """300 min at 0.2 from the setpoint, then 90 min at 0.03: all of these are its last two hours. Then 200 min, of
+    which the first 80 are 0.2 away and the last 120 0.05."""
+    minute = np.arange(591.0)[None]
+    error = np.select([minute < 300, minute < 390, minute < 470], [0.2, 0.03, 0.2], 0.05)
+    found = [mean_errors(minute, 0.5 - error, np.full_like(minute, 0.5), *w) for w in ((300.0, 390.0), (390.0, 590.0))]
+    assert [value[0] for value in found[0]] == pytest.approx([0.03, 0.03])
+    assert [value[0] for value in found[1]] == pytest.approx([(80 * 0.2 + 120 * 0.05) / 200, 0.05])

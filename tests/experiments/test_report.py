@@ -158,6 +158,47 @@ def test_every_lost_cell_is_said_and_no_other():
     assert comparison.losses([row("dqn", 1.0), row("pi", 2.0)], []) == []
 
 
+LAWS = ("a", "b", "c", "d", "e", "f")
+RANKED = ("ise_mean", "itae_mean", "itae_median", "clean_ise", "clean_itae", "clean_steady_abs_error")
+
+
+def marked(page: Page, name: str) -> list[str]:
+    """The laws that stand out in a table, whichever way round it is."""
+    (table,) = (table for table in page.tables if table.name == name)
+    across = [law for row in table.rows for law, cell in zip(table.columns, row, strict=True) if isinstance(cell, Best)]
+    return across if table.columns[0] == "plant" else [row[0] for row in table.rows if isinstance(row[1], Best)]
+
+
+def test_every_table_marks_the_law_that_is_best_by_its_own_measure():
+    """Six laws, each of which is best by one measure alone; the oracle is better still, and out of competition."""
+    measures = (*RANKED, "effort_ul_s", "media_ml", "held")
+    entries = [
+        {"controller": law, "plant": "p", "scenario": "s", "n": 3, "ise_sd": 0.1, "itae_sd": 0.1, "floor_ise": 0.1,
+         "floor_itae": 0.1} | {key: 1.0 if LAWS.index(law) == i else 2.0 + i for i, key in enumerate(measures)}
+        for law in LAWS
+    ]  # fmt: skip
+    entries.append({**entries[0], "controller": "oracle", **dict.fromkeys(measures, 0.5)})
+    page = one_section()
+    comparison.every_plant(page, {"totals": entries, "paired_totals": []}, "s")
+    for key, law in zip(RANKED, LAWS, strict=True):
+        assert (key, marked(page, f"s_{key.removesuffix('_mean')}")) == (key, [law])
+    for key in ("effort_ul_s", "media_ml", "held"):
+        assert marked(page, f"s_{key}") == []
+
+
+def test_every_table_of_a_share_marks_the_law_that_is_best_by_its_own_measure(tmp_path):
+    measures = ("ratio_abs_error_mean", "ratio_abs_error_last2h", "ratio_abs_error_last_day")
+    rest = dict.fromkeys(("estimate_rms", "band_covers", "od_min", "od_mean", "od_max"), 0.5)
+    entries = [
+        {"controller": law, "plant": "p", "scenario": "s", "n": 3, **rest}
+        | {key: 0.1 if LAWS.index(law) == i else 0.2 for i, key in enumerate(measures)}
+        for law in LAWS[:3]
+    ]
+    page = one_section()
+    comparison.SECTIONS["share"].add(page, {"rows": entries, "paired": [], "figures": []}, tmp_path)
+    assert [marked(page, f"s_{key}") for key in measures] == [["a"], ["b"], ["c"]]
+
+
 def test_published_losses_are_the_papers():
     """The PI beats the published DQN in three of the four temperature numbers, the MPC in the other (Table 2)."""
     said = comparison.published_losses()

@@ -15,13 +15,16 @@ from experiments.comparison.trials import Cell, DensityTrial, Trial, Window, win
 NAMES = {"signal": "density", "controller": "pi", "plant": "quiet", "scenario": "steps"}
 
 
-def trial(controller: str = "pi", error: tuple[float, ...] = (0.1, 0.2), minutes: float = 20.0) -> DensityTrial:
-    """Replicates that stay `error` above the setpoint for two phases; their sensor reads 0.01 too much."""
-    schedule = Scenario((0.5, 0.8), (minutes, minutes), (37.0, 37.0))
-    minute = np.arange(0.0, 2.0 * minutes + 1e-9)
-    setpoint = np.where(minute < minutes, 0.5, 0.8)
+def trial(controller: str = "pi", error: tuple[float, ...] = (0.1, 0.2)) -> DensityTrial:
+    """Replicates that stay `error` above the setpoint for 20 min and for 30 more; their sensor reads 0.01 too much.
+
+    The pump moves by 2 uL/s a minute in the first phase, by 5 in the second.
+    """
+    schedule = Scenario((0.5, 0.8), (20.0, 30.0), (37.0, 37.0))
+    minute = np.arange(51.0)
+    setpoint = np.where(minute < 20.0, 0.5, 0.8)
     od = setpoint + np.array(error)[:, None]
-    rate = np.where(minute % 2 == 0, 0.01, 0.012) * np.ones_like(od)
+    rate = np.where(minute % 2 == 0, 0.01, np.where(minute < 20.0, 0.012, 0.015)) * np.ones_like(od)
     media = np.outer(np.arange(1.0, len(error) + 1), minute)  # 1, 2 mL a minute
     held = np.arange(3.0, 3.0 + len(error))
     overflowed = np.arange(len(error)) > 0
@@ -59,55 +62,79 @@ def test_a_row_tells_means_over_replicates() -> None:
         assert first[f"{key}_sd"] == pytest.approx(abs(expected[1] - expected[0]) / math.sqrt(2.0))
         half = 12.706204736 * abs(expected[1] - expected[0]) / 2.0  # Student's t with one degree of freedom
         assert first[f"{key}_ci95"] == pytest.approx([np.mean(expected) - half, np.mean(expected) + half])
-    assert (second["ise_mean"], second["itae_mean"]) == pytest.approx((20.0 * 0.025, 200.0 * 0.15))
+    assert (second["ise_mean"], second["itae_mean"]) == pytest.approx((30.0 * 0.025, 450.0 * 0.15))
     assert second["steady_abs_error"] == pytest.approx(0.15)
-    assert (first["media_ml"], second["media_ml"]) == (30.0, 30.0)
+    assert (first["media_ml"], second["media_ml"]) == (30.0, 45.0)
 
 
 @pytest.mark.parametrize(
     ("errors", "settling"),
-    [((0.0, 0.0, 0.0), 0.0), ((0.0, 0.0, 0.3), 0.0), ((0.0, 0.3, 0.3), math.nan), ((0.0, 0.3), math.nan)],
+    [
+        ((0.0, 0.0, 0.0), 0.0),
+        ((0.0, 0.0, 0.3), 0.0),
+        ((0.0, 0.3, 0.3), math.nan),
+        ((0.0, 0.3), math.nan),
+        ((0.045,), math.nan),
+        ((-0.035,), 0.0),
+    ],
 )
 def test_settling_is_the_median_and_never_is_late(errors: tuple[float, ...], settling: float) -> None:
+    """By the measured OD: 0.845 is beyond 5 % of 0.8 and 0.765 within, whatever a sensor without noise had shown."""
     one = trial(error=errors)
-    assert row(one, Window("0.8", 0.8, 20.0, 40.0))["settling_min"] == pytest.approx(settling, nan_ok=True)
+    assert row(one, Window("0.8", 0.8, 20.0, 50.0))["settling_min"] == pytest.approx(settling, nan_ok=True)
 
 
 def test_details_tell_the_rest() -> None:
-    [_, second] = details([trial(error=(0.03, 0.2))])
-    means = {"ise": (0.03**2 + 0.2**2) / 2.0, "itae": 0.115, "clean": (0.02**2 + 0.19**2) / 2.0}
+    """The first replicate settled as it was measured, 0.035 below 0.8, and not as it was, 0.045 below."""
+    [first, second] = details([trial(error=(-0.035, -0.2))])
+    means = {"ise": (0.035**2 + 0.2**2) / 2.0, "itae": 0.1175, "clean": (0.045**2 + 0.21**2) / 2.0}
+    assert (first["window_min"], first["effort_ul_s"]) == (20.0, pytest.approx(2.0))
     assert second == {
-        **NAMES, "window": "0.8", "window_min": 20.0,
-        "ise_per_window": pytest.approx(means["ise"]), "itae_per_window": pytest.approx(10.0 * means["itae"]),
-        "clean_ise": pytest.approx(20.0 * means["clean"]), "clean_itae": pytest.approx(200.0 * 0.105),
-        "clean_abs_error": pytest.approx(0.105),
-        "floor_ise": pytest.approx(20.0 * 1e-4), "floor_itae": pytest.approx(2.0), "effort_ul_s": pytest.approx(2.0),
+        **NAMES, "window": "0.8", "window_min": 30.0,
+        "ise_per_window": pytest.approx(means["ise"]), "itae_per_window": pytest.approx(15.0 * means["itae"]),
+        "clean_ise": pytest.approx(30.0 * means["clean"]), "clean_itae": pytest.approx(450.0 * 0.1275),
+        "clean_abs_error": pytest.approx(0.1275),
+        "floor_ise": pytest.approx(30.0 * 1e-4), "floor_itae": pytest.approx(4.5), "effort_ul_s": pytest.approx(5.0),
         "settled": 1, "overflowed": 1,
     }  # fmt: skip
 
 
 def test_totals_are_sums_over_windows() -> None:
+    """Of e from 0 to 20 min, where the last half minute goes to e + 0.3, and of e for 30 min; pump moves by time."""
     one = trial()
     [found] = totals([one])
-    both = [[r[key] for r in rows([one])] for key in ("ise_mean", "itae_mean", "media_ml")]
-    assert [found[key] for key in ("ise_mean", "itae_mean", "media_ml")] == pytest.approx([sum(b) for b in both])
-    parts = details([one])
-    for key in ("clean_ise", "clean_itae", "floor_ise", "floor_itae"):
-        assert found[key] == pytest.approx(sum(part[key] for part in parts))
-    assert (found["n"], found["held"], found["effort_ul_s"]) == (2, 3.5, pytest.approx(2.0))
+
+    def ise(*errors: float) -> np.ndarray:
+        return np.array([20.0 * e**2 + 0.5 * ((e + 0.3) ** 2 - e**2) + 30.0 * e**2 for e in errors])
+
+    def itae(*errors: float) -> np.ndarray:
+        return np.array([200.0 * e + 0.5 * 20.0 * 0.3 + 450.0 * e for e in errors])
+
+    for of, errors in (("clean", (0.09, 0.19)), ("floor", (0.01, 0.01))):
+        step = of != "floor"  # a floor has no setpoint, and no step in it
+        assert found[f"{of}_ise"] == pytest.approx(ise(*errors).mean() if step else 50.0 * 1e-4)
+        assert found[f"{of}_itae"] == pytest.approx(itae(*errors).mean() if step else 650.0 * 0.01)
+    for key, each in (("ise", ise(0.1, 0.2)), ("itae", itae(0.1, 0.2))):
+        half = 12.706204736 * abs(each[1] - each[0]) / 2.0  # Student's t with one degree of freedom
+        assert found[f"{key}_mean"] == pytest.approx(each.mean())
+        assert found[f"{key}_sd"] == pytest.approx(abs(each[1] - each[0]) / math.sqrt(2.0))
+        assert found[f"{key}_ci95"] == pytest.approx([each.mean() - half, each.mean() + half])
+    assert found["media_ml"] == pytest.approx(1.5 * 50.0)
+    assert (found["n"], found["held"]) == (2, 3.5)
+    assert found["effort_ul_s"] == pytest.approx((20.0 * 2.0 + 30.0 * 5.0) / 50.0)
     # the last eleven samples of the first window have one of the next setpoint among them
     assert found["clean_steady_abs_error"] == pytest.approx(0.14 + 0.5 * 0.3 / 11.0)
-    uneven = replace(one, rate=np.where(one.minute < 20.0, one.rate, 0.0))
-    assert totals([uneven])[0]["effort_ul_s"] == pytest.approx(1.0)
-    spread = Spread(np.array([sum(s) for s in zip(*(one.score(w).ise for w in windows(one.schedule)), strict=True)]))
-    assert (found["ise_sd"], found["ise_ci95"]) == (pytest.approx(spread.sd), pytest.approx(spread.ci95))
+    still = replace(one, rate=np.where(one.minute < 20.0, one.rate, 0.0))
+    assert totals([still])[0]["effort_ul_s"] == pytest.approx(20.0 * 2.0 / 50.0)
 
 
 def test_totals_keep_replicates_and_windows_apart() -> None:
     [found] = totals([trial(error=(0.1, 0.2, 0.6))])
     assert (found["n"], found["held"]) == (3, 4.0)
-    assert found["effort_ul_s"] == pytest.approx(2.0)
-    assert found["media_ml"] == pytest.approx(80.0)
+    assert found["effort_ul_s"] == pytest.approx(3.8)
+    assert found["media_ml"] == pytest.approx(100.0)
+    assert found["itae_median"] == pytest.approx(650.0 * 0.2 + 3.0)
+    assert found["itae_mean"] == pytest.approx(650.0 * 0.3 + 3.0)
     assert found["clean_steady_abs_error"] == pytest.approx(0.29 + 0.5 * 0.3 / 11.0)
     small = pairs([trial("mpc", (0.01, 0.011)), trial("pi", (0.02, 0.021))], "pi")
     assert small[2]["percent"] == pytest.approx(100.0 * (0.01**2 + 0.011**2) / (0.02**2 + 0.021**2) - 100.0)
@@ -120,14 +147,14 @@ def test_pairs_are_differences_against_the_same_plant_and_scenario() -> None:
     assert [(p["controller"], p["against"], p["window"], p["metric"]) for p in found] == [
         ("mpc", "pi", window, metric) for window in ("0.5", "0.8") for metric in ("ise", "itae")
     ]
-    late = found[3]  # the ITAE of the second window: 200 e
-    assert late["difference"] == pytest.approx(200.0 * (0.15 - 0.76 / 3.0))
+    late = found[3]  # the ITAE of the second window: 450 e
+    assert late["difference"] == pytest.approx(450.0 * (0.15 - 0.76 / 3.0))
     assert late["percent"] == pytest.approx(100.0 * (0.45 / 0.76 - 1.0))
     assert (late["n"], late["verdict"], late["plant"], late["scenario"]) == (3, "lower", "quiet", "steps")
-    assert late["ci95"] == pytest.approx(Spread(200.0 * np.array([-0.1, -0.1, -0.11])).ci95)
+    assert late["ci95"] == pytest.approx(Spread(450.0 * np.array([-0.1, -0.1, -0.11])).ci95)
     whole = total_pairs([mine, theirs], "pi")
     assert [(p["window"], p["metric"]) for p in whole] == [("all", "ise"), ("all", "itae")]
-    assert whole[1]["difference"] == pytest.approx(found[1]["difference"] + found[3]["difference"])
+    assert whole[1]["difference"] == pytest.approx(650.0 * (0.15 - 0.76 / 3.0))
     assert total_pairs([mine, theirs], "mpc")[1]["verdict"] == "higher"
     same = pairs([replace(theirs, cell=Cell("dqn", "quiet", "steps")), theirs], "pi")
     assert {p["verdict"] for p in same} == {"no difference shown"}
