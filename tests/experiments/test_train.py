@@ -16,6 +16,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing import plugin_event_accumulator as shown
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dqn import checkpoint, policy
@@ -39,6 +40,7 @@ SHORT = [
     "eval_every=200",
     "checkpoint_every=200",
 ]
+TWO = ["n_agents=2", "seed=2"]  # of which the second becomes the better one, and is best before the end
 KILL_SEED = int(os.environ.get("KILL_SEED", "0"))
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.xdist_group("train")  # its tests share a run, made once
@@ -59,14 +61,14 @@ def run(entry: str, *overrides: str, cwd: Path | None = None) -> subprocess.Comp
 def whole(tmp_path_factory):
     """One uninterrupted short training with two agents."""
     folder = tmp_path_factory.mktemp("whole") / "run"
-    done = run("train", *SHORT, "n_agents=2", "seed=4", f"hydra.run.dir={folder}")
+    done = run("train", *SHORT, *TWO, f"hydra.run.dir={folder}")
     assert done.returncode == 0, done.stderr
     return folder
 
 
 def test_summary_has_its_keys(whole):
     summary = json.loads((whole / "summary.json").read_text())
-    assert summary["seeds"] == [4, 5]
+    assert summary["seeds"] == [2, 3]
     assert summary["env_steps"] == 1000
     assert summary["updates"] == 900 * 4  # four updates a step (agent=tuned)
     for key in ("regret_pct", "steady_abs_error", "regret_pct_last"):
@@ -82,8 +84,8 @@ def test_every_file_is_there(whole):
         "progress.csv",
         "checkpoint.pt",
         "policy.npz",
-        "policies/seed0004.npz",
-        "policies/seed0005.npz",
+        "policies/seed0002.npz",
+        "policies/seed0003.npz",
     ):
         assert name in names
     for figure in ("learning", "policy_map", "trajectories"):
@@ -100,7 +102,7 @@ def test_tensorboard_reads_grouped_scalars_and_figures(whole):
     for name in ("learning", "policy_map", "trajectories"):  # drawn once: TensorBoard has the PNG of the folder
         (image,) = events.Tensors(f"figures/{name}")
         assert image.tensor_proto.string_val[2] == (whole / "figures" / f"{name}.png").read_bytes()
-    single = EventAccumulator(str(whole / "agents" / "seed0005")).Reload()
+    single = EventAccumulator(str(whole / "agents" / "seed0003")).Reload()
     assert [e.step for e in single.Tensors("train/return")] == list(range(100, 1001, 100))
 
 
@@ -113,6 +115,8 @@ def test_the_summary_can_be_recomputed_from_the_exported_policy(whole):
         learned = policy.load(whole / "policies" / f"seed{seed:04d}.npz")
         score = report(each(learned))
         assert score.regret_pct[0] == pytest.approx(summary["regret_pct"][i], rel=1e-3)
+        assert score.steady_abs_error[0] == pytest.approx(summary["steady_abs_error"][i], rel=1e-3)
+        assert score.mean_abs_error[0] == pytest.approx(summary["mean_abs_error"][i], rel=1e-3)
 
 
 def test_a_policy_file_says_what_a_reactor_is_told_before_it_runs(whole):
@@ -139,6 +143,24 @@ def test_a_policy_with_an_offset_at_one_setpoint_gives_way_to_one_without():
     assert (best.step.tolist(), best.steady.tolist(), best.weights.tolist()) == ([200], [0.0025], [[200.0, 200.0]])
 
 
+def test_the_policy_of_a_run_is_that_of_its_best_seed_and_says_so(whole):
+    """Which seed and which step, by hand from every evaluation: the second seed, and before the run's end."""
+    history = checkpoint.load(whole / "checkpoint.pt")["best"]["history"]
+    far = np.array([[max(r / 0.5, s / 0.003) for r, s in zip(*scores, strict=True)] for _, *scores in history])
+    steps, chosen = [history[k][0] for k in far.argmin(axis=0)], int(far.min(axis=0).argmin())
+    assert chosen == 1
+    assert steps[0] != steps[1] < 1000
+    summary = json.loads((whole / "summary.json").read_text())
+    assert (summary["policy_seed"], summary["kept_step"]) == (3, steps)
+    files = [whole / "policies" / f"seed000{seed}.npz" for seed in (2, 3)]
+    for file, seed, step in ((files[0], 2, steps[0]), (files[1], 3, steps[1]), (whole / "policy.npz", 3, steps[1])):
+        metadata = policy.load(file).metadata
+        assert (metadata["seed"], metadata["trained_steps"]) == (seed, step)
+        assert metadata["updates"] == 4 * (step - 100)
+    flies, *each_seed = (policy.load(file) for file in (whole / "policy.npz", *files))
+    assert [np.array_equal(flies.weights[0], other.weights[0]) for other in each_seed] == [False, True]
+
+
 def _limits(history) -> list[float]:
     """Of every evaluation, how far the kept policy of the slower agent is from the limits, in units of them."""
     each = [[max(r / 0.5, s / 0.003) for r, s in zip(*scores, strict=True)] for _, *scores in history]
@@ -149,10 +171,10 @@ def test_training_ends_when_every_agent_has_met_the_limits(whole, tmp_path):
     """Where it ends follows from the history of the run that was not to end; up to there it is the same run."""
     full = checkpoint.load(whole / "checkpoint.pt")["best"]
     far = _limits(full["history"])
-    k = next(k for k in range(1, len(far)) if far[k] < far[0])
+    k = next(k for k in range(2, len(far)) if far[k] < far[k - 1])
     within = (far[k - 1] + far[k]) / 2
     assert [step for step, *_ in full["history"]] == [200, 400, 600, 800, 1000]
-    options = [*SHORT, "n_agents=2", "seed=4", f"stop_within={within}", f"hydra.run.dir={tmp_path / 'run'}"]
+    options = [*SHORT, *TWO, f"stop_within={within}", f"hydra.run.dir={tmp_path / 'run'}"]
     done = run("train", *options)
     assert done.returncode == 0, done.stderr
     early = checkpoint.load(tmp_path / "run" / "checkpoint.pt")["best"]
@@ -199,7 +221,7 @@ def test_killed_at_a_random_moment_and_resumed_gives_the_same_weights(whole, tmp
     rng = np.random.default_rng(KILL_SEED)
     folder = tmp_path / "killed"
     process = subprocess.Popen(
-        command("train", *SHORT, "n_agents=2", "seed=4", f"hydra.run.dir={folder}"),
+        command("train", *SHORT, *TWO, f"hydra.run.dir={folder}"),
         env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     while not (folder / "checkpoint.pt").is_file():
@@ -272,17 +294,26 @@ def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path, caplog):
     number = r"\d+\.\d\d % regret, \d\.\d{4} OD steady error"
     assert re.fullmatch(rf"step 200 of 600, 33 %, \d:\d\d min left: selection grid: {number}; kept: {number}", step)
     assert [step for step, _, _ in first.best.history] == [200, 300, 400, 500, 600]
-    half = replace(c, agent=replace(c.agent, total_steps=300))
     (tmp_path / "b").mkdir()
-    second = Session(half, tmp_path / "b")
-    second.run()
-    second.writer.close()
+    for total in (300, 400):  # killed after step 400, before that was saved
+        second = Session(replace(c, agent=replace(c.agent, total_steps=total)), tmp_path / "b", resume=total > 300)
+        second.run()
+        second.writer.close()
+        if total == 300:
+            saved = (tmp_path / "b" / "checkpoint.pt").read_bytes()
+    (tmp_path / "b" / "checkpoint.pt").write_bytes(saved)
     third = Session(c, tmp_path / "b", resume=True)
     assert third.agents.steps == 300
     third.run()
     third.writer.close()
     assert torch.equal(first.agents.weights(), third.agents.weights())
     assert first.best.history == third.best.history
+    whole, resumed = (shown.EventAccumulator(str(tmp_path / name), {"tensors": 0}).Reload() for name in "ab")
+    tags = [tag for tag in whole.Tags()["tensors"] if tag.partition("/")[0] in ("train", "eval", "kept", "q", "limit")]
+    for tag in tags:  # every point once
+        ours, theirs = ([(e.step, *e.tensor_proto.float_val) for e in x.Tensors(tag)] for x in (whole, resumed))
+        assert (tag, ours) == (tag, theirs)
+    assert [e.step for e in resumed.Tensors("train/return")] == [100, 200, 300, 400, 500, 600]
 
 
 @pytest.mark.parametrize(
