@@ -230,9 +230,8 @@ def relearned(config: RelearnedConfig, folder: Path) -> None:
     head = ["vials", "flew", *found, *(f"less {than}" for than in THAN)]
     (folder / "table.md").write_text(markdown(head, table), encoding="utf-8")
     verdicts = [verdict(place).row() if k in new else None for k, place in enumerate(places)]
-    content = {"rows": rows, "errors": found, "verdicts": verdicts, "table": table, "judge": judge}
-    content["known_h"] = known_h
-    files.write_json(folder / "summary.json", content)
+    content = {"rows": rows, "errors": found, "verdicts": verdicts, "table": table}
+    files.write_json(folder / "summary.json", {**content, "judge": judge, "known_h": known_h})
 
 
 main = command(__file__, RelearnedConfig(), relearned)
