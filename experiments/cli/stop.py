@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -15,8 +16,8 @@ from typing import ParamSpec, TypeVar
 from experiments.cli import extensions
 
 __all__ = [
-    "SIGNALS", "STATUS", "Pause", "Workers", "handled", "interrupts", "one_interrupt", "pausing", "undisturbed",
-    "unmasked",
+    "SIGNALS", "STATUS", "Pause", "Workers", "handled", "heard", "interrupts", "one_interrupt", "pausing",
+    "undisturbed", "unmasked",
 ]  # fmt: skip
 
 P = ParamSpec("P")
@@ -26,6 +27,7 @@ log = logging.getLogger(__name__)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CLUSTER = (signal.SIGUSR1, signal.SIGUSR2)  # how a batch system says that a job's time is nearly over
 STATUS = 130  # of a stopped command, as shells have it for Ctrl-C
+AGAIN_S = 0.1  # after which a stop that was lost is raised once more
 
 
 @contextmanager
@@ -42,15 +44,59 @@ def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> 
 
 
 class _Wait:
-    """Whether a stop waits, and whether one does."""
+    """Whether a stop waits; the number of one that does; whether the last has arrived, and it while on its way."""
 
-    asked = came = False
+    asked = heard = False
+    came = 0
+    stop: Callable[[], KeyboardInterrupt | None] = staticmethod(lambda: None)
+
+
+class _Stop(KeyboardInterrupt):
+    """A stop on its way: it lives until somebody has handled it, or lost it."""
+
+    def __init__(self) -> None:
+        _Wait.stop = weakref.ref(self)  # here, where no frame of its traceback holds it
+
+
+def heard() -> None:
+    """A stop has arrived, and what follows must not be stopped again: whoever handles one and goes on says so."""
+    _Wait.heard = True
+
+
+def _arrives() -> bool:
+    return _Wait.heard or _Wait.stop() is not None
 
 
 def _interrupt(number: int, stack: FrameType | None) -> None:
-    if not _Wait.asked:
-        raise KeyboardInterrupt
-    _Wait.came = True
+    """Raise a stop, again and again until it arrives.
+
+    A handler runs between two steps of any Python code, and whatever C code has called that may take what it raises
+    for an answer: NumPy asks operands for `__array_ufunc__`, an enum answers in Python, an error means no.
+    """
+    if _Wait.asked:
+        _Wait.came = number
+        return
+
+    def again(alarm: int, stack: FrameType | None) -> None:
+        signal.setitimer(signal.ITIMER_REAL, 0.0 if _Wait.heard else AGAIN_S)
+        if not _arrives():
+            signal.raise_signal(number)  # whoever listens now may put it off
+
+    signal.signal(signal.SIGALRM, again)
+    signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+    raise _Stop
+
+
+@contextmanager
+def _stopping(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """The signals of a stop go to `handler`; one that leaves this has arrived."""
+    before, _Wait.heard = signal.getsignal(signal.SIGALRM), False
+    try:
+        with handled(handler, *SIGNALS):
+            yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
 
 
 @contextmanager
@@ -65,30 +111,28 @@ def undisturbed() -> Iterator[None]:
     finally:
         _Wait.asked = False
         if _Wait.came:
-            _Wait.came = False
-            raise KeyboardInterrupt
+            number, _Wait.came = _Wait.came, 0
+            _interrupt(number, None)
 
 
 @contextmanager
 def interrupts() -> Iterator[None]:
     """Ctrl-C, SIGTERM (a service manager, a shutting-down PC) or SIGHUP (a closed terminal) raise KeyboardInterrupt."""
-    with handled(_interrupt, *SIGNALS):
+    with _stopping(_interrupt):
         yield
 
 
 @contextmanager
 def one_interrupt() -> Iterator[None]:
     """As `interrupts`, but only the first: others do not cut short the switching off of pumps, nor the summary."""
-    came: list[int] = []
 
     def answer(number: int, stack: FrameType | None) -> None:
-        came.append(number)
-        if len(came) == 1:
-            _interrupt(number, stack)
-        else:
+        if _arrives():
             log.warning("the pumps are being switched off and verified; this takes up to a minute")
+        else:
+            _interrupt(number, stack)
 
-    with handled(answer, *SIGNALS):
+    with _stopping(answer):
         yield
 
 

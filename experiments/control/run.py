@@ -13,7 +13,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from experiments.cli import files, frame
 from experiments.cli.frame import swept
-from experiments.cli.stop import one_interrupt
+from experiments.cli.stop import heard, one_interrupt
 from experiments.control import assemble, notify
 from experiments.control.assemble import Setup
 from experiments.control.bench_marks import BenchMarks
@@ -65,6 +65,7 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier, learning: Relearning 
         given_up = [name for name, s in zip(reactors.names, loop.stopped, strict=True) if s]
         outcome = f"stopped by the interlock: {', '.join(given_up)}" if given_up else "completed"
     except KeyboardInterrupt:
+        heard()
         outcome = "stopped by the operator"
     except ReactorError as error:
         outcome = f"failed: {error}"

@@ -72,7 +72,7 @@ def _cut_after(wait_s: float) -> Iterator[Callable[[str, dict[str, Any]], None]]
         for number, old in before.items():
             signal.signal(number, old)
         if came:
-            raise came[0]
+            raise came.pop()
 
 
 def fetch(

@@ -12,8 +12,10 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
+import numpy as np
 import pytest
 
 from dqn import checkpoint
@@ -166,6 +168,72 @@ def test_a_stop_while_an_extension_module_loads_is_a_stop() -> None:
         raise masked
     with pytest.raises(ImportError, match="no module"), stop.unmasked():
         raise ImportError("no module")
+
+
+@pytest.mark.parametrize("kept", [stop.interrupts, stop.one_interrupt])
+@pytest.mark.parametrize("writes", [False, True])
+def test_a_stop_that_a_library_takes_for_an_error_of_its_own_is_not_lost(
+    kept: Callable[[], AbstractContextManager[None]], writes: bool
+) -> None:
+    """NumPy asks the type of an operand whether it has `__array_ufunc__`, and takes any error for a no.
+
+    When the stop is raised again something may just be written, which is written to its end.
+    """
+
+    class Asked(type):
+        def __getattr__(cls, name: str) -> None:
+            if name == "__array_ufunc__":
+                os.kill(os.getpid(), signal.SIGTERM)
+            raise AttributeError(name)
+
+    class Operand(metaclass=Asked):
+        pass
+
+    seen = []
+
+    def work() -> None:
+        with kept():
+            seen.append((np.zeros(2) == Operand()) is not None)
+            with stop.undisturbed() if writes else contextlib.nullcontext():
+                time.sleep(3 * stop.AGAIN_S)
+                seen.append("written")
+            seen.append("gone on")
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert seen == [True, "written"][: 1 + writes]
+
+
+def test_a_stop_that_was_heard_is_not_repeated_while_the_pumps_are_switched_off() -> None:
+    with stop.one_interrupt():
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        stop.heard()
+        for _ in range(2):
+            time.sleep(2 * stop.AGAIN_S)
+            os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(2 * stop.AGAIN_S)
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("kept", [stop.interrupts, stop.one_interrupt, lambda: stop.pausing("later")])
+def test_a_closed_terminal_ends_nothing_that_was_started_to_outlive_it(kept: Callable[[], Any]) -> None:
+    """Under `nohup` SIGHUP is ignored; Ctrl-C of another terminal is not."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with kept() as waits:
+            try:
+                os.kill(os.getpid(), signal.SIGHUP)
+            except KeyboardInterrupt:
+                pytest.fail("it was stopped")
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            assert not (waits and waits())
+            with pytest.raises(KeyboardInterrupt) if waits is None else contextlib.nullcontext():
+                os.kill(os.getpid(), signal.SIGINT)
+            assert waits is None or waits()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 @pytest.mark.parametrize("kept", [stop.interrupts, stop.one_interrupt])
