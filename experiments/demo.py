@@ -4,6 +4,7 @@ Each step is the command a user would type, shown before it runs.
 """
 
 import argparse
+import os
 import subprocess
 import sys
 import time
@@ -48,7 +49,7 @@ def main() -> None:
     """Entry point; exits with the status of the first step that fails."""
     parser = argparse.ArgumentParser(prog="python -m experiments.demo", description=__doc__)
     parser.parse_args()
-    folder = Path("runs") / "demo" / time.strftime("%Y-%m-%d_%H-%M-%S")
+    folder = Path("runs") / "demo" / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"  # two demos never meet
     signals: list[int] = []
     with stop.handled(lambda number, _: signals.append(number), *stop.SIGNALS):
         for arguments in commands(folder):

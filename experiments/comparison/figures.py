@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from experiments.comparison.page import law_of
 from experiments.comparison.published import TABLE_2
 from experiments.comparison.trials import DensityTrial, ShareTrial
-from experiments.reporting.charts import COLOURS, new_figure
+from experiments.reporting.charts import COLOURS, new_figure, pump_end
 
 __all__ = ["LONG_MIN", "bands", "differences", "plants", "published_and_ours", "share_errors", "shares"]
 
@@ -108,7 +108,7 @@ def bands(trials: Sequence[DensityTrial]) -> Figure:
         top.set_title(f"{trial.cell.controller}, n = {trial.od.shape[0]}")
         axes[(rows - 1) * len(trials) + column].set_xlabel("time, min")
     axes[0].set_ylabel("OD")
-    axes[len(trials)].set(ylabel="pump rate, µL/s", ylim=(-0.8, 21.5))
+    axes[len(trials)].set(ylabel="pump rate, µL/s", ylim=(-0.8, 0.5 + pump_end(*(trial.rate for trial in trials))))
     if switched:
         axes[2 * len(trials)].set_ylabel("vial, °C")
     return figure

@@ -16,8 +16,8 @@ from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
 __all__ = [
-    "COLOURS", "closed_loop", "learning", "new_figure", "policy_map", "relative_map", "relative_trajectories", "save",
-    "trajectories",
+    "COLOURS", "closed_loop", "learning", "new_figure", "policy_map", "pump_end", "relative_map",
+    "relative_trajectories", "save", "trajectories",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -72,6 +72,11 @@ class _Plain(LogFormatter):
         return f"{x:g}" if super().__call__(x, pos) else ""
 
 
+def pump_end(*rates: Array) -> float:
+    """Where an axis of pump rates in mL/s ends, uL/s: as on the usual bench, or beyond the largest that is drawn."""
+    return max(21.0, *(1050.0 * float(np.nanmax(rate, initial=0.0)) for rate in rates))
+
+
 def _population(ax: Axes, x: Array, curves: Array, colour: str, label: str) -> None:
     """One line for one agent; median, quartiles and range for several. curves: (K, S)."""
     if curves.shape[1] == 1:
@@ -114,10 +119,11 @@ def policy_map(od: Array, setpoint: Array, learned: Array, optimal: Array) -> Fi
     Args: od (X,), setpoint (Y,), learned and optimal (Y, X) in mL/s.
     """
     figure, axes = new_figure(9.0, 3.6, 1, 2, sharey=True)
+    most = max(20.0, 1000.0 * float(learned.max()), 1000.0 * float(optimal.max()))
     for ax, rate, title in zip(
         axes, (learned, optimal), ("learned policy", "optimum (dynamic programming)"), strict=True
     ):
-        mesh = ax.pcolormesh(od, setpoint, rate * 1000.0, cmap="viridis", vmin=0.0, vmax=20.0, rasterized=True)
+        mesh = ax.pcolormesh(od, setpoint, rate * 1000.0, cmap="viridis", vmin=0.0, vmax=most, rasterized=True)
         ax.plot([setpoint[0], setpoint[-1]], [setpoint[0], setpoint[-1]], color="white", linewidth=1, linestyle="--")
         ax.set(xlabel="OD x")
         ax.set_title(title)
@@ -149,7 +155,7 @@ def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates:
                 minutes[:-1], best_rates[:, g] * 1000.0, where="post", color="black", linewidth=0.8, linestyle=":"
             )
         top.set_title(f"setpoint {goal:g}")
-        bottom.set(xlabel="time, min", ylim=(-0.5, 21.0))
+        bottom.set(xlabel="time, min", ylim=(-0.5, pump_end(rates, best_rates)))
     axes[0].legend()
     axes[0].set_ylabel("OD")
     axes[goals.size].set_ylabel("pump rate, µL/s")
@@ -242,7 +248,7 @@ def closed_loop(
     axes[0].set_ylabel("OD")
     axes[0].set_title(title)
     axes[0].legend(ncols=3)
-    axes[1].set(ylabel="pump rate, µL/s", ylim=(-0.5, 21.0))
+    axes[1].set(ylabel="pump rate, µL/s", ylim=(-0.5, pump_end(rate)))
     if temperature is not None:
         axes[2].set_ylabel("temperature, °C")
     axes[-1].set_xlabel("time, min")

@@ -1,0 +1,565 @@
+"""What stands in a figure, read back from it: numbers in the unit of their axis, intervals the right way round.
+
+The data are made up so that no two units can be taken for each other: a pump that gives 4 uL/s, hours that are not
+minutes, a spread of which sd and variance differ, intervals that are longer to one side.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection, QuadMesh
+from matplotlib.figure import Figure
+
+from dqn.policy import load
+from envs.coculture.pair import PairConfig
+from envs.coculture.task import CocultureConfig
+from envs.identification.agreement import Agreement, Compared
+from envs.identification.curves import Plateau
+from envs.identification.drift import Drift, Segment
+from envs.identification.found import Calibration, Verdict
+from envs.identification.free_run import Fit
+from envs.identification.model import Parameter
+from envs.identification.prediction_error import Estimate, Quality
+from envs.identification.screening import Screened, Series
+from envs.identification.twin import Course, Noise, Twin
+from envs.identification.validation import Validation
+from envs.relative import RelativeConfig
+from envs.scenario import Scenario
+from envs.task import EnvConfig
+from experiments.calibration.result import environment_yaml, report
+from experiments.certification.config import CertifyConfig
+from experiments.certification.figure import figure as certificate_figure
+from experiments.certification.judge import Certificate, certify
+from experiments.comparison import figures
+from experiments.comparison.trials import Cell, DensityTrial, ShareTrial
+from experiments.control.policies import SHIPPED_COMPOSITION
+from experiments.record.record import Table
+from experiments.record.summary import composition_figure_of, figure_of
+from experiments.reporting import calibration_charts, charts, composition_charts, sweep_charts
+from experiments.reporting.agreement_chart import agreement_figure
+from experiments.reporting.pair_charts import pair_figure
+from experiments.reporting.verdict import verdict
+from experiments.training.coculture import Coculture
+from experiments.training.density import Density
+from experiments.training.relative import Relative
+from tests.experiments import laws
+
+MINUTES = np.arange(0.0, 331.0, 30.0)  # twelve samples, 5.5 h
+HOURS = MINUTES / 60.0
+OD = np.linspace(0.3, 0.52, 12)
+RATE = np.where(np.arange(12) % 3 == 0, 0.004, 0.012)  # mL/s
+SPREAD = np.array([-0.02, 0.0, 0.02])[:, None]  # sd 0.02, variance 0.0004
+
+
+def label(ax: Axes, axis: str) -> str:
+    """Of an axis, or of the one panel that says it for all that share it."""
+    shared = ax.get_shared_x_axes() if axis == "x" else ax.get_shared_y_axes()
+    said = {getattr(a, f"get_{axis}label")() for a in shared.get_siblings(ax)} - {""}
+    assert len(said) < 2
+    return str(*said).replace("\n", " ")
+
+
+def estimate(ax: Axes, low: float, high: float) -> tuple[float, float]:
+    """Value and height of the mark whose interval is this one."""
+    marks = [line.get_xydata() for line in ax.lines if len(line.get_xdata()) == 1]
+    for line in ax.lines:
+        x, y = map(np.asarray, line.get_data())
+        if x.size == 2 and np.allclose(x, (low, high)):
+            (mark,) = (m[0] for m in marks if low < m[0, 0] < high and m[0, 1] == y[0] == y[1])
+            return float(mark[0]), float(mark[1])
+    raise AssertionError(f"no interval from {low} to {high}: {[line.get_xdata() for line in ax.lines]}")
+
+
+def read(ax: Axes, what: str) -> tuple[Any, Any]:
+    """x and y of the so-manyth line, band (low, high) or bar (value, low, high) of a panel."""
+    kind, *k = what.split()
+    if kind == "row":
+        return estimate(ax, *map(float, k))
+    k = k[0] if k else "0"
+    if kind == "line":
+        x, y = ax.lines[int(k)].get_data()
+        return np.asarray(x, float), np.asarray(y, float)
+    if kind == "band":
+        band = [c for c in ax.collections if isinstance(c, PolyCollection)][int(k)]
+        corners = band.get_paths()[0].vertices
+        x = np.unique(corners[:, 0])
+        ends = [[f(corners[np.isclose(corners[:, 0], at), 1]) for at in x] for f in (np.min, np.max)]
+        return x, np.array(ends)
+    if kind == "stick":
+        sticks = [s for c in ax.collections if isinstance(c, LineCollection) for s in c.get_segments()]
+        return np.array([s[0, 0] for s in sticks]), np.array([[s[i, 1] for s in sticks] for i in (0, 1)])
+    bar = ax.containers[int(k)]
+    (ends,) = (c.get_segments() for c in bar.lines[2] if np.ptp(c.get_segments()[0][:, 0]) == 0.0)
+    x, y = bar.lines[0].get_data()
+    return np.asarray(x, float), np.array([y, *np.array([s[:, 1] for s in ends]).T], float)
+
+
+def table() -> Table:
+    """Two reactors, of which the second has twice of everything."""
+    one = {
+        "time_min": MINUTES, "elapsed_min": MINUTES, "od": OD, "setpoint": np.full(12, 0.45),
+        "temperature_degc": 37 - HOURS,
+        "pump_rate_ml_s": RATE, "phase": np.zeros(12), "believed": np.ones(12), "ratio": OD, "ratio_low": OD - 0.1,
+        "ratio_high": OD + 0.2, "ratio_setpoint": np.full(12, 0.4), "temperature_target_degc": 36 - HOURS,
+        "fluorescence": 1000 * OD,
+    }  # fmt: skip
+    both = {key: np.stack([values, 2.0 * values]) for key, values in one.items()}
+    return Table(
+        ("M0", "M1"), both | {k: np.stack([MINUTES] * 2) for k in ("time_min", "elapsed_min")}, [[], []], [], []
+    )
+
+
+SCENARIO = Scenario((0.45, 0.45), (180.0, 150.0), (37.0, 30.0), ratios=(0.4, 0.4))
+
+
+def closed_loop() -> Figure:
+    return figure_of(table(), [SCENARIO, SCENARIO], "")
+
+
+def composition() -> Figure:
+    return composition_figure_of(table(), [SCENARIO, SCENARIO], "B", "")
+
+
+def parameter(value: float) -> Parameter:
+    return Parameter(value, 0.9 * value, 1.3 * value)
+
+
+def compared(values: tuple[float, float], expected: float) -> Compared:
+    return Compared("", (0.0, 120.0), (120.0, 330.0), tuple(map(parameter, values)), expected, expected)
+
+
+@cache
+def agreed() -> Figure:
+    """Segments of 2 and 3.5 h; the controller believed 0.02 1/min and a gain of 0.8."""
+    series = Series(MINUTES, OD, RATE, np.arange(12))
+    parts = compared((0.03, 0.02), 0.028), compared((1.1, 0.9), 1.0), compared((0.002, 0.004), 0.0)
+    found = Agreement(series, *parts, OD - 0.05, 0.01, 0.005, 330.0)
+    believed = {"minute": MINUTES, "mu": np.full(12, 0.02), "gain": np.full(12, 0.8)}
+    return agreement_figure(found, believed, np.array([90.0]), "")
+
+
+@cache
+def calibrated(method: str = "prediction_error") -> tuple[Series, Calibration]:
+    """The window is from hour 1 to hour 4; a reading before it was rejected."""
+    raw = Series(MINUTES, np.where(MINUTES == 30.0, 0.1, OD), RATE, np.arange(12))
+    clean, none = raw.rejecting(MINUTES == 30.0), Parameter(0.0, 0.0, 0.0)
+    quality = Quality(1.0, 0.1, none, none, none, 0.01, 0.002, 0.005, 0.1, 0.0, False, 10.0, 0.0)
+    mu, tau, inside = parameter(0.03), parameter(0.35), slice(2, 9)
+    estimate = Estimate(mu, tau, parameter(3.0), 1.0, OD[inside] - 0.01, np.linspace(-2.0, 2.0, 7), quality)
+    along = tuple(
+        Segment(a, b, MINUTES[a:b].mean(), parameter(m), parameter(t))
+        for a, b, m, t in ((0, 4, 0.031, 0.33), (4, 8, 0.029, 0.36), (8, 12, 0.027, 0.4))
+    )
+    line = Drift(0.031, 0.027, -13.0, none, 3), Drift(0.33, 0.4, 20.0, none, 3)
+    return raw, Calibration(
+        Screened(clean, ((0, 12),), ()), (2, 9), "", method, mu, tau, estimate, True, None, OD[inside] + 0.02, 7.0, 7.0,
+        Validation(None, None, 0, None, 0), along, *line, Verdict("use", "", ""), (),
+    )  # fmt: skip
+
+
+@cache
+def twin() -> Figure:
+    """Knots 1 h apart from the recording's first row on."""
+    courses = (Course(np.array(v), 0.9 * np.array(v), 1.3 * np.array(v)) for v in ([0.03, 0.02], [0.3, 0.4]))
+    behind = Twin(np.array([0.0, 60.0]), *courses, Noise(0.002, 0.005, 0.1, 0.1, 0.01), 0.3, (2, 9), 30.0, True)
+    return calibration_charts.twin_figure(*calibrated(), behind, "")
+
+
+def trial(minutes: float, temperatures: tuple[float, float] = (37.0, 30.0)) -> DensityTrial:
+    """Three replicates about an OD of 0.5 and a rate of 8 uL/s; without noise they are at 0.6."""
+    minute = np.arange(minutes + 1.0)
+    od, rate = 0.5 + SPREAD + 0.0 * minute, 0.008 + 0.2 * SPREAD + 0.0 * minute
+    schedule = Scenario((0.5, 0.5), (minutes / 2, minutes / 2), temperatures)
+    return DensityTrial(
+        Cell("pi", "p", "s"), schedule, minute, 33.0 + 50.0 * SPREAD + 0.0 * minute, od, od + 0.1, rate, rate,
+        np.zeros(3), np.zeros(3, dtype=bool),
+    )  # fmt: skip
+
+
+def share_trial() -> ShareTrial:
+    """A hundred vials whose shares are spread evenly from 0.2 to 0.4, at 30 to 32 degC, for 2 h."""
+    minute, spread = np.arange(121.0), np.linspace(0.0, 1.0, 101)[:, None]
+    share, warm = 0.2 + 0.2 * spread + 0.0 * minute, 30.0 + 2.0 * spread + 0.0 * minute
+    nothing = np.zeros_like(share)
+    cell = Cell("pi", "p", "s", "share")
+    return ShareTrial(
+        cell, SCENARIO, minute, warm, False, np.full(121, 0.35), share, nothing, nothing, nothing, nothing
+    )
+
+
+def totals(law: str, ise: float, itae: float) -> dict[str, Any]:
+    found: dict[str, Any] = {"controller": law, "plant": "p", "floor_ise": 0.01, "floor_itae": 2.0}
+    for name, value in (("ise", ise), ("itae", itae)):
+        found |= {f"{name}_mean": value, f"{name}_ci95": [0.9 * value, 1.3 * value]}
+    return found
+
+
+def row(ise: float, itae: float) -> dict[str, Any]:
+    return totals("dqn", ise, itae) | {"scenario": "setpoint_steps", "window": "0.8"}
+
+
+def difference(metric: str, percent: float) -> dict[str, Any]:
+    """Of which 1 is 50 %: an interval from 0.1 below to 0.3 above."""
+    value = percent / 50.0
+    between = {"difference": value, "ci95": [value - 0.1, value + 0.3], "verdict": "higher"}
+    return {"controller": "pi", "plant": "p", "metric": metric, "percent": percent, **between}
+
+
+@cache
+def density() -> dict[str, Figure]:
+    """What a training on a plant that is looked at every 5 min draws."""
+    return Density(EnvConfig(control_min=5.0, episode_steps=6)).figures(laws.law())
+
+
+@cache
+def relative() -> dict[str, Figure]:
+    return Relative(RelativeConfig()).figures(laws.share_law())
+
+
+@cache
+def proven(share: bool) -> Certificate:
+    policy = laws.share_law() if share else laws.law()
+    return certify(policy, CertifyConfig(env=EnvConfig(), setpoints=(0.4, 0.8), trajectories=0, quick=True))
+
+
+@cache
+def certificate(share: bool) -> Figure:
+    return certificate_figure(proven(share))
+
+
+def middle(share: bool) -> Any:
+    loop = proven(share).question.loop
+    return (loop.low + loop.high) / 2.0
+
+
+@cache
+def two() -> Figure:
+    """E. coli by its published line, and a point that is longer to one side."""
+    points = (
+        [Plateau(30.0, Parameter(0.6, 0.5, 0.9), None, 0, 1)],
+        [Plateau(34.0, Parameter(0.8, 0.75, 1.0), None, 0, 1)],
+    )
+    return pair_figure(PairConfig(), points)
+
+
+def fit(method: str) -> Figure:
+    return calibration_charts.fit_figure(*calibrated(method), "")
+
+
+def coverage() -> Figure:
+    """Three recordings of 0.02 1/min and tau 0.5, of which the second misses both; drawn by rising estimate."""
+    mu = np.array([[0.02, 0.018, 0.026], [0.016, 0.014, 0.018], [0.024, 0.019, 0.03]])
+    return calibration_charts.coverage_figure(mu, 25.0 * mu, (np.full(3, 0.02), np.full(3, 0.5)), "")
+
+
+def learning(agents: int) -> Figure:
+    """Two episodes that cost 0.2 and 30; regrets at steps 100 and 200, from 4 and 0.5 % upwards."""
+    more = np.arange(agents)
+    regret = np.array([[4.0], [0.5]]) + more
+    return charts.learning(np.array([[-0.2], [-30.0]]) - more, np.array([100.0, 200.0]), regret, np.array([200.0]))
+
+
+def episodes() -> Figure:
+    columns = ([[0.4], [0.5]], [[0.2], [0.3]], [[0.1], [0.15]], [[30.0], [31.0]], [[33.0], [34.0]])
+    return composition_charts.episodes(np.array([1.0, 2.0]), *map(np.array, columns), "B. subtilis")
+
+
+def compared_laws() -> Figure:
+    return figures.plants([totals("oracle", 0.05, 6.0), totals("pi", 0.2, 9.0)])
+
+
+def bounds(*values: float) -> list[list[float]]:
+    """Values, and the ends of their intervals."""
+    return [[f * v for v in values] for f in (1.0, 0.9, 1.3)]
+
+
+H, MIN, GOAL, SHARE, PERIODS = "time, h", "time, min", "setpoint", "growth share", "periods of full pump"
+MU, TAU, GAIN, PUMP = "growth rate µ, 1/min", "dilution constant τ", "pump gain, 1 = the model's", "pump rate, µL/s"
+SORTED = "simulated recording, sorted by estimate"
+MISSED, WARM = "measured minus predicted, OD", "temperature, °C"
+INSIDE, KNOTS, MIDDLES = HOURS[2:9], [0.0, 1.0], [0.75, 2.75, 4.75]
+WARMTH = np.linspace(29.0, 36.0, 141)
+FED = [4, 12, 12] * 4
+ONES, TENS = np.arange(90.0), np.arange(4.5, 400.0, 10.0)
+STEPS = [100.0, 200.0]
+
+Drawn = tuple[int, str, str, str, Any, Any]
+DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
+    "closed loop": (closed_loop, [
+        (0, "line 0", MIN, "OD", MINUTES, OD),
+        (0, "line 1", MIN, "OD", MINUTES, np.full(12, 0.45)),
+        (0, "line 2", MIN, "OD", MINUTES, 2 * OD),
+        (1, "line 0", MIN, PUMP, MINUTES, FED),
+        (2, "line 0", MIN, WARM, MINUTES, 37 - HOURS),
+    ]),
+    "composition": (composition, [
+        (0, "line 0", H, "share of B", HOURS, OD),
+        (0, "band 0", H, "share of B", HOURS, [OD - 0.1, OD + 0.2]),
+        (1, "line 0", H, WARM, HOURS, 37 - HOURS),
+        (1, "line 1", H, WARM, HOURS, 36 - HOURS),
+        (2, "line 0", H, "OD", HOURS, OD),
+        (3, "line 0", H, PUMP, HOURS, FED),
+        (4, "line 0", H, "fluorescence, counts", HOURS, 1000 * OD),
+    ]),
+    "agreement": (agreed, [
+        (0, "bar 0", H, MU, [1.0, 3.75], bounds(0.03, 0.02)),
+        (0, "line 0", H, MU, [0, 1], [0.028, 0.028]),
+        (0, "band 1", H, MU, [2.0, 5.5], [[0.028 + 0.0036] * 2, [0.028 + 0.0052] * 2]),
+        (0, "line -1", H, MU, HOURS, np.full(12, 0.02)),
+        (1, "bar 0", H, GAIN, [1.0, 3.75], bounds(1.1, 0.9)),
+        (1, "line -1", H, GAIN, HOURS, np.full(12, 0.8)),
+        (2, "line 1", H, MISSED, HOURS, np.full(12, 0.05)),
+        (2, "line 2", H, MISSED, [1.5], [0.0]),
+    ]),
+    "fit": (lambda: fit("prediction_error"), [
+        (0, "line 0", H, "OD", INSIDE, OD[2:9]),
+        (0, "line -1", H, "OD", INSIDE, OD[2:9] - 0.01),
+        (1, "line 1", H, "innovation, predicted sd", INSIDE, np.linspace(-2.0, 2.0, 7)),
+        (2, "line 0", H, PUMP, HOURS, FED),
+    ]),
+    "fit of a free run": (lambda: fit("free_run"), [
+        (0, "line -1", H, "OD", INSIDE, OD[2:9] + 0.02),
+        (1, "line 1", H, "measured minus model, OD", INSIDE, np.full(7, -0.02)),
+    ]),
+    "drift": (lambda: calibration_charts.drift_figure(calibrated()[1], ""), [
+        (0, "bar 0", H, MU, MIDDLES, bounds(0.031, 0.029, 0.027)),
+        (0, "line 0", H, MU, [1.0, 4.0], [0.03, 0.03]),
+        (0, "band 0", H, MU, [1.0, 4.0], [[0.027] * 2, [0.039] * 2]),
+        (0, "line -1", H, MU, [0.75, 4.75], [0.031, 0.027]),
+        (1, "bar 0", H, TAU, MIDDLES, bounds(0.33, 0.36, 0.4)),
+        (1, "band 0", H, TAU, [1.0, 4.0], [[0.315] * 2, [0.455] * 2]),
+        (1, "line -1", H, TAU, [0.75, 4.75], [0.33, 0.4]),
+    ]),
+    "twin": (twin, [
+        (0, "line 0", H, MU, [1.0, 2.0], [0.03, 0.02]),
+        (0, "band 0", H, MU, [1.0, 2.0], bounds(0.03, 0.02)[1:]),
+        (0, "line 2", H, MU, MIDDLES, [0.031, 0.029, 0.027]),
+        (1, "line 0", H, TAU, [1.0, 2.0], [0.3, 0.4]),
+        (1, "band 0", H, TAU, [1.0, 2.0], bounds(0.3, 0.4)[1:]),
+        (2, "line 0", H, "OD", HOURS, np.where(MINUTES == 30.0, np.nan, OD)),
+    ]),
+    "coverage": (coverage, [
+        (0, "line 0", SORTED, "growth rate µ over its truth", [0, 1, 2], [0.8, 1.0, 1.2]),
+        (0, "stick", SORTED, "growth rate µ over its truth", [1, 2, 0], [[0.9, 0.95, 0.7], [1.3, 1.5, 0.9]]),
+        (1, "stick", SORTED, "dilution constant τ over its truth", [1, 2, 0], [[0.9, 0.95, 0.7], [1.3, 1.5, 0.9]]),
+    ]),
+    "pair": (two, [
+        (0, "line 0", WARM, "growth rate, 1/h", WARMTH, 0.07727 * WARMTH - 1.66954),
+        (0, "line 4", WARM, "growth rate, 1/h", WARMTH, -0.02208 * WARMTH**2 + 1.3796 * WARMTH - 20.56996),
+        (0, "bar 0", WARM, "growth rate, 1/h", [30.0], [[0.6], [0.5], [0.9]]),
+        (0, "bar 1", WARM, "growth rate, 1/h", [34.0], [[0.8], [0.75], [1.0]]),
+        (1, "line 0", WARM, "pigment, counts per hour and OD", WARMTH, PairConfig().production(WARMTH)),
+    ]),
+    "learning": (lambda: learning(1), [
+        (0, "line 0", "episode", "cost of the episode, sum of (x − setpoint)²", [1, 2], [0.2, 30.0]),
+        (1, "line 0", "environment step", "regret against the optimum, %", STEPS, [4.0, 0.5]),
+        (1, "line 1", "environment step", "regret against the optimum, %", [200.0, 200.0], [0.0, 1.0]),
+    ]),
+    "learning of five": (lambda: learning(5), [
+        (0, "line 0", "episode", "cost of the episode, sum of (x − setpoint)²", [1, 2], [2.2, 32.0]),
+        (1, "line 0", "environment step", "regret against the optimum, %", STEPS, [6.0, 2.5]),
+        (1, "band 0", "environment step", "regret against the optimum, %", STEPS, [[4.0, 0.5], [8.0, 4.5]]),
+        (1, "band 1", "environment step", "regret against the optimum, %", STEPS, [[5.0, 1.5], [7.0, 3.5]]),
+    ]),
+    "episodes": (episodes, [
+        (0, "line 0", "hours", "share of B. subtilis", [1, 2], [0.4, 0.5]),
+        (0, "line 1", "hours", "share of B. subtilis", [1, 2], [0.2, 0.3]),
+        (0, "line 2", "hours", "share of B. subtilis", [1, 2], [0.1, 0.15]),
+        (1, "line 0", "hours", "thermostat, °C", [1, 2], [30.0, 31.0]),
+        (1, "line 1", "hours", "thermostat, °C", [1, 2], [33.0, 34.0]),
+    ]),
+    "bands": (lambda: figures.bands([trial(90.0)]), [
+        (0, "line 1", MIN, "OD", ONES, np.full(90, 0.5)),
+        (0, "band 0", MIN, "OD", ONES, [[0.48] * 90, [0.52] * 90]),
+        (1, "line 0", MIN, PUMP, ONES, np.full(90, 8.0)),
+        (1, "band 0", MIN, PUMP, ONES, [[4.0] * 90, [12.0] * 90]),
+        (2, "line 0", MIN, "vial, °C", ONES, np.full(90, 33.0)),
+        (2, "band 0", MIN, "vial, °C", ONES, [[32.0] * 90, [34.0] * 90]),
+    ]),
+    "bands of a long run": (lambda: figures.bands([trial(400.0)]), [
+        (0, "line 1", MIN, "OD", TENS, np.full(40, 0.6)),
+        (1, "line 0", MIN, PUMP, TENS, np.full(40, 8.0)),
+    ]),
+    "shares": (lambda: figures.shares([share_trial()]), [
+        (0, "line 0", "hours", "share of the second species", np.arange(0, 121, 5) / 60, np.full(25, 0.3)),
+        (0, "band 0", "hours", "share of the second species", np.arange(0, 121, 5) / 60, [[0.21] * 25, [0.39] * 25]),
+        (0, "line 1", "hours", "share of the second species", np.arange(0, 121, 5) / 60, np.full(25, 0.35)),
+        (1, "line 0", "hours", "vial, °C", np.arange(0, 121, 5) / 60, np.full(25, 31.0)),
+        (1, "band 0", "hours", "vial, °C", np.arange(0, 121, 5) / 60, [[30.1] * 25, [31.9] * 25]),
+    ]),
+    "the paper's table": (lambda: figures.published_and_ours([row(0.05, 6.0)]), [
+        (0, "row 0.045 0.065", "ISE (T = 1 min), OD² min", "", 0.05, -0.24),
+        (1, "row 5.4 7.8", "ITAE (T = 1 min), OD min²", "", 6.0, -0.24),
+    ]),
+    "plants": (compared_laws, [
+        (0, "row 0.045 0.065", "ISE, OD² min, sum over the windows (T = 1 min)", "", 0.05, -0.18),
+        (0, "row 0.18 0.26", "ISE, OD² min, sum over the windows (T = 1 min)", "", 0.2, 0.18),
+        (1, "row 5.4 7.8", "ITAE, OD min², sum over the windows (T = 1 min)", "", 6.0, -0.18),
+        (1, "row 8.1 11.7", "ITAE, OD min², sum over the windows (T = 1 min)", "", 9.0, 0.18),
+    ]),
+    "differences": (lambda: figures.differences([difference("ise", -40.0), difference("itae", 25.0)], "dqn"), [
+        (0, "row -45 -25", "ISE minus that of dqn, %", "", -40.0, 0.0),
+        (1, "row 20 40", "ITAE minus that of dqn, %", "", 25.0, 0.0),
+    ]),
+    "errors of a share": (lambda: figures.share_errors(
+        [{"controller": "pi", "plant": "p", "ratio_abs_error_mean": 0.1, "ci95": [0.09, 0.13]}]), [
+        (0, "row 0.09 0.13", "mean |r - setpoint|", "", 0.1, 0.0),
+    ]),
+    "curves of a sweep": (lambda: sweep_charts.learning_curves(
+        [("a", np.array(STEPS), np.array([[4.0, 5.0, 6.0, 9.0], [1.0, 2.0, 3.0, 8.0]]))], "regret, %"), [
+        (0, "line 0", "environment step", "regret, %", STEPS, [5.5, 2.5]),
+        (0, "line 1", "environment step", "regret, %", STEPS, [9.0, 8.0]),
+    ]),
+    "values of a sweep": (lambda: sweep_charts.values(
+        {"a": np.array([1.0, 2.0, 3.0, 8.0]), "b": np.array([4.0])}, "regret, %"), [
+        (0, "line 0", "regret, %", "", [1.0, 2.0, 3.0, 8.0], [0, 0, 0, 0]),
+        (0, "line 1", "regret, %", "", [2.5, 2.5], [-0.3, 0.3]),
+        (0, "line 2", "regret, %", "", [4.0], [1]),
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(DRAWN))
+def test_what_is_drawn_is_in_the_unit_of_its_axis(name: str) -> None:
+    make, parts = DRAWN[name]
+    axes = make().axes
+    for panel, what, xlabel, ylabel, x, y in parts:
+        where = f"panel {panel}, {what}"
+        if "pump rate" in ylabel:  # the whole of it is seen
+            assert max(float(np.nanmax(line.get_ydata())) for line in axes[panel].lines) < axes[panel].get_ylim()[1]
+        assert (where, label(axes[panel], "x"), label(axes[panel], "y")) == (where, xlabel, ylabel)
+        for found, expected in zip(read(axes[panel], what), (x, y), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9, err_msg=where)
+
+
+def test_every_figure_of_the_program_is_among_these() -> None:
+    """What a module of figures offers, and what the rooms that draw call."""
+    here = Path(__file__).read_text(encoding="utf-8")
+    modules = [charts, calibration_charts, composition_charts, sweep_charts, figures]
+    drawing = {
+        n for m in modules for n in m.__all__ if getattr(getattr(m, n), "__annotations__", {}).get("return") is Figure
+    }
+    assert len(drawing) >= 17
+    assert not [n for n in drawing if f".{n}(" not in here and n not in THROUGH]
+
+
+THROUGH = {"closed_loop", "composition_figure", "policy_map", "trajectories", "relative_map", "relative_trajectories"}
+"""Drawn here through whoever calls them."""
+
+
+def test_a_map_of_a_policy_shows_its_rates_where_it_chooses_them() -> None:
+    axes = density()["policy_map"].axes
+    assert (label(axes[0], "x"), label(axes[0], "y"), axes[2].get_ylabel()) == ("OD x", "setpoint, OD", PUMP)
+    (mesh,) = (c for c in axes[0].collections if isinstance(c, QuadMesh))
+    edges, shown = mesh.get_coordinates(), np.asarray(mesh.get_array())
+    od, goal = (edges[0, :-1, 0] + edges[0, 1:, 0]) / 2, (edges[:-1, 0, 1] + edges[1:, 0, 1]) / 2
+    assert (od[0], od[-1], goal[0], goal[-1]) == pytest.approx((0.05, 1.25, 0.2, 1.0))
+    policy = laws.law()
+    for i, k in ((0, 240), (16, 120), (32, 200), (5, 60)):
+        rate = policy.actions[int(policy.act(np.array([[od[k], goal[i]]]))[0])]
+        assert shown[i, k] == pytest.approx(1000.0 * rate)
+    assert {0.0, 20.0} <= set(shown.ravel())
+    assert mesh.get_clim() == (0.0, 20.0)
+    strong = charts.policy_map(od, goal, 2.0 * shown / 1000.0, shown / 1000.0).axes[0].collections[0]
+    assert strong.get_clim() == (0.0, 40.0)
+
+
+def test_example_loops_follow_the_model_by_what_their_axes_say() -> None:
+    """x' = x exp((mu - u / tau) min), with min and uL/s as they are drawn: of the policy, and of the optimum."""
+    axes = density()["trajectories"].axes
+    top, bottom = axes[0], axes[3]
+    assert (label(top, "x"), label(top, "y"), label(bottom, "y")) == (MIN, "OD", PUMP)
+    for k in (0, 1):
+        (minutes, od), (begins, rate) = read(top, f"line {1 + k}"), read(bottom, f"line {k}")
+        np.testing.assert_allclose(minutes, 5.0 * np.arange(7))
+        np.testing.assert_allclose(begins, minutes[:-1])
+        np.testing.assert_allclose(np.diff(np.log(od)), 5.0 * (0.03 - rate / 1000.0 / (1 / 3)), rtol=0.01, atol=1e-6)
+        assert rate.max() > 1.0
+
+
+def test_example_loops_in_relative_coordinates_follow_their_model() -> None:
+    """e' = e + s - v, with s in the title of the column."""
+    axes = relative()["trajectories"].axes
+    assert (label(axes[0], "x"), label(axes[0], "y"), label(axes[3], "y")) == (
+        "control periods", f"error e, {PERIODS}", "dose, share of full pump"
+    )  # fmt: skip
+    for column, share in enumerate((0.1, 0.5, 0.9)):
+        assert axes[column].get_title() == f"growth takes {share:g} of the pump"
+        (period, error), (_, dose) = read(axes[column], "line 0"), read(axes[3 + column], "line 0")
+        np.testing.assert_array_equal(period, np.arange(period.size))
+        k = min(error.size, dose.size) - 1
+        np.testing.assert_allclose(np.diff(error)[:k], share - dose[:k], atol=1e-6)
+    axes = relative()["policy_map"].axes
+    assert (label(axes[0], "x"), label(axes[0], "y"), axes[2].get_ylabel()) == (
+        f"error e, {PERIODS}", "growth's share of the pump, s", "dose, share of full pump"
+    )  # fmt: skip
+    (mesh,) = (c for c in axes[0].collections if isinstance(c, QuadMesh))
+    edges, shown = mesh.get_coordinates(), np.asarray(mesh.get_array())
+    error, share = (edges[0, :-1, 0] + edges[0, 1:, 0]) / 2, (edges[:-1, 0, 1] + edges[1:, 0, 1]) / 2
+    inside = np.abs(error) < 1.0
+    law = np.clip(error[None, inside] + share[:, None], 0.0, 1.0)
+    np.testing.assert_allclose(shown[:, inside], law, atol=1 / 32 + 1e-6)  # the nearest of 17 levels
+
+
+def test_example_episodes_of_a_share_are_as_long_as_they_say() -> None:
+    """Twelve decisions of 10 min, each of one of 17 temperatures from 29 to 36 degC."""
+    task, shipped = Coculture(CocultureConfig(episode_steps=12)), load(SHIPPED_COMPOSITION["dqn"])
+    axes = task.figures(shipped)["trajectories"].axes
+    hours, chosen = read(axes[6], "line 0")
+    np.testing.assert_allclose(hours, np.arange(1, 13) / 6.0)
+    assert set(chosen) <= set(np.linspace(29.0, 36.0, 17))
+    assert (label(axes[0], "x"), label(axes[0], "y"), label(axes[6], "y")) == (
+        "hours", "share of P. putida", "thermostat, °C"
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("share", [False, True], ids=["OD", "relative"])
+def test_the_figure_of_a_certificate_shows_what_is_proven(share: bool) -> None:
+    found, unit, over = proven(share), PERIODS if share else "OD", SHARE if share else GOAL
+    polygons, widths, entries, doses = certificate_figure(found).axes
+    low, high = (0.05, 0.97) if share else (0.4, 0.8)
+    first = found.proofs[0]
+    for ax, line, ylabel, y in (
+        (widths, 0, f"half-width, {unit}", first.half_width),
+        (widths, 1, f"half-width, {unit}", first.law_half_width),
+        (entries, 0, "periods after the one-line law" if share else "entry time over the pump's own",
+         first.later if share else first.entry),
+        (doses, 0, "periods of growth", found.doses[0]),
+    ):  # fmt: skip
+        assert (label(ax, "x"), label(ax, "y")) == (over, ylabel)
+        x, drawn = read(ax, f"line {line}")
+        assert (x[0], x[-1]) == pytest.approx((low, high), abs=0.005)
+        np.testing.assert_allclose(drawn, y)
+    seen = "estimate of e" if share else "reading, OD"
+    assert (label(polygons, "x"), label(polygons, "y")) == (seen, over)
+    (cut,) = (c for c in polygons.collections if isinstance(c, PolyCollection))
+    corners = np.concatenate([p.vertices for p in cut.get_paths()])
+    (left, bottom), (right, top) = corners.min(axis=0), corners.max(axis=0)
+    assert left < 0.0 < 1.1 < right
+    assert (bottom, top) == pytest.approx((low, high), abs=0.6 if share else 1e-3)
+    assert not share or (bottom >= 0.05 - 1e-6 and top <= 0.98 + 1e-6)
+
+
+def test_intervals_are_written_from_low_to_high() -> None:
+    """On the screen, in the environment that a training reads, and on the page."""
+    _, result = calibrated()
+    said = report(result, SimpleNamespace(notes=()), {"doubling_min": 23.1})
+    assert "mu          0.03000 1/min   95 % 0.02700 to 0.03900 " in said
+    assert "tau         0.3500          95 % 0.3150 to 0.4550 " in said
+    assert "# 95 % intervals: mu 0.027 to 0.039 1/min, tau 0.315 to 0.455." in environment_yaml(result, "here")
+    free = Fit(parameter(0.031), parameter(0.36), 0.3, OD, 7.0, 0.01, 100, 0.1)
+    beside = report(replace(result, free_run=free), SimpleNamespace(notes=()), {"doubling_min": 23.1})
+    assert "beside      free_run: mu 0.03100 (0.02790 to 0.04030), tau 0.3600 (0.3240 to 0.4680)" in beside
+    pair = {"mu": {"value": 0.03, "ci95": [0.027, 0.039]}, "tau": {"value": 0.35, "ci95": [0.315, 0.455]}}
+    rest = {"verdict": {"word": "use", "why": "", "then": ""}, "warnings": [], "doubling_min": 23.1}
+    found = verdict({"pmse_pct": 7.0, "n_used": 9, "n_rejected": 0, **pair, **rest}, {})
+    assert found is not None
+    assert found.items[0] == "mu 0.03 1/min, 95 % interval 0.027 to 0.039; doubling time 23.1 min"
+    assert found.items[1] == "tau 0.35, 95 % interval 0.315 to 0.455"
