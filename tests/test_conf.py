@@ -73,14 +73,50 @@ def test_the_papers_agent_adds_nothing_to_a_plain_dqn():
     assert len(agent.input_matrix) == 0
 
 
+def said(group: str, option: str) -> dict[str, Any]:
+    """What the file of a preset and those it stands on say, read by nothing but YAML."""
+    own = yaml.safe_load((CONF / group / f"{option}.yaml").read_text()) or {}
+    values: dict[str, Any] = {}
+    for below in own.pop("defaults", []):
+        if below != "_self_":
+            merge(values, said(group, below))
+    merge(values, own)
+    return values
+
+
+def merge(into: dict[str, Any], values: dict[str, Any]) -> None:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            merge(into.setdefault(key, {}), value)
+        else:
+            into[key] = value
+
+
+def held(config: Any, values: dict[str, Any], prefix: str = "") -> dict[str, tuple[Any, Any]]:
+    """Every value of a preset that a config has otherwise: the two of them by name."""
+    wrong = {}
+    for key, value in values.items():
+        found = getattr(config, key)
+        if isinstance(value, dict) and not isinstance(found, dict):
+            wrong |= held(found, value, f"{prefix}{key}.")
+        elif (list(found) if isinstance(found, tuple) else found) != value:
+            wrong[f"{prefix}{key}"] = found, value
+    return wrong
+
+
 @pytest.mark.parametrize("option", options("scenario"))
 def test_every_scenario_composes(option):
-    assert load_deploy(f"scenario={option}").scenario.total_min > 0
+    """To what its file says; its minutes are those of its steps together."""
+    scenario, values = load_deploy(f"scenario={option}").scenario, said("scenario", option)
+    assert held(scenario, values) == {}
+    minutes = values.get("minutes", [60] if option == "hold" else list(scenario.minutes))
+    assert scenario.total_min == sum(minutes)
+    assert len(scenario.setpoints) == len(scenario.temperatures) == len(minutes)
 
 
 @pytest.mark.parametrize("option", options("plant"))
 def test_every_plant_composes(option):
-    assert load_deploy(f"plant={option}").plant.growth.mu > 0
+    assert held(load_deploy(f"plant={option}").plant, said("plant", option)) == {}
 
 
 def test_the_overflow_pump_of_the_device_is_off_and_its_values_are_checked():

@@ -65,6 +65,10 @@ def test_a_drifting_run_is_told_to_calibrate_again(copy):
         with open(copy / "tables" / f"after_{name}.csv", newline="") as f:
             rows = list(csv.reader(f))
         net = [float(row[3].split(" (")[0]) for row in rows[1:]]
+        intervals = [re.fullmatch(r"(\S+) \((\S+) to (\S+)\)", cell) for row in rows[1:] for cell in row[1:]]
+        known = [[float(number) for number in found.groups()] for found in intervals if found]
+        assert len(known) >= 6
+        assert all(low < value < high for value, low, high in known)
         # by hand: 6 % an hour of 0.03 1/min, in the middle of each two hours
         np.testing.assert_allclose(net, [0.03 * 0.06 * h for h in (1.0, 3.0, 5.0)], atol=0.0015)
     assert sections(copy) == text  # a second report finds the same run

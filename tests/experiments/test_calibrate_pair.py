@@ -1,6 +1,7 @@
 """Two species from recordings of each alone, against plants whose curves are known."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,7 +65,9 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     return str(folder / "a.csv"), str(folder / "b.csv")
 
 
-def test_curves_pigment_and_crossing_are_found(alone: tuple[str, str], tmp_path: Path) -> None:
+def test_curves_pigment_and_crossing_are_found(
+    alone: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = CalibratePairConfig((alone[0],), (alone[1],), ("alpha", "beta"), factor=1.0)
     calibrate_pair(config, tmp_path)
     pair = named_pair(str(tmp_path / "pair.yaml"))
@@ -75,6 +78,12 @@ def test_curves_pigment_and_crossing_are_found(alone: tuple[str, str], tmp_path:
     np.testing.assert_allclose(pair.production(t), TRUE.production(t), rtol=0.15)
     assert pair.temperatures == pytest.approx((27.5, 35.0), abs=0.11)
     assert (tmp_path / "figures" / "pair.png").is_file()
+    said = re.findall(r"^ +(\S+)  (\S+) \((\S+) to (\S+)\)", capsys.readouterr().out, re.MULTILINE)
+    assert len(said) == 8
+    for k, (at, *growth) in enumerate(map(float, line) for line in said):
+        value, low, high = growth
+        assert low < value < high
+        assert value == pytest.approx(TRUE.rates(at)[k // 4], rel=0.05)
     found = json.loads((tmp_path / "summary.json").read_text())
     assert [len(mine) for mine in found["plateaus"]] == [4, 4]
     assert np.abs(found["off_sd"]).max() < 3.0

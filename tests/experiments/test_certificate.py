@@ -370,6 +370,10 @@ def test_the_command_leaves_a_certificate_a_figure_and_a_page(tmp_path: Path) ->
     assert stored.config.env is not None
     assert (stored.config.env.mu, stored.config.env.tau) == (0.03, 1 / 3)
     assert (folder / "figures" / "certificate.svg").is_file()
+    for case in json.loads((tmp_path / "certificate.json").read_text())["cases"]:
+        assert all(
+            proven and low < 0.0 < high for proven, (low, high) in zip(case["proven"], case["band"], strict=True)
+        )
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "nominal: half-width over that of the law, OD" in page
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))

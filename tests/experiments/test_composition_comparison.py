@@ -160,6 +160,13 @@ def test_the_command_leaves_numbers_figures_and_a_page(tmp_path):
     assert [r["controller"] for r in summary["rows"]] == ["pi", "proportional", "dqn_preview"]
     assert [r["preview"] for r in summary["rows"]] == [False, False, True]
     assert all(keys <= set(r) for r in summary["rows"])
+    for r in summary["rows"][:2]:
+        t = trial(r["controller"], calibrated=r["calibrated"])
+        asked = ~np.isnan(t.setpoint)
+        error = np.abs(t.share[:, asked] - t.setpoint[asked]).mean(axis=1)
+        assert (r["n"], r["ratio_abs_error_mean"]) == (3, pytest.approx(error.mean()))
+        assert r["ratio_abs_error_sd"] == pytest.approx(error.std(ddof=1))
+        assert (r["od_min"], r["od_max"]) == pytest.approx((t.od.min(), t.od.max()))
     assert {e["signal"] for e in summary["rows"] + summary["paired"]} == {"share"}
     assert [p["controller"] for p in summary["paired"]] == ["proportional", "dqn_preview"]
     page = (tmp_path / "report.html").read_text()

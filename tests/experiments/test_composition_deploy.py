@@ -77,7 +77,8 @@ def test_the_summary_has_the_errors_of_every_window(deployed: Path) -> None:
     assert third["ratio_abs_error_last2h"] == pytest.approx(np.abs(ratio[late] - 0.7).mean())
     assert third["true_ratio_abs_error_mean"] == pytest.approx(np.abs(true[inside] - 0.7).mean())
     assert third["od_abs_error_mean"] == pytest.approx(np.abs(od[inside] - 0.5).mean())
-    assert third["ise"] > 0.0
+    ends = (minute >= 170.0) & (minute <= 350.0)
+    assert third["ise"] == pytest.approx(np.trapezoid((od[ends] - 0.5) ** 2, minute[ends]))
     assert windows[0]["ratio_abs_error_mean"] is windows[5]["ratio_abs_error_last2h"] is None
 
 

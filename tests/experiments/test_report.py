@@ -110,6 +110,12 @@ def test_page_holds_what_it_must(text, benchmark):
     for cell in TABLE_2:
         if cell.scenario == "setpoint_steps":
             assert number(cell.itae, 4) in text
+    fitted = re.search(
+        r"Calibration: mu (\S+) \(95 % (\S+) to (\S+); true 0.03\), tau (\S+) \(95 % (\S+) to (\S+);", text
+    )
+    assert fitted
+    mu, low, high, tau, lower, higher = map(float, fitted.groups())
+    assert low < mu < high < lower < tau < higher
     assert "gain_ml_s: 1.11" in text  # the plants' values stand in the unfolded configuration
 
 
@@ -130,7 +136,15 @@ def test_tables_are_the_summarys_numbers(benchmark):
             assert r[f"{c}, here"] == plus_minus(ours[c]["itae_mean"], ours[c]["itae_sd"])
         assert r["lowest here"] == min(ours, key=lambda c: ours[c]["itae_mean"])
     with open(benchmark / "tables" / "rows.csv", newline="") as f:
-        assert len(list(csv.DictReader(f))) == len(summary["rows"])
+        head, *every = csv.reader(f)
+    assert len(every) == len(summary["rows"])
+    for line, own, more in zip(every, summary["rows"], summary["details"], strict=True):
+        said = dict(zip(head, line, strict=True))
+        assert line[3] == f"{number(own['ise_ci95'][0])} to {number(own['ise_ci95'][1])}"
+        assert line[5] == f"{number(own['itae_ci95'][0])} to {number(own['itae_ci95'][1])}"
+        assert (said["settling, min"], said["medium, mL"]) == (number(own["settling_min"]), number(own["media_ml"]))
+        assert said["effort, µL/s"] == number(more["effort_ul_s"])
+        assert own["ise_ci95"][0] < own["ise_mean"] < own["ise_ci95"][1] or own["ise_sd"] == 0.0
     latex = (benchmark / "tables" / "table2_ise.tex").read_text()
     assert all(line.count("&") == 8 for line in latex.splitlines() if line.endswith(r"\\"))
     assert r"\textbf{" in latex
@@ -179,7 +193,11 @@ def test_every_table_marks_the_law_that_is_best_by_its_own_measure():
     ]  # fmt: skip
     entries.append({**entries[0], "controller": "oracle", **dict.fromkeys(measures, 0.5)})
     page = one_section()
-    comparison.every_plant(page, {"totals": entries, "paired_totals": []}, "s")
+    pair = {"controller": "a", "against": "dqn", "plant": "p", "scenario": "s", "metric": "ise", "percent": -40.0,
+            "difference": -0.8, "ci95": [-0.9, -0.5]}  # fmt: skip
+    comparison.every_plant(page, {"totals": entries, "paired_totals": [pair]}, "s")
+    (differences,) = (table for table in page.tables if table.name == "s_ise_vs_dqn")
+    assert differences.rows == (("p", "-40.0 [-45.0, -25.0]"),)
     for key, law in zip(RANKED, LAWS, strict=True):
         assert (key, marked(page, f"s_{key.removesuffix('_mean')}")) == (key, [law])
     for key in ("effort_ul_s", "media_ml", "held"):
@@ -194,8 +212,11 @@ def test_every_table_of_a_share_marks_the_law_that_is_best_by_its_own_measure(tm
         | {key: 0.1 if LAWS.index(law) == i else 0.2 for i, key in enumerate(measures)}
         for law in LAWS[:3]
     ]
+    pair = {**entries[1], "difference": -0.1, "ci95": [-0.12, -0.05], "lower_in": 2}
     page = one_section()
-    comparison.SECTIONS["share"].add(page, {"rows": entries, "paired": [], "figures": []}, tmp_path)
+    comparison.SECTIONS["share"].add(page, {"rows": entries, "paired": [pair], "figures": []}, tmp_path)
+    (differences,) = (table for table in page.tables if table.name == "s_paired")
+    assert differences.rows == (("b", "-0.1000 [-0.1200, -0.0500], lower in 2 of 3"),)
     assert [marked(page, f"s_{key}") for key in measures] == [["a"], ["b"], ["c"]]
 
 

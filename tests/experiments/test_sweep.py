@@ -10,12 +10,14 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from dqn import checkpoint
+from experiments import deploy
 from experiments.cli import frame, sweep
 from experiments.cli.frame import UserError
 from experiments.control import run as control
@@ -168,11 +170,64 @@ def test_a_folder_goes_on_with_the_same_config_only_and_one_process_at_a_time(tm
 
 def test_what_a_finished_job_found_stands_when_it_is_asked_for_something_else(tmp_path):
     ran = []
-    calm = frame.Command("train", TrainConfig(), lambda config, folder: ran.append(config.seed) or 0.5)
+    calm = frame.Command("train", TrainConfig(), lambda config, folder: ran.append(config.seed) or 0.0)
     for seed in (1, 2):
         calm._once(frame.compose("train", [f"seed={seed}"]), tmp_path, sweep.Job.at(tmp_path))
+    assert calm._once(frame.compose("train", ["seed=1"]), tmp_path, sweep.Job.at(tmp_path)) == 0.0
     job = sweep.Job.at(tmp_path)
-    assert (job.state, job.objective, ran) == ("finished", 0.5, [1])
+    assert (job.state, job.objective, ran) == ("finished", 0.0, [1])
+
+
+@pytest.mark.parametrize(
+    ("entry", "saved", "goes_on"),
+    [(main, "checkpoint.pt", True), (deploy.main, "state.json", False)],
+    ids=["a training", "a deployment"],
+)
+def test_of_a_job_that_was_stopped_twice_each_life_is_kept_or_gone_on_with(
+    entry: frame.Command[Any], saved: str, goes_on: bool, tmp_path: Path
+) -> None:
+    """A training goes on from what it saved, to the same result. A deployment begins anew, on vials that are new: what
+    its earlier lives left lies aside, in a folder each."""
+    asked: list[str | None] = []
+
+    def stopped(config: Any, folder: Path) -> float:
+        asked.append(config.resume)
+        (folder / saved).write_text(f"life {len(asked)}")
+        if len(asked) < 3:
+            raise KeyboardInterrupt
+        return 0.5
+
+    swept = replace(entry, body=stopped)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            swept._once(frame.compose(entry.name, []), tmp_path, sweep.Job.at(tmp_path))
+    assert swept._once(frame.compose(entry.name, []), tmp_path, sweep.Job.at(tmp_path)) == 0.5
+    assert asked == [None, *([str(tmp_path)] * 2 if goes_on else [None] * 2)]
+    kept = {p.parent.name: p.read_text() for p in tmp_path.glob(f"*/{saved}")}
+    assert kept == ({} if goes_on else {"stopped_1": "life 1", "stopped_2": "life 2"})
+    assert (tmp_path / saved).read_text() == "life 3"
+
+
+def test_two_runs_that_begin_in_the_same_second_have_a_folder_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep.time, "strftime", lambda form: "2026-01-02_03-04-05")
+    folders = []
+    for number in (17, 18):
+        monkeypatch.setattr(sweep.os, "getpid", lambda number=number: number)
+        folders += [sweep.fresh("train"), sweep.asked(["-m", "seed=0,1"], "train").folder]
+    assert len(set(folders)) == 4
+
+
+def test_jobs_are_told_of_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    """Twelve, of which the third and the eleventh failed."""
+    for k in range(12):
+        (tmp_path / str(k) / ".hydra").mkdir(parents=True)
+        (tmp_path / str(k) / ".hydra" / "overrides.yaml").write_text(f"- ++seed={k}\n")
+        sweep.Job(tmp_path / str(k)).save(
+            "failed" if k in (2, 10) else "finished", 0.1 * k, "full" if k in (2, 10) else ""
+        )
+    for found in (sweep.survey(tmp_path), sweep.survey(tmp_path, [[f"++seed={k}"] for k in range(12)])):
+        assert [(job.folder.name, job.overrides) for job in found] == [(str(k), [f"seed={k}"]) for k in range(12)]
+    assert sweep.errors(tmp_path, None) == "error: full (job 2: seed=2; job 10: seed=10); "
 
 
 def test_another_launcher_is_not_told_what_the_one_before_was(tmp_path):

@@ -62,6 +62,8 @@ def test_seeds_are_pooled_and_the_best_configuration_comes_first(trained: Path) 
     assert [(row["n"], row["median"], row["IQM"], row["worst"]) for row in rows] == [
         ("4", "2.5", "2.5", "10"), ("4", "35", "35", "50"),
     ]  # fmt: skip
+    ends = [[float(end) for end in row["95 % of IQM"].split(" to ")] for row in rows]
+    assert [low < middle < high for (low, high), middle in zip(ends, (2.5, 35.0), strict=True)] == [True, True]
     assert "Of 2 configurations, agent tuned is best" in text
     assert "4 of 6 jobs finished" in text
     assert "python -m experiments.train -m agent=tuned seed=0,2 n_agents=2" in text
@@ -94,6 +96,19 @@ def test_a_closed_loop_is_judged_by_its_worst_window(tmp_path: Path) -> None:
     assert [(row["controller"], row["steady_abs_error: worst"], row["ise: worst"]) for row in rows] == [
         ("mpc", "0.02", "2"), ("pi", "0.03", "2"),
     ]  # fmt: skip
+
+
+def test_of_twelve_jobs_the_one_that_returned_nothing_is_best_and_the_others_follow_by_number(tmp_path: Path) -> None:
+    """Job 10 returned 0, the others 1; the last two never ran."""
+    arguments = [f"env.mu={','.join(f'0.0{10 + k}' for k in range(14))}"]
+    (tmp_path / "sweep.json").write_text(json.dumps({"command": "train", "arguments": arguments}))
+    for k in range(12):
+        job(tmp_path / str(k), [f"++env.mu=0.0{10 + k}"], objective=0.0 if k == 10 else 1.0, loss=1.0)
+    text = report.compare(tmp_path).read_text(encoding="utf-8")
+    assert "Of 12 configurations, mu 0.02 is best" in text
+    rows = table(tmp_path, "configurations_objective")
+    assert [row["env.mu"] for row in rows] == ["0.02", *(f"{0.01 + 0.001 * k:.4g}" for k in range(12) if k != 10)]
+    assert [row["job"] for row in table(tmp_path, "missing_jobs")] == ["12", "13"]
 
 
 def test_the_interval_is_that_of_a_bootstrap() -> None:

@@ -7,8 +7,10 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from hydra.core.utils import JobReturn, JobStatus
 
 from experiments.cli import frame, search, sweep
 from tests.experiments.test_sweep import ENVIRONMENT
@@ -61,6 +63,26 @@ def test_two_processes_share_a_search_and_take_up_the_trial_of_a_killed_one(tmp_
     study.folder = folder
     trials = study._open().get_trials()
     assert [(t.number, t.state.name, t.value) for t in trials] == [(k, "COMPLETE", ours[str(k)]) for k in range(TRIALS)]
+
+
+@pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
+def test_an_objective_of_nothing_is_the_best_of_those_above_it(tmp_path: Path) -> None:
+    """Twelve trials: one of them reaches 0, one fails, the others return their number."""
+
+    def launch(overrides: list[list[str]], initial_job_idx: int) -> list[JobReturn]:
+        (words,) = overrides
+        value = 0.0 if initial_job_idx == 10 else float(initial_job_idx + 1)
+        status = JobStatus.FAILED if initial_job_idx == 3 else JobStatus.COMPLETED
+        done = JobReturn(overrides=words, status=status)
+        done.return_value = RuntimeError("full") if initial_job_idx == 3 else value
+        return [done]
+
+    study = search.Search(12, 1, frame.OmegaConf.create({"env.mu": {"low": 0.01, "high": 0.03}}))
+    study.folder, study.launcher = tmp_path, SimpleNamespace(launch=launch)  # type: ignore[assignment]
+    study.sweep([])
+    best = json.loads((tmp_path / "best.json").read_text())
+    assert (best["trial"], best["objective"]) == (10, 0.0)
+    assert [t.value for t in study._open().get_trials()] == [1.0, 2.0, 3.0, None, *map(float, range(5, 11)), 0.0, 12.0]
 
 
 @pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")

@@ -3,6 +3,7 @@
 KILL_SEED=7 python -m pytest tests/experiments/test_train.py tests/campaigns/test_kills.py     kills at other moments
 """
 
+import csv
 import json
 import os
 import re
@@ -378,8 +379,15 @@ def test_an_agent_of_another_task_is_refused_before_it_trains(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["coculture", "coculture_preview"])
-def test_a_composition_is_trained_scored_and_exported(tmp_path, name):
-    """A few hundred steps: what is written, and that the file says what the summary says."""
+def test_a_composition_is_trained_scored_and_exported(tmp_path, name, monkeypatch):
+    """A few hundred steps: what is written, that the file says what the summary says, the figure what was measured."""
+    drawn, save = {}, train_run.charts.save
+
+    def kept(figure, folder, name):
+        drawn[name] = figure
+        return save(figure, folder, name)
+
+    monkeypatch.setattr(train_run.charts, "save", kept)
     words = ["agent.total_steps=240", "agent.learn_start=100", "agent.updates_per_step=1", "eval_every=120"]
     train_run.train(entry_point.config([f"env={name}", f"agent={name}", *words]), tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -389,3 +397,11 @@ def test_a_composition_is_trained_scored_and_exported(tmp_path, name):
     assert learned.metadata["regret_pct"] == pytest.approx(summary["regret_pct"][0])
     assert (summary["myopic_regret_pct"] > 300.0) == (name == "coculture_preview")
     assert (tmp_path / "figures" / "trajectories.png").exists()
+    with open(tmp_path / "progress.csv", newline="") as f:
+        rows = list(csv.DictReader(f))
+    left, right = (ax.lines[0].get_data() for ax in drawn["learning"].axes)
+    regrets = [(int(row["step"]), float(row["value"])) for row in rows if row["tag"] == "eval/regret_pct"]
+    assert [step for step, _ in regrets] == right[0].tolist()
+    assert [regret for _, regret in regrets] == pytest.approx(right[1].tolist())
+    costs = [-float(row["value"]) for row in rows if row["tag"] == "train/return"]
+    assert costs == pytest.approx(left[1].tolist())

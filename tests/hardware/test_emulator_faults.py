@@ -2,15 +2,17 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hardware.emulator.device import plant_preset
 from hardware.emulator.faults import FAULTS, inject
 from hardware.emulator.transport import EmulatorTransport
 from hardware.errors import LinkError
-from tests.hardware.emulator_lab import Lab
+from tests.hardware.emulator_lab import Lab, quiet
 
 
 class Client:
@@ -353,20 +355,54 @@ def test_impossible_faults_are_refused_by_name(name: str, reactor: str, value: f
         inject(Lab().device, name, reactor, value)
 
 
-@pytest.mark.parametrize("name", sorted(FAULTS))
-def test_every_fault_can_be_injected_into_a_running_device(name: str) -> None:
-    c = Client(blanked=True)
-    c.link.post("/Experiment/1/M0")
-    c.lab.wait(30.0)
-    inject(c.device, name, "M0")
-    for _ in range(20):
-        c.lab.wait(10.0)
+FAULTY = {"pump_gain_factor": 0.5, "waste_gain_factor": 0.0, "overflow_gain_factor": 0.5, "media_left_ml": 0.0,
+          "mu_factor": 0.5, "clock_step": 30.0}  # fmt: skip
+SOUND = {"pump_gain_factor": 1.0, "waste_gain_factor": 1.0, "overflow_gain_factor": 1.0, "media_left_ml": 1e6,
+         "mu_factor": 1.0}  # fmt: skip
+"""Values of faults, and values at which they are none, where these are not 1 and 0."""
+
+
+def course(*faults: tuple[str, float]) -> list[object]:
+    """What a client sees and what truly is, every 10 s, of two species that are fed, drained and lit; a fault sets in
+    with the fifth time, another one with the ninth."""
+    options = replace(quiet(overflow_pump="Pump4"), plant=plant_preset("coculture"))
+    c, seen = Client(blanked=True, options=options), []
+
+    def answer(act: Callable[[], object]) -> None:
         try:
-            c.link.post("/changeDevice/M0")
-            c.link.get("/getSysdata/")
-        except LinkError:
-            continue
-    assert c.device.truth("M0")["volume_ml"] > 0.0
+            seen.append(act())
+        except (LinkError, ConnectionError) as error:
+            seen.append(str(error))
+
+    for pump in ("Pump1", "Pump2", "Pump4"):
+        c.link.post(f"/SetOutputTarget/{pump}/M0/1")
+    for path in ("changeDevice/M0", "SetFPMeasurement/FP1/LEDA/CLEAR/nm440/OFF/x10", "Experiment/1/M0",
+                 "SetOutputTarget/Thermostat/M0/20", "SetOutputOn/Stir/1/M0"):  # fmt: skip
+        c.link.post(f"/{path}")
+    for k in range(24):
+        for name, value in faults[k // 4 - 1 : k // 4] if k in (4, 8) else ():
+            inject(c.device, name, "M0", value)
+        for number, pump in enumerate(("Pump1", "Pump2", "Pump4")):
+            path = f"/SetOutputOn/{pump}/{int((k + number) % 3 == 0)}/M0"
+            answer(lambda path=path: c.link.post(path).status)
+        answer(lambda k=k: c.link.post(f"/changeDevice/M{k % 2}").status)
+        answer(lambda: c.link.get("/getSysdata/").body)
+        answer(lambda: c.lab.post("/changeDevice/M0"))  # as somebody's script does, without our headers
+        seen += [c.device.truth("M0"), c.clock.now()]
+        c.lab.wait(10.0)
+    return seen
+
+
+@pytest.mark.parametrize("name", sorted(FAULTS))
+def test_every_fault_changes_what_a_client_sees_or_what_is_true(name: str) -> None:
+    """And before it everything is as without it. The software is started again where it had crashed."""
+    before = [("crash", 1.0)] if name == "restart" else []
+    none = [] if FAULTS[name][0] == "act" else [(name, SOUND.get(name, 0.0))]
+    one, other = course(*before, (name, FAULTY.get(name, 1.0))), course(*before, *none)
+    assert len(one) == len(other) == 24 * 8
+    differs = [k for k, (a, b) in enumerate(zip(one, other, strict=True)) if a != b]
+    assert differs
+    assert differs[0] >= 8 * (8 if before else 4)
 
 
 def test_timeout_must_be_positive() -> None:
