@@ -84,8 +84,9 @@ class Trainer:
         total = self.agent.config.total_steps
         while self.agent.steps < total:
             self._until(min(total, self.agent.steps - self.agent.steps % self.interval + self.interval))
-            yield self._record()
-            self._finished[:] = np.nan
+            record = self._record()
+            self._finished[:] = np.nan  # whoever saves at a record saves none of its returns
+            yield record
 
     @torch.inference_mode()  # gradients are written out by hand: torch need not be ready for any
     def _until(self, step: int) -> None:

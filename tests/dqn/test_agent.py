@@ -80,11 +80,14 @@ def test_agent_of_a_population_is_the_agent_alone(changes: dict[str, Any]) -> No
 
 
 @pytest.mark.parametrize("changes", [{}, EVERYTHING], ids=["plain", "everything"])
-@pytest.mark.parametrize("stop", [1, 5])
+@pytest.mark.parametrize("stop", [1, 5, -1])
 def test_a_resumed_run_is_the_uninterrupted_one(changes: dict[str, Any], stop: int) -> None:
-    config = DQNConfig(**{**SMALL.__dict__, **changes})
+    """Also where no episode ends in what is left of it, 7 steps."""
+    total = SMALL.total_steps + 7 * (stop < 0)
+    config = DQNConfig(**{**SMALL.__dict__, **changes, "total_steps": total})
     whole = _trainer(config, range(3))
     returns = [record.episode_return for record in whole.run()]
+    stop %= len(returns)
     stopped = _train(_trainer(config, range(3)), records=stop)
     state = copy.deepcopy(stopped.state_dict())
     resumed = _trainer(config, range(3))
