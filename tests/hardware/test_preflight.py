@@ -1,6 +1,7 @@
 """Preflight: every check passes on a sound device and fails with a remedy on the trouble it is for."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -117,3 +118,15 @@ def test_an_absent_reactor_a_dead_sensor_a_lost_link() -> None:
     assert not found["connection"].ok
     assert "M0 present" not in found
     assert math.isfinite(lab.clock.now())
+
+
+@pytest.mark.parametrize(("speed", "required", "remedy"), [(1.0, True, "faster link"), (60.0, False, "backend.speed")])
+def test_slow_answers_end_a_run_on_a_bench_and_none_in_fast_motion(speed: float, required: bool, remedy: str) -> None:
+    """A computer that is busy answers 40 ms late, which at speed 60 are 2.4 s."""
+    lab = DriverLab()
+    lab.config = replace(lab.config, speed=speed)
+    lab.fault("slow_s", value=2.4)
+    found = checks(lab)["connection"]
+    assert (found.ok, found.required) == (False, required)
+    assert found.detail == "2.40 s per answer"
+    assert remedy in found.remedy
