@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.documented import PAGES, ROOT, commands, needs_hardware
+from tests.patience import PATIENCE_S
 
 OTHERS = (
     "experiments", "experiments.demo", "experiments.cli.reference", "hardware.emulator", "hardware.rig",
@@ -81,7 +82,7 @@ def test_the_pages_have_commands_at_all() -> None:
     assert sum(needs_hardware(words) for words in SHOWN.values()) >= 6
 
 
-def run(words: list[str], folder: Path, seconds: float = 280.0) -> None:
+def run(words: list[str], folder: Path, seconds: float = PATIENCE_S) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "HOME": str(folder), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-m", *words],
@@ -103,15 +104,30 @@ def shorter(words: list[str]) -> list[str]:
     return [*words, *less]
 
 
-@pytest.mark.timeout(900)
-def test_the_readme_works_line_by_line(tmp_path: Path) -> None:
-    lines = [words for words in commands(ROOT / "README.md") if words[0] not in ("turbidostat", "experiments.demo")]
-    for words in lines:
-        if not needs_hardware(words):
-            run(shorter(words), tmp_path)
-        if SHIPPED in words:
-            newest = max(tmp_path.glob("runs/train/*/policy.npz"), key=lambda path: path.stat().st_mtime)
-            shutil.copy(ROOT / "dqn" / "shipped" / "policy.npz", newest)
+README = [
+    words
+    for words in commands(ROOT / "README.md")
+    if words[0] not in ("turbidostat", "experiments.demo") and not needs_hardware(words)
+]
+
+
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of somebody who types the lines of the README one after the other."""
+    return tmp_path_factory.mktemp("reader")
+
+
+@pytest.mark.xdist_group("readme")
+@pytest.mark.parametrize("words", README, ids=[" ".join(words) for words in README])
+def test_the_readme_works_line_by_line(words: list[str], reader: Path) -> None:
+    run(shorter(words), reader)
+    if SHIPPED in words:
+        newest = max(reader.glob("runs/train/*/policy.npz"), key=lambda path: path.stat().st_mtime)
+        shutil.copy(ROOT / "dqn" / "shipped" / "policy.npz", newest)
+
+
+def test_the_readme_has_lines_that_need_no_hardware() -> None:
+    assert len(README) > 12
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ import torch
 from dqn import policy
 from dqn.export import export
 from dqn.network import QNetwork, action_basis, initial_weights
+from tests.patience import PATIENCE_S
 
 SIZES = (3, 64, 64, 17)
 RATES = np.linspace(0.0, 0.02, 17)
@@ -76,7 +77,7 @@ def test_reading_needs_no_torch(tmp_path: Path) -> None:
         "from dqn import policy\n"
         f"print(policy.load(Path({str(tmp_path / 'policy.npz')!r})).chosen(__import__('numpy').array([[0.9, 0.3]]))[0])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=PATIENCE_S)
     assert float(done.stdout) == _policy().chosen(np.array([[0.9, 0.3]]))[0]
 
 

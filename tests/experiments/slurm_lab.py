@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.patience import PATIENCE_S
+
 PROGRAMS = ("slurmctld", "slurmd", "munged", "sbatch", "srun", "scontrol", "scancel", "setpriv")
 
 CONFIG = """
@@ -106,7 +108,7 @@ def _said(environment: dict[str, str], *words: str) -> str:
     return subprocess.run(words, env=environment, capture_output=True, text=True).stdout.strip()
 
 
-def _until(there: Callable[[], bool], folder: Path, seconds: float = 30.0) -> None:
+def _until(there: Callable[[], bool], folder: Path, seconds: float = PATIENCE_S) -> None:
     deadline = time.monotonic() + seconds
     while not there():
         if time.monotonic() > deadline:

@@ -19,6 +19,7 @@ from hardware.chibio.dosing import fit_pump
 from hardware.chibio.protocol import PERIOD_S
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import UnfitError
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 
@@ -68,7 +69,7 @@ def test_from_a_file_on_the_command_line(tmp_path: Path) -> None:
     (tmp_path / "w.csv").write_text("duty,doses,grams\n" + "\n".join(rows) + "\n")
     command = [sys.executable, "-m", "experiments.calibrate_pump", f"csv={tmp_path}/w.csv", "reactor=M2", "pump=waste"]
     command += ["duties=[0.1,0.2]", f"backend.calibration={tmp_path}/c", f"hydra.run.dir={tmp_path}/run"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stderr
     [rig] = load_calibrations(tmp_path / "c", ["M2"])
     assert rig.waste.flow_ml_s == pytest.approx(0.9, rel=1e-3)
@@ -115,7 +116,9 @@ def test_two_series_leave_the_spread_unknown_and_say_what_to_do() -> None:
 
 def test_without_a_terminal_there_is_one_clear_line(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "experiments.calibrate_pump", f"hydra.run.dir={tmp_path}/run"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, stdin=subprocess.DEVNULL
+    )
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("error: no terminal to ask for the weights; give csv=FILE")
 
@@ -204,6 +207,6 @@ def test_the_operator_is_not_shown_every_request(tmp_path: Path) -> None:
     with EmulatorProcess(["--speed", "200", "--od", "0", "--unblanked"]) as emulator:
         command = [sys.executable, "-m", "experiments.blank", "samples=3", f"hydra.run.dir={tmp_path}/run"]
         command += [f"backend.url={emulator.url}", "backend.speed=200", f"backend.calibration={tmp_path}/c"]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stderr
     assert len((done.stdout + done.stderr).splitlines()) <= 4  # what it does, how warm it is, what it found

@@ -23,6 +23,7 @@ from experiments.cli import frame
 from experiments.cli.calibrated import read_plant_file
 from experiments.reporting.verdict import verdict
 from hardware.storage.recording_reader import read_recording
+from tests.patience import PATIENCE_S
 from tests.real_recording import DITHER, needs_dither
 
 ROOT = Path(__file__).parents[2]
@@ -46,7 +47,7 @@ def cli(tmp_path: Path) -> Cli:
             env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=PATIENCE_S,
             check=False,
         )
 

@@ -38,6 +38,7 @@ from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.simulated import SimulatedConfig
 from tests.experiments import laws
 from tests.experiments.test_exits import ENVIRONMENT
+from tests.patience import PATIENCE_S
 
 ASKED = CertifyConfig(env=EnvConfig(), setpoints=(0.4, 0.8), trajectories=0)
 SCENARIO = Scenario((0.45, 0.65), (30.0, 30.0), (37.0, 37.0))
@@ -384,7 +385,7 @@ def test_the_command_leaves_a_certificate_a_figure_and_a_page(tmp_path: Path) ->
 def test_a_policy_that_fails_ends_the_command_with_one_line_and_its_certificate_says_so(tmp_path: Path) -> None:
     policy.save(tmp_path / "policy.npz", laws.high_corner())
     call = [sys.executable, "-m", "experiments.certify", f"policy={tmp_path}", f"hydra.run.dir={tmp_path / 'run'}"]
-    done = subprocess.run(call, capture_output=True, text=True, env=ENVIRONMENT, timeout=100, check=False)
+    done = subprocess.run(call, capture_output=True, text=True, env=ENVIRONMENT, timeout=PATIENCE_S, check=False)
     assert done.returncode == 1
     said = [line for line in done.stderr.splitlines() if line.startswith("error:")]
     assert len(said) == 1

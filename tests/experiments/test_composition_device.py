@@ -34,6 +34,7 @@ from tests.experiments.composition_keeper import Reckoning
 from tests.experiments.test_composition_deploy import column, rows
 from tests.hardware.emulator_lab import quiet
 from tests.hardware.test_serial_transport import Cable, wired
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 STEPS = build(Scenario(), presets.load("scenario/ratio_steps"), "scenario")
@@ -207,14 +208,14 @@ def test_over_the_serial_line(two_species: Cable, tmp_path: Path) -> None:
     client = subprocess.Popen(
         command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=tmp_path
     )
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + PATIENCE_S
     path = folder / "recordings" / "M0.csv"
     while not (path.exists() and len(rows(folder)) >= 5):
         assert client.poll() is None, client.communicate()[0]
         assert time.monotonic() < deadline
         time.sleep(0.05)
     client.send_signal(signal.SIGINT)
-    said = client.communicate(timeout=60.0)[0]
+    said = client.communicate(timeout=PATIENCE_S)[0]
     assert client.returncode == 0, said
     assert tuple(rows(folder)[0])[: len(USUAL)] == USUAL
     assert (column(folder, "fluorescence") > 100.0).all()

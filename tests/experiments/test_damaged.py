@@ -23,6 +23,7 @@ from hardware.emulator.process import EmulatorProcess
 from hardware.errors import RecordingError
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.experiments.test_deploy import ENVIRONMENT, inverse_policy
+from tests.patience import PATIENCE_S
 
 Change = Callable[[Any], object]
 HOLD = Scenario((0.4,), (600.0,), (37.0,))
@@ -227,7 +228,7 @@ def test_a_user_who_resumes_reads_one_line(tmp_path: Path) -> None:
 
     def deploy(*arguments: str) -> list[str]:
         command = [sys.executable, "-m", "experiments.deploy", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, timeout=60, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, timeout=PATIENCE_S, check=False)
         assert done.returncode == 1
         assert "Traceback" not in done.stderr
         return [line for line in done.stderr.strip().splitlines() if not line[:2].isdigit()]

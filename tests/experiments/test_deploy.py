@@ -34,6 +34,7 @@ from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.journal import read_journal
 from hardware.storage.recording_reader import read_recording
 from tests.hardware.driver_lab import DriverLab
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.xdist_group("deploy")  # its tests share a run, made once
@@ -42,7 +43,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 
 def run(*overrides: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "experiments.deploy", *overrides]
-    return subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, timeout=120, cwd=cwd)
+    return subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, timeout=PATIENCE_S, cwd=cwd)
 
 
 def inverse_policy(control_min: float = 1.0) -> policy.Policy:

@@ -15,6 +15,7 @@ from experiments.control.config import DeployConfig
 from experiments.control.timetable import expected, timetable
 from experiments.deploy import main
 from tests.experiments.test_deploy import ROOT
+from tests.patience import PATIENCE_S
 
 NOON = datetime(2026, 3, 2, 12, 0)
 GROWTH, DILUTION, VOLUME_ML = 0.03, 0.06, 20.0
@@ -76,7 +77,7 @@ def test_no_device_is_asked_and_no_folder_left(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "experiments.deploy", "backend=chibio", "backend.url=http://127.0.0.1:9"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
-        [*command, "dry_run=true"], capture_output=True, text=True, env=environment, timeout=60, cwd=tmp_path
+        [*command, "dry_run=true"], capture_output=True, text=True, env=environment, timeout=PATIENCE_S, cwd=tmp_path
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert "pumps not weighed, taken as 1 mL/s: M0" in done.stdout

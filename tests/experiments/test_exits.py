@@ -17,6 +17,7 @@ import pytest
 
 from hardware.emulator.process import EmulatorProcess
 from hardware.storage.journal import read_journal
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
@@ -62,7 +63,7 @@ class Bench:
 
     def until_a_dose(self) -> None:
         """Wait until a pump runs."""
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + PATIENCE_S
         while not self.motors():
             assert time.monotonic() < deadline
             assert self.client.poll() is None
@@ -70,7 +71,7 @@ class Bench:
 
     def end(self) -> tuple[int, str]:
         """Status and what was said, after the client has ended by itself."""
-        said = self.client.communicate(timeout=60.0)[0]
+        said = self.client.communicate(timeout=PATIENCE_S)[0]
         return self.client.returncode, said
 
     def check(self, outcome: str) -> None:
@@ -110,7 +111,7 @@ def test_a_signal_while_the_pumps_are_being_switched_on_costs_no_row(bench: Benc
         urllib.request.Request(f"{bench.device.control}/_emulator/fault/slow_s/all/6", method="POST"), timeout=10.0
     ).close()  # 0.2 s for each request: the signal falls inside the switching on
     began = journal.stat().st_size
-    deadline = time.monotonic() + 150.0  # over so slow a link not every sample is new enough for a dose
+    deadline = time.monotonic() + PATIENCE_S  # over so slow a link not every sample is new enough for a dose
     while b'"kind":"intent"' not in journal.read_bytes()[began:]:
         assert time.monotonic() < deadline
         time.sleep(0.002)
@@ -208,7 +209,7 @@ def test_an_overflow_pump_runs_over_doses_and_a_kill_and_is_off_after_every_othe
 
     def until_fed(bench: Bench) -> None:
         """Until a dose is given beside a running overflow pump."""
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + PATIENCE_S
         while not (state.exists() and any({f"{m}/Pump1", f"{m}/Pump3"} <= set(bench.motors()) for m in ("M0", "M1"))):
             assert time.monotonic() < deadline
             assert bench.client.poll() is None

@@ -17,6 +17,7 @@ from hardware.safety.interlock import Response
 from hardware.storage.journal import read_journal
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.experiments.test_exits import SPEED, Bench
+from tests.patience import PATIENCE_S
 
 LOST = """
 import experiments.deploy
@@ -247,7 +248,7 @@ def test_kill_9_and_resume_of_a_real_run(tmp_path: Path) -> None:
             return dict(json.load(answer)["M0"])
 
     def until(kind: str, count: int) -> None:
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + PATIENCE_S
         path = folder / "journal.jsonl"
         while not path.exists() or path.read_bytes().count(kind.encode()) < count:
             assert time.monotonic() < deadline

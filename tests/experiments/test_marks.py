@@ -30,6 +30,7 @@ from hardware.storage.recording_reader import read_recording
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.experiments.test_deploy import ROOT
 from tests.hardware.emulator_lab import BLANK, quiet
+from tests.patience import PATIENCE_S
 
 SCHEDULE = Scenario((0.6,), (20.0,), (37.0,))
 
@@ -367,7 +368,7 @@ def test_the_command_leaves_a_mark_and_no_folder_of_its_own(tmp_path: Path) -> N
     _under_way(tmp_path / "run")
     command = [sys.executable, "-m", "experiments.mark", "run=run", "reactor=M0", "text=new bottle"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=PATIENCE_S)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("M0: new bottle at minute ")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -25,6 +25,7 @@ from hardware.emulator.faults import inject
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.experiments.test_deploy import ROOT
 from tests.hardware.emulator_lab import quiet
+from tests.patience import PATIENCE_S
 
 SECRET = "T0SECRET"
 
@@ -76,7 +77,7 @@ def deployed(folder: Path, *overrides: str, **variables: str) -> subprocess.Comp
     command = [sys.executable, "-m", "experiments.deploy", f"hydra.run.dir={folder}", "controller=pi"]
     short = ["scenario=hold", "scenario.minutes=[5]"]
     return subprocess.run(
-        [*command, *short, *overrides], capture_output=True, text=True, env=environment, timeout=100, check=False
+        [*command, *short, *overrides], capture_output=True, text=True, env=environment, timeout=PATIENCE_S, check=False
     )
 
 
@@ -183,7 +184,7 @@ def test_a_command_that_hangs_is_ended_with_its_children(tmp_path: Path) -> None
     assert hook.send(b"{}\n") == "TimeoutExpired"
     both = [int(number) for number in pids.read_text().split()]
     assert len(set(both)) == 2
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + PATIENCE_S
     while left := [number for number in both if living(number)]:
         assert time.monotonic() < deadline, left
         time.sleep(0.02)

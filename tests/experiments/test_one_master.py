@@ -14,6 +14,7 @@ from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.family import linked
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import DeviceStateError
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 
@@ -45,7 +46,11 @@ def test_a_wrong_address_is_one_line_at_once_and_speaks_of_no_pumps(tmp_path: Pa
     words += ["backend=chibio", "controller=adaptive_inverse"] if command == "deploy" else []
     start = time.monotonic()
     done = subprocess.run(
-        [sys.executable, "-m", f"experiments.{command}", *words], cwd=ROOT, capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", f"experiments.{command}", *words],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
     )
     said = (done.stdout + done.stderr).splitlines()
     assert done.returncode == 1
@@ -80,7 +85,7 @@ def test_a_service_manager_that_ends_a_blank_leaves_its_pumps_off(tmp_path: Path
         client.terminate()
         time.sleep(0.02)
         client.terminate()
-        said = client.communicate(timeout=60.0)[0]
+        said = client.communicate(timeout=PATIENCE_S)[0]
         with urllib.request.urlopen(f"{device.url}/getSysdata/", timeout=10.0) as answer:
             assert json.load(answer)["Pump1"]["ON"] == 0
     assert client.returncode == 130

@@ -40,6 +40,7 @@ from experiments.record.record import Record
 from experiments.record.summary import composition_figure_of
 from hardware import memory
 from hardware.storage.journal import Journal, read_journal
+from tests.patience import PATIENCE_S
 
 SHIPPED = SHIPPED_COMPOSITION["dqn_preview"]
 BIAS_E, BIAS_P, GAIN, FACTOR, THERMOMETER = 4, 5, 6, 7, 9
@@ -327,7 +328,7 @@ def go(loop: ClosedLoop, learning: Relearning, record: Record, minutes: float) -
             return step
 
 
-def finish(learning: Relearning, step: Step, at_most_s: float = 240.0) -> None:
+def finish(learning: Relearning, step: Step, at_most_s: float = PATIENCE_S) -> None:
     """The training under way, to its end."""
     until = time.monotonic() + at_most_s
     while learning._child is not None and time.monotonic() < until:
@@ -640,13 +641,13 @@ def test_a_training_ends_with_the_process_that_started_it(tmp_path: Path) -> Non
     policies.save(tmp_path / FIRST, policies.load(SHIPPED))
     command = [sys.executable, "-m", "experiments.comparison.lesson", str(folder / "001.json"), "--until-eof"]
     child = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL)
-    until = time.monotonic() + 120.0
+    until = time.monotonic() + PATIENCE_S
     while not (folder / "001").is_dir() and time.monotonic() < until:
         time.sleep(0.05)
     assert child.poll() is None
     assert child.stdin is not None
     child.stdin.close()
-    assert child.wait(60.0) != 0
+    assert child.wait(PATIENCE_S) != 0
 
 
 # -- the doors ---------------------------------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from experiments.reporting import charts
 from experiments.reporting.page import Page
 from experiments.reporting.tables import Best, Table, number, plus_minus, typeset
 from tests.experiments.test_deploy import inverse_policy
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.xdist_group("report")  # its tests share a run, made once
@@ -48,7 +49,7 @@ def benchmark(tmp_path_factory):
             "+studies.setpoint_steps={scenarios:[setpoint_steps],plants:[nominal_noise],controllers:[dqn,pi,mpc]}",
             "studies.long.controllers=[]",
         ],
-        capture_output=True, text=True, timeout=280,
+        capture_output=True, text=True, timeout=PATIENCE_S,
         env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -398,7 +399,7 @@ def chromium(folder: Path, page: Path, *arguments: str) -> str:
             "--disable-background-networking", f"--user-data-dir={folder / 'profile'}", "--window-size=1300,2400",
             *arguments, page.as_uri(),
         ],
-        capture_output=True, text=True, timeout=120,
+        capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -17,6 +17,7 @@ from hardware.emulator.vial import Dose
 from hardware.storage.journal import read_journal
 from tests.campaigns.audit import audit_doses
 from tests.hardware.test_serial_transport import Cable, cable  # noqa: F401  (a fixture)
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 SPEED = 60.0
@@ -59,7 +60,7 @@ def test_the_line_is_unplugged_for_three_minutes(
     line.plug()
     wait(lambda: len(rows(folder, "M1")) >= before + 4, 40.0)
     client.send_signal(signal.SIGINT)
-    said = client.communicate(timeout=60.0)[0]
+    said = client.communicate(timeout=PATIENCE_S)[0]
     assert client.returncode == 0, said
     assert "pumps verified off" in said
     journal, torn = read_journal(folder / "journal.jsonl")

@@ -23,6 +23,7 @@ from experiments.cli import frame, stop
 from experiments.reporting.tensorboard import Events
 from experiments.training.config import TrainConfig
 from experiments.training.session import Session
+from tests.patience import PATIENCE_S
 from tests.studies.ablate import AblateConfig, _read
 
 ROOT = Path(__file__).parents[2]
@@ -69,7 +70,7 @@ class Run:
         self._until(lambda: len(self.processes()) >= count)
 
     def _until(self, there) -> None:
-        deadline = time.monotonic() + 240.0
+        deadline = time.monotonic() + PATIENCE_S
         while not there():
             assert time.monotonic() < deadline
             assert self.process.poll() is None, (self.folder / "err").read_text()
@@ -81,12 +82,12 @@ class Run:
 
     def end(self) -> str:
         """The one line on standard error, after the command has ended as a stopped one and left no process."""
-        status = self.process.wait(60.0)
+        status = self.process.wait(PATIENCE_S)
         said = (self.folder / "err").read_text()
         assert status == 130, said
         assert len(said.splitlines()) == 1, said
         assert "Traceback" not in (self.folder / "out").read_text()
-        deadline = time.monotonic() + 5.0  # a process that was ended may take a moment
+        deadline = time.monotonic() + PATIENCE_S  # a process that was ended may take a moment
         while self.processes():
             assert time.monotonic() < deadline, self.processes()
             time.sleep(0.02)
@@ -268,7 +269,7 @@ def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
     run.until_processes(4)  # the command, two workers, and what tracks their semaphores
     run.process.kill()
     run.process.wait()
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + PATIENCE_S
     while run.processes():
         assert time.monotonic() < deadline
         time.sleep(0.05)

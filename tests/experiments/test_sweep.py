@@ -25,6 +25,7 @@ from experiments.control.config import DeployConfig
 from experiments.train import main, train
 from experiments.training.config import TrainConfig
 from experiments.training.session import Session
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
@@ -48,7 +49,7 @@ def summary(folder: Path) -> dict[str, Any]:
 
 
 def until(there: Callable[[], bool], process: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + 100.0
+    deadline = time.monotonic() + PATIENCE_S
     while not there():
         assert time.monotonic() < deadline
         assert process.poll() is None
@@ -84,7 +85,7 @@ def test_a_stopped_sweep_does_only_what_is_missing(tmp_path):
     folder = tmp_path / "a sweep"
     until((folder / "1/checkpoint.pt").is_file, process)
     process.send_signal(signal.SIGINT)
-    assert process.wait(60.0) == 130
+    assert process.wait(PATIENCE_S) == 130
     (line,) = (tmp_path / "err").read_text().splitlines()
     told = re.fullmatch(
         r"stopped; 1 of 3 jobs finished in a sweep; what is missing: python -m experiments.train (.+)", line

@@ -14,6 +14,7 @@ from hydra.core.utils import JobReturn, JobStatus
 
 from experiments.cli import frame, search, sweep
 from tests.experiments.test_sweep import ENVIRONMENT
+from tests.patience import PATIENCE_S
 
 WORDS = ["+hparams_search=tuned", "+experiment=smoke", "n_agents=1", "agent.total_steps=300", "checkpoint_every=100"]
 TRIALS = 4
@@ -40,7 +41,7 @@ def worker(folder: Path, name: str) -> subprocess.Popen[str]:
 def test_two_processes_share_a_search_and_take_up_the_trial_of_a_killed_one(tmp_path: Path) -> None:
     first = worker(tmp_path, "first")
     folder = tmp_path / "search"
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + PATIENCE_S
     while not (folder / "0/config.yaml").is_file():  # the first trial is at work
         assert time.monotonic() < deadline
         assert first.poll() is None, (tmp_path / "first").read_text()
@@ -49,7 +50,7 @@ def test_two_processes_share_a_search_and_take_up_the_trial_of_a_killed_one(tmp_
     first.wait()
     assert sweep.Job.at(folder / "0").state == "running"
     for each in [worker(tmp_path, "second"), worker(tmp_path, "third")]:
-        assert each.wait(120.0) == 0, [(tmp_path / name).read_text() for name in ("second", "third")]
+        assert each.wait(PATIENCE_S) == 0, [(tmp_path / name).read_text() for name in ("second", "third")]
     said = "".join((tmp_path / name).read_text() for name in ("second", "third"))
     assert said.count("trial 0 goes on: its process is gone") == 1
     jobs = sweep.survey(folder)

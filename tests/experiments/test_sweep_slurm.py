@@ -17,6 +17,7 @@ from experiments.cli import sweep
 from experiments.train import main
 from experiments.training.session import Session
 from tests.experiments import slurm_lab
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 WORDS = ["agent.total_steps=1000", "agent.learn_start=100", "eval_every=500", "checkpoint_every=100"]
@@ -29,7 +30,7 @@ def cluster(tmp_path: Path) -> Iterator[dict[str, str]]:
         yield {**environment, "PYTHONPATH": str(ROOT)}
 
 
-def until(there: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 60.0) -> None:
+def until(there: Callable[[], bool], process: subprocess.Popen[str], seconds: float = PATIENCE_S) -> None:
     deadline = time.monotonic() + seconds
     while not there():
         assert time.monotonic() < deadline
@@ -75,7 +76,7 @@ def test_jobs_killed_or_told_to_end_are_queued_again_and_end_with_the_weights_of
         until(lambda: "Requeued job" in log(folder, array, 1), process)
         ask.kill()  # it would ask again and again, also the job's next life
         ask.wait()
-        status = process.wait(120.0)
+        status = process.wait(PATIENCE_S)
     finally:
         process.kill()
         process.wait()

@@ -18,6 +18,8 @@ from typing import Any
 import pytest
 from matplotlib.image import imread
 
+from tests.patience import PATIENCE_S
+
 ROOT = Path(__file__).parents[2]
 BROWSER = next((b for b in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if b), None)
 DRAWN = os.environ.get("BOARD_FIGURES")
@@ -51,7 +53,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     processes = [start(f"experiments.{name}", *words) for name, *words in commands]
     try:
         for process in processes:
-            said, _ = process.communicate(timeout=280)
+            said, _ = process.communicate(timeout=PATIENCE_S)
             assert process.returncode == 0, said
     finally:
         for process in processes:
@@ -79,7 +81,7 @@ def address(logs: Path) -> Iterator[str]:
         yield url
     finally:
         process.terminate()
-        process.wait(timeout=60)
+        process.wait(timeout=PATIENCE_S)
 
 
 def has_read(url: str) -> bool:
@@ -137,7 +139,7 @@ def test_time_series_show_a_card_with_a_line_for_each_tag(address: str, browser:
     for tag in tags:
         card = page.locator("scalar-card", has=page.locator(f'[title="{tag}"]'))
         card.wait_for(timeout=40_000)
-        deadline = time.monotonic() + 40.0
+        deadline = time.monotonic() + PATIENCE_S
         while ink(card) < 100:
             assert time.monotonic() < deadline, f"{tag}: no line"
             page.wait_for_timeout(100)

@@ -23,6 +23,7 @@ from experiments.deploy import main
 from hardware import family
 from hardware.storage.journal import read_journal
 from tests.evolver_stub import VIALS, EvolverStub
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 DRIVER = ROOT / "tests" / "evolver.py"
@@ -132,10 +133,15 @@ def test_a_run_is_killed_in_a_dose_and_goes_on(device: EvolverStub, tmp_path: Pa
     )
     assert device.held.wait(120.0), first.communicate(timeout=5.0)[0].decode()
     first.send_signal(signal.SIGKILL)
-    first.communicate(timeout=30.0)
+    first.communicate(timeout=PATIENCE_S)
     device.go.set()
     done = subprocess.run(
-        client(tmp_path, "resume=here"), cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=180
+        client(tmp_path, "resume=here"),
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == 0, done.stderr + done.stdout
     summary = json.loads((tmp_path / "here/summary.json").read_text())

@@ -33,6 +33,7 @@ from experiments.training.config import TrainConfig
 from experiments.training.density import Density, first_actions
 from experiments.training.evaluation import Evaluation, Score, each
 from experiments.training.session import Best, Session, merit
+from tests.patience import PATIENCE_S
 
 SHORT = [
     "agent.total_steps=1000",
@@ -54,7 +55,7 @@ def command(entry: str, *overrides: str) -> list[str]:
 
 def run(entry: str, *overrides: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        command(entry, *overrides), capture_output=True, text=True, env=ENVIRONMENT, timeout=120, cwd=cwd
+        command(entry, *overrides), capture_output=True, text=True, env=ENVIRONMENT, timeout=PATIENCE_S, cwd=cwd
     )
 
 

@@ -32,6 +32,7 @@ from hardware.board.board_agent import Agent, Device, decode_request, encode_rep
 from hardware.link.serial import decode_header, encode_request
 from tests.hardware.emulator_lab import Lab
 from tests.hardware.test_emulator_server import Process
+from tests.patience import PATIENCE_S
 
 SOURCE = Path(board_agent.__file__)
 PYTHON = os.environ.get("BOARD_PYTHON", sys.executable)
@@ -46,7 +47,7 @@ PATHS = st.text(st.characters(min_codepoint=33, max_codepoint=126, exclude_chara
 
 def test_python_3_7_suffices() -> None:
     command = [str(Path(sys.executable).with_name("vermin")), "-t=3.7-", "--no-tips", "--violations", str(SOURCE)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -615,7 +616,7 @@ def test_armed_from_the_start(tmp_path: Path) -> None:
 )
 def test_bad_arguments_give_one_line(arguments: list[str], tmp_path: Path) -> None:
     given = [word.format(token=make_token(tmp_path)) for word in arguments]
-    done = subprocess.run([PYTHON, str(SOURCE), *given], capture_output=True, text=True, timeout=20)
+    done = subprocess.run([PYTHON, str(SOURCE), *given], capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 2
     assert done.stderr.startswith("board_agent: ")
     assert done.stderr.count("\n") == 1

@@ -26,6 +26,7 @@ from hardware.link.open import open_transport
 from hardware.link.transport import TransportConfig, switched_off
 from tests.hardware.test_board_agent import PYTHON, SOURCE, TOKEN, AgentLab, Recorder, make_token
 from tests.hardware.test_http_transport import Server
+from tests.patience import PATIENCE_S
 
 PUMP = "/SetOutputOn/Pump1/1/M0"
 BEARER = f"Authorization: Bearer {TOKEN}"
@@ -223,7 +224,7 @@ def test_http_mode(tmp_path: Path) -> None:
 def test_without_a_token_it_does_not_listen(text: str | None, mode: int, words: str, tmp_path: Path) -> None:
     given = [] if text is None else ["--token-file", str(make_token(tmp_path, text, mode))]
     command = [PYTHON, str(SOURCE), "--http", "127.0.0.1:0", *given]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 2
     assert done.stderr.startswith("board_agent: ")
     assert words in done.stderr
@@ -487,7 +488,9 @@ def test_a_run_through_the_agent_writes_the_token_nowhere(tmp_path: Path) -> Non
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
     command = [sys.executable, "-m", "experiments.deploy", *link, *words]
     try:
-        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        done = subprocess.run(
+            command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         assert json.loads(ask(lab.port, "GET", "/_agent/status", BEARER)[1])["armed"] is False  # it said BYE
         written = [path for path in run.rglob("*") if path.is_file()]

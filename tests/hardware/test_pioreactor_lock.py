@@ -18,12 +18,13 @@ from hardware.pioreactor.mailbox import Cluster, Mailbox
 from hardware.rig.build import broker
 from hardware.rig.processes import _free_port, _listens
 from tests.hardware.pioreactor_lab import UNIT, Lab
+from tests.patience import PATIENCE_S
 
 HELD = "process 7 on elsewhere controls pio01: one client per unit; remedy"
 
 
 def holds(what: Callable[[], bool]) -> bool:
-    until = time.monotonic() + 60.0
+    until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until and not what():
         time.sleep(0.05)
     return what()

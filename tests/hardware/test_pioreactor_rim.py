@@ -20,6 +20,7 @@ from hardware.pioreactor.web import NotHeard, Web
 from hardware.rig.build import broker
 from hardware.rig.processes import _free_port
 from tests.hardware.test_pioreactor_lock import real_broker
+from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 
@@ -178,8 +179,8 @@ def test_a_password_stands_in_no_file_of_a_run_and_a_refusal_is_a_line_of_the_pr
         command = [sys.executable, "-m", "experiments.deploy", "backend=pioreactor", "preflight_only=true"]
         environment = {**os.environ, PASSWORD: secret, "PYTHONPATH": str(ROOT)}
         done = subprocess.run(
-            [*command, *given, f"hydra.run.dir={folder}"], capture_output=True, text=True, env=environment, timeout=120,
-            check=False, cwd=tmp_path,
+            [*command, *given, f"hydra.run.dir={folder}"], capture_output=True, text=True, env=environment,
+            timeout=PATIENCE_S, check=False, cwd=tmp_path,
         )  # fmt: skip
         assert done.returncode == 1
         assert said in done.stdout + done.stderr

@@ -15,6 +15,7 @@ import pytest
 from hardware.errors import RecordingError
 from hardware.storage.recorder import Recorder
 from hardware.storage.recording_reader import Recording, read_recording
+from tests.patience import PATIENCE_S
 from tests.real_recording import DITHER, needs_dither
 
 COLUMNS = ("time_min", "od", "pump_rate_ml_s")
@@ -90,7 +91,7 @@ def test_every_returned_row_survives_kill_9_and_the_torn_line_is_cut(tmp_path: P
         "    i += 1\n    done.write(b'.')\n"
     )
     child = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parents[2])
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + PATIENCE_S
     while not (acknowledged.exists() and acknowledged.stat().st_size > 2) and time.monotonic() < deadline:
         time.sleep(0.02)
     child.send_signal(signal.SIGKILL)

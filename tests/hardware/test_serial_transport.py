@@ -27,6 +27,7 @@ from hardware.link.open import open_transport
 from hardware.link.serial import SerialTransport
 from hardware.link.transport import Reply, TransportConfig
 from hardware.reactor import Command
+from tests.patience import PATIENCE_S
 
 AGENT = Path(__file__).parents[2] / "hardware" / "board" / "board_agent.py"
 HELLO = b'{"agent": "board_agent", "protocol": 2}'
@@ -226,7 +227,7 @@ def wired(folder: Path, *words: str) -> Iterator[tuple[Cable, EmulatorProcess]]:
             [sys.executable, str(AGENT), "--tty", str(line.board), "--url", emulator.url, "--deadman", "30"], stderr=log
         )
         try:
-            deadline = time.monotonic() + 5.0
+            deadline = time.monotonic() + PATIENCE_S
             while " open\n" not in (folder / "log").read_text() and time.monotonic() < deadline:
                 time.sleep(0.02)
             yield line, emulator

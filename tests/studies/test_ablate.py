@@ -14,6 +14,7 @@ from hydra import compose, initialize_config_module
 
 from dqn.config import DQNConfig
 from experiments.cli import frame
+from tests.patience import PATIENCE_S
 from tests.studies.ablate import AblateConfig, Row, summarise
 from tests.studies.variants import variant
 
@@ -33,7 +34,7 @@ def ablate(*overrides: str) -> subprocess.CompletedProcess[str]:
         capture_output=True,
         text=True,
         env=environment,
-        timeout=120,
+        timeout=PATIENCE_S,
         check=False,
     )
 

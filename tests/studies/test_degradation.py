@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE_S
+
 ROOT = Path(__file__).parents[2]
 SHORT = [
     "agent.total_steps=120", "agent.learn_start=60", "agent.epsilon_steps=60", "agent.batch_size=16", "n_agents=2",
@@ -24,7 +26,7 @@ COLUMNS = [
 def degradation(*overrides: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "tests.studies.degradation", *overrides]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=PATIENCE_S, check=False)
 
 
 def test_a_study_leaves_curves_summary_and_figure(tmp_path: Path) -> None:
