@@ -1,5 +1,6 @@
 # make run    calibrate on the shipped recording, train on the result, deploy on the simulated reactor, report
 # make test   style, types and the whole test suite
+# make coverage   which share of each package's lines the last `PYTEST_ADDOPTS=--cov make test` executed
 # make docs   the pages and the API reference as a site, build/docs/index.html; a warning is an error
 PYTHON ?= python3
 VENV := .venv
@@ -7,7 +8,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 EXTRAS := dev,bench,sweep,docs
 
-.PHONY: run test lint docs clean
+ROOMS := conf dqn envs experiments hardware $(sort $(patsubst %/,%,$(dir $(wildcard experiments/*/*.py hardware/*/*.py))))
+
+.PHONY: run test lint coverage docs clean
 .DELETE_ON_ERROR:
 
 $(STAMP): pyproject.toml constraints.txt
@@ -29,9 +32,13 @@ lint: $(STAMP)
 test: $(STAMP) lint
 	$(BIN)/python -m pytest
 
+coverage:
+	@for room in $(ROOMS); do \
+	  printf '%-28s %4s %%\n' $$room $$($(BIN)/python -m coverage report --include="$$room/*" --format=total); done
+
 docs: $(STAMP)
 	$(BIN)/python -m sphinx -W --keep-going -q docs build/docs
 	@echo "the pages: build/docs/index.html"
 
 clean:
-	rm -rf $(VENV) runs .pytest_cache .mypy_cache .ruff_cache build docs/api *.egg-info
+	rm -rf $(VENV) runs .coverage .pytest_cache .mypy_cache .ruff_cache build docs/api *.egg-info
