@@ -1,6 +1,6 @@
 """Scores of the modules of TABLE: killed / (all - equivalent), printed and written to runs/mutants.json.
 
-Equivalent mutants are those that docs/mutation.md lists, each with its reason.
+Equivalent mutants are those that equivalent.txt lists, each with its reason.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from tests.mutants.operators import ROOT, Module, Mutant
 from tests.mutants.server import run_group
 
-LISTED = ROOT / "docs" / "mutation.md"
+LISTED = Path(__file__).with_name("equivalent.txt")
 
 SAFETY, STORAGE, CHIBIO = "hardware/safety", "hardware/storage", "hardware/chibio"
 TABLE = {
@@ -55,9 +55,9 @@ TABLE = {
 
 
 def listed() -> dict[tuple[str, str, str, str], str]:
-    """The equivalent mutants of docs/mutation.md, each with its reason."""
-    row = re.compile(r"^- `([^`]+)` `([^`]+)` `([^`]+)` → `([^`]+)`: (.+)$", re.MULTILINE)
-    found = row.findall(LISTED.read_text()) if LISTED.exists() else []
+    """The equivalent mutants, each with its reason."""
+    row = re.compile(r"^`([^`]+)` `([^`]+)` `([^`]+)` → `([^`]+)`: (.+)$", re.MULTILINE)
+    found = row.findall(LISTED.read_text())
     return {(path, where, was, now): reason for path, where, was, now, reason in found}
 
 

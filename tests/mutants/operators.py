@@ -137,7 +137,7 @@ class Mutant:
 
     @property
     def key(self) -> tuple[str, str, str, str]:
-        """By what docs/mutation.md names it."""
+        """By what equivalent.txt names it."""
         return (self.path, self.where, self.was, self.now)
 
     def __str__(self) -> str:
