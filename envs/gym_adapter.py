@@ -13,6 +13,7 @@ __all__ = ["BioreactorEnv", "EpisodeEnv", "register"]
 PREVIEW = {"control_min": 30.0, "episode_steps": 24, "preview_min": 360.0}
 REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
     "Bioreactor-v0": ("envs.gym_adapter:BioreactorEnv", "envs.vector_env:BioreactorVectorEnv", {}),
+    "Relative-v0": ("envs.relative:RelativeEnv", "envs.relative:RelativeVectorEnv", {}),
     "Coculture-v0": ("envs.coculture.task:CocultureEnv", "envs.coculture.task:CocultureVectorEnv", {}),
     "CoculturePreview-v0": ("envs.coculture.task:CocultureEnv", "envs.coculture.task:CocultureVectorEnv", PREVIEW),
 }
@@ -23,7 +24,8 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
     """A vector environment with N = 1 and no autoreset; observation, action and reward are specified there.
 
     Args: config: the task; overrides: values of it. render_mode: None, there is nothing to draw.
-    Raises: ValueError naming what is not allowed.
+    `info` holds the observation's numbers by name in full precision, as far as the model knows them: {"od": ...}.
+    Raises: ValueError naming what is not allowed; TypeError for a `render_mode`.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
@@ -40,12 +42,18 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; with a seed the same one every time."""
+        """Start an episode; with a seed the same one every time. Args: options: as of the vector environment.
+
+        Raises: ValueError naming an option that there is not, or a value out of range.
+        """
         super().reset(seed=seed)
-        if seed is not None or self._next is None:
-            self._next = self._batch.reset(seed=seed)[0][0]
+        if seed is not None or self._next is None or options:
+            self._next = self._batch.reset(seed=seed, options=options)[0][0]
         observation, self._next = self._next, None
-        return observation, {}
+        return observation, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        return dict(zip(self._batch.names, self._batch.state[0].tolist(), strict=False))
 
     def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """One control period; `truncated` after `episode_steps`, after which `reset` must follow.
@@ -54,9 +62,11 @@ class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
         """
         index = checked_actions(action, (), self.config.n_actions)
         observation, reward, _, truncated, infos = self._batch.step(index[None])
+        info = self._info()
         if truncated[0]:
             self._next, observation = observation[0], infos["final_obs"]
-        return observation[0], float(reward[0]), False, bool(truncated[0]), {}
+            info = dict(zip(info, observation[0].tolist(), strict=True))
+        return observation[0], float(reward[0]), False, bool(truncated[0]), info
 
 
 class BioreactorEnv(EpisodeEnv):

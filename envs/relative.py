@@ -18,9 +18,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from conf.schema import check, setting
+from envs.gym_adapter import EpisodeEnv
 from envs.vector_env import EpisodeVectorEnv
 
-__all__ = ["RelativeConfig", "RelativeVectorEnv", "nearest_level", "relative_reward"]
+__all__ = ["RelativeConfig", "RelativeEnv", "RelativeVectorEnv", "nearest_level", "relative_reward"]
 
 Array = NDArray[np.float64]
 
@@ -75,6 +76,7 @@ class RelativeVectorEnv(EpisodeVectorEnv[RelativeConfig]):
     """
 
     default = RelativeConfig
+    names = ("error", "growth_share")
 
     @staticmethod
     def observations(config: RelativeConfig) -> spaces.Box:
@@ -94,3 +96,9 @@ class RelativeVectorEnv(EpisodeVectorEnv[RelativeConfig]):
         self.state[:, 0] += self.state[:, 1] - self._levels[actions]
         reward: Array = relative_reward(self.state[:, 0])
         return reward
+
+
+class RelativeEnv(EpisodeEnv):
+    """`RelativeVectorEnv` as one environment. Version history: v0."""
+
+    batch = RelativeVectorEnv

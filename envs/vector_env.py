@@ -106,11 +106,13 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
       num_envs: N >= 1. config: the task; overrides: values of it, `episode_steps=50`.
       autoreset_mode: SAME_STEP or NEXT_STEP, as `gymnasium.vector.AutoresetMode` or its value.
       render_mode: None, there is nothing to draw. max_episode_steps: Gymnasium's name; ends episodes that are longer.
-    Raises: ValueError naming what is not allowed.
+    Raises: ValueError naming what is not allowed; TypeError for a `render_mode`.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
     default: type[C]
+    names: tuple[str, ...]
+    """Of the numbers of an observation, in their order; a reset's options may give them."""
     numbers = 2
     """Uniform numbers that an episode begins from."""
 
@@ -129,7 +131,8 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         config = self.default(**overrides) if config is None else config
         steps = min(config.episode_steps, max_episode_steps or config.episode_steps)
         self.config = replace(config, episode_steps=steps)
-        require(render_mode is None, "render_mode", render_mode, "None (there is nothing to draw)")
+        if render_mode is not None:  # a TypeError: Stable-Baselines3 asks for a picture, and goes on without
+            raise TypeError(f"render_mode = {render_mode}: allowed None (there is nothing to draw)")
         modes = {AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP}
         allowed = ", ".join(sorted(str(mode) for mode in modes))
         require(autoreset_mode in modes | {m.value for m in modes}, "autoreset_mode", autoreset_mode, allowed)
@@ -187,9 +190,10 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
 
         Args:
           seed: an integer (copy i gets seed + i), one integer or None per copy, or None to go on with the streams.
-          options: {"reset_mask": bool array (N,)} restarts only some copies.
+          options: {"reset_mask": bool array (N,)} restarts only some copies; {NAME: number or (N,)} of `names` is how
+            they start, instead of as drawn, {"od": 0.3, "setpoint": 0.5}.
         Returns: observations (N, O), {}.
-        Raises: ValueError if the mask has another shape.
+        Raises: ValueError if the mask has another shape, or naming an option that there is not or a value out of range.
         """
         if isinstance(seed, int):
             seed = [seed + i for i in range(self.num_envs)]
@@ -197,11 +201,30 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
             self.seed_streams([np.random.SeedSequence(s) for s in seed])
         elif self._streams is None:
             self.seed_streams(np.random.SeedSequence().spawn(self.num_envs))
-        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=np.bool_))
-        if np.shape(mask) != (self.num_envs,):
-            raise ValueError(f"reset_mask has shape {np.shape(mask)}: allowed ({self.num_envs},)")
+        given = dict(options or {})
+        mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
+        if mask.shape != (self.num_envs,):
+            raise ValueError(f"reset_mask has shape {mask.shape}: allowed ({self.num_envs},)")
+        starts = {self._column(name): self._checked(name, value) for name, value in given.items()}
         self._start(np.flatnonzero(mask))
+        for column, value in starts.items():
+            self.state[mask, column] = value[mask]
         return self._observe(), {}
+
+    def _column(self, name: str) -> int:
+        """Which number of an observation. Raises: ValueError."""
+        names = self.names[: self.state.shape[1]]
+        require(name in names, "reset option", name, ", ".join(("reset_mask", *names)))
+        return names.index(name)
+
+    def _checked(self, name: str, value: Any) -> Array:
+        """A start that a reset was given, (N,). Raises: ValueError."""
+        space, column = self.observations(self.config), self._column(name)
+        low, high = float(space.low[column]), float(space.high[column])
+        given = np.asarray(value, dtype=np.float64)
+        fits = given.shape in ((), (self.num_envs,)) and bool(np.all((low <= given) & (given <= high)))
+        require(fits, name, reprlib.repr(given.tolist()), f"{low:g} to {high:g}, one number or {self.num_envs}")
+        return np.broadcast_to(given, (self.num_envs,))
 
     def step(
         self, actions: NDArray[np.intp]
@@ -273,6 +296,7 @@ class BioreactorVectorEnv(EpisodeVectorEnv[EnvConfig]):
     """
 
     default = EnvConfig
+    names = ("od", "setpoint")
 
     @staticmethod
     def observations(config: EnvConfig) -> spaces.Box:

@@ -166,6 +166,7 @@ class CocultureVectorEnv(EpisodeVectorEnv[CocultureConfig]):
     """
 
     default = CocultureConfig
+    names = ("share_logit", "temperature", "growth_rate", "setpoint_logit", "next_setpoint_logit", "minutes_to_change")
     numbers = 5
 
     @staticmethod

@@ -1,5 +1,7 @@
 """The native vector environment against Gymnasium's own machinery and against a plain loop."""
 
+import warnings
+
 import gymnasium
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
 import envs  # registers the environment
+from envs.gym_adapter import REGISTERED
 from envs.task import EnvConfig, step_factors
 from envs.vector_env import BioreactorVectorEnv
 
@@ -133,7 +136,7 @@ def test_gymnasiums_own_time_limit_shortens_episodes():
 @pytest.mark.filterwarnings("ignore:.*render_mode")  # Gymnasium's own
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
 def test_a_way_to_draw_that_does_not_exist_is_refused(make):
-    with pytest.raises(ValueError, match="render_mode = human: allowed None"):
+    with pytest.raises(TypeError, match="render_mode = human: allowed None"):
         make(ID, render_mode="human")
 
 
@@ -259,3 +262,53 @@ def test_actions_of_many_copies_are_refused_together(actions):
     with pytest.raises(ValueError, match=r"action .* of shape .*: allowed 0 to 16 .*, integers of shape \(3,\)"):
         env.step(np.array(actions))
     np.testing.assert_array_equal(env.od, before)
+
+
+def test_an_episode_begins_where_it_is_told_and_says_where_it_is():
+    """Of three copies two are restarted: one start for each, one setpoint for both; the third goes on."""
+    many = gymnasium.make_vec(ID, num_envs=3)
+    first = many.reset(seed=4)[0]
+    mask = np.array([True, False, True])
+    begun = many.reset(options={"reset_mask": mask, "od": np.array([0.3, 0.4, 0.7]), "setpoint": 0.45})[0]
+    np.testing.assert_array_equal(begun, np.float32([[0.3, 0.45], first[1], [0.7, 0.45]]))
+    one = gymnasium.make("envs:" + ID, mu=0.02, episode_steps=2)
+    _, info = one.reset(seed=1, options={"od": 0.3, "setpoint": 0.5})
+    assert info == {"od": 0.3, "setpoint": 0.5}
+    for k, ended in ((1, False), (2, True)):  # with the pump off the culture grows by 2 % a minute
+        observation, reward, _, truncated, info = one.step(0)
+        assert info["od"] == pytest.approx(0.3 * np.exp(0.02 * k), rel=1e-4)
+        assert reward == pytest.approx(-((info["od"] - 0.5) ** 2), rel=1e-6)
+        np.testing.assert_allclose(observation, list(info.values()), rtol=1e-6)
+        assert truncated is ended
+    assert one.reset()[1]["od"] != 0.3  # told once, not for good
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"start_od": 0.3}, "reset option = start_od: allowed reset_mask, od, setpoint"),
+        ({"od": -0.1}, "od = -0.1: allowed 0 to 1000, one number or 2"),
+        ({"setpoint": [0.5, 3.0]}, r"setpoint = \[0.5, 3.0\]: allowed 0 to 2"),
+        ({"od": [0.5, 0.5, 0.5]}, "one number or 2"),
+        ({"od": float("nan")}, "od = nan"),
+    ],
+)
+def test_a_start_that_there_is_not_is_refused_and_changes_nothing(options, words):
+    env = gymnasium.make_vec(ID, num_envs=2)
+    before, _ = env.reset(seed=3)
+    with pytest.raises(ValueError, match=words):
+        env.reset(options=options)
+    np.testing.assert_array_equal(env.unwrapped.state.astype(np.float32), before)
+
+
+@pytest.mark.parametrize("name", sorted(REGISTERED))
+def test_stable_baselines_opens_every_task_by_its_name(name):
+    """It asks for a way to draw first, and does without one only after a TypeError."""
+    env_util = pytest.importorskip("stable_baselines3.common.env_util", reason="needs the extra [bench]")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*render_mode")
+        env = env_util.make_vec_env(f"envs:{name}", 2, seed=1)
+    assert env.reset().shape == (2, *env.observation_space.shape)
+    *_, infos = env.step(np.array([0, 1]))
+    assert len(infos) == 2
+    assert set(infos[0]) > {"TimeLimit.truncated"}
