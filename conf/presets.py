@@ -123,6 +123,18 @@ def owner(name: str) -> str | None:
     return found[1] if found else None
 
 
+def companion(name: str) -> str | None:
+    """The preset of another group that belongs to this one, `agent=relative`, which a line `# @with ...` says.
+
+    Args: name: group and option, "env/relative".
+    """
+    path = ROOT / f"{name}.yaml"
+    if not path.is_file():  # null, or a file of the user's own
+        return None
+    found = re.search(r"^# @with ([\w/]+=\w+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return found[1] if found else None
+
+
 def options(command: str, group: str) -> list[str]:
     """The presets of a group that a command accepts."""
     return [option for option in groups()[group] if owner(f"{group}/{option}") in (None, command)]

@@ -8,6 +8,7 @@ from difflib import get_close_matches
 
 from conf.presets import commands, sentence
 from experiments.cli import completion
+from experiments.cli.start import version
 
 KINDS = {
     "From a recording to a reactor": ("demo", "calibrate", "train", "certify", "deploy", "report"),
@@ -21,6 +22,7 @@ usage: turbidostat COMMAND [key=value ...]     the same as  python -m experiment
 END = """\
 turbidostat COMMAND --help     what a command takes, with units, ranges and defaults
 turbidostat COMMAND --cfg job  the config it would run with
+turbidostat --version          which version this is
 eval "$(turbidostat completion bash)"     completes commands, groups and keys; also zsh and fish
 
 An emulated Chi.Bio is started by  python -m hardware.emulator --help
@@ -59,6 +61,8 @@ def main() -> None:
     name, *rest = sys.argv[1:] or ["--help"]
     if name in ("--help", "-h", "help"):
         print("\n".join(page()))
+    elif name == "--version":
+        print(version())
     elif name == "completion" and len(rest) == 1 and rest[0] in completion.SHELLS:
         print(completion.SHELLS[rest[0]], end="")
     elif name == "complete":

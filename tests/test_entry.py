@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,14 @@ def test_a_command_of_another_name_is_one_line_and_exit_code_2() -> None:
     done = run("depoly")
     assert (done.returncode, done.stderr) == (2, "error: depoly: no such command; did you mean deploy?\n")
     assert run("xyzzy").stderr.startswith("error: xyzzy: no such command; there are demo, ")
+
+
+@pytest.mark.parametrize("words", [["--version"], ["train", "--version"], ["deploy", "controller=pi", "--version"]])
+def test_the_version_is_the_program_s(words: list[str], tmp_path: Path) -> None:
+    said = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    done = run(*words, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{said['name']} {said['version']}\n", "")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_command_runs_as_by_its_own_module(tmp_path: Path) -> None:

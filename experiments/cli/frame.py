@@ -29,7 +29,7 @@ from omegaconf.errors import OmegaConfBaseException
 from conf.presets import program
 from conf.schema import build
 from experiments.cli import extensions, files, help_page, latest, search, stop, sweep, words
-from experiments.cli.start import stopped
+from experiments.cli.start import stopped, version
 from experiments.cli.words import UserError, normalise, refusing
 
 __all__ = ["Command", "UserError", "compose", "load", "normalise", "refusing", "save_config", "swept"]
@@ -197,6 +197,9 @@ class Command(Generic[T]):
         plain = [a for a in given if not a.startswith("-")]
         if flags & {"--help", "-h"}:
             print(help_page.text(self.name, self.config(plain)), flush=True)
+            return
+        if "--version" in flags:
+            print(version())
             return
         if flags & {"--cfg", "-c"} and "job" in plain:
             plain.remove("job")

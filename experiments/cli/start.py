@@ -1,11 +1,12 @@
 """Before a command imports anything: whether the packages are its own, and what Ctrl-C says until it has begun."""
 
 import sys
+from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 
-__all__ = ["begin", "stopped"]
+__all__ = ["begin", "stopped", "version"]
 
 PACKAGES = ("conf", "dqn", "envs", "hardware")
 HOME = Path(__file__).parents[2]  # where all packages of ours stand side by side
@@ -32,6 +33,11 @@ def _other_package() -> str | None:
             remedy = "rename that one, or start the command from another folder"
             return f"package {name} is taken from {places[0]}, not from {HOME / name}; {remedy}"
     return None
+
+
+def version() -> str:
+    """What `--version` says."""
+    return f"turbidostat-dqn {metadata.version('turbidostat-dqn')}"
 
 
 def stopped() -> str:

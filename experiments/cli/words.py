@@ -48,7 +48,8 @@ def _choose(command: str, group: str, option: str) -> None:
 def normalise(argv: Sequence[str], command: str) -> list[str]:
     """Arguments in the one form that Hydra takes for each of them, whatever the YAML files hold.
 
-    A group is chosen by `group=option` or `+group=option`, where the option may be a YAML file of one's own. Every
+    A group is chosen by `group=option` or `+group=option`, where the option may be a YAML file of one's own; with a
+    task comes the agent that belongs to it, unless another is chosen. Every
     other key is forced in, because a default stands in the dataclass and not in YAML, and an unknown key is named by
     the schema. `resume=RUN` makes RUN the run folder; `extend=FILE.py` has been obeyed when this returns.
     Raises: UserError for a group or option that the command does not take, naming those that it does, and for a file
@@ -65,6 +66,7 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
     extensions.offer()
     known = presets.groups()
     out: list[str] = []
+    belongs: list[str] = []
     for arg in argv:
         match = re.match(r"^\+?([\w/]+)=(.*)$", arg)
         if match and match[1].startswith("hydra/"):
@@ -73,9 +75,13 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
             arg = f"{match[1]}={match[2]}"
             for option in match[2].split(","):
                 _choose(command, match[1], option)
+            if "," not in match[2] and (other := presets.companion(f"{match[1]}/{match[2]}")):
+                belongs.append(other)
         elif re.split("[@=]", arg.lstrip("+"))[0] not in known and not arg.startswith("hydra."):
             arg = re.sub(r"^\+*(?=\w+[^=]*=)", "++", arg)
         out.append(arg)
+    chosen = {arg.partition("=")[0] for arg in out}
+    out += [other for other in belongs if other.partition("=")[0] not in chosen]
     if old:
         if not (Path(old) / "config.yaml").is_file():
             raise UserError(f"resume={old}: no run folder (it holds no config.yaml); give the folder of a run")

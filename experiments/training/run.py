@@ -65,8 +65,16 @@ def train(config: TrainConfig, folder: Path) -> float:
 
 
 def _check_inputs(config: TrainConfig) -> None:
-    """Refuse an agent whose input map is made for observations of another width. Raises: UserError."""
+    """Refuse an agent that never learns, or whose inputs are made for observations of another width.
+
+    Raises: UserError.
+    """
     agent, names = config.agent, tasks.of(config.env).observation
+    if agent.learn_start >= agent.total_steps:
+        raise frame.UserError(
+            f"agent.learn_start = {agent.learn_start}: allowed 0 to {agent.total_steps - 1}, below agent.total_steps; "
+            "nothing is learned before"
+        )
     width = np.size(agent.input_matrix) // len(agent.input_offset) if agent.input_offset else len(names)
     if width != len(names):
         raise frame.UserError(

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 COMMANDS = sorted(p.stem for p in (ROOT / "conf").glob("*.yaml") if p.stem != "base")
-SHORT = ["agent=paper", "agent.total_steps=200", "checkpoint_every=100"]
+SHORT = ["agent=paper", "agent.total_steps=200", "agent.learn_start=100", "checkpoint_every=100"]
 
 
 def run(*words: str, cwd: Path, limit: int | None = None) -> subprocess.CompletedProcess[str]:

@@ -20,6 +20,7 @@ import torch
 from tensorboard.backend.event_processing import plugin_event_accumulator as shown
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from conf import presets
 from dqn import checkpoint, policy
 from dqn.checkpoint import CheckpointError
 from dqn.config import DQNConfig
@@ -379,6 +380,32 @@ def test_an_agent_of_another_task_is_refused_before_it_trains(tmp_path):
         train_run.train(config, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("words", "agent"),
+    [
+        (["env=coculture"], "coculture"),
+        (["+env=coculture_preview", "seed=3"], "coculture_preview"),
+        (["env=relative"], "relative"),
+        (["env=relative", "agent=tuned"], "tuned"),
+        (["agent=paper", "env=coculture"], "paper"),
+        (["+env=sim"], "tuned"),
+        ([], "tuned"),
+    ],
+)
+def test_a_task_comes_with_the_agent_that_belongs_to_it(words, agent):
+    """Unless another is chosen; values on the command line count in either."""
+    own, config = presets.load(f"agent/{agent}"), entry_point.config(words)
+    assert json.loads(json.dumps({key: getattr(config.agent, key) for key in own})) == own
+    assert config.seed == 3 * ("seed=3" in words)
+
+
+def test_an_agent_that_would_never_learn_is_refused(tmp_path):
+    config = entry_point.config(["agent.total_steps=300", "agent.learn_start=300"])
+    with pytest.raises(UserError, match=r"agent.learn_start = 300: allowed 0 to 299, below agent.total_steps"):
+        train_run.train(config, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", ["coculture", "coculture_preview"])
 def test_a_composition_is_trained_scored_and_exported(tmp_path, name, monkeypatch):
     """A few hundred steps: what is written, that the file says what the summary says, the figure what was measured."""
@@ -390,7 +417,7 @@ def test_a_composition_is_trained_scored_and_exported(tmp_path, name, monkeypatc
 
     monkeypatch.setattr(train_run.charts, "save", kept)
     words = ["agent.total_steps=240", "agent.learn_start=100", "agent.updates_per_step=1", "eval_every=120"]
-    train_run.train(entry_point.config([f"env={name}", f"agent={name}", *words]), tmp_path)
+    train_run.train(entry_point.config([f"env={name}", *words]), tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     learned = policy.load(tmp_path / "policy.npz")
     assert learned.observation == (policy.COCULTURE if name == "coculture" else policy.COCULTURE_PREVIEW)
