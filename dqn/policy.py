@@ -140,6 +140,8 @@ def load(path: Path) -> Policy:
         raise PolicyError(f"policy {path}: no such file; {remedy}") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
+        if "pickle" in reason:  # NumPy's advice is for files that one trusts
+            reason = "no NumPy archive"
         raise PolicyError(f"policy {path}: not a policy file ({reason}); {remedy}") from None
     try:
         metadata = json.loads(str(arrays["metadata"]))

@@ -219,7 +219,9 @@ class _Handler(BaseHTTPRequestHandler):
 
 def parser() -> argparse.ArgumentParser:
     """Arguments of the program."""
-    p = argparse.ArgumentParser(prog="python -m hardware.emulator", description="Emulated Chi.Bio behind HTTP.")
+    program = "python -m hardware.emulator"
+    usage = f"{program} [--reactors M0,M1] [--speed 60] ...; {program} --help says all"
+    p = argparse.ArgumentParser(prog=program, usage=usage, description="Emulated Chi.Bio behind HTTP.")
     add, start = p.add_argument, VialConfig()
     add("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
     add("--port", type=int, default=5000, help="port of the device; 0 = any free one (default %(default)s)")

@@ -14,7 +14,9 @@ from hardware.rig.processes import Rig
 
 def main() -> int:
     """Start it, say where it is, wait."""
-    parser = argparse.ArgumentParser(prog="python -m hardware.rig", description=__doc__)
+    program = "python -m hardware.rig"
+    usage = f"{program} [--units NAME=ML,...] ...; {program} --help says all"
+    parser = argparse.ArgumentParser(prog=program, usage=usage, description=__doc__)
     parser.add_argument("--units", default="pio01=20,pio02=14", help="NAME=CULTURE_ML of each, separated by commas")
     parser.add_argument("--growth-x", type=float, default=10.0, help="how much faster than real time cultures grow: 10")
     parser.add_argument("--build-only", action="store_true", help="build the environment and start nothing")

@@ -17,6 +17,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE_S
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -248,3 +250,16 @@ def test_a_port_in_use_gives_one_line(emulator: Process) -> None:
         assert (done.returncode, done.stderr, done.stdout.count("\n")) == (2, "", 1)
         assert "in use" in done.stdout
         assert port[-1] in done.stdout
+
+
+@pytest.mark.parametrize("program", ["hardware.emulator", "hardware.rig"])
+def test_a_wrong_word_is_two_lines_and_help_says_all(program: str) -> None:
+    words = [sys.executable, "-m", program]
+    done = subprocess.run(
+        [*words, "--reactor-speed=x"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    usage, error = done.stderr.splitlines()
+    assert usage.endswith(f"python -m {program} --help says all")
+    assert error == f"python -m {program}: error: unrecognized arguments: --reactor-speed=x"
+    shown = subprocess.run([*words, "--help"], capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
+    assert "--seed" in shown
