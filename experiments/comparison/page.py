@@ -112,7 +112,7 @@ def table_2(rows: Sequence[Row], metric: str) -> Table:
             cells.append(_mark(text, c == low_ours))
         body.append((*cells, low_theirs, low_ours))
     columns = ("window", *(f"{c}, published" for c in PUBLISHED), *(f"{c}, here" for c in (*PUBLISHED, *others)),
-               "lowest published", "lowest here")  # fmt: skip
+               "lowest published", "lowest of the three here")  # fmt: skip
     n = rows[0]["n"]
     return Table(
         f"table2_{metric}",

@@ -51,7 +51,7 @@ def test_published_stands_left_and_ours_right():
     table = page.table_2(ours(2.0), "ise")
     assert table.columns == (
         "window", "dqn, published", "pi, published", "mpc, published", "dqn, here", "pi, here", "mpc, here",
-        "lowest published", "lowest here",
+        "lowest published", "lowest of the three here",
     )  # fmt: skip
     assert [str(cell) for cell in table.rows[1]] == [
         "OD 0.65", "0.032", "0.039", "0.092", "0.064", "0.078", "0.184", "dqn", "dqn",

@@ -135,7 +135,7 @@ def test_tables_are_the_summarys_numbers(benchmark):
         }  # fmt: skip
         for c in published:
             assert r[f"{c}, here"] == plus_minus(ours[c]["itae_mean"], ours[c]["itae_sd"])
-        assert r["lowest here"] == min(ours, key=lambda c: ours[c]["itae_mean"])
+        assert r["lowest of the three here"] == min(ours, key=lambda c: ours[c]["itae_mean"])
     with open(benchmark / "tables" / "rows.csv", newline="") as f:
         head, *every = csv.reader(f)
     assert len(every) == len(summary["rows"])
