@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -15,6 +16,7 @@ __all__ = ["REMEDY", "Journal", "read_journal"]
 
 TAIL = 20_000_000  # bytes; about 16 h of eight reactors
 REMEDY = "the file was changed by hand: put it back as the run wrote it, or start a new run"
+BEGUN, ENDED, REACTOR = b'"kind":"intent"', b'"kind":"dose_end"', re.compile(rb'"reactor":"([^"]+)"')
 LANDMARKS = tuple(
     f'"kind":"{kind}"'.encode()
     for kind in ("device", "temperature", "regulate", "guard", "level", "share", "learn", "judged")
@@ -60,15 +62,30 @@ def _tail(path: Path, before: int) -> bytes:
 
 
 def _landmarks(path: Path, before: int) -> Iterator[dict[str, Any]]:
-    """The rows in the first `before` bytes that a resumed run still needs, without holding the rest in memory."""
-    if before:
-        with path.open("rb") as f:
-            at = 0
-            while at < before:
-                line = f.readline()
-                if at == 0 or any(mark in line[:120] for mark in LANDMARKS):
-                    yield from _parse(line, path)
-                at += len(line)
+    """The rows in the first `before` bytes that a resumed run still needs, without holding the rest in memory.
+
+    These are LANDMARKS and, of each reactor whose dose is open at byte `before`, its rows from that dose on.
+    """
+    kept: dict[int, bytes] = {}  # by where they begin
+    dose: dict[bytes, dict[int, bytes]] = {}
+    at = 0
+    with path.open("rb") as f:
+        while at < before:
+            line = f.readline()
+            head, name = line[:120], REACTOR.search(line[:200])
+            if at == 0 or any(mark in head for mark in LANDMARKS):
+                kept[at] = line
+            elif name and BEGUN in head:
+                dose[name[1]] = {at: line}
+            elif name and ENDED in head:
+                dose.pop(name[1], None)
+            elif name and name[1] in dose:
+                dose[name[1]][at] = line
+            at += len(line)
+    for rows in dose.values():
+        kept |= rows
+    for _, line in sorted(kept.items()):
+        yield from _parse(line, path)
 
 
 class Journal:
@@ -82,8 +99,8 @@ class Journal:
       wall: clock of the day, s since 1970; only ever for the record and for the position of a resumed run.
       fsync: False leaves the flushing to the operating system: survives a kill, not a power cut (simulated runs).
     Attributes: cut, bytes of a torn last line that were removed on opening; rows, what was there before: all of it in a
-      file of up to 20 MB, else its first row, those of the kinds in LANDMARKS, and the last 20 MB; next_row, the number
-      the next row will have.
+      file of up to 20 MB, else its first row, those of the kinds in LANDMARKS, doses left open, and the last 20 MB;
+      next_row, the number the next row will have.
     Raises: RecordingError if the file cannot be opened, read or written; the message says what to do.
     """
 

@@ -156,6 +156,10 @@ def test_a_long_journal_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.Mo
     assert (tmp_path / "j").stat().st_size > whole
 
 
+PUMP = "/SetOutputOn/Pump1/1/M4"
+DOSE = {"sample": [50.0, 1], "feed_ml": 0.3, "waste_ml": 0.6, "on_s": 0.0, "feed_duty": 0.01, "waste_duty": 0.02}
+
+
 def test_what_was_said_once_days_ago_is_known_behind_20_mb_of_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,6 +172,16 @@ def test_what_was_said_once_days_ago_is_known_behind_20_mb_of_samples(
         ("regulate", {"reactor": "M0", "setpoint": 0.6}),
         ("guard", {"reactor": "M2", "pump": "Pump3", "duty": 0.1, "found": "off"}),
         *((kind, {"reactor": "M1"}) for kind in ("level", "share", "learn", "judged")),
+        ("intent", {"time_s": 60.0, "reactor": "M3", **DOSE}),
+        ("dose_end", {"time_s": 100.0, "reactor": "M3"}),
+        ("intent", {"time_s": 120.0, "reactor": "M4", **DOSE}),  # it falls silent in its second dose
+        ("dose_end", {"time_s": 130.0, "reactor": "M4"}),
+        ("intent", {"time_s": 180.0, "reactor": "M4", **DOSE, "feed_ml": 0.4}),
+        (
+            "command",
+            {"time_s": 181.5, "reactor": "M4", "path": "/SetOutputOn/Pump1/1/M4", "answer": 204, "took_s": 0.5},
+        ),
+        ("feed_on", {"time_s": 181.0, "reactor": "M4", "on_s": 181.0}),
         *(("sample", {"reactor": "M0", "od": 0.6}) for _ in range(300)),
     ):
         journal.append(kind, fields)
@@ -180,6 +194,11 @@ def test_what_was_said_once_days_ago_is_known_behind_20_mb_of_samples(
     assert (known["M0"].device_id, known["M0"].blank, known["M0"].handed_over) == ("28-0516", 21500.0, 0.6)
     assert known["M1"].temperature == 30.0
     assert known["M2"].overflow_pump_on
+    assert "M3" not in known
+    silent = known["M4"]
+    assert (silent.open, silent.fed, silent.feed_ml, silent.on_s) == (True, True, 0.4, 181.0)
+    assert silent.feed_on == (181.0, 181.5)
+    assert [row["n"] for row in again.rows] == sorted(row["n"] for row in again.rows)
     assert [row["kind"] for row in again.rows if row["kind"] in ("level", "share", "learn", "judged")] == [
         "level", "share", "learn", "judged",
     ]  # fmt: skip
