@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -121,21 +121,26 @@ def write(page: Page, run: Path, label: str = "") -> None:
     """
     if not ((run / "recordings").is_dir() and (run / "config.yaml").is_file()):
         return
-    model, summary = believed(run), json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    model, bench = believed(run), _bench(_config(run))
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     reactors = summary.get("reactors") if isinstance(summary, Mapping) else None
     page.section(f"{label}: predicted and measured" if label else "Predicted and measured")
     if _config(run).get("composition"):
         page.text("Not compared: the growth of two species follows their share, and the model is of one species.")
         return
+    own = {name: model.tau * ml / bench.volume_ml for name, ml in bench.volumes_ml.items()}
+    told = "".join(f", {number(tau, 4)} of {name}" for name, tau in own.items())
+    growth, tau = number(model.mu, 4), number(model.tau, 4)
     page.text(
-        f"The model: growth {number(model.mu, 4)} 1/min, tau {number(model.tau, 4)} ({model.source}). Growth and pump "
+        f"The model: growth {growth} 1/min, tau {tau}{told} ({model.source}). Growth and pump "
         "gain are estimated from segments of about two hours, each alone. Net growth is what a sample grew or shrank "
         "beyond the prediction from the one before; it shows also where growth and pump hide one behind the other. A "
         "value no longer holds once the intervals exclude it and it is off by 10 % or more."
     )
     for path in sorted((run / "recordings").glob("*.csv")):
         known = reactors.get(path.stem) if isinstance(reactors, Mapping) else None
-        _reactor(page, run, path, model, known if isinstance(known, Mapping) else {}, f"{run.name}_" if label else "")
+        mine = replace(model, tau=own.get(path.stem, model.tau))
+        _reactor(page, run, path, mine, known if isinstance(known, Mapping) else {}, f"{run.name}_" if label else "")
 
 
 def _reactor(page: Page, run: Path, path: Path, model: Believed, summary: Mapping[str, Any], prefix: str) -> None:

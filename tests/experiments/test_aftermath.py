@@ -157,3 +157,16 @@ def test_a_folder_of_runs_names_the_deployment(drifting, tmp_path):
     assert "Deploy: predicted and measured" in text
     assert "Calibrate: predicted" not in text
     assert (tmp_path / "tables" / "3_deploy_after_M0.csv").is_file()
+
+
+def test_each_reactor_is_compared_with_the_model_of_its_own_volume(tmp_path):
+    """Vials of 14 and 9 mL that grow and are fed as planned; tau = V / 60."""
+    vials = "backend.reactors=[M0,M1]", "bench.volume_ml=14", "bench.volumes_ml.M1=9", "scenario.minutes=[80,80,80]"
+    text = sections(deployed(tmp_path / "run", "controller=inverse", *vials))
+    assert "tau 0.2333, 0.15 of M1 (nominal)" in text
+    assert text.count("No need to recalibrate: the model held to the end of the run.") == 2
+    gains = re.findall(r"the pump&#39;s gain: last ([\d.]+) \(([\d.]+) to ([\d.]+)\), the model&#39;s 1 ", text)
+    assert len(gains) == 2
+    for gain, low, high in gains:
+        assert float(gain) == pytest.approx(1.0, abs=0.12)
+        assert float(low) < 1.0 < float(high)
