@@ -182,6 +182,10 @@ def test_a_scenario_alone_is_completed(tmp_path: Path) -> None:
             "0.95; give composition=midpoint",
         ),
         (
+            (*WORDS[:2], "composition=dqn_preview", "backend.reactors=[M0,M1]", "+each.M1.ratios=[null,0.95,0.5,0.4]"),
+            "composition=dqn_preview: its policy was trained for shares of 0.1 to 0.9, the scenario asks for 0.95; ",
+        ),
+        (
             (*WORDS[:2], "composition=dqn_preview", "pair=ecoli_psyringae"),
             "policy's pair = of E. coli and P. putida, for a run with E. coli and P. syringae; growth differs by up to "
             "0.5. 1/h: allowed the run's own: train one with pair=",

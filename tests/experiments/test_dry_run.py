@@ -65,6 +65,21 @@ def test_each_step_begins_where_the_one_before_it_is_expected_to_end() -> None:
     assert "the times below count from its end" in text
 
 
+def test_each_reactor_is_reckoned_by_its_own_volume_and_the_bench_s_fastest_pump() -> None:
+    """From 0.8 to 0.4 at full rate, u / V - mu, then mu V to hold it; an hour at most, or until OD 0.5."""
+    down = "plant.start_od=0.8", "scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[60]"
+    down += "scenario.recovery_od=0", "bench.volume_ml=16", "bench.max_rate=0.015", "backend.reactors=[M0,M1]"
+    for until, level, lasts in (("null", 0.4, 60.0), ("'od <= 0.5'", 0.5, 0.0)):
+        text = told(*down, "bench.volumes_ml.M1=12", f"scenario.until=[{until}]")
+        steps = [line.split() for line in text.splitlines() if line.split()[1:2] == ["Mon"]]
+        for words, volume_ml in zip(steps, (16.0, 12.0), strict=True):
+            full = 60.0 * 0.015 / volume_ml
+            falls = math.log(0.8 / level) / (full - 0.03)
+            ml = volume_ml * (falls * full + max(lasts - falls, 0.0) * 0.03)
+            assert float(words[7]) == pytest.approx(max(falls, lasts), abs=0.5)
+            assert float(words[11]) == pytest.approx(ml, abs=0.05)
+
+
 def test_what_the_run_would_refuse_is_refused() -> None:
     with pytest.raises(frame.UserError, match="nowhere"):
         told("policy=nowhere.npz")

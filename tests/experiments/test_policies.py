@@ -88,6 +88,18 @@ def test_elsewhere_it_is_warned_of(
     assert re.search(message, warned[0])
 
 
+@pytest.mark.parametrize("reactor", ["M0", "M1"])
+def test_setpoints_of_a_single_reactor_are_judged_as_those_of_all(reactor: str, tmp_path: Path) -> None:
+    """Trained up to 1.0, certified up to 0.8; asked for by one reactor alone."""
+    devices = ChiBioConfig(reactors=("M0", "M1"))
+    for setpoint, said in ((1.1, "trained for setpoints 0.2 to 1, the scenario asks for 1.1"), (0.9, "certif.* 0.9")):
+        asked = {reactor: {"setpoints": [0.8, setpoint, 0.5]}}
+        with pytest.raises(UserError, match=rf"policy refused: .*{said}"):
+            assemble.unpack(deployed(tmp_path, {}, backend=devices, each=asked), tmp_path)
+    within = {reactor: {"setpoints": [0.7, 0.6, 0.4]}}
+    assert assemble.unpack(deployed(tmp_path, {}, backend=devices, each=within), tmp_path).policy is not None
+
+
 def test_a_sound_policy_and_a_limit_of_ones_own(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     assemble.unpack(deployed(tmp_path, {}, backend=ChiBioConfig()), tmp_path)
     assemble.unpack(deployed(tmp_path, {"regret_pct": 30.0}, backend=ChiBioConfig(), poor_regret_pct=40.0), tmp_path)

@@ -90,6 +90,20 @@ def test_where_no_dose_may_be_decided_nothing_is_owed_or_given() -> None:
     assert given(supply, range(2)) == [(0.0, 4, 1.0)]
 
 
+def test_minutes_without_a_believed_reading_are_made_up_for_in_that_reactor_alone() -> None:
+    """6 mL/h owe 0.1 mL a minute and 3 mL/h half of it; of both only the second's readings fail, at minutes 2 to 4."""
+    hourly = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 6 mL/h",))
+    supply = Supply([hourly, replace(hourly, outputs=("pump4 3 mL/h",))], 1.2)
+    doses: list[list[tuple[int, int, float]]] = [[], []]
+    for minute in range(13):
+        rows = np.array([True, not 2 <= minute <= 4])
+        pump, ml = supply.due(np.full(2, float(minute)), np.zeros(2, dtype=np.intp), rows)
+        for n in np.flatnonzero(ml):
+            doses[n].append((minute, int(pump[n]), round(float(ml[n]), 6)))
+        supply.given(pump, ml)
+    assert doses == [[(5, 3, 0.5), (10, 3, 0.5)], [(10, 4, 0.5)]]
+
+
 def config(schedule: Scenario = STEPS, **flows: float) -> Any:
     made = rehearsed(("M0",), schedule)
     supply = SupplyConfig(**({"pump3_ml_s": 1.0, "pump4_ml_s": 1.0} | flows))
