@@ -134,6 +134,16 @@ def test_the_file_is_the_plant_with_its_bands_beside_it() -> None:
     np.testing.assert_allclose(20.0 / (60.0 * np.array(flow)), own.tau.value, rtol=1e-4)
 
 
+def test_a_twin_begins_at_the_od_and_the_rows_of_its_recording() -> None:
+    """Five hours from 0.15, not from the OD that plants have by default; in a file they stand at rows 50 to 349."""
+    time, od, rate = record(replace(TRUTH, start_od=0.15), "threshold", 1)
+    raw = Series(time[:300], od[0, :300], rate[0, :300], 50 + np.arange(300))
+    own = twin(raw, calibrate(raw), 120.0)
+    text = twin_yaml(own, "a.csv")
+    assert build(PlantConfig(), yaml.safe_load(text), "plant").start_od == pytest.approx(0.15, rel=0.04)
+    assert "a.csv, rows 50:350" in text.replace("\n# ", " ")
+
+
 def test_a_short_recording_has_one_tau_and_says_so() -> None:
     time, od, rate = record(TRUTH, "threshold", 1)
     result, own = found(time[:300], od[0, :300], rate[0, :300])

@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,11 +20,13 @@ from envs.scenario import Scenario
 from experiments.benchmark import _schema
 from experiments.cli import frame
 from experiments.comparison import statistics as comparison
+from experiments.comparison import studies
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.published import TABLE_2
-from experiments.comparison.run import with_seeds
+from experiments.comparison.run import learned, with_seeds
 from experiments.comparison.trials import Cell, DensityTrial, Window, cells, run_trial, windows
 from experiments.laws import registry
+from experiments.training import run as training
 from tests.experiments.test_deploy import inverse_policy
 
 ROOT = Path(__file__).parents[2]
@@ -374,3 +377,58 @@ def test_window_end_belongs_to_both_sides():
     t = synthetic("c", np.array([0.01]))
     assert t.media(Window("x", 1.0, 0.0, 1.0))[0] == pytest.approx(0.6)
     assert t.media(Window("x", 1.0, 1.0, 2.0))[0] == pytest.approx(0.8)
+
+
+def test_the_calibration_is_of_the_config_s_own_model_and_control_period() -> None:
+    """Six hours from the first row to the last, a row every other minute; drawn and counted."""
+    found, drawing = studies.calibration(load("env.control_min=2", "env.mu=0.025", "env.tau=0.4", "seed=3"))
+    rows = 180 + 1
+    assert 0.8 * rows < found["n_used"] <= rows
+    assert max(len(line.get_xdata()) for axes in drawing.figure.axes for line in axes.get_lines()) == rows
+    for key, truth in (("mu", 0.025), ("tau", 0.4)):
+        assert found[key]["truth"] == truth
+        assert found[key]["value"] == pytest.approx(truth, rel=0.05)
+
+
+def test_the_learning_curve_is_told_with_the_regret_of_the_policy_that_controls(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That policy is best on the selection grid, another seed on the reported one."""
+    asked = []
+
+    def train(setup: Any, run: Path) -> None:
+        asked.append(setup)
+        policies.save(run / "policy.npz", inverse_policy())
+        seeds = {"seeds": [5, 6, 7], "regret_pct": [1.25, 3.5, 0.75], "policy_seed": 6}
+        rest = {"env_steps": 1200, "updates": 300, "steady_abs_error": [0.01] * 3, "config_hash": "x"}
+        (run / "summary.json").write_text(json.dumps(seeds | rest))
+
+    monkeypatch.setattr(training, "train", train)
+    asked_for = load("+experiment=training", "seed=5", "train_seeds=3", "env.control_min=2")
+    found, agents, drawn = learned(asked_for, {"dqn_paper"}, tmp_path)
+    assert [(s.seed, s.n_agents, s.env.control_min, s.agent) for s in asked] == [
+        (5, 3, 2.0, asked_for.agents["dqn_paper"])
+    ]
+    (figure,) = drawn
+    assert "3 seeds of 1200 environment steps" in figure["caption"]
+    assert "that of seed 6" in figure["caption"]
+    assert "regret 3.50 % on the reported grid" in figure["caption"]
+    assert agents["dqn_paper"]["regret_pct"] == [1.25, 3.5, 0.75]
+    assert list(found) == ["dqn_paper"]
+
+
+def test_the_interlock_of_a_comparison_lets_the_config_s_pump_run_at_its_period() -> None:
+    """Off or on, 0.03 mL/s over two minutes come to 3.6 mL, by which 20 mL are thinned to exp(-0.18)."""
+    c = load("env.max_pump_rate=0.03", "env.control_min=2", "env.tau=0.3333333333", "plants.nominal.start_od=0.9")
+
+    def bang(vials: Plant) -> Any:
+        return registry.build(replace(c.controllers["threshold"], rate=0.03), model=c.env, plant=vials)
+
+    schedule = Scenario((0.5,), (60.0,), (37.0,))
+    t = run_trial(Cell("threshold", "nominal", "s"), c.plants["nominal"], schedule, bang, c.env, 2, 0)
+    np.testing.assert_array_equal(t.minute, np.arange(0.0, 61.0, 2.0))
+    assert set(np.unique(t.rate)) == {0.0, 0.03}
+    np.testing.assert_array_equal(t.held, 0.0)
+    on = t.rate[:, :-1] > 0.0
+    np.testing.assert_allclose(np.diff(t.media_ml, axis=1), np.where(on, 3.6, 0.0), atol=1e-6)
+    np.testing.assert_allclose(np.diff(np.log(t.clean), axis=1), np.where(on, 2.0 * 0.03 - 0.18, 2.0 * 0.03), atol=2e-3)

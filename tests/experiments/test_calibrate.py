@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib import resources
 from pathlib import Path
 
@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from envs.identification.calibration import calibrate
+from envs.identification.calibration import Calibration, calibrate
+from envs.identification.model import Parameter
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
 from envs.task import EnvConfig
 from experiments.calibration.config import CalibrateConfig
-from experiments.calibration.result import environment_yaml
+from experiments.calibration.result import environment_yaml, summary
+from experiments.calibration.study import against_truth, simulated
 from experiments.cli import frame
 from experiments.cli.calibrated import read_plant_file
 from experiments.reporting.verdict import verdict
@@ -328,3 +330,59 @@ def test_environment_file_tells_its_origin() -> None:
     head = environment_yaml(result, "open_loop.csv").splitlines()[:3]
     assert all(line.startswith("#") for line in head)
     assert "open_loop.csv, rows 0:361, 361 readings" in head[1]
+
+
+def test_rows_are_those_of_the_file_also_where_its_beginning_is_left_out() -> None:
+    """From minute 40 of a recording by the minute, with two rows rejected among them."""
+    r = read_recording(str(resources.files("experiments") / "data" / "open_loop.csv"))
+    od = r.od.copy()
+    od[[90, 200]] *= 4.0
+    raw = Series(r.time_min[40:], od[40:], r.pump_rate[40:], r.row[40:])
+    content = summary(calibrate(raw), r, raw)
+    assert content["rows"] == [40, 361]
+    assert [(each["rows"], each["n"]) for each in content["rejected"]] == [("90, 200", 2)]
+    spans = [each["rows"] for each in content["segments"]]
+    assert len(spans) >= 2
+    assert (spans[0][0], spans[-1][1]) == (40, 361)
+    assert [end for _, end in spans[:-1]] == pytest.approx([first for first, _ in spans[1:]], abs=1)
+    for (first, end), each in zip(spans, content["segments"], strict=True):
+        assert each["middle_min"] == pytest.approx(0.5 * (first + end - 1), abs=1.0)
+    assert 40 <= content["rows_used"][0] < content["rows_used"][1] <= 361
+
+
+def test_a_tuned_pi_is_tuned_for_the_protocol_s_period() -> None:
+    """u = (K z + I) / 3, I <- I + K dt z / T with K = 1/2, T = 8 min and dt = 2 min, but where u is at a bound."""
+    protocol = OpenLoop(start_od=0.5, control_min=2.0, hours=2.0, noise=0.03)
+    config = CalibrateConfig(law="pi_tuned", setpoints=(0.5,), rest_min=0.0, protocol=protocol)
+    time, od, rate, _ = simulated(config, 2)
+    np.testing.assert_array_equal(time, np.arange(0.0, 121.0, 2.0))
+    for readings, given in zip(od, rate, strict=True):
+        integral = 0.03
+        for reading, u in zip(readings, given, strict=True):
+            z = np.log(reading / 0.5)
+            wanted = (0.5 * z + integral) / 3.0
+            assert u == pytest.approx(np.clip(wanted, 0.0, 0.02))
+            if not ((wanted > 0.02 and z > 0.0) or (wanted < 0.0 and z < 0.0)):
+                integral += 0.5 * 2.0 * z / 8.0
+
+
+def test_a_study_counts_what_is_wrong_of_all_and_what_holds_of_those_accepted() -> None:
+    """Eight recordings, three refused; of the others each pair of intervals by hand, truth 0.03 and 0.3."""
+    r = read_recording(str(resources.files("experiments") / "data" / "open_loop.csv"))
+    real = calibrate(Series(r.time_min, r.od, r.pump_rate, r.row))
+
+    def off(mu: float, tau: float) -> Calibration:
+        """So many half widths, of 0.001 and of 0.01."""
+        centres = ((0.03, 0.001, mu), (0.3, 0.01, tau))
+        found = [Parameter(at + half * by, at + half * (by - 1.0), at + half * (by + 1.0)) for at, half, by in centres]
+        return replace(real, mu=found[0], tau=found[1])
+
+    kept = [off(0.5, -0.5), off(1.5, 0.0), off(3.0, 0.0), off(0.0, -2.5), off(-3.0, 4.0)]
+    found = ["flat", kept[0], "short", kept[1], kept[2], kept[3], "flat", kept[4]]
+    true = [isinstance(each, Calibration) for each in found]
+    numbers = against_truth(found, np.where(true, 0.03, 1.0), np.where(true, 0.3, 1.0))
+    assert (numbers["recordings"], numbers["refused"], numbers["refusals"]) == (8, 3, ["flat", "short"])
+    assert numbers["wrong_pct"] == pytest.approx(100.0 * 3 / 8)
+    assert numbers["coverage_pct"] == pytest.approx({"mu": 100.0 * 2 / 5, "tau": 100.0 * 3 / 5})
+    assert numbers["median_bias_pct"] == pytest.approx({"mu": 100.0 * 0.0005 / 0.03, "tau": 0.0})
+    assert against_truth(["flat"], np.ones(1), np.ones(1))["wrong_pct"] == 0.0

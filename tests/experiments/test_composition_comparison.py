@@ -96,6 +96,20 @@ def test_a_law_is_paired_with_the_vendors_reactor_by_reactor():
     assert statistics.pairs([other], "pi") == []
 
 
+def test_a_law_is_paired_with_the_vendors_beside_the_same_density_on_the_same_sensor():
+    """Four kinds of vials, and laws that are off by so much less on each; whoever is told ahead meets the same ones."""
+    kinds = [("inverse", False), ("pi_tuned", False), ("inverse", True), ("pi_tuned", True)]
+    trials = []
+    for k, (density, calibrated) in enumerate(kinds):
+        for law, off, announced in (("proportional", 0.1, False), ("pi", 0.1 * (k + 2), True)):
+            one = made_up([[0.9, 0.5 + off, 0.5 + off, 0.4 + off], [0.9, 0.5 + off, 0.5 + off, 0.4 + off]], law=law)
+            trials.append(replace(one, cell=Cell(law, "coculture", "s", "share", density, announced, calibrated)))
+    found = {(p["density"], p["calibrated"]): p["difference"] for p in statistics.pairs(trials, "pi")}
+    assert found == pytest.approx({kind: -0.1 * (k + 1) for k, kind in enumerate(kinds)})
+    elsewhere = [replace(t, cell=t.cell._replace(plant="other")) for t in trials if t.cell.controller == "pi"]
+    assert statistics.pairs([t for t in trials if t.cell.controller != "pi"] + elsewhere, "pi") == []
+
+
 def test_every_law_meets_the_same_reactors_and_nothing_happens_before_a_share_is_asked_for():
     one, other = trial("pi"), trial("proportional")
     hour = slice(0, 30)
