@@ -14,6 +14,7 @@ from experiments.loop.signals import Density
 from hardware.chibio.config import EmulatorConfig
 from hardware.emulator.family import _words
 from hardware.emulator.server import build, parser
+from hardware.storage.journal import read_journal
 
 
 def error(folder: Path, *words: str) -> dict[str, float]:
@@ -38,6 +39,26 @@ def test_a_law_decides_in_shares_of_the_bench_s_own_volume(tmp_path: Path) -> No
     words = ["plant=nominal_noise", "backend.reactors=[M0,M1]", "controller=hold", "plant.start_od=0.6"]
     found = error(tmp_path / "run", *words, "bench.volume_ml=9", "bench.volumes_ml.M1=18")
     assert max(found.values()) < 0.03
+
+
+def test_the_oracle_knows_what_the_simulated_driver_takes_its_pump_for(tmp_path: Path) -> None:
+    """Growth of 3 % a minute is diluted by as much, within half of a 129th of the rates, 0.03 %, and not by 4 %."""
+    words = ["plant=nominal", "controller=oracle", "backend.pump_ml_s=0.7", "bench.volume_ml=16"]
+    assert error(tmp_path / "run", *words)["M0"] < 0.6 * 0.001
+
+
+def test_the_device_s_own_law_is_told_the_volume_of_each_vial(tmp_path: Path) -> None:
+    """P = 0.7 ln(x / r) V / 240 in the first minute in which it doses, when all vials are still alike."""
+    tmp_path.joinpath("run").mkdir()
+    vials = ["plant=nominal", "plant.start_od=0.55", "backend.reactors=[M0,M1,M2]", "controller=pi", "fsync=false"]
+    vials += ["bench.volume_ml=16", "bench.volumes_ml.M1=9", "bench.volumes_ml.M2=31"]
+    shape = ["scenario=hold", "scenario.setpoints=[0.5]", "scenario.minutes=[3]", "scenario.recovery_od=0"]
+    run.deploy(main.config([*vials, *shape]), tmp_path / "run")
+    rows = [row for row in read_journal(tmp_path / "run" / "journal.jsonl")[0] if row["kind"] == "decision"]
+    first = {row["reactor"]: row for row in reversed(rows) if row["why"]["p"] > 0.0}
+    for name, volume_ml in (("M0", 16.0), ("M1", 9.0), ("M2", 31.0)):
+        by_hand = 0.7 * np.log(first[name]["row"]["od"] / 0.5) * volume_ml / 240.0
+        assert first[name]["why"]["p"] == pytest.approx(by_hand, rel=1e-3)
 
 
 def test_no_rate_for_a_larger_volume_passes_the_cap() -> None:

@@ -8,7 +8,9 @@ import pytest
 
 from conf import presets
 from conf.schema import build
+from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
+from experiments.laws import registry
 from experiments.laws.base import Controller, Explains
 from experiments.laws.density.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
 from experiments.laws.density.inverse import Inverse, InverseConfig
@@ -116,6 +118,23 @@ def test_threshold_and_hold_by_hand() -> None:
         HoldConfig(rate=1.0)
     with pytest.raises(ValueError, match=r"controller.hysteresis = -0.1 OD"):
         ThresholdConfig(hysteresis=-0.1)
+
+
+@pytest.mark.parametrize(("flow_ml_s", "period"), [(1.0, 1.0), (0.7, 1.0), (1.4, 2.0)])
+def test_the_oracle_reckons_with_the_pulse_that_the_driver_gives(flow_ml_s: float, period: float) -> None:
+    """A driver that takes a pump of 1 mL/s for one of 0.7 lets it run 1/0.7 as long; one period is enough to arrive.
+
+    With 129 rates each period takes off ln x up to 1.2 period / (20 flow), so the last one is off by half of a part.
+    """
+    model = EnvConfig(control_min=period)
+    plant = Plant(PlantConfig(), 3, np.random.default_rng(0))
+    plant.reset(np.array([0.5, 0.505, 0.51]))
+    oracle = registry.build(registry.config("oracle"), model=model, plant=plant, flow_ml_s=flow_ml_s)
+    oracle.reset(3)
+    rate = oracle.act(plant.read_od(), np.full(3, 0.5), np.zeros(3), np.ones(3, dtype=bool))
+    plant.advance(period, 60.0 * period * rate / flow_ml_s)
+    most = 1.2 * period / (20.0 * flow_ml_s)
+    np.testing.assert_allclose(np.log(plant.apparent_od / 0.5), 0.0, atol=0.51 * most / 128)
 
 
 @pytest.mark.parametrize("name", ["pi", "pi_tuned", "inverse"])

@@ -118,6 +118,20 @@ def test_the_law_inverts_the_model() -> None:
     np.testing.assert_array_equal(u[2:], [0.02, 0.0])
 
 
+@pytest.mark.parametrize(("levels", "rates"), [(2, [0.0, 0.02]), (5, [0.0, 0.005, 0.01, 0.015, 0.02])])
+def test_with_levels_it_gives_the_nearest_of_them_from_none_to_all(levels: int, rates: list[float]) -> None:
+    """Of a law that knows the truth: u = tau (mu + ln(x / r)), over the range of the pump and beyond."""
+    model = EnvConfig(mu=0.03, tau=1.0 / 3.0)
+    known = EstimatorConfig(mu_sd=1e-5, gain_sd=0.0, gain_walk=0.0, mu_walk=0.0)
+    od = 0.5 * np.exp(np.linspace(-0.05, 0.05, 23))
+    stepped = Inverse(InverseConfig(levels=levels, estimator=known), model)
+    stepped.reset(od.size)
+    given = stepped.act(od, np.full(od.size, 0.5), np.zeros(od.size), np.ones(od.size, dtype=bool))
+    exact = np.clip((0.03 + np.log(od / 0.5)) / 3.0, 0.0, 0.02)
+    np.testing.assert_allclose(given, np.asarray(rates)[np.abs(exact[:, None] - rates).argmin(axis=1)], atol=1e-9)
+    np.testing.assert_allclose(np.unique(given.round(9)), rates)
+
+
 def test_ranges() -> None:
     with pytest.raises(ValueError, match=r"controller.estimator.noise_floor = 0.0 OD: allowed 0.0001 to 0.1"):
         EstimatorConfig(noise_floor=0.0)

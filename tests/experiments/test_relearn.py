@@ -284,6 +284,32 @@ def test_each_culture_follows_its_own_policy_and_is_shown_what_that_does_not_kno
         law.follow(1, 5, slower)
 
 
+def test_of_each_culture_the_growth_is_corrected_by_what_its_own_policy_does_not_know(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """E. coli grows by 20 % less than its curve: for policies that know of 0, 20 and 30 % the rest is -0.2, 0, 0.1."""
+    shown = {}
+
+    def chosen(policy: Policy, observation: np.ndarray) -> np.ndarray:
+        shown[policy.metadata["model"].get("scale_e", 1.0)] = observation[:, 2].copy()
+        return np.full(len(observation), 33.0)
+
+    monkeypatch.setattr(Policy, "chosen", chosen)
+    law = registry.build(registry.config("dqn_preview", "share"), "share", policy=policies.load(SHIPPED))
+    law.reset(5)
+    law.follow(1, 4, claiming(0.8))
+    law.follow(4, 9, claiming(0.7))
+    x, rate = np.zeros(5), np.array([0.9, 0.8, 0.7, 0.6, 0.5])
+    estimate = Estimate(x, x + 33.2, x + 33.2, rate, x - 0.2, x, x)
+    law.act(estimate, Wanted(x + 0.5, x + 0.5, x), x, np.array([True, True, True, False, True]))
+    growth = 0.07727 * law._even_c - 1.66954  # of E. coli, 1/h
+    assert shown == {
+        1.0: pytest.approx([0.9 + 0.2 * growth, 0.7 + 0.2 * growth], rel=1e-3),
+        0.8: pytest.approx([0.8], rel=1e-3),
+        0.7: pytest.approx([0.5 - 0.1 * growth], rel=1e-3),
+    }
+
+
 # -- the run -----------------------------------------------------------------------------------------------------------
 
 
