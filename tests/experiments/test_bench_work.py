@@ -53,6 +53,30 @@ def test_weighing_the_emulators_pump_finds_what_it_delivers() -> None:
     assert [s.grams for s in found[1:]] == pytest.approx(expected, rel=0.12)
 
 
+def test_of_two_pumps_the_one_that_is_asked_for_runs_and_is_weighed(tmp_path: Path) -> None:
+    """The waste pump, at duties that the feed pump may never have."""
+    with EmulatorProcess(["--speed", "300"]) as emulator:
+        backend = ChiBioConfig(url=emulator.url, speed=300.0, calibration=str(tmp_path / "c"))
+        config = CalibratePumpConfig(backend, pump="waste", duties=(0.1, 0.3, 0.5), doses=3)
+        asked = []
+
+        def ask(question: str) -> str:
+            asked.append(truth(emulator)["on_s"])
+            return "" if "tare" in question else f"{1.2 * 3 * (PERIOD_S * config.duties[(len(asked) - 1) // 2]):.3f}"
+
+        found, _ = weigh(config, ask)
+        after = truth(emulator)
+    assert [s.duty for s in found] == [0.1, 0.3, 0.5]
+    assert not any(after["motors"].values())
+    for tared, weighed, duty in zip(asked[::2], asked[1::2], config.duties, strict=True):
+        ran = {pump: weighed[pump] - tared[pump] for pump in tared}
+        assert ran.pop("Pump2") == pytest.approx(3 * PERIOD_S * duty, rel=0.1)
+        assert not any(ran.values())
+    for duties in ((0.02, 0.06), (0.02, 0.5)):
+        with pytest.raises(ValueError, match=r"duties = .*: allowed at least two different ones from 0.003 to 0.05"):
+            CalibratePumpConfig(backend, duties=duties)
+
+
 def test_pumps_of_a_running_experiment_are_not_weighed() -> None:
     from hardware.errors import DeviceStateError
 
@@ -141,7 +165,11 @@ def test_the_blank_of_clear_medium_is_found_stored_and_restored(tmp_path: Path) 
             dosing=ChiBioConfig().dosing,
         )
         blank(BlankConfig(backend, samples=4), tmp_path)
-        real = truth(emulator)["blank"]
+        real, left = truth(emulator)["blank"], truth(emulator)
+        connected = CalibratePumpConfig(backend, duties=(0.008, 0.02), doses=3)
+        found, _ = weigh(connected, lambda _: "1.0")
+    assert len(found) == 2, "the experiment is over: the next work on the bench begins"
+    assert not any((left["heat"], left["stir"], *left["motors"].values()))
     rigs = load_calibrations(tmp_path / "c", ["M0", "M1"])
     assert rigs[0].blank == pytest.approx(real, rel=0.01)
     assert rigs[1].blank != rigs[0].blank

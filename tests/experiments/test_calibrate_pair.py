@@ -120,6 +120,7 @@ def test_shares_that_were_counted_in_a_mixed_run_correct_the_curves(tmp_path: Pa
     rng = np.random.default_rng(0)
     for minute, share in list(zip(minutes, shares, strict=True))[100::120]:
         add_mark(run, Mark(minute, "M0", "counted", None, float(share + 0.02 * rng.standard_normal()), 0.02))
+        add_mark(run, Mark(minute, "M1", "counted", None, 0.05, 0.01))  # of another culture
     calibrate_pair(plain, tmp_path)
     told = json.loads((tmp_path / "summary.json").read_text())["mixed"]
     less = (1.0 + told["second"]) / (1.0 + told["first"])

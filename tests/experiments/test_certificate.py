@@ -7,6 +7,7 @@ import sys
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -565,3 +566,29 @@ def test_too_few_trajectories_are_asked_for_no_end_of_a_band() -> None:
     found = certify(laws.share_law(), replace(ASKED, trajectories=2000, quick=True))
     assert not [check for check in found.checks if "no attack reaches" in check.name]
     assert [check.value for check in found.checks if "left the band" in check.name] == [0.0]
+
+
+def test_a_row_of_the_page_is_of_the_strips_that_a_pump_can_hold() -> None:
+    """Of five strips from 0.3 to 0.8 the first and the fourth cannot be held, where every number is the largest."""
+    strips, held = np.linspace(0.3, 0.8, 6), np.array([False, True, True, False, True])
+
+    def where_held(*values: float) -> np.ndarray:
+        found = np.array([0.0, 9.0, 9.0, 0.0, 9.0])
+        found[~held], found[held] = 99.0, values
+        return found
+
+    proof = SimpleNamespace(
+        case=SimpleNamespace(name="a case"), holdable=held, half_width=where_held(0.02, 0.05, 0.03),
+        law_half_width=where_held(0.01, 0.02, 0.04), excess=where_held(0.01, 0.03, -0.01),
+        later=where_held(1.0, 2.0, 3.0), band=SimpleNamespace(periods=where_held(7.0, 5.0, 6.0)),
+    )  # fmt: skip
+    loop = SimpleNamespace(low=strips[:-1], high=strips[1:], in_od=lambda case, width: 10.0 * width)
+    assert command._row(loop, proof) == {
+        "case": "a case", "half-width, least": 0.02, "half-width, largest": 0.05, "law, largest": 0.04,
+        "over the law, largest": 0.03, "half-width in OD, middle strip": 0.5, "periods after the law, largest": 3.0,
+        "periods, largest": 7.0,
+    }  # fmt: skip
+    none = where_held(0.02, 0.05, 0.03)
+    none[~held] = 0.0
+    proof.half_width = none
+    assert command._row(loop, proof)["half-width, least"] == 0.02

@@ -13,7 +13,7 @@ from envs.scenario import Scenario
 from experiments.cli import frame
 from experiments.control.config import DeployConfig
 from experiments.control.timetable import expected, timetable
-from experiments.deploy import main
+from experiments.deploy import deploy, main
 from tests.experiments.test_deploy import ROOT
 from tests.patience import PATIENCE_S
 
@@ -85,6 +85,18 @@ def test_what_the_run_would_refuse_is_refused() -> None:
         told("policy=nowhere.npz")
     with pytest.raises(frame.UserError, match="drop dry_run"):
         timetable(DeployConfig(resume="RUN"), "HERE", NOON)
+
+
+@pytest.mark.parametrize("swept", [False, True])
+def test_what_has_no_timetable_is_refused_and_does_not_run(
+    swept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A job of a sweep comes here with its folder; it doses nothing."""
+    monkeypatch.setattr(frame, "swept", lambda: swept)
+    config = main.config(["dry_run=true", "controller=pi", "scenario.minutes=[2,2,2]"])
+    with pytest.raises(frame.UserError, match="dry_run=true: a sweep has no timetable; drop --multirun"):
+        deploy(config, tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_no_device_is_asked_and_no_folder_left(tmp_path: Path) -> None:

@@ -266,7 +266,8 @@ def test_a_run_that_was_stopped_and_resumed_is_under_way_again(tmp_path: Path) -
     (folder / "summary.json").write_text("{}")
     _ends(folder, "start", "stop", "start")
     mark(MarkConfig(str(folder), "M0", "inoculated"))
-    assert len(read_marks(folder)) == 1
+    (found,) = read_marks(folder)
+    assert found.time_min == pytest.approx(20.0, abs=2.0), "of the run, not since it was resumed"
 
 
 @pytest.mark.parametrize("text", ["foam (2 mL)", "pH=7", "a, b", "it's in", "'quoted already'"])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments import report
-from experiments.cli import frame
+from experiments.cli import frame, sweep
 from experiments.reporting import sweep_results
 
 
@@ -109,6 +109,17 @@ def test_of_twelve_jobs_the_one_that_returned_nothing_is_best_and_the_others_fol
     rows = table(tmp_path, "configurations_objective")
     assert [row["env.mu"] for row in rows] == ["0.02", *(f"{0.01 + 0.001 * k:.4g}" for k in range(12) if k != 10)]
     assert [row["job"] for row in table(tmp_path, "missing_jobs")] == ["12", "13"]
+
+
+def test_of_a_search_the_values_of_its_jobs_are_those_of_the_command_line(tmp_path: Path) -> None:
+    """The preset says n_agents=4, the command 2; what the preset alone says stands beside it."""
+    words = ["+hparams_search=tuned", "agent.total_steps=300", "++agent.huber=0.02", "hydra.sweep.subdir=0"]
+    for k, more in enumerate(([], ["n_agents=2"], ["++n_agents=3"])):
+        job(tmp_path / str(k), [*words, *more], objective=1.0, loss=1.0)
+    found = [report._result(each).overrides for each in sweep.survey(tmp_path)]
+    assert [each["n_agents"] for each in found] == ["4", "2", "3"]
+    for each in found:
+        assert each | {"n_agents": ""} == {"n_agents": "", "agent.total_steps": "300", "agent.huber": "0.02"}
 
 
 def test_the_interval_is_that_of_a_bootstrap() -> None:

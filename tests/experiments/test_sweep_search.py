@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hydra.core.utils import JobReturn, JobStatus
@@ -84,6 +85,36 @@ def test_an_objective_of_nothing_is_the_best_of_those_above_it(tmp_path: Path) -
     best = json.loads((tmp_path / "best.json").read_text())
     assert (best["trial"], best["objective"]) == (10, 0.0)
     assert [t.value for t in study._open().get_trials()] == [1.0, 2.0, 3.0, None, *map(float, range(5, 11)), 0.0, 12.0]
+
+
+@pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
+def test_a_range_is_of_whole_numbers_where_both_its_ends_are(tmp_path: Path) -> None:
+    said = {
+        "whole": {"low": 1, "high": 4}, "part": {"low": 0, "high": 0.5}, "down": {"low": -0.5, "high": 1},
+        "even": {"low": 2, "high": 8, "step": 2}, "tens": {"low": 0.001, "high": 1.0, "log": True},
+        "some": {"choices": ["a", "b"]},
+    }  # fmt: skip
+    tried: list[dict[str, Any]] = []
+
+    def launch(overrides: list[list[str]], initial_job_idx: int) -> list[JobReturn]:
+        done = [JobReturn(overrides=words, status=JobStatus.COMPLETED) for words in overrides]
+        for words, job in zip(overrides, done, strict=True):
+            values = dict(word.removeprefix("++").split("=") for word in words[:-1])
+            tried.append({key: v if key == "some" else json.loads(v) for key, v in values.items()})
+            job.return_value = 1.0
+        return done
+
+    study = search.Search(40, 40, frame.OmegaConf.create(said))
+    study.folder, study.launcher = tmp_path, SimpleNamespace(launch=launch)  # type: ignore[assignment]
+    study.sweep([])
+    assert len(tried) == 40
+    for key, allowed in (("whole", {1, 2, 3, 4}), ("even", {2, 4, 6, 8}), ("some", {"a", "b"})):
+        assert {params[key] for params in tried} == allowed
+    for key, low, high in (("part", 0.0, 0.5), ("down", -0.5, 1.0), ("tens", 0.001, 1.0)):
+        values = [params[key] for params in tried]
+        assert all(low <= value <= high for value in values)
+        assert len(set(values)) == 40
+    assert 5 <= sum(params["tens"] < 0.03 for params in tried) <= 35  # half of three tens
 
 
 @pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
