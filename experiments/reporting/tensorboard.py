@@ -51,10 +51,9 @@ class Events:
             self._writer = EventFileWriter(str(folder))
         self._known: set[str] = set()
         self._flushed = time.monotonic()
-        if first_step:
-            started = SessionLog(status=SessionLog.START)
-            with undisturbed():
-                self._writer.add_event(Event(step=first_step, wall_time=time.time(), session_log=started))
+        started = SessionLog(status=SessionLog.START)  # TensorBoard hides nothing at the first one that it meets
+        with undisturbed():
+            self._writer.add_event(Event(step=first_step, wall_time=time.time(), session_log=started))
 
     def _add(self, values: Sequence[Summary.Value], step: int, wall: float | None = None) -> None:
         when = time.time() if wall is None else wall
