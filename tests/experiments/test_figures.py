@@ -49,10 +49,12 @@ from experiments.reporting.verdict import verdict
 from experiments.training.coculture import Coculture
 from experiments.training.density import Density
 from experiments.training.relative import Relative
+from hardware.storage.marks import Mark
 from tests.experiments import laws
 
 MINUTES = np.arange(0.0, 331.0, 30.0)  # twelve samples, 5.5 h
 HOURS = MINUTES / 60.0
+LATER = MINUTES + 5.0
 OD = np.linspace(0.3, 0.52, 12)
 RATE = np.where(np.arange(12) % 3 == 0, 0.004, 0.012)  # mL/s
 SPREAD = np.array([-0.02, 0.0, 0.02])[:, None]  # sd 0.02, variance 0.0004
@@ -82,6 +84,8 @@ def read(ax: Axes, what: str) -> tuple[Any, Any]:
     kind, *k = what.split()
     if kind == "row":
         return estimate(ax, *map(float, k))
+    if k[:1] == ["announced"]:
+        k = [[str(i) for i, line in enumerate(ax.lines) if line.get_marker() == ">"][int(k[1])]]
     k = k[0] if k else "0"
     if kind == "line":
         x, y = ax.lines[int(k)].get_data()
@@ -102,7 +106,10 @@ def read(ax: Axes, what: str) -> tuple[Any, Any]:
 
 
 def table() -> Table:
-    """Two reactors, of which the second has twice of everything."""
+    """Two reactors, of which the second has twice of everything, is seen 5 min later, and once is not believed.
+
+    At the bench somebody looked at M1 in minute 45, and counted a sample of each.
+    """
     one = {
         "time_min": MINUTES, "elapsed_min": MINUTES, "od": OD, "setpoint": np.full(12, 0.45),
         "temperature_degc": 37 - HOURS,
@@ -111,9 +118,10 @@ def table() -> Table:
         "fluorescence": 1000 * OD,
     }  # fmt: skip
     both = {key: np.stack([values, 2.0 * values]) for key, values in one.items()}
-    return Table(
-        ("M0", "M1"), both | {k: np.stack([MINUTES] * 2) for k in ("time_min", "elapsed_min")}, [[], []], [], []
-    )
+    both |= {"time_min": np.stack([MINUTES, LATER]), "elapsed_min": np.stack([MINUTES] * 2)}
+    both["believed"][1, 3] = 0.0
+    marks = [Mark(45.0, "M1", "looked"), Mark(60.0, "M0", "", None, 0.3, 0.02), Mark(120.0, "M1", "", None, 0.6, 0.05)]
+    return Table(("M0", "M1"), both, [[], []], [], marks)
 
 
 SCENARIO = Scenario((0.45, 0.45), (180.0, 150.0), (37.0, 30.0), ratios=(0.4, 0.4))
@@ -124,7 +132,9 @@ def closed_loop() -> Figure:
 
 
 def composition() -> Figure:
-    return composition_figure_of(table(), [SCENARIO, SCENARIO], "B", "")
+    """After 180 min the share is to be 0.7 in M0, 0.9 in M1; an hour ahead it is known in M0, two in M1."""
+    scenarios = [replace(SCENARIO, ratios=(0.4, to), announce_min=ahead) for to, ahead in ((0.7, 60.0), (0.9, 120.0))]
+    return composition_figure_of(table(), scenarios, "B", "")
 
 
 def parameter(value: float) -> Parameter:
@@ -254,9 +264,14 @@ def fit(method: str) -> Figure:
 
 
 def coverage() -> Figure:
-    """Three recordings of 0.02 1/min and tau 0.5, of which the second misses both; drawn by rising estimate."""
-    mu = np.array([[0.02, 0.018, 0.026], [0.016, 0.014, 0.018], [0.024, 0.019, 0.03]])
-    return calibration_charts.coverage_figure(mu, 25.0 * mu, (np.full(3, 0.02), np.full(3, 0.5)), "")
+    """Recordings of 0.04, 0.02 and 0.02 1/min and tau 1.2, 0.6 and 0.6, of which the second misses both.
+
+    Drawn by rising estimate over truth, which is not the order of the estimates.
+    """
+    mu = np.array([[0.04, 0.036, 0.052], [0.016, 0.014, 0.018], [0.024, 0.019, 0.03]])
+    return calibration_charts.coverage_figure(
+        mu, 30.0 * mu, (np.array([0.04, 0.02, 0.02]), np.array([1.2, 0.6, 0.6])), ""
+    )
 
 
 def learning(agents: int) -> Figure:
@@ -286,7 +301,7 @@ SORTED = "simulated recording, sorted by estimate"
 MISSED, WARM = "measured minus predicted, OD", "temperature, °C"
 INSIDE, KNOTS, MIDDLES = HOURS[2:9], [0.0, 1.0], [0.75, 2.75, 4.75]
 WARMTH = np.linspace(29.0, 36.0, 141)
-FED = [4, 12, 12] * 4
+FED, TWICE = [4, 12, 12] * 4, [8, 24, 24] * 4
 ONES, TENS = np.arange(90.0), np.arange(4.5, 400.0, 10.0)
 STEPS = [100.0, 200.0]
 
@@ -295,18 +310,34 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
     "closed loop": (closed_loop, [
         (0, "line 0", MIN, "OD", MINUTES, OD),
         (0, "line 1", MIN, "OD", MINUTES, np.full(12, 0.45)),
-        (0, "line 2", MIN, "OD", MINUTES, 2 * OD),
+        (0, "line 2", MIN, "OD", LATER, np.where(MINUTES == 90.0, np.nan, 2 * OD)),
+        (0, "line 3", MIN, "OD", LATER, np.full(12, 0.9)),
+        (0, "line 4", MIN, "OD", [45, 45], [0, 1]),
+        (0, "line 6", MIN, "OD", LATER, np.where(MINUTES == 90.0, 2 * OD, np.nan)),
         (1, "line 0", MIN, PUMP, MINUTES, FED),
+        (1, "line 1", MIN, PUMP, LATER, TWICE),
         (2, "line 0", MIN, WARM, MINUTES, 37 - HOURS),
+        (2, "line 1", MIN, WARM, LATER, 74 - 2 * HOURS),
     ]),
     "composition": (composition, [
         (0, "line 0", H, "share of B", HOURS, OD),
         (0, "band 0", H, "share of B", HOURS, [OD - 0.1, OD + 0.2]),
+        (0, "band 1", H, "share of B", LATER / 60, [2 * OD - 0.2, 2 * OD + 0.4]),
+        (0, "bar 0", H, "share of B", [1.0], [[0.3], [0.3 - 1.96 * 0.02], [0.3 + 1.96 * 0.02]]),
+        (0, "bar 1", H, "share of B", [2.0], [[0.6], [0.6 - 1.96 * 0.05], [0.6 + 1.96 * 0.05]]),
+        (0, "line announced 0", H, "share of B", [2.0], [0.7]),
+        (0, "line announced 1", H, "share of B", [65 / 60], [0.9]),
         (1, "line 0", H, WARM, HOURS, 37 - HOURS),
         (1, "line 1", H, WARM, HOURS, 36 - HOURS),
+        (1, "line 2", H, WARM, LATER / 60, 74 - 2 * HOURS),
+        (1, "line 3", H, WARM, LATER / 60, 72 - 2 * HOURS),
         (2, "line 0", H, "OD", HOURS, OD),
+        (2, "line 2", H, "OD", LATER / 60, np.where(MINUTES == 90.0, np.nan, 2 * OD)),
+        (2, "line 3", H, "OD", LATER / 60, np.full(12, 0.9)),
         (3, "line 0", H, PUMP, HOURS, FED),
+        (3, "line 1", H, PUMP, LATER / 60, TWICE),
         (4, "line 0", H, "fluorescence, counts", HOURS, 1000 * OD),
+        (4, "line 1", H, "fluorescence, counts", LATER / 60, 2000 * OD),
     ]),
     "agreement": (agreed, [
         (0, "bar 0", H, MU, [1.0, 3.75], bounds(0.03, 0.02)),
@@ -413,12 +444,12 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (0, "row 0.09 0.13", "mean |r - setpoint|", "", 0.1, 0.0),
     ]),
     "curves of a sweep": (lambda: sweep_charts.learning_curves(
-        [("a", np.array(STEPS), np.array([[4.0, 5.0, 6.0, 9.0], [1.0, 2.0, 3.0, 8.0]]))], "regret, %"), [
+        [("a", np.array(STEPS), np.array([[9.0, 4.0, 5.0, 6.0], [1.0, 2.0, 8.0, 3.0]]))], "regret, %"), [
         (0, "line 0", "environment step", "regret, %", STEPS, [5.5, 2.5]),
         (0, "line 1", "environment step", "regret, %", STEPS, [9.0, 8.0]),
     ]),
     "values of a sweep": (lambda: sweep_charts.values(
-        {"a": np.array([1.0, 2.0, 3.0, 8.0]), "b": np.array([4.0])}, "regret, %"), [
+        {"b": np.array([1.0, 2.0, 3.0, 8.0]), "a": np.array([4.0])}, "regret, %"), [
         (0, "line 0", "regret, %", "", [1.0, 2.0, 3.0, 8.0], [0, 0, 0, 0]),
         (0, "line 1", "regret, %", "", [2.5, 2.5], [-0.3, 0.3]),
         (0, "line 2", "regret, %", "", [4.0], [1]),
@@ -437,6 +468,51 @@ def test_what_is_drawn_is_in_the_unit_of_its_axis(name: str) -> None:
         assert (where, label(axes[panel], "x"), label(axes[panel], "y")) == (where, xlabel, ylabel)
         for found, expected in zip(read(axes[panel], what), (x, y), strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9, err_msg=where)
+
+
+def drawn_as(figure: Figure, panel: int) -> list[str]:
+    """How the lines of a panel go from one point to the next."""
+    return [line.get_drawstyle() for line in figure.axes[panel].lines if len(line.get_xdata()) > 1]
+
+
+def test_what_holds_until_the_next_row_is_drawn_over_the_time_after_its_own() -> None:
+    """Pump rates and targets hold from their row on; an episode of a share has them at the end of their decision."""
+    after = "steps-post"
+    assert drawn_as(closed_loop(), 0)[:4] == ["default", after] * 2
+    assert drawn_as(closed_loop(), 1)[:2] == [after] * 2
+    assert drawn_as(composition(), 1) == drawn_as(composition(), 2) == ["default", after] * 2
+    assert drawn_as(composition(), 3) == [after] * 2
+    for method in ("prediction_error", "free_run"):
+        assert drawn_as(fit(method), 2) == [after]
+    for panel in (3, 4, 5):
+        assert set(drawn_as(density()["trajectories"], panel)) == {after}
+        assert set(drawn_as(relative()["trajectories"], panel)) == {after}
+    assert [drawn_as(episodes(), panel) for panel in (0, 1)] == [["steps-pre", "default", "default"], ["steps-pre"] * 2]
+
+
+def test_rows_curves_and_counts_stand_beside_their_names() -> None:
+    """Names in the order of the ranking, which is not that of the alphabet; a recording of three misses its truth."""
+    values = DRAWN["values of a sweep"][0]().axes[0]
+    assert list(zip(values.get_yticks(), (t.get_text() for t in values.get_yticklabels()), strict=True)) == [
+        (0, "b"), (1, "a")
+    ]  # fmt: skip
+    assert values.get_ylim()[0] > 1 > 0 > values.get_ylim()[1]  # the first row on top
+    one, other = np.array([[1.0, 1.0]]), np.array([[2.0]])
+    drawn = sweep_charts.learning_curves([("b", np.ones(1), one), ("a", np.ones(1), other)], "")
+    lines = {line.get_label(): line.get_ydata()[0] for line in drawn.axes[0].lines if len(line.get_xdata())}
+    assert {name: lines[name] for name in ("b (n = 2)", "a (n = 1)")} == {"b (n = 2)": 1.0, "a (n = 1)": 2.0}
+    for ax in coverage().axes:
+        said = [text.get_text() for text in ax.get_legend().get_texts()]
+        assert said[:2] == ["95 % interval holds the truth: 2 of 3", "95 % interval misses it: 1 of 3"]
+
+
+def test_the_temperature_of_equal_growth_is_where_both_curves_cross() -> None:
+    """0.07727 T - 1.66 = -0.02208 T^2 + 1.3796 T - 20.56996 at 33.138 degC."""
+    crossing = max(np.roots([-0.02208, 1.3796 - 0.07727, 1.66 - 20.56996]))
+    first = replace(PairConfig().first, polynomial=(0.07727, -1.66))
+    growth = pair_figure(replace(PairConfig(), first=first), [[], []]).axes[0]
+    assert growth.lines[-1].get_xdata() == pytest.approx([crossing] * 2, abs=2e-3)
+    assert growth.get_legend().get_texts()[-1].get_text() == f"alike at {crossing:.2f} °C"
 
 
 def test_every_figure_of_the_program_is_among_these() -> None:

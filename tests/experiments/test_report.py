@@ -324,6 +324,37 @@ def test_a_folder_of_runs_gets_one_page(tmp_path):
     assert text.index("Calibrate: results") < text.index("Train: results")
 
 
+def test_tables_of_several_runs_are_files_of_their_own(tmp_path):
+    for name in ("2_deploy", "3_deploy"):
+        run_folder(tmp_path / "demo" / name, {"windows": [{"reactor": name}], "marks": [{"text": name}]})
+    report.write(tmp_path / "demo")
+    assert {path.name: path.read_text().split() for path in (tmp_path / "demo/tables").glob("*.csv")} == {
+        f"{run}_{table}.csv": [column, run]
+        for run in ("2_deploy", "3_deploy")
+        for table, column in (("windows", "reactor"), ("marks", "text"))
+    }
+
+
+@pytest.mark.parametrize(
+    ("env", "unit"),
+    [("density", "OD"), ("relative", "periods of full pump"), ("coculture", "of the share")],
+)
+def test_errors_of_a_training_are_in_the_unit_of_its_task(env, unit, tmp_path):
+    errors = (
+        "steady_abs_error", "steady_abs_error_last", "mean_abs_error", "optimum_steady_abs_error",
+        "optimum_mean_abs_error", "myopic_steady_abs_error", "steady_abs_error_by_setpoint",
+    )  # fmt: skip
+    run = run_folder(
+        tmp_path / "run", {key: [0.1] for key in errors} | {"regret_pct": [2.0], "setpoint": 0.5, "nodes": 3}
+    )
+    (run / "config.yaml").write_text(f"env:\n  kind: {env}\n")
+    text = report.write(run).read_text(encoding="utf-8")
+    said = dict(re.findall(r"<th>([^<,]+), ([^<]+)</th>", text))
+    assert {key: said.get(key) for key in errors} == dict.fromkeys(errors, unit)
+    assert (said["regret"], said["setpoint"]) == ("%", "OD")
+    assert "<th>nodes</th>" in text
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,11 @@ def training(folder: Path, agent: str, seed: int, regret: list[float]) -> None:
     seeds = list(range(seed, seed + len(regret)))
     words = [f"agent={agent}", f"++seed={seed}", f"++n_agents={len(regret)}"]
     job(folder, words, objective=max(regret), seeds=seeds, regret_pct=regret, steady_abs_error=regret)
+    learned(folder, seeds, regret)
+
+
+def learned(folder: Path, seeds: list[int], regret: list[float]) -> None:
+    """The curves of a training."""
     rows = [
         f"{step},{s},eval/regret_pct,{r * 100 / step}"
         for step in (100, 200)
@@ -88,13 +94,22 @@ def test_curves_are_those_of_every_seed_of_every_job(trained: Path) -> None:
 
 
 def test_a_closed_loop_is_judged_by_its_worst_window(tmp_path: Path) -> None:
+    """Two windows of M0 and one of M1, each of whose costs differ; costs are those of a reactor's whole schedule."""
     for k, (law, errors) in enumerate({"pi": [0.01, 0.03], "mpc": [0.02, 0.02]}.items()):
-        windows = [{"reactor": "M0", "ise": 1.0, "itae": 2.0, "steady_abs_error": e} for e in errors]
-        job(tmp_path / str(k), [f"controller={law}"], windows=windows, reactors={"M0": {"volume_ml": 60.0 + k}})
+        windows = [
+            {"reactor": name, "ise": ise, "itae": itae, "steady_abs_error": e}
+            for name, ise, itae, e in (("M0", 1.0, 2.0, errors[0]), ("M0", 3.0, 5.0, errors[1]), ("M1", 0.5, 6.0, 0.01))
+        ]
+        reactors = {"M0": {"volume_ml": 60.0 + k}, "M1": {"volume_ml": 50.0}}
+        job(tmp_path / str(k), [f"controller={law}"], windows=windows, reactors=reactors)
     report.compare(tmp_path)
     rows = table(tmp_path, "configurations")
-    assert [(row["controller"], row["steady_abs_error: worst"], row["ise: worst"]) for row in rows] == [
-        ("mpc", "0.02", "2"), ("pi", "0.03", "2"),
+    told = ("controller", *(f"{name}: worst" for name in ("steady_abs_error", "ise", "itae")), "volume_ml: n")
+    assert [tuple(row[key] for key in told) for row in rows] == [
+        ("mpc", "0.02", "4", "7", "2"), ("pi", "0.03", "4", "7", "2"),
+    ]  # fmt: skip
+    assert [(row["ise: median"], row["itae: median"], row["volume_ml: worst"]) for row in rows] == [
+        ("2.25", "6.5", "61"), ("2.25", "6.5", "60"),
     ]  # fmt: skip
 
 
@@ -126,6 +141,53 @@ def test_the_interval_is_that_of_a_bootstrap() -> None:
     """Of 0 and 1 two draws are 0, 1/2 or 1 in one, two and one of four cases: 95 % reach from 0 to 1."""
     found = sweep_results.statistics(np.array([0.0, 1.0]))
     assert (found.n, found.interval, found.iqm, found.worst) == (2, (0.0, 1.0), 0.5, 1.0)
+
+
+def test_the_interval_is_one_of_95_per_cent() -> None:
+    """Three draws of 0, 1, 1 are all 0 in 1 of 27 cases: 3.7 %, more than 2.5 and less than 5.
+
+    The middle three of five draws of 0, 1, 1, 1, 1 are 0 if four are, in 21 of 3125 cases, and hold at least two zeros
+    if three are, in 160: 0.7 and 5.8 %, about 2.5 as well.
+    """
+    five = np.array([0.0, 1.0, 1.0, 1.0, 1.0])
+    for values, end in ((np.array([0.0, 1.0, 1.0]), 0.0), (five, 1.0 / 3.0)):
+        low, high = sweep_results.statistics(values).interval
+        assert (low, high) == pytest.approx((end, 1.0))
+        low, high = sweep_results.statistics(1.0 - values).interval
+        assert (low, high) == pytest.approx((0.0, 1.0 - end))
+
+
+def compared(folder: Path, **regrets: list[float]) -> str:
+    """The page of a configuration per agent with these regrets of its seeds, which returned no objective."""
+    for k, (agent, regret) in enumerate(regrets.items()):
+        seeds = list(range(len(regret)))
+        job(folder / str(k), [f"agent={agent}"], seeds=seeds, regret_pct=regret, steady_abs_error=regret)
+        learned(folder / str(k), seeds, regret)
+    return report.compare(folder).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("second", "apart"), [([5.0, 6.0, 7.0], True), ([2.5, 3.5, 4.5], False), ([0.5, 2.0, 9.0], False), ([3.5], True)]
+)
+def test_a_winner_whose_interval_meets_that_of_the_next_is_said_to_be_none(
+    second: list[float], apart: bool, tmp_path: Path
+) -> None:
+    """The interval of 1, 2 and 3 is from 1 to 3, which the next one's begins below or above; one seed has none."""
+    text = compared(tmp_path, a=[1.0, 2.0, 3.0], b=second)
+    assert "Of 2 configurations, agent a is best: regret against the optimum, %, 3 at its worst, with an" in text
+    assert f"; the next has {max(second):g}" in text
+    assert ("and the intervals of the two do not tell them apart" not in text) == apart
+
+
+def test_long_names_give_way_to_their_place_in_the_table(tmp_path: Path) -> None:
+    """The best one, which ran second, has three seeds, the other one two; a short name stays."""
+    long = "x" * 40
+    compared(tmp_path, **{f"{long}1": [4.0, 5.0], f"{long}2": [1.0, 2.0, 3.0], "short": [6.0]})
+    assert [row["agent"][-1] for row in table(tmp_path, "configurations_regret_pct")] == ["2", "1", "t"]
+    drawn = (tmp_path / "figures/learning_regret_pct.svg").read_text(encoding="utf-8")
+    assert re.findall(r">([^<>]+) \(n = (\d)\)</text>", drawn) == [("#1", "3"), ("#2", "2"), ("agent short", "1")]
+    rows = (tmp_path / "figures/values_regret_pct.svg").read_text(encoding="utf-8")
+    assert re.findall(r">(#\d|agent short)</text>", rows) == ["#1", "#2", "agent short"]
 
 
 def test_a_folder_without_a_sweep_is_one_line(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from tensorboard.backend.event_processing import plugin_event_accumulator as shown
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.custom_scalar import metadata as custom
@@ -19,7 +20,7 @@ from experiments.cli import frame
 from experiments.control import run as control
 from experiments.deploy import main as deploy
 from experiments.reporting.curves import CURVES, METRICS, PARAMETERS, POPULATION, described
-from experiments.reporting.tensorboard import Events
+from experiments.reporting.tensorboard import Events, PopulationWriter
 from experiments.train import main as train
 from experiments.training import run as training
 from hardware.storage.recording_reader import read_recording
@@ -153,6 +154,11 @@ def test_charts_of_the_custom_page_show_curves_that_exist(runs: Path) -> None:
             assert shown, chart.title
             assert shown == patterns or "supervised" in str(patterns) or "target" in str(patterns), chart.title
         bands = [(s.value, s.lower, s.upper) for chart in charts for s in chart.margin.series]
+        if name == "population":  # one limit for all agents, of whose own curves there is a range
+            for tag in ("limit/regret_pct", "limit/steady_abs_error", "train/epsilon"):
+                assert (tag,) * 3 in bands
+            for tag in ("eval/regret_pct", "eval/steady_abs_error", "train/loss", "train/return", "q/min", "q/max"):
+                assert (f"{tag}/iqm", f"{tag}/min", f"{tag}/max") in bands
         if name in ("dqn", "shares"):
             assert ("culture/setpoint", "culture/setpoint_low", "culture/setpoint_high") in bands
             assert ("culture/od",) * 3 in bands
@@ -204,6 +210,28 @@ def test_a_run_can_be_watched_while_it_goes_on(tmp_path: Path, monkeypatch: pyte
         (live,) = parts(tmp_path)
         assert curve(live, "culture/od")[:, 0].tolist() == list(range(minute + 1))
     events.close()
+
+
+def test_a_resumed_training_keeps_what_is_older_than_its_checkpoint_and_that_of_its_own_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Evaluated at steps 100, 200 and 300 and at 250 and 300 of its second life, which began at 200."""
+    tag = "eval/regret_pct"
+    for first, steps in ((0, (100, 200, 300)), (200, (250, 300))):
+        monkeypatch.setattr("time.time", lambda began=first: 1e9 + began)  # files of events are read by their second
+        writer = PopulationWriter(tmp_path, [4, 9], first)
+        for step in steps:
+            writer.scalars(step, {tag: np.array([1.0, 2.0]) * step + first, "train/epsilon": 0.5})
+        writer.close()
+    with open(tmp_path / "progress.csv", newline="", encoding="utf-8") as f:
+        rows = [(int(row["step"]), row["seed"], float(row["value"])) for row in csv.DictReader(f)]
+    curves = {100: (100.0, 200.0), 200: (200.0, 400.0), 250: (450.0, 700.0), 300: (500.0, 800.0)}
+    assert rows == [
+        line for k, each in curves.items() for line in ((k, "4", each[0]), (k, "9", each[1]), (k, "all", 0.5))
+    ]
+    for where, name, n in ((".", f"{tag}/max", 1), ("agents/seed0004", tag, 0), ("agents/seed0009", tag, 1)):
+        events = shown.EventAccumulator(str(tmp_path / where)).Reload()
+        assert curve(events, name).tolist() == [[k, each[n]] for k, each in curves.items()]
 
 
 def test_a_picture_has_its_size(runs: Path) -> None:

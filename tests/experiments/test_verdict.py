@@ -68,6 +68,21 @@ def test_a_deployment_is_good_if_every_window_ends_at_its_setpoint() -> None:
         assert said.remark == f"Not good: {held} windows ended within 5 % of their setpoint."
 
 
+def test_a_calibration_without_a_pair_names_the_rows_that_it_used():
+    """Rows 40 to 99, of which the 100th is the first that was not used."""
+    alone = {"value": 0.021, "ci95": [0.019, 0.024], "rows": [40, 100]}
+    said = verdict(
+        {
+            "verdict": {"word": "not usable", "why": "the pump never ran", "then": "record doses"},
+            "mu": None, "mu_alone": alone, "net_growth": None, "notes": ["a", "b"], "pmse_pct": None,
+        },
+        {"data": "runs/here/one.csv"},
+    )  # fmt: skip
+    assert said.claim == "Calibration of one.csv: not usable: the pump never ran; record doses."
+    assert said.items == ["mu alone 0.021 1/min, 95 % interval 0.019 to 0.024, rows 40 to 99"]
+    assert said.remark == "a; b"
+
+
 @pytest.mark.parametrize("summary", [{}, {"windows": 3}, {"train_seconds": 1.0}, {"pmse_pct": None}])
 def test_what_is_not_whole_is_not_judged(summary: dict[str, object]) -> None:
     assert verdict(summary, {}) is None
