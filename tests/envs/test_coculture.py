@@ -8,7 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
-from envs.coculture.task import CocultureConfig, CocultureVectorEnv, advance, at_rest, logit, passed, share
+from envs.coculture.task import CocultureConfig, CocultureVectorEnv, advance, at_rest, limits, logit, passed, share
 from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Evaluation
 from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
@@ -63,6 +63,9 @@ def test_an_announced_change_comes_nearer_and_is_then_the_setpoint() -> None:
     np.testing.assert_array_equal(first := passed(PREVIEW, goal), [[0.1, 0.9, 30.0]])
     np.testing.assert_array_equal(second := passed(PREVIEW, first), [[0.9, 0.9, 0.0]])
     np.testing.assert_array_equal(passed(PREVIEW, second), second)
+    slow = CocultureConfig(control_min=20.0, preview_min=360.0)
+    np.testing.assert_array_equal(passed(slow, goal), [[0.1, 0.9, 40.0]])
+    np.testing.assert_array_equal(passed(slow, np.array([[0.1], [0.2]])), [[0.1], [0.2]])
 
 
 def test_starts_are_drawn_one_by_one() -> None:
@@ -157,6 +160,20 @@ def test_short_programs_agree_with_all_sequences_of_actions() -> None:
         costs += np.square(1.0 / (1.0 + np.exp(-states[:, 0])) - wanted)
     assert cost == pytest.approx(costs.min(), rel=5e-3)
     assert np.sort(costs)[1] > 1.005 * costs.min()
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.0, 1.6])
+def test_the_optimum_s_grid_holds_what_a_culture_can_be(scale: float) -> None:
+    """At rest anywhere from 29 to 36 degC, the second species growing by its curve times its scale."""
+    config = CocultureConfig(scale_p=scale, scale_e=1.3)
+    temperature, rate, x = Grid().axes(config)
+    curve = scale * p_putida_rate(np.linspace(29.0, 36.0, 701))
+    assert (temperature[0], temperature[-1], x[0], x[-1]) == (29.0, 36.0, -6.0, 6.0)
+    assert (rate[0], rate[-1]) == pytest.approx((curve.min(), curve.max()), rel=1e-3)
+    rest = at_rest(config, np.zeros(3), np.array([29.0, 31.2, 36.0]))
+    np.testing.assert_allclose(rest[:, 2], scale * p_putida_rate(np.array([29.0, 31.2, 36.0])), rtol=1e-9)
+    low, high = limits(config)
+    assert low[2] <= curve.min() < curve.max() <= high[2]
 
 
 @pytest.fixture(scope="module")

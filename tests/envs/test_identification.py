@@ -6,10 +6,12 @@ from scipy.optimize import minimize
 
 from envs.growth import DilutedCulture, Exponential
 from envs.identification.calibration import Calibration, IdentifyConfig, calibrate
+from envs.identification.drift import Segment
 from envs.identification.free_run import _sum_variance, fit
-from envs.identification.model import NotIdentifiable, pmse, trajectory
+from envs.identification.model import NotIdentifiable, Parameter, pmse, trajectory
 from envs.identification.open_loop import OpenLoop, open_loop
-from envs.identification.screening import Series, noise_sd, pumped_volume, screen
+from envs.identification.screening import Screened, Series, noise_sd, pumped_volume, screen
+from envs.identification.window import choose_window, longest
 from envs.integrators import rk4
 from hardware.storage.recording_reader import read_recording
 from tests.real_recording import DITHER, needs_dither
@@ -308,7 +310,22 @@ def test_pause_parts_the_recording_without_rejecting() -> None:
     result = calibrate(series(s.time[keep], s.od[keep], s.pump_rate[keep]))
     assert len(result.screened.stretches) == 2
     assert sum(len(r.rows) for r in result.screened.rejections) <= 1
-    assert result.window_rows[0] == 200
+    assert (result.window, result.window_rows) == ((200, 660), (200, 660))
+    later = Series(s.time[keep], s.od[keep], s.pump_rate[keep], s.row[keep] + 7)  # as a file has them, with the pause
+    assert calibrate(later).window_rows == (268, 728)
+
+
+def test_the_window_is_the_stretch_with_most_readings_not_with_most_rows() -> None:
+    """Three hours of which every other row was rejected, a pause, and two hours without a gap."""
+    time = np.concatenate([np.arange(181.0), np.arange(400.0, 521.0)])
+    od = np.where((time < 200.0) & (time % 2 == 1.0), np.nan, 0.5)
+    clean, known = Series(time, od, np.zeros(time.size), np.arange(time.size)), Parameter(0.03, 0.029, 0.031)
+    along = tuple(
+        Segment(a, b, time[a:b].mean(), known, known) for a, b in ((0, 90), (90, 181), (181, 241), (241, 302))
+    )
+    found, why = choose_window(Screened(clean, ((0, 181), (181, 302)), ()), along, 60.0)
+    assert (found, why) == ((181, 302), "the longest stretch without a pause")
+    assert longest(Screened(clean, ((0, 181), (181, 302)), ())) == (181, 302)
 
 
 def test_noise_sd_is_measured_through_growth_and_dilution() -> None:

@@ -86,6 +86,12 @@ def test_blocked_waste_overflows_after_the_minutes_the_rim_allows() -> None:
     assert first == 9  # 10 mL of room at 1.2 mL per minute
     np.testing.assert_array_equal(p.vessel.overflowed, [False, True])
     assert p.vessel.volume_ml[1] == 30.0
+    p.vessel.waste_gain_factor[1] = 1.0  # repaired: what was spilt stays spilt, until the vial is another one
+    p.advance(1.0, np.zeros(2), np.full(2, 60.0))
+    np.testing.assert_allclose(p.vessel.volume_ml, 20.0)
+    np.testing.assert_array_equal(p.vessel.overflowed, [False, True])
+    p.reset(0.5)
+    assert not p.vessel.overflowed.any()
 
 
 def test_an_overflow_guard_keeps_the_level_where_its_tube_ends() -> None:
@@ -273,6 +279,17 @@ def test_priming_loses_part_of_the_first_pulse_after_a_rest() -> None:
     assert first.min() >= 0.3
     assert first.max() <= 0.7
     assert first.mean() == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize("step", [0.1, 0.5, 1.0, 2.0])
+def test_a_line_is_unprimed_after_ten_minutes_whatever_the_steps_are(step: float) -> None:
+    p = plant(PlantConfig(pump=replace(PULSE, prime_low=0.5, prime_high=0.5)), 1)
+    for rest, delivered in ((8.0, 1.0), (10.0, 1.0), (12.0, 0.5)):
+        for _ in range(round(rest / step) - 1):  # and the rest of the step with the pulse before
+            p.advance(step, np.zeros(1))
+        before = p.feed.delivered_ml
+        p.advance(step, np.ones(1))
+        assert p.feed.delivered_ml - before == pytest.approx(delivered), rest
 
 
 def test_pulse_spread_and_its_memory() -> None:

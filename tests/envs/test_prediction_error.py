@@ -10,7 +10,15 @@ from envs.identification.free_run import fit
 from envs.identification.model import NotIdentifiable
 from envs.identification.noise_model import FULL, NoiseModel, average, effective
 from envs.identification.open_loop import OpenLoop
-from envs.identification.prediction_error import Estimate, _batch, _deletion_residuals, _solve, estimate, outliers
+from envs.identification.prediction_error import (
+    Estimate,
+    _batch,
+    _deletion_residuals,
+    _mean_growth,
+    _solve,
+    estimate,
+    outliers,
+)
 from envs.identification.screening import Series
 from experiments.calibration.config import CalibrateConfig
 from experiments.calibration.study import simulated
@@ -106,6 +114,27 @@ def test_filter_is_generalised_least_squares(short: Series, cell: int) -> None:
     other = (cell + 1) % 4
     got = solved.score[0, cell] - solved.score[0, other]
     assert got == pytest.approx(score - squares(short, other)[3], abs=1e-5)
+
+
+@pytest.mark.parametrize("cell", range(4))
+def test_mean_growth_and_its_sd_are_those_of_the_wandering_growth_given_all_readings(short: Series, cell: int) -> None:
+    """mu + S/L with S the sum of w dt: what least squares and the readings say of both, and how well they say it."""
+    batch = _batch([short])
+    value, sd = _mean_growth(batch, _solve(batch, CELLS), np.full((1, 4), 0.7))
+    covariance, x = dense(short, CELLS, cell)
+    om, memory = CELLS.wander[0, cell], CELLS.memory[0, cell]
+    dt = np.append(np.diff(short.time), 0.0)
+    moved = np.outer(dt, dt) * om**2 * np.exp(-np.abs(np.subtract.outer(short.time, short.time)) / memory)
+    seen = np.isfinite(short.od)
+    v, x = covariance[np.ix_(seen, seen)], x[seen]
+    with_end = (np.tril(np.ones(moved.shape), -1) @ moved).sum(axis=1)[seen]  # covariance of the readings with S
+    best, spread, *_ = squares(short, cell)
+    weight, length = np.linalg.solve(v, with_end), short.time[-1] - short.time[0]
+    towards = np.array([0.0, 1.0, 0.0]) - x.T @ weight / length
+    expected = towards @ best + weight @ np.log(short.od[seen]) / length
+    variance = towards @ spread @ towards + (moved.sum() - with_end @ weight) / length**2
+    assert value[0, cell] == pytest.approx(expected, rel=1e-5)
+    assert sd[0, cell] == pytest.approx(0.7 * np.sqrt(variance), rel=1e-5)
 
 
 def test_deletion_residuals_are_those_of_the_inverse_covariance(short: Series) -> None:

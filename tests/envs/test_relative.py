@@ -1,5 +1,7 @@
 """The task in relative coordinates: it is the growth model in other units, and its optimum is the one-line law."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -69,6 +71,16 @@ def test_the_nearest_level_by_hand() -> None:
     error = np.array([-2.0, 0.0, 0.03, 0.04, 0.2, 0.5, 2.0])
     #              clip(e + s) 16:  0   8   8.48  8.64  11.2  16  16
     assert nearest_level(error, np.full(7, 0.5)).tolist() == [0, 8, 8, 9, 11, 16, 16]
+    #              clip(e + s) 32:  0   16  16.96  17.28  22.4  32  32;    clip(e + s) 4: 0  2  2.12  2.16  2.8  4  4
+    assert nearest_level(error, np.full(7, 0.5), 33).tolist() == [0, 16, 17, 17, 22, 32, 32]
+    assert nearest_level(error, np.full(7, 0.5), 5).tolist() == [0, 2, 2, 2, 3, 4, 4]
+
+
+@pytest.mark.parametrize("levels", [9, 33])
+def test_the_one_line_law_is_the_optimum_of_any_number_of_levels(levels: int) -> None:
+    task = Relative(replace(CONFIG, n_actions=levels))
+    law = Evaluation(task, task.report_grid()[::7])(task.myopic)
+    assert abs(law.regret_pct[0]) < 1e-3
 
 
 def test_nothing_beats_the_optimum_and_the_one_line_law_is_it() -> None:

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from envs.outputs import Output, outputs_of
 from envs.scenario import Scenario
+from envs.until import Conditions
 
 STEPS = Scenario((0.8, 0.65, 0.5), (30.0, 30.0, 30.0), (37.0, 37.0, 30.0), recovery_od=0.8)
 
@@ -41,6 +43,34 @@ def test_phases_change_at_their_edges():
 def test_values_out_of_range_are_named(key, arguments):
     with pytest.raises(ValueError, match=rf"scenario\.{key}.*allowed"):
         Scenario(**arguments)
+
+
+def test_a_phase_has_its_own_temperature_and_the_even_one_only_where_it_gives_none():
+    mixed = Scenario((0.5,) * 4, (10.0,) * 4, (None, 31.0, None, 36.0), ratios=(0.3, 0.3, 0.4, None))
+    assert mixed.resting(33.2).temperatures == (33.2, 31.0, 33.2, 36.0)
+    assert (STEPS.resting(33.2).temperatures, mixed.resting(33.2).ratios) == (STEPS.temperatures, mixed.ratios)
+
+
+def test_each_reactor_s_step_ends_by_its_own_condition():
+    """Two reactors that are both settled at an OD of 0.5, of which each asks for something else in its two steps."""
+    conditions = Conditions([["od >= 0.6", "settled"], ["settled", "od <= 0.5"], [None, None]])
+    assert conditions.any
+    od, settled = np.full(3, 0.5), np.ones(3, dtype=bool)
+    for phases, met in (
+        ([0, 0, 0], [False, True, False]),
+        ([1, 1, 1], [True, True, False]),
+        ([0, 1, 0], [False, True, False]),
+        ([1, 0, 1], [True, True, False]),
+    ):
+        assert conditions.met(np.array(phases), od, settled).tolist() == met
+    assert conditions.met(np.array([0, 0, 0]), np.array([0.6, 0.9, 0.9]), ~settled).tolist() == [True, False, False]
+    assert conditions.met(np.array([1, 1, 1]), np.array([np.nan] * 3), ~settled).tolist() == [False] * 3
+
+
+@pytest.mark.parametrize("unit", ["mL/h", "ml/h", "ML/H"])
+def test_a_rate_is_one_however_it_is_spelt(unit):
+    assert outputs_of(f"pump3 2 {unit}") == (Output(3, ml_h=2.0),)
+    assert outputs_of(f"pump4 2 {unit[:2]}") == (Output(4, ml=2.0),)
 
 
 def test_a_share_may_be_asked_for_in_some_phases_in_all_or_in_none():

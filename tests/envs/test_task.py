@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from envs.bench import Bench
 from envs.task import EnvConfig, pump_rates, step_factors, tracking_reward
 
 
@@ -42,6 +43,18 @@ def test_reward_is_minus_the_squared_error():
 def test_values_out_of_range_are_named(key, value):
     with pytest.raises(ValueError, match=rf"env\.{key} = .*allowed"):
         EnvConfig(**{key: value})
+
+
+@pytest.mark.parametrize(("period_s", "stale_s"), [(30.0, 70.0), (60.0, 100.0), (120.0, 160.0), (600.0, 660.0)])
+def test_a_sample_is_no_basis_for_a_dose_when_the_next_one_is_late_by_40_s_or_a_tenth(period_s, stale_s):
+    bench = Bench(period_s=period_s)
+    assert (bench.stale_s, bench.control_min) == (pytest.approx(stale_s), period_s / 60.0)
+
+
+def test_each_reactor_has_its_own_volume_or_that_of_all():
+    bench = Bench(volume_ml=18.0, volumes_ml={"M1": 14.0})
+    assert bench.volumes(["M0", "M1", "M2"]).tolist() == [18.0, 14.0, 18.0]
+    assert bench.tau == pytest.approx(0.3)
 
 
 def test_a_pump_that_cannot_stop_is_refused():
