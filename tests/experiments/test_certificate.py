@@ -22,8 +22,8 @@ from experiments import certify as command
 from experiments import deploy
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
-from experiments.certification.config import CertifyConfig
-from experiments.certification.judge import certify
+from experiments.certification.config import CertifyConfig, Limits
+from experiments.certification.judge import Certificate, Check, certify
 from experiments.certification.question import question
 from experiments.certification.verdict import attacked
 from experiments.cli import files
@@ -419,9 +419,11 @@ def test_bounds_of_an_estimator_depend_on_the_od_and_return_from_a_file() -> Non
     np.testing.assert_allclose(bounds.error_bound(np.array([0.1, 1.0, 0.0])), [0.8132, 0.1, np.inf], atol=1e-4)
     cases = np.array(
         [[1.0, 0.1, 0.5, 0.05], [1.0, 0.11, 0.5, 0.05], [1.0, 0.1, 0.5, 0.051], [1.0, 0.1, 0.98, 0.05],
-         [1.0, np.nan, 0.5, 0.05], [0.1, 0.8, 0.5, 0.05]]
+         [1.0, np.nan, 0.5, 0.05], [0.1, 0.8, 0.5, 0.05], [1.0, 0.1, 0.04, 0.05], [1.0, 0.1, 0.05, 0.05],
+         [1.0, 0.1, 0.97, 0.05], [0.1, 0.82, 0.5, 0.05], [1.0, 0.1, np.nan, 0.05], [1.0, 0.1, 0.5, np.nan]]
     )  # fmt: skip
-    np.testing.assert_array_equal(bounds.hold(*cases.T), [True, False, False, False, False, True])
+    within = [True, False, False, False, False, True, False, True, True, False, False, False]
+    np.testing.assert_array_equal(bounds.hold(*cases.T), within)
     assert EstimateBounds.of(json.loads(json.dumps(asdict(bounds)))) == bounds
 
 
@@ -519,6 +521,66 @@ def test_a_certificate_that_asks_for_less_than_usual_is_refused_and_says_what(re
     ):  # fmt: skip
         assert part in said
     assert not any(name in said for name in ("noise", "strip", "late"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"growth_shares": (0.3, 0.97)}, ["growth_shares = [0.3, 0.97], by itself [0.05, 0.97]"]),
+        ({"growth_shares": (0.05, 0.5)}, ["growth_shares = [0.05, 0.5], by itself [0.05, 0.97]"]),
+        ({"growth_shares": (0.3, 0.98)}, ["growth_shares = [0.3, 0.98], by itself [0.05, 0.97]"]),
+        ({"growth_shares": (0.04, 0.98)}, []),
+        ({"start_od": (0.1, 1.5)}, ["start_od = [0.1, 1.5], by itself [0.05, 1.5]"]),
+        ({"start_od": (0.05, 1.2)}, ["start_od = [0.05, 1.2], by itself [0.05, 1.5]"]),
+        ({"start_od": (0.01, 2.0)}, []),
+        ({"strip": 0.006, "error_od": 0.004}, ["error_od = 0.004, by itself 0.005", "strip = 0.006, by itself 0.005"]),
+        ({"strip": 0.004, "error_od": 0.006}, []),
+        ({"limits": Limits(reached=0.96, reached_nominal=0.8)}, ["limits.reached_nominal = 0.8, by itself 0.9"]),
+        ({"limits": Limits(entry=1.2, late=0)}, ["limits.entry = 1.2, by itself 1.15"]),
+    ],
+)
+def test_whatever_is_narrower_or_laxer_on_one_side_alone_is_named(changes: dict[str, Any], named: list[str]) -> None:
+    assert replace(CertifyConfig(), **changes).laxer() == named
+
+
+@pytest.mark.parametrize("share", [False, True], ids=["OD", "relative"])
+def test_what_is_written_down_of_a_band_holds_what_was_proven(share: bool) -> None:
+    """To six places, both ends outwards, and no further."""
+    given = laws.share_law() if share else laws.law()
+    found = certify(given, replace(ASKED, quick=True))
+    content = certificate.content(given, settings(given), ASKED, found)
+    proofs = {proof.case.name: proof for proof in found.proofs}
+    assert len(content["cases"]) > 3
+    for case in content["cases"]:
+        proof, (low, high) = proofs[case["name"]], case["band"].T
+        for outer, inner in ((-low, -proof.band.low), (high, proof.band.high), (case["half_width"], proof.half_width)):
+            assert (outer >= inner).all()
+            np.testing.assert_allclose(outer, inner, atol=1.001e-6)
+        assert (np.abs(low * 1e6 - np.rint(low * 1e6)) < 1e-6).all()
+    for level, depth in zip(found.levels, found.doses, strict=True):
+        written_down = content["dose_below"][str(level)]
+        assert (written_down >= depth).all()
+        np.testing.assert_allclose(written_down, depth, atol=1.001e-3)
+
+
+def test_what_is_told_of_a_certificate_is_what_fails_and_what_comes_closest() -> None:
+    checks = (
+        Check("polygons", 0.0, 0.0),
+        Check("nominal: entry", 0.4, 1.0),
+        Check("noise: entry", 0.9, 1.0, "setpoint 0.4"),
+        Check("uncertain: entry", 0.7, 1.0),
+        Check("nominal: half-width", 0.5, 0.1),
+        Check("noise: half-width", float("nan"), 2.0),
+        Check("uncertain: half-width", 0.3, 2.0),
+    )
+    told = Certificate(None, (), checks, (), np.zeros(0), [], None, False).told()  # type: ignore[arg-type]
+    assert told == [
+        "pass  polygons: 0, allowed 0",
+        "pass  noise: entry: 0.9, allowed 1 (setpoint 0.4); and 2 more",
+        "FAIL  nominal: half-width: 0.5, allowed 0.1",
+        "FAIL  noise: half-width: nan, allowed 2",
+        "pass  uncertain: half-width: 0.3, allowed 2",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,14 @@ def test_the_band_is_that_of_the_worst_simulated_culture() -> None:
     assert max(seen[0] - low, high - seen[1]) < 0.15 * (high - low) / 2.0
 
 
+def test_a_band_is_as_wide_as_its_farther_end() -> None:
+    """At the highest setpoint of a strip; below, exp(-0.2) - 1 = -0.1813 is farther than exp(0.15) - 1 = 0.1618."""
+    strips = loop(0.5, 0.6)
+    ends = np.array([[-0.2, 0.15], [-0.1, 0.15], [-0.1, 0.1], [-0.5, 0.0]])
+    found = [float(strips.half_width(low, high)[0]) for low, high in ends[:, :, None]]
+    assert found == pytest.approx([0.6 * 0.181269, 0.6 * 0.161834, 0.6 * 0.105171, 0.6 * 0.393469], abs=1e-6)
+
+
 def test_lines_and_polygons_prove_the_same() -> None:
     policy, asked = laws.random(8), question(laws.random(8), FAST)
     network, r = Network.of(policy), np.array([0.47, 0.6, 0.71])
@@ -206,6 +214,24 @@ def test_a_band_that_is_too_narrow_is_left() -> None:
     narrow = replace(proof, band=replace(proof.band, low=0.9 * proof.band.low, high=0.9 * proof.band.high))
     assert attacked(policy, certificate.question.loop, proof, 5000)[0] == 0
     assert attacked(policy, certificate.question.loop, narrow, 5000)[0] > 0
+
+
+class Excursion(OdLoop):
+    """A loop in which the disturbance moves every state up by 0.01 in the first period and back in the next one."""
+
+    def attack(self, case: Any, state: Any, second: Any, push: Any) -> Any:
+        seen, change = super().attack(case, state, second, push)
+        self.__dict__["asked"] = asked = self.__dict__.get("asked", 0) + 1
+        return seen, np.full_like(change, {1: 0.01, 2: -0.01}.get(asked, 0.0))
+
+
+def test_a_trajectory_that_left_its_band_and_came_back_has_left_it() -> None:
+    policy, one = laws.law(), loop(0.6, 0.6)
+    case = OdCase("", 0.0, 0.0)
+    regions = partition(Network.of(policy), BOX)[1]
+    proof = prove(one, points_in_strips(regions, one.low, one.high), regions.action, case)
+    narrow = replace(proof, band=replace(proof.band, low=np.full(1, -0.005), high=np.full(1, 0.004)))
+    assert attacked(policy, Excursion(**vars(one)), narrow, 300)[0] == 300
 
 
 FAULTS: dict[str, tuple[Callable[[], Policy], str]] = {
