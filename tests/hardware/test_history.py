@@ -7,6 +7,7 @@ import pytest
 
 from hardware.chibio.resume import ReactorHistory, replay
 from hardware.errors import RecordingError
+from hardware.pioreactor.resume import replay as units
 from hardware.storage.doses import Ending, Given, dosed
 
 
@@ -44,6 +45,54 @@ def test_what_was_given_beside_says_by_which_pump_and_how_little_and_earlier_jou
     (before,), (now,) = dosed([old]), dosed([row(3, "given", **new)])
     assert before == replace(now, pump=1)
     assert now.pump == 3
+
+
+def test_a_resumed_run_counts_its_doses_on_and_knows_what_it_put_off() -> None:
+    rows = [
+        row(1, "intent", **INTENT, on_s=75.0),
+        row(2, "intent", **INTENT | {"doses": 7, "carry_ml": 0.25}, on_s=135.0),
+        row(3, "temperature", temperature=33.5),
+        row(4, "sample", doses=99, carry_ml=9.0),
+        row(5, "intent", "M1", **INTENT | {"doses": 2}, on_s=140.0),
+    ]
+    for family in (replay(rows), units([entry | {"id": "run/1"} for entry in rows])):
+        assert (family["M0"].doses, family["M0"].carry_ml, family["M0"].temperature) == (7, 0.25, 33.5)
+        assert (family["M1"].doses, family["M1"].carry_ml) == (2, 0.1)
+
+
+def test_a_resumed_run_knows_when_a_unit_was_started_and_which_task_a_dose_was() -> None:
+    rows = [
+        row(1, "device", "pio01", boot="08:00", device_id="pio01"),
+        row(2, "intent", "pio01", **INTENT, on_s=75.0, id="run/1"),
+        row(3, "task", "pio01", id="run/1", job="add_media", task="a1"),
+    ]
+    known = units(rows)["pio01"]
+    assert (known.boot, known.id, known.task, known.wasted) == ("08:00", "run/1", "a1", False)
+    later = units([*rows, row(4, "device", "pio01", boot="09:30"), row(5, "temperature", "pio01", temperature=30.0)])
+    assert later["pio01"].boot == "09:30"
+    wasted = units([*rows, row(4, "task", "pio01", id="run/1", job="remove_waste", task="w1")])["pio01"]
+    assert (wasted.task, wasted.wasted) == ("w1", True)
+    assert units([*rows, row(4, "task", "pio01", id="run/0", job="remove_waste", task="w0")])["pio01"].task == "a1"
+
+
+def test_repetitions_of_a_spare_pump_s_dose_are_by_that_pump_not_by_the_feed() -> None:
+    """Pump3 gave 0.5 mL, and again twice; the feed of the other reactor once more."""
+    rows = [
+        row(1, "intent", **INTENT | {"feed_pump": "Pump3"}, on_s=75.0),
+        row(2, "feed_on", on_s=76.0),
+        row(3, "intent", "M1", **INTENT, on_s=77.0),
+        row(4, "feed_on", "M1", on_s=78.0),
+        row(5, "dose_end", **Ending(76.0, 0.5, 6.0, 2, 0, 3, 0.2).row()),
+        row(6, "dose_end", "M1", **Ending(78.0, 0.5, 6.0, 1, 1).row()),
+    ]
+    told = [(one.reactor, one.pump, one.again, one.at_s, one.feed_ml, one.waste_ml) for one in dosed(rows)]
+    assert told == [
+        ("M0", 3, False, 76.0, 0.5, 6.0),
+        ("M1", 1, False, 78.0, 0.5, 6.0),
+        ("M0", 3, True, 139.0, 0.5, 0.0),
+        ("M1", 1, True, 141.0, 0.5, 6.0),
+        ("M0", 3, True, 202.0, 0.2, 0.0),
+    ]
 
 
 def test_what_later_rows_say_of_a_dose() -> None:

@@ -55,6 +55,17 @@ def test_what_an_overflow_pump_covers(pump: OverflowPumpConfig, feed_ml_s: float
     assert "verified on when the run starts" in found.detail
 
 
+def test_an_overflow_pump_is_judged_by_the_strongest_feed_pump() -> None:
+    """Of 1.14 mL/s that it takes, M0 feeds 0.8 and M1 1.5."""
+    lab = DriverLab(("M0", "M1"), overflow_pump=OverflowPumpConfig("Pump4", 0.95, 1.2))
+    weak, strong = (ReactorCalibration(PumpCalibration(flow_ml_s=flow), SOUND.waste) for flow in (0.8, 1.5))
+    for rigs, covers in (((weak, strong), False), ((strong, weak), False), ((weak, weak), True)):
+        found = preflight(lab.wire, lab.clock, lab.config, list(rigs), Path("."))
+        (check,) = (check for check in found if check.name == "overflow pump")
+        assert ("and a feed motor stuck on" in check.detail) == covers
+        assert f"feed pump {0.8 if covers else 1.5:.2f} mL/s" in check.detail
+
+
 def test_a_guard_that_runs_already_is_no_pump_left_on() -> None:
     lab = DriverLab(overflow_pump=OverflowPumpConfig("Pump3"))
     for path in ("/SetOutputTarget/Pump3/M0/0.1", "/SetOutputOn/Pump3/1/M0"):

@@ -456,6 +456,34 @@ def test_each_vial_has_its_own_level() -> None:
     assert fed.tolist() == pytest.approx([4.8, 4.8, 1.8])
 
 
+def test_what_was_booked_and_not_given_is_taken_back() -> None:
+    """Of 2 mL in a run 1.5 were booked, of which 1.2 turn out not to have flowed: then 1.7 are left."""
+    limits = {"run": (SafetyConfig(ml_per_run=2.0), Bench()), "hour": (SafetyConfig(ml_per_hour=2.0), Bench()),
+              "bottle": (SafetyConfig(), Bench(bottle_ml=2.0))}  # fmt: skip
+    for config, bench in limits.values():
+        budget = FeedBudget(config, bench, np.full(2, 20.0), np.full(2, 25.0))
+        budget.book(np.array([1.5, 0.0]), np.array([9.0, 0.0]), 0.0)
+        asked, both = np.full(2, 0.01), np.array([True, True])
+        assert budget.check(asked, both, 120.0)[0].tolist() == [0.0, 0.01]
+        budget.book(np.array([-1.2, 0.0]), np.array([0.0, 0.0]), 0.0)
+        assert budget.fed_ml == pytest.approx([0.3, 0.0])
+        assert budget.check(asked, both, 120.0)[0].tolist() == [0.01, 0.01]
+
+
+def test_a_fall_is_judged_by_the_volume_of_its_own_vial() -> None:
+    """5 mL into 5 mL leave exp(-1) of an OD of 0.8, 0.29; into 20 mL they leave 0.62, and 0.29 is no culture's."""
+    interlock = Interlock(2, SafetyConfig(), Bench(volume_ml=20.0), np.array([5.0, 20.0]))
+
+    def kinds(minute: int, od: list[float]) -> tuple[tuple[str, ...], ...]:
+        now = np.full(2, 60.0 * minute)
+        m = Measurement(now, np.array(od), np.full(2, 37.0), np.full(2, True), None)
+        return interlock.check(m, np.zeros(2), np.full(2, 0.5), np.full(2, np.nan), now[0]).kinds
+
+    assert kinds(0, [0.8, 0.8]) == ((), ())
+    interlock.confirm(Receipt(np.full(2, 5.0), (), np.full(2, 20.0)), 0.0)
+    assert kinds(1, [0.294, 0.294]) == ((), ("falls",))
+
+
 # -- conclusions -----------------------------------------------------------------------------------------------------
 
 
