@@ -9,6 +9,7 @@ import pytest
 
 from envs.bench import Bench
 from experiments.control import run
+from experiments.control.assemble import unpack
 from experiments.deploy import main
 from experiments.loop.signals import Density
 from hardware.chibio.config import EmulatorConfig
@@ -39,6 +40,22 @@ def test_a_law_decides_in_shares_of_the_bench_s_own_volume(tmp_path: Path) -> No
     words = ["plant=nominal_noise", "backend.reactors=[M0,M1]", "controller=hold", "plant.start_od=0.6"]
     found = error(tmp_path / "run", *words, "bench.volume_ml=9", "bench.volumes_ml.M1=18")
     assert max(found.values()) < 0.03
+
+
+@pytest.mark.parametrize(("words", "gain"), [((), 14 / 24), (("plant.vessel.volume_ml=18",), 18 / 24)])
+def test_a_calibrated_model_is_that_of_laws_and_of_the_simulated_vials(
+    words: tuple[str, ...], gain: float, tmp_path: Path
+) -> None:
+    """tau = V / (60 g), so that g = V / 24 with tau = 0.4; the laws have the bench's period and the slower cap."""
+    (tmp_path / "calibrated.yaml").write_text("mu: 0.021\ntau: 0.4\nmax_pump_rate: 0.018\n")
+    bench = "bench.volume_ml=14", "bench.period_s=120", "bench.max_rate=0.015", "plant=nominal_noise", "controller=mpc"
+    setup = unpack(main.config([f"env_file={tmp_path}/calibrated.yaml", *bench, *words]), tmp_path)
+    model, plant = setup.model, setup.plant
+    assert (model.mu, model.tau, model.control_min, model.max_pump_rate) == (0.021, 0.4, 2.0, 0.015)
+    assert (plant.growth.mu, plant.pump.gain_ml_s) == (0.021, pytest.approx(gain))
+    usual = unpack(main.config([*bench, "bench.max_rate=0.022"]), tmp_path)
+    assert (usual.model.tau, usual.model.max_pump_rate) == (pytest.approx(14 / 60), 0.02)
+    assert usual.plant.growth.mu == 0.03
 
 
 def test_the_oracle_knows_what_the_simulated_driver_takes_its_pump_for(tmp_path: Path) -> None:

@@ -47,6 +47,9 @@ def test_steps_clock_and_bottle_are_told() -> None:
     assert text.count("900 mL of medium expected") == 2  # 1500 min x 0.03 1/min x 20 mL
     assert text.count("bench.bottle_ml=500 does NOT last") == 2
     assert "controller dqn, policy shipped" in text
+    budget = told("scenario=hold", "scenario.minutes=[100]", "bench.bottle_ml=500", "safety.ml_per_run=59")
+    assert "safety.ml_per_run=59 does NOT last: the interlock stops feeding there" in budget  # 60 mL expected
+    assert "safety.ml_per_run=61 lasts" in told("scenario=hold", "scenario.minutes=[100]", "safety.ml_per_run=61")
     assert "would record in HERE" in text
     assert "bench.bottle_ml=2000 lasts" in told("scenario=hold")
     both = told("scenario=hold", "scenario.minutes=[90]", "scenario.outputs=['pump3 2 mL/h, pump4 1.5 mL']")

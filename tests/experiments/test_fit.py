@@ -86,6 +86,10 @@ def test_a_large_pioreactor_runs_up_to_the_limit_of_its_vial(ml: float, tmp_path
         (["backend=chibio", "bench.volume_ml=7"], "bench.volume_ml = 7 mL of M0: allowed 10"),
         (["backend=chibio", "bench.volume_ml=30"], "bench.volume_ml = 30 mL of M0: allowed 10"),
         (["backend=chibio", "bench.volume_ml=29.5"], "comes to 1.2 mL at once: allowed 0.5 mL"),
+        (
+            ["backend=chibio", "backend.reactors=[M0,M1]", "bench.volumes_ml.M1=29.5"],
+            "comes to 1.2 mL at once: allowed 0.5 mL",
+        ),
         (["backend=sim", "bench.period_s=600"], "comes to 12 mL at once: allowed 5 mL .* give bench.max_rate=0.00833"),
         (["backend=sim", "safety.ml_per_minute=1"], "comes to 1.2 mL at once: allowed 1 mL"),
     ],
