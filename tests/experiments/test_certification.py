@@ -98,6 +98,43 @@ def test_boxes_bound_what_is_chosen_inside() -> None:
     assert (allowed.sum(axis=1) == 1).mean() > 0.5
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "other", "allowed"),
+    [
+        (-3.0, 1.0, 0.7, [True, True]),  # the chord of relu is 0.25 (x + 3), at most 1
+        (-3.0, 1.0, 1.1, [False, True]),
+        (-3.0, 1.0, -0.7, [True, True]),
+        (-3.0, 1.0, -0.8, [True, False]),
+        (-1.0, 3.0, 2.9, [True, True]),
+        (-1.0, 3.0, 3.1, [False, True]),
+        (-1.0, 3.0, -0.8, [True, False]),
+        (0.5, 3.0, 0.4, [True, False]),  # it does not bend here
+        (-3.0, -0.5, 0.1, [False, True]),
+    ],
+)
+def test_the_bound_of_a_box_by_hand(low: float, high: float, other: float, allowed: list[bool]) -> None:
+    """Q of the first action is relu(x), of the second one a number; in a box relu is its chord less 0 to 0.75."""
+    weights = np.eye(2), np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]])
+    network = Network(weights, (np.zeros(2), np.zeros(1), np.array([0.0, other])))
+    assert possible(network, np.array([[low, 0.4]]), np.array([[high, 0.8]])).tolist() == [allowed]
+
+
+@pytest.mark.parametrize("seed", [3, 6, 8])
+def test_a_line_knows_every_action_that_is_chosen_along_it_and_hardly_another(seed: int) -> None:
+    """A network that bends in both of its hidden layers, at 20 000 readings of two setpoints."""
+    policy, setpoints, x = laws.random(seed), np.array([0.47, 0.71]), np.linspace(-0.02, 1.52, 20_000)
+    points, action = on_lines(Network.of(policy), BOX[0], setpoints)
+    ends, line = points.x.reshape(-1, 2), points.strip[::2]
+    assert np.unique(action).size > 1
+    for n, setpoint in enumerate(setpoints):
+        chosen = policy.act(np.stack([x, np.full_like(x, setpoint)], axis=1))
+        mine = line == n
+        holds = (ends[mine, :1] <= x) & (x <= ends[mine, 1:])
+        assert (holds & (action[mine, None] == chosen)).any(axis=0).all()
+        assert holds.sum(axis=0).mean() < 1.001
+        np.testing.assert_array_equal(points.y[points.strip == n], setpoint)
+
+
 def test_the_limit_of_images_against_sets_of_points() -> None:
     """Random overlapping pieces; the points of a fine grid under every action and both ends of its shift."""
     rng = np.random.default_rng(3)

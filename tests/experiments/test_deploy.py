@@ -15,6 +15,7 @@ import pytest
 from dqn import policy
 from envs.bench import Bench
 from envs.plant.plant import Plant, PlantConfig
+from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
@@ -28,6 +29,7 @@ from experiments.record.summary import ChangeLog
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError
+from hardware.reactor import Command
 from hardware.safety.config import Responses, SafetyConfig
 from hardware.safety.interlock import Interlock
 from hardware.simulated import SimulatedConfig, SimulatedReactors
@@ -185,6 +187,19 @@ def test_the_perfect_plant_is_the_training_model():
         assert step.od[0] == pytest.approx(od, rel=1e-12)
         od *= step_factors(EnvConfig(), step.rate)[0]
     assert loop.done.all()
+
+
+def test_a_rate_holds_for_the_whole_of_a_control_period():
+    """0.01 mL/s over 2 min are 1.2 mL, of a pump of 0.8 mL/s, in one of two vials."""
+    plant = Plant(PlantConfig(pump=PumpConfig(dosing="pulse", gain_ml_s=0.8)), 2, np.random.default_rng(0))
+    reactors = SimulatedReactors(plant, SimulatedConfig(reactors=("A", "B"), pump_ml_s=0.8), control_min=2.0)
+    assert reactors.measure().time_s.tolist() == [0.0, 0.0]
+    receipt = reactors.actuate(Command(np.array([True, False]), np.full(2, 0.01), np.full(2, np.nan)))
+    assert receipt.volume_ml == pytest.approx([1.2, 0.0])
+    assert reactors.measure().time_s.tolist() == [120.0, 120.0]
+    assert plant.feed.delivered_ml == pytest.approx([1.2, 0.0])
+    reactors.measure()  # without a command there is no dose
+    assert plant.feed.delivered_ml == pytest.approx([1.2, 0.0])
 
 
 def test_recovery_is_undiluted_and_each_reactor_has_its_own_clock():

@@ -13,8 +13,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from envs.bench import Bench
+from envs.plant.plant import PlantConfig
 from hardware.chibio.resume import replay
 from hardware.errors import RecordingError
+from hardware.family import Opening
 from hardware.storage.journal import Journal, read_journal
 
 
@@ -202,3 +205,23 @@ def test_what_was_said_once_days_ago_is_known_behind_20_mb_of_samples(
     assert [row["kind"] for row in again.rows if row["kind"] in ("level", "share", "learn", "judged")] == [
         "level", "share", "learn", "judged",
     ]  # fmt: skip
+
+
+def test_a_run_began_with_the_first_row_of_its_journal_however_often_it_was_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows at 1000 s and, of a second life, at 5000 s; looked at again at 8000 s."""
+    monkeypatch.setattr("hardware.family.time.time", lambda: 8000.0)
+    new = Journal(tmp_path / "j", fsync=False)
+    assert Opening(None, Bench(), PlantConfig(), new, tmp_path, False).began == 8000.0
+    assert Opening(None, Bench(), PlantConfig(), new, tmp_path, False).elapsed_s() == 0.0
+    new.close()
+    for wall in (1000.0, 5000.0):
+        journal = Journal(tmp_path / "j", wall=lambda at=wall: at, fsync=False)
+        journal.append("start", {})
+        journal.append("sample", {})
+        journal.close()
+    resumed = Opening(None, Bench(), PlantConfig(), Journal(tmp_path / "j", fsync=False), tmp_path, True)
+    assert (resumed.began, resumed.elapsed_s(), resumed.elapsed_s(60.0)) == (1000.0, 7000.0, 420_000.0)
+    assert len(resumed.earlier()) == 4
+    resumed.journal.close()
