@@ -22,6 +22,7 @@ from hardware.safety.unexplained_change import UnexplainedChange
 
 N = 16
 C = SafetyConfig()
+TUBES = np.resize([20.0, 12.0, 31.0], N)  # mL, of vials that are not alike
 
 
 def told(findings: list[Finding], rows: int = N) -> list[list[str]]:
@@ -55,10 +56,14 @@ class Ledger:
 
     c: SafetyConfig
     bench: Bench
+    tube: float
     doses: list[tuple[float, float]] = field(default_factory=list)
-    level: float = 20.0
+    level: float = math.nan
     owed: float = 0.0
     unusable: int = 0
+
+    def __post_init__(self) -> None:
+        self.level = self.tube
 
     @property
     def fed(self) -> float:
@@ -86,7 +91,7 @@ class Ledger:
             c.ml_per_run - self.fed,
         )
         bottle = bench.bottle_ml - self.fed
-        for kind, room in (("budget", budget), ("bottle", bottle), ("overflow", 25.0 - self.level)):
+        for kind, room in (("budget", budget), ("bottle", bottle), ("overflow", self.tube + 5.0 - self.level)):
             if wanted * bench.period_s > room + 1e-9 and (wanted > 0.0 or kind != "budget"):
                 kinds.append(kind)
                 wanted = 0.0
@@ -96,7 +101,7 @@ class Ledger:
         if feed > 0.0:
             self.doses.append((now, feed))
             self.owed = 0.0
-        self.level = max(self.level + feed - waste, 20.0) if waste > 0.0 else self.level + feed
+        self.level = max(self.level + feed - waste, self.tube) if waste > 0.0 else self.level + feed
 
 
 @pytest.mark.parametrize(
@@ -114,8 +119,8 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
     tight = {"ml_per_minute": 1.9, "ml_per_hour": 14.0, "ml_per_run": 30.0, "controller_patience": 2}
     c = SafetyConfig(**{limit: tight[limit]} if limit in tight else {})
     bench = Bench(period_s=period_s, bottle_ml=30.0 if limit == "bottle_ml" else 2000.0)
-    given = (c, bench, np.full(N, 20.0), np.full(N, 25.0))
-    budget, twins, now = FeedBudget(*given), [Ledger(c, bench) for _ in range(N)], 0.0
+    given = (c, bench, TUBES, TUBES + 5.0)
+    budget, twins, now = FeedBudget(*given), [Ledger(c, bench, tube) for tube in TUBES.tolist()], 0.0
     order = {"controller": 0, "controller_lost": 1, "limit": 2, "undosed": 3, "budget": 4, "bottle": 5, "overflow": 6}
     for _ in range(200):
         now += float(
@@ -290,6 +295,7 @@ def test_heat_is_judged_as_sample_by_sample() -> None:
 class Culture:
     """One culture's readings against growth, doses and noise."""
 
+    volume: float
     od: float = math.nan
     at: float = math.nan
     since: float = 0.0
@@ -307,7 +313,7 @@ class Culture:
 
     def band(self, od: float, minutes: float) -> tuple[float, float]:
         tolerance = max(0.04, 0.08 * abs(od))
-        low = max(od, 0.0) * math.exp(-1.6 * self.since / 20.0 - 0.005 * minutes)
+        low = max(od, 0.0) * math.exp(-1.6 * self.since / self.volume - 0.005 * minutes)
         return low - tolerance, max(od, 0.0) * math.exp(min(0.04 * minutes, 5.0)) + tolerance
 
     def judge(self, od: float, t: float, believed: bool, setpoint: float) -> list[str]:
@@ -340,12 +346,12 @@ class Culture:
     def accumulate(self, od: float, t: float, setpoint: float) -> list[str]:
         if od <= 0.05 or self.od <= 0.05:
             return []
-        dt, d, x = max(t - self.at, 1e-3), self.since / 20.0, math.log(od / self.od)
-        least = self.least / 20.0
+        dt, d, x = max(t - self.at, 1e-3), self.since / self.volume, math.log(od / self.od)
+        least = self.least / self.volume
         rise = x - min(0.04, self.mu + 0.01) * dt + 0.5 * least if least > 0.0 else min(x - 0.04 * dt, 0.0)
         self.excess = max(self.excess + rise, 0.0)
         self.deficit = max(self.deficit - x - 1.6 * d - 0.005 * dt, 0.0)
-        full = least / dt >= 0.8 * 0.06
+        full = least / dt >= 0.8 * 0.02 * 60.0 / self.volume
         short = full and od > 1.05 * setpoint
         self.futile = max(self.futile + x + 0.004 * dt, 0.0) if full else 0.0
         self.mu += (1.0 - math.exp(-dt / 60.0)) * (min(max((x + d) / dt, 0.0), 0.04) - self.mu)
@@ -376,7 +382,8 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
     rng = np.random.default_rng(2)
     seen: set[str] = set()
     for _ in range(10):
-        change, twins, minute = UnexplainedChange(C, 0.02, np.full(N, 20.0)), [Culture() for _ in range(N)], 0.0
+        change, twins = UnexplainedChange(C, 0.02, TUBES), [Culture(tube) for tube in TUBES.tolist()]
+        minute = 0.0
         true = rng.choice([0.04, 0.055, 0.3, 0.5, 1.2], N)
         mu, gain = rng.choice([-0.03, -0.008, 0.0, 0.02, 0.035, 0.05], N), rng.choice([0.0, 0.4, 0.6, 1.0, 1.5, 1.8], N)
         feeds, setpoint = rng.choice([0.0, 0.5, 0.96, 1.2], N), rng.choice([0.04, 0.3, 0.5, 2.0], N)
@@ -388,7 +395,7 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
             change.dosed(feed, low)
             for twin, ml, least_ml in zip(twins, feed, low, strict=True):
                 twin.since, twin.least = twin.since + ml, twin.least + least_ml
-            true = np.clip(true * np.exp(mu * dt - gain * feed / 20.0), 0.02, 3.0)
+            true = np.clip(true * np.exp(mu * dt - gain * feed / TUBES), 0.02, 3.0)
             true = np.where(rng.random(N) < 0.01, true * rng.choice([0.6, 0.93, 1.07, 1.5], N), true)
             minute += dt
             bubble = np.where(rng.random(N) < 0.05, rng.uniform(-0.1, 0.15, N), 0.0)
@@ -408,7 +415,7 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
                 _futile="futile", _over="over", _helpless_od="helpless", _eased="eased",
             )  # fmt: skip
             if rng.random() < 0.05:
-                change = resumed(change, UnexplainedChange(C, 0.02, np.full(N, 20.0)))
+                change = resumed(change, UnexplainedChange(C, 0.02, TUBES))
     assert seen == {"jump", "falls", "falls+", "no_dilution+", "cannot_hold"}
 
 
