@@ -202,6 +202,23 @@ def test_a_rate_holds_for_the_whole_of_a_control_period():
     assert plant.feed.delivered_ml == pytest.approx([1.2, 0.0])
 
 
+def test_what_is_switched_off_is_off_in_its_own_vial_alone():
+    plant = Plant(PlantConfig(pump=PumpConfig(dosing="pulse")), 2, np.random.default_rng(0))
+    reactors = SimulatedReactors(plant, SimulatedConfig(reactors=("A", "B")))
+    plant.reset(0.5, temperature=37.0)
+    reactors.measure()
+    reactors.actuate(Command(np.array([True, True]), np.full(2, 0.01), np.array([38.0, 36.0])))
+    second = np.array([False, True])
+    assert reactors.pumps_off(second) == []
+    reactors.measure()
+    assert plant.feed.delivered_ml == pytest.approx([0.6, 0.0])
+    assert plant.thermal.target.tolist() == [38.0, 36.0]
+    assert reactors.heat_off(second) == []
+    reactors.measure()
+    assert plant.thermal.target.tolist() == [38.0, 0.0]
+    assert reactors.regulate(second, np.full(2, 0.5)) == ["B: no on-board regulation in simulation, pumps off"]
+
+
 def test_recovery_is_undiluted_and_each_reactor_has_its_own_clock():
     reactors = SimulatedReactors(
         Plant(PlantConfig(), 2, np.random.default_rng(0)), SimulatedConfig(reactors=("A", "B"))

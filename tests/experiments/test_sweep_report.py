@@ -11,7 +11,7 @@ import pytest
 
 from experiments import report
 from experiments.cli import frame, sweep
-from experiments.reporting import sweep_results
+from experiments.reporting import sweep_page, sweep_results
 
 
 def job(folder: Path, overrides: list[str], state: str = "finished", error: str = "", **summary: Any) -> None:
@@ -188,6 +188,47 @@ def test_long_names_give_way_to_their_place_in_the_table(tmp_path: Path) -> None
     assert re.findall(r">([^<>]+) \(n = (\d)\)</text>", drawn) == [("#1", "3"), ("#2", "2"), ("agent short", "1")]
     rows = (tmp_path / "figures/values_regret_pct.svg").read_text(encoding="utf-8")
     assert re.findall(r">(#\d|agent short)</text>", rows) == ["#1", "#2", "agent short"]
+
+
+@pytest.mark.parametrize(
+    ("measure", "task", "command", "said"),
+    [
+        ("steady_abs_error", "density", "train", "steady error at the worst setpoint, OD"),
+        ("steady_abs_error", "relative", "train", "steady error at the worst setpoint, periods of full pump"),
+        ("steady_abs_error", "coculture", "train", "steady error at the worst setpoint, of the share"),
+        ("objective", "density", "train", "merit of the worst seed (1: limit of the task)"),
+        ("objective", "density", "deploy", "what the command returned"),
+        ("itae", "density", "deploy", "ITAE over all windows, OD min²"),
+        ("my_number", "density", "mine", "my_number"),
+    ],
+)
+def test_a_measure_is_called_by_its_unit(measure: str, task: str, command: str, said: str) -> None:
+    assert sweep_results.label(measure, task, command) == said
+
+
+def test_what_differs_names_a_configuration_and_what_all_share_is_said_once() -> None:
+    """Seeds differ within a configuration; a list of numbers is one value."""
+    shared = {"fsync": "false", "setpoints": "[0.4,0.5]"}
+    found = ((0.02, "pi", 1, 3.0), (0.02, "pi", 2, 5.0), (0.03, "pi", 1, 4.0), (0.02, "mpc", 1, 6.0))
+    jobs = [
+        sweep_results.Result(
+            Path(str(k)),
+            {"env.mu": str(mu), "controller": law, "plant.seed": str(seed), **shared},
+            "finished",
+            "",
+            cost,
+        )
+        for k, (mu, law, seed, cost) in enumerate(found)
+    ]
+    ranked, common = sweep_results.configurations(jobs)
+    assert [(one.name, one.measured["objective"].tolist()) for one in ranked] == [
+        ("mu 0.03, controller pi", [4.0]), ("mu 0.02, controller pi", [3.0, 5.0]), ("mu 0.02, controller mpc", [6.0]),
+    ]  # fmt: skip
+    assert common == shared
+    assert sweep_page.repeats("deploy", ranked[1]) == (
+        "python -m experiments.deploy -m env.mu=0.02 controller=pi plant.seed=1,2 fsync=false 'setpoints=[0.4,0.5]'"
+    )
+    assert sweep_page.repeats("deploy", ranked[0]).startswith("python -m experiments.deploy env.mu=0.03 controller=pi")
 
 
 def test_a_folder_without_a_sweep_is_one_line(tmp_path: Path) -> None:

@@ -68,6 +68,35 @@ def test_a_deployment_is_good_if_every_window_ends_at_its_setpoint() -> None:
         assert said.remark == f"Not good: {held} windows ended within 5 % of their setpoint."
 
 
+def test_a_deployment_of_two_species_says_its_error_and_what_it_learned():
+    """Three windows of unlike errors, in one of which no share was asked for."""
+    windows = [{**WINDOW, "ratio_abs_error_mean": error} for error in (0.02, None, 0.05)]
+    learned = [
+        {"minute": 61.4, "reactor": "M1", "number": 2, "flies": True, "why": "it is better"},
+        {"minute": 130.0, "reactor": "M0", "number": 13, "flies": False, "why": "it is not"},
+    ]
+    said = verdict(DEPLOYED | {"windows": windows, "learned": learned}, LOOP)
+    assert said.items[3:] == [
+        "mean error of the share 0.035, as estimated",
+        "learned during the run, from minute 61: M1, policy 002 flies, it is better",
+        "learned during the run, from minute 130: M0, policy 013 does not fly, it is not",
+    ]
+    short = [{**WINDOW, "steady_abs_error": None}]
+    said = verdict(DEPLOYED | {"windows": short}, LOOP)
+    assert said.items == ["fresh medium 65 mL", "interlock spoke in 3 samples"]
+    assert said.remark == "No window was long enough to say how well its setpoint was held."
+
+
+def test_one_agent_is_told_by_its_seed():
+    said = verdict(TRAINED | {"seeds": [9], "regret_pct": [0.3], "steady_abs_error": [0.002]}, MODEL)
+    assert said.claim == "Training: one agent, seed 9, learned mu 0.02 1/min, tau 0.5 for 20000 steps in 31 s."
+    assert said.items == [
+        "regret 0.3 %: what the policy costs beyond the exact optimum",
+        "error at rest at its worst setpoint 0.002 OD",
+        "the one-line law that looks one period ahead: regret 0.01 %, error 0.001 OD",
+    ]
+
+
 def test_a_calibration_without_a_pair_names_the_rows_that_it_used():
     """Rows 40 to 99, of which the 100th is the first that was not used."""
     alone = {"value": 0.021, "ci95": [0.019, 0.024], "rows": [40, 100]}
