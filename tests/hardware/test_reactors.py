@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs.bench import Bench
 from envs.scenario import Scenario
 from hardware.chibio.config import ChiBioConfig
-from hardware.chibio.dosing import ReactorCalibration
+from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
+from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError, RecordingError
 from hardware.reactor import Command
@@ -646,6 +648,32 @@ def test_the_hot_guard_switches_heating_off_for_good() -> None:
     lab.fault("worker_wipe")
     lab.run(5)
     assert lab.device.apps["M0"].data["Thermostat"]["ON"] == 0
+
+
+def test_each_reactor_is_dosed_by_its_own_pumps_and_has_its_own_volume_and_blank() -> None:
+    """0.6 mL of a pump of 0.8 mL/s take 0.75 s, of one of 1.2 mL/s 0.5 s; the waste pump 4 times that and 4.4 s."""
+    lab = DriverLab(("M0", "M3"), options=quiet())
+    weak = ReactorCalibration(PumpCalibration(flow_ml_s=0.8), PumpCalibration(flow_ml_s=1.5))
+    strong = ReactorCalibration(PumpCalibration(flow_ml_s=1.2), PumpCalibration(flow_ml_s=0.9), blank=13000.0)
+    bench = Bench(volumes_ml={"M3": 15.0})
+    reactors = ChiBioReactors(lab.wire, lab.clock, lab.config, [weak, strong], lab.log, bench)
+    reactors.begin()
+    waste_ml = np.zeros(2)
+    while not waste_ml.all():
+        fresh = reactors.measure().fresh
+        receipt = reactors.actuate(Command(fresh, np.full(2, 0.01), np.full(2, np.nan)))
+        waste_ml = np.where(fresh & (waste_ml == 0.0), receipt.waste_ml, waste_ml)
+        np.testing.assert_allclose(receipt.volume_ml, 0.6 * fresh, atol=1e-3)
+    reactors.stop()
+    sent = [path.split("/")[1:] for _, path in lab.wire.posts]
+    for name, feed_s, own in (("M0", 0.75, 1.5 * 7.4), ("M3", 0.5, 0.9 * 6.4)):
+        duties = {item: float(value) for verb, item, where, value in (s for s in sent if len(s) == 4 and s[2] == name)
+                  if verb == "SetOutputTarget" and item.startswith("Pump")}  # fmt: skip
+        assert 63.0 * duties["Pump1"] == pytest.approx(feed_s, abs=1e-3)
+        assert 63.0 * duties["Pump2"] == pytest.approx(4.0 * feed_s + 4.4, abs=1e-3)
+        assert waste_ml[lab.names.index(name)] == pytest.approx(own, abs=5e-3)
+    assert [s[2:] for s in sent if s[:2] == ["SetOutputTarget", "Volume"]] == [["M3", "15.000000"]]
+    assert [s[2:4] for s in sent if s[0] == "CalibrateOD"] == [["M3", "13000.000000"]]
 
 
 def test_handing_over_leaves_a_culture_that_regulates_itself() -> None:
