@@ -51,9 +51,10 @@ class Events:
             self._writer = EventFileWriter(str(folder))
         self._known: set[str] = set()
         self._flushed = time.monotonic()
-        started = SessionLog(status=SessionLog.START)  # TensorBoard hides nothing at the first one that it meets
-        with undisturbed():
-            self._writer.add_event(Event(step=first_step, wall_time=time.time(), session_log=started))
+        for _ in range(2 if first_step else 0):  # TensorBoard hides nothing at the first start that it meets
+            started = SessionLog(status=SessionLog.START)
+            with undisturbed():
+                self._writer.add_event(Event(step=first_step, wall_time=time.time(), session_log=started))
 
     def _add(self, values: Sequence[Summary.Value], step: int, wall: float | None = None) -> None:
         when = time.time() if wall is None else wall
