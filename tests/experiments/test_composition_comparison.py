@@ -85,6 +85,8 @@ def test_the_last_day_is_that_of_a_run_of_two_days_or_more():
     t = made_up([[0.0]], setpoint=np.full(3000, 0.5))
     t = replace(t, schedule=phases(3000.0), minute=minute, share=share, estimate=share, low=share, high=share)
     assert statistics.share_row(t)["ratio_abs_error_last_day"] == pytest.approx(0.01)
+    short = {key: getattr(t, key)[..., :2800] for key in ("minute", "share", "setpoint", "estimate", "low", "high")}
+    assert math.isnan(statistics.share_row(replace(t, **short))["ratio_abs_error_last_day"])
 
 
 def test_a_law_is_paired_with_the_vendors_reactor_by_reactor():

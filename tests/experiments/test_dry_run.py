@@ -54,6 +54,8 @@ def test_steps_clock_and_bottle_are_told() -> None:
     assert "bench.bottle_ml=2000 lasts" in told("scenario=hold")
     both = told("scenario=hold", "scenario.minutes=[90]", "scenario.outputs=['pump3 2 mL/h, pump4 1.5 mL']")
     assert "at most 3.0 mL by Pump3, at most 1.5 mL by Pump4" in both
+    fed = told("scenario=hold", "scenario.minutes=[60]", "scenario.outputs=['pump3 20 mL/h, pump4 20 mL']")
+    assert "40 mL of medium expected, 40 mL if" in fed  # more than growth asks for, 36 mL
     longer = told("scenario=hold", "scenario.minutes=[1500]", "scenario.until=[settled]", "bench.bottle_ml=500")
     assert "may not last" in longer
 

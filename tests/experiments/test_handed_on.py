@@ -12,7 +12,7 @@ import pytest
 
 from envs.coculture.pair import named_pair
 from envs.coculture.task import CocultureConfig
-from experiments.cli import extensions, files
+from experiments.cli import extensions, files, latest
 from experiments.cli.calibrated import read_curves
 
 
@@ -81,3 +81,32 @@ def test_files_of_the_environment_and_of_the_command_line_are_both_loaded(
     assert sorted(path.name for path in (tmp_path / "extensions").iterdir()) == sorted(path.name for path in paths)
     assert extensions.taken(["controller=pi"]) == ["controller=pi"]
     assert os.environ[extensions.VARIABLE].split(os.pathsep) == [str(path) for path in paths]
+
+
+def test_latest_is_the_file_that_was_written_last_or_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the folders are called; of `resume` and `runs` the folder, of the command itself."""
+    monkeypatch.chdir(tmp_path)
+    written = [
+        "runs/calibrate/b/calibrated.yaml", "runs/calibrate/b/twin.yaml", "runs/demo/z/1_calibrate/calibrated.yaml",
+        "runs/demo/a/1_calibrate/calibrated.yaml", "runs/calibrate/a/twin.yaml", "runs/train/c/checkpoint.pt",
+        "runs/train/b/sweep.json", "runs/train/a/checkpoint.pt", "runs/deploy/y/state.json", "runs/deploy/x/state.json",
+    ]  # fmt: skip
+    for age, name in enumerate(written):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (1e9 + age, 1e9 + age))
+    told = {
+        ("env_file=latest", "train"): "env_file=runs/demo/a/1_calibrate/calibrated.yaml",
+        ("+env_file=latest", "deploy"): "+env_file=runs/demo/a/1_calibrate/calibrated.yaml",
+        ("plant_file=latest", "deploy"): "plant_file=runs/calibrate/a/twin.yaml",
+        ("resume=latest", "train"): "resume=runs/train/a",
+        ("resume=latest", "deploy"): "resume=runs/deploy/x",
+        ("runs=latest", "report"): "runs=runs/train/b",
+        ("policy=latest", "deploy"): "policy=latest",
+        ("env_file=x.yaml", "train"): "env_file=x.yaml",
+    }
+    assert {(arg, command): latest.resolved(arg, command) for arg, command in told} == told
+    with pytest.raises(ValueError, match=r"resume=latest: nothing under runs/; run python -m experiments\.benchmark"):
+        latest.resolved("resume=latest", "benchmark")

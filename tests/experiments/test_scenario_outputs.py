@@ -104,6 +104,19 @@ def test_minutes_without_a_believed_reading_are_made_up_for_in_that_reactor_alon
     assert doses == [[(5, 3, 0.5), (10, 3, 0.5)], [(10, 4, 0.5)]]
 
 
+def test_a_volume_is_given_at_the_first_believed_reading_of_its_step() -> None:
+    """The step begins at minute 3, in the second reactor with two readings that are not believed."""
+    steps = Scenario((0.4, 0.4), (3.0, 60.0), (37.0, 37.0), outputs=("pump3 6 mL/h", "pump4 1 mL"))
+    supply = Supply([steps, steps], 1.2)
+    doses = []
+    for minute in range(8):
+        rows = np.array([True, minute not in (3, 4)])
+        pump, ml = supply.due(np.full(2, float(minute)), np.full(2, int(minute >= 3)), rows)
+        supply.given(pump, ml)
+        doses += [(minute, int(n), int(pump[n]), float(ml[n])) for n in np.flatnonzero(ml)]
+    assert doses == [(3, 0, 4, 1.0), (5, 1, 4, 1.0)]
+
+
 def config(schedule: Scenario = STEPS, **flows: float) -> Any:
     made = rehearsed(("M0",), schedule)
     supply = SupplyConfig(**({"pump3_ml_s": 1.0, "pump4_ml_s": 1.0} | flows))

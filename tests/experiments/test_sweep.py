@@ -229,6 +229,10 @@ def test_jobs_are_told_of_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for found in (sweep.survey(tmp_path), sweep.survey(tmp_path, [[f"++seed={k}"] for k in range(12)])):
         assert [(job.folder.name, job.overrides) for job in found] == [(str(k), [f"seed={k}"]) for k in range(12)]
     assert sweep.errors(tmp_path, None) == "error: full (job 2: seed=2; job 10: seed=10); "
+    swept, done = sweep.Sweep(tmp_path, "train", []), f"10 of 12 jobs finished in {tmp_path}"
+    assert sweep.progress(swept, None).startswith(f"{done}; compare them: ")  # a search: who failed has been tried
+    every = [[f"++seed={k}"] for k in range(12)]
+    assert sweep.progress(swept, every) == f"{done}; what is missing: {swept.again()}"
 
 
 def test_another_launcher_is_not_told_what_the_one_before_was(tmp_path):

@@ -1,5 +1,6 @@
 """Parts of a training run by hand: what is scored when, what is kept and told, and what a resumed run knows."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from envs.coculture.task import CocultureConfig
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
-from experiments.training import announcements
+from experiments.training import announcements, build
 from experiments.training import run as train_run
 from experiments.training.coculture import Coculture
 from experiments.training.config import TrainConfig
@@ -198,3 +199,73 @@ def test_the_learning_rate_falls_in_the_second_half_of_the_updates_to_its_end(ea
     found = [config.learning_rate_at(round(part * updates)) for part in (0.0, 0.3, 0.5, 0.75, 1.0)]
     assert found == pytest.approx([1e-3, 1e-3, 1e-3, 1e-4, 1e-5], rel=0.01)
     assert replace(config, learning_rate_end=None).learning_rate_at(updates) == 1e-3
+
+
+def test_progress_tells_the_time_left_what_is_scored_and_what_is_kept() -> None:
+    """A quarter done in a minute: three are left. Medians over three agents."""
+    score = scored([4.0, 2.0, 9.0], [[0.03], [0.01], [0.02]])
+    kept = np.array([1.0, 0.5, 3.0]), np.array([0.004, 0.006, 0.009])
+    assert announcements.progress(250, 1000, 60.0, score, kept, Density(EnvConfig())) == (
+        "25 %, 3:00 min left: selection grid: 4.00 % regret, 0.0200 OD steady error; "
+        "kept: 1.00 % regret, 0.0060 OD steady error"
+    )
+
+
+def test_curves_show_speed_of_all_agents_limits_and_what_is_kept(tmp_path: Path) -> None:
+    one = session(tmp_path / "run", n_agents=3)
+    one.writer.close()
+    one.writer, one.seconds = Mock(), 8.0
+    record = Mock(step=120, episode_return=np.array([-1.0, -2.0, -3.0]))
+    one._log(record)
+    step, values = one.writer.scalars.call_args.args
+    assert (step, values["speed/steps_per_s"]) == (120, 3 * 120 / 8.0)
+    assert values["train/return"].tolist() == one.returns[-1] == [-1.0, -2.0, -3.0]
+    one.best.merit[0] = 0.0  # of the first agent nothing better comes
+    one.best.regret[0], one.best.steady[0] = 0.2, 0.001
+    score = one.evaluate(200)
+    step, values = one.writer.scalars.call_args.args
+    assert step == 200
+    for key, now in (("regret_pct", score.regret_pct), ("steady_abs_error", score.steady_abs_error)):
+        np.testing.assert_array_equal(values[f"eval/{key}"], now)
+        np.testing.assert_array_equal(values[f"kept/{key}"][1:], now[1:])
+    assert (values["kept/regret_pct"][0], values["kept/steady_abs_error"][0]) == (0.2, 0.001)
+    limits = {"limit/regret_pct": 0.5, "limit/steady_abs_error": 0.003}
+    assert one.writer.events.scalars.call_args.args == (limits, 200)
+
+
+def test_the_summary_tells_the_kept_policies_from_the_last_ones(tmp_path: Path) -> None:
+    one = session(tmp_path / "run", n_agents=2, seed=4)
+    one.evaluate(50)
+    one.returns = [[-1.0, -2.0], [-1.0, -1.5]]
+    one.best.weights[:] = 0.1 * one.best.weights.flip(0)
+    report = Evaluation(one.task, one.task.report_grid())
+    kept, last = (report(build.act_with(one.agents.network, w), 2) for w in (one.best.weights, one.agents.weights()))
+    assert not np.allclose(kept.regret_pct, last.regret_pct)
+    train_run._finish(one)
+    one.writer.close()
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["seeds"], summary["kept_step"]) == ([4, 5], [50, 50])
+    assert summary["regret_pct"] == pytest.approx(kept.regret_pct)
+    assert summary["steady_abs_error"] == pytest.approx(kept.steady_abs_error)
+    assert summary["mean_abs_error"] == pytest.approx(kept.mean_abs_error)
+    assert summary["regret_pct_last"] == pytest.approx(last.regret_pct)
+    assert summary["steady_abs_error_last"] == pytest.approx(last.steady_abs_error)
+
+
+def test_a_relative_policy_sees_the_edge_of_its_training_beyond_it() -> None:
+    low, high = Relative(RelativeConfig(growth_shares=(0.1, 0.9), largest_error=1.5)).limits
+    assert (low.tolist(), high.tolist()) == (pytest.approx([-1.45, 0.1]), pytest.approx([1.45, 0.9]))
+
+
+def test_the_share_that_is_drawn_as_asked_for_is_that_of_the_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decision by decision, also at that in which the change comes."""
+    drawn: list[Any] = []
+    monkeypatch.setattr("experiments.reporting.composition_charts.episodes", lambda *given: drawn.append(given))
+    task = Coculture(CocultureConfig(preview_min=120.0, episode_steps=12, control_min=30.0))
+    monkeypatch.setattr("experiments.training.coculture.each", lambda _: lambda o: np.zeros(o.shape[:-1], dtype=int))
+    best = task.best
+    monkeypatch.setattr(task, "best", lambda start: drawn.append(best(start)) or drawn[-1])
+    task.figures(inverse_policy())
+    optimum, (hours, wanted, _, theirs, *_) = drawn
+    np.testing.assert_allclose(hours, 0.5 * np.arange(1, 13))
+    np.testing.assert_allclose(theirs - wanted, optimum.error[:, 0], atol=1e-9)
