@@ -63,6 +63,23 @@ def test_a_pulse_dilutes_exactly_and_growth_follows_it() -> None:
     assert p.culture.od[0] == pytest.approx(0.5 * np.exp(-1.2 / 20.0 + 0.03), rel=1e-9)
 
 
+@pytest.mark.parametrize("minutes", [0.5, 1.0, 1.5, 4.5])
+def test_an_even_feed_dilutes_as_fast_in_an_interval_of_any_length(minutes: float) -> None:
+    """x' = (mu - u / tau) x at 0.02 mL/s: 0.06 1/min are washed out while 0.03 grow."""
+    p = plant(PlantConfig(integrator="rk4"), 2)
+    p.reset(np.array([0.5, 0.3]))
+    p.advance(minutes, 60.0 * minutes * np.array([0.02, 0.0]))
+    np.testing.assert_allclose(p.culture.od, [0.5 * np.exp(-0.03 * minutes), 0.3 * np.exp(0.03 * minutes)], rtol=1e-7)
+
+
+@pytest.mark.parametrize("minutes", [1.0, 2.0, 0.75])
+def test_growth_makes_up_for_a_share_of_the_dose_between_two_doses(minutes: float) -> None:
+    """2.4 s of 1 mL/s take 0.12 off ln x; growth brings back 0.03 a minute."""
+    taken, share = plant(PlantConfig(), 2).at_rest(minutes, np.array([2.4, 4.8]))
+    np.testing.assert_allclose(taken, [0.12, 0.24])
+    np.testing.assert_allclose(share, [0.25 * minutes, 0.125 * minutes])
+
+
 def test_without_waste_the_dose_stays_in_the_vial() -> None:
     p = plant(PlantConfig(pump=PULSE, growth=GrowthConfig(mu=0.0)))
     p.advance(1.0, np.array([2.0]), np.array([0.0]))

@@ -168,6 +168,16 @@ def loop(low: float, high: float) -> OdLoop:
     return OdLoop(0.03, 1 / 3, 1.0, laws.RATES, (0.05, 1.5), np.array([low]), np.array([high]))
 
 
+@pytest.mark.parametrize("control_min", [1.0, 2.0, 0.5])
+def test_a_period_of_growth_is_as_long_as_the_control_period(control_min: float) -> None:
+    """Growth at 0.03 1/min with the pump at rest, and against its full rate, which takes 0.06 1/min off."""
+    case = OdCase("nominal", 0.0, 0.0)
+    one = OdLoop(0.03, 1 / 3, control_min, laws.RATES, (0.05, 1.5), np.array([0.5, 0.6]), np.array([0.6, 0.7]))
+    np.testing.assert_allclose(one.growth, [0.03 * control_min] * 2)
+    np.testing.assert_allclose(one.shift(case)[:, 0], 0.03 * control_min)
+    np.testing.assert_allclose(one.shift(case)[:, -1], (0.03 - 0.02 * 3.0) * control_min)
+
+
 def test_bands_of_the_one_line_law_by_hand() -> None:
     """r = 1. Nominal: mu tau is level 8, which is dosed while |d| < B/32: the band.
 

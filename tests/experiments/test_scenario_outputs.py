@@ -337,11 +337,13 @@ class Still:
         return np.zeros(od.shape)
 
 
-def test_in_a_simulation_it_dilutes_too_each_reactor_by_its_own_schedule() -> None:
+@pytest.mark.parametrize("period_min", [1.0, 2.0])
+def test_in_a_simulation_it_dilutes_too_each_reactor_by_its_own_schedule(period_min: float) -> None:
     with_it = Scenario((0.5,), (30.0,), (37.0,), outputs=("pump3 2 mL",))
     plant = PlantConfig(start_od=0.4, growth=replace(PlantConfig().growth, mu=0.0))
-    reactors = SimulatedReactors(Plant(plant, 2, np.random.default_rng(0)), SimulatedConfig(reactors=("M0", "M1")))
-    loop = ClosedLoop(reactors, Still(), Interlock(2), [with_it, replace(with_it, outputs=())])
+    vials, both = Plant(plant, 2, np.random.default_rng(0)), SimulatedConfig(reactors=("M0", "M1"))
+    reactors, bench = SimulatedReactors(vials, both, period_min), Bench(period_s=60.0 * period_min)
+    loop = ClosedLoop(reactors, Still(), Interlock(2, bench=bench), [with_it, replace(with_it, outputs=())])
     for _ in loop.run():
         pass
     np.testing.assert_allclose(reactors.plant.culture.od, [0.4 * np.exp(-2.0 / 20.0), 0.4], rtol=0.005)

@@ -211,6 +211,22 @@ def test_progress_tells_the_time_left_what_is_scored_and_what_is_kept() -> None:
     )
 
 
+def test_speed_and_time_left_of_a_resumed_training_count_its_earlier_life(tmp_path: Path) -> None:
+    """An hour before, and less than that now: 200 steps are done, and it took an hour."""
+    one = session(tmp_path / "run", checkpoint_every=1)
+    one.run()
+    one.seconds = 3600.0
+    one._save()
+    one.writer.close()
+    again = session(tmp_path / "run", resume=True, agent=replace(SMALL, total_steps=200))
+    again.run()
+    again.writer.close()
+    assert 3600.0 < again.seconds < 7200.0
+    rows = [line.split(",") for line in (tmp_path / "run" / "progress.csv").read_text().splitlines()]
+    speeds = {int(row[0]): float(row[-1]) for row in rows if "speed/steps_per_s" in row}
+    assert speeds[200] == pytest.approx(200 / 3600.0, rel=0.5)
+
+
 def test_curves_show_speed_of_all_agents_limits_and_what_is_kept(tmp_path: Path) -> None:
     one = session(tmp_path / "run", n_agents=3)
     one.writer.close()
