@@ -21,7 +21,7 @@ NAMED = re.compile(r"`(\w+\.(?:py|yaml))`(?:(?!`\w+\.(?:py|yaml)`)[\s\S])*?```(?
 FILES = {name: text for name, text in NAMED.findall(PAGE)}
 WHOLE = {"light.py": (ROOT / "tests" / "extensions" / "light.py").read_text(encoding="utf-8")}  # named by the page
 COMMANDS = [line.removeprefix("    ") for line in PAGE.splitlines() if line.startswith("    python ")]
-SHORT = {"experiments.benchmark": ["replicates=1"], "experiments.train": ["agent.total_steps=500"]}
+SHORT = {"experiments.benchmark": ["replicates=1"], "experiments.train": ["agent.total_steps=500", "agent.learn_start=100"]}
 
 
 def run(words: list[str], folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
@@ -121,6 +121,7 @@ def test_a_family_of_ones_own_is_looked_at_before_a_run(tmp_path: Path) -> None:
 
 def test_the_run_folder_keeps_the_file_and_resumes_without_it(folder: Path) -> None:
     first = ["-m", "experiments.train", "extend=log_error.py", "env=log_error", "agent.total_steps=300"]
+    first.append("agent.learn_start=100")
     done = run([*first, "checkpoint_every=100", "hydra.run.dir=here"], folder)
     assert done.returncode == 0, done.stderr
     (folder / "log_error.py").unlink()

@@ -69,7 +69,7 @@ def test_the_console_script_is_declared(wheel: Path) -> None:
 def test_the_way_from_a_recording_to_a_page_from_another_folder(installed: Path, tmp_path: Path) -> None:
     for line in (
         "calibrate",
-        "train env_file=latest agent.total_steps=400",
+        "train env_file=latest agent.total_steps=400 agent.learn_start=100",
         "deploy policy=latest scenario=hold scenario.minutes=[10]",
         "certify policy=shipped",
         "report",
