@@ -21,7 +21,10 @@ NAMED = re.compile(r"`(\w+\.(?:py|yaml))`(?:(?!`\w+\.(?:py|yaml)`)[\s\S])*?```(?
 FILES = {name: text for name, text in NAMED.findall(PAGE)}
 WHOLE = {"light.py": (ROOT / "tests" / "extensions" / "light.py").read_text(encoding="utf-8")}  # named by the page
 COMMANDS = [line.removeprefix("    ") for line in PAGE.splitlines() if line.startswith("    python ")]
-SHORT = {"experiments.benchmark": ["replicates=1"], "experiments.train": ["agent.total_steps=500", "agent.learn_start=100"]}
+SHORT = {
+    "experiments.benchmark": ["replicates=1"],
+    "experiments.train": ["agent.total_steps=500", "agent.learn_start=100"],
+}
 
 
 def run(words: list[str], folder: Path, **more: str) -> subprocess.CompletedProcess[str]:

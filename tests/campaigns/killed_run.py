@@ -341,6 +341,8 @@ class _Comparison:
 def errors_in_lives(seen: Sequence[tuple[float, float, Life]]) -> list[float]:
     """Distance of each true OD from where the client that lived then could have brought it from its first sample on.
 
+    Above the setpoint it is a share of the OD, times the setpoint: what a dose that comes a minute late leaves is one.
+
     Args: seen: device time of a sample, s, true OD, and the life of its client.
     """
     errors, before, reference = [], (-math.inf, (-math.inf, -math.inf)), np.zeros(1)
@@ -349,7 +351,7 @@ def errors_in_lives(seen: Sequence[tuple[float, float, Life]]) -> list[float]:
             reference = np.array([od])
         else:
             reference = reachable(reference, np.array([SETPOINT]), (at - before[0]) / 60.0)
-        errors.append(abs(od - float(reference[0])))
+        errors.append(abs(od - float(reference[0])) * min(1.0, SETPOINT / float(reference[0])))
         before = at, life
     return errors
 

@@ -240,9 +240,19 @@ def test_a_client_that_doses_no_more_once_it_was_resumed_fails(tmp_path: Path, m
     assert any("not held" in line for line in summary["runs"][0]["trouble"])
 
 
+def test_a_dose_that_comes_late_weighs_the_same_in_a_dense_culture() -> None:
+    life = (0.0, 600.0)
+    for found in (0.6, 1.4):  # two minutes of growth, then full dilution: 17 % above what was possible
+        ods = [found * math.exp(0.025 * min(k, 2) - 0.035 * max(k - 2, 0)) for k in range(6)]
+        errors = errors_in_lives([(60.0 * k, od, life) for k, od in enumerate(ods)])
+        assert errors[2] == pytest.approx(0.5 * math.expm1(0.12), rel=1e-9)
+    assert errors_in_lives([(0.0, 0.3, life), (60.0, 0.2, life)])[1] == pytest.approx(0.3 * math.exp(0.025) - 0.2)
+
+
 def test_errors_are_counted_from_where_a_client_found_the_culture() -> None:
     first, second = (0.0, 100.0), (400.0, 900.0)
     seen = [(60.0, 0.5, first), (460.0, 0.6, second), (520.0, 0.6 * math.exp(-0.035), second), (580.0, 0.7, second)]
-    expected = [0.0, 0.0, 0.0, 0.7 - 0.6 * math.exp(-0.07)]
+    possible = 0.6 * math.exp(-0.07)  # still above the setpoint of .5
+    expected = [0.0, 0.0, 0.0, 0.5 * (0.7 / possible - 1.0)]
     assert errors_in_lives(seen) == pytest.approx(expected, abs=1e-12)
     assert longest_out_min([0.2, 0.05, 0.2, 0.3, 0.11, 0.1, 0.2]) == 3.0
