@@ -20,7 +20,7 @@ USAGE = """\
 usage: turbidostat COMMAND [key=value ...]     the same as  python -m experiments.COMMAND [key=value ...]
 """
 END = """\
-turbidostat COMMAND --help     what a command takes, with units, ranges and defaults
+turbidostat COMMAND --help     what a command takes; --help=all with every value, unit, range and default
 turbidostat COMMAND --cfg job  the config it would run with
 turbidostat --version          which version this is
 eval "$(turbidostat completion bash)"     completes commands, groups and keys; also zsh and fish

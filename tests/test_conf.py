@@ -209,18 +209,35 @@ def test_every_field_of_every_command_says_what_it_is(name):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_shows_usage_and_every_value(name, capsys, monkeypatch):
     command = importlib.import_module(f"experiments.{name}").main
-    monkeypatch.setattr(sys, "argv", [name, "--help"])
-    command()
-    page = capsys.readouterr().out
-    assert f"python -m experiments.{name}" in page
-    for entry in entries(command.schema):
-        assert re.search(rf"^(  )?{entry.name}\b", page, re.MULTILINE), entry.name
-    assert max(len(line) for line in page.splitlines()) <= 122
+    pages = {}
+    for word in ("--help", "--help=all"):
+        monkeypatch.setattr(sys, "argv", [name, word])
+        command()
+        pages[word] = page = capsys.readouterr().out
+        assert f"python -m experiments.{name}" in page
+        for entry in entries(command.schema):
+            assert re.search(rf"^(  )?{entry.name}\b", page, re.MULTILINE), entry.name
+        assert max(len(line) for line in page.splitlines()) <= 122
+    assert len(pages["--help"].splitlines()) <= 100
+    whole = set(pages["--help=all"].splitlines())
+    words = pages["--help"].partition("the same of one: ")[2].replace("\n", " ")
+    for word in words.split(", ") if words else ():
+        monkeypatch.setattr(sys, "argv", [name, f"--help={word.strip()}"])
+        command()
+        part = capsys.readouterr().out.splitlines()
+        assert part
+        assert set(part) <= whole
+
+
+def test_help_of_a_part_that_there_is_not_names_those_that_there_are():
+    command = importlib.import_module("experiments.deploy").main
+    with pytest.raises(frame.UserError, match=r"^--help = plnat: allowed all, backend, plant, .*relearn"):
+        command._answer(["--help=plnat"])
 
 
 def test_help_shows_the_values_that_the_rest_of_the_line_gives(capsys, monkeypatch):
     command = importlib.import_module("experiments.deploy").main
-    monkeypatch.setattr(sys, "argv", ["deploy", "backend=chibio", "--help", "backend.stir=0.7"])
+    monkeypatch.setattr(sys, "argv", ["deploy", "backend=chibio", "--help=backend", "backend.stir=0.7"])
     command()
     page = capsys.readouterr().out
     assert re.search(r"^  backend\.stir = 0\.7 +stirrer \(allowed: 0 to 1; default: 0\.5\)$", page, re.MULTILINE)
@@ -350,7 +367,7 @@ def test_a_wrong_override_is_one_line_with_key_value_and_what_is_allowed(overrid
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_lists_what_the_command_takes_and_every_option_of_it_composes(name, capsys, monkeypatch):
     command = importlib.import_module(f"experiments.{name}").main
-    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    monkeypatch.setattr(sys, "argv", [name, "--help=all"])
     command()
     page = capsys.readouterr().out.partition("Values (key=value)")[0]
     listed = {}

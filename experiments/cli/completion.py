@@ -11,7 +11,7 @@ from experiments.cli.frame import Command, UserError
 
 __all__ = ["SHELLS", "candidates"]
 
-FLAGS = ("--help", "--cfg", "--multirun")
+FLAGS = ("--help", "--help=all", "--cfg", "--multirun")
 SHELLS = {
     "bash": """\
 _turbidostat() {

@@ -194,9 +194,12 @@ class Command(Generic[T]):
         with refusing(ValueError):
             given = [latest.resolved(arg, self.name) for arg in given]
         flags = {a for a in given if a.startswith("-")}
+        about = next((a.removeprefix("--help=") for a in flags if a.startswith("--help=")), "")
         plain = [a for a in given if not a.startswith("-")]
-        if flags & {"--help", "-h"}:
-            print(help_page.text(self.name, self.config(plain)), flush=True)
+        if about or flags & {"--help", "-h"}:
+            with refusing(ValueError):
+                page = help_page.text(self.name, self.config(plain), about)
+            print(page, flush=True)
             return
         if "--version" in flags:
             print(version())

@@ -1,4 +1,4 @@
-"""What `--help` prints: how a command is used, what can be chosen, and every value with its meaning and range.
+"""What `--help` prints: how a command is used, what can be chosen, and the values with meaning and range.
 
 Usage is the comment that opens conf/NAME.yaml; all else comes from the fields of the command's config.
 """
@@ -38,8 +38,8 @@ def _line(left: str, right: str, at: int) -> list[str]:
     return [line.rstrip() for line in (*head, lines[0], *(" " * at + line for line in lines[1:]))]
 
 
-def _values(config: Any, prefix: str) -> Iterator[str]:
-    """The plain values of a config, then its parts, each below a line of its own."""
+def _values(config: Any, prefix: str, deep: bool = True) -> Iterator[str]:
+    """The plain values of a config, then its parts, each below a line of its own; without `deep` a line for each."""
     parts: list[tuple[str, str, Any]] = []
     default = type(config)()
     for entry in entries(config):
@@ -61,22 +61,74 @@ def _values(config: Any, prefix: str) -> Iterator[str]:
                 f"({'; '.join(notes)})" if notes else "",
             )
             yield from _line(f"  {key} = {shown(entry.value)}", " ".join(filter(None, words)), LEFT)
+    if not deep:
+        yield from (line for key, what, _ in parts for line in _line(f"  {key}.…", what, LEFT))
+        return
     for key, what, inner in parts:
         yield ""
         yield f"{key}: {what}"
         yield from _values(inner, f"{key}.")
 
 
-def text(name: str, config: Any) -> str:
-    """The whole page, with the values that the rest of the command line gives.
+def _group(name: str, group: str, start: str | None) -> list[str]:
+    """A config group: each of its presets with a sentence."""
+    lines = [f"  {group}=" + (f"    (by itself {start})" if start else "")]
+    return lines + [
+        x for option in options(name, group) for x in _line(f"    {option}", sentence(f"{group}/{option}"), 26)
+    ]
 
-    Args: name: of the command; config: what it would run with.
+
+def _short(name: str, config: Any) -> list[str]:
+    """Examples, what can be chosen, and the command's own keys; of a part its name."""
+    choices = [
+        line
+        for group, start in chosen(name).items()
+        for line in _line(
+            f"  {group}=",
+            " | ".join(options(name, group)) + (f"    (by itself {start})" if start else ""),
+            26,
+        )
+    ]
+    head = ["Choices (group=option)", "", *choices, ""] if choices else []
+    words = [word for word, _ in _about(name, config)]
+    number = sum(1 for _ in _leaves(config))
+    more = ["", f"--help=all    every choice and every value, with unit, range and default ({number})"]
+    more += textwrap.wrap(f"--help=NAME   the same of one: {', '.join(words)}", WIDTH, subsequent_indent=" " * 14)
+    own = ["Values (key=value)", "", *_values(config, "", deep=False)]
+    return [*opening(name), "", *head, *own, *(more if words else ())]
+
+
+def _leaves(config: Any) -> Iterator[str]:
+    for entry in entries(config):
+        if is_dataclass(entry.value):
+            yield from _leaves(entry.value)
+        else:
+            yield entry.name
+
+
+def _about(name: str, config: Any) -> Iterator[tuple[str, Any]]:
+    """Groups of a command and parts of its config; None where a group has no part of its name."""
+    parts = {e.name: e.value for e in entries(config) if is_dataclass(e.value)}
+    yield from {**dict.fromkeys(chosen(name)), **parts}.items()
+
+
+def text(name: str, config: Any, about: str = "") -> str:
+    """What `--help` prints, with the values that the rest of the command line gives.
+
+    Args: name: of the command; config: what it would run with; about: "all", a group or a part of the config with its
+      own values; "": what one looks for first.
+    Raises: ValueError for an `about` that there is not.
     """
-    choices = []
-    for group, start in chosen(name).items():
-        choices.append(f"  {group}=" + (f"    (by itself {start})" if start else ""))
-        for option in options(name, group):
-            choices += _line(f"    {option}", sentence(f"{group}/{option}"), 26)
-        choices.append("")
-    head = ["Choices (group=option)", ""] if choices else []
-    return "\n".join([*opening(name), "", *head, *choices, "Values (key=value)", "", *_values(config, "")])
+    if not about:
+        return "\n".join(_short(name, config))
+    groups = {group: _group(name, group, start) for group, start in chosen(name).items()}
+    if about == "all":
+        choices = [line for lines in groups.values() for line in (*lines, "")]
+        head = ["Choices (group=option)", ""] if choices else []
+        return "\n".join([*opening(name), "", *head, *choices, "Values (key=value)", "", *_values(config, "")])
+    parts = dict(_about(name, config))
+    if about not in parts:
+        raise ValueError(f"--help = {about}: allowed all, {', '.join(parts)}")
+    inner = parts[about]
+    values = _values(inner, f"{about}.") if inner is not None else ()
+    return "\n".join([*groups.get(about, []), *([""] if about in groups and inner is not None else []), *values])

@@ -67,7 +67,7 @@ def test_a_command_takes_it_from_a_file_outside(tmp_path: Path) -> None:
     assert (tmp_path / "here" / "extensions" / "light.py").is_file()
     decided = [json.loads(line) for line in (tmp_path / "here" / "journal.jsonl").read_text().splitlines()]
     assert all("thermostat_degc" in row["why"] for row in decided if row["kind"] == "decision")
-    shown: Any = subprocess.run([*python, "--help"], **place)  # type: ignore[call-overload]
+    shown: Any = subprocess.run([*python, "--help=all"], **place)  # type: ignore[call-overload]
     assert "signals.NAME.setpoint = 1400" in shown.stdout
     told_first: Any = subprocess.run([*python, "dry_run=true"], **place)  # type: ignore[call-overload]
     assert "controller dqn" in told_first.stdout

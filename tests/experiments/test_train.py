@@ -366,7 +366,7 @@ def test_help_that_nobody_reads_to_the_end_says_nothing_about_it():
     assert done.stdout.count("\n") == 1
 
 
-@pytest.mark.parametrize("flags", [["--help"], ["--cfg", "job"], ["--cfg", "job", "+env=sim", "+experiment=smoke"]])
+@pytest.mark.parametrize("flags", [["--help=all"], ["--cfg", "job"], ["--cfg", "job", "+env=sim", "+experiment=smoke"]])
 def test_help_and_config_printing(flags):
     done = run("train", *flags)
     assert done.returncode == 0
