@@ -19,6 +19,7 @@ from experiments.cli import files, frame
 from experiments.cli.calibrated import read_env_file
 from experiments.control.policies import SHIPPED, find_policy
 from experiments.laws.density.learned import settings
+from experiments.reporting.verdict import REMEDY
 
 __all__ = ["main"]
 
@@ -48,6 +49,7 @@ def body(config: CertifyConfig, folder: Path) -> None:
     _write(folder, source, certificate.content(policy, beside, config, found), to, found)
     if failed := [check for check in found.checks if not check.holds]:
         of = f"{len(failed)} of {len(found.checks)} requirements fail"
+        log.info("what helps: %s", REMEDY)
         raise frame.UserError(f"policy {source}: not certified, {of}, the first: {failed[0]}")
 
 

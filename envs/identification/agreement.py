@@ -98,18 +98,23 @@ class Agreement:
         found = [c for c in (self.growth, self.gain, self.net) if c.left_min is not None]
         return sorted(found, key=lambda c: c.left_min or 0.0)
 
-    def verdict(self) -> str:
-        """One sentence: whether to calibrate again, and why."""
+    def verdict(self, planned: bool = True) -> str:
+        """One sentence: whether to calibrate again, and why.
+
+        Args: planned: whether anything was decided with the model; where nothing was, there is nothing to calibrate.
+        """
         if not self.long_enough:
             return (
                 f"Too short to tell: {self.minutes:.0f} min of trustworthy readings, at least "
                 f"{SHORTEST_WINDOW_MIN:.0f} are needed."
             )
         if self.left:
-            return f"Recalibrate: {'; '.join(_words(c) for c in self.left)}{self._which()}."
+            head = "Recalibrate: " if planned else f"{UNUSED}, and the culture was another one: "
+            return f"{head}{'; '.join(_words(c) for c in self.left)}{self._which()}."
         unknown = " and ".join(c.name for c in (self.growth, self.gain) if c.latest is None)
         but = f"; {unknown} cannot be told from these readings alone" if unknown else ""
-        return f"No need to recalibrate: the model held to the end of the run{but}."
+        head = "No need to recalibrate: " if planned else f"{UNUSED}: "
+        return f"{head}the model held to the end of the run{but}."
 
     def _which(self) -> str:
         """Where only their balance is known to be wrong, the two that it may come from."""
@@ -117,6 +122,9 @@ class Agreement:
             return ""
         faster, weaker = ("faster", "weaker") if self.net.latest.value > 0.0 else ("slower", "stronger")
         return f"; the culture grows {faster} or the pump is {weaker}, which this run alone cannot tell"
+
+
+UNUSED = "Nothing to calibrate, since nothing here was decided with this model"
 
 
 def _words(c: Compared) -> str:

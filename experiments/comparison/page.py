@@ -47,6 +47,9 @@ ESTIMATES = (
     ("supervised_pct", "Decisions by the supervisor's law, %"),
     ("alarm_pct", "Decisions by it because of surprises, %"),
 )
+RANKED = {"density": ("itae_mean", "ITAE, OD min²"), "share": ("ratio_abs_error_mean", "mean |r - setpoint|")}
+"""Signal -> the measure by which a page says in short what is lowest, and its name."""
+OUT_OF_COMPETITION = ("oracle", "optimum")
 SHARE = {
     "error": "mean over the scenario of |r - setpoint|, r the true share of the second species, wherever one is asked "
     "for.",
@@ -336,11 +339,32 @@ def _interval(ci: Sequence[float | None]) -> str:
     return "–" if ci[0] is None else f"{number(ci[0])} to {number(ci[1])}"
 
 
-def _paper_section(out: Page, summary: Row) -> None:
+def _in_short(out: Page, summary: Row) -> None:
+    """What came out: the learned policy beside the paper's, and the lowest of every scenario and plant."""
+    out.section("In short")
+    if summary["beside_paper"]:
+        _beside_paper(out, summary)
+    places: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for entry in (*summary["totals"], *(r for r in summary["rows"] if r["signal"] == "share")):
+        key, _ = RANKED[str(entry["signal"])]
+        if entry.get(key) is not None and entry["controller"] not in OUT_OF_COMPETITION:
+            laws = places.setdefault((entry["scenario"], entry["plant"]), {})
+            laws.setdefault(law_of(entry), []).append(float(entry[key]))
+    unit = dict.fromkeys(RANKED[s][1] for s in dict.fromkeys(str(r["signal"]) for r in summary["rows"]))
+    items = [f"{scenario} on {plant}: {_first(laws)}" for (scenario, plant), laws in places.items() if len(laws) > 1]
+    if items:
+        out.add("verdict", claim=f"Lowest {' and '.join(unit)}, mean of the replicates:", items=items, remark="")
+
+
+def _first(laws: Mapping[str, Sequence[float]]) -> str:
+    """The lowest of laws and the next one, by the mean of their values."""
+    means = {law: sum(values) / len(values) for law, values in laws.items()}
+    (law, value), (other, beyond), *_ = sorted(means.items(), key=lambda item: item[1])
+    return f"{law} {number(value)}, then {other} {number(beyond)}"
+
+
+def _beside_paper(out: Page, summary: Row) -> None:
     rows = beside(summary)
-    out.section("The paper's Table 2 beside this run")
-    for metric in METRICS:
-        out.table(table_2(rows, metric))
     lost, cells = losses(rows, summary["paired"]), 2 * len(_windows(rows))
     cells_lost = len({loss.cell for loss in lost})
     certain = len({loss.cell for loss in lost if loss.certain})
@@ -356,6 +380,13 @@ def _paper_section(out: Page, summary: Row) -> None:
     theirs = published_losses()
     remark = f"In the published table the DQN loses {len(theirs)} of 10: {', '.join(theirs)}."
     out.add("verdict", claim=claim, items=[loss.sentence for loss in lost], remark=remark)
+
+
+def _paper_section(out: Page, summary: Row) -> None:
+    rows = beside(summary)
+    out.section("The paper's Table 2 beside this run")
+    for metric in METRICS:
+        out.table(table_2(rows, metric))
     out.table(cell_by_cell(rows))
     if bounded := _below_bound(summary):
         out.text(bounded)
@@ -440,7 +471,7 @@ def _density(out: Page, summary: Row, run: Path) -> None:
         out.section("Every plant")
         out.text(
             "Model-based controllers and the learned policy believe the model of the configuration (env) "
-            "whatever the plant is; what each plant is stands in the configuration above."
+            "whatever the plant is; what each plant is stands in the configuration below."
         )
         for scenario in wide:
             every_plant(out, summary, scenario)
@@ -515,14 +546,15 @@ def of_benchmark(run: Path) -> Page:
         parts[0].title,
         f"{summary['loops']} closed loops of {summary['replicates']} simulated replicates each, seed {summary['seed']}",
     )
-    out.section("What was run")
-    provenance(out, run)
-    _learning_section(out, summary, run)
+    _in_short(out, summary)
     for part in parts:
         part.add(out, summary, run)
+    _learning_section(out, summary, run)
     out.section("Definitions")
     out.add("definitions", pairs=[pair for part in parts for pair in part.definitions.items()])
     if summary["details"]:
         out.section("All numbers")
         out.table(all_rows(summary), folded=f"{len(summary['details'])} rows; also in tables/rows.csv")
+    out.section("What was run")
+    provenance(out, run)
     return out

@@ -38,11 +38,12 @@ COLUMNS = ("hours", "growth rate, 1/min", "pump gain, 1 = the model's", "net gro
 
 @dataclass(frozen=True)
 class Believed:
-    """The model a run was planned with, and where it is from."""
+    """The model a run is compared with, where it is from, and whether anything was decided with it."""
 
     mu: float
     tau: float
     source: str
+    planned: bool = False
 
 
 def believed(run: Path) -> Believed:
@@ -54,13 +55,13 @@ def believed(run: Path) -> Believed:
     if learned and (run / "policy.npz").is_file():
         try:
             model = policies.load(run / "policy.npz").metadata["model"]
-            return Believed(float(model["mu"]), float(model["tau"]), "the policy's training model")
+            return Believed(float(model["mu"]), float(model["tau"]), "the policy's training model", True)
         except (policies.PolicyError, KeyError, TypeError, ValueError):
             pass  # exported without its model, or damaged: another one was believed as well
     if path := config.get("env_file"):
         try:
             env = read_env_file(str(path))
-            return Believed(env.mu, env.tau, f"env_file {path}")
+            return Believed(env.mu, env.tau, f"env_file {path}", not learned)
         except frame.UserError:
             return Believed(nominal.mu, nominal.tau, f"nominal, since env_file {path} cannot be read any more")
     return Believed(nominal.mu, nominal.tau, "nominal")
@@ -135,7 +136,7 @@ def write(page: Page, run: Path, label: str = "") -> None:
         f"The model: growth {growth} 1/min, tau {tau}{told} ({model.source}). Growth and pump "
         "gain are estimated from segments of about two hours, each alone. Net growth is what a sample grew or shrank "
         "beyond the prediction from the one before; it shows also where growth and pump hide one behind the other. A "
-        "value no longer holds once the intervals exclude it and it is off by 10 % or more."
+        "value has changed when it is off by 10 % or more and its interval excludes the model's."
     )
     for path in sorted((run / "recordings").glob("*.csv")):
         known = reactors.get(path.stem) if isinstance(reactors, Mapping) else None
@@ -155,7 +156,9 @@ def _reactor(page: Page, run: Path, path: Path, model: Believed, summary: Mappin
     except (RecordingError, ValueError) as error:
         page.text(f"Not compared: {error}")
     else:
-        page.add("verdict", claim=found.verdict(), items=_facts(found) + _sure(why), remark=_acted(summary, why))
+        page.add(
+            "verdict", claim=found.verdict(model.planned), items=_facts(found) + _sure(why), remark=_acted(summary, why)
+        )
         page.table(_segments(found, f"{prefix}after_{name}", name))
         estimates = {key: values for key, values in why.items() if key in ("minute", *ESTIMATES)}
         figure = agreement_figure(found, estimates, supervised, f"{name}: growth and pump along the run")
@@ -175,9 +178,9 @@ def _fact(c: Compared) -> str:
         return "not identifiable"
     last = f"last {_shown(c.latest)}, the model's {number(c.expected)}"
     if c.left_min is not None:
-        last += f", which no longer holds from hour {c.left_min / 60:.1f} on"
+        last += f", which has not held since hour {c.left_min / 60:.1f}"
     elif not c.latest.low <= c.expected <= c.latest.high:
-        last += ", outside in too few segments, or by too little, to say more"
+        last += "; its interval excludes that, but in too few segments or by less than 10 %"
     if c.line is not None and c.line.significant and c.expected > 0.0:
         last += f"; a line through the segments changes by {c.line.change_pct:+.0f} %"
     return last

@@ -8,7 +8,7 @@ import base64
 import json
 import platform
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -187,18 +187,26 @@ def _show(value: Any) -> str:
     return "–" if value is None else str(value)
 
 
-def _results(page: Page, run: Path, prefix: str) -> None:
-    """summary.json as tables, whose names begin with `prefix`, and every figure of a run folder."""
-    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
-    leaves = dict(flat(summary if isinstance(summary, Mapping) else {"summary": summary}))
-    lists = {k: v for k, v in leaves.items() if isinstance(v, list) and v and all(isinstance(e, Mapping) for e in v)}
+def _read(run: Path) -> tuple[Any, Mapping[str, Any]]:
+    """summary.json of a run folder, and its configuration."""
     path = run / "config.yaml"
     config = _config(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return json.loads((run / "summary.json").read_text(encoding="utf-8")), config
+
+
+def _said(page: Page, runs: Iterable[Path]) -> None:
+    """What each run came to, beside each other."""
+    told = [verdict(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping)]
+    page.add("verdicts", found=[said for said in told if said is not None])
+
+
+def _results(page: Page, run: Path, prefix: str) -> None:
+    """summary.json as tables, whose names begin with `prefix`, and every figure of a run folder."""
+    summary, config = _read(run)
+    leaves = dict(flat(summary if isinstance(summary, Mapping) else {"summary": summary}))
+    lists = {k: v for k, v in leaves.items() if isinstance(v, list) and v and all(isinstance(e, Mapping) for e in v)}
     env = config.get("env")
     kind = str(env.get("kind", "")) if isinstance(env, Mapping) and "regret_pct" in leaves else ""
-    said = verdict(summary, config) if isinstance(summary, Mapping) else None
-    if said is not None:
-        page.add("verdict", claim=said.claim, items=said.items, remark=said.remark)
     _figures(page, run)
     page.add("keys", pairs=[(_labelled(k, kind), _show(v)) for k, v in leaves.items() if k not in lists])
     for key, value in lists.items():
@@ -219,13 +227,22 @@ def _figures(page: Page, run: Path) -> None:
 def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str], None] | None = None) -> Page:
     """The page of any command's run: what it found, and what was run. `runs` is the folder itself or runs below it.
 
+    Of several runs it begins with what each came to.
+
     Args: after: adds to the page what only some runs have; it is given the run and its name on a page of several.
     """
     name = folder.resolve()
     page = Page(f"{name.parent.name}, {name.name}", f"{PACKAGE} {_version()}")
-    for run in runs:
-        label = re.sub(r"^\d+_", "", run.name).capitalize() if run != folder else ""
+    labels = {re.sub(r"^\d+_", "", run.name).capitalize() if run != folder else "": run for run in runs}
+    if len(labels) < len(runs):
+        labels = {run.name: run for run in runs}
+    if "" not in labels:
+        page.section("In short")
+        _said(page, runs)
+    for label, run in labels.items():
         page.section(f"{label}: results" if label else "Results")
+        if not label:
+            _said(page, [run])
         _results(page, run, f"{run.name}_" if label else "")
         if after is not None:
             after(page, run, label)

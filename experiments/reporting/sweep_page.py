@@ -6,7 +6,7 @@ from pathlib import Path
 
 from experiments.reporting import charts, sweep_charts
 from experiments.reporting.page import Page
-from experiments.reporting.sweep_results import Configuration, Result, configurations, curve, label, statistics
+from experiments.reporting.sweep_results import MERIT, Configuration, Result, configurations, curve, label, statistics
 from experiments.reporting.tables import Best, Table, number
 
 __all__ = ["of_sweep", "repeats"]
@@ -87,6 +87,8 @@ def _headline(ranked: Sequence[Configuration], jobs: Sequence[Result], called: C
         apart = s.n < 2 or other.n < 2 or s.interval[1] < other.interval[0]
         text += f"; the next has {number(other.worst)}"
         text += "" if apart else ", and the intervals of the two do not tell them apart"
+    if what == MERIT:
+        text += f". That is {'within' if s.worst <= 1.0 else 'beyond'} the limits of the task"
     return f"{text}. {done} of {len(jobs)} jobs finished."
 
 

@@ -41,7 +41,7 @@ def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def typeset(text: str) -> str:
     """With true minus signs before numbers."""
-    return re.sub(r"(?<![\w.])-(?=\d)", "−", text)
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", text.replace("+-", "±"))
 
 
 @dataclass(frozen=True)

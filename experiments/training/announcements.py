@@ -65,11 +65,13 @@ def _verdict(score: Score, task: Task) -> str:
 
 
 def ended(
-    folder: Path, task: Task, kept: Score, myopic: Score, spent: str, path: Path, pair: str | None = None
-) -> None:
+    folder: Path, task: Task, kept: Score, myopic: Score, spent: str, path: Path, pair: str | None = None,
+    whole: bool = True,
+) -> None:  # fmt: skip
     """Say what was reached, against what, and what to do with it.
 
-    Args: spent: steps, updates and time, in words. pair: of two species, as it was asked for.
+    Args: spent: steps, updates and time, in words. pair: of two species, as it was asked for. whole: it was trained
+      for all its steps.
     """
     many = kept.regret_pct.size > 1
     worst = f"; the worst of {kept.regret_pct.size}: {kept.regret_pct.max():.2f} %, {kept.steady_abs_error.max():.4f}"
@@ -83,7 +85,7 @@ def ended(
     log.info("policy %s; figures %s", path, folder / "figures")
     if task.tried:
         file = shlex.quote(str(path))
-        if task.provable:
+        if task.provable and whole:  # seldom proven of a policy that was good enough, and no better
             log.info("next, prove its closed loop: python -m experiments.certify policy=%s", file)
         pair_words = "" if pair is None else f"pair={shlex.quote(pair)} "
         log.info("next, try it: python -m experiments.deploy %s%s", pair_words, task.tried.format(file))

@@ -127,7 +127,9 @@ def _finish(session: Session) -> None:
     files.write_json(session.folder / "summary.json", summary)
     announcements.results(session.writer, agents.steps, kept, session.task, session.seeds)
     spent = f"{agents.steps} steps and {agents.updates} updates of each agent in {session.seconds:.1f} s"
-    announcements.ended(session.folder, session.task, kept, myopic, spent, path, session.config.pair)
+    config = session.config
+    whole = config.stop_within is None
+    announcements.ended(session.folder, session.task, kept, myopic, spent, path, config.pair, whole)
 
 
 def fingerprint(config: TrainConfig) -> str:

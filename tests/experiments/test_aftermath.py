@@ -50,13 +50,15 @@ def sections(folder: Path) -> str:
     return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", re.sub(r'src="[^"]*"', "", page)))
 
 
-def test_a_drifting_run_is_told_to_calibrate_again(copy):
+def test_a_drifting_run_says_since_when_the_model_does_not_hold(copy):
     text = sections(copy)
     assert "Predicted and measured" in text
     assert "growth 0.03 1/min, tau 0.3333 (nominal)" in text
-    assert len(re.findall(r"Recalibrate: .*?the predicted net growth is off by 10 % or more since hour", text)) == 2
+    of = r"Nothing to calibrate, since nothing here was decided with this model, and the culture was another one: "
+    assert len(re.findall(of + ".*?the predicted net growth is off by 10 % or more since hour", text)) == 2
+    assert "ecalibrate" not in text  # nobody fitted the nominal model
     # in the first two hours growth is off by 6 % in the mean, in the next two by 18 %
-    hours = re.findall(r"10 % or more since hour ([\d.]+)|which no longer holds from hour ([\d.]+) on", text)
+    hours = re.findall(r"10 % or more since hour ([\d.]+)|which has not held since hour ([\d.]+)", text)
     assert [float(since or on) for since, on in hours] == pytest.approx([2.0] * 4, abs=0.2)
     assert "The interlock spoke in 0 of" in text
     assert "A supervisor acted on 0 rows." in text
@@ -100,6 +102,21 @@ def test_rows_on_which_a_supervisor_acted_are_counted(copy):
     assert text.count("A supervisor acted on 40 rows, minute 100 to 139.") == 1
 
 
+def test_only_who_decides_with_a_fitted_model_is_told_to_calibrate_again(copy, tmp_path):
+    fitted = tmp_path / "calibrated.yaml"
+    fitted.write_text("mu: 0.03\ntau: 0.3333\n")
+    config = (copy / "config.yaml").read_text()
+    with_file = config.replace("env_file: null", f"env_file: {fitted}")
+    (copy / "config.yaml").write_text(with_file)
+    assert sections(copy).count("Recalibrate: ") == 2
+    policies.save(copy / "policy.npz", inverse_policy())  # which was trained on no model of its own
+    (copy / "config.yaml").write_text(with_file.replace("kind: inverse", "kind: dqn"))
+    assert "ecalibrate" not in sections(copy)
+    own = inverse_policy()
+    policies.save(copy / "policy.npz", replace(own, metadata={**own.metadata, "model": {"mu": 0.03, "tau": 0.3333}}))
+    assert sections(copy).count("Recalibrate: ") == 2
+
+
 def test_what_the_interlock_did_stands_beside_it(copy):
     summary = json.loads((copy / "summary.json").read_text())
     summary["reactors"]["M0"] |= {
@@ -120,7 +137,7 @@ def test_a_recording_that_cannot_be_compared_says_why(copy):
     path.write_text("\n".join(path.read_text().splitlines()[:5]) + "\n")
     text = sections(copy)
     assert text.count("Not compared: ") == 1
-    assert text.count("Recalibrate: ") == 1
+    assert text.count("the culture was another one: ") == 1
 
 
 def test_the_model_is_the_runs(copy, tmp_path):
@@ -164,7 +181,7 @@ def test_each_reactor_is_compared_with_the_model_of_its_own_volume(tmp_path):
     vials = "backend.reactors=[M0,M1]", "bench.volume_ml=14", "bench.volumes_ml.M1=9", "scenario.minutes=[80,80,80]"
     text = sections(deployed(tmp_path / "run", "controller=inverse", *vials))
     assert "tau 0.2333, 0.15 of M1 (nominal)" in text
-    assert text.count("No need to recalibrate: the model held to the end of the run.") == 2
+    assert text.count("with this model: the model held to the end of the run.") == 2
     gains = re.findall(r"the pump&#39;s gain: last ([\d.]+) \(([\d.]+) to ([\d.]+)\), the model&#39;s 1 ", text)
     assert len(gains) == 2
     for gain, low, high in gains:

@@ -221,6 +221,26 @@ def test_every_table_of_a_share_marks_the_law_that_is_best_by_its_own_measure(tm
     assert [marked(page, f"s_{key}") for key in measures] == [["a"], ["b"], ["c"]]
 
 
+def test_in_short_the_lowest_of_each_plant_is_named_and_the_oracle_is_not():
+    def entry(signal, law, value, **more):
+        key = "itae_mean" if signal == "density" else "ratio_abs_error_mean"
+        return {"signal": signal, "controller": law, "plant": "p", "scenario": signal, key: value} | more
+
+    totals = [entry("density", law, value) for law, value in (("dqn", 9.0), ("mpc", 8.5), ("oracle", 3.0))]
+    rows = [entry("share", "midpoint", value, preview=True) for value in (0.05, 0.03)]
+    rows += [entry("share", "pi", 0.045), entry("density", "dqn", 1.0), entry("density", "mpc", 2.0)]
+    page = one_section()
+    comparison._in_short(page, {"beside_paper": [], "totals": totals, "rows": rows})
+    text = page.html()
+    assert "<h2>In short</h2>" in text
+    assert "<li>density on p: mpc 8.5, then dqn 9</li>" in text
+    assert "<li>share on p: midpoint, told ahead 0.04, then pi 0.045</li>" in text
+    assert "Lowest mean |r - setpoint| and ITAE, OD min², mean of the replicates:" in text
+    alone = one_section()
+    comparison._in_short(alone, {"beside_paper": [], "totals": totals[:1], "rows": rows[3:4]})
+    assert "Lowest" not in alone.html()
+
+
 def test_published_losses_are_the_papers():
     """The PI beats the published DQN in three of the four temperature numbers, the MPC in the other (Table 2)."""
     said = comparison.published_losses()
@@ -322,6 +342,38 @@ def test_a_folder_of_runs_gets_one_page(tmp_path):
         run_folder(tmp_path / "demo" / name, {"value": name})
     text = report.write(tmp_path / "demo").read_text(encoding="utf-8")
     assert text.index("Calibrate: results") < text.index("Train: results")
+
+
+def test_several_runs_begin_with_what_each_came_to(tmp_path):
+    for name, passed in (("1_first", True), ("2_second", False)):
+        checks = [{"name": f"{name}'s", "holds": passed}]
+        found = {"cannot_hold": [], "observation": [name], "passed": passed, "checks": checks}
+        run_folder(tmp_path / "both" / name, found)
+    text = re.sub(r"<[^>]*>", " ", report.write(tmp_path / "both").read_text(encoding="utf-8"))
+    order = ["Certificate of a policy for 1_first", "Good: certified", "Certificate of a policy for 2_second",
+             "Not certified. What helps", "First: results", "First: what was run", "Second: results"]  # fmt: skip
+    places = [text.rindex(words) for words in order[:4]] + [text.rindex(words) for words in order[4:]]
+    assert places == sorted(places)
+    assert [text.count(words) for words in order[:4]] == [1, 1, 1, 1]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)")
+def test_on_a_phone_no_page_scrolls_sideways_and_no_cell_is_a_column_of_letters(tmp_path):
+    api = pytest.importorskip("playwright.sync_api", reason="no playwright (python -m pip install playwright)")
+    keys = {"a_key_of_summary_json_that_is_rather_long.value": "x" * 300, "b": " ".join(["word"] * 60)}
+    wide = [{f"a column with a long heading {k}": "95 % of IQM, 1.2345 to 2.3456" for k in range(9)}]
+    run_folder(tmp_path / "run", keys | {"rows": wide})
+    page_file = report.write(tmp_path / "run")
+    with api.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 390, "height": 844})
+        page.goto(page_file.as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") == 390
+        sizes = page.evaluate(
+            "[...document.querySelectorAll('td, th')].map(e => [e.textContent.length, e.getBoundingClientRect().width])"
+        )
+        browser.close()
+    assert min(width for length, width in sizes if length > 8) > 60
 
 
 def test_tables_of_several_runs_are_files_of_their_own(tmp_path):

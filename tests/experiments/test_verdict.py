@@ -97,6 +97,22 @@ def test_one_agent_is_told_by_its_seed():
     ]
 
 
+def test_a_certificate_says_what_fails_and_what_helps():
+    checks = [{"name": f"no. {k}", "holds": k == 1} for k in range(6)]
+    summary = {"cannot_hold": [], "observation": ["e", "s"], "passed": False, "checks": checks}
+    said = verdict(summary, {})
+    assert said.items == [
+        "6 requirements were judged, listed below", "fails: no. 0", "fails: no. 2", "fails: no. 3", "and 2 more fail",
+    ]  # fmt: skip
+    assert said.remark.startswith("Not certified. What helps: policy=shipped, ")
+    assert verdict(summary | {"checks": checks[1:2], "passed": True}, {}).remark == "Good: certified."
+
+
+def test_a_regret_that_rounding_makes_negative_is_none():
+    said = verdict(TRAINED | {"myopic_regret_pct": -7.8e-6}, MODEL)
+    assert "the one-line law that looks one period ahead: regret 0 %, error 0.001 OD" in said.items
+
+
 def test_a_calibration_without_a_pair_names_the_rows_that_it_used():
     """Rows 40 to 99, of which the 100th is the first that was not used."""
     alone = {"value": 0.021, "ci95": [0.019, 0.024], "rows": [40, 100]}
