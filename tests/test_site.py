@@ -10,7 +10,11 @@ import pytest
 # one worker makes what its tests look at, which takes minutes where the machine is busy
 pytestmark = [pytest.mark.xdist_group("site"), pytest.mark.timeout(1200)]
 ROOT = Path(__file__).parents[1]
-PAGES = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
+PAGES = sorted(
+    path.relative_to(ROOT / "docs").with_suffix("").as_posix()
+    for folder in ("docs", "docs/records")
+    for path in (ROOT / folder).glob("*.md")
+)
 NEEDED = ("sphinx", "myst_parser", "furo", "sphinx_copybutton", "sphinxcontrib.mermaid")
 
 
