@@ -3,7 +3,7 @@
 It sucks air unless the level rises, so it may run all the time: `target` = duty and ON, and the pump repeats that every
 63 s without a client (docs/device.md, Pumps), whatever becomes of doses, trips and this program. The experiment cycle
 does not look at Pump3 and Pump4; a start or end of an experiment and a restart of the device switch them
-off. Nothing relies on it: the interlock's ledger does not know of it. Plumbing: docs/chibio.md.
+off. Nothing relies on it: the interlock's ledger does not know of it. Plumbing: docs/device.md, The overflow pump.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ MIN_DUTY = 0.1  # with a pump of 1 mL/s twice as much as the feed pump may ever 
 
 @dataclass(frozen=True)
 class OverflowPumpConfig:
-    """A second waste line that keeps a vial from overflowing (docs/chibio.md); none as a rule.
+    """A second waste line that keeps a vial from overflowing (docs/device.md, The overflow pump); none as a rule.
 
     Raises: ValueError naming key, value and allowed range.
     """

@@ -107,7 +107,7 @@ def _overflow_pump(config: ChiBioConfig, calibrations: list[ReactorCalibration],
             "overflow pump",
             False,
             f"none: with a blocked waste tube a vial overflows after about {room_ml:.0f} mL of feed",
-            "a second waste tube on Pump3, backend.overflow_pump.pump=Pump3 (docs/chibio.md)",
+            "a second waste tube on Pump3, backend.overflow_pump.pump=Pump3 (docs/device.md)",
             required=False,
         )
     covers = "a blocked waste tube" + " and a feed motor stuck on" * (overflow.removes_ml_s > MARGIN * feed)

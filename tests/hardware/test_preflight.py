@@ -33,7 +33,7 @@ def test_without_an_overflow_pump_a_note_says_what_may_happen_and_nothing_else_i
     assert [check.name for check in found.values() if not check.ok] == ["overflow pump"]
     assert str(found["overflow pump"]) == (
         "note  overflow pump: none: with a blocked waste tube a vial overflows after about 10 mL of feed -> a second "
-        "waste tube on Pump3, backend.overflow_pump.pump=Pump3 (docs/chibio.md)"
+        "waste tube on Pump3, backend.overflow_pump.pump=Pump3 (docs/device.md)"
     )
 
 

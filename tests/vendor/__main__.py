@@ -2,7 +2,7 @@
 
 A name stands for every fault that contains it; `planted` are those that the judge must find. Writes outcomes.json.
 `python -m tests.vendor table=[FOLDER,...]` writes the newest outcome of each fault below these folders, app beside
-emulator, into docs/faults.md.
+emulator, into docs/records/vendor_app.md.
 """
 
 import json
@@ -16,7 +16,7 @@ from typing import Any
 from tests.vendor.bench import BENCHES, ROOT, missing
 from tests.vendor.faults import FAULTS, PLANTED, Fault, play
 
-PAGE = ROOT / "docs" / "faults.md"
+PAGE = ROOT / "docs" / "records" / "vendor_app.md"
 BEGIN, END = "<!-- vendor's app -->\n", "<!-- end -->"
 HEADER = """\
 | fault | told after, s | in the words | booked of true volume, mL, app | emulator | app | emulator |
