@@ -1,7 +1,7 @@
 # make run    calibrate on the shipped recording, train on the result, deploy on the simulated reactor, report
 # make test   style, types and the whole test suite
 # make coverage   which share of each package's lines the last `PYTEST_ADDOPTS=--cov make test` executed
-# make docs   the pages and the API reference as a site, build/docs/index.html; a warning is an error
+# make docs   the pages and the API reference as a site, build/docs/index.html, whole without a network; a warning is an error
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin

@@ -5,15 +5,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from docutils.nodes import SkipNode
+from latex2mathml.converter import convert
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("conf", "dqn", "envs", "hardware", "experiments")
 
 project = "turbidostat-dqn"
 copyright = "the authors, MIT licence"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.apidoc", "sphinx_copybutton", "sphinxcontrib.mermaid"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.apidoc", "sphinx_copybutton"]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 4
-myst_fence_as_directive = ["mermaid"]
+html_math_renderer = "mathml"  # set here, so that a page loads nothing from the network
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_theme = "furo"
 html_title = "turbidostat-dqn"
 highlight_language = "none"
@@ -71,6 +76,15 @@ def _docstring(app: Any, what: str, name: str, obj: Any, options: Any, lines: li
     lines[:] = [line for block in _blocks(lines) for line in (*_rendered(block), "")]
 
 
+def _formula(page: Any, node: Any, display: str) -> None:
+    """LaTeX as MathML, which browsers set by themselves."""
+    formula = convert(node.astext().replace(r"\arg", r"\operatorname{arg}"), display=display)
+    page.body.append(f'<div class="math">{formula}</div>' if display == "block" else formula)
+    raise SkipNode
+
+
 def setup(app: Any) -> None:
     """Called by Sphinx."""
+    inline, block = (lambda page, node, d=display: _formula(page, node, d) for display in ("inline", "block"))
+    app.add_html_math_renderer("mathml", (inline, None), (block, None))
     app.connect("autodoc-process-docstring", _docstring)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs" / "records").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PYTHON = r"(?:python3?|\.venv/bin/python) -m (?:experiments|hardware|tests\.(?:campaigns|studies))[\w.]*"
 SHELL = rf"(?:^|[`\s])(?={PYTHON})|`|^    "  # the word turbidostat alone may be a reactor
 PROGRAM = re.compile(rf"(?:{SHELL})({PYTHON}|turbidostat)(?![\w.])((?: [^`\n]*)?)", re.MULTILINE)

@@ -1,5 +1,7 @@
 """The pages and the reference made of the docstrings are built as a site; a warning is an error."""
 
+import re
+import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -15,7 +17,7 @@ PAGES = sorted(
     for folder in ("docs", "docs/records")
     for path in (ROOT / folder).glob("*.md")
 )
-NEEDED = ("sphinx", "myst_parser", "furo", "sphinx_copybutton", "sphinxcontrib.mermaid")
+NEEDED = ("sphinx", "myst_parser", "furo", "sphinx_copybutton", "latex2mathml")
 
 
 def built(source: Path, target: Path) -> subprocess.CompletedProcess[str]:
@@ -48,6 +50,17 @@ def test_equations_labels_and_code_of_a_docstring_are_on_its_page(site: Path) ->
     assert "<p>Everything" in (site / "api" / "envs" / "envs.plant.html").read_text(encoding="utf-8")
 
 
+def test_the_site_is_whole_without_a_network(site: Path) -> None:
+    loads = re.compile(
+        r"""<(?:script|img|iframe|object|source)\b[^>]*?\b(?:src|data)=["'](?:https?:)?//"""
+        r"""|<link\b(?=[^>]*\brel=["'](?:stylesheet|preload|icon))[^>]*\bhref=["'](?:https?:)?//"""
+        r"""|\b(?:import|from|fetch)\s*\(?\s*["'](?:https?:)?//"""
+    )
+    found = {page.name: loads.findall(page.read_text(encoding="utf-8")) for page in site.rglob("*.html")}
+    assert not any(found.values()), found
+    assert (site / "method.html").read_text(encoding="utf-8").count("<math") > 100
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("page", "text"),
@@ -62,6 +75,7 @@ def test_a_warning_is_an_error(page: str, text: str, tmp_path: Path) -> None:
     lines = (ROOT / "docs" / "conf.py").read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines if not line.startswith("apidoc_modules")]
     (tmp_path / "conf.py").write_text("\n".join(kept), encoding="utf-8")
+    shutil.copytree(ROOT / "docs" / "_static", tmp_path / "_static")
     (tmp_path / "index.md").write_text("# Index\n", encoding="utf-8")
     (tmp_path / page).write_text(text, encoding="utf-8")
     assert built(tmp_path, tmp_path / "out").returncode != 0

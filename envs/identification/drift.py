@@ -97,7 +97,7 @@ def drifts(along: tuple[Segment, ...]) -> bool:
     """True when tau of the segments moves by 10 %, or mu by a third, beyond their 80 % interval, or mu steps so far.
 
     Growth that wanders is part of the model and mu its mean. Less certainty than for a warning: a window that may drift
-    is not to be trusted (docs/calibration.md, Method, shows what either rule brings).
+    is not to be trusted (docs/records/calibration.md, The window, shows what either rule brings).
     """
     mu, tau = drift(along, [s.mu for s in along]), drift(along, [s.tau for s in along])
     return _steps([s.mu for s in along if s.mu is not None]) or any(

@@ -159,7 +159,7 @@ def _interval(value: float, influence: Array, n_parameters: int) -> tuple[float,
     an accident of a short record. Few readings at a high OD carry most of the information and correlated ones repeat
     each other, so V is itself uncertain: nu = 1.5 (sum z^2)^2 / sum z^4 * sum z^2 / V - p, at least 4, after
     Satterthwaite's effective number of readings, 3 (sum z^2)^2 / sum z^4 for normal errors, halved because their
-    correlation is estimated from the same readings. docs/calibration.md measures the coverage.
+    correlation is estimated from the same readings. docs/records/calibration.md measures the coverage.
     """
     from scipy.special import stdtrit
 
