@@ -1,11 +1,17 @@
-"""Which presets a run was started with, as its folder tells."""
+"""With which presets and values a run was started, as its folder tells."""
 
 import re
 from pathlib import Path
 
-__all__ = ["choices"]
+__all__ = ["choices", "given"]
 
 BLOCK = re.compile(r"^    choices:\n((?:      .*\n)+)", re.MULTILINE)
+
+
+def given(folder: Path) -> list[str]:
+    """The words of the command line of a run folder, `key=value` each; [] where it does not say."""
+    path = folder / ".hydra" / "overrides.yaml"
+    return re.findall(r"^- \+*(.+)$", path.read_text(encoding="utf-8"), re.MULTILINE) if path.is_file() else []
 
 
 def choices(folder: Path) -> dict[str, str]:

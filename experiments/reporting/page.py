@@ -17,6 +17,7 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from experiments.cli.choices import given
 from experiments.reporting import tables
 from experiments.reporting.curves import ERROR_UNITS
 from experiments.reporting.tables import Best, Table, number, typeset
@@ -115,14 +116,10 @@ def _other_versions() -> str:
 
 def provenance(page: Page, run: Path) -> None:
     """What was run: command, seed, versions, and the whole configuration to unfold."""
-    overrides = run / ".hydra" / "overrides.yaml"
-    given = (
-        re.findall(r"^- \+*(.+)$", overrides.read_text(encoding="utf-8"), re.MULTILINE) if overrides.is_file() else []
-    )
     config = run / "config.yaml"
     text = config.read_text(encoding="utf-8") if config.is_file() else ""
     seed = re.search(r"^seed: (\d+)", text, re.MULTILINE)
-    pairs = [("run folder", run.name), ("overrides", _near(" ".join(given)) or "none")]
+    pairs = [("run folder", run.name), ("overrides", _near(" ".join(given(run))) or "none")]
     if seed:
         pairs.append(("seed", seed[1]))
     pairs += [(PACKAGE, _version()), ("with", _other_versions())]

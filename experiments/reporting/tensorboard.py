@@ -27,6 +27,8 @@ from tensorboard.plugins.scalar import metadata as scalar
 from tensorboard.plugins.text import metadata as text
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
+from conf.presets import groups
+from experiments.cli.choices import given
 from experiments.cli.stop import undisturbed
 from experiments.reporting.curves import METRICS, PARAMETERS, Chart, Column, described
 
@@ -104,11 +106,15 @@ class Events:
     def hyper_parameters(self, values: Mapping[str, float | str], folder: Path, part: str = "") -> None:
         """A row of TensorBoard's HPARAMS table; its results are the last values of the tags in `METRICS`.
 
+        Whatever else was given on the command line is a column of its own, so that a sweep has one for what it varies.
+
         Args: values: by the names in `PARAMETERS`, or by names of one's own. folder: run folder, whose last two names
           are those of the row; rows of one name would be averaged. part: of it, where a run has several rows.
         """
+        values = {**_varied(folder), **values}
         name = "/".join([*folder.resolve().parts[-2:], *([part] if part else [])])
-        own = {key: Column(key, "of the task", True) for key in values if key not in PARAMETERS}
+        own = {k: Column(k, "of the task or the command line", not isinstance(v, str)) for k, v in values.items()
+               if k not in PARAMETERS}  # fmt: skip
         columns = [_column(key, column) for key, column in (PARAMETERS | own).items()]
         metrics = [
             api_pb2.MetricInfo(name=api_pb2.MetricName(tag=tag), display_name=title, description=described(tag))
@@ -137,6 +143,20 @@ def _chart(title: str, chart: Chart) -> layout_pb2.Chart:
         return layout_pb2.Chart(title=title, margin=layout_pb2.MarginChartContent(series=series))
     tags = [f"{tag}$" for tag in chart.lines]
     return layout_pb2.Chart(title=title, multiline=layout_pb2.MultilineChartContent(tag=tags))
+
+
+def _varied(folder: Path) -> dict[str, float | str]:
+    """Values of a run's command line by their keys; presets and where it is written are no values."""
+    words = (word.partition("=") for word in given(folder))
+    found = {key: value for key, sign, value in words if sign and key not in groups() and key != "seed"}
+    return {k: _number(v) for k, v in found.items() if not k.startswith(("hydra.", "hydra/", "~")) and k != "extend"}
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _ordered(key: str) -> str:

@@ -57,7 +57,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, words in RUNS.items():
         command = train if name in ("learning", "population") else deploy
         config, folder = command.config(words), root / name
-        folder.mkdir()
+        (folder / ".hydra").mkdir(parents=True)  # as Hydra leaves it
+        (folder / ".hydra" / "overrides.yaml").write_text("".join(f"- {word}\n" for word in words))
         frame.save_config(config, folder)
         (training.train if command is train else control.deploy)(config, folder)
     return root
@@ -172,13 +173,18 @@ def test_hparams_has_a_row_for_each_policy_with_seed_model_and_results(runs: Pat
         content = {tag: events.SummaryMetadata(tag).plugin_data.content for tag in events.summary_metadata}
         start = hparams.parse_session_start_info_plugin_data(content[hparams.SESSION_START_INFO_TAG])
         columns = hparams.parse_experiment_plugin_data(content[hparams.EXPERIMENT_TAG])
-        assert [c.display_name for c in columns.hparam_infos] == [c.title for c in PARAMETERS.values()]
+        titles = [c.display_name for c in columns.hparam_infos]
+        assert titles[: len(PARAMETERS)] == [c.title for c in PARAMETERS.values()]
+        assert all("." in title or title in ("n_agents", "eval_every") for title in titles[len(PARAMETERS) :])
         assert [c.name for c in columns.hparam_infos] == sorted(c.name for c in columns.hparam_infos)
         assert {m.name.tag: m.display_name for m in columns.metric_infos} == METRICS
         names = {c.name: c.display_name for c in columns.hparam_infos}
         given = {names[key]: v.string_value or v.number_value for key, v in start.hparams.items()}
         rows[start.group_name.removeprefix(f"{runs.name}/")] = (given, events)
     assert set(rows) == {*RUNS, "population/seed0000", "population/seed0001"} - {"population"}
+    given, _ = rows["pi"]
+    assert (given["bench.period_s"], given["safety.ml_per_run"], given["scenario.minutes"]) == (120.0, 3.0, "[20]")
+    assert not {"controller", "backend.seed"} & given.keys()  # a preset has its own column; nobody gave the other here
     given, events = rows["learning"]
     summary = json.loads((runs / "learning" / "summary.json").read_text())
     assert (given["seed"], given["mu, 1/min"], given["tau"]) == (3.0, 0.03, pytest.approx(1 / 3))

@@ -1,0 +1,204 @@
+"""Learners side by side on the tasks whose exact optimum is known: `python -m tests.studies.learners`.
+
+Every policy is the last iterate of one training, scored noise-free on the task's reported grid (`Evaluation`), the
+same for all: regret, what it costs beyond the optimum, and the error at rest at the worst setpoint. Rivals have their
+own defaults and normalised observations; `dqn_paper` has what the paper states, as far as that library knows it.
+"""
+
+import json
+import logging
+import statistics
+import time
+from concurrent.futures import as_completed
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from conf.schema import check, setting
+from experiments.cli import files
+from experiments.cli.stop import Workers
+from experiments.reporting.tables import number
+from experiments.train import main as train
+from experiments.training import build, tasks
+from experiments.training.evaluation import Act, Evaluation
+from experiments.training.session import Session
+from tests.entry import command
+
+__all__ = ["LearnersConfig", "learners", "main"]
+
+log = logging.getLogger(__name__)
+
+TASKS = {
+    "sim": "Bioreactor-v0", "relative": "Relative-v0", "coculture": "Coculture-v0",
+    "coculture_preview": "CoculturePreview-v0",
+}  # fmt: skip
+RIVALS: dict[str, tuple[str, dict[str, Any]]] = {
+    "dqn": ("SB3 DQN", {}),
+    "dqn_paper": ("SB3 DQN, the paper's settings", {
+        "learning_rate": 1e-3, "buffer_size": 10_000, "learning_starts": 500, "batch_size": 64, "gamma": 0.99,
+        "train_freq": 1, "target_update_interval": 500, "exploration_fraction": 0.5, "exploration_final_eps": 0.05,
+    }),
+    "qrdqn": ("sb3-contrib QR-DQN", {}),
+    "ppo": ("SB3 PPO", {}),
+    "a2c": ("SB3 A2C", {}),
+}  # fmt: skip
+WITHOUT = {
+    "value_root": ["agent.value_root=0", "agent.huber=1", "agent.reward_scale=10"],
+    "hindsight": ["agent.hindsight_share=0"],
+    "falling rate": ["agent.learning_rate_end=null"],
+}
+COMMAND = "python -m tests.studies.learners"
+OURS, LAW = "this program's DQN", "one look ahead, one line"
+COLUMNS = ("task", "policy", "steps", "regret, %", "worst seed", "error at rest", "CPU s")
+
+
+@dataclass(frozen=True)
+class LearnersConfig:
+    """Which trainings."""
+
+    tasks: tuple[str, ...] = setting(tuple(TASKS), "to learn", choices=tuple(TASKS), some=True)
+    rivals: tuple[str, ...] = setting(tuple(RIVALS), "beside our agent", choices=tuple(RIVALS))
+    steps: tuple[int, ...] = setting((10_000,), "of each training", within=(1000, 10_000_000), some=True)
+    long: tuple[str, ...] = setting(("ppo",), "rivals that are trained for `long_steps`, too", choices=tuple(RIVALS))
+    long_steps: int = setting(100_000, "of those", within=(1000, 10_000_000))
+    without: tuple[str, ...] = setting(
+        tuple(WITHOUT),
+        "parts that our agent is left without, one at a time, on coculture_preview",
+        choices=tuple(WITHOUT),
+    )
+    seeds: int = setting(5, "of each", within=(1, 1000))
+    workers: int = setting(0, "processes; 0 for one per core", within=(0, 256))
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training. steps: 0 for the agent's own."""
+
+    task: str
+    learner: str
+    steps: int
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its file."""
+        return f"{self.task} {self.learner} {self.steps} {self.seed}".replace(" ", "_")
+
+
+def jobs(c: LearnersConfig) -> list[Job]:
+    """All trainings, short ones first."""
+    kinds = [(t, r, n) for n in sorted(c.steps) for t in c.tasks for r in ("ours", *c.rivals)]
+    kinds += [(t, "ours", 0) for t in c.tasks]
+    kinds += [("coculture_preview", f"without {part}", 0) for part in c.without if "coculture_preview" in c.tasks]
+    kinds += [(t, r, c.long_steps) for t in c.tasks for r in c.long]
+    return [Job(*kind, seed) for kind in dict.fromkeys(kinds) for seed in range(c.seeds)]
+
+
+@cache
+def evaluation(task: str) -> tuple[tasks.Task, Evaluation]:
+    """Of the reported grid; the optimum of some tasks takes half a minute."""
+    known = tasks.of(train.config([f"env={task}"]).env)
+    return known, Evaluation(known, known.report_grid())
+
+
+def run(job: Job, folder: Path) -> dict[str, float]:
+    """Regret in per cent, error at rest, CPU seconds and steps of one training; kept in a file."""
+    import torch
+
+    torch.set_num_threads(1)
+    began = time.process_time()
+    steps, act = ours(job, folder / job.name) if job.learner not in RIVALS else rival(job)
+    spent = time.process_time() - began
+    found = evaluation(job.task)[1](act, 1)
+    regret, steady = float(found.regret_pct[0]), float(found.steady_abs_error[0])
+    result = {"regret_pct": regret, "steady": steady, "cpu_s": spent, "steps": float(steps)}
+    files.write_json(folder / f"{job.name}.json", result)
+    return result
+
+
+def ours(job: Job, folder: Path) -> tuple[int, Act]:
+    """Our agent as `train env=TASK` trains it."""
+    words = [f"env={job.task}", f"seed={job.seed}", "threads=1", "eval_every=100000000"]
+    words += [f"agent.total_steps={job.steps}"] * bool(job.steps)
+    config = train.config([*words, *WITHOUT.get(job.learner.removeprefix("without "), [])])
+    folder.mkdir(parents=True, exist_ok=True)
+    session = Session(config, folder)
+    session.run()
+    session.writer.close()
+    return config.agent.total_steps, build.act_with(session.agents.network, session.agents.weights())
+
+
+def rival(job: Job) -> tuple[int, Act]:
+    """A rival with observations normalised by what it met."""
+    import sb3_contrib
+    import stable_baselines3
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    _, settings = RIVALS[job.learner]
+    kind = {"dqn": "DQN", "dqn_paper": "DQN", "qrdqn": "QRDQN", "ppo": "PPO", "a2c": "A2C"}[job.learner]
+    learner = getattr(sb3_contrib if kind == "QRDQN" else stable_baselines3, kind)
+    copies = make_vec_env(f"envs:{TASKS[job.task]}", 1, seed=job.seed)
+    normalised = VecNormalize(copies, norm_reward=False)
+    model = learner("MlpPolicy", normalised, seed=job.seed, device="cpu", **settings)
+    model.learn(job.steps)
+
+    def act(observation: Any) -> Any:
+        rows = normalised.normalize_obs(observation[0].astype(np.float32))
+        return model.predict(rows, deterministic=True)[0][None]
+
+    return job.steps, act
+
+
+def law(task: str) -> list[str]:
+    """The row of the one-line law."""
+    known, report = evaluation(task)
+    found = report(known.myopic, 1)
+    regret, steady = float(found.regret_pct[0]), float(found.steady_abs_error[0])
+    return [TASKS[task], LAW, "–", number(abs(round(regret, 3))), "–", number(steady), "–"]
+
+
+def table(c: LearnersConfig, found: dict[Job, dict[str, float]]) -> list[list[str]]:
+    """Rows of what is finished with all its seeds: of each task by regret, the lowest first."""
+    rows: list[tuple[int, float, list[str]]] = []
+    for kind in dict.fromkeys((job.task, job.learner, job.steps) for job in jobs(c)):
+        each = [found[job] for job in (Job(*kind, seed) for seed in range(c.seeds)) if job in found]
+        if len(each) < c.seeds:
+            continue
+        task, learner, _ = kind
+        name = RIVALS[learner][0] if learner in RIVALS else OURS + f" {learner}".replace(" ours", "")
+        regrets = [e["regret_pct"] for e in each]
+        middle = statistics.median(regrets)
+        cells = [number(middle), number(max(regrets)), number(statistics.median(e["steady"] for e in each)),
+                 number(statistics.median(e["cpu_s"] for e in each), 2)]  # fmt: skip
+        rows.append((c.tasks.index(task), middle, [TASKS[task], name, f"{each[0]['steps']:.0f}", *cells]))
+    rows += [(k, float(row[3]), row) for k, row in ((k, law(task)) for k, task in enumerate(c.tasks))]
+    return [row for *_, row in sorted(rows, key=lambda entry: entry[:2])]
+
+
+def learners(c: LearnersConfig, folder: Path) -> None:
+    """All trainings that have no result yet, and the table of those that have."""
+    kept = folder / "jobs"
+    kept.mkdir(parents=True, exist_ok=True)
+    wanted = jobs(c)
+    found = {j: json.loads(path.read_text()) for j in wanted if (path := kept / f"{j.name}.json").is_file()}
+    with Workers(c.workers) as executor:
+        running = {executor.submit(run, job, kept): job for job in wanted if job not in found}
+        for done in as_completed(running):
+            job = running[done]
+            found[job] = done.result()
+            log.info("%d of %d, %s: regret %.3g %%", len(found), len(wanted), job.name, found[job]["regret_pct"])
+    files.write_json(folder / "table.json", {"command": COMMAND, "columns": COLUMNS, "rows": table(c, found)})
+
+
+main = command(__file__, LearnersConfig(), learners)
+
+
+if __name__ == "__main__":
+    main()

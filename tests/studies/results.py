@@ -1,0 +1,92 @@
+"""Tables of results on the pages, from the files that commands leave: `python -m tests.studies.results`.
+
+  python -m tests.studies.results --check            every table equals its file
+  python -m tests.studies.results NAME=RUN           RUN/table.json becomes docs/results/NAME.json, and the pages follow
+
+A table stands between `<!-- result NAME -->` and `<!-- end -->`; its file holds columns and rows as they are shown,
+and command, commit and date of the run.
+"""
+
+import json
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from experiments.cli import files
+from experiments.reporting.tables import markdown
+
+__all__ = ["adopt", "differences", "main"]
+
+ROOT = Path(__file__).parents[2]
+BLOCK = re.compile(r"(<!-- result (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+
+
+def pages(docs: Path) -> Iterator[Path]:
+    """Every page."""
+    yield from sorted(docs.rglob("*.md"))
+
+
+def shown(stored: dict[str, Any]) -> str:
+    """What stands on a page of a file: the table, and where it is from."""
+    source = f"`{stored['command']}`, commit {stored['commit']}, {stored['date']}."
+    return f"\n{markdown(stored['columns'], stored['rows'])}\n{source}\n\n"
+
+
+def differences(docs: Path) -> list[str]:
+    """What of pages and files does not agree, a line each."""
+    stored = {path.stem: json.loads(path.read_text("utf-8")) for path in sorted((docs / "results").glob("*.json"))}
+    found, used = [], set()
+    for page in pages(docs):
+        for _, name, text, _ in BLOCK.findall(page.read_text("utf-8")):
+            used.add(name)
+            if name not in stored:
+                found.append(f"{page.name}: result {name}: no file docs/results/{name}.json")
+            elif text != shown(stored[name]):
+                found.append(f"{page.name}: result {name}: the page is not what docs/results/{name}.json says")
+    return found + [f"docs/results/{name}.json: on no page" for name in stored if name not in used]
+
+
+def adopt(docs: Path, name: str, run: Path, commit: str, date: str) -> None:
+    """The table of a run becomes the result of this name, on every page that shows it.
+
+    Raises: OSError, ValueError or LookupError for a run that left no table.
+    """
+    table = json.loads((run / "table.json").read_text("utf-8"))
+    content = {"command": table["command"], "commit": commit, "date": date,
+               "columns": table["columns"], "rows": table["rows"]}  # fmt: skip
+    (docs / "results").mkdir(exist_ok=True)
+    files.write_json(docs / "results" / f"{name}.json", content)
+    for page in pages(docs):
+        text = page.read_text("utf-8")
+        new = BLOCK.sub(lambda m: m[1] + shown(content) + m[4] if m[2] == name else m[0], text)
+        if new != text:
+            page.write_text(new, encoding="utf-8")
+
+
+def main(arguments: list[str], docs: Path = ROOT / "docs") -> int:
+    """Entry point; returns the status: 1 where something differs or cannot be read."""
+    wrong: list[str] = []
+    for argument in (a for a in arguments if a != "--check"):
+        name, given, run = argument.partition("=")
+        if not given:
+            print(__doc__)
+            return 2
+        head = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+        commit = subprocess.run(head, capture_output=True, text=True, check=True).stdout.strip()
+        try:
+            adopt(docs, name, Path(run), commit, time.strftime("%Y-%m-%d"))
+        except (OSError, ValueError, LookupError) as error:
+            wrong.append(f"{argument}: no table.json of a study ({error})")
+    wrong += differences(docs)
+    print(
+        "\n".join(wrong) if wrong else f"{len(list((docs / 'results').glob('*.json')))} results, all as the pages say"
+    )
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
