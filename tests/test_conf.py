@@ -421,5 +421,45 @@ def test_a_group_or_recipe_of_another_command_names_the_right_one(name, override
         importlib.import_module(f"experiments.{name}").main.config([override])
 
 
+@pytest.mark.parametrize(
+    ("name", "override", "line"),
+    [
+        ("train", "agent=tuned,papr,paper", "agent=papr: no such option; allowed: "),
+        ("deploy", "controller=pi,mpc,pid", "controller=pid: no such option; allowed: "),
+        ("train", "+experiment=smoke,paper", "experiment=paper: a recipe of benchmark; python -m"),
+    ],
+)
+def test_each_preset_that_a_sweep_goes_over_is_judged_before_a_job_begins(name, override, line):
+    with pytest.raises(frame.UserError, match=f"^{re.escape(line)}"):
+        frame.normalise([override], name)
+
+
+@pytest.mark.parametrize("order", [("{}", "tuned"), ("tuned", "{}"), ("paper", "{}", "tuned")])
+def test_a_file_of_one_s_own_stands_anywhere_among_the_presets_of_a_sweep(order, tmp_path, monkeypatch):
+    monkeypatch.setattr(presets, "_added", {})
+    (tmp_path / "mine.yaml").write_text("hidden: [8]\n", encoding="utf-8")
+    said = ",".join(order)
+    assert frame.normalise([f"agent={said.format(tmp_path / 'mine.yaml')}"], "train") == [
+        f"agent={said.format('mine')}"
+    ]
+    assert presets.load("agent/mine") == {"hidden": [8]}
+
+
+@pytest.mark.parametrize("where", [0, 1, 2])
+def test_a_value_beside_resume_is_refused_wherever_it_is_typed(where, tmp_path, monkeypatch):
+    """What Hydra is told, and nothing else, stands beside it."""
+    goes_on = []
+    monkeypatch.setattr(sys, "argv", ["train"])
+    monkeypatch.setattr(frame.Command, "_hydra", lambda command: goes_on.append(command.name))
+    (tmp_path / "config.yaml").write_text("seed: 3\n", encoding="utf-8")
+    given = [f"resume={tmp_path}", "hydra.verbose=true"]
+    main._answer(given)
+    assert goes_on == ["train"]
+    line = f"seed=7: a resumed run takes every value from {tmp_path}/config.yaml; drop it"
+    with pytest.raises(frame.UserError, match=f"^{re.escape(line)}$"):
+        main._answer([*given[:where], "seed=7", *given[where:]])
+    assert goes_on == ["train"]
+
+
 def test_a_recipe_says_which_command_it_is_for():
     assert {presets.owner(f"experiment/{option}") for option in options("experiment")} == {"benchmark", "train"}

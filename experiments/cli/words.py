@@ -90,8 +90,8 @@ def normalise(argv: Sequence[str], command: str) -> list[str]:
 
 
 def _with_preset_files(arg: str) -> str:
-    """`group=FILE.yaml` as `group=FILE`, a preset from here on."""
-    match = re.match(r"^(\+?([\w/]+)=)(.*\.yaml)$", arg)
+    """`group=FILE.yaml` as `group=FILE`, a preset from here on; so is each of several that a sweep goes over."""
+    match = re.match(r"^(\+?([\w/]+)=)(.*\.yaml\b.*)$", arg)
     if match is None or match[2] not in presets.groups():
         return arg
     return match[1] + ",".join(extensions.preset_file(match[2], option) for option in match[3].split(","))

@@ -427,6 +427,16 @@ def test_bounds_of_an_estimator_depend_on_the_od_and_return_from_a_file() -> Non
     assert EstimateBounds.of(json.loads(json.dumps(asdict(bounds)))) == bounds
 
 
+def test_a_quick_look_at_a_policy_leaves_the_certificate_beside_it(tmp_path: Path) -> None:
+    policy.save(tmp_path / "mine.npz", laws.law())
+    (tmp_path / "mine.certificate.json").write_text("of an hour")
+    words = [f"policy={tmp_path / 'mine.npz'}", "quick=true", "trajectories=0", "setpoints=[0.4,0.8]"]
+    (tmp_path / "run").mkdir()
+    command.body(command.main.config(words), tmp_path / "run")
+    assert certificate.load(tmp_path / "run" / "certificate.json").config.quick
+    assert (tmp_path / "mine.certificate.json").read_text() == "of an hour"
+
+
 def test_the_shipped_policy_has_its_certificate() -> None:
     """Proven again, and attacked: by few in every case, by as many as it takes to reach the ends of bands in six."""
     shipped = find_policy("shipped")

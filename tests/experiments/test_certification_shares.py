@@ -90,6 +90,18 @@ def test_doses_that_scatter_take_more_or_less_and_a_wrong_gain_is_another_unit_o
         np.testing.assert_allclose(given.range(at), [[np.log(0.05 / 0.6) / b, np.log(1.5 / 0.6) / b]])
 
 
+def test_a_half_width_in_od_is_that_of_the_pump_as_strong_as_it_may_be() -> None:
+    """Half a period of full pump above 0.6: OD 0.6 exp(0.06 / 2), and exp(1.25 * 0.06 / 2) of a gain that is 25 % off.
+
+    Doses that scatter leave the unit of the error as it is.
+    """
+    given, off = single(0.5), bounds(gain=0.25)
+    slow, spread = ShareCase("", off, 0.6, slow=True), ShareCase("", off, 0.6)
+    assert given.in_od(slow, 0.5) == pytest.approx(0.6 * np.exp(0.0375) - 0.6)
+    assert given.in_od(spread, 0.5) == pytest.approx(0.6 * np.exp(0.03) - 0.6)
+    assert given.in_od(replace(slow, setpoint=None), 0.5) is None
+
+
 def by_brute_force(strip: tuple[float, float], case: ShareCase, step: float = 0.001) -> tuple[float, float]:
     """The band of the one-line law from a grid of true errors of e, every disturbance tried at each of them.
 

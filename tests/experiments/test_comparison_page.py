@@ -129,6 +129,7 @@ def test_a_cell_that_the_policy_loses_to_two_is_lost_once() -> None:
     ise = {"0.8": (0.05, 0.04, 0.03), "0.65": (0.02, 0.04, 0.03), "0.5": (0.05, 0.04, 0.06)}
     itae = {"0.8": (5.0, 6.0, 7.0), "0.65": (9.0, 8.0, 10.0), "0.5": (5.0, 6.0, 7.0)}
     sure = {("pi", "0.8", "ise"), ("mpc", "0.8", "ise"), ("pi", "0.65", "itae")}
+    beyond = {"0.8": -0.015, "0.65": -0.012, "0.5": -0.018}
     rows, paired = [], []
     for window in ise:
         for k, law in enumerate(("dqn", "pi", "mpc")):
@@ -143,14 +144,17 @@ def test_a_cell_that_the_policy_loses_to_two_is_lost_once() -> None:
                     "ci95": [-0.02, -0.01 if known else 1.0],
                 }
                 if law != "dqn":
-                    paired.append({**at, "against": "dqn", "metric": metric, "difference": -0.015, **said})
+                    paired.append({**at, "against": "dqn", "metric": metric, "difference": beyond[window], **said})
             rows.append(row)
     keys = ("controller", "plant", "scenario", "window")
     summary = {"rows": rows, "paired": paired, "beside_paper": [{k: r[k] for k in keys} for r in rows]}
     out = Page("", "")
-    page._paper_section(out, summary)
+    out.section("")
+    page._beside_paper(out, summary)
     (said,) = [content for _, blocks in out.sections for kind, content in blocks if kind == "verdict"]
     assert said["claim"].startswith("Of 6 cells here, the learned policy (dqn) loses 3, 2 of them with a 95 %")
     assert len(said["items"]) == 4
     assert said["items"][0].startswith("OD 0.8, ISE: dqn 0.05 loses to mpc 0.03; mpc minus dqn: -0.015, 95 % -0.02 to")
+    each = [item.split(" minus dqn: ")[1].split(",")[0] for item in said["items"]]
+    assert each == ["-0.015", "-0.015", "-0.012", "-0.018"]
     assert [item.endswith("which holds 0.") for item in said["items"]] == [False, False, False, True]

@@ -8,13 +8,17 @@ from functools import cache
 import numpy as np
 import pytest
 
+from dqn import policy
+from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from experiments.benchmark import _schema, benchmark
 from experiments.cli import frame
 from experiments.comparison import statistics
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.run import policies_of, with_pair
-from experiments.comparison.trials import Cell, ShareTrial, cells, run_cell
+from experiments.comparison.trials import Cell, ShareTrial, calibrate, cells, run_cell
+from experiments.laws.share.estimator import FACTOR, OFFSET, CompositionEstimator, CompositionEstimatorConfig
+from tests.experiments.test_deploy import inverse_policy
 
 SHORT = (
     "replicates=3", "workers=1", "studies.composition.scenarios=[ratio_steps]",
@@ -64,6 +68,20 @@ def test_errors_by_hand():
     assert row["band_covers"] == 1.0
     assert (row["od_min"], row["od_mean"], row["od_max"]) == (0.5, 0.5, 0.5)
     assert math.isnan(row["ratio_abs_error_last_day"])
+
+
+def test_a_calibrated_estimator_begins_with_each_reactor_s_own_sensor():
+    """The same 2 % and 5 counts for everybody: twelve reactors whose factors differ by more than a fifth."""
+    plant = Plant(config().plants["coculture_mixed"], 12, np.random.default_rng(3))
+    estimator = CompositionEstimator(CompositionEstimatorConfig())
+    estimator.reset(12)
+    calibrate(estimator, plant, 5)
+    known, truth = estimator.mean, plant.draws
+    factor = truth["fluorescence_factor"]
+    assert np.ptp(factor) > 0.2
+    np.testing.assert_allclose(known[..., FACTOR] / factor[:, None], 1.0, atol=4 * 0.02)
+    np.testing.assert_allclose(known[..., OFFSET] - truth["fluorescence_offset"][:, None], 0.0, atol=4 * 5.0)
+    assert len(np.unique(known[..., FACTOR] / factor[:, None])) == 12
 
 
 def test_the_last_two_hours_are_those_of_every_window():
@@ -129,6 +147,19 @@ def test_who_is_told_and_who_is_calibrated_makes_a_difference():
     assert np.abs(trial("receding").share - trial("receding", announced=False).share).max() > 1e-3
     sure, unsure = (trial("pi", "coculture_mixed", calibrated=c) for c in (True, False))
     assert (sure.high - sure.low)[:, -1].mean() < (unsure.high - unsure.low)[:, -1].mean()
+
+
+def test_a_policy_that_is_named_holds_the_density_beside_a_share(tmp_path):
+    """Here it lets the culture grow: the action of no dose is worth more than all others."""
+    given = inverse_policy()
+    worth = np.array([1e3, *given.biases[1][1:]], dtype=np.float32)
+    policy.save(tmp_path / "mine.npz", replace(given, biases=(given.biases[0], worth)))
+    mine = replace(config(), policies={"dqn": str(tmp_path / "mine.npz")})
+    at = cell("proportional")._replace(density="dqn")
+    ours, shipped = run_cell(mine, at, None), run_cell(config(), at, None)
+    assert (np.diff(ours.od, axis=1) > 0.0).all()
+    assert ours.od[:, -1].min() > 1.5
+    assert 0.4 < shipped.od[:, -1].min() < shipped.od[:, -1].max() < 0.6
 
 
 def test_the_recipe_asks_for_every_law_on_every_plant():

@@ -180,7 +180,9 @@ def test_hparams_has_a_row_for_each_policy_with_seed_model_and_results(runs: Pat
         assert {m.name.tag: m.display_name for m in columns.metric_infos} == METRICS
         names = {c.name: c.display_name for c in columns.hparam_infos}
         given = {names[key]: v.string_value or v.number_value for key, v in start.hparams.items()}
-        rows[start.group_name.removeprefix(f"{runs.name}/")] = (given, events)
+        above, _, name = start.group_name.partition("/")
+        assert above == runs.name  # job 0 of another sweep has a row of its own
+        rows[name] = (given, events)
     assert set(rows) == {*RUNS, "population/seed0000", "population/seed0001"} - {"population"}
     given, _ = rows["pi"]
     assert (given["bench.period_s"], given["safety.ml_per_run"], given["scenario.minutes"]) == (120.0, 3.0, "[20]")

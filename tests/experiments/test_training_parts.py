@@ -103,6 +103,21 @@ def test_the_policy_that_flies_is_of_least_merit_also_where_another_seed_has_les
         assert (metadata["seed"], metadata["regret_pct"], metadata["trained_steps"]) == (seed, regret, step)
 
 
+def test_the_summary_names_the_seed_of_the_policy_that_flies(tmp_path: Path) -> None:
+    """Here not the one with the least regret on the reported grid, whichever that is."""
+    agent, env = replace(SMALL, total_steps=60), EnvConfig(episode_steps=24, setpoints=(0.3, 0.7))
+    one = session(tmp_path / "run", n_agents=3, seed=5, agent=agent, env=env, eval_every=30)
+    one.run()
+    least = int(one.report()[1].regret_pct.argmin())
+    other = (least + 1) % 3
+    one.best.merit[:] = [4.0 - 3.0 * (i == other) for i in range(3)]
+    train_run._finish(one)
+    one.writer.close()
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["seeds"], summary["policy_seed"]) == ([5, 6, 7], 5 + other)
+    assert policy.load(tmp_path / "run" / "policy.npz").metadata["seed"] == 5 + other
+
+
 @pytest.mark.parametrize(
     ("regret", "steady", "said"),
     [
