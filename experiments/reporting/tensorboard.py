@@ -113,8 +113,11 @@ class Events:
         """
         values = {**_varied(folder), **values}
         name = "/".join([*folder.resolve().parts[-2:], *([part] if part else [])])
-        own = {k: Column(k, "of the task or the command line", not isinstance(v, str)) for k, v in values.items()
-               if k not in PARAMETERS}  # fmt: skip
+        own = {
+            key: Column(key, "of the task or the command line", not isinstance(value, str))
+            for key, value in sorted(values.items())
+            if key not in PARAMETERS
+        }
         columns = [_column(key, column) for key, column in (PARAMETERS | own).items()]
         metrics = [
             api_pb2.MetricInfo(name=api_pb2.MetricName(tag=tag), display_name=title, description=described(tag))
