@@ -1,5 +1,6 @@
 """A run against its model: errors by hand, plants that left the model at a known time, plants that never did."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -86,6 +87,20 @@ def test_a_pump_of_another_flow_is_told_throughout(flow: float, sign: float, wor
         assert sum(p.low <= flow <= p.high for p in gains) >= len(gains) - 1  # one in twenty is wrong by chance
         assert "throughout" in found.verdict()
         assert word in found.verdict() or "the pump's gain is off" in found.verdict()
+
+
+def test_net_growth_is_per_minute_also_where_rows_are_two_minutes_apart() -> None:
+    """A culture left to itself grows by .004/min where the model says .003: a third of its growth is missed."""
+    time = np.arange(0.0, 300.0, 2.0)
+    noise = 1.0 + 0.003 * np.random.default_rng(5).standard_normal(time.size)
+    grown = Series(time, 0.3 * np.exp(0.004 * time) * noise, np.zeros(time.size), np.arange(time.size))
+    found = agreement(grown, 0.003, 1.0 / 3.0)
+    for net in found.net.found:
+        assert net is not None
+        assert net.value == pytest.approx(0.001, abs=1e-4)
+        assert net.low < 0.001 < net.high
+    said = r"the predicted net growth is off by 10 % or more throughout, by \+3\d % at the end"
+    assert re.search(said, found.verdict())
 
 
 def test_a_short_run_says_that_it_is_too_short() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from envs.coculture.optimum import Grid, cost_to_go, transitions
 from envs.coculture.pair import PairConfig, SpeciesConfig, named_pair
-from envs.coculture.task import CocultureConfig, CocultureVectorEnv, limits
+from envs.coculture.task import CocultureConfig, CocultureVectorEnv, advance, limits
 from envs.plant.plant import Plant, PlantConfig, of_pair
 from tests.envs.test_plant import preset
 
@@ -159,3 +159,12 @@ def test_plant_task_and_optimum_are_of_the_pair() -> None:
     model = transitions(config, Grid(41, 5, 5))
     value = cost_to_go(model, np.full((6, 1), 0.7))
     assert value[0].min() < 1e-3 < value[0].max()
+
+
+def test_the_second_species_of_the_task_follows_with_the_lag_of_its_own_pair() -> None:
+    """WARM's at 28 degC, where it grows by .68/h and the other by .6/h: of a gap e^-2 is left after 90 min."""
+    config, start = CocultureConfig(pair=WARM, ambient_c=15.0), np.array([[0.7, 28.0, 0.3]])
+    ((logit, degc, rate),) = advance(config, start, np.array(28.0), 90.0)
+    left = np.exp(-2.0)
+    assert (degc, rate) == (pytest.approx(28.0), pytest.approx(0.68 - 0.38 * left))
+    assert logit == pytest.approx(0.7 + 1.5 * 0.08 - 0.38 * 0.75 * (1.0 - left), abs=1e-4)

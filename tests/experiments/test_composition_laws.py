@@ -139,6 +139,15 @@ def test_the_midpoint_law_is_half_way_at_the_change(now, following):
     assert abs(shares[-1] - following) < 0.01
 
 
+def test_a_midpoint_law_that_has_begun_does_not_turn_back_nor_does_one_that_is_resumed():
+    """From .3 to .7 in 90 min is late, and from .5 in 85 min early: one that had not begun would warm it."""
+    begun, resumed, other = law("midpoint"), law("midpoint"), law("midpoint")
+    assert begun.act(seen(logit(0.3)), asked(0.3, 0.7, 90.0), *at(0))[0] == 29.0
+    memory.restore(resumed, json.loads(json.dumps(memory.save(begun))), memory.words("composition"))
+    targets = [each.act(seen(0.0), asked(0.3, 0.7, 85.0), *at(5))[0] for each in (begun, resumed, other)]
+    assert targets == [29.0, 29.0, 36.0]
+
+
 def test_errors_of_curves_and_thermometer_reach_the_laws():
     """A culture that is on its setpoint with its rates in balance stays there, whatever is off by how much."""
     off = replace(seen(np.zeros(1)), error_e=np.array([0.2]), error_p=np.array([-0.1]), thermometer=np.array([0.5]))

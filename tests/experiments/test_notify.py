@@ -190,11 +190,12 @@ def test_a_command_that_hangs_is_ended_with_its_children(tmp_path: Path) -> None
         time.sleep(0.02)
 
 
-def test_what_a_hook_answers_is_said_without_the_address(caplog) -> None:  # type: ignore[no-untyped-def]
-    server = Server(status=403)
+@pytest.mark.parametrize("status", [301, 403, 500])  # one who is elsewhere has not heard either
+def test_what_a_hook_answers_is_said_without_the_address(status: int, caplog) -> None:  # type: ignore[no-untyped-def]
+    server = Server(status=status)
     hook = Hook(server.url)
     assert hook.name == "http://127.0.0.1/…"
-    assert hook.send(b"{}\n") == "status 403"
+    assert hook.send(b"{}\n") == f"status {status}"
     server.shutdown()
     server.server_close()
     assert hook.send(b"{}\n") == "ConnectError"

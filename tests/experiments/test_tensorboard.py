@@ -4,6 +4,8 @@ import csv
 import io
 import json
 import re
+import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from tensorboard.plugins.hparams import metadata as hparams
 from experiments.cli import frame
 from experiments.control import run as control
 from experiments.deploy import main as deploy
+from experiments.record.record import Record
 from experiments.reporting.curves import CURVES, METRICS, PARAMETERS, POPULATION, described
 from experiments.reporting.tensorboard import Events, PopulationWriter
 from experiments.train import main as train
@@ -239,6 +242,24 @@ def test_a_resumed_training_keeps_what_is_older_than_its_checkpoint_and_that_of_
     for where, name, n in ((".", f"{tag}/max", 1), ("agents/seed0004", tag, 0), ("agents/seed0009", tag, 1)):
         events = shown.EventAccumulator(str(tmp_path / where)).Reload()
         assert curve(events, name).tolist() == [[k, each[n]] for k, each in curves.items()]
+
+
+def test_a_resumed_run_keeps_the_curves_of_all_reactors_where_one_stopped_early(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """M1 has three rows, M0 those of the whole run; files of events are read by their second."""
+    folder = tmp_path / "run"
+    shutil.copytree(runs / "pi", folder)
+    (folder / "journal.jsonl").unlink()  # or M1's rows were completed from it
+    stopped = folder / "recordings" / "M1.csv"
+    stopped.write_text("".join(stopped.read_text().splitlines(keepends=True)[:4]))
+    later = time.time() + 10.0
+    monkeypatch.setattr("time.time", lambda: later)
+    Record(folder, ("M0", "M1"), fsync=False).close()
+    events = shown.EventAccumulator(str(folder / "reactors" / "M0")).Reload()
+    recorded = read_recording(folder / "recordings" / "M0.csv")
+    assert recorded.od.size > 9
+    assert curve(events, "culture/od")[:, 0].tolist() == recorded.time_min.tolist()
 
 
 def test_a_picture_has_its_size(runs: Path) -> None:

@@ -12,14 +12,16 @@ import pytest
 from envs.bench import Bench
 from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError
+from hardware.pioreactor import reactors as pioreactors
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
 from hardware.pioreactor.jobs import request
 from hardware.pioreactor.mailbox import Mailbox
 from hardware.pioreactor.preflight import _unit
 from hardware.pioreactor.reactors import PioreactorReactors
+from hardware.pioreactor.resume import replay
 from hardware.pioreactor.versions import Facts, facts
 from hardware.rig import family as rig
-from tests.hardware.pioreactor_lab import Lab
+from tests.hardware.pioreactor_lab import UNIT, Lab, World
 
 
 @pytest.fixture
@@ -56,6 +58,20 @@ def test_what_a_reboot_ended_is_started_again_and_nothing_is_dosed_without_it(la
     lab.until(lambda: lab.fault is None, 30.0)
     lab.sample()
     assert lab.dose(0.5) == 0.5
+
+
+@pytest.mark.parametrize("rebooted", [False, True])
+def test_a_resumed_run_heats_to_what_was_set_last_and_not_to_the_first_temperature(monkeypatch, lab, rebooted):
+    """30 degC by its config, 33.4 by the scenario when it was killed."""
+    lab.station.set_temperature(33.4)
+    lab.until(lambda: lab.station._box.target == 33.4, 10.0)
+    world = World() if rebooted else lab.world
+    world.box = None
+    again = Lab(monkeypatch, world, stirring=True, thermostat=True, temperature=30.0)
+    again.begin(replay(lab.rows)[UNIT], 60.0)
+    again.wait(10.0)
+    assert again.station._box.target == 33.4
+    assert started(again, "temperature_automation")[-1]["target-temperature"] == (33.4 if rebooted else 30.0)
 
 
 @pytest.mark.parametrize("job", ["stirring", "temperature_automation"])
@@ -228,6 +244,18 @@ def test_a_photodiode_is_judged_by_the_channel_of_its_own_unit(channel: str | No
     checks = {check.name: check for check in found}
     assert (checks["pio02 photodiode"].ok, checks["pio02 volume"].ok) == (ok, True)
     assert checks["pio02 photodiode"].detail == f"{channel or '2'} of 1 at 90 degrees"
+
+
+@pytest.mark.parametrize(("tube", "ok"), [("13.8", True), ("30", False)])
+def test_a_tube_is_judged_by_the_volume_of_its_own_unit(tube: str, ok: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    web: Any = Said({"1": "90", "2": "REF"}, tube)
+    monkeypatch.setattr(pioreactors, "Web", lambda *_given: web)
+    monkeypatch.setattr(pioreactors, "Cluster", lambda *_given: SimpleNamespace(holder=lambda name: ""))
+    bench = Bench(volume_ml=30.0, volumes_ml={"pio02": 14.0})
+    units = PioreactorReactors(PioreactorConfig(reactors=("pio01", "pio02")), VirtualClock(), bench=bench)
+    checks = {check.name: check for check in _unit(units.stations[1], units, web)}
+    found = checks["pio02 volume"]
+    assert (found.ok, found.detail) == (ok, f"{tube} mL in its settings, 14 here")
 
 
 def test_a_rig_has_vials_of_the_volume_of_each_unit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
