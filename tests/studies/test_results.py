@@ -18,18 +18,18 @@ def test_a_run_s_table_comes_to_its_place_and_what_differs_is_named(
     docs, run = tmp_path / "docs", tmp_path / "run"
     (docs / "records").mkdir(parents=True)
     run.mkdir()
-    page = docs / "records" / "a.md"
+    page = (docs / "records" / "one").with_suffix(".md")
     page.write_text("# A\n\n<!-- result one -->\nold\n<!-- end -->\n\n<!-- result two -->\nkept<!-- end -->\nrest\n")
     table = {"command": "python -m x", "columns": ["law", "error"], "rows": [["pi", ".25"], ["mpc", ".5"]]}
     (run / "table.json").write_text(json.dumps(table))
     assert results.main([f"one={run}"], docs) == 1  # two has no file
-    assert capsys.readouterr().out == "a.md: result two: no file docs/results/two.json\n"
+    assert capsys.readouterr().out == f"{page.name}: result two: no file docs/results/two.json\n"
     text = page.read_text()
     assert "| law | error |\n|---|---|\n| pi | .25 |\n| mpc | .5 |\n" in text
     assert "`python -m x`, commit " in text
     assert text.endswith("<!-- result two -->\nkept<!-- end -->\nrest\n")
     page.write_text(text.replace("| .25 |", "| .24 |").partition("<!-- result two")[0])
-    assert results.differences(docs) == ["a.md: result one: the page is not what docs/results/one.json says"]
+    assert results.differences(docs) == [f"{page.name}: result one: the page is not what docs/results/one.json says"]
     page.write_text("# A\n")
     assert results.differences(docs) == ["docs/results/one.json: on no page"]
     assert results.main([f"two={docs}"], docs) == 1
