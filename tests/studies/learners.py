@@ -19,6 +19,7 @@ import numpy as np
 
 from conf.schema import check, setting
 from experiments.cli import files
+from experiments.cli.choices import given
 from experiments.cli.stop import Workers
 from experiments.reporting.tables import number
 from experiments.train import main as train
@@ -179,7 +180,8 @@ def table(c: LearnersConfig, found: dict[Job, dict[str, float]]) -> list[list[st
                  number(statistics.median(e["cpu_s"] for e in each), 2)]  # fmt: skip
         rows.append((c.tasks.index(task), middle, [TASKS[task], name, f"{each[0]['steps']:.0f}", *cells]))
     rows += [(k, float(row[3]), row) for k, row in ((k, law(task)) for k, task in enumerate(c.tasks))]
-    return [row for *_, row in sorted(rows, key=lambda entry: entry[:2])]
+    ranked = [row for *_, row in sorted(rows, key=lambda entry: entry[:2])]
+    return [row for k, row in enumerate(ranked) if row[:3] not in (other[:3] for other in ranked[:k])]
 
 
 def learners(c: LearnersConfig, folder: Path) -> None:
@@ -194,7 +196,8 @@ def learners(c: LearnersConfig, folder: Path) -> None:
             job = running[done]
             found[job] = done.result()
             log.info("%d of %d, %s: regret %.3g %%", len(found), len(wanted), job.name, found[job]["regret_pct"])
-    files.write_json(folder / "table.json", {"command": COMMAND, "columns": COLUMNS, "rows": table(c, found)})
+    command = " ".join([COMMAND, *(word for word in given(folder) if not word.startswith("hydra."))])
+    files.write_json(folder / "table.json", {"command": command, "columns": COLUMNS, "rows": table(c, found)})
 
 
 main = command(__file__, LearnersConfig(), learners)
