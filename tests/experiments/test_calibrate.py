@@ -297,7 +297,7 @@ def test_coverage_study_writes_its_figure(cli: Cli, tmp_path: Path) -> None:
 
 
 def test_help_documents_the_generator(cli: Cli) -> None:
-    done = cli("--help")
+    done = cli("--help=all")
     assert done.returncode == 0
     for word in ("generate=true", "protocol.noise", "coverage=200", "rows=0:700", "pmse_limit"):
         assert word in done.stdout
