@@ -101,7 +101,7 @@ class Agreement:
     def verdict(self, planned: bool = True) -> str:
         """One sentence: whether to calibrate again, and why.
 
-        Args: planned: whether anything was decided with the model; where nothing was, there is nothing to calibrate.
+        Args: planned: whether anything was decided with a model that somebody fitted; else there is none to renew.
         """
         if not self.long_enough:
             return (
@@ -124,7 +124,7 @@ class Agreement:
         return f"; the culture grows {faster} or the pump is {weaker}, which this run alone cannot tell"
 
 
-UNUSED = "Nothing to calibrate, since nothing here was decided with this model"
+UNUSED = "No calibration decided anything here"
 
 
 def _words(c: Compared) -> str:

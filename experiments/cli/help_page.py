@@ -90,7 +90,7 @@ def _short(name: str, config: Any) -> list[str]:
         )
     ]
     head = ["Choices (group=option)", "", *choices, ""] if choices else []
-    words = [word for word, _ in _about(name, config)]
+    words = _parts(name, config)
     number = sum(1 for _ in _leaves(config))
     more = ["", f"--help=all    every choice and every value, with unit, range and default ({number})"]
     more += textwrap.wrap(f"--help=NAME   the same of one: {', '.join(words)}", WIDTH, subsequent_indent=" " * 14)
@@ -106,10 +106,9 @@ def _leaves(config: Any) -> Iterator[str]:
             yield entry.name
 
 
-def _about(name: str, config: Any) -> Iterator[tuple[str, Any]]:
+def _parts(name: str, config: Any) -> dict[str, Any]:
     """Groups of a command and parts of its config; None where a group has no part of its name."""
-    parts = {e.name: e.value for e in entries(config) if is_dataclass(e.value)}
-    yield from {**dict.fromkeys(chosen(name)), **parts}.items()
+    return dict.fromkeys(chosen(name)) | {e.name: e.value for e in entries(config) if is_dataclass(e.value)}
 
 
 def text(name: str, config: Any, about: str = "") -> str:
@@ -126,7 +125,7 @@ def text(name: str, config: Any, about: str = "") -> str:
         choices = [line for lines in groups.values() for line in (*lines, "")]
         head = ["Choices (group=option)", ""] if choices else []
         return "\n".join([*opening(name), "", *head, *choices, "Values (key=value)", "", *_values(config, "")])
-    parts = dict(_about(name, config))
+    parts = _parts(name, config)
     if about not in parts:
         raise ValueError(f"--help = {about}: allowed all, {', '.join(parts)}")
     inner = parts[about]

@@ -341,9 +341,6 @@ def _interval(ci: Sequence[float | None]) -> str:
 
 def _in_short(out: Page, summary: Row) -> None:
     """What came out: the learned policy beside the paper's, and the lowest of every scenario and plant."""
-    out.section("In short")
-    if summary["beside_paper"]:
-        _beside_paper(out, summary)
     places: dict[tuple[str, str], dict[str, list[float]]] = {}
     for entry in (*summary["totals"], *(r for r in summary["rows"] if r["signal"] == "share")):
         key, _ = RANKED[str(entry["signal"])]
@@ -352,6 +349,10 @@ def _in_short(out: Page, summary: Row) -> None:
             laws.setdefault(law_of(entry), []).append(float(entry[key]))
     unit = dict.fromkeys(RANKED[s][1] for s in dict.fromkeys(str(r["signal"]) for r in summary["rows"]))
     items = [f"{scenario} on {plant}: {_first(laws)}" for (scenario, plant), laws in places.items() if len(laws) > 1]
+    if items or summary["beside_paper"]:
+        out.section("In short")
+    if summary["beside_paper"]:
+        _beside_paper(out, summary)
     if items:
         out.add("verdict", claim=f"Lowest {' and '.join(unit)}, mean of the replicates:", items=items, remark="")
 

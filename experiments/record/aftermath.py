@@ -38,7 +38,7 @@ COLUMNS = ("hours", "growth rate, 1/min", "pump gain, 1 = the model's", "net gro
 
 @dataclass(frozen=True)
 class Believed:
-    """The model a run is compared with, where it is from, and whether anything was decided with it."""
+    """The model a run is compared with, where it is from, and whether one that was fitted decided something."""
 
     mu: float
     tau: float

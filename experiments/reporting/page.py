@@ -21,7 +21,7 @@ from experiments.cli.choices import given
 from experiments.reporting import tables
 from experiments.reporting.curves import ERROR_UNITS
 from experiments.reporting.tables import Best, Table, number, typeset
-from experiments.reporting.verdict import verdict
+from experiments.reporting.verdict import Verdict, verdict
 
 __all__ = ["Page", "flat", "of_runs", "provenance", "save"]
 
@@ -191,10 +191,10 @@ def _read(run: Path) -> tuple[Any, Mapping[str, Any]]:
     return json.loads((run / "summary.json").read_text(encoding="utf-8")), config
 
 
-def _said(page: Page, runs: Iterable[Path]) -> None:
-    """What each run came to, beside each other."""
-    told = [verdict(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping)]
-    page.add("verdicts", found=[said for said in told if said is not None])
+def _told(runs: Iterable[Path]) -> list[Verdict]:
+    """What each run came to, of those that can say it."""
+    found = (verdict(summary, config) for summary, config in map(_read, runs) if isinstance(summary, Mapping))
+    return [said for said in found if said is not None]
 
 
 def _results(page: Page, run: Path, prefix: str) -> None:
@@ -233,13 +233,14 @@ def of_runs(folder: Path, runs: Sequence[Path], after: Callable[[Page, Path, str
     labels = {re.sub(r"^\d+_", "", run.name).capitalize() if run != folder else "": run for run in runs}
     if len(labels) < len(runs):
         labels = {run.name: run for run in runs}
-    if "" not in labels:
+    told = _told(runs)
+    if told and "" not in labels:
         page.section("In short")
-        _said(page, runs)
+        page.add("verdicts", found=told)
     for label, run in labels.items():
         page.section(f"{label}: results" if label else "Results")
-        if not label:
-            _said(page, [run])
+        if told and not label:
+            page.add("verdicts", found=told)
         _results(page, run, f"{run.name}_" if label else "")
         if after is not None:
             after(page, run, label)

@@ -40,7 +40,7 @@ def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def typeset(text: str) -> str:
-    """With true minus signs before numbers."""
+    """With true minus signs before numbers, and ± for +-."""
     return re.sub(r"(?<![\w.])-(?=\d)", "−", text.replace("+-", "±"))
 
 

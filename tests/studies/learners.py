@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from conf.schema import check, setting
 from experiments.cli import files
@@ -110,8 +111,6 @@ def evaluation(task: str) -> tuple[tasks.Task, Evaluation]:
 
 def run(job: Job, folder: Path) -> dict[str, float]:
     """Regret in per cent, error at rest, CPU seconds and steps of one training; kept in a file."""
-    import torch
-
     torch.set_num_threads(1)
     began = time.process_time()
     steps, act = ours(job, folder / job.name) if job.learner not in RIVALS else rival(job)
@@ -162,7 +161,7 @@ def law(task: str) -> list[str]:
     known, report = evaluation(task)
     found = report(known.myopic, 1)
     regret, steady = float(found.regret_pct[0]), float(found.steady_abs_error[0])
-    return [TASKS[task], LAW, "–", number(abs(round(regret, 3))), "–", number(steady), "–"]
+    return [TASKS[task], LAW, "–", number(round(regret, 3)), "–", number(steady), "–"]
 
 
 def table(c: LearnersConfig, found: dict[Job, dict[str, float]]) -> list[list[str]]:

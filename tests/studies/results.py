@@ -12,7 +12,6 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +24,6 @@ ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"(<!-- result (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 
-def pages(docs: Path) -> Iterator[Path]:
-    """Every page."""
-    yield from sorted(docs.rglob("*.md"))
-
-
 def shown(stored: dict[str, Any]) -> str:
     """What stands on a page of a file: the table, and where it is from."""
     source = f"`{stored['command']}`, commit {stored['commit']}, {stored['date']}."
@@ -40,7 +34,7 @@ def differences(docs: Path) -> list[str]:
     """What of pages and files does not agree, a line each."""
     stored = {path.stem: json.loads(path.read_text("utf-8")) for path in sorted((docs / "results").glob("*.json"))}
     found, used = [], set()
-    for page in pages(docs):
+    for page in sorted(docs.rglob("*.md")):
         for _, name, text, _ in BLOCK.findall(page.read_text("utf-8")):
             used.add(name)
             if name not in stored:
@@ -60,7 +54,7 @@ def adopt(docs: Path, name: str, run: Path, commit: str, date: str) -> None:
                "columns": table["columns"], "rows": table["rows"]}  # fmt: skip
     (docs / "results").mkdir(exist_ok=True)
     files.write_json(docs / "results" / f"{name}.json", content)
-    for page in pages(docs):
+    for page in docs.rglob("*.md"):
         text = page.read_text("utf-8")
         new = BLOCK.sub(lambda m: m[1] + shown(content) + m[4] if m[2] == name else m[0], text)
         if new != text:
