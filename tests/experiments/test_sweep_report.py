@@ -179,6 +179,18 @@ def test_a_winner_whose_interval_meets_that_of_the_next_is_said_to_be_none(
     assert ("and the intervals of the two do not tell them apart" not in text) == apart
 
 
+@pytest.mark.parametrize(("worst", "said"), [(0.4, "within"), (1.0, "within"), (1.3, "beyond")])
+def test_the_merit_of_the_best_is_judged_against_the_limits_of_the_task(worst: float, said: str) -> None:
+    best, other = (
+        sweep_results.Configuration({"agent": name}, [], {"objective": np.array([0.2, value])})
+        for name, value in (("a", worst), ("b", 7.0))
+    )
+    text = sweep_page._headline([best, other], [], lambda name: sweep_results.label(name, "density", "train"))
+    assert f"That is {said} the limits of the task." in text
+    text = sweep_page._headline([best, other], [], lambda name: sweep_results.label(name, "density", "deploy"))
+    assert "limits of the task" not in text
+
+
 def test_long_names_give_way_to_their_place_in_the_table(tmp_path: Path) -> None:
     """The best one, which ran second, has three seeds, the other one two; a short name stays."""
     long = "x" * 40

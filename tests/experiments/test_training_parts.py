@@ -41,6 +41,17 @@ def scored(regret: list[float], steady: list[list[float]]) -> Score:
     return Score(one, np.array(regret), np.array(steady), one)
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_training_that_stopped_once_it_was_good_enough_is_not_sent_to_a_proof(
+    whole: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    score = scored([0.1], [[0.002]])
+    with caplog.at_level("INFO"):
+        announcements.ended(tmp_path, Density(EnvConfig()), score, score, "", tmp_path / "policy.npz", whole=whole)
+    assert any("next, try it: python -m experiments.deploy" in line for line in caplog.messages)
+    assert any("experiments.certify" in line for line in caplog.messages) == whole
+
+
 def test_a_policy_is_scored_by_the_first_episode_that_ends_behind_each_multiple(tmp_path: Path) -> None:
     """Episodes of 24 steps, an evaluation every 50, and one at the end; updates begin at step 40."""
     env, agent = EnvConfig(episode_steps=24), replace(SMALL, total_steps=340)
