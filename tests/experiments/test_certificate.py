@@ -393,7 +393,7 @@ def test_a_policy_that_fails_ends_the_command_with_one_line_and_its_certificate_
     assert (
         "not certified, 10 of 18 requirements fail, the first: nominal: strips without a band: 21, allowed 0" in said[0]
     )
-    (helps,) = [line for line in done.stderr.splitlines() if "what helps: " in line]
+    (helps,) = [line for line in (done.stdout + done.stderr).splitlines() if "what helps: " in line]
     assert "policy=shipped, which is certified" in helps
     assert not certificate.load(tmp_path / "certificate.json").passed
 

@@ -369,6 +369,8 @@ def test_on_a_phone_no_page_scrolls_sideways_and_no_cell_is_a_column_of_letters(
         page = browser.new_page(viewport={"width": 390, "height": 844})
         page.goto(page_file.as_uri())
         assert page.evaluate("document.documentElement.scrollWidth") == 390
+        keys_wider = "[...document.querySelectorAll('table.keys')].map(e => e.scrollWidth - e.parentNode.clientWidth)"
+        assert max(page.evaluate(keys_wider)) <= 0
         sizes = page.evaluate(
             "[...document.querySelectorAll('td, th')].map(e => [e.textContent.length, e.getBoundingClientRect().width])"
         )
