@@ -73,10 +73,12 @@ class Pin:
         if not on:
             self.ends(at)
         elif not self.on:
-            if word in LIVE or at == -math.inf or not echoes:
+            if at > -math.inf and word == "lost":
+                on_s = self.run_s
+            elif word in LIVE or at == -math.inf or not echoes:
                 on_s = at
-            elif word == "lost" or -math.inf < self.doubt_s < at - TWICE_S:
-                on_s = self.run_s if word == "lost" else self.doubt_s
+            elif -math.inf < self.doubt_s < at - TWICE_S:
+                on_s = self.doubt_s
             else:
                 self.doubt_s = at if self.doubt_s == -math.inf else self.doubt_s
                 return

@@ -337,6 +337,8 @@ class ForcedEnd:
     def __init__(self, pumps: Pumps, request: Request) -> None:
         self._p, self._request, self._job, self._since = pumps, request, request.job, request.asked_s
         self.began, self._calls = pumps.clock.now(), Calls(pumps.web, pumps.clock)
+        told_s = pumps.pin(request.job).event_s
+        self._from_s = max(request.asked_s, told_s) if math.isfinite(told_s) else request.asked_s
         self._listed: bool | None = None
         self._shorts_before, self._short_s, self._barrier = self._shorts(), math.inf, Barrier(pumps.web, pumps.clock)
         self._quiet_s, self._still_s, self._rows_s = math.inf, math.inf, -math.inf
@@ -382,7 +384,7 @@ class ForcedEnd:
         if now > p.box.heard_s + QUIET_S:
             self._quiet_s = min(self._quiet_s, p.box.heard_s)
         fresh, said = p.box.dc_s > self.began, state.word == "disconnected" and state.at >= self._since
-        if fresh and not pin.on and pin.doubt_s == -math.inf:
+        if fresh and not pin.on and pin.doubt_s == -math.inf and not self._untold:
             self._still_s = min(self._still_s, p.box.dc_s)
         if rows := self._calls.ask("rows", 2.0, p.web.running):
             self._rows_s = now
@@ -394,25 +396,36 @@ class ForcedEnd:
                 return off_s
         by_itself = said and not self._lost and (fresh or pin.off_s >= self._since)
         by_short = said and self._shorts() > self._shorts_before and state.at >= self._short_s
-        if pin.on or not (by_itself or by_short or (self._listed is False and fresh)):
+        if pin.on or not (by_itself or by_short or (self._listed is False and fresh and not self._untold)):
             return math.nan
         return pin.off_s if pin.off_s >= self._since else now
+
+    @property
+    def _untold(self) -> bool:
+        """Whether the job of a dose was killed and its pin was not said to be on.
+
+        The chip is told first, the unit and we an instant later: until a short run, what others say of the pin may be
+        what was before.
+        """
+        heard = self._since <= self._p.pin(self._job).on_s < self._short_s
+        return self._lost and self._request.ml > 0.0 and not heard
 
     def flowed(self) -> float:
         """What a pump that runs on, or told that it is about to and no end, moved up to now, mL; 0 for one of a silent
         unit, and for one whose bottle is empty by now."""
         p, pin, now = self._p, self._p.pin(self._job), self._p.clock.now()
         silent, broke = now > self._rows_s + QUIET_S, p.broke(self._request) and not self._lost
-        flowed = max(now - max(self._since, pin.on_s if pin.on else pin.event_s), 0.0) * p.flow_ml_s[self._job]
+        began = self._from_s if self._untold else pin.on_s if pin.on else pin.event_s
+        flowed = max(now - max(self._since, began), 0.0) * p.flow_ml_s[self._job]
         return flowed if not (silent or broke) and flowed < p.unit.bench.bottle_ml else 0.0
 
     def moved(self, off_s: float) -> Moved:
         """What the pump moved since it was asked. Args: off_s: as of `off_s`."""
         p, pin, flow = self._p, self._p.pin(self._job), self._p.flow_ml_s[self._job]
         ml, said_ml = self._request.ml, p.said(self._request)
-        longest = max(min(off_s, self._still_s) - self._since, 0.0) * flow
+        longest = max(min(off_s, self._still_s) - self._from_s, 0.0) * flow
         ran = min((pin.ran_s - self._request.ran_s) * flow - (self._shorts() - self._shorts_before), longest)
-        if self._held or (ran <= 0.0 and self._lost):  # since when it runs was never heard
+        if self._held or self._untold or (ran <= 0.0 and self._lost):  # since when it runs was never heard
             ran = longest
         low, end = max(said_ml - ROUNDED_S * flow, 0.0), "ended from here"
         if ran <= 0.0:  # its pin was never seen: a job times itself

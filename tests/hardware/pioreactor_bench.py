@@ -77,12 +77,15 @@ class Lateness:
 
 
 class UnitBench:
-    """One unit in the rig, and lives of the driver that end without a word and go on from the journal."""
+    """One unit in the rig, and lives of the driver that end without a word and go on from the journal.
+
+    Attributes: killed, how many doses lost their process.
+    """
 
     def __init__(self, folder: Path, package: str = PUBLISHED, period_s: float = 60.0, **values: Any) -> None:
         self.bench = Bench(period_s=period_s)
         self.rig = Rig({UNIT: 20.0}, RigConfig(package=package, od=0.5))
-        self.folder, self.run = folder, f"test{time.time():.0f}"
+        self.folder, self.run, self.killed = folder, f"test{time.time():.0f}", 0
         where: dict[str, Any] = {"broker": "127.0.0.1", "broker_port": self.rig.broker, "leader": self.rig.web[UNIT]}
         where["units"] = {UNIT: UnitConfig(address=self.rig.web[UNIT])}
         self.config = RigBackendConfig(reactors=(UNIT,), **{"speed": 5.0, **where, **values})
@@ -195,4 +198,4 @@ class UnitBench:
         runs = f"{self.truth():.2f} fed in {self.pulses()} runs for {intended} doses"
         told = f"{low:.2f} to {high:.2f} mL told, {runs}, messages up to {late:.2f} s late"
         assert low - slack <= self.truth() <= high + slack, told
-        assert self.pulses() <= intended + 1, told  # one cycled pin
+        assert self.pulses() <= intended + max(self.killed, 1), told  # a short run ends a pump whose job was killed

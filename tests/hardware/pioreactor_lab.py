@@ -39,7 +39,8 @@ class World(VirtualClock):
     Switches: web, queue, broker (up or not); stirs (stirring runs, and says all pins); locks, of pins; heard (how a
     POST of a dose is answered); kill_after_s, freeze_after_s (after its pump began; frozen for frozen_s), stop_after_s
     (somebody stops it); late_s (a job ends its pump so much late); mute (a pin that goes on is not told by its job);
-    dies (a job is over at once); barred (jobs beside the readings do not start); begin_s.
+    dies (a job is over at once); barred (jobs beside the readings do not start); begin_s; unkept (a job that is
+    killed had not yet written down that its pin is on: the chip is told first).
 
     Attributes: truth, mL by job; asked, what was asked for; waste, when the waste pump ran.
     """
@@ -52,7 +53,7 @@ class World(VirtualClock):
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self.web = self.queue = self.broker = self.stirs = True
-        self.dies = self.mute = self.barred = self.deaf = self.stands = False
+        self.dies = self.mute = self.barred = self.deaf = self.stands = self.unkept = False
         self.locks: set[int] = set()
         self.heard, self.holder, self.begin_s = "yes", "", BEGIN_S
         self.kill_after_s = self.freeze_after_s = self.stop_after_s = np.inf
@@ -162,6 +163,8 @@ class World(VirtualClock):
                 self.pins() if late <= 0.0 else self.later(late, tell)
 
         kill = np.inf if short or job != "add_media" else self.kill_after_s
+        if kill < np.inf and self.unkept:
+            self.cache.pop(PINS[job])
         freeze = np.inf if short or job != "add_media" else self.freeze_after_s
 
         def slice_() -> None:

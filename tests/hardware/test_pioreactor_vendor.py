@@ -15,6 +15,7 @@ import pytest
 from envs.bench import Bench
 from hardware.clock import RealClock
 from hardware.pioreactor.preflight import preflight
+from hardware.pioreactor.pumps import MEDIA
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.versions import facts
 from tests.hardware.pioreactor_bench import PACKAGES, UNIT, UnitBench, need_the_rig
@@ -94,12 +95,30 @@ def test_a_dose_reaches_the_vial_once_and_as_much_leaves_it(bench, monkeypatch):
     bench.judge(LATE_ML)
 
 
-def test_a_dose_whose_process_is_killed_is_an_alarm_and_nothing_is_sent_until_its_pump_is_off(bench, monkeypatch):
+@pytest.mark.parametrize("moment", ["as its pump begins", "in it"])
+def test_a_dose_whose_process_is_killed_is_an_alarm_and_nothing_is_sent_until_its_pump_is_off(
+    bench, monkeypatch, moment
+):
+    vial = bench.rig.vials.vials[UNIT]
+    drive = vial.drive
+
+    def kills(pin: int, duty: float, pid: int, now: float) -> None:
+        drive(pin, duty, pid, now)
+        if duty > 0.0 and not killed:  # the chip was told; the unit and its broker were not yet
+            killed.append(pid)
+            os.kill(pid, 9)
+
+    killed: list[int] = []
+    if moment != "in it":
+        monkeypatch.setattr(vial, "drive", kills)
     assert bench.sample(LONG_S)
     assert bench.dose(3.0) == 3.0
     assert bench.go_on(LONG_S, bench.pumping)
-    for pid in bench.rig.jobs(UNIT, "add_media"):
-        os.kill(pid, 9)
+    if moment == "in it":
+        assert bench.go_on(LONG_S, lambda: bench.station.doses.pumps.pin(MEDIA).on)
+        for pid in bench.rig.jobs(UNIT, "add_media"):
+            os.kill(pid, 9)
+    bench.killed += 1
     purge = facts(bench.rig.version).purge
     assert bench.go_on(LONG_S, lambda: f"{purge} pwm_locks 13 --as-int" in str(bench.station.book.fault))
     jobs = asked_for(bench, monkeypatch)
