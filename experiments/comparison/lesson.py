@@ -28,11 +28,12 @@ from envs.plant.plant import Plant, PlantConfig, of_pair
 from envs.task import EnvConfig
 from experiments.cli import frame
 from experiments.comparison.trials import run_share
-from experiments.control.question import ONE_LINE, Question, Verdict
+from experiments.control.question import Question, Verdict
 from experiments.laws import registry
 from experiments.laws.share import estimator as states
 from experiments.laws.share.base import Array, Estimate, Law, Mask, Wanted
 from experiments.laws.share.estimator import CompositionEstimator
+from experiments.laws.share.learned import ONE_LINE
 from experiments.loop.share import program_of
 from experiments.training.config import TrainConfig
 from experiments.training.run import train
@@ -111,11 +112,13 @@ def judged(question: Question, old: Policy, new: Policy) -> dict[str, list[float
     plan, scenario, curves = question.plan, question.scenario, question.curves
     limits = (question.limits[0], question.limits[1])
     program, model = program_of(scenario), EnvConfig(tau=question.volume_ml / 60.0)
-    followed: Mapping[str, Policy | None] = {"old": old, "new": new, ONE_LINE: None}
+    followed: Mapping[str, tuple[str, Policy | None]] = {
+        "old": (question.law, old), "new": (question.law, new), ONE_LINE: (ONE_LINE, None)
+    }  # fmt: skip
     laws = SideBySide(
         [
             registry.build(registry.config(kind, registry.SHARE), registry.SHARE, policy=policy, pair=curves)
-            for kind, policy in ((question.law if policy else name, policy) for name, policy in followed.items())
+            for kind, policy in followed.values()
         ],
         plan.vials,
     )

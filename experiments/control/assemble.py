@@ -54,7 +54,7 @@ __all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpac
 
 log = logging.getLogger(__name__)
 
-COMPOSITION, VIALS, USUAL_VIALS = "midpoint", "coculture", "nominal_noise"  # presets
+COMPOSITION, PREVIEW, VIALS, USUAL_VIALS = "midpoint", "dqn_preview", "coculture", "nominal_noise"  # presets
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,8 @@ def with_pair(config: DeployConfig, folder: Path) -> DeployConfig:
 def completed(config: DeployConfig) -> DeployConfig:
     """What was left as it is for one species, where a scenario asks for a share: who controls it, and the vials.
 
-    And of all simulated vials, the two species of the run. Raises: UserError for a schedule that is not allowed.
+    And of all simulated vials, the two species of the run; and whether a run learns. Raises: UserError for a schedule
+    that is not allowed.
     """
     with frame.refusing(ValueError):
         composed = any(s.composed for s in config.schedules())
@@ -122,7 +123,10 @@ def completed(config: DeployConfig) -> DeployConfig:
         config = _composed(config, pair)
     if family_of(config.backend).simulated and config.plant.pair == PairConfig():  # another one differs on purpose
         config = replace(config, plant=of_pair(config.plant, pair))
-    return config
+    announced = config.composition is not None and config.composition.kind == PREVIEW
+    longest_min = max(s.total_min for s in config.schedules())
+    learns = announced and not family_of(config.backend).simulated
+    return replace(config, relearn=config.relearn.settled(learns, longest_min))
 
 
 def _composed(config: DeployConfig, pair: PairConfig) -> DeployConfig:
@@ -252,9 +256,9 @@ def _check_fit(config: DeployConfig, family: Family, scenarios: list[Scenario], 
 
 def _check_learning(config: DeployConfig, family: Family) -> None:
     """Whether this run can learn. Raises: UserError."""
-    said = f"relearn.every_h = {config.relearn.every_h:g}"
     if not config.relearn.every_h:
         return
+    said = f"relearn.every_h = {config.relearn.every_h:g}"
     if config.composition is None or not registry.takes(config.composition.kind, "policy", registry.SHARE):
         found = "no share is held" if config.composition is None else f"composition={config.composition.kind}"
         raise frame.UserError(f"{said}: {found}, which follows no policy; give composition=dqn_preview, or 0")

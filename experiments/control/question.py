@@ -19,10 +19,10 @@ from experiments.laws.share.base import Array
 from experiments.laws.share.estimator import CompositionEstimator, CompositionEstimatorConfig
 from hardware import memory
 
-__all__ = ["LEAST_H", "ONE_LINE", "Question", "Relearn", "Verdict"]
+__all__ = ["LEAST_H", "Question", "Relearn", "Verdict"]
 
+EVERY_H, LONG_MIN = 12.0, 24 * 60.0  # the first training needs half a day of data, and its policy some hours to pay
 LEAST_H = 2.0  # of a program that is still to come, for a training to be worth it
-ONE_LINE = "midpoint"  # the best law without a policy
 BATCH = 128  # with twice the steps as good as 256 in the same time
 
 
@@ -30,8 +30,12 @@ BATCH = 128  # with twice the steps as good as 256 in the same time
 class Relearn:
     """When a run learns from itself, and with what means. Raises: ValueError naming key, value and allowed range."""
 
-    every_h: float = setting(
-        0.0, "at least so long from one training to the next, and before the first; 0: none", "h", within=(0, 240)
+    every_h: float | None = setting(
+        None,
+        "at least so long from one training to the next, and before the first; 0: none; null: 12 in a run of more than "
+        "a day with dqn_preview, else 0",
+        "h",
+        within=(0, 240),
     )
     sd: float = setting(0.03, "growth curves known so well, relative, are worth it ...", within=(0.001, 0.5))
     moved: float = setting(
@@ -47,6 +51,15 @@ class Relearn:
 
     def __post_init__(self) -> None:
         check(self, "relearn")
+
+    def settled(self, announced: bool, run_min: float) -> "Relearn":
+        """With hours, where they were left open: it pays where a law foresees a program that lasts.
+
+        Args: announced: whether the policy sees what is still to come. run_min: length of the longest program.
+        """
+        if self.every_h is not None:
+            return self
+        return replace(self, every_h=EVERY_H if announced and run_min > LONG_MIN else 0.0)
 
 
 @dataclass(frozen=True)
@@ -150,24 +163,30 @@ class Verdict:
         return float(difference.mean()), 1.96 * float(difference.std(ddof=1)) / len(difference) ** 0.5
 
     @property
+    def best(self) -> str:
+        """Of those that are better than the old policy by an interval that excludes 0 the lowest, else "old"."""
+        better = [law for law in self.errors if sum(self.less(law, "old")) < 0.0]
+        return min(better, key=self.means.__getitem__, default="old")
+
+    @property
     def flies(self) -> bool:
-        """Whether the new policy's error is lower by an interval that excludes 0."""
-        mean, half = self.less("new", "old")
-        return mean + half < 0.0
+        """Whether the old policy does not go on."""
+        return self.best != "old"
 
     @property
     def why(self) -> str:
         """In words."""
-        mean, half = self.less("new", "old")
+        law = self.best if self.flies else "new"
+        mean, half = self.less(law, "old")
         found = ", ".join(f"{law} {error:.4f}" for law, error in self.means.items())
-        said = f"new less old {mean:+.4f} ± {half:.4f}"
+        said = f"{law} less old {mean:+.4f} ± {half:.4f}"
         return f"{said}: {'better' if self.flies else 'not surely better'} (mean errors: {found})"
 
     def row(self) -> dict[str, Any]:
         """For journal, summary and policy file."""
-        mean, half = self.less("new", "old")
+        mean, half = self.less(self.best if self.flies else "new", "old")
         vials = len(self.errors["new"])
         return {
-            "flies": self.flies, "why": self.why, "errors": self.means, "difference": mean, "half_interval": half,
-            "vials": vials, "regret_pct": self.regret_pct,
+            "flies": self.flies, "law": self.best, "why": self.why, "errors": self.means, "difference": mean,
+            "half_interval": half, "vials": vials, "regret_pct": self.regret_pct,
         }  # fmt: skip

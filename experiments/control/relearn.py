@@ -63,7 +63,8 @@ class Relearning:
     ) -> None:
         share = next(s for s in loop.signals if isinstance(s, Share))
         if not isinstance(share.law, LearnedLaw) or not isinstance(share.estimator, Recall):
-            raise frame.UserError(f"relearn.every_h = {config.every_h:g}: the law of the share follows no policy")
+            raise frame.UserError(f"relearn.every_h = {config.every_h}: the law of the share follows no policy")
+        self._every_h = config.every_h or 0.0
         self.config, self._loop, self._record, self._limits = config, loop, record, limits
         self._share, self._law, self._recall = share, share.law, share.estimator
         self._tell, self._clock, self._folder = tell, clock, record.folder / LEARNT
@@ -93,7 +94,7 @@ class Relearning:
             if name in self._names:
                 self._follow(name, number, self._read(self._record.folder / named(number)))
         self._last = max(asked, default=0)
-        if self._last and self._last not in judged and self.config.every_h:
+        if self._last and self._last not in judged and self._every_h:
             self._go_on(asked[self._last])
 
     def _go_on(self, row: Mapping[str, Any]) -> None:
@@ -128,7 +129,7 @@ class Relearning:
     def take(self, step: Step) -> None:
         """Look after the training under way, or begin the next one that is due. Raises: RecordingError."""
         try:
-            if self.config.every_h:
+            if self._every_h:
                 self._weigh(step)
             if self._child is not None:
                 self._look()
@@ -145,7 +146,7 @@ class Relearning:
         """Who is due, by the newest sample of each; what others wait for is said once it is their turn."""
         for n in map(int, np.flatnonzero(step.rows)):
             before, self._why[n] = self._why[n], self._not_yet(n, step)
-            overdue = step.minute[n] - self._last_min[n] >= 60.0 * self.config.every_h
+            overdue = step.minute[n] - self._last_min[n] >= 60.0 * self._every_h
             if self._why[n] and overdue and kind_of(self._why[n]) != kind_of(before):
                 log.info("%s: no training yet: %s", self._names[n], self._why[n])
 
@@ -158,8 +159,8 @@ class Relearning:
     def _not_yet(self, n: int, step: Step) -> str:
         """Why reactor n learns nothing now; "" if it does."""
         elapsed, schedule = float(step.elapsed[n]), self._share.schedules[n]
-        if step.minute[n] - self._last_min[n] < 60.0 * self.config.every_h:
-            return f"the last training began less than {self.config.every_h:g} h ago"
+        if step.minute[n] - self._last_min[n] < 60.0 * self._every_h:
+            return f"the last training began less than {self._every_h:g} h ago"
         if not elapsed >= 0.0 or self._loop.stopped[n] or not schedule.composed:
             return "no share is asked for"
         if self._recall.behind or not self._estimator.since[n] >= step.minute[n] - 1e-6:
@@ -279,7 +280,8 @@ class Relearning:
         if policy is not None:
             self._follow(name, number, policy)
         self.learned = [*self.learned, row]
-        text = f"policy {number:03d} {'flies from now on' if row['flies'] else 'does not fly'}: {row['why']}"
+        flown_by = "" if row.get("law") in (None, "new", "old") else f"as {row['law']} "
+        text = f"policy {number:03d} {f'flies {flown_by}from now on' if row['flies'] else 'does not fly'}: {row['why']}"
         log.log(logging.INFO if verdict is not None else logging.WARNING, "%s: %s", name, text)
         if row["flies"] or verdict is None:
             self._tell("policy", text, name)

@@ -34,6 +34,7 @@ from experiments.deploy import main
 from experiments.laws import registry
 from experiments.laws.share.base import Estimate, Wanted
 from experiments.laws.share.estimator import CompositionEstimator, CompositionEstimatorConfig
+from experiments.laws.share.learned import one_line
 from experiments.loop.loop import ClosedLoop, Step
 from experiments.loop.share import program_of
 from experiments.record.record import Record
@@ -165,16 +166,34 @@ def test_a_verdict_by_hand() -> None:
     unsure = Verdict({"old": old, "new": [0.04, 0.07, 0.03, 0.05]}, 3.0)
     assert not unsure.flies
     assert "not surely better" in unsure.why
+    law = Verdict({"old": old, "new": new, "midpoint": [0.039, 0.049, 0.031, 0.04]}, 3.0)
+    assert (law.best, law.flies, law.row()["law"]) == ("midpoint", True, "midpoint")
+    assert law.row()["difference"] == pytest.approx(-0.01025)
+    assert law.why.startswith("midpoint less old -0.01")
+    spread = Verdict(
+        {"old": old, "new": new, "midpoint": [0.01, 0.09, 0.01, 0.01]}, 3.0
+    )  # lower in the mean, not surely
+    assert (spread.best, spread.row()["law"]) == ("new", "new")
 
 
 def test_a_policy_for_other_curves_does_not_fly_and_one_for_these_does() -> None:
     asked = question((-0.2, 0.0), vials=32, hours=12.0)
     right, wrong = policies.load(SHIPPED), claiming(0.6)  # as if E. coli grew by 20 % more, where it grows by 20 % less
     said_no = Verdict(lesson.judged(asked, right, wrong), 0.0)
-    assert not said_no.flies
+    assert said_no.best != "new"
     assert said_no.less("new", "old")[0] > 0.005
-    assert Verdict(lesson.judged(asked, wrong, right), 0.0).flies
-    assert not Verdict(lesson.judged(asked, right, right), 0.0).flies, "of two that are one, neither"
+    errors = lesson.judged(asked, wrong, right)
+    assert Verdict({law: errors[law] for law in ("old", "new")}, 0.0).best == "new"
+    assert Verdict(lesson.judged(asked, right, right), 0.0).best != "new", "of two that are one, neither"
+
+
+def test_a_law_in_force_is_what_the_next_policy_is_compared_with() -> None:
+    asked = question((-0.2, 0.0), vials=32, hours=5.0)
+    policy = policies.load(SHIPPED)
+    law = replace(policy, metadata={**policy.metadata, "learned": {"law": "midpoint"}})
+    errors = lesson.judged(asked, law, policy)
+    assert errors["old"] == errors["midpoint"]
+    assert errors["new"] != errors["midpoint"]
 
 
 def test_the_thermostat_of_the_judge_keeps_the_run_s_limits(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,6 +301,36 @@ def test_each_culture_follows_its_own_policy_and_is_shown_what_that_does_not_kno
     slower = replace(own, metadata={**own.metadata, "model": {**own.metadata["model"], "control_min": 20.0}})
     with pytest.raises(ValueError, match=r"control_min = 20.*30"):
         law.follow(1, 5, slower)
+
+
+def test_where_midpoint_was_better_it_decides_for_that_culture_also_after_a_resume() -> None:
+    """A change from .3 to .7 in 6 h, by hand: midpoint begins with full authority at half the way, and goes on."""
+    policy = policies.load(SHIPPED)
+    beaten = replace(claiming(0.8), metadata={**claiming(0.8).metadata, "learned": {"law": "midpoint"}})
+    law = registry.build(registry.config("dqn_preview", "share"), "share", policy=policy)
+    alone = registry.build(registry.config("midpoint", "share"), "share")
+    law.reset(3)
+    alone.reset(3)
+    law.follow(1, 2, beaten)
+    for minute in np.arange(0.0, 361.0, 5.0):
+        x, rows = np.zeros(3), np.ones(3, dtype=bool)
+        reached = np.log(0.3 / 0.7) + 0.02 * max(minute - 260.0, 0.0)  # faster than thought, once it has begun
+        estimate = Estimate(x + reached, x + 0.1, x + 33.2, x + 0.9, x - 0.1, x, x + 0.2)
+        wanted = Wanted(x + 0.3, x + 0.7, x + 360.0 - minute)
+        chosen = law.act(estimate, wanted, x + minute, rows)
+        expected = alone.act(estimate, wanted, x + minute, rows)
+        assert chosen[1] == expected[1]
+        assert chosen[0] == chosen[2]
+        if minute == 300.0:  # begun, and told anew by a resumed run
+            kept, law = (
+                memory.save(law),
+                registry.build(registry.config("dqn_preview", "share"), "share", policy=policy),
+            )
+            law.reset(3)
+            memory.restore(law, kept, memory.words("law"))
+            law.follow(1, 2, beaten)
+    assert kept["one_line"]["towards"][1] == 0.7
+    assert kept["one_line"]["towards"][0] is None
 
 
 def test_of_each_culture_the_growth_is_corrected_by_what_its_own_policy_does_not_know(
@@ -400,12 +449,13 @@ def test_a_training_is_asked_for_and_judged_in_the_journal(learned: Flight) -> N
     assert decisions[0]["why"]["policy"] == 0
 
 
-def judge(flight: Flight, number: int, flies: bool) -> None:
-    """Put a verdict of one's own in place of what a training has left."""
+def judge(flight: Flight, number: int, flies: bool, law: float | None = None) -> None:
+    """Put a verdict of one's own in place of what a training has left. Args: law: error of `midpoint`."""
     folder = flight.folder / "policies" / f"{number:03d}"
     folder.mkdir(exist_ok=True)
     new = [0.03 if flies else 0.06] * 7 + [0.031]
-    (folder / "verdict.json").write_text(json.dumps({"errors": {"old": [0.05] * 8, "new": new}, "regret_pct": 3.0}))
+    errors = {"old": [0.05] * 8, "new": new} | ({} if law is None else {"midpoint": [law] * 7 + [law + 0.001]})
+    (folder / "verdict.json").write_text(json.dumps({"errors": errors, "regret_pct": 3.0}))
     policies.save(folder / "policy.npz", claiming(0.9))
 
 
@@ -448,6 +498,20 @@ def test_a_better_policy_flies_with_its_origin_and_is_named_before_it_does(tmp_p
     (flight.folder / named(1)).unlink()
     with pytest.raises(frame.UserError, match=r"001\.npz.*in force by the journal"), flight.life():
         pass
+
+
+def test_where_midpoint_is_better_than_both_it_flies_and_stays_over_a_resume(tmp_path: Path) -> None:
+    flight = begun(tmp_path / "run")
+    judge(flight, 1, flies=True, law=0.02)
+    for _ in range(2):
+        with flight.life() as (loop, learning, record):
+            finish(learning, None)  # type: ignore[arg-type]
+            assert learning._law.number.tolist() == [1]
+            assert one_line(learning._law._policies[1])
+            assert learning.learned[0]["law"] == "midpoint"
+            go(loop, learning, record, 1.0)
+    assert "flies as midpoint from now on: midpoint less old -0.0299" in flight.told[0][1]
+    assert policies.load(flight.folder / named(1)).metadata["learned"]["law"] == "midpoint"
 
 
 def test_two_reactors_that_differ_learn_each_its_own(tmp_path: Path) -> None:
@@ -690,6 +754,28 @@ def test_a_run_that_cannot_learn_says_so(tmp_path: Path, words: tuple[str, ...],
     config = main.config([*WORDS, *words, "relearn.every_h=12"])
     with pytest.raises(frame.UserError, match=said):
         assemble.unpack(assemble.completed(config), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "hours"),
+    [
+        ((), 12.0),  # 27 h
+        (("relearn.every_h=0",), 0.0),
+        (("relearn.every_h=5",), 5.0),
+        (("composition=midpoint",), 0.0),
+        (("composition=dqn",), 0.0),
+        (("scenario.minutes=[60,360,600,420]",), 0.0),  # a day and no more
+        (("scenario.minutes=[60,360,600,421]",), 12.0),
+        (("backend.reactors=[M0,M1]", "scenario.minutes=[60,60,60,60]", "each.M1.minutes=[60,360,600,600]"), 12.0),
+    ],
+)
+def test_a_run_of_more_than_a_day_that_foresees_its_program_learns_unless_told_otherwise(words, hours) -> None:
+    words = (*WORDS[1:], "backend=emulator", *words)
+    assert assemble.completed(main.config(list(words))).relearn.every_h == hours
+
+
+def test_a_simulation_does_not_learn_by_itself() -> None:
+    assert assemble.completed(main.config([*WORDS])).relearn.every_h == 0.0
 
 
 def test_a_task_takes_the_curves_that_a_run_has_found(learned: Flight) -> None:

@@ -19,9 +19,9 @@ from conf.schema import check, part, setting
 from dqn.config import DQNConfig
 from envs.task import EnvConfig
 from experiments.cli import files, frame
-from experiments.reporting.tables import markdown
 from experiments.training.config import TrainConfig
 from tests.entry import command
+from tests.studies.results import leave
 from tests.studies.variants import seeds, variant
 
 __all__ = ["AblateConfig", "Row", "main", "summarise"]
@@ -29,6 +29,7 @@ __all__ = ["AblateConfig", "Row", "main", "summarise"]
 log = logging.getLogger(__name__)
 
 MEASURES = ("regret_pct", "steady_abs_error", "regret_pct_last", "steady_abs_error_last")
+COLUMNS = ("variant", "seeds", "regret, %", "steady error, OD", "last regret, %", "last steady error, OD", "time, s")
 
 
 @dataclass(frozen=True)
@@ -139,15 +140,14 @@ def summarise(rows: list[Row]) -> dict[str, dict[str, Any]]:
     return out
 
 
-def table(rows: list[Row]) -> str:
-    """The summary as a Markdown table: median over seeds and, in brackets, the worst seed."""
-    head = ("variant", "seeds", "regret, %", "steady error, OD", "last regret, %", "last steady error, OD", "time, s")
-    lines = []
+def table(rows: list[Row]) -> list[tuple[object, ...]]:
+    """The summary by `COLUMNS`: median over seeds and, in brackets, the worst seed."""
+    lines: list[tuple[object, ...]] = []
     for name, entry in summarise(rows).items():
         values = zip((entry[m] for m in MEASURES), (3, 4, 3, 4), strict=True)
         cells = [f"{v['median']:.{digits}f} ({v['worst']:.{digits}f})" for v, digits in values]
         lines.append((name, entry["seeds"], *cells, f"{entry['train_seconds']:.0f}"))
-    return markdown(head, lines)
+    return lines
 
 
 def draw(rows: list[Row], folder: Path) -> None:
@@ -191,7 +191,7 @@ def ablate(config: AblateConfig, folder: Path) -> float:
         )  # fmt: skip
     summary = summarise(rows)
     files.write_json(folder / "summary.json", {"agents": config.n_agents, "seed": config.seed, "ablations": summary})
-    (folder / "table.md").write_text(table(rows), encoding="utf-8")
+    leave(folder, __file__, COLUMNS, table(rows))
     draw(rows, folder)
     log.info("table %s, figure %s", folder / "table.md", folder / "figures" / "ablation.png")
     return float(summary[config.names[0]]["regret_pct"]["median"])

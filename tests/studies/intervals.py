@@ -19,8 +19,8 @@ from experiments.calibration.config import CalibrateConfig
 from experiments.calibration.study import against_truth, fitted, simulated
 from experiments.cli import files
 from experiments.cli.stop import Workers
-from experiments.reporting.tables import markdown
 from tests.entry import command
+from tests.studies.results import leave
 from tests.studies.second_simulator import Conditions, simulate
 
 __all__ = ["IntervalsConfig", "intervals", "main"]
@@ -86,7 +86,7 @@ def intervals(config: IntervalsConfig, folder: Path) -> None:
             found.append(future.result())
             rows[kind[5]].append(row(kind[:3], found[-1]))
             log.info("%s, %s: %s", kind[5], ", ".join(map(str, kind[:4])), " | ".join(rows[kind[5]][-1][3:]))
-            (folder / f"{kind[5]}.md").write_text(markdown(COLUMNS, rows[kind[5]]), encoding="utf-8")
+            leave(folder, __file__, COLUMNS, rows[kind[5]], kind[5])
     files.write_json(folder / "summary.json", {"kinds": kinds, "found": found})
 
 

@@ -20,7 +20,6 @@ import torch
 
 from conf.schema import check, setting
 from experiments.cli import files
-from experiments.cli.choices import given
 from experiments.cli.stop import Workers
 from experiments.reporting.tables import number
 from experiments.train import main as train
@@ -28,6 +27,7 @@ from experiments.training import build, tasks
 from experiments.training.evaluation import Act, Evaluation
 from experiments.training.session import Session
 from tests.entry import command
+from tests.studies.results import leave
 
 __all__ = ["LearnersConfig", "learners", "main"]
 
@@ -52,7 +52,6 @@ WITHOUT = {
     "hindsight": ["agent.hindsight_share=0"],
     "falling rate": ["agent.learning_rate_end=null"],
 }
-COMMAND = "python -m tests.studies.learners"
 OURS, LAW = "this program's DQN", "one look ahead, one line"
 COLUMNS = ("task", "policy", "steps", "regret, %", "worst seed", "error at rest", "CPU s")
 
@@ -195,8 +194,7 @@ def learners(c: LearnersConfig, folder: Path) -> None:
             job = running[done]
             found[job] = done.result()
             log.info("%d of %d, %s: regret %.3g %%", len(found), len(wanted), job.name, found[job]["regret_pct"])
-    command = " ".join([COMMAND, *(word for word in given(folder) if not word.startswith("hydra."))])
-    files.write_json(folder / "table.json", {"command": command, "columns": COLUMNS, "rows": table(c, found)})
+    leave(folder, __file__, COLUMNS, table(c, found))
 
 
 main = command(__file__, LearnersConfig(), learners)

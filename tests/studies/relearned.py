@@ -30,11 +30,12 @@ from experiments.control.question import Question, Relearn, Verdict
 from experiments.laws import registry
 from experiments.laws.share.base import Array, Estimate, Mask, Wanted
 from experiments.laws.share.estimator import CompositionEstimator, CompositionEstimatorConfig
+from experiments.laws.share.learned import ONE_LINE
 from experiments.laws.share.recall import Recall
-from experiments.reporting.tables import markdown
 from hardware import memory
 from tests.entry import command
 from tests.studies import second_vials
+from tests.studies.results import leave
 from tests.studies.second_vials import PROGRAMS, Conditions, draw, nominal
 
 __all__ = ["RelearnedConfig", "main", "relearned"]
@@ -218,17 +219,20 @@ def relearned(config: RelearnedConfig, folder: Path) -> None:
             question = Question.read(places[k] / "policies" / "001.json")
             judge = misjudged(pool, question, shipped, new[k], config.judgements)
             log.info("the worse policy, by %(worse_by).4f, flies %(worse_flew)d times of %(judgements)d", judge)
-    flies = np.array([k in new and verdict(place).flies for k, place in enumerate(places)])
+    laws = {kind: flown(conditions, config, Second(law(LAW, shipped), law(kind)))[1] for kind in BESIDE}
+    best = np.array([verdict(place).best if k in new else "old" for k, place in enumerate(places)])
     found["trained"] = flown(conditions, config, Second(law(LAW, shipped), learned=new))[1]
-    found["with learning"] = np.where(flies, found["trained"], found["shipped"])
-    found |= {kind: flown(conditions, config, Second(law(LAW, shipped), law(kind)))[1] for kind in BESIDE}
+    beside = np.where(best == ONE_LINE, laws[ONE_LINE], found["shipped"])
+    found["with learning"] = np.where(best == "new", found["trained"], beside)
+    found |= laws
     table = []
     for row in dict.fromkeys(rows[k] for k in sorted(new)):
         own = np.array([k in new and one == row for k, one in enumerate(rows)])
-        cells = [row, f"{flies[own].sum()} of {own.sum()}", *(f"{error[own].mean():.4f}" for error in found.values())]
+        flew = [f"{(best[own] == law).sum()}" for law in ("new", ONE_LINE, "old")]
+        cells = [row, ", ".join(flew), *(f"{error[own].mean():.4f}" for error in found.values())]
         table.append([*cells, *(compared(found["with learning"][own] - found[than][own]) for than in THAN)])
-    head = ["vials", "flew", *found, *(f"less {than}" for than in THAN)]
-    (folder / "table.md").write_text(markdown(head, table), encoding="utf-8")
+    head = ["vials", f"flew: new, {ONE_LINE}, old", *found, *(f"less {than}" for than in THAN)]
+    leave(folder, __file__, head, table)
     verdicts = [verdict(place).row() if k in new else None for k, place in enumerate(places)]
     content = {"rows": rows, "errors": found, "verdicts": verdicts, "table": table}
     files.write_json(folder / "summary.json", {**content, "judge": judge, "known_h": known_h})

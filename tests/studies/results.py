@@ -2,6 +2,7 @@
 
   python -m tests.studies.results --check            every table equals its file
   python -m tests.studies.results NAME=RUN           RUN/table.json becomes docs/results/NAME.json, and the pages follow
+  python -m tests.studies.results NAME=RUN/week.json the same of another table of the run
 
 A table stands between `<!-- result NAME -->` and `<!-- end -->`; its file holds columns and rows as they are shown,
 and command, commit and date of the run.
@@ -12,16 +13,35 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from experiments.cli import files
+from experiments.cli.choices import given
 from experiments.reporting.tables import markdown
 
-__all__ = ["adopt", "differences", "main"]
+__all__ = ["adopt", "differences", "leave", "main"]
 
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"(<!-- result (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+
+
+def leave(
+    folder: Path, module: str, columns: Iterable[str], rows: Iterable[Iterable[object]], name: str = "table"
+) -> None:
+    """A table of a run: NAME.md to read, and NAME.json with command, commit and date for a page.
+
+    Args: folder: of the run. module: file of the command.
+    """
+    words = [word for word in given(folder) if not word.startswith("hydra.")]
+    command = " ".join(["python -m", ".".join(Path(module).relative_to(ROOT).with_suffix("").parts), *words])
+    newest = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(newest, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+    head, cells = [*columns], [[str(cell) for cell in row] for row in rows]
+    origin = {"command": command, "commit": commit, "date": time.strftime("%Y-%m-%d")}
+    files.write_json(folder / f"{name}.json", {**origin, "columns": head, "rows": cells})
+    (folder / f"{name}.md").write_text(markdown(head, cells), encoding="utf-8")
 
 
 def shown(stored: dict[str, Any]) -> str:
@@ -44,14 +64,14 @@ def differences(docs: Path) -> list[str]:
     return found + [f"docs/results/{name}.json: on no page" for name in stored if name not in used]
 
 
-def adopt(docs: Path, name: str, run: Path, commit: str, date: str) -> None:
+def adopt(docs: Path, name: str, run: Path) -> None:
     """The table of a run becomes the result of this name, on every page that shows it.
 
     Raises: OSError, ValueError or LookupError for a run that left no table.
     """
-    table = json.loads((run / "table.json").read_text("utf-8"))
-    content = {"command": table["command"], "commit": commit, "date": date,
-               "columns": table["columns"], "rows": table["rows"]}  # fmt: skip
+    path = run if run.suffix == ".json" else run / "table.json"
+    table = json.loads(path.read_text("utf-8"))
+    content = {key: table[key] for key in ("command", "commit", "date", "columns", "rows")}
     (docs / "results").mkdir(exist_ok=True)
     files.write_json(docs / "results" / f"{name}.json", content)
     for page in docs.rglob("*.md"):
@@ -69,10 +89,8 @@ def main(arguments: list[str], docs: Path = ROOT / "docs") -> int:
         if not given:
             print(__doc__)
             return 2
-        head = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-        commit = subprocess.run(head, capture_output=True, text=True, check=True).stdout.strip()
         try:
-            adopt(docs, name, Path(run), commit, time.strftime("%Y-%m-%d"))
+            adopt(docs, name, Path(run))
         except (OSError, ValueError, LookupError) as error:
             wrong.append(f"{argument}: no table.json of a study ({error})")
     wrong += differences(docs)

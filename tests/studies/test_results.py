@@ -20,17 +20,23 @@ def test_a_run_s_table_comes_to_its_place_and_what_differs_is_named(
     run.mkdir()
     page = (docs / "records" / "one").with_suffix(".md")
     page.write_text("# A\n\n<!-- result one -->\nold\n<!-- end -->\n\n<!-- result two -->\nkept<!-- end -->\nrest\n")
-    table = {"command": "python -m x", "columns": ["law", "error"], "rows": [["pi", ".25"], ["mpc", ".5"]]}
-    (run / "table.json").write_text(json.dumps(table))
+    results.leave(run, results.__file__, ("law", "error"), (("pi", 0.25), ("mpc", 0.5)))
+    assert (run / "table.md").read_text() == "| law | error |\n|---|---|\n| pi | 0.25 |\n| mpc | 0.5 |\n"
     assert results.main([f"one={run}"], docs) == 1  # two has no file
     assert capsys.readouterr().out == f"{page.name}: result two: no file docs/results/two.json\n"
     text = page.read_text()
-    assert "| law | error |\n|---|---|\n| pi | .25 |\n| mpc | .5 |\n" in text
-    assert "`python -m x`, commit " in text
+    assert "| law | error |\n|---|---|\n| pi | 0.25 |\n| mpc | 0.5 |\n" in text
+    left = json.loads((run / "table.json").read_text())
+    assert f"`python -m tests.studies.results`, commit {left['commit']}, {left['date']}." in text
     assert text.endswith("<!-- result two -->\nkept<!-- end -->\nrest\n")
-    page.write_text(text.replace("| .25 |", "| .24 |").partition("<!-- result two")[0])
+    page.write_text(text.replace("| 0.25 |", "| 0.24 |").partition("<!-- result two")[0])
     assert results.differences(docs) == [f"{page.name}: result one: the page is not what docs/results/one.json says"]
     page.write_text("# A\n")
     assert results.differences(docs) == ["docs/results/one.json: on no page"]
+    other = run / "week.json"
+    other.write_text(json.dumps(left | {"rows": [["day", "1"]]}))
+    page.write_text("# A\n<!-- result one -->\n<!-- end -->\n")
+    assert results.main([f"one={other}"], docs) == 0
+    assert "| day | 1 |" in page.read_text()
     assert results.main([f"two={docs}"], docs) == 1
     assert "no table.json of a study" in capsys.readouterr().out

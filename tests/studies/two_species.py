@@ -22,9 +22,9 @@ from experiments.laws import registry
 from experiments.laws.share.base import Array
 from experiments.laws.share.estimator import CompositionEstimator, CompositionEstimatorConfig
 from experiments.laws.share.recall import Recall
-from experiments.reporting.tables import markdown
 from tests.entry import command
 from tests.studies import second_vials
+from tests.studies.results import leave
 from tests.studies.second_vials import PROGRAMS, Conditions, Trace, draw, nominal
 
 __all__ = ["TwoSpeciesConfig", "main", "two_species"]
@@ -109,9 +109,9 @@ def two_species(config: TwoSpeciesConfig, folder: Path) -> None:
             log.info("%s, %s: %s", place[1], place[0], " | ".join(compared(laws[-1])))
     head = ["vials", *(f"day {k + 1}" for k in range(config.days))]
     rows = [(named(*kind), *daily(found)) for kind, found in zip(kinds, days, strict=True)]
-    (folder / "week.md").write_text(markdown(head, rows), encoding="utf-8")
+    leave(folder, __file__, head, rows, "week")
     rows = [(program, which, *compared(found)) for (which, program), found in zip(places, laws, strict=True)]
-    (folder / "laws.md").write_text(markdown(["program", "vials", *RIVALS], rows), encoding="utf-8")
+    leave(folder, __file__, ["program", "vials", *RIVALS], rows, "laws")
     beaten = [place for place, found in zip(places, laws, strict=True) if any(better(found, law) for law in RIVALS)]
     log.info("in %d of %d cells some law is better than %s: %s", len(beaten), len(places), COMPOSITION, beaten)
     found = {"weeks": [{"kind": kind, **d} for kind, d in zip(kinds, days, strict=True)], "beaten": beaten}

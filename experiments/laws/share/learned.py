@@ -9,9 +9,11 @@ from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
 from envs.coculture.pair import PairConfig
 from envs.coculture.task import logit
 from experiments.laws.share.base import Array, Estimate, Wanted
-from experiments.laws.share.laws import Index, LawConfig, Periodic
+from experiments.laws.share.laws import Index, LawConfig, Midpoint, MidpointConfig, Periodic
 
-__all__ = ["LearnedLaw", "LearnedLawConfig", "PreviewLawConfig"]
+__all__ = ["ONE_LINE", "LearnedLaw", "LearnedLawConfig", "PreviewLawConfig", "one_line"]
+
+ONE_LINE = "midpoint"  # the best law without a policy
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,11 @@ class PreviewLawConfig(LearnedLawConfig):
     control_min: float = setting(5.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
+def one_line(policy: Policy) -> bool:
+    """Whether a run found `ONE_LINE` better than this policy, so that it decides where the policy would."""
+    return bool(policy.metadata.get("learned", {}).get("law") == ONE_LINE)
+
+
 def _unnamed(pair: PairConfig) -> PairConfig:
     """A pair whose species are called by numbers."""
     return replace(pair, first=replace(pair.first, name="1"), second=replace(pair.second, name="2"))
@@ -44,12 +51,17 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
     not shown to it yet. It may decide more often than in training, as a receding horizon does: an action is worth what
     it is worth for a whole period, and is thought over before.
     Args: policy: with one of these observations, which all cultures follow until `follow` gives one another.
+    Where the policy that a culture follows was beaten by `ONE_LINE` (`one_line`), that law decides in its place.
     Attributes: number, of the policy that each culture follows, 0 for that, (N,).
     Raises: ValueError for a policy of another task.
     """
 
+    remembers = ("target", "next", "one_line")
+    added = ("one_line",)
+
     def __init__(self, config: LearnedLawConfig, policy: Policy, pair: PairConfig | None = None) -> None:
         self._policies: dict[int, Policy] = {}
+        self._one_line = Midpoint(MidpointConfig(control_min=config.control_min), pair)
         super().__init__(config, pair)
         self._check(policy)
         self.policy = self._policies[0] = policy
@@ -70,6 +82,7 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
     def reset(self, n: int) -> None:
         """See `Law.reset`; every culture follows the first policy."""
         super().reset(n)
+        self._one_line.reset(n)
         self.number = np.zeros(n, dtype=np.int64)
 
     def follow(self, n: int, number: int, policy: Policy) -> None:
@@ -94,6 +107,10 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
             columns += [np.where(shown, logit(wanted.following), now), np.where(shown, wanted.minutes, 0.0)]
         observation, chosen = np.stack(columns, axis=1), np.empty(idx.size)
         for k in np.unique(following):
-            rows = following == k
-            chosen[rows] = self._policies[int(k)].chosen(observation[rows])
+            rows, policy = following == k, self._policies[int(k)]
+            if one_line(policy):
+                asked = Wanted(wanted.setpoint[rows], wanted.following[rows], wanted.minutes[rows])
+                chosen[rows] = self._one_line._decide(estimate.of(np.flatnonzero(rows)), asked, minute[rows], idx[rows])
+            else:
+                chosen[rows] = policy.chosen(observation[rows])
         return chosen
