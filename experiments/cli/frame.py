@@ -39,6 +39,27 @@ log = logging.getLogger(__name__)
 for talker in ("httpx", "torch"):  # of every request, which journal and summary do better; of its caches at the end
     logging.getLogger(talker).setLevel(logging.WARNING)
 
+
+class _Once(logging.Filter):
+    """Says a warning of another library that counts its calls once, by the log alone; it has handlers of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """See `logging.Filter`."""
+        if record.levelno != logging.WARNING:
+            return True
+        kind = re.sub(r"\d+", "", record.getMessage())
+        if kind not in self._said:
+            self._said.add(kind)
+            log.warning("%s: %s (said once)", record.name, record.getMessage())
+        return False
+
+
+logging.getLogger("submitit").addFilter(_Once())  # a cluster without accounting refuses `sacct` at each poll
+
 BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}  # deprecated from 1.4 on
 
 SPACE, PLACE = "free disk space", "choose a folder that can be written, with hydra.run.dir=FOLDER"

@@ -94,10 +94,7 @@ class Hook:
         return "" if status < 300 else f"status {status}"
 
     def _run(self, line: bytes) -> str:
-        quiet = subprocess.DEVNULL
-        self._child = subprocess.Popen(
-            self._command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, start_new_session=True
-        )
+        self._child = subprocess.Popen(self._command, stdin=subprocess.PIPE, start_new_session=True)
         try:
             self._child.communicate(line, timeout=self._limit_s)
         finally:

@@ -205,6 +205,11 @@ def test_what_a_hook_answers_is_said_without_the_address(status: int, caplog) ->
     assert SECRET not in caplog.text
 
 
+def test_what_a_command_writes_is_seen(capfd: pytest.CaptureFixture[str]) -> None:
+    assert Hook("cat").send(b'{"event": "start"}\n') == ""
+    assert capfd.readouterr().out == '{"event": "start"}\n'
+
+
 def test_the_command_line_is_cleaned_of_an_address() -> None:
     environment: dict[str, str] = {}
     given = ["backend=sim", f"+notify=https://h/{SECRET}=1"]

@@ -243,6 +243,18 @@ def test_another_launcher_is_not_told_what_the_one_before_was(tmp_path):
     assert again.arguments == ["seed=0,1", "hydra/launcher=submitit_local"]
 
 
+def test_a_cluster_without_accounting_is_said_once_by_the_log_alone(caplog, monkeypatch, tmp_path):
+    slurm = pytest.importorskip("submitit.slurm.slurm")
+    monkeypatch.setenv("PATH", str(tmp_path))  # no sacct, which fails as one without accounting does
+    watcher = slurm.SlurmInfoWatcher()
+    for number in ("12", "13", "14"):
+        watcher.register_job(number)
+        watcher.update()
+    (said,) = caplog.records
+    assert said.name == frame.log.name
+    assert "sacct" in said.getMessage()
+
+
 def test_a_single_run_is_not_resumed_as_a_sweep(tmp_path):
     with pytest.raises(UserError, match="no sweep; a single run goes on without -m"):
         sweep.asked(["-m", f"resume={tmp_path}"], "train")

@@ -19,17 +19,22 @@ import numpy as np
 import torch
 
 from conf.schema import check, setting
+from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
+from envs.coculture.task import CocultureConfig, advance, passed, share
 from experiments.cli import files
 from experiments.cli.stop import Workers
+from experiments.laws import registry
+from experiments.laws.share.base import Array, Estimate, Wanted
 from experiments.reporting.tables import number
 from experiments.train import main as train
 from experiments.training import build, tasks
+from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Act, Evaluation
 from experiments.training.session import Session
 from tests.entry import command
 from tests.studies.results import leave
 
-__all__ = ["LearnersConfig", "learners", "main"]
+__all__ = ["LearnersConfig", "learners", "main", "one_line", "receding"]
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +58,7 @@ WITHOUT = {
     "falling rate": ["agent.learning_rate_end=null"],
 }
 OURS, LAW = "this program's DQN", "one look ahead, one line"
+PLANS = (1, 3, 6)  # h
 COLUMNS = ("task", "policy", "steps", "regret, %", "worst seed", "error at rest", "CPU s")
 
 
@@ -155,12 +161,57 @@ def rival(job: Job) -> tuple[int, Act]:
     return job.steps, act
 
 
-def law(task: str) -> list[str]:
-    """The row of the one-line law."""
+def laws(task: str) -> list[list[str]]:
+    """Rows of the laws that learn nothing."""
     known, report = evaluation(task)
     found = report(known.myopic, 1)
     regret, steady = float(found.regret_pct[0]), float(found.steady_abs_error[0])
-    return [TASKS[task], LAW, "–", number(round(regret, 3)), "–", number(steady), "–"]
+    rows = [(LAW, number(round(regret, 3)), number(steady))]
+    if isinstance(known, Coculture):
+        config, start, optimum = known.config, report.start, report.optimum_cost
+        kinds = ("midpoint" if config.preview_min else "inverse_dynamics", "proportional", "pi")
+        costs = {f"`{kind}`, one line": one_line(kind, config, start) for kind in kinds}
+        costs |= {f"a plan of {h} h, made anew": receding(h, config, start) for h in PLANS if config.preview_min}
+        rows += [(name, number(round(100.0 * (cost / optimum - 1.0), 3)), "–") for name, cost in costs.items()]
+    return [[TASKS[task], name, "–", regret, "–", steady, "–"] for name, regret, steady in rows]
+
+
+def one_line(kind: str, config: CocultureConfig, start: Array) -> float:
+    """Cost of a law of the share, mean over the starts of the sum of squared errors, with the state as the estimate.
+
+    Its target is not one of the policies' but any, and those with a period of a minute act within a decision, too.
+    """
+    law = registry.build(registry.config(kind, registry.SHARE), registry.SHARE)
+    n, each_min = len(start), round(config.control_min)
+    law.reset(n)
+    state, goal, total = start[:, :3], start[:, 3:], np.zeros(n)
+    for k in range(config.episode_steps):
+        wanted = share(goal[:, 0])
+        following = share(goal[:, 1]) if config.preview_min else wanted
+        left = goal[:, 2] if config.preview_min else np.zeros(n)
+        for minute in range(each_min):
+            believed = Estimate(state[:, 0], np.full(n, 0.01), state[:, 1], state[:, 2], *np.zeros((3, n)))
+            told = Wanted(wanted, following, np.maximum(left - minute, 0.0) * (left > 0.0))
+            target = law.act(believed, told, np.full(n, k * each_min + minute), np.ones(n, dtype=np.bool_))
+            state = advance(config, state, target, 1.0)
+        total += np.square(share(state[:, 0]) - wanted)
+        goal = passed(config, goal)
+    return float(total.mean())
+
+
+def receding(hours: int, config: CocultureConfig, start: Array) -> float:
+    """The same of the optimal plan that ends after so many hours, made anew before each decision."""
+    model, state, ahead = transitions(config, Grid()), start[:, :3], round(60.0 * hours / config.control_min)
+    program, goal = np.empty((config.episode_steps + ahead, len(start))), start[:, 3:]
+    for k in range(len(program)):
+        program[k], goal = share(goal[:, 0]), passed(config, goal)
+    total = np.zeros(len(start))
+    for k in range(config.episode_steps):
+        value = cost_to_go(model, program[k : k + ahead])[1]
+        action = best_action(config, model, value, state, program[k])
+        state = advance(config, state, config.targets()[action], config.control_min)
+        total += np.square(share(state[:, 0]) - program[k])
+    return float(total.mean())
 
 
 def table(c: LearnersConfig, found: dict[Job, dict[str, float]]) -> list[list[str]]:
@@ -177,7 +228,7 @@ def table(c: LearnersConfig, found: dict[Job, dict[str, float]]) -> list[list[st
         cells = [number(middle), number(max(regrets)), number(statistics.median(e["steady"] for e in each)),
                  number(statistics.median(e["cpu_s"] for e in each), 2)]  # fmt: skip
         rows.append((c.tasks.index(task), middle, [TASKS[task], name, f"{each[0]['steps']:.0f}", *cells]))
-    rows += [(k, float(row[3]), row) for k, row in ((k, law(task)) for k, task in enumerate(c.tasks))]
+    rows += [(k, float(row[3]), row) for k, task in enumerate(c.tasks) for row in laws(task)]
     ranked = [row for *_, row in sorted(rows, key=lambda entry: entry[:2])]
     return [row for k, row in enumerate(ranked) if row[:3] not in (other[:3] for other in ranked[:k])]
 

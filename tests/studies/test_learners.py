@@ -10,7 +10,9 @@ from tests.studies.learners import Job, LearnersConfig
 def two_tasks(monkeypatch: pytest.MonkeyPatch) -> LearnersConfig:
     """A law of regret 4 in the first task and of .25 in the second."""
     regret = {"sim": "4", "coculture_preview": "0.25"}
-    monkeypatch.setattr(learners, "law", lambda task: [learners.TASKS[task], "law", "–", regret[task], "–", "0.1", "–"])
+    monkeypatch.setattr(
+        learners, "laws", lambda task: [[learners.TASKS[task], "law", "–", regret[task], "–", "0.1", "–"]]
+    )
     return LearnersConfig(("sim", "coculture_preview"), ("ppo",), (2000,), ("ppo",), 9000, ("hindsight",), 3)
 
 
