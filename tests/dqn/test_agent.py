@@ -244,6 +244,60 @@ def test_epsilon_without_steps_is_its_end() -> None:
     assert DQNConfig(epsilon_end=0.05, epsilon_steps=0).epsilon(0) == 0.05
 
 
+def test_as_large_a_share_of_a_minibatch_gets_another_goal_as_is_asked_for() -> None:
+    """A quarter of 16: four of each agent, whatever is drawn."""
+    config = DQNConfig(**{**SMALL.__dict__, "hindsight_share": 0.25})
+
+    class Marked(Shifted):
+        def replace(self, batch: Transition, drawn: torch.Tensor) -> None:
+            batch.r_t.fill_(77.0)
+
+    agent = DQNAgent(config, 3, 3, streams(range(2)), Marked())
+    before = np.zeros((2, 3), dtype=np.float32)
+    agent.replay.add(before, np.zeros(2), np.zeros(2), before, np.ones(2))
+    assert ((agent._minibatches(3).r_t == 77.0).sum(-1) == 4).all()
+
+
+def test_the_last_updates_are_taken_at_the_rate_that_the_config_ends_with() -> None:
+    """Adam's first step is as long as its rate, whatever the gradient."""
+    config = DQNConfig(**{**SMALL.__dict__, "learning_rate_end": 3e-5})
+    for update, rate in ((0, 3e-3), (config.total_updates, 3e-5)):
+        agent = DQNAgent(config, 3, 3, streams(range(2)))
+        agent.updates, before = update, agent.online.flat.clone()
+        agent.fit(torch.ones(2, 4, 3), torch.zeros(2, 4, dtype=torch.int64), torch.full((2, 4), 9.0))
+        assert float((agent.online.flat - before).abs().max()) == pytest.approx(rate, rel=0.01)
+
+
+def test_costs_are_learned_in_the_scale_of_their_root_and_gaps_are_widened_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """h(z) = c - sqrt(c^2 - z), h^-1(q) = c^2 - (c - q)^2: y = h(r + g h^-1(max q')) - gap (max q - q_a), c = 0.4."""
+    config = DQNConfig(**{**SMALL.__dict__, "value_root": 0.4, "action_gap": 0.25, "gamma": 0.9})
+    agent = DQNAgent(config, 1, 3, streams(range(1)))
+    after, now = torch.tensor([-0.5, -0.3, -0.7]), torch.tensor([-0.9, -0.1, -0.6])
+    monkeypatch.setattr(agent, "_q_target", lambda seen: torch.where(seen[..., :1] > 0.0, after, now))
+    here, there = torch.full((1, 1, 1, 1), -1.0), torch.full((1, 1, 1, 1), 1.0)
+    one = torch.ones(1, 1, 1)
+    y = agent._td_target(Transition(here, torch.full((1, 1, 1), 2), -0.05 * one, there, one))
+    value = -0.05 + 0.9 * (0.4**2 - (0.4 + 0.3) ** 2)
+    assert float(y) == pytest.approx(0.4 - np.sqrt(0.4**2 - value) - 0.25 * (-0.1 + 0.6))
+
+
+def test_what_explores_tries_every_action_equally_often() -> None:
+    agent = DQNAgent(DQNConfig(**{**SMALL.__dict__, "epsilon_start": 1.0}), 1, 5, streams(range(400)))
+    tried = np.concatenate([agent.act(np.zeros((400, 1), dtype=np.float32)) for _ in range(10)])
+    np.testing.assert_allclose(np.bincount(tried, minlength=5) / tried.size, 0.2, atol=0.03)
+
+
+def test_a_resumed_agent_tells_of_the_loss_and_the_range_of_q_that_it_had() -> None:
+    """Until it looks at them again, which may be an hundred updates off; each agent has its own."""
+    first, second = (DQNAgent(SMALL, 3, 3, streams(range(2))) for _ in range(2))
+    first.loss, first.q_range = torch.tensor([0.25, 4.0]), torch.tensor([[-3.0, 0.5], [-7.0, 2.0]])
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    assert second.loss.tolist() == [0.25, 4.0]
+    assert second.q_range.tolist() == [[-3.0, 0.5], [-7.0, 2.0]]
+
+
 def test_relabelling_without_a_goal_is_refused() -> None:
     config = DQNConfig(**{**SMALL.__dict__, "hindsight_share": 0.5})
     with pytest.raises(ValueError, match=r"agent\.hindsight_share = 0\.5"):

@@ -162,6 +162,34 @@ def test_a_file_of_the_first_format_is_read_without_limits(tmp_path: Path) -> No
     np.testing.assert_array_equal(old.actions, RATES)
 
 
+@pytest.mark.parametrize(
+    ("part", "changes"),
+    [
+        ("limits", {"low": np.array([-np.inf, 0.1], np.float32)}),
+        ("map of the inputs", {"input_matrix": (MATRIX * 1.001).numpy()}),
+        ("weights", {"biases": tuple(b + np.float32(k == 2) for k, b in enumerate(_policy().biases))}),
+        ("observation or model", {"metadata": {**_policy().metadata, "control_min": 2.0}}),
+        ("observation or model", {"metadata": {**_policy().metadata, "observation": ["error", "growth_share"]}}),
+    ],
+    ids=["low", "matrix", "last bias", "period", "observation"],
+)
+def test_whatever_of_a_policy_decides_is_in_its_fingerprint(part: str, changes: dict[str, Any]) -> None:
+    own, other = policy.fingerprints(_policy()), policy.fingerprints(replace(_policy(), **changes))
+    assert [name for name in own if own[name] != other[name]] == [part]
+
+
+def test_what_is_exported_are_the_weights_and_the_limits_that_are_given() -> None:
+    """Not those that the network has now: the best ones may be of long ago."""
+    network = _network()
+    kept = network.flat.flip(0) * 0.5
+    limits = np.array([-2.0, 0.1]), np.array([3.0, 0.9])
+    own = export(network, 0, kept, RATES, limits, {"seed": 4})
+    expected = network.with_weights(kept)(torch.tensor([[[0.4, 0.6]]]).expand(3, -1, -1))[0].numpy()
+    np.testing.assert_allclose(own.q_values(np.array([[0.4, 0.6]])), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose([own.low, own.high], limits)
+    assert own.metadata == {"format": policy.FORMAT, "seed": 4}
+
+
 def test_limits_that_hold_nothing_are_refused(tmp_path: Path) -> None:
     wrong = replace(_policy(), low=np.array([1.0, 0.0], np.float32), high=np.array([1.0, 1.0], np.float32))
     policy.save(tmp_path / "policy.npz", wrong)
