@@ -13,10 +13,11 @@ from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from experiments.benchmark import _schema, benchmark
 from experiments.cli import frame
-from experiments.comparison import statistics
+from experiments.comparison import statistics, trials
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.run import policies_of, with_pair
 from experiments.comparison.trials import Cell, ShareTrial, calibrate, cells, run_cell
+from experiments.control.policies import SHIPPED_COMPOSITION
 from experiments.laws.share.estimator import FACTOR, OFFSET, CompositionEstimator, CompositionEstimatorConfig
 from tests.experiments.test_deploy import inverse_policy
 
@@ -227,6 +228,102 @@ def test_a_learned_law_follows_the_policy_that_ships(tmp_path):
     found = policies_of(config(), ["dqn", "pi"], tmp_path)
     assert found["pi"] is None
     assert found["dqn"] is not None
+
+
+def test_a_row_of_a_share_tells_root_mean_square_cover_and_densities_of_all_its_samples():
+    """The estimate is off in two of eight samples; the band lies above the truth in one and below it in two."""
+    share = [[0.9, 0.6, 0.5, 0.5], [0.9, 0.5, 0.5, 0.4]]
+    t = made_up(share, setpoint=(math.nan, 0.5, 0.6, 0.4))
+    off = np.array([[0.0, 0.3, 0.0, 0.0], [0.0, 0.0, 0.0, -0.1]])
+    low, high = t.low.copy(), t.high.copy()
+    low[0, 1], high[1, 2:] = 0.7, 0.3
+    od = np.array([[0.4, 0.5, 0.6, 0.5], [0.5, 0.5, 0.5, 0.9]])
+    row = statistics.share_row(replace(t, estimate=t.share + off, low=low, high=high, od=od))
+    assert row["estimate_rms"] == pytest.approx(math.sqrt((0.09 + 0.01) / 8.0))
+    assert row["band_covers"] == pytest.approx(5.0 / 8.0)
+    assert (row["od_min"], row["od_mean"], row["od_max"]) == pytest.approx((0.4, 0.55, 0.9))
+    assert row["ratio_abs_error_mean"] == pytest.approx(0.2 / 3.0)  # of 0.1 and 0.1 / 3
+    half = 12.706204736 * 0.1 / 3.0  # Student's t with one degree of freedom
+    assert row["ci95"] == pytest.approx([0.2 / 3.0 - half, 0.2 / 3.0 + half])
+    assert row["ratio_abs_error_sd"] == pytest.approx(0.2 / 3.0 / math.sqrt(2.0))
+    assert row["ratio_abs_error_last2h"] == pytest.approx(0.05)  # the one window in which the setpoint rests
+
+
+class Asked(Exception):
+    """What a loop of a share was begun with."""
+
+
+def begun(monkeypatch, cell, **changes):
+    """Plant, estimator, law, density, program, setpoints, temperatures and foresight of a cell, before its first."""
+
+    def run_share(*given):
+        raise Asked(given)
+
+    monkeypatch.setattr(trials, "run_share", run_share)
+    with pytest.raises(Asked) as caught:
+        run_cell(replace(config(), **changes), cell, None)
+    return caught.value.args[0]
+
+
+def test_the_seed_of_the_config_is_that_of_vials_and_of_what_is_known_of_their_sensors(monkeypatch):
+    """The same seed gives the same vials to two laws, another one others, with other errors of the calibration."""
+    one, same, other = (
+        begun(monkeypatch, cell(law, "coculture_mixed"), seed=seed)
+        for law, seed in (("pi", 4), ("receding", 4), ("pi", 5))
+    )
+    for key in one[0].draws:
+        np.testing.assert_array_equal(one[0].draws[key], same[0].draws[key])
+    factors = [each[0].draws["fluorescence_factor"] for each in (one, other)]
+    assert (factors[0] != factors[1]).all()
+    errors = [each[1].mean[:, 0, FACTOR] / factor for each, factor in zip((one, other), factors, strict=True)]
+    assert (np.abs(errors[0] - errors[1]) > 1e-6).all()
+    np.testing.assert_array_equal(one[1].mean, same[1].mean)
+
+
+def test_each_phase_of_a_share_has_its_own_density_and_temperature_and_each_vial_its_own_dose(monkeypatch):
+    """Three minutes without a share at OD 0.3 and 31 degC, then four in which the law asks for more than is allowed."""
+
+    class Density:
+        seen, told = [], []
+
+        def reset(self, n):
+            self.told.clear(), self.seen.clear()
+
+        def act(self, od, setpoint, minute, rows):
+            self.seen.append((minute.tolist(), setpoint.tolist()))
+            return np.array([0.001, 0.002])
+
+        def dosed(self, volume_ml):
+            self.told.append(volume_ml.tolist())
+
+    class Law:
+        def act(self, estimate, wanted, minute, rows):
+            return np.full(2, 40.0)
+
+    schedule = Scenario((0.3, 0.6), (3.0, 4.0), (31.0, 35.0), ratios=(None, 0.4))
+    plant, density = Plant(config().plants["coculture"], 2, np.random.default_rng(1)), Density()
+    estimator = CompositionEstimator(CompositionEstimatorConfig())
+    estimator.reset(2)
+    given, advance = [], plant.advance
+    monkeypatch.setattr(plant, "advance", lambda *a, **k: (given.append((*a, *k.values())), advance(*a, **k)))
+    phases = np.asarray(schedule.setpoints), np.asarray(schedule.temperatures)
+    found = trials.run_share(plant, estimator, Law(), density, trials.program_of(schedule), *phases, 0.0)
+    assert density.seen == [([float(k)] * 2, [0.3 if k < 3 else 0.6] * 2) for k in range(8)]
+    assert density.told == [pytest.approx([0.06, 0.12])] * 8
+    assert [each[1].tolist() for each in given] == [pytest.approx([0.06, 0.12])] * 8
+    assert [each[2].tolist() for each in given] == [[31.0] * 2] * 3 + [[36.0] * 2] * 5
+    assert {key: values.shape for key, values in found.items()} == dict.fromkeys(found, (2, 8))
+
+
+def test_each_law_follows_the_policy_that_is_named_for_it(tmp_path):
+    """One of them a file of one's own, the other what ships."""
+    own = policy.load(SHIPPED_COMPOSITION["dqn"])
+    policy.save(tmp_path / "own.npz", replace(own, metadata={**own.metadata, "regret_pct": 12.5}))
+    named = replace(config(), composition_policies={"dqn": str(tmp_path / "own.npz")})
+    found = policies_of(named, ["dqn", "dqn_preview"], tmp_path / "run")
+    assert found["dqn"][0].metadata["regret_pct"] == 12.5
+    preview = policy.load(SHIPPED_COMPOSITION["dqn_preview"])
+    assert found["dqn_preview"][0].metadata == preview.metadata
 
 
 @pytest.mark.parametrize(

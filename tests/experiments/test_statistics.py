@@ -174,3 +174,17 @@ def test_a_third_signal_has_rows_and_pairs(monkeypatch: pytest.MonkeyPatch) -> N
     assert [r["signal"] for r in rows([density, mine])] == ["density", "density", "heat"]
     [found] = pairs([density, trial("mine"), mine, theirs], "theirs")
     assert (found["signal"], found["metric"], found["difference"], found["lower_in"]) == ("heat", "warmth", -1.0, 2)
+
+
+def test_medians_of_costs_and_of_differences_are_those_of_the_replicates_and_not_their_means() -> None:
+    """Seven vials, one of them far off; the interval of a median of seven is from the least to the largest."""
+    off = (0.02, 0.01, 0.03, 0.04, 0.05, 0.06, 0.9)
+    _, second = rows([trial(error=off)])
+    assert (second["ise_median"], second["itae_median"]) == pytest.approx((30.0 * 0.04**2, 450.0 * 0.04))
+    [whole] = totals([trial(error=off)])
+    each = [20.0 * e**2 + 0.5 * ((e + 0.3) ** 2 - e**2) + 30.0 * e**2 for e in off]
+    assert whole["ise_median"] == pytest.approx(sorted(each)[3])
+    late = pairs([trial("mpc", tuple(0.1 + e for e in off)), trial("pi", (0.1,) * 7)], "pi")[3]
+    assert (late["difference"], late["median"]) == pytest.approx((450.0 * sum(off) / 7.0, 450.0 * 0.04))
+    assert late["median_ci95"] == pytest.approx([450.0 * 0.01, 450.0 * 0.9])
+    assert late["lower_in"] == 0
