@@ -1,6 +1,7 @@
 """Figures of a benchmark, from trials and from the rows of its summary."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -103,8 +104,9 @@ def bands(trials: Sequence[DensityTrial]) -> Figure:
         if switched:
             bottom = axes[2 * len(trials) + column]
             _band(bottom, minute, temperature, colour)
-            for ax in (top, middle, bottom):
-                ax.axvline(edges[1], color="#888888", linewidth=0.8, linestyle=":")
+            for edge, (before, after) in zip(edges[1:-1], pairwise(trial.schedule.temperatures), strict=True):
+                for ax in (top, middle, bottom) if after != before else ():
+                    ax.axvline(edge, color="#888888", linewidth=0.8, linestyle=":")
         top.set_title(f"{trial.cell.controller}, n = {trial.od.shape[0]}")
         axes[(rows - 1) * len(trials) + column].set_xlabel("time, min")
     axes[0].set_ylabel("OD")

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection, QuadMesh
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from dqn.policy import load
@@ -650,3 +651,224 @@ def test_intervals_are_written_from_low_to_high() -> None:
     assert found is not None
     assert found.items[0] == "mu 0.03 1/min, 95 % interval 0.027 to 0.039; doubling time 23.1 min"
     assert found.items[1] == "tau 0.35, 95 % interval 0.315 to 0.455"
+
+
+def legend(figure: Figure, panel: int | None = None) -> dict[str, tuple[str, str]]:
+    """Colour and marker of each entry."""
+    (said,) = figure.legends if panel is None else [figure.axes[panel].get_legend()]
+    handles = zip(said.get_texts(), said.legend_handles, strict=True)
+    return {text.get_text(): (to_hex(line.get_color()), str(line.get_marker())) for text, line in handles}
+
+
+def dots(ax: Axes) -> dict[tuple[float, float], tuple[str, str]]:
+    """Colour and marker of each mark that stands alone, by its place."""
+    alone = [line for line in ax.lines if len(line.get_xdata()) == 1 and line.get_marker() not in ("None", "")]
+    places = [tuple(np.round(np.ravel(line.get_data()).astype(float), 6).tolist()) for line in alone]
+    return {at: (to_hex(line.get_color()), str(line.get_marker())) for at, line in zip(places, alone, strict=True)}
+
+
+def test_each_law_has_its_own_column_and_colour_and_a_switch_stands_where_the_temperature_changes() -> None:
+    """Three phases, the last one colder; the second law's pump runs five times as fast, beyond the usual 21 uL/s."""
+    schedule = Scenario((0.5, 0.4, 0.6), (30.0, 40.0, 20.0), (37.0, 37.0, 30.0))
+    one = replace(trial(90.0), schedule=schedule)
+    other = replace(
+        one, cell=Cell("mpc", "p", "s"), od=one.od + 0.2, rate=5.0 * one.rate, temperature=one.temperature - 2.0
+    )
+    drawn = figures.bands([one, other])
+    known = legend(figures.plants([totals("pi", 0.1, 1.0), totals("mpc", 0.2, 2.0)]))
+    for column, (law, values) in enumerate((("pi", (0.5, 8.0, 33.0)), ("mpc", (0.7, 40.0, 31.0)))):
+        panels = drawn.axes[column::2]
+        assert panels[0].get_title() == f"{law}, n = 3"
+        np.testing.assert_allclose(panels[0].lines[0].get_xdata(), [0.0, 30.0, 70.0, 90.0])
+        np.testing.assert_allclose(panels[0].lines[0].get_ydata(), [0.5, 0.4, 0.6, 0.6])
+        for ax, mean in zip(panels, values, strict=True):
+            (line,) = (line for line in ax.lines if len(line.get_xdata()) == 90)
+            np.testing.assert_allclose(line.get_ydata(), mean)
+            assert to_hex(line.get_color()) == known[law][0]
+            assert [line.get_xdata()[0] for line in ax.lines if line.get_linestyle() == ":"] == [70.0]
+        assert panels[1].get_ylim()[1] > 60.0
+
+
+def test_a_long_run_is_drawn_by_the_means_of_its_blocks() -> None:
+    """An OD that rises by 0.001 a minute: the mean of ten minutes is that of the minute in their middle."""
+    one = trial(400.0)
+    ax = figures.bands([replace(one, clean=0.001 * one.minute + SPREAD)]).axes[0]
+    np.testing.assert_allclose(ax.lines[1].get_data(), [TENS, 0.001 * TENS])
+
+
+def test_shares_of_two_laws_stand_in_the_column_of_their_own_name() -> None:
+    one = share_trial()
+    told = replace(one, cell=Cell("midpoint", "p", "s", "share"), foresight=True, share=one.share + 0.3)
+    told = replace(told, temperature=one.temperature + 2.0, setpoint=one.setpoint + 0.3)
+    axes = figures.shares([told, one]).axes
+    assert [ax.get_title() for ax in axes] == ["midpoint, told ahead", "pi", "", ""]
+    assert [float(ax.lines[0].get_ydata()[0]) for ax in axes] == pytest.approx([0.6, 0.3, 33.0, 31.0])
+    assert [float(ax.lines[1].get_ydata()[0]) for ax in axes[:2]] == pytest.approx([0.65, 0.35])
+
+
+def test_errors_of_a_share_have_the_mark_of_their_law_in_the_row_of_their_plant() -> None:
+    """Two laws on two plants, one of the laws told ahead and not; a law that did not run leaves its place empty."""
+    laws_of = (("pi", False), ("midpoint", False), ("midpoint", True))
+    entries = [
+        {"controller": law, "preview": told, "plant": plant, "ratio_abs_error_mean": 0.01 * (3 * i + k + 1),
+         "ci95": [0.005 * (3 * i + k + 1), 0.03 * (3 * i + k + 1)]}
+        for i, plant in enumerate(("wide", "narrow"))
+        for k, (law, told) in enumerate(laws_of)
+        if (i, k) != (1, 1)
+    ]  # fmt: skip
+    drawn = figures.share_errors(entries)
+    (ax,) = drawn.axes
+    assert [text.get_text() for text in ax.get_yticklabels()] == ["wide", "narrow"]
+    marks = legend(drawn)
+    assert list(marks) == ["pi", "midpoint", "midpoint, told ahead"]
+    assert len(set(marks.values())) == 3
+    pi, midpoint, told = marks.values()
+    assert dots(ax) == {
+        (0.01, -0.24): pi, (0.02, 0.0): midpoint, (0.03, 0.24): told, (0.04, 0.76): pi, (0.06, 1.24): told,
+    }  # fmt: skip
+
+
+def test_every_law_keeps_its_mark_and_one_that_does_nothing_is_off_the_scale() -> None:
+    """Told in the legend, the same in costs, differences and beside the paper."""
+    costs = figures.plants([totals("pi", 0.05, 6.0), totals("hold", 9.0, 900.0), totals("mpc", 0.2, 9.0)])
+    marks = legend(costs)
+    assert [name for name in marks if name != "sensor-noise floor"] == ["pi", "mpc"]
+    assert dots(costs.axes[0]) == {(0.05, -0.18): marks["pi"], (0.2, 0.18): marks["mpc"]}
+    assert dots(costs.axes[1]) == {(6.0, -0.18): marks["pi"], (9.0, 0.18): marks["mpc"]}
+    entries = [difference("ise", 30.0), {**difference("ise", -10.0), "controller": "mpc"}]
+    entries.append({**difference("ise", 9000.0), "controller": "hold"})
+    drawn = figures.differences(entries, "dqn_adaptive")
+    assert dots(drawn.axes[0]) == {(30.0, -0.18): marks["pi"], (-10.0, 0.18): marks["mpc"]}
+    assert [label(ax, "x") for ax in drawn.axes] == [f"{m} minus that of dqn_adaptive, %" for m in ("ISE", "ITAE")]
+    assert drawn.axes[0].get_xlim()[1] < 9000.0
+    paper = figures.published_and_ours([row(0.05, 6.0), {**row(0.06, 7.0), "controller": "mpc", "window": "0.5"}])
+    assert legend(paper).items() >= {law: marks[law] for law in ("pi", "mpc")}.items()
+    names = [text.get_text() for text in paper.axes[0].get_yticklabels()]
+    assert names == ["OD 0.8", "OD 0.65", "OD 0.5", "37 °C", "30 °C"]
+    at = dots(paper.axes[0])
+    assert (at[0.117, 2.24], at[0.06, 2.24], at[0.033, 3.0]) == (marks["mpc"], marks["mpc"], marks["pi"])
+
+
+def test_every_curve_of_a_run_is_named_as_its_reactor_in_every_panel() -> None:
+    """The first reactor's setpoint is black, the other's has its own colour."""
+    drawn = closed_loop()
+    top, pump, heat = drawn.axes
+    named = {str(line.get_label()): line for line in top.lines if not str(line.get_label()).startswith("_")}
+    assert list(named) == ["M0", "setpoint", "M1", "not believed"]
+    for k, name in enumerate(("M0", "M1")):
+        assert np.nanmax(named[name].get_ydata()) == pytest.approx((k + 1) * 0.52)
+        assert {ax.lines[k].get_color() for ax in (pump, heat)} == {named[name].get_color()}
+    assert top.texts[0].get_text() == "M1 looked"
+    share = composition().axes[0]
+    entries = {text.get_text() for text in share.get_legend().get_texts()}
+    assert entries == {
+        "M0, estimate and 95 % band", "M1, estimate and 95 % band", "setpoint", "counted, 95 %",
+        "next setpoint, when announced",
+    }  # fmt: skip
+    lines = {str(line.get_label()): line for line in share.lines}
+    for k, name in enumerate(("M0", "M1")):
+        own = lines[f"{name}, estimate and 95 % band"]
+        assert own.get_ydata()[-1] == pytest.approx((k + 1) * 0.52)
+        band = [c for c in share.collections if isinstance(c, PolyCollection)][k]
+        assert to_hex(band.get_facecolor()[0]) == to_hex(own.get_color())
+        assert to_hex(share.containers[k].lines[0].get_color()) == to_hex(own.get_color())
+
+
+def test_a_calibration_says_in_words_what_its_figures_show() -> None:
+    """Half widths 0.006 and 0.07; five of seven innovations lie within 1.96 sd; a residual of 0.02 throughout."""
+    found = fit("prediction_error")
+    words = [text.get_text() for text in found.legends[0].get_texts()]
+    assert words == [
+        "measured, used", "measured, not used", "rejected reading", "free run of this pair, PMSE 7 %",
+        "one step ahead: µ = 0.03000 ± 0.00600 /min, τ = 0.350 ± 0.070",
+    ]  # fmt: skip
+    lines = {str(line.get_label()): line for line in found.axes[0].lines}
+    np.testing.assert_allclose(lines["rejected reading"].get_data(), [[0.5], [0.1]])
+    np.testing.assert_allclose(lines["measured, not used"].get_xdata(), [HOURS[0], *HOURS[9:]])
+    np.testing.assert_allclose(lines[words[3]].get_ydata(), OD[2:9] + 0.02)
+    assert found.axes[1].get_title() == (
+        "one-step innovations: 71 % in the 95 % band, correlation from row to row 0.10"
+    )
+    free = fit("free_run")
+    assert free.axes[1].get_title() == "residuals of the free run: rms 0.0200 OD"
+    assert free.legends[0].get_texts()[-1].get_text().startswith("free run: µ = 0.03000")
+    raw, result = calibrated()
+    far = calibration_charts.fit_figure(replace(raw, od=np.where(MINUTES == 30.0, 3.7, raw.od)), result, "").axes[0]
+    (beyond,) = (line for line in far.lines if line.get_marker() == "^")
+    assert beyond.get_label() == "rejected, up to 3.7"
+    assert beyond.get_xdata().tolist() == [0.5]
+    assert 0.52 < beyond.get_ydata()[0] < far.get_ylim()[1] < 0.7
+    drift = calibration_charts.drift_figure(result, "")
+    for ax, trend in zip(drift.axes, ("trend -13 %", "trend +20 %"), strict=True):
+        assert ax.lines[-1].get_label() == trend
+    assert twin().axes[2].get_title() == (
+        "reading: sd hypot(0.0020, 0.5 % of OD), correlation 0.10; doses spread 10 %; outliers 1.00 %"
+    )
+    assert [line.get_label() for line in twin().axes[1].lines] == ["twin", "returned pair", "segment alone"]
+    assert agreed().axes[2].get_title() == (
+        "one sample ahead: rms 0.0100 OD, 0.0050 without the model's error of net growth"
+    )
+
+
+def test_each_species_is_named_beside_its_own_curve() -> None:
+    pair = PairConfig()
+    growth, pigment = two().axes
+    lines = {text.get_text(): line for text, line in
+             zip(growth.get_legend().get_texts(), growth.get_legend().legend_handles, strict=True)}  # fmt: skip
+    assert list(lines)[:2] == [pair.first.name, pair.second.name]
+    drawn = {str(line.get_label()): line for line in growth.lines}
+    assert drawn[pair.first.name].get_ydata()[0] == pytest.approx(0.07727 * 29.0 - 1.66954)
+    assert pigment.lines[0].get_color() == drawn[pair.second.name].get_color()
+
+
+def test_example_loops_stand_in_the_column_of_their_setpoint_with_the_optimum_from_the_same_start() -> None:
+    """Three starts, of which the second is at the lower setpoint; the optimum pumps up to 30 uL/s."""
+    minutes, goal = np.array([0.0, 2.0, 4.0]), np.array([0.8, 0.4, 0.8])
+    od, best = np.array([[0.9, 0.5, 0.7]] * 3) * np.array([[1.0], [0.9], [0.8]]), np.array([[0.91, 0.51, 0.71]] * 3)
+    rates, most = np.array([[0.001, 0.002, 0.003]] * 2), np.array([[0.01, 0.02, 0.03]] * 2)
+    axes = charts.trajectories(minutes, od, best, goal, rates, most).axes
+    for column, (to, members) in enumerate(((0.4, (1,)), (0.8, (0, 2)))):
+        top, bottom = axes[column], axes[2 + column]
+        assert top.get_title() == f"setpoint {to:g}"
+        assert set(top.lines[0].get_ydata()) == {to}
+        for k, g in enumerate(members):
+            own, other = top.lines[1 + 2 * k : 3 + 2 * k]
+            assert own.get_label() == f"learned, from {od[0, g]:g}"
+            np.testing.assert_allclose(own.get_ydata(), od[:, g])
+            np.testing.assert_allclose(other.get_ydata(), best[:, g])
+            assert other.get_linestyle() == ":"
+            given, optimal = bottom.lines[2 * k : 2 * k + 2]
+            assert given.get_color() == own.get_color()
+            np.testing.assert_allclose([given.get_ydata()[0], optimal.get_ydata()[0]], [g + 1.0, 10.0 * (g + 1.0)])
+        assert bottom.get_ylim()[1] > 30.0
+    od, best, rates, most = (np.repeat(each, 20, axis=0) for each in (od, best, 10.0 * rates, 10.0 * most))
+    axes = charts.relative_trajectories(od, best, np.array([0.9, 0.1, 0.9]), rates, most).axes
+    for column, (to, members) in enumerate(((0.1, (1,)), (0.9, (0, 2)))):
+        assert axes[column].get_title() == f"growth takes {to:g} of the pump"
+        for k, g in enumerate(members):
+            own, other = axes[column].lines[2 * k : 2 * k + 2]
+            assert own.get_label() == f"learned, from {od[0, g]:g}"
+            np.testing.assert_allclose([own.get_ydata(), other.get_ydata()], [od[:40, g], best[:40, g]])
+            given, optimal = axes[2 + column].lines[2 * k : 2 * k + 2]
+            np.testing.assert_allclose(
+                [given.get_ydata()[0], optimal.get_ydata()[0]], [0.01 * (g + 1.0), 0.1 * (g + 1.0)]
+            )
+
+
+def test_curves_of_several_seeds_say_how_many_they_are_and_one_where_its_policy_was_kept() -> None:
+    costs, regrets = np.array([[-0.2], [-30.0]]) - np.arange(5), np.array([[4.0], [0.5]]) + np.arange(5)
+    many, one = charts.learning(costs, np.array(STEPS), regrets, np.array([200.0, 100.0] * 2 + [100.0])), learning(1)
+    words = [text.get_text() for text in many.axes[1].get_legend().get_texts()]
+    assert words == ["range of 5 seeds", "middle half", "greedy policy, median"]
+    assert [text.get_text() for text in one.axes[1].get_legend().get_texts()] == ["greedy policy", "policy kept"]
+    kept = charts.learning(np.array([[-0.2], [-30.0]]), np.array(STEPS), np.array([[4.0], [0.5]]), np.array([100.0]))
+    assert kept.axes[1].lines[1].get_xdata()[0] == 100.0
+
+
+def test_a_seed_without_a_value_at_a_step_costs_the_others_nothing_and_wide_values_are_on_a_logarithmic_axis() -> None:
+    """Of 9, 4 and 5 the worst is 9 and the mean of the middle half is that of all; the second step has one value."""
+    each = np.array([[9.0, 4.0, 5.0], [np.nan, 2.0, np.nan]])
+    ax = sweep_charts.learning_curves([("a", np.array(STEPS), each)], "").axes[0]
+    np.testing.assert_allclose([line.get_ydata() for line in ax.lines[:2]], [[6.0, 2.0], [9.0, 2.0]])
+    narrow, wide = ({"a": np.array([1.0, 2.0]), "b": np.array([most])} for most in (29.0, 31.0))
+    assert [sweep_charts.values(each, "").axes[0].get_xscale() for each in (narrow, wide)] == ["linear", "log"]
