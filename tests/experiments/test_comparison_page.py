@@ -1,5 +1,6 @@
 """What stands on the page of a comparison, from numbers made up: each beside its own law, plant and unit."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ from experiments.cli import frame
 from experiments.comparison import figures, page, studies
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.trials import Cell, DensityTrial, Trial, cells
+from experiments.reporting import charts
 from experiments.reporting.page import Page
+from experiments.reporting.tables import Best
 
 FLOOR_RED = "#b00020"
 
@@ -158,3 +161,198 @@ def test_a_cell_that_the_policy_loses_to_two_is_lost_once() -> None:
     each = [item.split(" minus dqn: ")[1].split(",")[0] for item in said["items"]]
     assert each == ["-0.015", "-0.015", "-0.012", "-0.018"]
     assert [item.endswith("which holds 0.") for item in said["items"]] == [False, False, False, True]
+
+
+def section() -> Page:
+    out = Page("", "")
+    out.section("")
+    return out
+
+
+def texts(out: Page) -> list[str]:
+    return [content["text"] for _, blocks in out.sections for kind, content in blocks if kind == "paragraph"]
+
+
+def test_every_number_of_a_row_stands_under_its_own_heading() -> None:
+    """No two numbers of the row are alike, and three of four vials settled."""
+    row = {"scenario": "day", "plant": "bench", "controller": "pi", "window": "6-12 h", "n": 4, "ise_mean": 0.1}
+    row |= {"ise_sd": 0.02, "ise_ci95": [0.06, 0.16], "itae_mean": 7.0, "itae_sd": 0.5, "itae_ci95": [6.0, 8.5]}
+    row |= {"settling_min": 12.0, "steady_abs_error": 0.013, "media_ml": 41.0, "ise_median": 0.3, "itae_median": 9.0}
+    more = {"ise_per_window": 0.0033, "itae_per_window": 0.23, "settled": 3, "floor_itae": 1.7, "effort_ul_s": 2.6}
+    more |= {"clean_ise": 0.08, "clean_itae": 5.5, "floor_ise": 0.9, "clean_abs_error": 0.011, "overflowed": 1}
+    table = page.all_rows({"rows": [row], "details": [more]})
+    assert list(zip(table.columns, table.rows[0], strict=True)) == [
+        ("scenario, plant, controller, window", "day, bench, pi, 6-12 h"), ("n", "4"), ("ISE", "0.1 ± 0.02"),
+        ("95 %", "0.06 to 0.16"), ("ITAE", "7 ± 0.5"), ("95 %", "6 to 8.5"), ("ISE, T = window", "0.0033"),
+        ("ITAE, T = window", "0.23"), ("settling, min", "12"), ("settled", "3/4"), ("steady error", "0.013"),
+        ("floor ITAE", "1.7"), ("medium, mL", "41"), ("effort, µL/s", "2.6"),
+    ]  # fmt: skip
+
+
+def test_differences_to_each_law_stand_in_a_table_of_their_own_by_metric() -> None:
+    """Of pi on two plants against three laws; a difference to a mean of nothing is no percentage."""
+    totals = [entry(plant, law, 0.004) for plant in ("nominal", "bench") for law in ("pi", "mpc")]
+    pairs = []
+    for k, against in enumerate(("oracle", "dqn", "dqn_adaptive")):
+        for j, metric in enumerate(("ise", "itae")):
+            for i, plant in enumerate(("nominal", "bench")):
+                percent = 10.0 * k + 3.0 * j + i + 1.0
+                low, high = percent / 200.0, percent / 50.0
+                at = {"scenario": "day", "plant": plant, "controller": "pi", "against": against, "metric": metric}
+                pairs.append({**at, "percent": percent, "difference": percent / 100.0, "ci95": [low, high]})
+    pairs[-1] |= {"percent": None, "difference": 0.75}
+    out = section()
+    page.every_plant(out, {"totals": totals, "paired_totals": pairs}, "day")
+    tables = {table.name: table for table in out.tables}
+    shown = {(k, m): tables[f"day_{m}_vs_{k}"] for k in ("oracle", "dqn", "dqn_adaptive") for m in ("ise", "itae")}
+    assert [[str(row[1]) for row in table.rows] for table in shown.values()] == [
+        ["+1.0 [+0.5, +2.0]", "+2.0 [+1.0, +4.0]"], ["+4.0 [+2.0, +8.0]", "+5.0 [+2.5, +10.0]"],
+        ["+11.0 [+5.5, +22.0]", "+12.0 [+6.0, +24.0]"], ["+14.0 [+7.0, +28.0]", "+15.0 [+7.5, +30.0]"],
+        ["+21.0 [+10.5, +42.0]", "+22.0 [+11.0, +44.0]"], ["+24.0 [+12.0, +48.0]", "0.75"],
+    ]  # fmt: skip
+    words = {"oracle": "Distance from the oracle", "dqn": "Paired difference to the learned policy",
+             "dqn_adaptive": "Paired difference to the adaptive policy"}  # fmt: skip
+    assert {(k, m): table.title for (k, m), table in shown.items()} == {
+        (k, m): f"{words[k]}, {m.upper()}, %" for k, m in shown
+    }
+    assert all(f"in % of {k}'s mean" in table.note for (k, _), table in shown.items())
+
+
+def test_what_estimates_and_supervisor_did_stands_under_its_own_title_and_law() -> None:
+    """A law that estimates nothing is not among them, nor what happened in another scenario."""
+    parts = {"error_2sd_pct": 91.0, "share_2sd_pct": 83.0, "supervised_pct": 12.0, "alarm_pct": 4.0}
+    totals = [
+        entry("bench", "dqn_adaptive", 0.004) | parts,
+        entry("bench", "pi", 0.004),
+        entry("nominal", "dqn_adaptive", 0.004) | {key: value / 2.0 for key, value in parts.items()},
+        entry("bench", "dqn_adaptive", 0.004) | {**dict.fromkeys(parts, 1.0), "scenario": "night"},
+    ]
+    out = section()
+    page.estimates(out, {"totals": totals}, "day")
+    said = {table.title: (table.columns, [tuple(map(str, row)) for row in table.rows]) for table in out.tables}
+    columns = ("plant", "dqn_adaptive")
+    assert said == {
+        "Decisions in which e lay within two of its own sd of the truth, %":
+            (columns, [("bench", "91"), ("nominal", "45.5")]),
+        "Decisions in which s lay within two of its own sd of the share that holds at rest, %":
+            (columns, [("bench", "83"), ("nominal", "41.5")]),
+        "Decisions by the supervisor's law, %": (columns, [("bench", "12"), ("nominal", "6")]),
+        "Decisions by it because of surprises, %": (columns, [("bench", "4"), ("nominal", "2")]),
+    }  # fmt: skip
+
+
+def share_entry(scenario: str, plant: str, law: str, k: float) -> dict[str, Any]:
+    errors = {"ratio_abs_error_mean": 0.01 * k, "ratio_abs_error_last2h": 0.02 * k, "ratio_abs_error_last_day": None}
+    rest = {"estimate_rms": 0.03 * k, "band_covers": 0.09 * k, "od_min": 0.1 * k, "od_mean": 0.2 * k, "od_max": 0.4 * k}
+    return {"signal": "share", "scenario": scenario, "plant": plant, "controller": law, "n": 3, **errors, **rest}
+
+
+def test_shares_stand_beside_their_law_plant_and_scenario_with_what_the_estimate_covers_and_the_density(
+    tmp_path: Path,
+) -> None:
+    """Laws down, plants across; one law did not run on the second plant; no reading is of a last day."""
+    rows = [share_entry("steps", "one", "pi", 1.0), share_entry("steps", "one", "midpoint", 2.0)]
+    rows += [share_entry("steps", "two", "midpoint", 3.0), share_entry("sine", "one", "pi", 4.0)]
+    at = {"plant": "one", "controller": "midpoint", "n": 3}
+    paired = [
+        {**at, "scenario": "steps", "difference": 0.01, "ci95": [-0.002, 0.03], "lower_in": 1},
+        {**at, "scenario": "sine", "difference": -0.02, "ci95": [None, None], "lower_in": 3},
+    ]
+    out = section()
+    page.SECTIONS["share"].add(out, {"rows": rows, "paired": paired, "figures": []}, tmp_path)
+    tables = {table.name: (table.columns, [tuple(map(str, row)) for row in table.rows]) for table in out.tables}
+    two = ("law", "one", "two")
+    assert tables.pop("steps_ratio_abs_error_mean") == (two, [("pi", "0.01", "–"), ("midpoint", "0.02", "0.03")])
+    assert tables.pop("steps_ratio_abs_error_last2h") == (two, [("pi", "0.02", "–"), ("midpoint", "0.04", "0.06")])
+    assert tables.pop("steps_estimate") == (two, [("pi", "0.03, 9 %", "–"), ("midpoint", "0.06, 18 %", "0.09, 27 %")])
+    density = [("pi", "0.100, 0.200, 0.400", "–"), ("midpoint", "0.200, 0.400, 0.800", "0.300, 0.600, 1.200")]
+    assert tables.pop("steps_od") == (two, density)
+    assert tables.pop("steps_paired")[1] == [("midpoint", "+0.0100 [-0.0020, +0.0300], lower in 1 of 3")]
+    assert tables.pop("sine_paired")[1] == [("midpoint", "-0.0200, lower in 3 of 3")]
+    assert tables.pop("sine_ratio_abs_error_mean") == (("law", "one"), [("pi", "0.04")])
+    assert set(tables) == {"sine_ratio_abs_error_last2h", "sine_estimate", "sine_od"}
+    assert [heading for heading, _ in out.sections[1:]] == ["steps", "sine"]
+
+
+def paper_row(law: str, scenario: str, window: str, value: float, plant: str = "nominal") -> dict[str, Any]:
+    numbers = {"ise_mean": value, "ise_sd": 0.0, "itae_mean": value, "itae_sd": 0.0, "settling_min": 100.0 * value}
+    return {"signal": "density", "controller": law, "plant": plant, "scenario": scenario, "window": window, "n": 5,
+            **numbers}  # fmt: skip
+
+
+def of_paper(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    keys = ("controller", "plant", "scenario", "window")
+    return {"rows": rows, "paired": [], "beside_paper": [{k: r[k] for k in keys} for r in rows]}
+
+
+def test_the_paper_s_table_marks_the_lowest_of_the_three_on_either_side_and_no_other_law() -> None:
+    """Published is mpc the lowest at 0.8 and dqn at 0.65; here pi, and a law that the paper does not have is lower."""
+    rows = [
+        paper_row(law, "setpoint_steps", window, value)
+        for window, values in (("0.8", (3.0, 2.0, 5.0, 1.0)), ("0.65", (4.0, 6.0, 7.0, 0.5)))
+        for law, value in zip(("dqn", "pi", "mpc", "oracle"), values, strict=True)
+    ]
+    table = page.table_2(rows, "ise")
+    assert table.columns[4:8] == ("dqn, here", "pi, here", "mpc, here", "oracle, here")
+    assert [[head for head, cell in zip(table.columns, row, strict=True) if isinstance(cell, Best)]
+            for row in table.rows] == [["mpc, published", "pi, here"], ["dqn, published", "dqn, here"]]  # fmt: skip
+    assert [row[-2:] for row in table.rows] == [("mpc", "pi"), ("dqn", "dqn")]
+    assert "n = 5" in table.note
+
+
+def test_published_values_that_no_law_can_reach_on_the_model_are_named_with_the_bound() -> None:
+    """Published at 0.8: dqn 0.039, pi 0.046, mpc 0.035. An oracle on another plant is no bound."""
+    oracle = paper_row("oracle", "setpoint_steps", "0.8", 0.04)
+    said = page._below_bound({"rows": [paper_row("oracle", "setpoint_steps", "0.8", 9.0, "bench"), oracle]})
+    assert said.startswith("Published ISE below what even the oracle reaches on the nominal model")
+    assert ": dqn at OD 0.8 (0.039 against 0.040), mpc at OD 0.8 (0.035 against 0.040). The" in said
+    assert page._below_bound({"rows": [{**oracle, "ise_mean": 0.034}]}) == ""
+    assert page._below_bound({"rows": [{**oracle, "plant": "bench"}]}) == ""
+
+
+def test_a_policy_that_loses_nothing_is_said_to_be_lowest_and_none_is_said_to_be_none() -> None:
+    rows = [paper_row(law, "setpoint_steps", "0.8", value) for law, value in (("pi", 3.0), ("mpc", 2.0))]
+    for more, claim in (
+        ([paper_row("dqn", "setpoint_steps", "0.8", 1.0)], "The learned policy (dqn) is lowest in all 2 cells here."),
+        ([], "No learned policy was run."),
+    ):
+        out = section()
+        page._beside_paper(out, of_paper(rows + more))
+        [(_, [(_, said)])] = out.sections
+        assert (said["claim"], said["items"]) == (claim, [])
+        assert said["remark"].startswith("In the published table the DQN loses 7 of 10: OD 0.8 ISE (mpc), 37 °C ISE")
+
+
+def test_agents_are_told_apart_by_what_differs_and_each_by_its_own_regrets(tmp_path: Path) -> None:
+    fitted = {"mu": {"value": 0.0312, "ci95": [0.0301, 0.0319], "truth": 0.03}, "pmse_pct": 4.5, "n_used": 300}
+    fitted["tau"] = {"value": 0.352, "ci95": [0.331, 0.366], "truth": 0.34}
+    agents = {
+        "dqn": {"regret_pct": [0.25, 1.5], "agent": {"gamma": 0.9, "hidden": [], "double": True}},
+        "dqn_paper": {"regret_pct": [7.0, 3.0], "agent": {"gamma": 0.99, "hidden": [64], "double": True}},
+        "dqn_adaptive": {"regret_pct": 0.125, "policy": "shipped"},
+    }
+    out = Page("", "")
+    page._learning_section(out, {"figures": [], "agents": agents, "calibration": fitted}, tmp_path)
+    assert texts(out) == [
+        "Calibration: mu 0.0312 (95 % 0.0301 to 0.0319; true 0.03), tau 0.352 (95 % 0.331 to 0.366; true 0.34); "
+        "PMSE 4.5 %.",
+        "dqn: regret against the optimum of the model, % per seed: 0.25, 1.5.",
+        "dqn_paper: regret against the optimum of the model, % per seed: 7, 3.",
+        "dqn_adaptive: regret against the optimum of the model, % per seed: 0.125.",
+    ]
+    [table] = out.tables
+    assert table.columns == ("hyper-parameter", "dqn", "dqn_paper")
+    assert table.rows == (("gamma", "0.9", "0.99"), ("hidden", "none", "[64]"))
+
+
+def test_the_settling_time_beside_the_paper_s_is_that_of_the_policy_in_the_regulation(tmp_path: Path) -> None:
+    rows = [paper_row("pi", "regulation", "0.5", 0.2), paper_row("dqn", "setpoint_steps", "0.8", 0.3)]
+    rows.append(paper_row("dqn", "regulation", "0.5", 0.125))
+    charts.save(charts.new_figure(2.0, 2.0)[0], tmp_path / "figures", "regulation")
+    figure = {"file": "figures/regulation.svg", "title": "", "caption": ""}
+    summary = {"rows": rows, "beside_paper": [], "figures": [figure], "totals": [], "paper_settling_min": 10.0}
+    out = Page("", "")
+    page._density(out, summary, tmp_path)
+    assert texts(out) == [
+        "Settling at 0.5 from 0.7: 12.5 min (median of 5; paper: 10 min on average, start and band not stated)."
+    ]
