@@ -2,14 +2,27 @@
 
 import csv
 import json
+import math
+import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from experiments.record.record import Record
-from experiments.record.recovery import COLUMNS, load_state
+from envs.scenario import Scenario
+from experiments.loop.loop import Step
+from experiments.loop.progress import Progress
+from experiments.record import summary
+from experiments.record.curves import Curves, _results, _table
+from experiments.record.record import Record, Table
+from experiments.record.recovery import COLUMNS, Rows, _caught_up, _put_off, load_state
 from hardware.errors import RecordingError
 from hardware.storage.doses import Ending
+from hardware.storage.marks import Mark, add_mark
 
 
 def decision(minute: float) -> dict[str, object]:
@@ -94,3 +107,262 @@ def test_state_that_cannot_be_written_ends_the_run_with_the_remedy(tmp_path: Pat
     record.close()
     with pytest.raises(RecordingError, match="no state to resume from"):
         load_state(tmp_path / "recordings" / "state.json")
+
+
+def recorded(minutes: list[float], words: dict[float, str], **cells: float) -> Rows:
+    """A recording whose schedule began with its first row."""
+    found = Rows()
+    for minute in minutes:
+        row = dict.fromkeys(COLUMNS, 0.0) | {"believed": 1.0, **cells, "interlock": words.get(minute, "")}
+        found.append(row | {"time_min": minute, "elapsed_min": minute - minutes[0]})
+    return found
+
+
+def two_reactors() -> Table:
+    """M0 stays 0.02 above its 0.5 for 4 min; M1 at 0.7 begins 10 min later and is not over."""
+    words = {1.0: "budget: none left | stale: as before", 3.0: "stale: as before"}
+    rows = [recorded([0.0, 1.0, 2.0, 3.0, 4.0], words, od=0.52, volume_ml=0.5, setpoint=0.5)]
+    rows.append(recorded([10.0, 11.0, 12.0], {}, od=0.7, volume_ml=0.2, setpoint=0.8, temperature_degc=33.0))
+    columns = {
+        key: np.array([[*own.columns[key], *[np.nan] * (5 - len(own))] for own in rows]) for key in rows[0].columns
+    }
+    return Table(("M0", "M1"), columns, rows, ["mended"], [Mark(2.0, "M1", "looked")])
+
+
+SCHEDULES = Scenario((0.5,), (4.0,), (37.0,)), Scenario((0.8, 0.6), (1.0, 3.0), (33.0, 30.0))
+
+
+def test_the_summary_has_of_each_reactor_its_own_medium_words_and_windows() -> None:
+    """Of five rows and of three; the second step of M1 was not over when the run ended."""
+    found = summary.summarise(two_reactors(), SCHEDULES, ("replicate", "control"), "stopped")
+    assert found["reactors"] == {
+        "M0": {
+            "role": "replicate", "volume_ml": pytest.approx(2.5), "rows": 5, "interlock": 2,
+            "reasons": {
+                "budget": {"rows": 1, "first_min": 1.0, "last_min": 1.0},
+                "stale": {"rows": 2, "first_min": 1.0, "last_min": 3.0},
+            },
+        },
+        "M1": {"role": "control", "volume_ml": pytest.approx(0.6), "rows": 3, "interlock": 0, "reasons": {}},
+    }  # fmt: skip
+    assert (found["outcome"], found["minutes"], found["volume_ml"]) == ("stopped", 12.0, pytest.approx(3.1))
+    assert (found["repairs"], [mark["text"] for mark in found["marks"]]) == (["mended"], ["looked"])
+    keys = ("reactor", "phase", "setpoint", "start_min", "end_min", "ended", "temperature")
+    assert [tuple(w[key] for key in keys) for w in found["windows"]] == [
+        ("M0", 0, 0.5, 0.0, 4.0, "time", 37.0), ("M1", 0, 0.8, 0.0, 1.0, "time", 33.0),
+        ("M1", 1, 0.6, 1.0, 4.0, None, 30.0),
+    ]  # fmt: skip
+    assert [w["steady_abs_error"] for w in found["windows"]] == pytest.approx([0.02, 0.1, 0.1])
+    assert [w["ise"] for w in found["windows"]] == pytest.approx([4.0 * 0.0004, 0.01, 0.01])
+    assert [w["itae"] for w in found["windows"]] == pytest.approx([8.0 * 0.02, 0.5 * 0.1, 0.5 * 0.1])
+
+
+def test_what_the_interlock_said_most_often_is_said_first() -> None:
+    m0, m1 = two_reactors().rows
+    assert summary.reasons_line(m0) == "stale in 2 of 5 rows, minute 1 to 3; budget in 1 of 5 rows, minute 1 to 1"
+    assert summary.reasons_line(m1) == ""
+
+
+def test_a_temperature_is_drawn_where_any_of_the_schedules_changes_it() -> None:
+    drawn = summary.figure_of(two_reactors(), SCHEDULES, "")
+    assert [ax.get_ylabel() for ax in drawn.axes] == ["OD", "pump rate, µL/s", "temperature, °C"]
+    assert len(summary.figure_of(two_reactors(), (SCHEDULES[0], SCHEDULES[0]), "").axes) == 2
+
+
+def under(head: str, table: str, line: int) -> str:
+    """What stands under a heading whose words end where it does."""
+    lines = table.splitlines()
+    end = lines[0].index(head) + len(head)
+    return lines[line][end - 8 : end].strip()
+
+
+def test_every_metric_stands_under_its_own_heading_on_the_console() -> None:
+    window = {"reactor": "M1", "setpoint": 0.65, "ise": 0.1234, "itae": 5.67, "ise_mean": 0.00411, "itae_mean": 0.189}
+    window |= {"settling_min": 12.5, "steady_abs_error": 0.0123}
+    table = summary.metrics_table([window, {**window, "reactor": "M0", "settling_min": math.nan}])
+    heads = {"setpoint": "0.65", "ISE": "0.1234", "ITAE": "5.67", "ISE/T": "0.00411", "ITAE/T": "0.189"}
+    heads |= {"settled": "12.5", "steady": "0.0123"}
+    assert {head: under(f" {head}", table, 1) for head in heads} == heads
+    assert [line.split()[0] for line in table.splitlines()] == ["reactor", "M1", "M0"]
+    assert under("settled", table, 2) == "–"
+
+
+def test_every_error_of_a_share_stands_under_its_own_heading_on_the_console() -> None:
+    """Hours, of windows in minutes; a window without a share is left out, and a setpoint that changes has no number."""
+    asked = {"reactor": "M1", "start_min": 90.0, "end_min": 210.0, "ratio_setpoint": 0.4, "od_abs_error_mean": 0.007}
+    asked |= {"ratio_abs_error_mean": 0.031, "ratio_abs_error_last2h": 0.012, "true_ratio_abs_error_mean": 0.041}
+    none = {**asked, "reactor": "M0", "ratio_abs_error_mean": math.nan}
+    waves = {**asked, "reactor": "M2", "ratio_setpoint": None, "true_ratio_abs_error_mean": math.nan}
+    table = summary.shares_table([none, asked, waves])
+    heads = {"hours": "1.5-3.5", "asked": "0.400", "mean |e|": "0.031", "last 2 h": "0.012", "true |e|": "0.041"}
+    heads |= {"OD |e|": "0.007"}
+    assert {head: under(head, table, 1) for head in heads} == heads
+    assert [line.split()[0] for line in table.splitlines()] == ["reactor", "M1", "M2"]
+    assert (under("asked", table, 2), under("true |e|", table, 2)) == ("varies", "–")
+    assert summary.shares_table([none]) == ""
+
+
+def step(minute: float, **told: Any) -> Step:
+    """Of two reactors, both of which have a sample."""
+    zero = np.zeros(2)
+    given = {
+        "now_s": 60.0 * minute, "rows": np.ones(2, dtype=bool), "minute": zero + minute, "elapsed": zero + minute,
+        "phase": np.array([0, 0]), "od": zero + 0.5, "temperature": zero + 37.0, "setpoint": zero + 0.5,
+        "proposed": zero, "rate": zero, "volume_ml": zero, "reasons": (None, None), "response": np.array([0, 0]),
+        "notes": (), "explanation": {}, "done": np.zeros(2, dtype=bool),
+    } | told  # fmt: skip
+    return Step(**{key: np.array(v) if isinstance(v, list) else v for key, v in given.items()})
+
+
+def test_the_log_of_a_run_says_of_each_reactor_what_changes_and_how_well_its_own_window_was_held(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """M1 recovers first and moves on by its condition; a reading that is not believed counts for no error."""
+    schedules = SCHEDULES[0], Scenario((0.8, 0.6), (40.0, 9.0), (37.0, 37.0), until=("od >= 0.9", None))
+    reactors = SimpleNamespace(names=("M0", "M1"), handed_over=np.array([False, False]))
+    progress, told = Progress(schedules), []
+    changes = summary.ChangeLog(
+        SimpleNamespace(reactors=reactors, progress=progress), lambda *words: told.append(words)
+    )
+    progress.edges[1, 1:] = [3.0, 12.0]  # where the condition has put them
+    with caplog.at_level("INFO"):
+        changes(step(0.0, phase=[0, -1], od=[0.5, 0.3], setpoint=[0.5, 0.8]))
+        changes(step(1.0, od=[0.52, 0.75], setpoint=[0.5, 0.8], notes=("M0: drained 3 s",)))
+        doubt = {"explanation": {"supervised": np.array([0.0, 1.0])}, "believed": np.array([True, False])}
+        changes(step(2.0, od=[0.54, 9.9], setpoint=[0.5, 0.8], notes=("M0: drained 4.5 s",), **doubt))
+        ended = {"phase": [0, 1], "setpoint": [0.5, 0.6], "ended": np.array([False, True])}
+        changes(step(3.0, od=[0.53, 0.91], reasons=(None, "stale: as before"), **ended))
+        reactors.handed_over[0] = True
+        done = {"phase": [0, 1], "setpoint": [0.5, 0.6], "done": np.array([True, False])}
+        changes(step(70.0, od=[0.5, 0.65], notes=("M0: drained 5 s",), **done))
+    again = "(noted here once an hour, every time in the journal)"
+    assert [record.getMessage() for record in caplog.records] == [
+        "M0: setpoint 0.5 from minute 0, OD 0.500",
+        "M1: recovery from minute 0, OD 0.300",
+        "M1: setpoint 0.8 from minute 1, OD 0.750",
+        f"M0: drained 3 s {again}",
+        "M1: the supervisor's law acts, the estimate is in doubt, from minute 2",
+        "M1: step 1 ended after 3 min: od >= 0.9 at OD 0.910",
+        "M1: window ends at minute 3, mean error 0.0500 OD",
+        "M1: setpoint 0.6 from minute 3, OD 0.910",
+        "M1: the policy acts again from minute 3",
+        "M1: stale: as before",
+        "M0: window ends at minute 70, mean error 0.0225 OD",
+        "M1: interlock: all well again",
+        f"M0: drained 5 s {again}",
+    ]
+    assert told == [
+        ("hand_over", "the supervisor's law acts, the estimate is in doubt, from minute 2", "M1"),
+        ("hand_over", "the policy acts again from minute 3", "M1"),
+        ("alarm", "stale: as before", "M1"),
+        ("alarm", "interlock: all well again", "M1"),
+        ("hand_over", "the device regulates by itself from now on", "M0"),
+    ]
+
+
+def curves_of(folder: Path) -> dict[str, list[tuple[int, float, float]]]:
+    """Step, seconds since 1970 and value of every point, by its tag."""
+    events = EventAccumulator(str(folder), size_guidance={"tensors": 0}).Reload()
+    points = {tag: events.Tensors(tag) for tag in events.PluginTagToContent("scalars")}
+    return {tag: [(e.step, e.wall_time, e.tensor_proto.float_val[0]) for e in each] for tag, each in points.items()}
+
+
+def test_each_reactor_has_curves_of_its_own_dated_by_the_minute_of_its_sample(tmp_path: Path) -> None:
+    """The interlock speaks of M0, the reading of M1 is not believed, M0 has no setpoint yet."""
+    curves = Curves(tmp_path, ("M0", "M1"), True, 0, 1e9)
+    told = {"explanation": {"mu": np.array([0.02, np.nan])}, "believed": np.array([True, False])}
+    told["columns"] = {"ratio": np.array([0.3, 0.6]), "light": np.array([11.0, 12.0])}
+    told |= {"od": [0.41, 0.82], "setpoint": [0.5, 0.8], "temperature": [33.0, 36.0], "phase": [-1, 0]}
+    told |= {"rate": [0.004, 0.009], "proposed": [0.02, 0.02], "reasons": ("stale: as before", None)}
+    curves.step(replace(step(0.0, **told), minute=np.array([5.0, 7.0])))
+    curves.close()
+    m0, m1 = (curves_of(tmp_path / "reactors" / name) for name in ("M0", "M1"))
+    assert m0 == {
+        tag: [(5, 1e9 + 300.0, pytest.approx(value))]
+        for tag, value in {
+            "culture/od": 0.41, "culture/temperature_degc": 33.0, "pump/rate_ml_s": 0.004, "safety/interlock": 1.0,
+            "share/estimate": 0.3, "further/light": 11.0, "controller/mu": 0.02,
+        }.items()
+    }  # fmt: skip
+    assert m1 == {
+        tag: [(7, 1e9 + 420.0, pytest.approx(value))]
+        for tag, value in {
+            "culture/setpoint": 0.8, "culture/setpoint_low": 0.76, "culture/setpoint_high": 0.84,
+            "culture/temperature_degc": 36.0, "pump/rate_ml_s": 0.009, "safety/interlock": 0.0, "share/estimate": 0.6,
+            "further/light": 12.0,
+        }.items()
+    }  # fmt: skip
+
+
+def test_the_points_of_a_resumed_run_are_dated_by_the_beginning_of_its_first_life(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed_after(tmp_path, ("sample", sample(2.0)), ("decision", decision(2.0)))
+    record = Record(tmp_path, ("M0",), fsync=False)
+    began = record.journal.rows[0]["wall"]
+    record.close()
+    later = time.time() + 9000.0
+    monkeypatch.setattr("time.time", lambda: later)
+    record = Record(tmp_path, ("M0",), fsync=False)
+    record.curves.step(step(150.0, rows=[True, False]))
+    record.close()
+    [(minute, wall, _)] = curves_of(tmp_path)["culture/od"]
+    assert (minute, wall) == (150, pytest.approx(began + 9000.0, abs=1e-3))
+
+
+def test_the_results_of_a_run_are_its_worst_error_the_sum_of_its_costs_and_the_mean_of_its_shares() -> None:
+    windows = [
+        {"reactor": name, "setpoint": goal, "start_min": start, "end_min": 2.0 * start, "steady_abs_error": steady,
+         "settling_min": settled, "ise": ise, "ratio_abs_error_mean": share}
+        for name, goal, start, steady, settled, ise, share in (
+            ("M0", 0.5, 30.0, 0.01, 4.0, 0.2, 0.03), ("M1", 0.8, 40.0, 0.03, math.nan, 0.5, None),
+            ("M1", 0.6, 50.0, None, 7.0, 0.1, 0.05),
+        )
+    ]  # fmt: skip
+    assert _results({"windows": windows, "volume_ml": 61.0}) == pytest.approx(
+        {"result/steady_abs_error": 0.03, "result/ise": 0.8, "result/share_abs_error": 0.04, "result/medium_ml": 61.0}
+    )
+    head, _, *rows = (line.strip("| ").split(" | ") for line in _table(windows).splitlines())
+    assert [dict(zip(head, row, strict=True)) for row in rows] == [
+        {"reactor": name, "setpoint, OD": goal, "from, min": start, "to, min": end, "steady error, OD": steady,
+         "settled after, min": settled, "ISE, OD² min": ise, "error of the share": share}
+        for name, goal, start, end, steady, settled, ise, share in (
+            ("M0", "0.5", "30", "60", "0.01", "4", "0.2", "0.03"), ("M1", "0.8", "40", "80", "0.03", "–", "0.5", "–"),
+            ("M1", "0.6", "50", "100", "–", "7", "0.1", "0.05"),
+        )
+    ]  # fmt: skip
+
+
+def test_what_a_kill_left_behind_of_the_second_reactor_is_not_that_of_the_first() -> None:
+    """Schedules as their newest decisions have them, and what was put off last by each."""
+    state = {"began": [1.0, 2.0], "steps": [{"edges": [0]}, {"edges": [5]}], "other": [8, 9]}
+    places = [("M1", 7.5, 1), ("M9", 3.0, 2), ("M1", 7.5, 3)]
+    rows = [
+        {"kind": "decision", "reactor": name, "position": {"began": began, "edges": [k]}} for name, began, k in places
+    ]
+    assert _caught_up(state, rows, ["M0", "M1"]) == {
+        "began": [1.0, 7.5], "steps": [{"edges": [0]}, {"began": 7.5, "edges": [3]}], "other": [8, 9],
+    }  # fmt: skip
+    intents = [
+        {"kind": kind, "reactor": name, "carry_ml": ml}
+        for kind, name, ml in (("intent", "M1", 0.1), ("intent", "M0", 0.2), ("intent", "M1", 0.3), ("x", "M0", 0.9))
+    ]
+    loop = SimpleNamespace(reactors=SimpleNamespace(names=("M0", "M1", "M2")))
+    np.testing.assert_array_equal(_put_off(intents, loop), [0.2, 0.3, 0.0])
+
+
+def test_marks_are_in_order_of_time_and_recordings_side_by_side_whoever_wrote_first(tmp_path: Path) -> None:
+    """Two rows of M0 and one of M1; the marks were written late."""
+    killed_after(tmp_path, ("decision", decision(2.0)), ("decision", decision(3.0)))
+    other = decision(2.5) | {"reactor": "M1"}
+    record = Record(tmp_path, ("M0", "M1"), fsync=False)
+    record.journal.append("decision", other)
+    record.close()
+    for minute, name in ((9.0, "M1"), (4.0, "M0")):
+        add_mark(tmp_path, Mark(minute, name, "looked"))
+    record = Record(tmp_path, ("M0", "M1"), fsync=False)
+    table = record.table()
+    record.close()
+    assert [(mark.time_min, mark.reactor) for mark in table.marks] == [(4.0, "M0"), (9.0, "M1")]
+    np.testing.assert_array_equal(table.columns["time_min"], [[2.0, 3.0], [2.5, np.nan]])
+    assert "interlock" not in table.columns
