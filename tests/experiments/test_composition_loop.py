@@ -234,6 +234,60 @@ def test_an_estimate_that_stays_wide_is_uncertain() -> None:
     assert warned(composition, 330.0) == ["share_uncertain"]
 
 
+def test_of_two_cultures_each_is_warned_of_by_its_own_share_goal_and_thermostat() -> None:
+    """The first one's target is inside the limits; the second one's share has not fallen, at 36 degC."""
+    keeper = Scripted()
+    keeper.ratio, keeper.answer = np.array([0.5, 0.3]), np.array([31.0, 36.0])  # type: ignore[assignment]
+    keeper.width = np.array([0.1, 0.2])  # type: ignore[assignment]
+    composition = held(keeper, [HOLD, replace(HOLD, ratios=(0.05,))])
+    for minute in np.arange(0.0, 180.0, 10.0):
+        assert step(composition, minute).warnings == [None, None]
+    first, second = step(composition, 180.0).warnings
+    assert first is None
+    stuck = "share_stuck: share 0.30, wanted 0.05, no nearer for 3.0 h with the thermostat at 36.0 degC; reported"
+    assert second.startswith(stuck)
+    keeper.width = np.array([0.5, 0.2])  # type: ignore[assignment]
+    for minute in np.arange(190.0, 290.0, 10.0):
+        assert step(composition, minute).warnings[0] is None
+    first, second = step(composition, 291.0).warnings  # the estimate was narrow at minute 180
+    assert first is None
+    first, second = step(composition, 300.0).warnings
+    assert first.startswith("share_uncertain: share between 0.25 and 0.75; reported")
+    assert kinds_of(second) == ["share_stuck"]
+
+
+class Retold(Scripted):
+    """Keeps what it is told of an earlier life."""
+
+    known = np.array([10.0, 12.0])
+
+    def retell(self, shown: Any) -> None:
+        self.told = [(minute, method, *(a.tolist() for a in arguments)) for minute, method, arguments in shown]
+
+
+def test_what_an_earlier_life_recorded_is_told_in_order_each_reactor_as_far_as_it_is_not_known() -> None:
+    """Light out of range is none, a row that was not believed no reading; a share comes before the dose after it."""
+    nan, keeper = float("nan"), Retold()
+    share = held(keeper, [HOLD, HOLD])
+    keys = ("time_min", "od", "fluorescence", "temperature_degc", "believed", "volume_ml")
+    first = [(10.0, 0.5, 900.0, 33.0, 1, 0.4), (11.0, 0.51, 900.0, 33.1, 1, 0.6), (13.0, 0.9, 900.0, 33.2, 0, 0.7)]
+    second = [(12.0, 0.4, 500.0, 31.0, 1, 0.5), (12.5, 0.41, 65535.0, 31.1, 1, 0.0), (13.5, 0.42, 4.0, 31.2, 1, nan)]
+    rows = [dict(zip(keys, zip(*each, strict=True), strict=True)) for each in (first, second)]
+    counted = [(1, 0.25, 0.02, 12.5), (0, 0.6, 0.05, 10.0), (1, 0.3, 0.04, 11.5), (0, 0.7, 0.03, 11.0)]
+    share.retell(rows, counted, (5.0, 65534.0))
+    mine, other = [True, False], [False, True]
+
+    assert json.dumps(keeper.told) == json.dumps([
+        (11.0, "watch", [0.51, nan], [900.0, nan], [33.1, nan], [11.0, nan], mine),
+        (11.0, "sample", [0.7, nan], [0.03, 0.03], mine),
+        (11.0, "dosed", [0.6, 0.0]),
+        (12.5, "watch", [nan, 0.41], [nan, nan], [nan, 31.1], [nan, 12.5], other),
+        (12.5, "sample", [nan, 0.25], [0.02, 0.02], other),
+        (13.0, "dosed", [0.7, 0.0]),
+        (13.5, "watch", [nan, 0.42], [nan, nan], [nan, 31.2], [nan, 13.5], other),
+    ])  # fmt: skip
+
+
 def vials(n: int) -> SimulatedReactors:
     names = tuple(f"M{k}" for k in range(n))
     return SimulatedReactors(Plant(PLANT, n, np.random.default_rng(3)), SimulatedConfig(reactors=names))

@@ -37,6 +37,31 @@ def test_what_a_step_takes_by_hand() -> None:
     assert step(0.5, 60.0, 0.9, "od >= 0.8")[0] == 1.0  # it is there already
 
 
+def test_a_step_that_is_to_settle_takes_its_way_to_the_band_and_then_its_minutes() -> None:
+    """0.5 +- 5 % begins at 0.525 from above and at 0.475 from below; another band and other minutes by the scenario."""
+    assert step(0.5, 600.0, 0.8, "settled")[0] == pytest.approx(10.0 + math.log(0.8 / 0.525) / (0.06 - 0.03))
+    assert step(0.5, 600.0, 0.4, "settled")[0] == pytest.approx(10.0 + math.log(0.475 / 0.4) / 0.03)
+    assert step(0.5, 12.0, 0.4, "settled")[0] == 12.0  # its longest time comes first
+    wide = Scenario((0.4, 0.5), (9.0, 600.0), (37.0,) * 2, until=(None, "settled"), settled_band=0.2, settled_min=25.0)
+    found = expected(wide, 1, 0.8, GROWTH, DILUTION, VOLUME_ML)
+    assert found.minutes == pytest.approx(25.0 + math.log(0.8 / 0.6) / (0.06 - 0.03))
+
+
+def test_what_a_step_needs_that_takes_its_longest_is_reckoned_from_where_it_would_have_ended() -> None:
+    """0.4 to 0.8 in 23 min needs nothing; held there for the rest of two hours it needs what grows."""
+    up = math.log(2.0) / GROWTH
+    grows = Scenario((0.8,), (120.0,), (37.0,), until=("od >= 0.8",))
+    found = expected(grows, 0, 0.4, GROWTH, DILUTION, VOLUME_ML)
+    assert (found.ml, found.longest_ml) == pytest.approx((0.0, (120.0 - up) * 0.03 * 20.0))
+    assert step(0.4, 50.0, 0.35, "od <= 0.38")[0] == 1.0  # it is below already
+    assert step(0.4, 50.0, 0.8, "od <= 0.3")[0] == 50.0  # held at 0.4 it never gets there
+
+
+def test_a_culture_that_outgrows_the_pump_is_fed_at_full_rate_and_grows_on() -> None:
+    found = expected(Scenario((0.4,), (50.0,), (37.0,)), 0, 0.8, 0.03, 0.02, 16.0)
+    assert (found.minutes, found.ml, found.od) == pytest.approx((50.0, 16.0 * 0.02 * 50.0, 0.8 * math.exp(0.01 * 50.0)))
+
+
 def told(*overrides: str) -> str:
     return timetable(main.config(["dry_run=true", *overrides]), "HERE", NOON)
 
@@ -83,6 +108,67 @@ def test_each_reactor_is_reckoned_by_its_own_volume_and_the_bench_s_fastest_pump
             ml = volume_ml * (falls * full + max(lasts - falls, 0.0) * 0.03)
             assert float(words[7]) == pytest.approx(max(falls, lasts), abs=0.5)
             assert float(words[11]) == pytest.approx(ml, abs=0.05)
+
+
+def table(text: str) -> dict[str, list[str]]:
+    """The lines of each reactor of a timetable."""
+    found: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        if " from OD " in line:
+            found[line.split()[0]] = mine = []
+        if found:
+            mine.append(line)
+    return found
+
+
+def test_each_reactor_has_its_own_steps_role_and_bottle() -> None:
+    """M0 is held at 0.5 for an hour; M1 goes up to 0.7 in 11 min, and down to 0.4 in 19, and outlasts the bottle."""
+    words = "backend.reactors=[M0,M1]", "scenario=hold", "plant.start_od=0.5", "bench.bottle_ml=60", "at_end=stop"
+    words += "scenario.minutes=[60]", "scenario.setpoints=[0.5]", "scenario.recovery_od=0", "each.M1.role=control"
+    words += "each.M1.setpoints=[0.7,0.4]", "each.M1.minutes=[90,30]", "each.M1.temperatures=[30,36.5]"
+    text = told(*words, "each.M1.outputs=[null,'pump4 2 mL']")
+    head = "controller dqn, policy shipped (regret 0.003 %); at_end stop\nbackend sim (in this computer)"
+    assert text.startswith(head)
+    of = table(text)
+    assert [of[name][0] for name in ("M0", "M1")] == [
+        "M0 (replicate), from OD 0.5, growth 0.03 1/min", "M1 (control), from OD 0.5, growth 0.03 1/min"
+    ]  # fmt: skip
+    steps = {name: [line.split()[7:12] for line in lines if "Mon 02" in line] for name, lines in of.items()}
+    assert steps["M0"] == [["60", "60", "0.50", "37.0", "36.0"]]
+    up, down = math.log(0.7 / 0.5) / 0.03, math.log(0.7 / 0.4) / 0.03
+    ml = (90.0 - up) * 0.6, down * 1.2 + (30.0 - down) * 0.6
+    assert steps["M1"] == [
+        ["90", "90", "0.70", "30.0", f"{ml[0]:.1f}"], ["30", "30", "0.40", "36.5", f"{ml[1]:.1f}"]
+    ]  # fmt: skip
+    assert "36 mL if every step takes its longest; bench.bottle_ml=60 lasts" in of["M0"][-1]
+    total = f"{sum(ml):.0f} mL of medium expected, {sum(ml):.0f} mL if every step takes its longest"
+    assert f"  {total}; bench.bottle_ml=60 does NOT last" in of["M1"][-2]
+    assert of["M1"][4] == "           gives pump4 2 mL: at most 2.0 mL by Pump4"
+    assert not any("gives" in line for line in of["M0"])
+
+
+def test_a_device_s_culture_is_taken_to_begin_at_its_first_setpoint() -> None:
+    """Nobody has measured it; its recovery, where there is one, ends it at another."""
+    device = "backend=chibio", "backend.url=http://10.0.0.7:5000", "controller=pi", "scenario.setpoints=[0.6,0.7,0.3]"
+    text = told(*device, "scenario.recovery_od=0", "backend.reactors=[M3,M5]")
+    assert "backend chibio (http://10.0.0.7:5000), reactors M3, M5\n" in text
+    assert "M5 (replicate), from OD 0.6, growth" in text
+    text = told(*device, "scenario.recovery_od=0.45", "scenario.recovery_limit_min=75")
+    assert "from OD 0.45, growth" in text
+    assert "recovery grows undiluted to OD 0.45, at most 75 min; the times below count from its end" in text
+
+
+def test_what_a_run_would_learn_and_who_would_hold_the_share_is_told() -> None:
+    learns = {"every_h": 6, "sd": 0.02, "moved": 0.05, "steps": 5000, "vials": 48, "hours": 12, "limit_min": 90}
+    words = "backend=emulator", "scenario=ratio_steps", "composition=dqn_preview", "controller=pi"
+    text = told(*words, *(f"relearn.{key}={value}" for key, value in learns.items()))
+    assert text.splitlines()[:2] == [
+        "controller pi; share: dqn_preview; at_end hold",
+        "learns every 6 h, where both growth curves are known to 0.02 and one has moved by 0.05: 5000 steps, then 48 "
+        "vials of 12 h on which a new policy has to be better before it flies; one training at a time, at most 90 min",
+    ]
+    shares = [line.partition("its time")[2] for line in table(text)["M1"] if " its time" in line]
+    assert shares == ["", *(f"; share {share}, which decides the temperature" for share in ("0.3", "0.7", "0.3"))]
 
 
 def test_what_the_run_would_refuse_is_refused() -> None:

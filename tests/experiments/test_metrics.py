@@ -82,3 +82,24 @@ def test_the_last_two_hours_begin_no_earlier_than_the_window():
     found = [mean_errors(minute, 0.5 - error, np.full_like(minute, 0.5), *w) for w in ((300.0, 390.0), (390.0, 590.0))]
     assert [value[0] for value in found[0]] == pytest.approx([0.03, 0.03])
     assert [value[0] for value in found[1]] == pytest.approx([(80 * 0.2 + 120 * 0.05) / 200, 0.05])
+
+
+def test_a_later_window_counts_from_its_own_start_on_either_side_of_its_setpoint() -> None:
+    """From minute 30 on: 20 % too high for 12 min, then 4 % too low; the other 4 % too high after 20 min of too low."""
+    minute = np.tile(np.arange(0.0, 91.0), (2, 1))
+    t = minute[0] - 30.0
+    od = 0.5 + np.stack([np.where(t < 12.0, 0.1, -0.02), np.where(t < 20.0, -0.1, 0.02)])
+    m = window_metrics(minute, od, 0.5, 30.0, 60.0)
+    assert m.settling_min.tolist() == [12.0, 20.0]
+    whole = [(11 * 0.1 + 0.06 + 18 * 0.02) / 30.0, (19 * 0.1 + 0.06 + 10 * 0.02) / 30.0]  # trapezia of |e|
+    np.testing.assert_allclose(m.abs_error, whole)
+    np.testing.assert_allclose(m.ise, [11 * 0.01 + 0.0052 + 18 * 0.0004, 19 * 0.01 + 0.0052 + 10 * 0.0004])
+
+
+def test_the_steady_error_is_that_of_the_last_ten_minutes_with_both_their_ends() -> None:
+    """Minutes 20 to 30 of 30: the sample at 19 is not one of them, those at 20 and at 30 are."""
+    minute = np.tile(np.arange(0.0, 31.0), (2, 1))
+    od = np.full((2, 31), 0.52)
+    od[0, 19], od[0, 20], od[1, 30] = 0.9, 0.63, 0.41
+    m = window_metrics(minute, od, 0.5, 0.0, 30.0)
+    np.testing.assert_allclose(m.steady_abs_error, [(0.13 + 10 * 0.02) / 11, (0.09 + 10 * 0.02) / 11])

@@ -117,6 +117,26 @@ def test_a_volume_is_given_at_the_first_believed_reading_of_its_step() -> None:
     assert doses == [(3, 0, 4, 1.0), (5, 1, 4, 1.0)]
 
 
+def test_reactors_in_different_steps_are_given_what_each_one_s_step_says() -> None:
+    """At one moment the first is in its second step, the other still in its first, by another pump and rate."""
+    first = Scenario((0.4, 0.4), (5.0, 60.0), (37.0,) * 2, outputs=("pump3 6 mL/h", "pump4 12 mL/h"))
+    second = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 3 mL/h",))
+    supply, doses = Supply([first, second], 1.2), []
+    for minute in range(21):
+        pump, ml = supply.due(np.full(2, float(minute)), np.array([int(minute >= 5), 0]), np.ones(2, dtype=bool))
+        supply.given(pump, ml)
+        doses += [(minute, int(n), int(pump[n]), round(float(ml[n]), 6)) for n in np.flatnonzero(ml)]
+    hers = [(8, 0, 4, 0.6), (11, 0, 4, 0.6), (14, 0, 4, 0.6), (17, 0, 4, 0.6), (20, 0, 4, 0.6)]  # 0.2 mL a minute
+    assert sorted(doses) == sorted([*hers, (10, 1, 3, 0.5), (20, 1, 3, 0.5)])
+
+
+def test_of_two_pumps_that_owe_the_one_that_owes_more_gives_first() -> None:
+    both = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 0.6 mL, pump4 1.1 mL",))
+    assert given(Supply([both], 1.2), range(4)) == [(0.0, 4, 1.1), (1.0, 3, 0.6)]
+    other = replace(both, outputs=("pump3 1.1 mL, pump4 0.6 mL",))
+    assert given(Supply([other], 1.2), range(4)) == [(0.0, 3, 1.1), (1.0, 4, 0.6)]
+
+
 def config(schedule: Scenario = STEPS, **flows: float) -> Any:
     made = rehearsed(("M0",), schedule)
     supply = SupplyConfig(**({"pump3_ml_s": 1.0, "pump4_ml_s": 1.0} | flows))

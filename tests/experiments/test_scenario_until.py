@@ -84,6 +84,19 @@ def test_what_was_counted_is_kept_and_goes_on() -> None:
             memory.restore_rows(second, damaged, "steps")
 
 
+def test_reactors_are_judged_by_their_own_band_minutes_and_number_of_steps() -> None:
+    """Both read 0.72. That is 10 % below 0.8, where the first allows 5 %, and within 0.15 of the second's, for 4 min.
+    After its schedule the second goes on at its own last step."""
+    wide = Scenario((0.8, 0.6), (40.0, 7.0), (37.0, 31.0), until=("settled", None), settled_band=0.15, settled_min=4.0)
+    progress = Progress([STEPS, wide])
+    ended = [minute for minute in range(12) if fed(progress, float(minute), 0.72 - 0.1 * (minute < 2), 0.72)[1]]
+    assert ended == [4]
+    assert progress.totals.tolist() == [progress.edges[0, 3], 11.0]
+    assert progress.steps(1) == [(0.0, 4.0, "condition"), (4.0, 11.0, "time")]
+    phase, setpoint, temperature = progress.asked(np.array([200.0, 200.0]))
+    assert (phase.tolist(), setpoint.tolist(), temperature.tolist()) == ([2, 1], [0.3, 0.6], [30.0, 31.0])
+
+
 @pytest.mark.parametrize("text", ["od => 0.8", "od >= high", "OD >= 0.8", "setled", "od >= 0", "od <= 7", "time"])
 def test_a_misspelt_condition_is_named(text: str) -> None:
     with pytest.raises(ValueError, match=rf"scenario\.until: '{text}': allowed "):
