@@ -19,11 +19,13 @@ from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
-from experiments.control import assemble, policies
+from experiments.control import assemble, notify, policies
+from experiments.control import run as control
 from experiments.control.config import DeployConfig
 from experiments.laws import registry
 from experiments.laws.density.learned import LearnedController
 from experiments.loop.loop import ClosedLoop
+from experiments.record.curves import Curves
 from experiments.record.record import Record
 from experiments.record.summary import ChangeLog
 from hardware.chibio.config import ChiBioConfig
@@ -175,6 +177,52 @@ def test_every_controller_runs_and_is_recorded(kind, tmp_path):
     assert len(decisions) == 4
     if kind == "mpc":
         assert len(decisions[0]["why"]["planned_rate"]) == registry.config(kind).horizon
+
+
+def test_a_run_says_which_reactor_was_stopped_and_what_each_of_them_was_given(tmp_path, monkeypatch, caplog):
+    """M0 grows towards 1.2 for 20 min without a dose; M1 is held at 0.4, and given up once it has had 3 mL."""
+    told = []
+
+    class Tell:
+        def __call__(self, event, text, reactor=""):
+            told.append((event, reactor, text))
+
+        def close(self):
+            told.append("closed")
+
+    monkeypatch.setattr(notify, "opened", lambda target, run, resumed: Tell())
+    monkeypatch.setattr(control.charts, "save", lambda figure, folder, name: folder / name)  # takes most of the time
+    monkeypatch.setattr(Curves, "end", lambda *given: told.append(("curves", given[1]["outcome"])))
+    config = DeployConfig(
+        SimulatedConfig(reactors=("M0", "M1")), PlantConfig(start_od=0.45), controller=registry.config("pi_tuned"),
+        scenario=Scenario((0.4,), (12.0,), (37.0,)), fsync=False,
+        safety=SafetyConfig(ml_per_run=3.0, responses=Responses(budget="stop")),
+        each={"M0": {"setpoints": [1.2], "minutes": [20.0], "role": "control"}},
+    )  # fmt: skip
+    with caplog.at_level("INFO"):
+        control.deploy(config, tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["outcome"] == "stopped by the interlock: M1"
+    assert summary["minutes"] == 20.0
+    assert {name: r["role"] for name, r in summary["reactors"].items()} == {"M0": "control", "M1": "replicate"}
+    fed = {name: r["volume_ml"] for name, r in summary["reactors"].items()}
+    assert fed["M0"] == 0.0
+    assert 2.0 < fed["M1"] <= 3.0
+    assert summary["volume_ml"] == fed["M1"]
+    assert [(w["reactor"], w["setpoint"], w["end_min"]) for w in summary["windows"]] == [
+        ("M0", 1.2, 20.0), ("M1", 0.4, 12.0),
+    ]  # fmt: skip
+    assert [row for row in told if row[0] != "alarm"] == [
+        ("start", "", "started: M0, M1"), ("curves", "stopped by the interlock: M1"),
+        ("end", "", "stopped by the interlock: M1"), "closed",
+    ]  # fmt: skip
+    assert {row[1] for row in told if row[0] == "alarm"} == {"M1"}
+    assert "pi_tuned on given, M0, M1: 20 min (0.3 h) of schedule once the culture has grown" in caplog.text
+    assert f"stopped by the interlock: M1 after 20 min, {fed['M1']:.1f} mL of fresh medium" in caplog.text
+    assert "M1: the interlock told: budget in " in caplog.text
+    assert "M0: the interlock told" not in caplog.text
+    starts = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "start"]
+    assert [(row["time_s"], row["pid"]) for row in starts] == [(0.0, os.getpid())]
 
 
 def test_the_perfect_plant_is_the_training_model():

@@ -9,6 +9,8 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -230,6 +232,65 @@ def test_a_level_that_the_saved_state_knows_is_not_restored_again_and_0_ml_is_on
     BenchMarks(made.record).take(made.loop)
     assert made.loop.interlock.budget.volume_ml.tolist() == [0.0, 20.0]
     made.close()
+
+
+def test_what_was_measured_is_told_of_its_own_reactor_with_its_own_numbers(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of a reactor that is not in the run it stands in the journal alone; what is doubtful is a warning."""
+    told: list[tuple[Any, ...]] = []
+    journal = SimpleNamespace(rows=[], append=lambda kind, fields: told.append((kind, fields)))
+
+    def set_level(name: str, level_ml: float) -> float:
+        told.append((name, level_ml))
+        return 19.52
+
+    def counted(name: str, share: float, sd: float, minute: float) -> tuple[str, bool]:
+        told.append((name, share, sd, minute))
+        return f"answered for {name}", name == "M1"
+
+    loop: Any = SimpleNamespace(reactors=SimpleNamespace(names=("M0", "M1")), set_level=set_level, counted=counted)
+    record: Any = SimpleNamespace(folder=tmp_path, journal=journal)
+    marks = BenchMarks(record)
+    add_mark(tmp_path, Mark(1.0, "M0", "inoculated"))
+    add_mark(tmp_path, Mark(4.0, "M1", "level", 23.46))
+    add_mark(tmp_path, Mark(7.0, "M0", "share", None, 0.4, 0.05))
+    add_mark(tmp_path, Mark(7.5, "M7", "level", 12.0))
+    add_mark(tmp_path, Mark(8.0, "M7", "share", None, 0.6, 0.01))
+    with caplog.at_level("INFO"):
+        marks.take(loop)
+        assert len(told) == 6
+        add_mark(tmp_path, Mark(9.4, "M1", "share", None, 0.25, 0.02))
+        marks.take(loop)
+    assert told == [
+        ("level", {"reactor": "M1", "level_ml": 23.46}), ("M1", 23.46),
+        ("share", {"reactor": "M0", "share": 0.4, "sd": 0.05, "minute": 7.0}), ("M0", 0.4, 0.05, 7.0),
+        ("level", {"reactor": "M7", "level_ml": 12.0}),
+        ("share", {"reactor": "M7", "share": 0.6, "sd": 0.01, "minute": 8.0}),
+        ("share", {"reactor": "M1", "share": 0.25, "sd": 0.02, "minute": 9.4}), ("M1", 0.25, 0.02, 9.4),
+    ]  # fmt: skip
+    assert [(record.levelname, record.getMessage()) for record in caplog.records] == [
+        ("INFO", "M1: 23.5 mL in the vial by its mark, 19.5 by the ledger"),
+        ("INFO", "M0: share 0.4 +- 0.05 at minute 7 by its mark, answered for M0"),
+        ("WARNING", "M1: share 0.25 +- 0.02 at minute 9 by its mark, answered for M1"),
+    ]
+
+
+def test_a_sample_may_be_of_any_minute_up_to_the_newest_row_of_any_reactor(tmp_path: Path) -> None:
+    """M0 was given up at minute 7, M1 came to minute 93.5; the run is over."""
+    over = _under_way(tmp_path / "over", "sim")
+    (over / "recordings" / "M0.csv").write_text("time_min,od\n7.0,0.4\n")
+    (over / "recordings" / "M1.csv").write_text("time_min,od\n3.0,0.4\n93.5,0.5\n")
+    (over / "recordings" / "M2.csv").write_text("time_min,od\n")
+    said = mark(MarkConfig(str(over), "M0", share=0.4, minute=93.5))
+    assert said.startswith("M0: share 0.4 +- 0.03 at minute 93.5, in ")
+    assert said.endswith("marks.csv; a run under way takes it over with its next sample, and says so")
+    said = mark(MarkConfig(str(over), text="new bottle", minute=-30.0))
+    assert said == f"all reactors: new bottle at minute -30.0, in {over}/marks.csv"
+    with pytest.raises(frame.UserError, match=r"reactor=M3: not in this run; allowed M0, M1, M2$"):
+        mark(MarkConfig(str(over), "M3", minute=1.0))
+    with pytest.raises(frame.UserError, match=r"minute=94: allowed up to 94, now; nobody"):
+        mark(MarkConfig(str(over), "M0", share=0.4, minute=94.0))
 
 
 def test_a_level_is_of_one_reactor_and_of_now(tmp_path: Path) -> None:

@@ -169,6 +169,64 @@ def test_what_does_not_fit_into_the_queue_is_dropped_and_counted(tmp_path: Path,
     server.released.set()
 
 
+class Counting:
+    """Takes every second line, and keeps all of them."""
+
+    name = "counting"
+
+    def __init__(self) -> None:
+        self.lines: list[dict[str, str]] = []
+
+    def send(self, line: bytes) -> str:
+        self.lines.append(json.loads(line))
+        return "status 500" if len(self.lines) % 2 == 0 else ""
+
+    def give_up(self) -> None:
+        pass
+
+
+def test_every_message_comes_in_order_and_what_was_not_taken_is_counted_and_said_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    hook = Counting()
+    tell = Notifier(hook, tmp_path)  # type: ignore[arg-type]
+    told = [("start", "started: M0, M1", ""), ("alarm", "frozen: no news", "M1"), ("alarm", "jump: far", "M0"),
+            ("hand_over", "by itself", "M1"), ("end", "completed", "")]  # fmt: skip
+    for event, text, reactor in told:
+        tell(event, text, reactor)
+    tell.close()
+    tell.close()
+    assert [(m["event"], m["text"], m.get("reactor", "")) for m in hook.lines] == told
+    assert {m["run"] for m in hook.lines} == {str(tmp_path)}
+    assert (tell.sent, tell.failed, tell.dropped) == (3, 2, 0)
+    assert caplog.text.count("counting did not take a message (status 500); the run goes on") == 1
+    assert caplog.text.count("notify: counting took 3 messages; 2 failed, 0 were dropped, 0 were left at the end") == 1
+
+
+def test_a_hook_of_the_environment_is_used_and_one_that_is_wrong_stops_no_run_that_is_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("OTHER_HOOK", "no-such-command")
+    monkeypatch.setenv("MY_HOOK", "  cat -  \n")
+    tell = notify.opened("env:MY_HOOK", tmp_path, resumed=False)
+    assert tell._hook is not None
+    assert (tell._hook.name, tell._hook._command) == ("cat", ["cat", "-"])
+    tell.close()
+    with pytest.raises(frame.UserError, match="notify: there is no such command"):
+        notify.opened("env:OTHER_HOOK", tmp_path, resumed=False)
+    caplog.clear()
+    assert notify.opened("env:OTHER_HOOK", tmp_path, resumed=True)._hook is None
+    assert "there is no such command; allowed a command, https://... or env:NAME; mend it, then resume" in caplog.text
+    assert notify.opened("", tmp_path, resumed=False)._hook is None
+    for wrong, why in (
+        ("cat 'open", r"the command cannot be read \(No closing"),
+        ("https:///x", "address has no host"),
+    ):
+        with pytest.raises(frame.UserError, match=why):
+            notify.opened(wrong, tmp_path, resumed=False)
+
+
 def living(number: int) -> bool:
     """Whether a process is at work; one that ended may wait for somebody who asks how."""
     try:

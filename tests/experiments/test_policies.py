@@ -1,5 +1,6 @@
 """Which policy a run finds, and which ones it lets near a culture."""
 
+import json
 import os
 import re
 from collections.abc import Iterator
@@ -18,9 +19,9 @@ from experiments.certification.config import CertifyConfig
 from experiments.certification.judge import certify
 from experiments.cli import files, frame
 from experiments.cli.frame import UserError
-from experiments.control import assemble
+from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
-from experiments.control.policies import find_policy
+from experiments.control.policies import FIRST, composition_policy, find_policy, load_policy, named
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from experiments.training.config import TrainConfig
@@ -104,6 +105,55 @@ def test_a_sound_policy_and_a_limit_of_ones_own(tmp_path: Path, caplog: pytest.L
     assemble.unpack(deployed(tmp_path, {}, backend=ChiBioConfig()), tmp_path)
     assemble.unpack(deployed(tmp_path, {"regret_pct": 30.0}, backend=ChiBioConfig(), poor_regret_pct=40.0), tmp_path)
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
+
+
+def test_a_policy_is_sound_at_the_very_ends_of_what_is_allowed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its regret is as large as may be, and the scenario asks for its lowest and highest setpoint."""
+    edge = {"regret_pct": 10.0, "model": {"setpoints": [0.8, 0.65, 0.5]}, "updates": 1}
+    assemble.unpack(deployed(tmp_path, edge, backend=ChiBioConfig()), tmp_path)
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+
+
+def test_a_policy_that_pumps_faster_than_the_bench_allows_is_refused_with_both_rates(tmp_path: Path) -> None:
+    """It was trained for 0.02 mL/s; one of shares of the bench's own largest rate runs on any."""
+    policy.save(tmp_path / "policy.npz", laws.law())
+    assert load_policy(str(tmp_path), 1.0, 0.02).actions.max() == 0.02  # of the folder that holds it
+    with pytest.raises(UserError, match=r"policy\.npz pumps up to 0\.02 mL/s, the interlock allows 0\.019 mL/s; train"):
+        load_policy(str(tmp_path), 1.0, 0.019)
+    with pytest.raises(
+        UserError, match=r"a control period of 1\.0 min, the backend has 0\.5 min; .*env\.control_min=0\.5"
+    ):
+        load_policy(str(tmp_path), 0.5, 0.02)
+    assert load_policy("shipped", 0.5, 0.001).actions.max() == 1.0
+
+
+def test_a_share_s_policy_of_a_deployment_is_the_one_that_flew_last(tmp_path: Path) -> None:
+    """Nothing was learned: what all began with. M0 and M1 flew number 2, whatever was judged and not flown since."""
+    (tmp_path / "recordings").mkdir()
+    for name in ("M0", "M1"):
+        (tmp_path / "recordings" / f"{name}.csv").touch()
+    judged = [("M0", 1, True), ("M1", 2, True), ("M0", 2, True), ("M1", 3, False)]
+    rows: list[dict[str, Any]] = [{"kind": "start"}]
+    for upto, file in ((0, FIRST), (4, named(2))):
+        rows += [{"kind": "judged", "reactor": r, "number": n, "flies": flies} for r, n, flies in judged[:upto]]
+        lines = [json.dumps({"n": n, "wall": 1.0, "mono": 1.0, **row}) for n, row in enumerate(rows)]
+        (tmp_path / "journal.jsonl").write_text("\n".join(lines) + "\n")
+        assert policies._share_policy(str(tmp_path)) == tmp_path / file
+    assert policies._share_policy(str(tmp_path / "recordings")) == tmp_path / "recordings" / "policy.npz"
+
+
+def test_each_learned_law_of_a_share_has_a_policy_of_its_own_that_ships(tmp_path: Path) -> None:
+    for kind, sees in (("dqn", 4), ("dqn_preview", 6)):
+        (tmp_path / kind).mkdir()
+        flies = composition_policy(kind, "shipped", tmp_path / kind, False)
+        assert flies is not None
+        assert len(flies.observation) == sees
+        kept = policy.load(tmp_path / kind / FIRST)
+        assert kept.observation == flies.observation
+    assert composition_policy("midpoint", "shipped", tmp_path, False) is None
+    assert not (tmp_path / FIRST).exists()
 
 
 def test_a_file_of_an_earlier_version_runs_and_says_what_is_not_known(
