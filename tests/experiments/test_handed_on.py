@@ -1,5 +1,6 @@
 """What a command leaves for another one: numbers that every reader of JSON takes, curves with their pair, files."""
 
+import errno
 import json
 import math
 import os
@@ -12,8 +13,9 @@ import pytest
 
 from envs.coculture.pair import named_pair
 from envs.coculture.task import CocultureConfig
-from experiments.cli import extensions, files, latest
+from experiments.cli import choices, extensions, files, frame, latest, start
 from experiments.cli.calibrated import read_curves
+from experiments.cli.help_page import shown
 
 
 def refused(constant: str) -> None:
@@ -110,3 +112,87 @@ def test_latest_is_the_file_that_was_written_last_or_its_folder(
     assert {(arg, command): latest.resolved(arg, command) for arg, command in told} == told
     with pytest.raises(ValueError, match=r"resume=latest: nothing under runs/; run python -m experiments\.benchmark"):
         latest.resolved("resume=latest", "benchmark")
+
+
+def test_a_run_folder_tells_its_presets_and_the_words_it_was_started_with(tmp_path: Path) -> None:
+    """Hydra's own groups and those without a preset are none; a word stands as it was typed, whatever it holds."""
+    assert (choices.choices(tmp_path), choices.given(tmp_path)) == ({}, [])
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "hydra.yaml").write_text(
+        "hydra:\n  runtime:\n    version: 1.3\n    choices:\n      composition: null\n      plant: bench\n"
+        "      backend/transport: serial\n      hydra/launcher: slurm\n      scenario: day\n    cwd: /home\n"
+        "  verbose: false\n"
+    )
+    chosen = {"plant": "bench", "backend/transport": "serial", "scenario": "day"}
+    assert choices.choices(tmp_path) == chosen
+    words = ["plant=bench", "++each.M1.minutes=[90,30]", "+env=sim", "scenario.until=['od >= 0.8']"]
+    (tmp_path / ".hydra" / "overrides.yaml").write_text("".join(f"- {word}\n" for word in words))
+    assert choices.given(tmp_path) == [word.lstrip("+") for word in words]
+
+
+def test_rows_are_written_under_the_names_of_the_first(tmp_path: Path) -> None:
+    rows = [{"name": "a", "ml": 1.5, "od": None}, {"od": 0.4, "ml": 2.5, "name": "b, c"}]
+    files.write_csv(tmp_path / "rows.csv", rows)
+    assert (tmp_path / "rows.csv").read_text().splitlines() == ["name,ml,od", "a,1.5,", '"b, c",2.5,0.4']
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "null"), (True, "true"), (False, "false"), ("", "''"), ("sim", "sim"), (0, "0"), (0.02, "0.02"),
+        (1e-05, "1e-05"), (1 / 3, "0.333333"), ((0.5, None, "x"), "[0.5,null,x]"), ({"a": (1, 2.5)}, "{a: [1,2.5]}"),
+    ],
+)  # fmt: skip
+def test_a_value_is_shown_as_it_is_typed(value: Any, text: str) -> None:
+    assert shown(value) == text
+
+
+def test_what_a_disk_answers_is_told_with_its_remedy_however_it_is_wrapped() -> None:
+    """Of a full disk another than of a folder that is somebody else's; what is none of both is shown whole."""
+    free, place = "free disk space", "choose a folder that can be written, with hydra.run.dir=FOLDER"
+    full = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    for number, remedy in (
+        *((n, free) for n in full),
+        (errno.EACCES, place),
+        (errno.EROFS, place),
+        (errno.EEXIST, place),
+    ):
+        error = OSError(number, os.strerror(number), "run/a.csv")
+        said = f"run/a.csv: {os.strerror(number)}; {remedy}"
+        assert frame._refusal(error) == said
+        wrapped, then = RuntimeError("torch"), ValueError("logging")
+        wrapped.__cause__, then.__context__ = error, wrapped
+        assert frame._refusal(then) == said
+    assert frame._refusal(OSError(errno.ENOSPC, "No space left")) == f"writing: No space left; {free}"
+    assert frame._refusal(OSError(errno.ECONNREFUSED, "refused")) is None
+    assert frame._refusal(ValueError("x")) is None
+
+
+def test_what_a_run_leaves_is_named_with_the_command_that_goes_on(tmp_path: Path) -> None:
+    """Its config, log, events and what was not written to its end are no results."""
+    folder = tmp_path / "my run"
+    for name in ("config.yaml", "deploy.log", "events.out.1", "x.csv.part", ".hydra", "reactors"):
+        (folder / name).mkdir(parents=True)
+    command = frame.Command("deploy", None, lambda config, folder: None, resumes="state.json")
+    assert command._left(folder) == f"{folder} keeps no result; to try again, start anew"
+    (folder / "journal.jsonl").touch()
+    (folder / "recordings").mkdir()
+    assert command._left(folder) == f"{folder} keeps journal.jsonl, recordings/; to try again, start anew"
+    (folder / "state.json").touch()
+    kept = f"{folder} keeps journal.jsonl, recordings/, state.json"
+    assert command._left(folder) == f"{kept}; go on with: python -m experiments.deploy resume='{folder}'"
+
+
+@pytest.mark.parametrize(
+    ("words", "pumps"),
+    [
+        (["python", "-m", "experiments.deploy", "resume=x"], True), (["/a/turbidostat", "deploy", "+resume=x"], True),
+        (["python", "/a/experiments/deploy.py", "resume=x"], True), (["turbidostat", "deploy", "scenario=hold"], False),
+        (["turbidostat", "train", "resume=x"], False), (["python", "-m", "experiments.train", "resume=deploy"], False),
+    ],
+)  # fmt: skip
+def test_a_stop_before_anything_began_says_whether_a_pump_may_run(
+    words: list[str], pumps: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "orig_argv", words)
+    assert start.stopped() == "stopped before anything began" + "; pumps not verified off: resume the run" * pumps

@@ -235,6 +235,73 @@ def test_jobs_are_told_of_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert sweep.progress(swept, every) == f"{done}; what is missing: {swept.again()}"
 
 
+def saved(folder: Path, number: int, state: str, error: str = "") -> None:
+    (folder / str(number)).mkdir(parents=True)
+    sweep.Job(folder / str(number), config="x").save(state, 0.5 if state == "finished" else None, error)
+
+
+def test_of_many_errors_three_are_told_each_with_three_of_its_jobs(tmp_path: Path) -> None:
+    """Five failed with one error, three more each with its own; job 4 did not."""
+    failed = {0: "full", 1: "full", 2: "lost", 3: "full", 5: "full", 6: "mad", 7: "sad", 8: "full"}
+    for k in range(9):
+        saved(tmp_path, k, "failed" if k in failed else "finished", failed.get(k, ""))
+    told = sweep.errors(tmp_path, [[f"++seed={k}", "env.mu=1"] for k in range(9)])
+    full = "; ".join(f"job {k}: seed={k} env.mu=1" for k in (0, 1, 3))
+    one = "lost (job 2: seed=2 env.mu=1); mad (job 6: seed=6 env.mu=1)"
+    assert told == f"error: full ({full}; ...); {one}; and 1 other errors; "
+    assert "other" not in sweep.errors(tmp_path, [[f"seed={k}"] for k in range(7)])
+
+
+def test_a_job_at_work_elsewhere_is_waited_for_and_one_whose_process_is_gone_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "my sweep"
+    for k, state in enumerate(("finished", "running", "running", "finished")):
+        saved(folder, k, state)
+    (folder / "4").mkdir()
+    (folder / "4" / "summary.json").touch()  # of an earlier version, which kept no record of its jobs
+    gone: set[str] = set()
+    monkeypatch.setattr(sweep, "_free", lambda at: at.name in gone)
+    swept, every = sweep.Sweep(folder, "train", ["seed=range(0,5)"]), [[f"seed={k}"] for k in range(5)]
+    line = f"3 of 5 jobs finished in {folder}"
+    compare = f"compare them: python -m experiments.report runs='{folder}'"
+    assert sweep.progress(swept, every) == f"{line}; 2 still at work in other processes; {compare}"
+    gone.add("2")
+    assert [job.state for job in sweep.survey(folder, every)] == [
+        "finished", "running", "stopped", "finished", "finished",
+    ]  # fmt: skip
+    again = f"python -m experiments.train -m resume='{folder}'"
+    assert sweep.progress(swept, every) == f"{line}; 1 still at work in other processes; what is missing: {again}"
+    assert sweep.progress(swept, [*every, ["seed=5"]]).startswith("3 of 6 jobs finished")
+
+
+def test_a_sweep_goes_over_lists_as_over_numbers_and_leaves_a_list_alone() -> None:
+    words = ["++each.M0.minutes=[90],[60,30]", "++backend.reactors=[M0,M1]", "agent=paper,tuned", "hydra.verbose=true"]
+    assert sweep.jobs(["-m", *words, "hydra/launcher=joblib"]) == [
+        [f"++each.M0.minutes={minutes}", "++backend.reactors=[M0,M1]", f"agent={agent}"]
+        for minutes in ("[90]", "[60,30]") for agent in ("paper", "tuned")
+    ]  # fmt: skip
+
+
+def test_of_two_folders_the_last_is_taken_and_a_search_that_is_none_sweeps_nothing(tmp_path: Path) -> None:
+    first, second = ({"command": "train", "arguments": [f"seed={k}"]} for k in (1, 2))
+    for name, content in (("a", first), ("b", second)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "sweep.json").write_text(json.dumps(content))
+    found = sweep.asked(["-m", f"resume={tmp_path}/a", f"resume={tmp_path}/b"], "train")
+    assert (found.folder, found.arguments) == (tmp_path / "b", ["seed=2"])
+    with pytest.raises(
+        UserError, match=r"^experiments\.deploy: a resumed sweep is python -m experiments\.train -m resume="
+    ):
+        sweep.asked(["-m", f"resume={tmp_path}/a"], "deploy")
+    named = sweep.asked(["-m", "hydra.sweep.dir=x", "seed=1,2", "hydra.sweep.dir=y z"], "train")
+    assert (str(named.folder), named.arguments) == ("y z", ["seed=1,2"])
+    assert named.again() == "python -m experiments.train -m resume='y z'"
+    assert sweep.asked(["+hparams_search=null", "seed=1"], "train") is None
+    (tmp_path / "a" / "sweep.json").write_text("{")
+    assert sweep.read(tmp_path / "a") is None
+
+
 def test_another_launcher_is_not_told_what_the_one_before_was(tmp_path):
     first = ["seed=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
     sweep.Sweep(tmp_path, "train", first).save()

@@ -88,6 +88,33 @@ def test_an_objective_of_nothing_is_the_best_of_those_above_it(tmp_path: Path) -
 
 
 @pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
+def test_trials_that_are_given_out_together_keep_their_numbers_folders_and_results(tmp_path: Path) -> None:
+    """Five, two at a time: the words of the command line come first, and each result is its own trial's."""
+    given: list[tuple[int, list[list[str]]]] = []
+
+    def launch(overrides: list[list[str]], initial_job_idx: int) -> list[JobReturn]:
+        given.append((initial_job_idx, overrides))
+        done = [JobReturn(overrides=words, status=JobStatus.COMPLETED) for words in overrides]
+        for words, job in zip(overrides, done, strict=True):
+            job.return_value = 10.0 - float(words[-1].removeprefix("hydra.sweep.subdir="))
+        return done
+
+    space = {"agent.gamma": {"low": 0.1, "high": 0.9}, "agent.paper": {"choices": ["yes"]}}
+    study = search.Search(5, 2, frame.OmegaConf.create(space))
+    study.folder, study.launcher = tmp_path, SimpleNamespace(launch=launch)  # type: ignore[assignment]
+    study.sweep(["++seed=3", "env=sim"])
+    assert [(first, len(batch)) for first, batch in given] == [(0, 2), (2, 2), (4, 1)]
+    words = [job for _, batch in given for job in batch]
+    assert [job[:2] + job[-1:] for job in words] == [
+        ["++seed=3", "env=sim", f"hydra.sweep.subdir={k}"] for k in range(5)
+    ]
+    best = json.loads((tmp_path / "best.json").read_text())
+    assert (best["trial"], best["objective"]) == (4, 6.0)
+    assert best["values"] == [word.removeprefix("++") for word in words[4][2:-1]]
+    assert [t.value for t in study._open().get_trials()] == [10.0, 9.0, 8.0, 7.0, 6.0]
+
+
+@pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
 def test_a_range_is_of_whole_numbers_where_both_its_ends_are(tmp_path: Path) -> None:
     said = {
         "whole": {"low": 1, "high": 4}, "part": {"low": 0, "high": 0.5}, "down": {"low": -0.5, "high": 1},
