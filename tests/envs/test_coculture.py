@@ -176,6 +176,39 @@ def test_the_optimum_s_grid_holds_what_a_culture_can_be(scale: float) -> None:
     assert low[2] <= curve.min() < curve.max() <= high[2]
 
 
+def test_a_minute_by_hand_of_a_pair_a_heater_and_a_room_of_one_s_own() -> None:
+    """From 30 degC towards 35 in a room of 20: the heater adds 0.5 degC to what 20 min of cooling leave."""
+    config = CocultureConfig(scale_e=1.3, scale_p=0.7, heating_c_per_min=0.5, cooling_min=20.0, ambient_c=20.0)
+    warm = 20.0 + 10.0 * np.exp(-0.05) + 0.5
+    mean, follow = 0.5 * (30.0 + warm), 1.0 - np.exp(-1.0 / 60.0)
+    mu_e, mu_p = 0.07727 * mean - 1.66954, -0.02208 * mean**2 + 1.3796 * mean - 20.56996
+    for errors, e, p in ((None, 1.3, 0.7), (np.array([0.1, -0.2]), 1.43, 0.56)):
+        after = advance(config, np.array([0.4, 30.0, 0.5]), np.float64(35.0), 1.0, errors)
+        rate = 0.5 + (p * mu_p - 0.5) * follow
+        np.testing.assert_allclose(after, [0.4 + (0.5 * (0.5 + rate) - e * mu_e) / 60.0, warm, rate], rtol=1e-9)
+
+
+def test_each_number_of_a_start_is_of_its_own_range() -> None:
+    """Few start where the setpoints are, and a change comes after one, two or three decisions."""
+    config = CocultureConfig(
+        start_share=(0.05, 0.2), setpoints=(0.6, 0.9), temperatures=(30.0, 32.0), control_min=30.0, preview_min=90.0
+    )
+    env = CocultureVectorEnv(300, config)
+    env.reset(seed=3)
+    for values, low, high in (
+        (share(env.state[:, 0]), 0.05, 0.2),
+        (env.state[:, 1], 30.0, 32.0),
+        (share(env.state[:, 3]), 0.6, 0.9),
+        (share(env.state[:, 4]), 0.6, 0.9),
+    ):
+        assert low <= values.min() < low + 0.02 * (high - low) + 1e-9
+        assert high - 0.02 * (high - low) < values.max() <= high
+    assert set(env.state[:, 5]) == {30.0, 60.0, 90.0}
+    np.testing.assert_allclose(env.state[:, 2], p_putida_rate(env.state[:, 1]), rtol=1e-9)
+    env.reset(options={"temperature": 31.0, "next_setpoint_logit": 1.5})
+    np.testing.assert_array_equal(env.state[:, [1, 4]], np.tile([31.0, 1.5], (300, 1)))
+
+
 @pytest.fixture(scope="module")
 def tasks() -> dict[str, Evaluation]:
     """Both tasks on a few starts."""

@@ -9,7 +9,7 @@ from envs.identification.calibration import Calibration, IdentifyConfig, calibra
 from envs.identification.drift import Segment
 from envs.identification.free_run import _sum_variance, fit
 from envs.identification.model import NotIdentifiable, Parameter, pmse, trajectory
-from envs.identification.open_loop import OpenLoop, open_loop
+from envs.identification.open_loop import OpenLoop, open_loop, recordings
 from envs.identification.screening import Screened, Series, noise_sd, pumped_volume, screen
 from envs.identification.window import choose_window, longest
 from envs.integrators import rk4
@@ -408,6 +408,25 @@ def test_generator_follows_the_protocol() -> None:
     assert len({tuple(u) for u in pump_rate}) == 20
     y, u = od[0], pump_rate[0]
     np.testing.assert_allclose(trajectory(time, u, 0.028, 0.31, 0.12), y, rtol=1e-8)
+
+
+def test_a_simulated_recording_of_other_rows_is_the_model_s_too() -> None:
+    """Every two minutes for three hours: fed from an hour on, with a rate that holds for half an hour."""
+    time, od, rate = open_loop(OpenLoop(noise=0.0, control_min=2.0, hours=3.0), np.random.default_rng(3))
+    assert (time[0], time[1], time[-1], od.shape) == (0.0, 2.0, 180.0, (1, 91))
+    assert time[np.argmax(rate[0] > 0.0)] == 60.0
+    np.testing.assert_allclose(trajectory(time, rate[0], 0.028, 0.31, 0.12), od[0], rtol=1e-9)
+
+
+def test_a_dose_of_which_half_is_seen_late_is_in_the_reading_after_the_next() -> None:
+    config = OpenLoop(mu=0.02, tau=0.4, start_od=0.5, noise=0.0, late_share=0.5, hours=1.0)
+    _, od, rate, growth = recordings(
+        config, lambda t, y: np.full(1, 0.02 if t == 10.0 else 0.0), np.random.default_rng(1)
+    )
+    plain = 0.5 * np.exp(0.02 * np.arange(61.0))
+    assert rate[0, 10] == 0.02
+    np.testing.assert_allclose(od[0, [10, 11, 12]] / plain[[10, 11, 12]], np.exp([0.0, -0.025, -0.05]))
+    assert growth[0] == pytest.approx(0.02)
 
 
 # ---------------------------------------------------------------- the real recording

@@ -139,3 +139,10 @@ def test_a_setpoint_it_was_not_solved_for_is_refused():
     policy = solve(EnvConfig(setpoints=(0.5,)), grid=301)
     with pytest.raises(ValueError, match=r"setpoint 0\.6: the optimum was solved for"):
         policy.act(np.array([0.5]), np.array([0.6]))
+
+
+def test_setpoints_in_any_order_have_each_their_own_best_action():
+    """At an OD of 0.5 all of the pump where 0.2 is asked for, none of it for 1.0; held at 0.5, half of it."""
+    policy = solve(EnvConfig(setpoints=(1.0, 0.2, 0.5)), grid=601)
+    assert policy.act(np.full(3, 0.5), np.array([0.2, 1.0, 0.5])).tolist() == [16, 0, 8]
+    assert policy.gamma == 0.99

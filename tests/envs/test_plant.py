@@ -497,3 +497,98 @@ def test_ages_move_no_other_draw() -> None:
 def test_knots_that_do_not_fit_are_one_line(make: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("dosing", ["pulse", "continuous"])
+def test_three_minutes_at_once_run_each_pump_for_its_seconds_at_its_own_flow(dosing: str) -> None:
+    """1.5 s of 0.8 mL/s in, with 0.9 mL of another fluid; 0.6 s of 0.5 mL/s and 0.2 s of 2 mL/s out."""
+    pumps = PumpConfig(dosing=dosing, gain_ml_s=0.8, waste_ml_s=0.5, overflow_ml_s=2.0)
+    p = plant(PlantConfig(pump=pumps, vessel=VesselConfig(overflow_above_ml=0.0)))
+    p.advance(3.0, np.array([1.5]), np.array([0.6]), overflow_s=0.2, supply_ml=0.9)
+    assert p.feed.delivered_ml[0] == pytest.approx(1.2)
+    assert p.vessel.volume_ml[0] == pytest.approx(20.0 + 1.2 + 0.9 - 0.3 - 0.4)
+    p.advance(1.0, np.array([-2.0]), np.zeros(1))
+    assert p.vessel.volume_ml[0] == pytest.approx(21.4 - 1.6)
+
+
+def test_each_vial_has_the_dilution_and_the_rim_of_its_own_volume() -> None:
+    """14 mL in a vial of 30 and 26 mL in one of 36: a vial is 10 mL higher than its waste tube at least."""
+    still = PlantConfig(pump=PULSE, growth=GrowthConfig(mu=0.0))
+    p = Plant(still, 2, np.random.default_rng(0), np.array([14.0, 26.0]))
+    p.advance(1.0, np.array([1.2, 1.2]))
+    np.testing.assert_allclose(p.culture.od, 0.5 * np.exp(-1.2 / np.array([14.0, 26.0])))
+    np.testing.assert_allclose(p.vessel.volume_ml, [14.0, 26.0])
+    p.vessel.waste_gain_factor[:] = 0.0
+    p.advance(1.0, np.array([12.0, 12.0]))
+    np.testing.assert_array_equal(p.vessel.overflowed, [False, True])
+    np.testing.assert_allclose(p.vessel.volume_ml, [26.0, 36.0])
+
+
+def test_the_od_to_expect_is_that_of_the_mean_dose_in_the_vial_s_own_volume() -> None:
+    """1.2 s, longer by 0.1 on average and dead for 0.3, at 0.8 mL/s, less 0.05 mL that flow back: 0.75 mL."""
+    pump = replace(PULSE, gain_ml_s=0.8, dead_time_s=0.3, timing_error_s=0.2, back_leak_ml=0.05)
+    p = Plant(PlantConfig(pump=pump, integrator="rk4"), 2, np.random.default_rng(0), np.array([14.0, 25.0]))
+    expected = p.expected_od(0.5, np.array([[0.0, 0.0], [1.2, 1.2]]))
+    np.testing.assert_allclose(expected[0], 0.5 * np.exp(0.015))
+    np.testing.assert_allclose(expected[1], 0.5 * np.exp(0.015 - 0.75 / np.array([14.0, 25.0])))
+    taken, share = p.at_rest(2.0, 1.2)
+    np.testing.assert_allclose(taken, [0.75 / 14.0, 0.03])
+    np.testing.assert_allclose(share, [0.06 * 14.0 / 0.75, 2.0])
+
+
+def test_tubes_wear_and_growth_rises_with_the_age_at_which_a_run_begins() -> None:
+    aged = PlantConfig(growth=GrowthConfig(ramp_per_h=0.2), pump=replace(PULSE, gain_drift_per_h=-0.1), start_min=120.0)
+    p = plant(aged)
+    np.testing.assert_allclose(p.culture.rates(p.age_min), 0.03 * 1.4)
+    np.testing.assert_allclose(p.feed.expected(np.array([1.5]), p.age_min), 1.5 * 0.8)
+    p.advance(1.0, np.array([1.5]))
+    assert p.feed.delivered_ml[0] == pytest.approx(1.5 * 0.8)
+
+
+def test_a_bottle_runs_out_once_and_a_new_culture_does_not_fill_it() -> None:
+    p = plant(PlantConfig(pump=PULSE, vessel=VesselConfig(media_ml=2.0)))
+    p.advance(1.0, np.array([1.5]))
+    p.reset()
+    np.testing.assert_allclose(p.feed.expected(np.array([1.5]), p.age_min), 0.5)
+    p.advance(1.0, np.array([1.5]))
+    assert p.feed.delivered_ml[0] == pytest.approx(0.5)
+    assert p.feed.media_left_ml[0] == 0.0
+
+
+def test_growth_wanders_by_its_sd_within_an_hour() -> None:
+    p, rng = plant(PlantConfig(growth=GrowthConfig(drift_sd_per_h=0.1)), 1500), np.random.default_rng(2)
+    for _ in range(60):
+        p.culture.new_minute(rng.standard_normal(1500))
+    assert np.log(p.culture.rates(p.age_min) / 0.03).std() == pytest.approx(0.1, rel=0.06)
+
+
+def test_a_blank_ages_from_the_start_of_the_run_however_old_the_culture_is() -> None:
+    """It rises by 0.002 OD/h and jumps by 0.1 after 90 min; the culture is ten hours old."""
+    sensor = SensorConfig(drift_per_h=0.002, shift_od=0.1, shift_min=90.0)
+    p = plant(PlantConfig(sensor=sensor, growth=GrowthConfig(mu=0.0), start_min=600.0))
+    offsets = []
+    for minutes in (30.0, 59.0, 1.0):
+        p.advance(minutes, np.zeros(1))
+        offsets.append(float(p.read_od()[0] - 0.5))
+    assert offsets == pytest.approx([0.001, 0.002 * 89 / 60, 0.103])
+
+
+def test_a_thermostat_is_set_in_the_vials_that_are_told_and_its_ripple_is_in_the_reading_alone() -> None:
+    p = plant(PlantConfig(thermal=ThermalConfig(ripple_c=0.3)), 1000)
+    wanted = np.where(np.arange(1000) % 2, np.nan, 40.0)
+    p.advance(6.0, np.zeros(1000), temperature_target=wanted)
+    truth = np.where(np.arange(1000) % 2, 37.0, 40.0)
+    np.testing.assert_allclose(p.thermal.temperature, truth)
+    assert (p.thermal.read() - truth).std() == pytest.approx(0.3, rel=0.08)
+
+
+def test_cells_go_to_the_wall_and_back_and_sink_where_nothing_stirs() -> None:
+    """Without growth, w = x0 a / (a + d) (1 - exp(-(a + d) t)); 8 % sink with 1.5 min."""
+    held = GrowthConfig(mu=0.0, wall_attach_per_min=0.01, wall_detach_per_min=0.04)
+    p = plant(PlantConfig(growth=held, integrator="rk4"))
+    p.culture.stir_factor[:] = 0.0
+    p.advance(3.0, np.zeros(1))
+    assert p.apparent_od[0] / p.culture.od[0] == pytest.approx(1.0 - 0.08 * (1.0 - np.exp(-2.0)))
+    p.advance(17.0, np.zeros(1))
+    assert p.culture.wall[0] == pytest.approx(0.5 * 0.2 * (1.0 - np.exp(-1.0)), rel=1e-6)
+    assert p.culture.od[0] + p.culture.wall[0] == pytest.approx(0.5)

@@ -19,6 +19,43 @@ def test_phases_change_at_their_edges():
     assert STEPS.total_min == 90.0
 
 
+def test_phases_of_unequal_length_end_where_their_own_minutes_do():
+    long = Scenario((0.3, 0.6, 0.9), (10.0, 25.0, 5.0), (30.0, 37.0, 33.0), outputs=("pump4 1 mL", None, None))
+    minute = np.array([-5.0, 9.99, 10.0, 34.99, 35.0, 39.0, 41.0])
+    assert long.phase(minute).tolist() == [-1, 0, 1, 1, 2, 2, 2]
+    setpoint, temperature = long.at(minute)
+    assert setpoint.tolist() == [0.3, 0.3, 0.6, 0.6, 0.9, 0.9, 0.9]
+    assert temperature.tolist() == [30.0, 30.0, 37.0, 37.0, 33.0, 33.0, 33.0]
+    assert (long.edges.tolist(), long.total_min, long.supplied) == ([0.0, 10.0, 35.0, 40.0], 40.0, {4})
+
+
+@pytest.mark.parametrize(("text", "fits"), [
+    ("od >= 2", True), ("od <= 2.01", False), ("od >= 0", False), ("od > 0.5", False), ("od<=.3", True),
+])  # fmt: skip
+def test_a_condition_has_a_level_above_zero_and_up_to_two(text, fits):
+    if fits:
+        assert Scenario((0.5, 0.6), (9.0, 9.0), (37.0, 37.0), until=(None, text)).until == (None, text)
+    else:
+        with pytest.raises(ValueError, match=r"scenario.until: .*allowed"):
+            Scenario((0.5, 0.6), (9.0, 9.0), (37.0, 37.0), until=(None, text))
+
+
+@pytest.mark.parametrize(
+    ("text", "allowed"),
+    [
+        ("pump3 20 mL/h", None), ("pump3 20.1 mL/h", "0.1 to 20 mL/h"), ("pump3 0.1 mL/h, pump4 0.5 mL", None),
+        ("pump3 0.09 mL/h", "0.1 to 20 mL/h"), ("pump4 0.49 mL", "0.5 to 20 mL$"), ("pump4 21 mL", "0.5 to 20 mL$"),
+        ("pump3 1 mL, pump3 2 mL/h", "each pump once in a step"), ("pump2 1 mL", "'pump3 2 mL/h', 'pump4 1.5 mL'"),
+    ],
+)  # fmt: skip
+def test_an_amount_of_a_spare_pump_is_within_what_it_can_give(text, allowed):
+    if allowed is None:
+        assert sum(output.ml_h + output.ml for output in outputs_of(text)) in (20.0, 0.6)
+    else:
+        with pytest.raises(ValueError, match=f"scenario.outputs = .*allowed {allowed}"):
+            outputs_of(text)
+
+
 @pytest.mark.parametrize(
     ("key", "arguments"),
     [

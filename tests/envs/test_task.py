@@ -60,3 +60,18 @@ def test_each_reactor_has_its_own_volume_or_that_of_all():
 def test_a_pump_that_cannot_stop_is_refused():
     with pytest.raises(ValueError, match="allowed >= 2"):
         pump_rates(1)
+
+
+@pytest.mark.parametrize(("ml", "fits"), [(4.9, False), (5.0, True), (38.0, True), (38.1, False)])
+def test_a_reactor_s_own_volume_is_within_what_a_vial_may_hold(ml, fits):
+    if fits:
+        assert Bench(volumes_ml={"M0": 20.0, "M5": ml}).volume_of("M5") == ml
+    else:
+        with pytest.raises(ValueError, match=rf"bench.volumes_ml.M5 = {ml} mL: allowed 5 to 38"):
+            Bench(volumes_ml={"M0": 20.0, "M5": ml})
+
+
+def test_a_factor_is_that_of_the_whole_control_period_and_of_the_rates_that_are_given():
+    config = EnvConfig(mu=0.02, tau=0.4, control_min=5.0, substeps=4)
+    rates = np.array([[0.001, 0.013]])
+    np.testing.assert_allclose(step_factors(config, rates), (1.0 + 1.25 * (0.02 - rates / 0.4)) ** 4)

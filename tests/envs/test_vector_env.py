@@ -125,6 +125,7 @@ def test_a_made_environment_says_and_keeps_its_length(arguments, steps):
 def test_gymnasiums_own_time_limit_shortens_episodes():
     env = gymnasium.make(ID, max_episode_steps=4)
     many = gymnasium.make_vec(ID, num_envs=2, max_episode_steps=4)
+    assert BioreactorVectorEnv(2, episode_steps=7, max_episode_steps=30).config.episode_steps == 7
     assert env.spec.max_episode_steps == many.spec.max_episode_steps == 4
     many.reset(seed=0)
     for _ in range(2):
@@ -175,6 +176,31 @@ def test_copy_i_is_the_same_whatever_the_number_of_copies():
         one.step(np.full(1, 4))
         assert many.od[3] == one.od[0]
         assert many.setpoint[3] == one.setpoint[0]
+
+
+def test_copies_may_have_seeds_of_their_own():
+    """The third with none has a start that differs from time to time."""
+    many, one = BioreactorVectorEnv(3), BioreactorVectorEnv(1)
+    start = many.reset(seed=[7, 3, None])[0]
+    np.testing.assert_array_equal(start[0], one.reset(seed=7)[0][0])
+    np.testing.assert_array_equal(start[1], one.reset(seed=3)[0][0])
+    assert many.reset(seed=[7, 3, None])[0][2, 0] != start[2, 0]
+
+
+def test_a_hundred_episodes_begin_each_in_its_own_way_and_continue_from_any_of_them():
+    """Copies that are at different episodes, before and behind the end of a block of starts."""
+    env, other = BioreactorVectorEnv(2, episode_steps=1), BioreactorVectorEnv(2, episode_steps=1)
+    starts = [env.reset(seed=4)[0][:, 0]]
+    for _ in range(20):
+        env.reset(options={"reset_mask": np.array([True, False])})
+    for _ in range(50):
+        starts.append(env.step(np.zeros(2, dtype=int))[0][:, 0])
+    other.reset(seed=9)
+    other.load_state_dict(env.state_dict())
+    for _ in range(50):
+        starts.append(env.step(np.zeros(2, dtype=int))[0][:, 0])
+        np.testing.assert_array_equal(other.step(np.zeros(2, dtype=int))[0][:, 0], starts[-1])
+    assert len(np.unique(starts)) == 202
 
 
 def test_two_seeds_differ_and_one_seed_repeats():

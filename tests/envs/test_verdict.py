@@ -1,17 +1,21 @@
 """What a calibration is good for, in its first line; what rows tell that cannot tell tau; long and fine recordings."""
 
+import re
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from envs.identification.calibration import Calibration, IdentifyConfig, calibrate
-from envs.identification.drift import cuts
-from envs.identification.model import NotIdentifiable
+from envs.identification.drift import Drift, Segment, cuts, drift
+from envs.identification.model import NotIdentifiable, Parameter
 from envs.identification.open_loop import OpenLoop
-from envs.identification.refusal import growth_alone
+from envs.identification.refusal import check_estimate, growth_alone
 from envs.identification.screening import Series, merged
+from envs.identification.validation import Validation, attainable_pct
+from envs.identification.verdict import judged
 from experiments.calibration.study import against_truth
 from tests.studies.second_simulator import Conditions, simulate
 
@@ -119,6 +123,154 @@ def test_segments_of_a_stretch_that_begins_late_are_equally_long() -> None:
     time = 1000.0 + 2.0 * np.arange(301)
     series = Series(time, np.full(301, 0.5), np.zeros(301), np.arange(301))
     assert cuts(series, 61, 301, 120.0) == [(61, 121), (121, 181), (181, 241), (241, 301)]
+
+
+def known(value: float, half: float) -> Parameter:
+    return Parameter(value, value - half, value + half)
+
+
+def quality(**changes: object) -> SimpleNamespace:
+    """Of a fit against which nothing speaks, with changes."""
+    sound = {
+        "answers": False, "autocorrelation": 0.1, "late_share": known(0.3, 0.2), "dose_spread": known(0.2, 0.1),
+        "growth_spread": known(0.1, 0.05), "hills": 1.0,
+    }  # fmt: skip
+    return SimpleNamespace(**(sound | changes))
+
+
+def judgement(minutes: float = 90.0, apart: float = 1.0, **changes: object) -> tuple[str, tuple[str, ...]]:
+    """Word of the verdict on a good fit with changes, and all that speaks against it; predictions may miss by 0.5 %."""
+    good_one = {
+        "mu": known(0.02, 0.001), "tau": known(0.3, 0.02), "estimate": SimpleNamespace(quality=quality()),
+        "method": "prediction_error", "sound": True, "pmse_pct": 3.0, "drift_mu": None, "drift_tau": None,
+        "inside": SimpleNamespace(time=np.arange(7.0, 7.0 + minutes + apart, apart)),
+        "validation": Validation(0.4, 0.1, 50, 0.4, 70),
+    }  # fmt: skip
+    verdict, against = judged(SimpleNamespace(**(good_one | changes)), 0.5)  # type: ignore[arg-type]
+    return verdict.word, against
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "words"),
+    [
+        ({"mu": known(0.06, 0.001)}, {"mu": known(0.07, 0.001)}, "mu = 0.07 lies outside the usual 0.001 to 0.06"),
+        ({"tau": known(0.05, 0.004)}, {"tau": known(2.4, 0.1)}, "tau = 2.4 lies outside the usual 0.05 to 2"),
+        ({"apart": 2.0}, {"apart": 3.0}, "rows are 3 min apart"),
+        ({"minutes": 60.0}, {"minutes": 59.0}, "the window lasts 59 min"),
+        (
+            {"validation": Validation(0.9, 0.5, 9, 0.9, 9)},
+            {"validation": Validation(0.4, 0.1, 9, 0.6, 9)},
+            "the rows outside the window are predicted with a PMSE of 0.6 %, allowed 0.5 %",
+        ),
+        (
+            {"validation": Validation(0.9, 0.5, 9, None, 0)},
+            {"validation": Validation(0.9, 0.4, 9, None, 0)},
+            "the window's last 30 % are predicted with a PMSE of 0.9 %, allowed 0.8 %",
+        ),
+        (
+            {"drift_tau": Drift(0.3, 0.39, 30.0, known(0.01, 0.011), 5)},
+            {"drift_tau": Drift(0.3, 0.24, -20.0, known(-0.01, 0.009), 5)},
+            r"tau drifts from 0.3 to 0.24 \(-20 %\) on the way",
+        ),
+        (
+            {"drift_mu": Drift(0.02, 0.0219, 9.5, known(0.01, 0.001), 5)},
+            {"drift_mu": Drift(0.02, 0.022, 10.0, known(0.01, 0.001), 5)},
+            r"mu drifts from 0.02 to 0.022 \(\+10 %\)",
+        ),
+        ({"tau": known(0.3, 0.03)}, {"tau": known(0.3, 0.031)}, r"wider than \+-10 %"),
+        (
+            {"estimate": SimpleNamespace(quality=quality(growth_spread=known(0.3, 0.15)))},
+            {"estimate": SimpleNamespace(quality=quality(growth_spread=known(0.3, 0.1)))},
+            "growth wanders by 20 % at least from hour to hour",
+        ),
+        (
+            {"estimate": SimpleNamespace(quality=quality(late_share=known(0.7, 0.2)))},
+            {"estimate": SimpleNamespace(quality=quality(late_share=known(0.7, 0.1)))},
+            "does not see 60 % of a dose at least",
+        ),
+        (
+            {"estimate": SimpleNamespace(quality=quality(autocorrelation=-0.2))},
+            {"estimate": SimpleNamespace(quality=quality(autocorrelation=-0.31))},
+            r"correlates with the one before \(-0.31\)",
+        ),
+        (
+            {"sound": False, "estimate": SimpleNamespace(quality=quality(dose_spread=known(0.5, 0.1)))},
+            {"sound": True, "estimate": SimpleNamespace(quality=quality(dose_spread=known(0.5, 0.1)))},
+            "doses spread by 40 % at least",
+        ),
+        (
+            {"method": "free_run", "pmse_pct": 0.5},
+            {"method": "free_run", "pmse_pct": 0.6},
+            "PMSE 0.6 % exceeds 0.5 %",
+        ),
+        (
+            {"method": "free_run", "pmse_pct": 0.1},
+            {"method": "free_run", "pmse_pct": 0.1, "sound": False},
+            "the pump answers the readings",
+        ),
+    ],
+)
+def test_what_speaks_against_a_pair_is_told_from_its_limit_on(right, wrong, words) -> None:  # type: ignore[no-untyped-def]
+    assert judgement(**right) == ("use", ())
+    word, (said,) = judgement(**wrong)
+    assert word == "use with care"
+    assert re.search(words, said), said
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, None),
+        ({"inverse_tau": known(3.0, 0.9)}, None),
+        ({"inverse_tau": known(3.0, 1.0)}, r"1/tau = 3 with the 95 % interval 2 to 4; allowed within \+-30 %"),
+        ({"inverse_tau": known(-0.1, 1.1)}, "1/tau may be anything"),
+        ({"condition": 2e8}, "the pump's rate hardly changes"),
+        ({"quality": quality(hills=3.5)}, "it spreads 3.5 times as far"),
+        ({"quality": quality(hills=3.5), "inverse_tau": known(3.0, 0.2)}, None),
+        ({"mu": known(0.07, 0.001)}, None),
+        ({"mu": known(0.07, 0.001), "quality": quality(answers=True)}, "mu = 0.07 1/min, allowed 0.001 to 0.06"),
+    ],
+)
+def test_an_estimate_is_refused_from_its_limit_on(changes, words) -> None:  # type: ignore[no-untyped-def]
+    found = {"mu": known(0.02, 0.001), "inverse_tau": known(3.0, 0.5), "condition": 1e3, "quality": quality()} | changes
+    rows = Series(np.arange(3.0), np.full(3, 0.5), np.zeros(3), np.arange(11, 14))
+    if words is None:
+        check_estimate(SimpleNamespace(**found), rows)  # type: ignore[arg-type]
+        return
+    with pytest.raises(NotIdentifiable, match=f"rows 11-13: .*{words}"):
+        check_estimate(SimpleNamespace(**found), rows)  # type: ignore[arg-type]
+
+
+def test_a_line_through_segments_rises_per_hour_and_heeds_how_well_each_is_known() -> None:
+    """0.02 + 0.002 an hour at hours 1, 2, 4 and 5; one that is far off and hardly known bends it little."""
+    hours, along = (1.0, 2.0, 4.0, 5.0, 6.0), []
+    for hour in hours:
+        along.append(Segment(0, 1, 60.0 * hour, None, None))
+    on_line = [known(0.02 + 0.002 * hour, 0.0196) for hour in hours[:4]]
+    line = drift(tuple(along), [*on_line, None])
+    assert line is not None
+    assert (line.first, line.last, line.segments) == (pytest.approx(0.022), pytest.approx(0.03), 4)
+    assert line.change_pct == pytest.approx(100.0 * 8.0 / 22.0)
+    assert line.slope_per_h.value == pytest.approx(0.002)
+    # sd 0.01 of each; the squares of their distances from the middle sum to 4 + 1 + 1 + 4; t of two degrees is 4.303
+    assert line.slope_per_h.half_width == pytest.approx(4.303 * 0.01 / np.sqrt(10.0), rel=1e-3)
+    assert not line.significant
+    bent = drift(tuple(along), [*on_line, known(0.132, 1.96)])
+    assert bent is not None
+    assert bent.slope_per_h.value == pytest.approx(0.002, rel=0.01)
+    assert drift(tuple(along), [*on_line[:3], None, None]) is None
+
+
+def test_what_disturbances_make_of_a_prediction_by_hand() -> None:
+    """Rows two minutes apart, 10 in the horizon; doses of 0, 0.06 and 0.08 of the OD, off by 30 %, growth by 10 %."""
+    found = SimpleNamespace(
+        inverse_tau=known(4.0, 0.1), mu=known(0.03, 0.001), quality=quality(dose_spread=known(0.3, 0.0))
+    )
+    rates = np.array([0.0, 0.0075, 0.01, 0.02])
+    part = Series(2.0 * np.arange(4.0), np.full(4, 0.5), rates, np.arange(4))
+    doses = 0.5 * 10.0 * (0.06**2 + 0.08**2) / 3.0 * 0.09
+    expected = 100.0 * (doses + (0.03 * 0.1 * 20.0) ** 2 / 3.0)
+    assert attainable_pct(found, part, 20.0) == pytest.approx(expected)  # type: ignore[arg-type]
 
 
 # ---------------------------------------------------------------- where tau cannot be told
