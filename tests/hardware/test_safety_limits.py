@@ -638,3 +638,121 @@ def test_pause_and_latch_survive_a_restart() -> None:
     after.restore(before.state())
     assert again(4, 0.303)[1:3] == (Response.REGULATE, ("falls",))
     assert [again(minute, 0.3 + 0.001 * minute)[2] for minute in (7, 8)] == [("falls",), ()]
+
+
+# -- settings of one's own, and reactors that are not alike -----------------------------------------------------------
+
+
+def steps_of(config: SafetyConfig, *samples: tuple[float, float], **m: Any) -> list[tuple[str, ...]]:
+    """Kinds of samples (minute, OD) of one reactor that is not dosed."""
+    _, check = one(config)
+    return [check(minute, od, rate=0.0, **m)[2] for minute, od in samples]
+
+
+def test_each_limit_of_a_sample_is_the_one_that_is_set() -> None:
+    """None of these would be told, or all of them, by the limits that hold where nothing is set."""
+    for config, samples, last in (
+        (SafetyConfig(od_max=2.0), [(0, 1.99), (1, 2.01)], ("impossible",)),
+        (SafetyConfig(od_min=0.02), [(0, 0.03), (1, 0.01)], ("impossible",)),
+        (SafetyConfig(jump=0.2), [(0, 0.5), (1, 0.7)], ()),
+        (SafetyConfig(jump=0.2), [(0, 0.5), (1, 0.73)], ("jump",)),
+        (SafetyConfig(jump_fraction=0.3), [(0, 1.0), (1, 1.3)], ()),
+        (SafetyConfig(mu_max=0.01), [(0, 0.5), (20, 0.66)], ("jump",)),  # 20 % and 0.053 beyond it
+        (SafetyConfig(death=0.03), [(0, 0.5), (20, 0.26)], ()),  # exp(-0.6) of it are left, 0.04 less pass
+        (SafetyConfig(death=0.03), [(0, 0.5), (20, 0.22)], ("falls",)),
+    ):
+        assert steps_of(config, *samples)[-1] == last, config
+
+
+def test_a_pause_lasts_as_long_as_is_set_and_in_the_reactor_that_it_is_for() -> None:
+    """OD of the second falls at once; 12 min later it is dosed again, and the first was dosed all along."""
+    interlock, dosed = Interlock(2, SafetyConfig(cooldown=12.0)), []
+    for k in range(16):
+        od = np.array([0.5, 0.5 if k == 0 else 0.3]) + 0.001 * (k % 5)
+        m = Measurement(np.full(2, 60.0 * k), od, np.full(2, 37.0), np.ones(2, bool))
+        verdict = interlock.check(m, np.array([0.01, 0.002]), np.full(2, 0.5), np.full(2, np.nan), 60.0 * k)
+        interlock.confirm(Receipt(60.0 * verdict.rate), 60.0 * k)
+        dosed.append(verdict.rate.tolist())
+    assert [first for first, _ in dosed] == [0.01] * 16
+    assert [second for _, second in dosed] == [0.002] + [0.0] * 14 + [0.002]
+
+
+def test_heat_that_a_lower_target_explains_goes_as_slowly_as_is_set() -> None:
+    """From 37 to 30 degC: after an hour 7 exp(-60/30) = 0.95 are left of the relief, or 5.1 of one of 190 min."""
+    hot = []
+    for cooling in (30.0, 190.0):
+        heat, yes = Heat(1, SafetyConfig(cooling=cooling)), np.array([True])
+        for minute, degc, target in ((0, 37.0, 37.0), (1, 37.0, 30.0), (61, 34.0, 30.0), (62, 34.0, 30.0)):
+            heat.check(np.array([degc]), yes, np.array([target]), 60.0 * minute)
+        hot.append([f.kind for f in heat.check(np.array([34.0]), yes, np.array([30.0]), 3780.0) if f.rows.any()])
+    assert hot == [["hot"], []]
+
+
+def test_a_bench_of_another_period_and_cap_counts_in_its_own_doses() -> None:
+    """Every 2 min 0.006 mL/s at most, 0.72 mL: a minute holds 1.8 mL, and three doses that were not given are told."""
+    bench = Bench(period_s=120.0, max_rate=0.006)
+    budget, yes = FeedBudget(C, bench, np.full(1, 14.0), np.full(1, 19.0)), np.array([True])
+    seen = []
+    for k in range(4):
+        allowed, findings = budget.check(np.array([0.02]), yes, 120.0 * k)
+        budget.grant(allowed)
+        seen.append((float(allowed[0]), [f.text(0) for f in findings if f.rows[0]]))
+    assert seen[0] == (0.006, ["0.02 mL/s cut to 0.006"])
+    assert seen[2:] == [
+        (0.006, ["0.02 mL/s cut to 0.006"]),
+        (0.006, ["0.02 mL/s cut to 0.006", "2.16 mL were allowed, nothing was dosed"]),
+    ]
+    budget.book(np.array([1.2]), np.array([9.0]), 480.0)
+    allowed, findings = budget.check(np.array([0.006]), yes, 500.0)
+    assert [f.text(0) for f in findings if f.rows[0]] == ["0.60 mL left, 0.72 asked"]
+    assert allowed[0] == 0.0
+
+
+def test_a_reason_speaks_of_the_numbers_of_its_own_reactor() -> None:
+    interlock = Interlock(4, SafetyConfig(controller_patience=1), Bench(bottle_ml=9.0))
+    interlock.budget.book(np.array([0.0, 8.7, 0.0, 0.0]), np.array([0.0, 40.0, 0.0, 0.0]), -7200.0)
+
+    def lines(minute: int, od: list[float], rate: list[float], warm: list[float]) -> list[str]:
+        vitals = Vitals(np.zeros(4), np.array([9000.0, 8000.0, 7000.0, 2.0]), (None,) * 4)
+        m = Measurement(np.full(4, 60.0 * minute), np.array(od), np.array(warm), np.ones(4, bool), vitals)
+        target = np.array([37.0, 36.0, 35.0, 34.0])
+        verdict = interlock.check(m, np.array(rate), np.array([0.5, 0.6, 1.7, 0.8]), target, 60.0 * minute)
+        return [(line or "").split(";")[0] for line in verdict.reasons]
+
+    assert lines(0, [0.5, 0.6, 0.7, 0.8], [0.03, 0.01, 0.004, 0.004], [37.0, 45.1, 35.0, 34.0]) == [
+        "limit: 0.03 mL/s cut to 0.02",
+        "hot: 45.1 degC, target 36.0: heating off",
+        "setpoint: setpoint 1.7",
+        "spectrometer: OD 0.80, raw 2: the light sensor failed",
+    ]
+    assert lines(1, [0.71, 0.61, 4.2, 0.81], [0.0, -0.02, 0.0, 0.0], [37.0, 36.0, 35.0, 34.0]) == [
+        "jump: OD 0.500 to 0.710: growth cannot do that",
+        "controller_lost: 1 unusable proposals in a row",
+        "impossible: OD 4.200, raw 7000: outside what can be",
+        "spectrometer: OD 0.81, raw 2: the light sensor failed",
+    ]
+
+
+def test_what_was_fed_at_least_is_booked_beside_what_was_fed_at_most() -> None:
+    interlock = Interlock(3)
+    interlock.confirm(Receipt(np.array([1.2, 0.6, 0.4]), low_ml=np.array([0.3, 0.6, 0.0])), 60.0)
+    interlock.confirm(Receipt(np.array([0.1, 0.2, 0.3])), 120.0)
+    state = interlock.state()
+    assert state["_since_ml"] == pytest.approx([1.3, 0.8, 0.7])
+    assert state["_since_low_ml"] == pytest.approx([0.4, 0.8, 0.3])
+    assert state["fed_ml"] == pytest.approx([1.3, 0.8, 0.7])
+
+
+@pytest.mark.parametrize("case", [{"light_min": 50.0}, {"frozen_light": 3}])
+def test_limits_of_the_light_are_settings(case: dict[str, float]) -> None:
+    interlock = Interlock(2, SafetyConfig(**case))  # type: ignore[arg-type]
+    believed = []
+    for k in range(4):
+        light = np.array([1500.0 + k, 40.0 if "light_min" in case else 700.0])
+        m = Measurement(
+            np.full(2, 60.0 * k), np.full(2, 0.5 + 0.001 * k), np.full(2, 33.0), np.ones(2, bool), None, light
+        )
+        believed.append(np.isfinite(interlock.fluorescence(m)).tolist())
+        interlock.check(m, np.zeros(2), np.full(2, 0.5), np.full(2, np.nan), 60.0 * k)
+    assert [first for first, _ in believed] == [True] * 4
+    assert [second for _, second in believed] == ([False] * 4 if "light_min" in case else [True, True, False, False])
