@@ -1,6 +1,7 @@
 """A dose of a Pioreactor: in order, once, followed to its end; and every odd answer of the vendor's software."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -551,3 +552,79 @@ def test_what_is_put_off_is_told_once_and_taken_back_when_it_is_given(lab):
     lab.sample()
     assert lab.dose(0.04) == pytest.approx(0.07)
     assert lab.receipt.kept_ml[0] == pytest.approx(-0.03)
+
+
+def test_what_is_put_off_stays_while_nothing_is_asked_and_what_is_cut_is_not_put_off(lab):
+    for asked, given, kept in (
+        (0.03, 0.0, 0.03),
+        (0.0, 0.0, 0.0),
+        (0.04, 0.07, -0.03),
+        (9.0, 1.5, 0.0),
+        (0.2, 0.2, 0.0),
+    ):
+        assert lab.dose(asked) == pytest.approx(given)
+        assert lab.receipt.kept_ml[0] == pytest.approx(kept)
+        assert lab.receipt.waste_ml[0] == pytest.approx(2.0 * given)
+        lab.sample()
+    assert [row["doses"] for row in lab.of("intent")] == [0, 0, 1, 2, 3]
+    assert [row["carry_ml"] for row in lab.of("intent")] == pytest.approx([0.03, 0.03, 0.0, 0.0, 0.0])
+
+
+def test_waste_that_somebody_takes_out_is_no_feed(lab):
+    lab.world.event("remove_waste", 0.6, "UI")
+    lab.wait(1.0)
+    (row,) = lab.of("given")
+    assert (row["feed_ml"], row["feed_low_ml"], row["waste_ml"]) == (0.0, 0.0, 0.6)
+    assert row["why"] == "remove_waste of 0.60 mL without our command (by UI)"
+    ((at, receipt),) = lab.reactors.repeated()
+    assert (receipt.volume_ml[0], receipt.waste_ml[0]) == (0.0, 0.6)
+    assert at == pytest.approx(row["at_s"])
+
+
+def test_the_least_and_the_most_of_what_somebody_takes_back_is_what_is_left(lab):
+    """0.5 mL are told before they are pumped; of these 0.2 are taken back when it is stopped."""
+    lab.world.event("add_media", 0.5, "UI")
+    lab.world.event("add_media", -0.2, "UI")
+    lab.wait(1.0)
+    assert sum(row["feed_ml"] for row in lab.of("given")) == pytest.approx(0.3)
+    assert lab.fault is not None
+    assert "add_media of 0.30 mL without our command" in lab.fault.detail
+
+
+@pytest.mark.parametrize(("volume_ml", "rim_ml"), [(14.0, 20.0), (30.0, 40.0)])
+def test_after_a_stop_the_ledger_of_a_flooded_vial_stands_at_its_rim(monkeypatch, volume_ml, rim_ml):
+    """A media pump that stood on for half a minute gave some 21 mL; a stop drains nothing."""
+    lab = Lab(monkeypatch, volume_ml=volume_ml)
+    lab.begin()
+    lab.sample()
+    lab.world.freeze_after_s, lab.world.frozen_s = 0.6, 29.0
+    budget = FeedBudget(SafetyConfig(), lab.bench, np.full(1, volume_ml), np.full(1, 50.0))
+    planned = lab.dose(0.7)
+    budget.book(np.array([planned]), np.array([2.0 * planned]), 0.0)
+    lab.until(lambda: bool(lab.world.since), 5.0)
+    lab.wait(0.8)
+    lab.reactors.config = replace(lab.reactors.config, stop_s=60.0)
+    lab.reactors.stop()
+    for at, receipt in lab.reactors.repeated():
+        budget.book(receipt.volume_ml, receipt.waste_ml, at)
+    assert lab.world.truth["add_media"] > 15.0
+    assert float(budget.fed_ml[0]) >= lab.world.truth["add_media"] - 0.1
+    assert float(budget.volume_ml[0]) == pytest.approx(rim_ml, abs=0.01)
+
+
+def test_each_pump_s_flow_is_that_of_its_own_calibration_and_on_record(lab):
+    (row,) = lab.of("device")
+    assert row["flows"] == {"add_media": 0.7, "remove_waste": 1.6}
+    assert (row["device_id"], row["boot"]) == (UNIT, "boot1")
+
+
+def test_a_dose_has_the_name_of_its_run_its_unit_and_its_number(lab):
+    lab.dose(0.2)
+    lab.sample()
+    lab.dose(0.3)
+    lab.wait(6.0)
+    first, second = (o["source-of-event"] for o in lab.asked("add_media"))
+    assert (first, second) == ("turbidostat/run/pio01/1", "turbidostat/run/pio01/2")
+    assert [row["id"] for row in lab.of("dose_end")] == [first, second]
+    assert {row["id"] for row in lab.of("task")} == {first, second}
+    assert [row["job"] for row in lab.of("task")] == ["add_media", "remove_waste"] * 2

@@ -14,7 +14,7 @@ from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError
 from hardware.pioreactor import reactors as pioreactors
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
-from hardware.pioreactor.jobs import request
+from hardware.pioreactor.jobs import flow, regulates, request
 from hardware.pioreactor.mailbox import Mailbox
 from hardware.pioreactor.preflight import _unit
 from hardware.pioreactor.reactors import PioreactorReactors
@@ -304,3 +304,132 @@ def test_while_one_unit_is_switched_off_the_others_go_on() -> None:
     assert list(failed) == [stuck]
     assert beside.steps == 51  # all the time
     assert (quick.steps, slow.steps, stuck.steps) == (51 - 2, 1, 51 - 10)  # from when on their pumps were off
+
+
+@pytest.mark.parametrize(
+    ("version", "job", "said", "remedy"),
+    [
+        ("26.7.2", "stirring", "the unit does not stir", "pio jobs purge --job-name stirring, else reboot it"),
+        (
+            "26.7.2",
+            "temperature_automation",
+            "the unit does not heat",
+            "pio jobs purge --job-name temperature_automation",
+        ),
+        ("25.11.19", "stirring", "the unit does not stir", "on the unit: reboot it"),
+    ],
+)
+def test_a_job_that_is_gone_is_named_with_what_its_version_knows_against_it(monkeypatch, version, job, said, remedy):
+    lab = Lab(monkeypatch, World(version), stirring=True, thermostat=True)
+    lab.begin()
+    lab.sample()
+    lab.world.barred = True
+    lab.world.rows.pop(job)
+    lab.world.say(f"{job}/$state", "lost")
+    lab.wait(25.0)
+    assert lab.fault.detail == said
+    assert remedy in lab.fault.remedy
+
+
+def test_a_target_is_written_down_once_and_sent_once_and_nan_leaves_it(lab):
+    before, said = len(lab.of("temperature")), len(lab.world.mqtt.said)
+    for target in (33.0, 33.0, float("nan"), 33.0):
+        lab.station.set_temperature(target)
+        lab.wait(8.0)
+    assert [row["temperature"] for row in lab.of("temperature")[before:]] == [33.0]
+    sent = [payload for topic, payload in lab.world.mqtt.said[said:] if topic.endswith("target_temperature/set")]
+    assert sent == ["33.0"]
+
+
+@pytest.mark.parametrize(("stirring", "thermostat"), [(True, False), (False, True)])
+def test_only_the_jobs_that_a_run_wants_are_started(monkeypatch, stirring, thermostat):
+    lab = Lab(monkeypatch, stirring=stirring, thermostat=thermostat, temperature=31.0)
+    lab.begin()
+    lab.sample()
+    lab.wait(30.0)
+    wanted = {"od_reading", "stirring" if stirring else "temperature_automation"}
+    assert {job for job, options in lab.world.asked if "help" not in options} == wanted
+    assert lab.fault is None
+
+
+def test_a_unit_that_was_given_up_or_handed_over_says_so_of_each_dose(lab):
+    assert lab.reactors.regulate(np.array([True]), np.array([0.6])) == []
+    lab.sample()
+    assert lab.dose(0.5) == 0.0
+    assert lab.receipt.notes[-1] == "pio01: no dose: the unit regulates itself"
+    assert lab.reactors.give_up(np.array([True])) == []
+    lab.sample()
+    assert lab.dose(0.5) == 0.0
+    assert lab.receipt.notes[-1] == "pio01: no dose: the unit was given up"
+    assert not lab.asked("add_media")
+
+
+def test_a_flow_is_read_from_every_kind_of_curve():
+    """A line as a list or as coefficients; of points that were weighed the slope of the line through 0."""
+    recorded = {"x": [1.0, 2.0, "4"], "y": [0.5, 1.2, 2.0]}
+    calibrations = {
+        "media_pump": {"curve_data_": [0.62, 0.01]},
+        "waste_pump": {"curve_data_": {"type": "poly", "coefficients": ["1.4", -0.02]}},
+        "alt_media_pump": {"curve_data_": {"type": "spline", "knots": []}, "recorded_data": recorded},
+    }
+    flows = [flow(calibrations, pump) for pump in ("media_pump", "waste_pump", "alt_media_pump")]
+    assert flows == pytest.approx([0.62, 1.4, (0.5 + 2.4 + 8.0) / 21.0])
+    for curve in ([0.0, 0.5], [-0.3, 0.1], ["x", 0.0], [0.5], {"type": "poly"}, {"type": "spline"}, None):
+        with pytest.raises(
+            DeviceStateError, match="no active calibration of the media_pump .*page .Calibrations, media"
+        ):
+            flow({"media_pump": {"curve_data_": curve}, "waste_pump": {"curve_data_": [0.5, 0.0]}}, "media_pump")
+
+
+def test_a_turbidostat_regulates_only_by_what_it_was_asked_for():
+    asked = {"target-biomass": 0.6, "biomass-signal": "od"}
+    for settings, holds in (
+        ({"target_biomass": "0.6", "biomass_signal": "od", "volume": 3}, True),
+        ({"target_biomass": 0.61, "biomass_signal": "od"}, False),
+        ({"target_biomass": 0.6, "biomass_signal": "normalized_od"}, False),
+        ({"target_biomass": 0.6}, False),
+        ({"target_biomass": "many", "biomass_signal": "od"}, False),
+    ):
+        assert regulates({"settings": settings}, asked) is holds, settings
+    assert not regulates({"error": "no such job"}, asked)
+
+
+class Wrong(Said):
+    """A unit of which nothing is as a run needs it; its two pumps are not alike."""
+
+    def get(self, path: str, below: str = "/unit_api") -> Any:
+        curve = {"media_pump": {"curve_data_": [0.7, 0.0]}, "waste_pump": {"curve_data_": [1.6, 0.0]}}
+        return {
+            "/health": {"pioreactor_unit": "pio09", "utc_time": "2001-11-21T00:00:00Z"},
+            "/versions/app": {"version": "26.1.30"},
+            "/workers/pio02/experiment": {"experiment": "older"},
+            "/active_calibrations": curve,
+            "/config/merged": self.settings,
+        }[path]
+
+    def running(self) -> list[dict[str, Any]]:
+        return [{"job_name": job} for job in ("od_reading", "circulate_media", "add_alt_media", "stirring")]
+
+
+def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
+    config = PioreactorConfig(reactors=("pio01", "pio02"), max_dose_ml=1.2)
+    web: Any = Wrong({"1": "90", "2": "REF", "3": "135"}, "20")
+    unit = SimpleNamespace(web=web, config=config.of("pio02"), volume_ml=14.0)
+    mqtt = SimpleNamespace(holder=lambda name: f"process 7 on lab controls {name}: one client per unit; clear it")
+    found = list(_unit(SimpleNamespace(name="pio02", unit=unit), SimpleNamespace(config=config, mqtt=mqtt), web))  # type: ignore[arg-type]
+    checks = {check.name.removeprefix("pio02 "): check for check in found}
+    assert {name for name, check in checks.items() if not check.ok and check.required} == {
+        "identity", "experiment", "photodiode", "client", "dosing",
+    }  # fmt: skip
+    assert {name for name, check in checks.items() if not check.ok and not check.required} == {"version", "clock"}
+    assert checks["identity"].detail == "the unit at http://pio02.local is pio09"
+    assert checks["experiment"].detail == "older, backend.experiment = turbidostat"
+    assert checks["photodiode"].detail == "2 of 1 at 90 degrees, 3 at 135 degrees"
+    assert checks["dosing"].detail == "add_alt_media, circulate_media"
+    assert "pio jobs remove --job-name add_alt_media" in checks["dosing"].remedy
+    assert checks["client"].detail == "process 7 on lab controls pio02: one client per unit"
+    assert checks["client"].remedy == "clear it"
+    pumps = [checks[f"{pump}_pump"].detail for pump in ("media", "waste")]
+    assert pumps == ["0.700 mL/s at its calibrated duty", "1.600 mL/s at its calibrated duty"]
+    assert "ours is 1.2 mL" in checks["dead man"].detail
+    assert checks["volume"].detail == "not set mL in its settings, 14 here"

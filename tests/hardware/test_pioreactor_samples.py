@@ -10,6 +10,7 @@ import pytest
 
 from envs.bench import Bench
 from hardware.clock import VirtualClock
+from hardware.errors import UnfitError
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
 from hardware.pioreactor.family import PioreactorFamily
 from hardware.pioreactor.mailbox import LOCKS, Cluster, Mailbox, Reading
@@ -302,3 +303,99 @@ def test_two_units_have_their_own_values(monkeypatch):
     sampling = Sampling(own, 60.0, 0.0)
     sampling.take([reading, reading])
     assert sampling.look(6.0, 0.0).od == pytest.approx(3.0 * (0.4 - 0.2))
+
+
+def test_a_unit_s_own_zero_may_be_the_one_of_a_calibrated_unit():
+    """All units have 0.3 but the second, whose calibration is active: its own 0.0 stands."""
+    config = PioreactorConfig(
+        reactors=("pio01", "pio02"), od_zero=0.3, od_scale=2.5, units={"pio02": UnitConfig(od_zero=0.0)}
+    )
+    assert [(config.of(unit).od_zero, config.of(unit).od_scale) for unit in config.reactors] == [(0.3, 2.5), (0.0, 2.5)]
+    for leader, address in (("", "http://lead.local"), ("http://10.0.0.9/", "http://10.0.0.9")):
+        assert PioreactorConfig(broker="lead.local", leader=leader).leader_address == address
+
+
+@pytest.mark.parametrize(("reading", "raw"), [(0.6, 6000.0), (-0.2, 0.0), (6.1, 60000.0), (0.00005, 0.5)])
+def test_the_interlock_s_counts_are_those_of_the_photodiode_not_of_the_od(reading, raw):
+    sampling = Sampling(PioreactorConfig(od_zero=0.1, od_scale=2.0), 60.0, 0.0)
+    sampling.take([Reading(1.0, reading), Reading(3.0, reading)])
+    assert sampling.look(4.0, 0.0).raw == pytest.approx(raw)
+
+
+def test_readings_of_the_window_count_and_one_alone_is_no_sample():
+    """12 s of window: at 30 s what came at 18 s and later; the first of a sample is not older than it."""
+    sampling = Sampling(PioreactorConfig(window_s=12.0), 60.0, 0.0)
+    sampling.take([Reading(17.9, 9.0)])
+    sampling.take([Reading(18.0, 0.5)])
+    assert sampling.look(29.9, 0.0).number == 2
+    sampling = Sampling(PioreactorConfig(window_s=12.0), 60.0, 0.0)
+    sampling.take([Reading(17.9, 9.0), Reading(18.0, 0.5)])
+    assert sampling.look(30.0, 0.0) is None
+    sampling.take([Reading(30.0, 0.7)])
+    assert (sampling.look(30.0, 0.0).od, sampling.count, sampling.read_s) == (pytest.approx(0.6), 1, 30.0)
+
+
+def test_what_a_unit_says_of_its_heat_and_its_pumps_is_read_by_its_own_names():
+    """Pins of a board of one's own: media by 5, alternative medium by 6, waste by 9."""
+    box = Mailbox(UNIT, PioreactorConfig(pump_pins=(5, 6, 9)), VirtualClock(7.0))
+    below = f"pioreactor/{UNIT}/{EXPERIMENT}/"
+    for topic, payload in (
+        ("temperature_automation/temperature", '{"temperature": 36.2}'),
+        ("temperature_automation/target_temperature", "31.5"),
+        ("stirring/duty_cycle", "28"),
+        ("pwms/dc", '{"9": 100.0, "5": 0.0, "17": 30.0}'),
+    ):
+        box.take(below + topic, payload.encode(), False)
+        box.take(below.replace(EXPERIMENT, "older") + topic, b"99", False)
+    assert (box.temperature, box.target, box.stir_duty) == (36.2, 31.5, 28.0)
+    assert (box.jobs, box.dc_s) == ({"add_media": 5, "add_alt_media": 6, "remove_waste": 9}, 7.0)
+    box.take(f"{below}remove_waste/$state", b"ready", False)
+    box.take(f"{below}pwms/dc", b'{"9": 100.0}', False)
+    assert box.on() == [9]
+
+
+@pytest.mark.parametrize(("ml", "counts"), [(10.0, True), (-10.0, True), (10.1, False), (-10.1, False)])
+def test_an_event_tells_no_more_than_a_pump_can_give(ml, counts):
+    box = mailbox()
+    body = {"volume_change": ml, "event": "remove_waste", "source_of_event": "UI", "timestamp": "t"}
+    box.take(f"pioreactor/{UNIT}/{EXPERIMENT}/dosing_events", json.dumps(body).encode(), False)
+    assert [(e.pump, e.ml, e.source) for e in box.drain()[1]] == ([("remove_waste", ml, "UI")] if counts else [])
+
+
+def test_a_sample_is_on_record_with_the_time_of_its_readings_also_in_a_life_that_goes_on(monkeypatch):
+    """Ten times faster, an hour into the run: readings every 10 s of the culture, of which the last three count."""
+    lab = Lab(monkeypatch, speed=10.0, reading_s=1.0, od_scale=2.0)
+    lab.world.od_s = 1.0
+    lab.begin(elapsed_s=3600.0)
+    m = lab.sample()
+    assert m.od[0] == pytest.approx(1.0)
+    m = lab.sample()
+    row = lab.of("sample")[-1]
+    assert row["sample_s"] == pytest.approx(m.time_s[0], abs=1e-3)
+    assert 3600.0 < row["sample_s"] < lab.reactors.elapsed()
+    assert (row["readings"], row["od"], m.vitals.raw[0]) == (3, pytest.approx(1.0), pytest.approx(5000.0))
+
+
+VOLUMES = {"pio02": 17.9, "pio03": 14.0}
+
+
+@pytest.mark.parametrize(
+    ("bench", "words"),
+    [
+        ({}, None),
+        ({"period_s": 29.0}, r"bench.period_s = 29 s: allowed 30 to 600 with backend=pioreactor$"),
+        ({"period_s": 601.0}, r"bench.period_s = 601 s: allowed 30 to 600"),
+        ({"period_s": 30.0, "max_rate": 0.05}, None),
+        ({"volumes_ml": {"pio03": 18.0, "pio02": 36.0}}, r"= 36 mL of pio02: allowed less than .* vial, 36$"),
+        ({"max_rate": 0.0251}, r"backend.max_dose_ml = 1.5 mL, the interlock allows 1.51 mL in a period of 60 s"),
+        ({"period_s": 90.0, "max_rate": 0.017}, r"1.53 mL in a period of 90 s; give bench.max_rate=0.01666 or"),
+    ],
+)
+def test_a_bench_is_such_as_units_may_have(bench, words):
+    backend = PioreactorConfig(reactors=("pio01", "pio02", "pio03"))
+    given = Bench(**({"volume_ml": 20.0, "volumes_ml": VOLUMES} | bench))
+    if words is None:
+        PioreactorFamily().doses(backend, given)
+    else:
+        with pytest.raises(UnfitError, match=words):
+            PioreactorFamily().doses(backend, given)
