@@ -411,10 +411,14 @@ def test_generator_follows_the_protocol() -> None:
 
 
 def test_a_simulated_recording_of_other_rows_is_the_model_s_too() -> None:
-    """Every two minutes for three hours: fed from an hour on, with a rate that holds for half an hour."""
-    time, od, rate = open_loop(OpenLoop(noise=0.0, control_min=2.0, hours=3.0), np.random.default_rng(3))
-    assert (time[0], time[1], time[-1], od.shape) == (0.0, 2.0, 180.0, (1, 91))
-    assert time[np.argmax(rate[0] > 0.0)] == 60.0
+    """Every two minutes for six hours: fed from an hour on, then with rates that hold for half an hour each."""
+    config = OpenLoop(noise=0.0, control_min=2.0, hours=6.0, keep_od=(0.001, 2.0))
+    time, od, rate = open_loop(config, np.random.default_rng(3))
+    assert (time[0], time[1], time[-1], od.shape) == (0.0, 2.0, 360.0, (1, 181))
+    fed, drawn, *others = time[1:][np.diff(rate[0]) != 0.0]
+    assert fed == 60.0
+    assert np.diff([drawn, *others]).tolist() == [30.0] * len(others)
+    assert len(others) > 4
     np.testing.assert_allclose(trajectory(time, rate[0], 0.028, 0.31, 0.12), od[0], rtol=1e-9)
 
 

@@ -664,6 +664,17 @@ def test_each_limit_of_a_sample_is_the_one_that_is_set() -> None:
         assert steps_of(config, *samples)[-1] == last, config
 
 
+@pytest.mark.parametrize(
+    ("settings", "falls"), [({}, True), ({"death": 0.03}, False), ({"drift": 0.5}, False), ({"noise_od": 0.05}, False)]
+)
+def test_a_slow_fall_is_told_by_the_death_the_drift_and_the_noise_that_are_set(
+    settings: dict[str, float], falls: bool
+) -> None:
+    """By 2 % a minute without a dose, for 18 minutes: 0.27 beyond a death of 0.005."""
+    samples = [(float(k), 0.8 * math.exp(-0.02 * k)) for k in range(18)]
+    assert (("falls",) in steps_of(SafetyConfig(**settings), *samples)) is falls  # type: ignore[arg-type]
+
+
 def test_a_pause_lasts_as_long_as_is_set_and_in_the_reactor_that_it_is_for() -> None:
     """OD of the second falls at once; 12 min later it is dosed again, and the first was dosed all along."""
     interlock, dosed = Interlock(2, SafetyConfig(cooldown=12.0)), []
@@ -710,24 +721,24 @@ def test_a_bench_of_another_period_and_cap_counts_in_its_own_doses() -> None:
 
 def test_a_reason_speaks_of_the_numbers_of_its_own_reactor() -> None:
     interlock = Interlock(4, SafetyConfig(controller_patience=1), Bench(bottle_ml=9.0))
-    interlock.budget.book(np.array([0.0, 8.7, 0.0, 0.0]), np.array([0.0, 40.0, 0.0, 0.0]), -7200.0)
+    interlock.budget.book(np.array([8.7, 0.0, 0.0, 0.0]), np.array([40.0, 0.0, 0.0, 0.0]), -7200.0)
 
     def lines(minute: int, od: list[float], rate: list[float], warm: list[float]) -> list[str]:
         vitals = Vitals(np.zeros(4), np.array([9000.0, 8000.0, 7000.0, 2.0]), (None,) * 4)
         m = Measurement(np.full(4, 60.0 * minute), np.array(od), np.array(warm), np.ones(4, bool), vitals)
-        target = np.array([37.0, 36.0, 35.0, 34.0])
+        target = np.array([36.0, 37.0, 35.0, 34.0])
         verdict = interlock.check(m, np.array(rate), np.array([0.5, 0.6, 1.7, 0.8]), target, 60.0 * minute)
         return [(line or "").split(";")[0] for line in verdict.reasons]
 
-    assert lines(0, [0.5, 0.6, 0.7, 0.8], [0.03, 0.01, 0.004, 0.004], [37.0, 45.1, 35.0, 34.0]) == [
-        "limit: 0.03 mL/s cut to 0.02",
+    assert lines(0, [0.6, 0.5, 0.7, 0.8], [0.01, 0.03, 0.004, 0.004], [45.1, 37.0, 35.0, 34.0]) == [
         "hot: 45.1 degC, target 36.0: heating off",
+        "limit: 0.03 mL/s cut to 0.02",
         "setpoint: setpoint 1.7",
         "spectrometer: OD 0.80, raw 2: the light sensor failed",
     ]
-    assert lines(1, [0.71, 0.61, 4.2, 0.81], [0.0, -0.02, 0.0, 0.0], [37.0, 36.0, 35.0, 34.0]) == [
-        "jump: OD 0.500 to 0.710: growth cannot do that",
+    assert lines(1, [0.61, 0.71, 4.2, 0.81], [-0.02, 0.0, 0.0, 0.0], [36.0, 37.0, 35.0, 34.0]) == [
         "controller_lost: 1 unusable proposals in a row",
+        "jump: OD 0.500 to 0.710: growth cannot do that",
         "impossible: OD 4.200, raw 7000: outside what can be",
         "spectrometer: OD 0.81, raw 2: the light sensor failed",
     ]
