@@ -15,6 +15,7 @@ from experiments.control import assemble
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
 from experiments.control.question import Relearn
+from experiments.laws.share.learned import ONE_LINE
 from hardware.errors import ReactorError
 
 __all__ = ["Expected", "expected", "timetable"]
@@ -109,8 +110,8 @@ def _learns(plan: Relearn) -> Iterator[str]:
     if plan.every_h:
         yield (
             f"learns every {plan.every_h:g} h, where both growth curves are known to {plan.sd:g} and one has moved by "
-            f"{plan.moved:g}: {plan.steps} steps, then {plan.vials} vials of {plan.hours:g} h on which a new policy "
-            f"has to be better before it flies; one training at a time, at most {plan.limit_min:g} min"
+            f"{plan.moved:g}: {plan.steps} steps, then {plan.vials} vials of {plan.hours:g} h; what is best on "
+            f"them flies, old policy, new one or {ONE_LINE}; one training at a time, at most {plan.limit_min:g} min"
         )
 
 

@@ -165,7 +165,8 @@ def test_what_a_run_would_learn_and_who_would_hold_the_share_is_told() -> None:
     assert text.splitlines()[:2] == [
         "controller pi; share: dqn_preview; at_end hold",
         "learns every 6 h, where both growth curves are known to 0.02 and one has moved by 0.05: 5000 steps, then 48 "
-        "vials of 12 h on which a new policy has to be better before it flies; one training at a time, at most 90 min",
+        "vials of 12 h; what is best on them flies, old policy, new one or midpoint; one training at a time, at most "
+        "90 min",
     ]
     shares = [line.partition("its time")[2] for line in table(text)["M1"] if " its time" in line]
     assert shares == ["", *(f"; share {share}, which decides the temperature" for share in ("0.3", "0.7", "0.3"))]
