@@ -24,7 +24,7 @@ from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig, Limits
 from experiments.certification.judge import Certificate, Check, certify
-from experiments.certification.question import question
+from experiments.certification.question import CertificationError, question
 from experiments.certification.verdict import attacked
 from experiments.cli import files
 from experiments.cli.frame import UserError
@@ -98,6 +98,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "elsewhere": (
         {"given": laws.law(), "setpoints": [0.5, 0.8]},
         r"certified for setpoints 0.5 to 0.8, .* asks for 0.45",
+    ),
+    "elsewhere on both sides": (
+        {"given": laws.law(), "setpoints": [0.5, 0.6]},
+        r"certified for setpoints 0.5 to 0.6, the scenario asks for 0.45, 0.65",
     ),
     "damaged": ({"given": laws.law(), "setpoints": None}, r"certificate.json is damaged \(TypeError"),
     "of another format": ({"given": laws.law(), "format": 0}, r"is damaged \(of format 0, this version reads 2"),
@@ -547,6 +551,11 @@ def test_a_certificate_that_asks_for_less_than_usual_is_refused_and_says_what(re
         ({"start_od": (0.01, 2.0)}, []),
         ({"strip": 0.006, "error_od": 0.004}, ["error_od = 0.004, by itself 0.005", "strip = 0.006, by itself 0.005"]),
         ({"strip": 0.004, "error_od": 0.006}, []),
+        ({"uncertainty": 0.2, "noise": 0.02}, ["uncertainty = 0.2, by itself 0.3"]),
+        ({"uncertainty": 0.4, "noise": 0.01}, ["noise = 0.01, by itself 0.0108"]),
+        ({"error_share": 0.04, "error_gain": 0.3}, ["error_share = 0.04, by itself 0.05"]),
+        ({"error_share": 0.06, "error_gain": 0.1}, ["error_gain = 0.1, by itself 0.2"]),
+        ({"limits": Limits(low_dose=2.0, excess=0.01)}, ["limits.low_dose = 2.0, by itself 1.0"]),
         ({"limits": Limits(reached=0.96, reached_nominal=0.8)}, ["limits.reached_nominal = 0.8, by itself 0.9"]),
         ({"limits": Limits(entry=1.2, late=0)}, ["limits.entry = 1.2, by itself 1.15"]),
     ],
@@ -569,6 +578,12 @@ def test_what_is_written_down_of_a_band_holds_what_was_proven(share: bool) -> No
             assert (outer >= inner).all()
             np.testing.assert_allclose(outer, inner, atol=1.001e-6)
         assert (np.abs(low * 1e6 - np.rint(low * 1e6)) < 1e-6).all()
+        np.testing.assert_array_equal(case["entry_periods"], proof.band.periods)
+        np.testing.assert_allclose(case["entry_over_physics"], proof.entry, atol=1e-4)
+        np.testing.assert_allclose(case["law_half_width"], proof.law_half_width, atol=1e-6)
+        assert case["holdable"].all()
+    assert content["strips"] == ([0.05, 0.97, 184] if share else [0.4, 0.8, 80])
+    assert content["setpoints"] == [0.4, 0.8]
     for level, depth in zip(found.levels, found.doses, strict=True):
         written_down = content["dose_below"][str(level)]
         assert (written_down >= depth).all()
@@ -666,3 +681,46 @@ def test_a_row_of_the_page_is_of_the_strips_that_a_pump_can_hold() -> None:
     none[~held] = 0.0
     proof.half_width = none
     assert command._row(loop, proof)["half-width, least"] == 0.02
+
+
+def test_a_drop_that_is_written_down_says_where_it_is_and_from_which_dose_to_which() -> None:
+    """Beyond x + r = 2.2 of a policy that gives the second largest dose in place of the largest there."""
+    asked = replace(ASKED, setpoints=(0.79, 0.8))
+    found = certify(laws.swapped_level(), asked)
+    listed = certificate.content(laws.swapped_level(), {}, asked, found)["not_monotone"]
+    assert listed
+    for drop in listed:
+        assert (drop["from"], drop["to"]) == (16, 15)
+        assert 0.79 <= drop["second"] <= 0.8 < 1.4 < drop["first"]
+
+
+def test_a_policy_is_proven_on_the_model_that_was_calibrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[CertifyConfig] = []
+
+    def enough(given: policy.Policy, config: CertifyConfig) -> Certificate:
+        asked.append(config)
+        raise CertificationError("far enough")
+
+    monkeypatch.setattr(command, "certify", enough)
+    policy.save(tmp_path / "policy.npz", laws.law())
+    (tmp_path / "calibrated.yaml").write_text("mu: 0.02\ntau: 0.4\n")
+    for given in ({}, {"env_file": str(tmp_path / "calibrated.yaml")}, {"env": EnvConfig(mu=0.025)}):
+        with pytest.raises(UserError, match="far enough"):
+            command.body(CertifyConfig(policy=str(tmp_path), **given), tmp_path)  # type: ignore[arg-type]
+    models = [(config.env.mu, config.env.tau) for config in asked if config.env is not None]
+    assert models == [(0.03, 1 / 3), (0.02, 0.4), (0.025, 1 / 3)]
+    assert [config.env_file for config in asked] == [None] * 3
+
+
+def test_the_summary_of_a_certificate_has_a_row_for_every_case_that_can_be_held(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(command, "_row", lambda loop, proof: proof.case)
+    proofs = [SimpleNamespace(case=k, holdable=np.array(held)) for k, held in enumerate(([1, 1], [0, 0], [0, 1]))]
+    content = {name: name.upper() for name in ("passed", "of", "observation", "setpoints", "bounds", "checks")}
+    content |= {"cannot_hold": ["x"], "not_monotone": [], "strips": [0.0], "cases": ["of the certificate"]}
+    found: Any = SimpleNamespace(proofs=proofs, question=SimpleNamespace(loop=None))
+    summary = command._summary(Path("a/policy.npz"), content, found)
+    assert summary.pop("cases") == [0, 2]
+    assert summary.pop("policy") == "a/policy.npz"
+    assert summary == {name: value for name, value in content.items() if name not in ("strips", "cases")}

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,13 @@ from envs.task import EnvConfig
 from experiments.certification.boxes import contradictions, possible
 from experiments.certification.config import CertifyConfig
 from experiments.certification.intervals import Pieces, drops, images, points_in_strips
-from experiments.certification.judge import Certificate, certify, recheck
+from experiments.certification.judge import Certificate, _count, _worst, certify, recheck
 from experiments.certification.line import on_lines
 from experiments.certification.network import Network, q_values, rounding
 from experiments.certification.od_loop import OdCase, OdLoop
 from experiments.certification.polygons import Regions, area, partition
 from experiments.certification.question import CertificationError, question
-from experiments.certification.verdict import attacked, prove
+from experiments.certification.verdict import Proof, attacked, physical, prove
 from tests.experiments import laws
 
 BOX = ((-0.02, 1.52), (0.4, 0.8))
@@ -176,6 +177,81 @@ def test_a_period_of_growth_is_as_long_as_the_control_period(control_min: float)
     np.testing.assert_allclose(one.growth, [0.03 * control_min] * 2)
     np.testing.assert_allclose(one.shift(case)[:, 0], 0.03 * control_min)
     np.testing.assert_allclose(one.shift(case)[:, -1], (0.03 - 0.02 * 3.0) * control_min)
+
+
+def test_what_is_uncertain_makes_growth_fast_where_doses_are_weak_and_slow_where_they_are_strong() -> None:
+    """By 20 %, in periods of 2 min: the least change is that of 0.024 1/min with a dose by 1 / 0.8 as strong."""
+    one = replace(loop(0.5, 0.6), control_min=2.0)
+    found = one.shift(OdCase("", 0.2, 0.01))[0, [0, 16]]
+    np.testing.assert_allclose(found, [[0.048, 0.072], [0.048 - 0.12 / 0.8, 0.072 - 0.12 / 1.2]])
+
+
+def test_an_attack_pushes_what_is_shown_and_what_acts_each_by_its_own_part() -> None:
+    """In periods of 2 min, at the setpoints 0.5 and 0.56 of a strip from 0.5 to 0.6."""
+    one, state = replace(loop(0.5, 0.6), control_min=2.0), np.array([0.1, -0.2])
+    push = np.array([[1.0, -0.5], [-0.2, 1.0]])
+    seen, change = one.attack(OdCase("", 0.2, 0.01), state, np.array([[0.5, 0.6]] * 2), push)
+    np.testing.assert_allclose(seen, [[0.5 * np.exp(0.1) - 0.01, 0.5], [0.56 * np.exp(-0.2) + 0.002, 0.56]])
+    np.testing.assert_allclose(change[:, 0], [0.06 * 0.9, 0.06 * 1.2])
+    np.testing.assert_allclose(change[:, 16], [0.06 * 0.9 - 0.12 / 0.9, 0.06 * 1.2 - 0.12 / 1.2])
+
+
+def test_what_is_asked_is_of_the_model_that_the_policy_was_trained_on_unless_another_is_given() -> None:
+    """Its setpoints may stand in any order; values of the command go before those of the policy."""
+    policy = laws.law()
+    said = {**laws.MODEL, "mu": 0.02, "tau": 0.25, "control_min": 2.0, "setpoints": [0.7, 0.9, 0.5]}
+    policy = replace(policy, metadata={**policy.metadata, "control_min": 2.0, "model": said})
+    own = question(policy, replace(FAST, uncertainty=0.2, noise=0.004, start_od=(0.1, 1.2)))
+    assert (own.loop.mu, own.loop.tau, own.loop.control_min) == (0.02, 0.25, 2.0)
+    assert own.setpoints == (own.loop.low[0], own.loop.high[-1]) == (0.5, 0.9)
+    assert [(case.share, case.noise) for case in own.cases] == [(0.0, 0.0), (0.0, 0.004), (0.2, 0.0), (0.2, 0.004)]
+    assert own.loop.start == (0.1, 1.2)
+    limits = {case.name: limit for case, limit in zip(own.cases, (0.012, None, None, 0.025), strict=True) if limit}
+    assert own.judged == limits
+    given = EnvConfig(mu=0.05, tau=0.3, control_min=2.0)
+    other = question(policy, replace(FAST, env=given, setpoints=(0.6, 0.65)))
+    assert (other.loop.mu, other.loop.tau) == (0.05, 0.3)
+    assert other.setpoints == (other.loop.low[0], other.loop.high[-1]) == (0.6, 0.65)
+
+
+def test_the_physics_of_a_way_into_a_band_by_hand() -> None:
+    """From -3 at 0.2 a period 13 and from 2 at 0.6 three; 16 where the pump is the slower one; and at least one."""
+    start = np.array([[-3.0, 2.0], [-3.0, 2.0], [-1.0, 1.0]])
+    shift = np.array([[[0.2, 0.3], [-0.9, -0.6]], [[2.0, 2.5], [-0.3, -0.1]], [[0.2, 0.3], [-0.9, -0.6]]])
+    band: Any = SimpleNamespace(low=np.array([-0.5, -0.5, -2.0]), high=np.array([0.4, 0.4, 2.0]))
+    assert physical(start, shift, band).tolist() == [13.0, 16.0, 1.0]
+
+
+def test_how_much_later_than_the_law_a_policy_arrives_where_it_is_to_arrive() -> None:
+    """Within the law's half-width and the margin; of a law that never does, periods count from the start."""
+    asked: list[tuple[list[float], list[float]]] = []
+
+    def band(*periods: float) -> Any:
+        def until(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+            asked.append((low.tolist(), high.tolist()))
+            return np.array(periods)
+
+        return SimpleNamespace(until=until)
+
+    every, law = np.ones(3, dtype=bool), np.array([0.1, 0.2, 0.3])
+    policy = np.array([0.125, 0.1875, 0.75])
+    proof = Proof(None, every, band(5.0, 7.0, np.inf), band(3.0, np.inf, 2.0), policy, law, 0.5, np.ones(3), every)
+    assert proof.later.tolist() == [2.0, 7.0, np.inf]
+    assert asked == [([-0.6, -0.7, -0.8], [0.6, 0.7, 0.8])] * 2
+    np.testing.assert_allclose(proof.excess, [0.025, -0.0125, 0.45])
+
+
+def test_the_worst_strip_is_named_of_those_that_are_asked_about() -> None:
+    """Of five strips the second has no proof; the last one, which is worst of the others, cannot be held."""
+    edges = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
+    asked: Any = SimpleNamespace(loop=SimpleNamespace(low=edges[:-1], high=edges[1:]), what="setpoint")
+    value, held = np.array([0.1, np.nan, 0.3, 0.2, 9.0]), np.array([True, False, True, True, False])
+    assert str(_worst("wide", asked, value, 0.25, held)) == "wide: 0.3, allowed 0.25 (setpoint 0.5 to 0.6)"
+    unproven = _worst("wide", asked, value, 0.25, held | [False, True, False, False, False])
+    assert (unproven.where, unproven.holds) == ("setpoint 0.4 to 0.5", False)
+    assert _worst("wide", asked, value, 0.25, np.zeros(5, dtype=bool)).holds
+    found = _count("none", asked, np.array([False, True, True, False, True]))
+    assert str(found) == "none: 3, allowed 0 (setpoint 0.4 to 0.6, setpoint 0.7 to 0.8)"
 
 
 def test_bands_of_the_one_line_law_by_hand() -> None:

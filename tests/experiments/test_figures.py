@@ -635,6 +635,29 @@ def test_the_figure_of_a_certificate_shows_what_is_proven(share: bool) -> None:
     assert not share or (bottom >= 0.05 - 1e-6 and top <= 0.98 + 1e-6)
 
 
+def test_every_case_of_a_certificate_has_lines_of_its_own_with_a_gap_where_nothing_holds_the_culture() -> None:
+    """Its second case cannot be held in its first ten strips, and the third is not drawn."""
+    found = proven(False)
+    held = np.arange(found.question.loop.low.size) >= 10
+    first, second, third, *_ = found.proofs
+    second = replace(second, holdable=held, half_width=2.0 * second.half_width, entry=1.0 + second.entry)
+    asked = replace(found.question, drawn=(first.case.name, second.case.name))
+    failed = (replace(found.checks[0], limit=-1.0), *found.checks[1:])
+    shown = certificate_figure(replace(found, question=asked, proofs=(first, second, third), checks=failed))
+    _, widths, entries, doses = shown.axes
+    assert (len(widths.lines), len(entries.lines), len(doses.lines)) == (4, 2, 3)
+    for line, y in ((2, second.half_width), (3, second.law_half_width)):
+        np.testing.assert_allclose(widths.lines[line].get_ydata(), np.where(held, y, np.nan))
+    np.testing.assert_allclose(entries.lines[1].get_ydata(), np.where(held, second.entry, np.nan))
+    assert [widths.lines[k].get_label() for k in (0, 2)] == [first.case.name, second.case.name]
+    for line, level, depth in zip(doses.lines, found.levels, found.doses, strict=True):
+        assert line.get_label() == f"action {level} and higher"
+        np.testing.assert_allclose(line.get_ydata(), depth)
+    assert shown.get_suptitle() == (
+        f"Not certified: 1 of {len(found.checks)} requirements fail, first {found.checks[0].name}"
+    )
+
+
 def test_intervals_are_written_from_low_to_high() -> None:
     """On the screen, in the environment that a training reads, and on the page."""
     _, result = calibrated()
