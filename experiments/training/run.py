@@ -40,7 +40,7 @@ def train(config: TrainConfig, folder: Path) -> float:
         env = read_curves(config.env_file, config.env) if composed else read_env_file(config.env_file)
         config = replace(config, env=env, env_file=None)
         frame.save_config(config, folder)
-    if config.pair is not None:
+    if config.pair is not None and config.resume is None:  # a resumed run has it in env.pair
         if not isinstance(config.env, CocultureConfig):
             raise frame.UserError(f"pair={config.pair}: a task of one species; give env=coculture_preview beside it")
         with frame.refusing(ValueError):

@@ -1,8 +1,9 @@
 """Parts of a training run by hand: what is scored when, what is kept and told, and what a resumed run knows."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -14,19 +15,24 @@ from omegaconf import OmegaConf
 from dqn import checkpoint, policy
 from dqn.checkpoint import CheckpointError
 from dqn.config import DQNConfig
-from envs.coculture.task import CocultureConfig
+from dqn.replay import Transition
+from envs.coculture.optimum import Grid
+from envs.coculture.pair import PairConfig
+from envs.coculture.task import CocultureConfig, logit, share
 from envs.relative import RelativeConfig
 from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
+from experiments.laws.density.estimator import EstimatorConfig
 from experiments.training import announcements, build
 from experiments.training import run as train_run
 from experiments.training.coculture import Coculture
 from experiments.training.config import TrainConfig
 from experiments.training.density import Density
-from experiments.training.evaluation import Evaluation, Score
+from experiments.training.evaluation import Evaluation, Rollout, Score
 from experiments.training.relative import Relative
 from experiments.training.session import Best, Session, merit
 from tests.experiments.test_deploy import inverse_policy
+from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
 
 SMALL = DQNConfig(hidden=(8,), total_steps=100, learn_start=40, batch_size=8)
 
@@ -292,6 +298,17 @@ def test_the_summary_tells_the_kept_policies_from_the_last_ones(tmp_path: Path) 
     assert summary["mean_abs_error"] == pytest.approx(kept.mean_abs_error)
     assert summary["regret_pct_last"] == pytest.approx(last.regret_pct)
     assert summary["steady_abs_error_last"] == pytest.approx(last.steady_abs_error)
+    by_setpoint = np.array(summary["steady_abs_error_by_setpoint"])
+    assert by_setpoint.shape == (2, len(one.config.env.setpoints))
+    np.testing.assert_allclose(by_setpoint, kept.steady_by_setpoint)
+    names = ("optimum_cost", "optimum_steady_abs_error", "optimum_mean_abs_error")
+    of_optimum = report.optimum_cost, report.optimum_steady, report.optimum_abs_error
+    assert [summary[name] for name in names] == pytest.approx(of_optimum)
+    assert len(set(of_optimum)) == 3
+    myopic = report(one.task.myopic)
+    assert summary["myopic_regret_pct"] == pytest.approx(float(myopic.regret_pct[0]))
+    assert summary["myopic_steady_abs_error"] == pytest.approx(float(myopic.steady_abs_error[0]))
+    assert policy.load(Path(summary["policy"])).metadata["config_hash"] == summary["config_hash"]
 
 
 def test_a_relative_policy_sees_the_edge_of_its_training_beyond_it() -> None:
@@ -308,6 +325,360 @@ def test_the_share_that_is_drawn_as_asked_for_is_that_of_the_cost(monkeypatch: p
     best = task.best
     monkeypatch.setattr(task, "best", lambda start: drawn.append(best(start)) or drawn[-1])
     task.figures(inverse_policy())
-    optimum, (hours, wanted, _, theirs, *_) = drawn
+    optimum, (hours, wanted, ours, theirs, temperature, best_temperature, species) = drawn
     np.testing.assert_allclose(hours, 0.5 * np.arange(1, 13))
     np.testing.assert_allclose(theirs - wanted, optimum.error[:, 0], atol=1e-9)
+    assert (np.diff(ours[3:], axis=0) > 0.0).all()  # always at 29 degC, where the second gains
+    assert (temperature == 29.0).all()
+    np.testing.assert_allclose(best_temperature, 29.0 + 7.0 / 16.0 * optimum.action[:, 0])
+    assert species == "P. putida"
+
+
+class Fading:
+    """Errors that an action k leaves as large as k / 4 of them, and an optimum that leaves a fourth."""
+
+    steps, steady_steps, arrived = 4, 3, 0.3
+
+    def advance(self, observation: Any, action: Any) -> tuple[Any, Any]:
+        error = observation[..., 0] * action / 4.0
+        return np.stack([error, observation[..., 1]], axis=-1), error
+
+    def asked(self, start: Any) -> Any:
+        return start[:, 1]
+
+    def best(self, start: Any) -> Rollout:
+        error = start[:, 0] * 0.25 ** np.arange(1, 5)[:, None, None]
+        return Rollout(error, error, np.ones(error.shape, dtype=np.intp))
+
+
+def test_scores_of_two_policies_by_hand() -> None:
+    """Errors 4 and 8 at setpoint 1 and -2 at setpoint 5; one policy halves them, the other leaves them as they are.
+
+    From 8 the optimum is at 0.5 two steps before the end, beyond 0.3: that start is left out of the steady errors.
+    """
+    evaluation = Evaluation(Fading(), np.array([[4.0, 1.0], [8.0, 1.0], [-2.0, 5.0]]))
+    score = evaluation(lambda seen: np.array([[2], [4]]) * np.ones(seen.shape[:-1], dtype=np.intp), agents=2)
+    squares = 4.0**2 + 8.0**2 + 2.0**2
+    fade = [sum(kept ** (2 * k) for k in range(1, 5)) for kept in (0.5, 1.0, 0.25)]
+    assert score.cost == pytest.approx([squares / 3.0 * fade[0], squares / 3.0 * fade[1]])
+    assert evaluation.optimum_cost == pytest.approx(squares / 3.0 * fade[2])
+    assert score.regret_pct == pytest.approx([100.0 * (own / fade[2] - 1.0) for own in fade[:2]])
+    assert score.steady_by_setpoint.tolist() == [[0.5, 0.25], [4.0, 2.0]]
+    assert score.steady_abs_error.tolist() == [0.5, 4.0]
+    assert score.mean_abs_error == pytest.approx([14.0 / 3.0 * 0.9375 / 4.0, 14.0 / 3.0])
+    assert evaluation.optimum_steady == pytest.approx(0.0625)
+    assert evaluation.optimum_abs_error == pytest.approx(14.0 / 3.0 * 0.33203125 / 4.0)
+
+
+def replaced(task: Any, uniform: list[list[float]], before: list[float], after: list[float]) -> Transition:
+    """One transition, given as many other goals as there are rows of uniform numbers."""
+    n, relabel = len(uniform), task.hindsight(SMALL)
+    seen = [torch.tensor([[o] * n]) for o in (before, after)]
+    batch = Transition(seen[0], torch.zeros(1, n, dtype=torch.int64), torch.zeros(1, n), seen[1], torch.ones(1, n))
+    relabel.replace(batch, relabel.drawn(torch.tensor([uniform], dtype=torch.float64)))
+    return batch
+
+
+def test_goals_in_hindsight_reach_over_the_setpoints_of_the_task_in_whatever_order_they_are() -> None:
+    """0.3 to 0.7, and the reward is that of the OD reached, 0.6, not of the one before."""
+    task = Density(EnvConfig(setpoints=(0.5, 0.7, 0.3, 0.6)))
+    batch = replaced(task, [[0.0, 0.5], [0.25, 0.5], [1.0, 0.5]], [0.9, 0.5], [0.6, 0.5])
+    np.testing.assert_allclose(batch.s_t[0, :, 1], [0.3, 0.4, 0.7], rtol=1e-6)
+    np.testing.assert_allclose(batch.r_t[0], [-0.09, -0.04, -0.01], rtol=1e-5)
+
+
+def test_errors_in_hindsight_reach_as_far_as_those_that_are_trained() -> None:
+    task = Relative(RelativeConfig(largest_error=1.5))
+    batch = replaced(task, [[0.0, 0.5], [1.0, 0.5]], [0.2, 0.4], [0.5, 0.4])
+    np.testing.assert_allclose(batch.s_tm1[0, :, 0], [-1.5, 1.5])
+    np.testing.assert_allclose(batch.s_t[0, :, 0], [-1.2, 1.8])
+    np.testing.assert_allclose(batch.r_t[0], [-1.44, -3.24], rtol=1e-6)
+
+
+def test_programs_in_hindsight_are_those_of_the_task() -> None:
+    """Setpoints .2 to .6, decisions of 20 min, changes known 20 to 60 min ahead; the cost is that of the share."""
+    task = Coculture(CocultureConfig(setpoints=(0.2, 0.6), control_min=20.0, preview_min=60.0))
+    uniform = [[0.5, 0.0, 0.5, 1.0, 0.21], [1.0, 1.0, 0.5, 0.0, 0.999]]
+    batch = replaced(task, uniform, [0.1, 33.0, 0.8, 0.0, 0.0, 20.0], [0.3, 33.0, 0.8, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(batch.s_t[0, :, 0], [0.0, 3.0])
+    np.testing.assert_allclose(batch.s_tm1[0, :, 0], [-0.2, 2.8], rtol=1e-6)
+    np.testing.assert_allclose(share(batch.s_tm1[0, :, 3:5]), [[0.2, 0.6], [0.6, 0.2]], rtol=1e-6)
+    np.testing.assert_allclose(batch.s_tm1[0, :, 5], [20.0, 60.0])
+    np.testing.assert_allclose(batch.s_t[0, :, 5], [0.0, 40.0])
+    np.testing.assert_allclose(batch.r_t[0], [-((0.5 - 0.2) ** 2), -((share(3.0) - 0.6) ** 2)], rtol=1e-5)
+
+
+def test_more_agents_than_a_group_holds_are_the_seeds_that_they_are_called_by() -> None:
+    """Eighteen in groups of 16 and 2."""
+    task = Density(EnvConfig())
+    many = build.population(task, SMALL, range(5, 23), threads=3)
+    assert ([group.agent.n_agents for group in many.groups], many.n_agents, many.threads) == ([16, 2], 18, 3)
+    for k in (0, 15, 16, 17):
+        alone = build.trainer(task, SMALL, [5 + k]).agent.online.flat[0]
+        assert torch.equal(many.weights()[k], alone)
+    assert [group.interval for group in many.groups] == [EnvConfig().episode_steps] * 2
+
+
+def test_a_decision_of_a_share_lasts_its_period_and_is_judged_by_the_setpoint_before_a_change() -> None:
+    """20 min at 36 degC, long in balance with it: the logit falls by a third of an hour's difference of the rates."""
+    task = Coculture(CocultureConfig(control_min=20.0, preview_min=60.0))
+    fall = (float(p_putida_rate(36.0)) - float(e_coli_rate(36.0))) / 3.0
+    start = np.array([[0.2, 36.0, float(p_putida_rate(36.0)), logit(0.4), logit(0.7), left] for left in (20.0, 40.0)])
+    after, error = task.advance(start, np.array([16, 16]))
+    np.testing.assert_allclose(after[:, 0], 0.2 + fall)
+    np.testing.assert_allclose(error, share(0.2 + fall) - 0.4)
+    np.testing.assert_allclose(after[:, 3:], [[logit(0.7), logit(0.7), 0.0], [logit(0.4), logit(0.7), 20.0]])
+
+
+def test_a_policy_of_a_share_sees_the_edge_of_what_its_task_trains() -> None:
+    changes: dict[str, Any] = {"setpoints": (0.2, 0.6), "temperatures": (30.0, 34.0), "control_min": 20.0}
+    task = Coculture(CocultureConfig(preview_min=60.0, **changes))
+    low, high = (np.delete(end, 2) for end in task.limits)
+    np.testing.assert_allclose(low, [-3.0, 30.0, logit(0.2), logit(0.2), 0.0])
+    np.testing.assert_allclose(high, [3.0, 34.0, logit(0.6), logit(0.6), 60.0])
+    assert (task.actions[0], task.actions[-1]) == (30.0, 34.0)
+    assert task.model()["control_min"] == task.model()["model"]["control_min"] == 20.0
+    assert task.description == (
+        "shares of two species by temperature, a decision every 20 min, the next setpoint known 60 min ahead"
+    )
+    assert (task.regret_unit, Coculture(CocultureConfig()).regret_unit) == (5.0, 0.5)
+    assert Density(EnvConfig(control_min=2.5)).model()["control_min"] == 2.5
+
+
+def test_grids_of_a_share_are_every_start_with_every_setpoint_at_rest() -> None:
+    task = Coculture(CocultureConfig())
+    for grid, starts, goals in (
+        (task.selection_grid(), np.linspace(0.06, 0.94, 8), np.linspace(0.15, 0.85, 8)),
+        (task.report_grid(), np.linspace(0.05, 0.95, 19), np.linspace(0.1, 0.9, 9)),
+    ):
+        found = share(grid[:, [0, 3]])
+        np.testing.assert_allclose(found[:, 0], np.repeat(starts, goals.size))
+        np.testing.assert_allclose(found[:, 1], np.tile(goals, starts.size))
+        np.testing.assert_allclose(grid[:, 1], EQUAL_RATES_C)
+        np.testing.assert_allclose(grid[:, 2], float(p_putida_rate(EQUAL_RATES_C)))
+    ahead = Coculture(CocultureConfig(preview_min=180.0)).report_grid()
+    np.testing.assert_allclose(ahead[:, 0], ahead[:, 3])  # at rest at the first of two setpoints
+    assert set(ahead[:, 5]) == {180.0}
+
+
+def test_the_optimum_of_many_programs_at_once_is_that_of_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thirty changes, which are more than are taken together, on a coarse grid of shares."""
+    monkeypatch.setattr("experiments.training.coculture.FINE", Grid(logits=21))
+    task = Coculture(CocultureConfig(n_actions=5, control_min=30.0, preview_min=60.0, episode_steps=3))
+    start = task.report_grid()[:30][::-1]
+    together = task.best(start)
+    for k in (0, 23, 24):
+        alone = task.best(start[k : k + 1])
+        np.testing.assert_array_equal(together.action[:, 0, k], alone.action[:, 0, 0])
+        np.testing.assert_allclose(together.state[:, 0, k], alone.state[:, 0, 0])
+        np.testing.assert_allclose(together.error[:, 0, k], alone.error[:, 0, 0])
+
+
+def test_the_one_line_law_takes_the_rate_after_which_the_model_is_nearest_to_the_setpoint() -> None:
+    """u = tau (mu + ln(x / r) / h) in sixteenths of 0.02 mL/s: 38.8, 11.2 and 6.4, by tau 0.4 and h 2 min."""
+    task = Density(EnvConfig(mu=0.03, tau=0.4, control_min=2.0))
+    seen = np.array([[0.6, 0.5], [0.505, 0.5], [0.49, 0.5]])
+    assert task.myopic(seen).tolist() == [16, 11, 6]
+    assert task.myopic(seen[None, ::-1] * [[[1.0, 1.0]], [[2.0, 2.0]]]).tolist() == [[6, 11, 16]] * 2
+
+
+def still(value: Any) -> Any:
+    """A policy that never doses, whatever its map is drawn as."""
+    return SimpleNamespace(act=lambda seen: np.zeros(len(seen), dtype=np.intp), chosen=value)
+
+
+def captured(monkeypatch: pytest.MonkeyPatch, *names: str) -> dict[str, tuple[Any, ...]]:
+    """What the charts of these names are drawn from."""
+    drawn: dict[str, tuple[Any, ...]] = {}
+    for name in names:
+        monkeypatch.setattr(
+            f"experiments.reporting.charts.{name}", lambda *given, name=name: drawn.__setitem__(name, given)
+        )
+    return drawn
+
+
+def test_maps_and_trajectories_of_a_density_are_drawn_with_learned_first_and_the_optimum_second(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn = captured(monkeypatch, "policy_map", "trajectories")
+    env = EnvConfig(mu=0.03, tau=0.4, episode_steps=60, setpoints=(0.2, 0.3, 0.6, 0.9))
+    Density(env).figures(still(lambda seen: 10.0 * seen[:, 0] + seen[:, 1]))
+    od, setpoint, learned, best = drawn["policy_map"]
+    assert (setpoint[0], setpoint[-1]) == (0.2, 0.9)
+    np.testing.assert_allclose(learned, 10.0 * od + setpoint[:, None])
+    assert (best[0, -1], best[-1, 0]) == (0.02, 0.0)  # far above its setpoint, and far below
+    minutes, ours, theirs, goals, rates, best_rates = drawn["trajectories"]
+    assert goals.tolist() == [0.2, 0.6, 0.9] * 2
+    assert (minutes[-1], minutes.size, rates.shape) == (60.0, 61, (60, 6))
+    np.testing.assert_allclose(ours, ours[0] * step_factors(env)[0] ** np.arange(61)[:, None])
+    np.testing.assert_array_equal(theirs[0], ours[0])
+    np.testing.assert_allclose(theirs[-1, :2], [0.2, 0.6], rtol=0.01)  # in an hour from 0.1
+    assert not rates.any()
+    np.testing.assert_allclose(theirs[1:] / theirs[:-1], np.interp(best_rates, env.pump_rates(), step_factors(env)))
+
+
+def test_maps_and_trajectories_of_a_relative_task_are_drawn_with_learned_first_and_the_optimum_second(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In place of the optimum stands a law that gives the level of the growth share and leaves a tenth of an error."""
+
+    def level(config: RelativeConfig, s: float, steps: int) -> Any:
+        def rollout(start: Any) -> tuple[Any, Any]:
+            error = start * 0.1 ** np.arange(1, steps + 1)[:, None]
+            return error, np.full(error.shape, round(16 * s))
+
+        return SimpleNamespace(act=lambda error, k: np.full(error.shape, round(16 * s)), rollout=rollout)
+
+    monkeypatch.setattr("experiments.training.relative._optimum", level)
+    drawn = captured(monkeypatch, "relative_map", "relative_trajectories")
+    Relative(RelativeConfig(growth_shares=(0.25, 0.75), largest_error=1.5)).figures(
+        still(lambda seen: 10.0 * seen[:, 0] + seen[:, 1])
+    )
+    error, shares, learned, best = drawn["relative_map"]
+    assert (error[0], error[-1], shares[0], shares[-1]) == (-1.5, 1.5, 0.25, 0.75)
+    np.testing.assert_allclose(learned, 10.0 * error + shares[:, None])
+    np.testing.assert_allclose(best, np.rint(16.0 * shares)[:, None] / 16.0 * np.ones(error.size))
+    ours, theirs, goals, levels, best_levels = drawn["relative_trajectories"]
+    np.testing.assert_allclose(ours[:3], [ours[0], ours[0] + goals, ours[0] + 2.0 * goals])  # e grows by s
+    np.testing.assert_allclose(theirs[:3], [ours[0], 0.1 * ours[0], 0.01 * ours[0]])
+    assert not levels.any()
+    np.testing.assert_allclose(best_levels, np.rint(16.0 * goals) / 16.0 * np.ones((100, 1)))
+
+
+def test_a_sweep_is_told_the_merit_of_the_worst_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Mock()
+    made.return_value.best.merit = np.array([0.5, 3.0, 1.0])
+    monkeypatch.setattr(train_run, "Session", made)
+    monkeypatch.setattr(train_run, "_finish", Mock())
+    assert train_run.train(TrainConfig(agent=SMALL, n_agents=3), tmp_path) == 3.0
+    assert made.call_args.kwargs == {"resume": False}
+    train_run.train(TrainConfig(agent=SMALL, resume="latest"), tmp_path)
+    assert made.call_args.kwargs == {"resume": True}
+
+
+def test_the_hash_of_a_policy_is_of_model_and_agent_and_of_nothing_else() -> None:
+    config = TrainConfig(agent=SMALL)
+    own = train_run.fingerprint(config)
+    assert train_run.fingerprint(replace(config, seed=7, n_agents=3, eval_every=9, threads=2, stop_within=1.0)) == own
+    assert train_run.fingerprint(replace(config, env=EnvConfig(tau=0.4))) != own
+    assert train_run.fingerprint(replace(config, agent=replace(SMALL, gamma=0.9))) != own
+
+
+@pytest.mark.parametrize("env", [EnvConfig(), RelativeConfig(largest_error=1.5)], ids=["density", "relative"])
+def test_a_policy_of_estimates_says_with_which_estimator_it_was_meant(env: Any, tmp_path: Path) -> None:
+    config = TrainConfig(agent=SMALL, env=env, n_agents=2, seed=3)
+    task = train_run.tasks.of(env)
+    agents = build.population(task, SMALL, (3, 4))
+    best = Best.empty(agents.weights())
+    best.merit[:], best.step[:] = (2.0, 1.0), (90, 60)
+    parts = SimpleNamespace(config=config, best=best, task=task, folder=tmp_path, seeds=(3, 4), agents=agents)
+    path, flies = train_run._export(parts, scored([0.3, 0.6], [[0.01, 0.02], [0.001, 0.003]]))  # type: ignore[arg-type]
+    said = policy.load(path).metadata
+    assert said.get("estimator") == (asdict(EstimatorConfig()) if task.observation == policy.RELATIVE else None)
+    assert (said["seed"], said["steady_abs_error"], said["updates"]) == (4, 0.003, 20)
+    np.testing.assert_allclose([flies.low, flies.high], np.float32(task.limits))
+
+
+def test_learning_curves_are_drawn_of_every_agent_and_every_episode_that_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two agents; in the first interval no episode ended, in the last one that of the second agent alone."""
+    drawn = captured(monkeypatch, "learning")
+    monkeypatch.setattr("experiments.reporting.charts.save", lambda figure, folder, name: folder / f"{name}.png")
+    best = SimpleNamespace(
+        history=[(50, [3.0, 4.0], [0.3, 0.4]), (90, [1.0, 2.0], [0.1, 0.2])], step=np.array([90, 50])
+    )
+    returns = [[np.nan, np.nan], [-1.0, -2.0], [np.nan, -3.0]]
+    task, writer, agents = SimpleNamespace(figures=lambda _: {}), Mock(), SimpleNamespace(steps=120)
+    train_run._figures(
+        SimpleNamespace(best=best, returns=returns, task=task, writer=writer, agents=agents, folder=tmp_path),  # type: ignore[arg-type]
+        inverse_policy(),
+    )
+    episodes, steps, regret, kept = drawn["learning"]
+    np.testing.assert_array_equal(episodes, [[-1.0, -2.0], [np.nan, -3.0]])
+    assert (steps.tolist(), regret.tolist(), kept.tolist()) == ([50.0, 90.0], [[3.0, 4.0], [1.0, 2.0]], [90.0, 50.0])
+    assert writer.events.picture.call_args.args == ("figures/learning", tmp_path / "figures" / "learning.png", 120)
+
+
+def test_what_is_said_at_the_start_names_all_seeds_and_where_a_resumed_run_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    task = Coculture(CocultureConfig(preview_min=60.0, control_min=20.0))
+    config = TrainConfig(env=task.config, agent=SMALL)
+    with caplog.at_level("INFO"):
+        announcements.began(config, task, range(5, 8), tmp_path, 40)
+    assert caplog.messages[0].endswith("; 3 agents, seeds 5 to 7, goes on at step 40 of 100 steps")
+    assert caplog.messages[0].startswith("learns env=coculture agent=given: shares of two species")
+    assert caplog.messages[1].startswith("good is a policy within 5 % regret and 0.02 of the share at rest")
+
+
+def test_what_is_said_at_the_end_is_of_all_seeds_the_worst_and_of_two_species_their_pair(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept, myopic = scored([0.1, 0.9, 0.2], [[0.001], [0.002], [0.02]]), scored([-7.0], [[0.3]])
+    task, path = Coculture(CocultureConfig(preview_min=60.0, control_min=20.0)), tmp_path / "policy.npz"
+    with caplog.at_level("INFO"):
+        announcements.ended(tmp_path, task, kept, myopic, "spent", path, "pair.yaml")
+    spent, reached, compared, where, *following = caplog.messages
+    assert (spent, where) == ("spent", f"policy {path}; figures {tmp_path / 'figures'}")
+    assert "0.20 % regret, 0.0020 of the share steady error; the worst of 3: 0.90 %, 0.0200: within" in reached
+    assert compared.endswith("one period ahead: 7.00 % regret, 0.3000 of the share steady error")
+    assert following == [
+        "next, try it: python -m experiments.deploy pair=pair.yaml plant=coculture scenario=ratio_steps "
+        f"composition=dqn_preview composition_policy={path}"
+    ]
+
+
+def test_the_table_of_runs_has_of_each_seed_its_own_numbers() -> None:
+    writer = Mock(agents=[Mock(), Mock()])
+    announcements.results(writer, 90, scored([0.4, 7.0], [[0.001, 0.002], [0.05, 0.01]]), Density(EnvConfig()), (8, 9))
+    told = [events.scalars.call_args.args for events in writer.agents]
+    assert told == [
+        ({"result/regret_pct": 0.4, "result/steady_abs_error": 0.002}, 90),
+        ({"result/regret_pct": 7.0, "result/steady_abs_error": 0.05}, 90),
+    ]
+    _, table, step = writer.events.text.call_args.args
+    rows = [[cell.strip() for cell in line.strip("| ").split("|")] for line in table.splitlines()]
+    assert ["limit", "0.5", "0.003"] in rows
+    assert rows[-2:] == [["seed 8", "0.400", "0.0020"], ["seed 9", "7.000", "0.0500"]]
+    assert step == 90
+
+
+def test_a_checkpoint_is_written_behind_each_multiple_and_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Episodes of 24 steps, none of which ends at a multiple of 50 but the last."""
+    one = session(
+        tmp_path / "run", env=EnvConfig(episode_steps=24), agent=replace(SMALL, total_steps=220, learn_start=200),
+        eval_every=1000, checkpoint_every=50,
+    )  # fmt: skip
+    written: list[int] = []
+    monkeypatch.setattr(checkpoint, "save", lambda path, state: written.append(one.agents.steps))
+    one.run()
+    one.writer.close()
+    assert written == [72, 120, 168, 216, 220]
+
+
+def test_a_task_of_two_species_takes_growth_curves_and_pair_of_ones_own_and_a_resumed_one_keeps_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The curves by their file, the pair by its name; everything else of the task stays as it was asked for."""
+    pair = replace(PairConfig(), second=replace(PairConfig().second, name="B. subtilis"))
+    read = Mock(side_effect=lambda file, env: replace(env, scale_e=1.2))
+    monkeypatch.setattr(train_run, "read_curves", read)
+    monkeypatch.setattr(train_run, "read_pair", lambda name: {"bs.yaml": pair}[name])
+    monkeypatch.setattr(train_run, "Session", Mock(side_effect=CheckpointError("far enough")))
+    env = CocultureConfig(control_min=20.0)
+    with pytest.raises(UserError, match="far enough"):
+        train_run.train(TrainConfig(env=env, env_file="run", pair="bs.yaml", agent=SMALL), tmp_path)
+    assert read.call_args.args == ("run", env)
+    config = train_run.Session.call_args.args[0]  # type: ignore[attr-defined]
+    assert config.env == replace(env, scale_e=1.2, pair=pair)
+    kept: Any = OmegaConf.load(tmp_path / "config.yaml")
+    assert (kept.env_file, kept.env.scale_e, kept.env.pair.second.name) == (None, 1.2, "B. subtilis")
+    monkeypatch.setattr(train_run, "read_pair", Mock(side_effect=UserError("gone, or of another pair by now")))
+    with pytest.raises(UserError, match="far enough"):
+        train_run.train(replace(config, resume="latest"), tmp_path)
+    assert train_run.Session.call_args.args[0].env == config.env  # type: ignore[attr-defined]
+    with pytest.raises(UserError, match=r"pair=bs\.yaml: a task of one species; give env=coculture_preview beside it"):
+        train_run.train(TrainConfig(pair="bs.yaml", agent=SMALL), tmp_path)
