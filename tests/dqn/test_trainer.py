@@ -117,8 +117,8 @@ class Uneven:
         return self._show()
 
 
-def uneven() -> Trainer:
-    config = DQNConfig(hidden=(4,), total_steps=8, learn_start=8, replay_size=8)
+def uneven(total_steps: int = 8) -> Trainer:
+    config = DQNConfig(hidden=(4,), total_steps=total_steps, learn_start=total_steps, replay_size=8)
     return Trainer(Uneven(), DQNAgent(config, 1, 2, streams(range(2))), interval=4)
 
 
@@ -141,3 +141,11 @@ def test_an_episode_that_a_stop_cuts_in_two_counts_as_one_when_it_is_resumed() -
     second.load_state_dict(state)
     (rest,) = second.run()
     assert (rest.step, rest.episode_return.tolist()) == (8, [2.0, 6.0])
+
+
+def test_records_come_at_multiples_of_their_interval_wherever_a_run_goes_on() -> None:
+    """After six steps the next one is due at eight, and the last at the end."""
+    trainer = uneven(total_steps=11)
+    trainer._observation, _ = trainer.env.reset()
+    trainer._until(6)
+    assert [record.step for record in trainer.run()] == [8, 11]

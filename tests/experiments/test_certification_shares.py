@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from dqn.policy import Policy
 from envs.bench import Bench
+from envs.task import EnvConfig
 from experiments.certification import judge
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
@@ -291,6 +292,34 @@ def test_what_is_asked_of_a_policy_of_error_and_growth_share() -> None:
         *own, *(f"errors at setpoint {r}, B = 0.06" for r in ("0.2", "0.6", "1")), *watched
     ]  # fmt: skip
     assert not any(case.bounds.gain for case in quick.cases)
+
+
+def test_full_pump_is_that_of_the_bench_in_all_its_parts_unless_a_model_is_given() -> None:
+    """0.05 mL/s for 3 min into 12 mL take 0.75 off ln x; a model of tau 0.3 and 2 min with 0.03 mL/s takes 0.2."""
+    bench = Bench(volume_ml=12.0, period_s=180.0, max_rate=0.05)
+    given = EnvConfig(tau=0.3, control_min=2.0, max_pump_rate=0.03, setpoints=(0.9, 0.3, 0.4))
+    for config, b, setpoints in (
+        (replace(FAST, bench=bench, quick=True), 0.75, (0.2, 1.0)),
+        (replace(FAST, bench=bench, env=given, quick=True), 0.2, (0.3, 0.9)),
+    ):
+        asked = question(laws.share_law(), config)
+        assert [case.bounds.full_pump for case in asked.cases] == pytest.approx([b] * len(asked.cases))
+        assert asked.setpoints == asked.loop.setpoints == setpoints
+
+
+def test_what_the_supervisor_is_to_watch_is_the_largest_error_that_is_proven() -> None:
+    """Its own bounds of OD and growth share, and a gain that is exact; the others are those that are asked for."""
+    changes: dict[str, Any] = {"error": 0.2, "error_od": 0.006, "error_share": 0.04, "error_gain": 0.1}
+    config = replace(FAST, watched_od=0.03, watched_share=0.4, growth_shares=(0.1, 0.9), strip=0.1, **changes)
+    asked = question(laws.share_law(), config)
+    assert asked.bounds == asked.cases[-1].bounds
+    watched = EstimateBounds(B, 0.2, 0.03, 0.4, 0.0, (0.1, 0.9), (0.2, 1.0))
+    assert replace(asked.bounds, full_pump=B) == watched
+    exact, errors = (case.bounds for case in asked.cases[:2])
+    assert (exact.error, exact.od, exact.growth_share) == (0.0, 0.0, 0.0)
+    assert (errors.error, errors.od, errors.growth_share, errors.gain) == (0.2, 0.006, 0.04, 0.0)
+    assert {case.bounds.gain for case in asked.cases[2:-1]} == {0.0, 0.1}
+    assert (asked.loop.low[0], asked.loop.high[-1], asked.loop.low.size) == (0.1, 0.9, 8)
 
 
 def test_the_setpoints_that_are_named_are_those_that_are_asked_about() -> None:

@@ -11,6 +11,7 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
 from experiments.laws import registry
 from experiments.laws.share.calibration import calibrate_sensor
+from tests.two_species import p_putida_rate, steady_production
 
 
 def protocol(share, n=40, hours=5, factor=0.8, offset=300.0):
@@ -51,6 +52,26 @@ def test_what_is_not_known_of_the_culture_widens_the_factor():
     pigment = 0.4 * 5269.7 / 0.895  # counts per OD; the curves at 33.2 degC
     by_culture = pigment / (pigment + 150.0) * np.hypot(0.1, 0.05)
     assert unsure.factor_sd == pytest.approx(np.hypot(sure.factor_sd, sure.factor * by_culture), rel=0.01)
+
+
+@pytest.mark.parametrize("growth", [None, 0.6])
+def test_factor_and_offset_of_a_few_readings_by_hand(growth):
+    """At 31 degC, where the curve's growth is another, or at the rate that was dosed: L = 0.8 g / D + 150.
+
+    Mean light per OD over the blank's 300: that of 0.4 and 0.8, which is not the mean light over the mean OD.
+    """
+    rate = float(p_putida_rate(31.0)) if growth is None else growth
+    pigment = 0.8 * float(steady_production(31.0)) / rate
+    bright = 300.0 + np.array([0.4, 0.8]) * np.array([3000.0, 3300.0])
+    found = calibrate_sensor(
+        np.array([280.0, 300.0, 320.0]), bright, np.array([0.4, 0.8]), 31.0, 0.8, growth, share_sd=0.08, growth_cv=0.03
+    )
+    assert found.offset == pytest.approx(300.0)
+    assert found.offset_sd == pytest.approx(20.0 / np.sqrt(3.0))
+    factor = 3150.0 / (pigment + 150.0)
+    assert found.factor == pytest.approx(factor)
+    parts = [150.0, 20.0 / np.sqrt(3.0) * 1.875, factor * pigment * np.hypot(0.1, 0.03)]  # scatter, offset, culture
+    assert found.factor_sd == pytest.approx(np.linalg.norm(parts) / (pigment + 150.0))
 
 
 @pytest.mark.parametrize(

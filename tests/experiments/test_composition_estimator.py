@@ -16,6 +16,8 @@ from experiments.laws.share.estimator import (
     BIAS_E,
     BIAS_P,
     FACTOR,
+    GAIN,
+    LOG_F,
     LOG_OD,
     LOG_Q,
     LOGIT,
@@ -317,3 +319,81 @@ def test_what_passes_without_readings_is_closed_form_at_any_period(period):
     assert estimator.mean[0, 0, LOG_Q] == pytest.approx(0.3 * np.exp(-minutes / 63.0), rel=1e-9)
     walked = (0.99 * 0.03) ** 2 * minutes / 1440.0
     assert estimator.cov[0, 0, FACTOR, FACTOR] == pytest.approx(walked, rel=1e-9)
+
+
+def test_what_is_told_of_two_cultures_is_the_mixture_of_their_own_starts():
+    """The first culture believes its starts by 1 to 3, the second only in the one at which the first has a share of 1.
+
+    Of two starts 0.1 and 0.2 with variance 0.01 each that is 0.175, with 0.01 + 0.1^2 * 3 / 16 of variance.
+    """
+    estimator = CompositionEstimator(replace(CompositionEstimatorConfig(), starts=2))
+    estimator.reset(2)
+    starts = {
+        BIAS_E: (0.1, 0.2), BIAS_P: (-0.1, -0.3), GAIN: (0.8, 1.0), THERMOMETER: (0.2, 0.4),
+        LOG_OD: (np.log(0.4), np.log(0.6)), LOG_F: (np.log(100.0), np.log(300.0)), LOGIT: (-1.0, 1.0),
+    }  # fmt: skip
+    for state, values in starts.items():
+        estimator.mean[..., state] = values
+    for state, variance in ((BIAS_E, 0.01), (BIAS_P, 0.04), (LOGIT, 0.25)):
+        estimator.cov[..., state, state] = variance
+    estimator.log_weight[:] = np.log([[1.0, 3.0], [1.0, 1e-30]])
+    estimator._temperature[:] = 31.0, 34.0
+    told, now = estimator.explain(), estimator.estimate()
+    expected = {
+        "bias_e": (0.175, 0.1), "bias_p": (-0.25, -0.1), "thermometer_error": (0.35, 0.2), "dose_gain": (0.95, 0.8),
+        "composition_od": (0.55, 0.4), "pigment": (250.0, 100.0), "dose_spread": (0.1, 0.1),
+        "bias_e_sd": (np.sqrt(0.01 + 0.01 * 3 / 16), 0.1), "bias_p_sd": (np.sqrt(0.04 + 0.04 * 3 / 16), 0.2),
+    }  # fmt: skip
+    for key, values in expected.items():
+        np.testing.assert_allclose(told[key], values, err_msg=key)
+    x, sd = np.array([0.5, -1.0]), np.array([np.sqrt(0.25 + 4.0 * 3 / 16), 0.5])
+    for key, side in (("ratio", 0.0), ("ratio_low", -1.96), ("ratio_high", 1.96)):
+        np.testing.assert_allclose(told[key], 1.0 / (1.0 + np.exp(-x - side * sd)), err_msg=key)
+    np.testing.assert_allclose(now.sd, sd)
+    np.testing.assert_allclose(now.temperature, [31.35, 34.2])  # the true ones
+
+
+@pytest.mark.parametrize("period", [0.5, 3.0])
+def test_what_walks_walks_as_far_as_its_minutes_say_at_any_period(period):
+    """Both growth curves' errors by w^2 a minute; the share's logit by twice the spread of either species' growth."""
+    walking, still = replace(QUIET, bias_sd=0.1, bias_walk=0.01), replace(QUIET, bias_sd=0.0, growth_sd=0.02)
+    for config, state, expected in (
+        (walking, BIAS_E, 0.1**2 + 12.0 * 0.01**2), (walking, BIAS_P, 0.1**2 + 12.0 * 0.01**2),
+        (still, LOGIT, 1.8**2 + 2.0 * 12.0 * 0.02**2),
+    ):  # fmt: skip
+        estimator = CompositionEstimator(config)
+        for k in range(round(12.0 / period) + 1):
+            od = 0.5 if k == 0 else NAN
+            estimator.watch(*(np.array([v]) for v in (od, NAN, WARM, k * period)), rows=np.array([True]))
+        assert estimator.cov[0, 0, state, state] == pytest.approx(expected, rel=1e-9)
+
+
+def test_rates_follow_a_temperature_that_changes_along_a_line_between_two_readings():
+    """Two cultures in ten minutes, one from 31 to 35 degC and one back, and then at rest: m' = (mu_p(T) - m) / 1 h."""
+    estimator = CompositionEstimator(QUIET)
+    estimator.reset(2)
+    both, first, last = np.ones(2, dtype=bool), np.array([31.0, 35.0]), np.array([35.0, 31.0])
+    estimator.watch(np.full(2, 0.5), np.full(2, NAN), first, np.zeros(2), both)
+    rate, per_min = p_putida_rate(first), 100
+    for minutes, begins, ends in ((10, first, last), (20, last, last)):
+        for k in range(minutes * per_min):
+            warm = begins + (ends - begins) * (k + 0.5) / (minutes * per_min)
+            rate = rate + (p_putida_rate(warm) - rate) / (60.0 * per_min)
+        estimator.watch(np.full(2, NAN), np.full(2, NAN), ends, np.full(2, 10.0 + 20.0 * (minutes == 20)), both)
+        np.testing.assert_allclose(estimator.estimate().rate, rate, rtol=1e-3)
+        np.testing.assert_array_equal(estimator.estimate().temperature, ends)
+
+
+def test_an_od_that_a_dose_does_not_explain_widens_the_spread_of_doses_of_its_own_culture():
+    """A dose of 0.4 in 20 mL at OD 0.5, whose spread s moves the OD by 0.01 s: 0.003 off where 0.002 was expected.
+
+    That says s^2 = 0.1^2 + (9e-6 - 4e-6) / 1e-4 with precision (1e-4 / 4e-6)^2 / 2, beside 0.1^2 with 1 / 0.1^4. The
+    second culture got no dose, the third is further off than is believed, the fourth was off by less than expected.
+    """
+    estimator = CompositionEstimator(replace(QUIET, dose_cv=0.1), np.array([20.0, 20.0, 20.0, 10.0]))
+    estimator.reset(4)
+    estimator._dose[:] = 0.02, 0.0, 0.02, 0.02
+    off, expected, od = np.array([[9e-6], [9e-6], [9e-6], [1e-6]]), np.full((4, 1), 4e-6), np.full((4, 1), 0.5)
+    estimator._judge_dose(np.arange(4), off, expected, od, np.array([[True], [True], [False], [True]]))
+    wider = (1e4 * 0.01 + 312.5 * 0.06) / (1e4 + 312.5)
+    np.testing.assert_allclose(estimator.explain()["dose_spread"], np.sqrt([wider, 0.01, 0.01, 0.01]))

@@ -11,6 +11,7 @@ from envs.coculture.pair import PairConfig
 from envs.coculture.task import CocultureConfig, advance, at_rest, logit, share
 from experiments.laws import registry
 from experiments.laws.registry import SHARE
+from experiments.laws.share import planned
 from experiments.laws.share.base import Estimate, Wanted
 from experiments.laws.share.program import Program
 from hardware import memory
@@ -299,3 +300,91 @@ def test_where_warmth_makes_the_second_gain_every_target_is_mirrored(kind):
         ours = here.act(known, asked(s), *at(minute))[0]
         theirs = there.act(replace(known, temperature=65.0 - known.temperature), asked(s), *at(minute))[0]
         assert theirs == pytest.approx(65.0 - ours, abs=2e-3), (kind, minute)
+
+
+def test_settings_of_ones_own_are_those_that_decide():
+    """Two cultures whose shares and setpoints differ; the vendor's integral after one decision of a quarter of an hour.
+
+    Inverse dynamics with 2 h to reach it: m_p - mu_e(T) = (logit s - logit r) / 2.
+    """
+    x, goal = np.array([-0.05, 0.2]), Wanted(np.array([0.5, 0.52]), np.array([0.5, 0.52]), np.zeros(2))
+    error = logit(goal.setpoint) - x
+    found = {}
+    for kind, values in (
+        ("proportional", {"gain": 7.0}), ("pi", {"gain": 9.0, "integral": 2.0, "control_min": 15.0}),
+        ("inverse_dynamics", {"reach_min": 120.0}),
+    ):  # fmt: skip
+        found[kind] = law(kind, **values)
+        found[kind].reset(2)
+        found[kind] = found[kind].act(seen(x), goal, *at(0, 2))
+    np.testing.assert_allclose(found["proportional"], EQUAL_RATES_C - 7.0 * error, atol=2e-3)
+    np.testing.assert_allclose(found["pi"], EQUAL_RATES_C - 11.0 * (goal.setpoint - share(x)), atol=1e-9)
+    rates = p_putida_rate(33.2) - e_coli_rate(found["inverse_dynamics"])
+    np.testing.assert_allclose(rates, error / 2.0, atol=1e-6)
+
+
+def test_a_policy_is_shown_of_each_culture_its_own_numbers_and_each_thermostat_its_own_error():
+    """True temperatures are what was learned from; a thermostat goes by its thermometer, which is off by another."""
+    shown = []
+
+    class Watched(Policy):
+        def chosen(self, observation):
+            shown.append(observation.copy())
+            return np.where(observation[:, 0] > 0.0, 35.0, 31.0)
+
+    given = Watched(**vars(linear_policy(COCULTURE_PREVIEW, "rate")))
+    found = law("dqn_preview", policy=given)
+    found.reset(3)
+    one = seen([0.3, -0.2, 9.0])
+    one = replace(
+        one, temperature=np.array([30.5, 34.0, 29.0]), rate=np.array([0.7, 0.8, 0.9]),
+        thermometer=np.array([0.25, -0.5, 0.0]),
+    )  # fmt: skip
+    asked_for = Wanted(np.array([0.4, 0.6, 0.5]), np.array([0.7, 0.2, 0.5]), np.array([90.0, 400.0, 0.0]))
+    target = found.act(one, asked_for, np.zeros(3), np.array([True, True, False]))
+    np.testing.assert_allclose(
+        shown[0], [[0.3, 30.5, 0.7, logit(0.4), logit(0.7), 90.0], [-0.2, 34.0, 0.8, logit(0.6), logit(0.6), 0.0]]
+    )
+    np.testing.assert_allclose(target, [34.75, 31.5, EQUAL_RATES_C])
+
+
+def test_a_receding_plan_asks_for_the_next_share_from_its_change_on_and_no_further_than_its_horizon(monkeypatch):
+    """Three decisions of half an hour: the first is judged at once, a change in 45 min comes before the third one."""
+    plans, judged = [], []
+    monkeypatch.setattr(planned, "_ahead", lambda model, later: plans.append(later) or np.array([len(plans)]))
+    monkeypatch.setattr(
+        planned, "_best",
+        lambda model, value, known, goal: judged.append((int(value[0]), known.logit.tolist(), goal.tolist()))
+        or 30.0 + known.logit,
+    )  # fmt: skip
+    found = law("receding", control_min=30.0, horizon_min=90.0)
+    found.reset(4)
+    wanted = Wanted(np.array([0.3, 0.5, 0.3, 0.3]), np.array([0.7, 0.5, 0.7, 0.7]), np.array([45.0, 0.0, 400.0, 30.0]))
+    target = found.act(seen([1.0, 2.0, 3.0, 4.0]), wanted, *at(0, 4))
+    assert sorted(plans) == [(0.3, 0.3), (0.3, 0.7), (0.5, 0.5), (0.7, 0.7)]
+    by_culture = {known[0]: (plans[number - 1], goal) for number, known, goal in judged}
+    assert by_culture == {
+        1.0: ((0.3, 0.7), [0.3]), 2.0: ((0.5, 0.5), [0.5]), 3.0: ((0.3, 0.3), [0.3]), 4.0: ((0.7, 0.7), [0.3]),
+    }  # fmt: skip
+    assert target.tolist() == [31.0, 32.0, 33.0, 34.0]
+
+
+def test_the_optimum_plans_what_is_asked_for_in_each_period_and_goes_by_what_comes_after_it(monkeypatch):
+    """45 min without a share, 60 of .3, 30 without, in which the next one counts already, and 30 of .7."""
+    programs, values = [], []
+
+    def costs(model, setpoints):
+        programs.append(setpoints[:, 0].tolist())
+        return np.arange(len(setpoints) + 1.0)[:, None, None]
+
+    monkeypatch.setattr(planned, "cost_to_go", costs)
+    monkeypatch.setattr(planned, "transitions", lambda model: None)
+    monkeypatch.setattr(
+        planned, "_best",
+        lambda model, value, known, goal: values.append((known.logit.tolist(), float(value[0]))) or 30.0 + 0 * goal,
+    )  # fmt: skip
+    found = law("optimum", Program((NAN, 0.3, NAN, 0.7), (45.0, 60.0, 30.0, 30.0)), control_min=30.0)
+    found.reset(4)
+    found.act(seen([1.0, 2.0, 3.0, 4.0]), asked(0.5, n=4), np.array([95.0, 20.0, 1000.0, 60.0]), np.ones(4, dtype=bool))
+    assert programs == [[0.3, 0.3, 0.3, 0.7, 0.7, 0.7]]
+    assert {known[0]: value for known, value in values} == {1.0: 4.0, 2.0: 1.0, 3.0: 6.0, 4.0: 3.0}

@@ -74,3 +74,14 @@ def test_when_changes_are_announced() -> None:
     assert Program((), (60.0,), (0.5, 0.2, 100.0)).announcements(60.0)[0].size == 0
     assert program.extremes == (0.3, 0.3, 0.7, 0.5, 0.2)
     assert Program((), (60.0,), (0.5, -0.2, 100.0)).extremes == (0.3, 0.7)
+
+
+def test_a_sine_holds_only_where_a_share_is_asked_for_and_counts_from_the_beginning_of_the_program() -> None:
+    """The hour without one is part of its period of 12 h; nothing is announced into the last phase or from it."""
+    sine = Program((NAN, 0.5, NAN), (60.0, 600.0, 120.0), (0.5, 0.3, 720.0))
+    wanted = sine.setpoint(np.array([0.0, 59.0, 60.0, 180.0, 540.0, 700.0, 5000.0]))
+    np.testing.assert_allclose(wanted, [NAN, NAN, 0.35, 0.2, 0.8, NAN, NAN], atol=1e-9)
+    assert told(sine, 180, 240.0) == pytest.approx((0.2, 0.65, 96.0))  # s(420) = .5 - .3 sin(7 pi / 6)
+    assert told(sine, 500, 240.0)[2] == 0.0
+    assert (sine.asked, Program((NAN, NAN), (60.0, 60.0)).asked) == (True, False)
+    assert sine.edges.tolist() == [0.0, 60.0, 660.0, 780.0]

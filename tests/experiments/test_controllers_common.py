@@ -8,12 +8,14 @@ import pytest
 
 from conf import presets
 from conf.schema import build
+from dqn.policy import Policy
 from envs.plant.plant import Plant, PlantConfig
 from envs.task import EnvConfig
 from experiments.laws import registry
 from experiments.laws.base import Controller, Explains
 from experiments.laws.density.baselines import Hold, HoldConfig, Threshold, ThresholdConfig
 from experiments.laws.density.inverse import Inverse, InverseConfig
+from experiments.laws.density.learned import LearnedController
 from experiments.laws.density.mpc import Mpc, MpcConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 from experiments.laws.density.pso import SwarmConfig
@@ -118,6 +120,60 @@ def test_threshold_and_hold_by_hand() -> None:
         HoldConfig(rate=1.0)
     with pytest.raises(ValueError, match=r"controller.hysteresis = -0.1 OD"):
         ThresholdConfig(hysteresis=-0.1)
+
+
+@pytest.mark.parametrize(("config", "rate"), [(HoldConfig(), 0.009), (HoldConfig(rate=0.004), 0.004)])
+def test_a_constant_rate_is_the_one_that_is_asked_for_else_that_of_the_model(config: HoldConfig, rate: float) -> None:
+    hold = Hold(config, EnvConfig(mu=0.02, tau=0.45))
+    hold.reset(3)
+    np.testing.assert_allclose(hold.act(np.ones(3), np.ones(3), np.zeros(3), np.ones(3, dtype=bool)), rate)
+
+
+def test_a_constant_rate_of_nothing_is_one() -> None:
+    hold = Hold(HoldConfig(rate=0.0), MODEL)
+    assert hold.act(np.ones(1), np.ones(1), np.zeros(1), np.ones(1, dtype=bool))[0] == 0.0
+
+
+def test_two_volumes_two_gains_of_the_devices_law() -> None:
+    """0.7 ln(x / r) / (240 / V): a vial of 10 mL gets half of what one of 20 mL gets, in whatever order they are."""
+    device = registry.build(registry.config("pi"), volume_ml=np.array([10.0, 20.0, 15.0]))
+    device.reset(3)
+    for minute in range(3):
+        device.act(np.full(3, 0.52), np.full(3, 0.5), np.full(3, float(minute)), np.ones(3, dtype=bool))
+    np.testing.assert_allclose(device.explain()["p"], 0.7 * np.log(1.04) * np.array([10.0, 20.0, 15.0]) / 240.0)
+
+
+def test_a_policy_of_the_od_says_how_sure_it_is_of_each_vial() -> None:
+    """Q is (OD, setpoint, 0.25). The second vial has no reading, the third is not asked this time."""
+    none = np.zeros(2, np.float32)
+    policy = Policy(
+        (np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], np.float32),), (np.array([0.0, 0.0, 0.25], np.float32),),
+        np.eye(2, dtype=np.float32), none, np.array([0.001, 0.002, 0.003]), none - np.inf, none + np.inf, {},
+    )  # fmt: skip
+    law = LearnedController(policy)
+    law.reset(4)
+    od, setpoint = np.array([0.6, np.nan, 0.1, 0.1]), np.array([0.5, 0.5, 0.9, 0.2])
+    rate = law.act(od, setpoint, np.zeros(4), np.array([True, True, False, True]))
+    np.testing.assert_allclose(rate[[0, 1, 3]], [0.001, 0.0, 0.003])
+    told = law.explain()
+    np.testing.assert_allclose(told["q_best"], [0.6, 0.5, np.nan, 0.25], rtol=1e-6)
+    np.testing.assert_allclose(told["q_lead"], [0.1, 0.25, np.nan, 0.05], rtol=1e-5)
+
+
+def test_the_oracle_knows_each_vial_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three vials of other growth, pump and volume, whose setpoints differ; all of them are there in one period."""
+    monkeypatch.setattr("experiments.laws.density.oracle.GRID", 301)  # what comes later hardly matters here
+    plant = Plant(PlantConfig(), 3, np.random.default_rng(0))
+    plant.draws["mu"][:], plant.draws["volume_ml"][:] = (0.02, 0.03, 0.035), (20.0, 16.0, 24.0)
+    plant.draws["pump_gain_ml_s"][:] = (0.8, 1.0, 1.3)
+    setpoint = np.array([0.3, 0.5, 0.8])
+    plant.reset(setpoint * np.exp([0.01, 0.02, -0.005]))
+    oracle = registry.build(registry.config("oracle"), model=MODEL, plant=plant)
+    oracle.reset(3)
+    rate = oracle.act(plant.read_od(), setpoint, np.zeros(3), np.ones(3, dtype=bool))
+    assert np.unique(rate).size == 3
+    plant.advance(1.0, 60.0 * rate)
+    np.testing.assert_allclose(np.log(plant.apparent_od / setpoint), 0.0, atol=0.51 * 1.56 / 16.0 / 128)
 
 
 @pytest.mark.parametrize(("flow_ml_s", "period"), [(1.0, 1.0), (0.7, 1.0), (1.4, 2.0)])

@@ -118,6 +118,18 @@ def test_the_law_inverts_the_model() -> None:
     np.testing.assert_array_equal(u[2:], [0.02, 0.0])
 
 
+def test_the_law_inverts_the_model_of_another_period_and_a_stronger_pump() -> None:
+    """In 3 min to three other setpoints, with up to 0.05 mL/s."""
+    known = {"mu_sd": 1e-5, "gain_sd": 0.0, "gain_walk": 0.0, "mu_walk": 0.0}
+    inverse = law(EnvConfig(mu=0.025, tau=0.3, control_min=3.0, max_pump_rate=0.05), **known)
+    inverse.reset(4)
+    od, setpoint = np.array([0.42, 0.61, 0.3, 0.9]), np.array([0.4, 0.5, 0.31, 0.5])
+    u = inverse.act(od, setpoint, np.zeros(4), np.ones(4, dtype=bool))
+    np.testing.assert_allclose((od * np.exp(3.0 * (0.025 - u / 0.3)))[:3], setpoint[:3], rtol=1e-9)
+    assert u[1] > 0.02
+    assert u[3] == 0.05
+
+
 @pytest.mark.parametrize(("levels", "rates"), [(2, [0.0, 0.02]), (5, [0.0, 0.005, 0.01, 0.015, 0.02])])
 def test_with_levels_it_gives_the_nearest_of_them_from_none_to_all(levels: int, rates: list[float]) -> None:
     """Of a law that knows the truth: u = tau (mu + ln(x / r)), over the range of the pump and beyond."""

@@ -148,6 +148,49 @@ def test_the_plan_is_explained() -> None:
     np.testing.assert_allclose(plan["predicted_od"][:, 0], np.array([0.6, 0.4]) * step_factors(MODEL, rate))
 
 
+def test_a_plan_is_in_the_rates_of_the_pump_that_is_there() -> None:
+    """Half as much again as 0.02 mL/s, every other minute, three decisions ahead; before the first one mu tau."""
+    model = EnvConfig(mu=0.02, tau=0.4, control_min=2.0, max_pump_rate=0.03)
+    mpc = Mpc(MpcConfig(solver="gradient", horizon=3), model)
+    mpc.reset(2)
+    np.testing.assert_allclose(mpc.explain()["planned_rate"], np.full((2, 3), 0.008))
+    od, setpoint = np.array([0.9, 0.502]), np.array([0.3, 0.5])
+    rate = mpc.act(od, setpoint, np.zeros(2), np.ones(2, dtype=bool))
+    plan = mpc.explain()
+    assert rate[0] == 0.03
+    np.testing.assert_allclose(plan["planned_rate"][:, 0], rate)
+    steps = np.stack([step_factors(model, plan["planned_rate"][:, k]) for k in range(3)], axis=1)
+    np.testing.assert_allclose(plan["predicted_od"], od[:, None] * np.cumprod(steps, axis=1))
+    np.testing.assert_allclose(plan["predicted_od"][1], 0.5, rtol=1e-4)
+
+
+def test_a_decision_begins_at_the_last_plan_a_period_on_and_of_each_reactor_at_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The last move stands twice. The second reactor has no reading once, and keeps its plan for the next time."""
+    plans = [np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]), np.array([[0.7, 0.8, 0.9]]), np.zeros((2, 3))]
+    starts: list[list[list[float]]] = []
+    monkeypatch.setattr(
+        Problem, "by_gradient", lambda _, start: starts.append(start.tolist()) or plans[len(starts) - 1]
+    )
+    mpc = Mpc(MpcConfig(solver="gradient", horizon=3), EnvConfig(mu=0.03, tau=0.4))
+    mpc.reset(2)
+    od, setpoint, both = np.full(2, 0.5), np.full(2, 0.5), np.ones(2, dtype=bool)
+    rates = [mpc.act(od, setpoint, np.zeros(2), rows).tolist() for rows in (both, np.array([True, False]), both)]
+    assert starts[1:] == [[[0.2, 0.3, 0.3]], [[0.8, 0.9, 0.9], [0.5, 0.6, 0.6]]]
+    np.testing.assert_allclose(starts[0], 0.6)  # mu tau of 0.02 mL/s
+    np.testing.assert_allclose(rates, [[0.002, 0.008], [0.014, 0.008], [0.0, 0.0]])
+
+
+def test_a_swarm_is_never_worse_than_the_place_where_it_is_told_to_begin() -> None:
+    """Each swarm its own place, far outside of the box."""
+    start = np.array([[7.0, -3.0], [-5.0, 9.0]])
+    rngs, swarm = np.random.default_rng(0).spawn(2), SwarmConfig(particles=3, iterations=2)
+    found, cost = minimise(lambda x: ((x - start[:, None]) ** 2).sum(-1), 0.0, 1.0, start, rngs, swarm)
+    np.testing.assert_array_equal(found, start)
+    assert cost.tolist() == [0.0, 0.0]
+
+
 def test_ninety_minutes_of_64_replicates_in_seconds() -> None:
     mpc = Mpc(MpcConfig(), MODEL)
     mpc.reset(64)

@@ -84,6 +84,32 @@ def test_tuned_pi_by_hand() -> None:
     np.testing.assert_allclose(play(TunedPI(TunedPIConfig(), model), [0.51, 0.505], 0.5), expected)
 
 
+def test_the_devices_clamp_is_the_one_it_is_told() -> None:
+    assert play(ChiBioPI(ChiBioPIConfig(max_pump_rate=0.007)), [0.9, 0.9, 0.9], 0.5)[-1] == 0.007
+
+
+def test_tuned_pi_with_other_times_and_a_stronger_pump_by_hand() -> None:
+    """K = 1 / (2 + 3), and of I a part K h / (4 (2 + 3)) = 0.02 of z a period of 2 min; I begins at 0."""
+    model = EnvConfig(mu=0.03, tau=0.4, control_min=2.0, max_pump_rate=0.05)
+    config = TunedPIConfig(delay_min=2.0, closed_loop_min=3.0, feed_forward=False)
+    z1, z2, z3 = np.log(0.6 / 0.5), np.log(0.57 / 0.5), np.log(0.9 / 0.5)
+    expected = [0.4 * z1 / 5.0, 0.4 * (z2 / 5.0 + 0.02 * z1), 0.4 * (z3 / 5.0 + 0.02 * (z1 + z2))]
+    assert 0.04 < expected[2] < 0.05
+    pi = TunedPI(config, model)
+    np.testing.assert_allclose(play(pi, [0.6, 0.57, 0.9], 0.5), expected)
+    assert pi.explain()["p"][0] == pytest.approx(z3 / 5.0)
+
+
+def test_tuned_pi_does_not_wind_up_at_full_pump_and_comes_back_from_it_by_itself() -> None:
+    """K z alone asks for more than the pump gives; below the setpoint, still at full rate, I may fall again."""
+    pi = TunedPI(TunedPIConfig(), EnvConfig())
+    play(pi, [0.9, 0.85, 0.8], 0.5)
+    assert pi.explain()["i"][0] == 0.03
+    pi._integral[:] = 0.5
+    assert pi.act(np.array([0.49]), np.array([0.5]), np.array([3.0]), np.array([True]))[0] == 0.02
+    assert pi.explain()["i"][0] == pytest.approx(0.5 + np.log(0.98) / 16.0)
+
+
 @pytest.mark.parametrize("period", [1.0, 2.0])
 def test_tuned_pi_has_the_poles_it_claims(period: float) -> None:
     """Closed around z <- z + h (mu - u/tau) with another mu, z obeys z'' - 1.5 z' + 0.5625 z = 0: double pole 0.75.

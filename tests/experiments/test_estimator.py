@@ -187,6 +187,33 @@ def test_its_doubt_of_a_pump_that_is_not_sound_is_the_scatter_of_vials_as_it_bel
     assert told_s == pytest.approx(np.hypot(np.std(share), 0.02), rel=0.02)
 
 
+def test_what_is_told_of_its_doubt_is_as_much_larger_as_surprises_were_lately_or_for_long() -> None:
+    """0.75 of their squares is usual. Of ten readings four times that; and of forty, of which the last ten are usual.
+
+    The third has three readings yet, and the fourth was surprised less than usual, which makes nothing smaller.
+    """
+    e = Estimator(BARE, MODEL)
+    e.reset(5)
+    e.mean[:], e.cov[:] = [np.log(0.6), 0.021, 0.9, 0.0], np.diag([1e-4, 1e-6, 1e-3, 0.0])
+    e._squares[0, :30], e._squares[0, 30:] = 0.75, 3.0
+    e._squares[1, :30], e._squares[1, 30:] = 3.75, 0.75
+    e._squares[2, 37:] = 6.75
+    e._squares[3] = 0.1
+    setpoint = np.full(5, 0.4)
+    error, share = e.sd(setpoint)
+    larger = [2.0, np.sqrt((30 * 3.75 + 10 * 0.75) / 40 / 0.75), 3.0, 1.0, 1.0]
+    np.testing.assert_allclose(error / error[4], larger)
+    np.testing.assert_allclose(share, np.hypot(e.doubt(setpoint)[1] * larger, 0.02))
+
+
+def test_a_pump_is_taken_for_no_weaker_and_no_stronger_than_a_pump_can_be() -> None:
+    """B = g u_max h / tau with g from 0.2 to 3, whatever the filter has come to."""
+    e = Estimator(BARE, replace(MODEL, max_pump_rate=0.03, control_min=2.0))
+    e.reset(4)
+    e.mean[:, GAIN] = -1.0, 0.1, 0.9, 7.0
+    np.testing.assert_allclose(e.full_pump, np.array([0.2, 0.2, 0.9, 3.0]) * 0.03 * 2.0 * 3.0)
+
+
 def test_as_long_as_nobody_tells_a_rate_that_was_decided_counts_for_its_whole_period() -> None:
     """0.01 mL/s for two minutes are 1.2 mL."""
     told, untold = (Estimator(DEFAULT, replace(MODEL, control_min=2.0)) for _ in range(2))

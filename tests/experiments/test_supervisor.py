@@ -15,9 +15,10 @@ from envs.task import EnvConfig
 from experiments.certification import certificate
 from experiments.certification.bounds import EstimateBounds
 from experiments.control.policies import find_policy, load_policy
+from experiments.laws import registry
 from experiments.laws.density.estimator import LOG_OD, MU, Estimator, EstimatorConfig
 from experiments.laws.density.inverse import Inverse, InverseConfig
-from experiments.laws.density.learned import RelativeController, settings
+from experiments.laws.density.learned import LearnedConfig, RelativeController, settings
 from experiments.loop.loop import ClosedLoop
 from experiments.record.summary import ChangeLog
 from hardware.emulator.device import DeviceOptions, plant_preset
@@ -126,6 +127,33 @@ def test_the_share_that_is_shown_may_be_off_by_as_much_as_was_proven(share: floa
     low.reset(2)
     low.estimator.cov[:] = law.estimator.cov
     assert low._outside(np.full(2, 0.5), np.array([[0.0, 0.5], [0.0, 0.0]])).tolist() == [False, doubt > 0.15]
+
+
+def test_the_journal_is_told_of_each_vial_what_its_policy_saw_and_how_sure_that_was() -> None:
+    """After one reading e = ln(x / r) / 0.06 and s = 0.025 / 0.06 by the model; one that has none keeps its last."""
+    law = supervised(3)
+    od, setpoint = np.array([0.52, 0.3, np.nan]), np.array([0.5, 0.4, 0.5])
+    in_doubt(law, 1, 0.3)
+    law.act(od, setpoint, np.zeros(3), np.ones(3, dtype=bool))
+    told = law.explain()
+    np.testing.assert_allclose(told["error"], [np.log(1.04) / 0.06, np.log(0.75) / 0.06, np.nan], rtol=1e-6)
+    np.testing.assert_allclose(told["growth_share"], [0.025 / 0.06, 0.025 / 0.06, np.nan], rtol=1e-6)
+    error_sd, share_sd = law.estimator.sd(setpoint)
+    np.testing.assert_allclose(told["error_sd"][:2], error_sd[:2])
+    np.testing.assert_allclose(told["growth_share_sd"][:2], share_sd[:2])
+    assert not np.isclose(error_sd[:2], share_sd[:2]).any()
+    assert np.isnan([told["error_sd"][2], told["q_best"][2], told["q_lead"][2]]).all()
+
+
+def test_a_filter_is_set_by_the_policy_s_file_then_by_the_command_and_the_second_one_by_nobody() -> None:
+    """Bounds, model and policy are the run's own."""
+    given = replace(POLICY, metadata={**POLICY.metadata, "estimator": {"gate_max": 9, "noise_memory": 7.0}})
+    config = LearnedConfig(estimator={"gate_max": 3})
+    made = registry.build(config, model=replace(MODEL, max_pump_rate=0.03), policy=given, bounds=BOUNDS)
+    assert made.estimator.config == EstimatorConfig(gate_max=3, noise_memory=7.0)
+    assert made.second.config == EstimatorConfig()
+    assert made.estimator.model.max_pump_rate == made.second.model.max_pump_rate == 0.03
+    assert (made.policy, made.bounds) == (given, BOUNDS)
 
 
 def test_without_a_certificate_no_bounds_supervise_and_surprises_do() -> None:
