@@ -19,7 +19,7 @@ from experiments.certification.network import Network, q_values, rounding
 from experiments.certification.od_loop import OdCase, OdLoop
 from experiments.certification.polygons import Regions, area, partition
 from experiments.certification.question import CertificationError, question
-from experiments.certification.verdict import Proof, attacked, physical, prove
+from experiments.certification.verdict import Proof, attacked, dose_below, physical, prove
 from tests.experiments import laws
 
 BOX = ((-0.02, 1.52), (0.4, 0.8))
@@ -239,6 +239,22 @@ def test_how_much_later_than_the_law_a_policy_arrives_where_it_is_to_arrive() ->
     assert proof.later.tolist() == [2.0, 7.0, np.inf]
     assert asked == [([-0.6, -0.7, -0.8], [0.6, 0.7, 0.8])] * 2
     np.testing.assert_allclose(proof.excess, [0.025, -0.0125, 0.45])
+
+
+def test_how_low_a_dose_may_still_be_given_counts_periods_of_the_growth_of_each_strip() -> None:
+    """Level 2 from -0.3 on and 1 from -0.5 on, of which no more counts than the start, -0.4; and nothing above zero."""
+    pieces = Pieces(
+        np.array([[-9.0, -0.5, -0.3], [-9.0, 0.1, 0.2]]), np.array([[-0.5, -0.3, 9.0], [0.1, 0.2, 9.0]]),
+        np.array([[0, 1, 2], [0, 1, 2]]),
+    )  # fmt: skip
+    one: Any = SimpleNamespace(
+        low=np.zeros(2), growth=np.array([0.1, 0.05]), states=lambda case: None,
+        range=lambda case: np.array([[-0.4, 1.0], [-0.4, 1.0]]),
+    )  # fmt: skip
+    points: Any = SimpleNamespace(pieces=lambda action, states, strips: pieces)
+    np.testing.assert_allclose(dose_below(one, points, np.zeros(0, int), None, (1, 2)), [[4.0, 0.0], [3.0, 0.0]])
+    pieces.low[1, 1:] = -0.1, 0.2
+    np.testing.assert_allclose(dose_below(one, points, np.zeros(0, int), None, (1, 2)), [[4.0, 2.0], [3.0, 0.0]])
 
 
 def test_the_worst_strip_is_named_of_those_that_are_asked_about() -> None:

@@ -206,6 +206,23 @@ def test_what_is_told_of_its_doubt_is_as_much_larger_as_surprises_were_lately_or
     np.testing.assert_allclose(share, np.hypot(e.doubt(setpoint)[1] * larger, 0.02))
 
 
+def test_what_passes_between_two_readings_is_closed_form_for_each_vial() -> None:
+    """ln x + dt (mu + w (T - T0)) - g V / 30 mL, T the mean of both readings'; nothing is unsure, so none corrects it.
+
+    One cools for 10 min, the other is warmed for 4 and gets its first dose after a rest, of which 0.6 arrive.
+    """
+    still = replace(BARE, warmth=0.025, first_dose=0.6, pulse_cv=0.0, mu_walk=0.0, gain_walk=0.0)
+    e, both = Estimator(still, replace(MODEL, tau=0.5)), np.ones(2, dtype=bool)
+    e.reset(2)
+    e.watch(np.array([0.5, 0.4]), np.array([37.0, 30.0]), np.zeros(2), both)
+    e.cov[:], e._idle_min[:], e.mean[:, GAIN] = 0.0, (0.0, 12.0), (0.9, 1.1)
+    e.dosed(np.array([1.2, 0.5]))
+    expected = np.log([0.5, 0.4]) + np.array([10.0, 4.0]) * 0.025 * (1.0 + 0.025 * np.array([-2.0, 3.0]))
+    expected -= np.array([0.9 * 1.2, 1.1 * 0.5 * 0.6]) / 30.0
+    e.watch(np.exp(expected) + 0.002, np.array([33.0, 36.0]), np.array([10.0, 4.0]), both)
+    np.testing.assert_allclose(e.mean[:, LOG_OD], expected, rtol=1e-12)
+
+
 def test_a_pump_is_taken_for_no_weaker_and_no_stronger_than_a_pump_can_be() -> None:
     """B = g u_max h / tau with g from 0.2 to 3, whatever the filter has come to."""
     e = Estimator(BARE, replace(MODEL, max_pump_rate=0.03, control_min=2.0))
