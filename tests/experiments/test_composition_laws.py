@@ -388,3 +388,19 @@ def test_the_optimum_plans_what_is_asked_for_in_each_period_and_goes_by_what_com
     found.act(seen([1.0, 2.0, 3.0, 4.0]), asked(0.5, n=4), np.array([95.0, 20.0, 1000.0, 60.0]), np.ones(4, dtype=bool))
     assert programs == [[0.3, 0.3, 0.3, 0.7, 0.7, 0.7]]
     assert {known[0]: value for known, value in values} == {1.0: 4.0, 2.0: 1.0, 3.0: 6.0, 4.0: 3.0}
+
+
+def test_each_culture_is_looked_ahead_for_as_many_periods_as_are_nearest_to_its_own_change():
+    """At rest at 36 degC, and 36 asked for: the logit falls evenly, for 20, 30, 0 and 10 min in decisions of 10."""
+    warm = seen([0.1, 0.2, 0.3, 0.4], 36.0)
+    fall = (float(p_putida_rate(36.0)) - float(e_coli_rate(36.0))) / 60.0
+    found = law("midpoint", control_min=10.0)._reached(warm, np.full(4, 36.0), np.array([17.0, 33.0, 4.0, 10.0]))
+    np.testing.assert_allclose(found, warm.logit + fall * np.array([20.0, 30.0, 0.0, 10.0]))
+
+
+def test_a_midpoint_law_that_has_begun_is_not_on_its_way_to_another_change():
+    """Late on the way from .3 to .7. Then .32 is announced in its place, and a share of .42 has to fall to .3 first."""
+    begun, other = law("midpoint"), law("midpoint")
+    assert begun.act(seen(logit(0.3)), asked(0.3, 0.7, 90.0), *at(0))[0] == 29.0
+    targets = [each.act(seen(logit(0.42)), asked(0.3, 0.32, 85.0), *at(5))[0] for each in (begun, other)]
+    assert targets == [36.0, 36.0]
