@@ -21,7 +21,7 @@ __all__ = ["LONG_MIN", "bands", "differences", "plants", "published_and_ours", "
 Array = NDArray[np.float64]
 
 LONG_MIN = 360.0  # a scenario longer than this is drawn in blocks
-BLOCK = 10  # samples
+BLOCK_MIN = 10.0
 STEP = 5  # minutes between the points of a share's curve
 LEAST = 1e-9  # where an interval that reaches zero ends on a logarithmic axis
 NOISELESS = 1e-5  # scores below are those of a plant without noise
@@ -76,9 +76,11 @@ def _curves(trial: DensityTrial) -> tuple[Array, Array, Array, Array]:
     if trial.schedule.total_min <= LONG_MIN:
         return trial.minute[:last], trial.od[:, :last], trial.rate[:, :last], trial.temperature[:, :last]
 
+    size = max(round(BLOCK_MIN / float(trial.minute[1] - trial.minute[0])), 1)
+
     def blocks(values: Array) -> Array:
-        whole = last // BLOCK * BLOCK
-        return np.asarray(values[..., :whole].reshape(*values.shape[:-1], -1, BLOCK).mean(axis=-1))
+        whole = last // size * size
+        return np.asarray(values[..., :whole].reshape(*values.shape[:-1], -1, size).mean(axis=-1))
 
     return blocks(trial.minute), blocks(trial.clean), blocks(trial.rate), blocks(trial.temperature)
 

@@ -126,8 +126,8 @@ def _closed_loops(config: BenchmarkConfig, trials: Sequence[DensityTrial]) -> It
     """OD and pump rate of every study that is the paper's, or holds a single scenario and plant."""
     by_cell = {(t.cell.controller, t.cell.plant, t.cell.scenario): t for t in trials}
     for name, study in config.studies.items():
-        several = name not in CAPTIONS and len(study.plants) * len(study.scenarios) > 1
-        if study.compositions or not study.controllers or several:
+        several = len(study.plants) * len(study.scenarios) > 1
+        if study.compositions or not study.controllers or (several and name not in CAPTIONS):
             continue
         for scenario in study.scenarios:
             for plant in study.plants:
@@ -135,7 +135,7 @@ def _closed_loops(config: BenchmarkConfig, trials: Sequence[DensityTrial]) -> It
                 long = config.scenarios[scenario].total_min > figures.LONG_MIN
                 what = "noise-free OD and pump rate in blocks of 10 min" if long else "measured OD and pump rate"
                 yield Drawing(
-                    name if name in CAPTIONS else f"{name}_{scenario}_{plant}",
+                    f"{name}_{scenario}_{plant}" if several or name not in CAPTIONS else name,
                     figures.bands(shown),
                     CAPTIONS.get(name, f"{name}: {scenario} on {plant}"),
                     f"Plant {plant}, {config.replicates} replicates. Line: mean of {what}; band: one standard "

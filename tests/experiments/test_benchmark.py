@@ -19,12 +19,14 @@ from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from experiments.benchmark import _schema
 from experiments.cli import frame
+from experiments.comparison import run as comparison_run
 from experiments.comparison import statistics as comparison
 from experiments.comparison import studies
+from experiments.comparison import trials as trials_module
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.published import TABLE_2
 from experiments.comparison.run import learned, with_seeds
-from experiments.comparison.trials import Cell, DensityTrial, Window, cells, run_trial, windows
+from experiments.comparison.trials import Cell, DensityTrial, Loops, Window, cells, run_trial, windows
 from experiments.laws import registry
 from experiments.training import run as training
 from tests.experiments.test_deploy import inverse_policy
@@ -388,6 +390,10 @@ def test_the_calibration_is_of_the_config_s_own_model_and_control_period() -> No
     for key, truth in (("mu", 0.025), ("tau", 0.4)):
         assert found[key]["truth"] == truth
         assert found[key]["value"] == pytest.approx(truth, rel=0.05)
+        assert found[key]["ci95"][0] < found[key]["value"] < found[key]["ci95"][1]
+    assert "recording of 6 h, 1 % sensor noise" in drawing.caption
+    assert f"PMSE {found['pmse_pct']:.2g} % (paper: 6 %" in drawing.caption
+    assert drawing.figure.axes[0].get_title() == "open-loop recording and free-running model"
 
 
 def test_the_learning_curve_is_told_with_the_regret_of_the_policy_that_controls(
@@ -432,3 +438,74 @@ def test_the_interlock_of_a_comparison_lets_the_config_s_pump_run_at_its_period(
     on = t.rate[:, :-1] > 0.0
     np.testing.assert_allclose(np.diff(t.media_ml, axis=1), np.where(on, 3.6, 0.0), atol=1e-6)
     np.testing.assert_allclose(np.diff(np.log(t.clean), axis=1), np.where(on, 2.0 * 0.03 - 0.18, 2.0 * 0.03), atol=2e-3)
+
+
+def test_every_trajectory_is_stored_by_its_scenario_plant_and_controller(tmp_path: Path) -> None:
+    """Two controllers on two plants; OD as measured, without noise, mL/s and degC."""
+    trials = [
+        replace(synthetic(law, np.array([0.01 * k, 0.02 * k])), cell=Cell(law, plant, "s"))
+        for k, (law, plant) in enumerate((("a", "p"), ("b", "p"), ("a", "q")), 1)
+    ]
+    comparison_run._store(trials, tmp_path)
+    with np.load(tmp_path / "trajectories.npz") as stored:
+        found = {key: values.tolist() for key, values in stored.items()}
+    off = {"s/p/a": (0.01, 0.02), "s/p/b": (0.02, 0.04), "s/q/a": (0.03, 0.06)}
+    assert set(found) == {f"{key}/{what}" for key in off for what in ("od", "clean", "rate", "temperature")}
+    for key, errors in off.items():
+        np.testing.assert_allclose(found[f"{key}/od"], [[1.0 + e] * 3 for e in errors], rtol=1e-6)
+        np.testing.assert_allclose(found[f"{key}/clean"], [[0.999 + e] * 3 for e in errors], rtol=1e-6)
+        np.testing.assert_allclose(found[f"{key}/rate"], [[0.01, 0.013, 0.0]] * 2, rtol=1e-6)
+        np.testing.assert_allclose(found[f"{key}/temperature"], [[37.0] * 3] * 2)
+
+
+def test_every_loop_follows_the_policy_with_which_it_was_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trials_module, "run_cell", lambda config, cell, followed: (cell, followed))
+    one, two, three = (Cell(law, "p", "s") for law in ("pi", "dqn", "dqn_adaptive"))
+    policies_of = {one: None, two: ("a", None), three: ("b", None)}
+    with Loops(replace(config(), workers=1)) as loops:
+        for cell, followed in policies_of.items():
+            loops.start([cell], followed)  # type: ignore[arg-type]
+        assert loops.results() == {cell: (cell, followed) for cell, followed in policies_of.items()}
+
+
+def test_a_learned_controller_follows_its_own_file_and_without_one_what_ships(tmp_path: Path) -> None:
+    """Two names, two files: each with its own regret."""
+    for name, regret in (("one", 2.5), ("two", 7.0)):
+        given = inverse_policy()
+        policies.save(tmp_path / f"{name}.npz", replace(given, metadata={**given.metadata, "regret_pct": regret}))
+    given = {"dqn": str(tmp_path / "one.npz"), "dqn_paper": str(tmp_path / "two.npz")}
+    found, agents, drawn = learned(replace(config(), policies=given), {"dqn", "dqn_paper", "dqn_adaptive"}, tmp_path)
+    assert {name: policy.metadata.get("regret_pct") for name, (policy, _) in found.items() if name in given} == {
+        "dqn": 2.5, "dqn_paper": 7.0,
+    }  # fmt: skip
+    assert {name: agents[name] for name in given} == {
+        name: {"policy": given[name], "regret_pct": regret} for name, regret in (("dqn", 2.5), ("dqn_paper", 7.0))
+    }
+    assert agents["dqn_adaptive"]["policy"] == "shipped"
+    assert drawn == []
+
+
+def test_the_calibration_of_another_seed_is_of_another_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+    monkeypatch.setattr(studies, "calibrate", lambda raw, how: (seen.append((raw.od, how.method)), 1 / 0))
+    for seed in (3, 3, 4):
+        with pytest.raises(ZeroDivisionError):
+            studies.calibration(replace(config(), seed=seed))
+    (one, method), (again, _), (other, _) = seen
+    np.testing.assert_array_equal(one, again)
+    assert np.mean(one != other) > 0.9
+    assert method == "free_run"
+
+
+def test_a_trial_keeps_readings_and_what_they_were_taken_of_apart_and_the_vials_own_temperature() -> None:
+    """Readings scatter, the culture does not; half an hour after the switch it is at 30 degC."""
+    t = trial("hold", "bench", "temperature_switch", 6)
+    rough, smooth = (np.abs(np.diff(values[:, 10:25], 2, axis=1)).mean() for values in (t.od, t.clean))
+    assert rough > 3.0 * smooth
+    np.testing.assert_allclose(t.temperature[:, 29], 37.0, atol=0.5)
+    assert (t.temperature[:, 33] > 30.5).all()
+    np.testing.assert_allclose(t.temperature[:, -1], 30.0, atol=0.6)
+    assert (np.diff(t.media_ml, axis=1) >= 0.0).all()
+    given = 60.0 * t.rate[:, :-1].sum(axis=1)
+    assert len(set(np.round(t.media_ml[:, -1] / given, 3))) == 6  # each pump has a gain of its own
+    np.testing.assert_allclose(t.media_ml[:, -1] / given, 1.0, atol=0.5)

@@ -1,5 +1,8 @@
 """What stands on the page of a comparison, from numbers made up: each beside its own law, plant and unit."""
 
+import json
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +13,20 @@ from matplotlib.colors import to_hex
 from experiments.benchmark import _schema
 from experiments.cli import frame
 from experiments.comparison import figures, page, studies
-from experiments.comparison.config import BenchmarkConfig
+from experiments.comparison.config import BenchmarkConfig, StudyConfig
 from experiments.comparison.trials import Cell, DensityTrial, Trial, cells
 from experiments.reporting import charts
 from experiments.reporting.page import Page
 from experiments.reporting.tables import Best
 
 FLOOR_RED = "#b00020"
+STEPS = (
+    "+experiment=setpoint_steps", "studies.setpoint_steps.plants=[upset_pump,bench]",
+    "studies.setpoint_steps.controllers=[mpc,pi,dqn]", "replicates=2",
+)  # fmt: skip
 
 
+@cache
 def load(*overrides: str) -> BenchmarkConfig:
     cfg = frame.compose("benchmark", overrides)
     return frame.load(cfg, _schema(cfg))
@@ -39,8 +47,7 @@ def trial(config: BenchmarkConfig, cell: Cell, number: int) -> DensityTrial:
 
 def test_each_number_stands_beside_its_own_plant_and_law_whatever_order_a_study_names_them_in() -> None:
     """The paper's table has those of the study's first plant alone."""
-    named = "studies.setpoint_steps.plants=[upset_pump,bench]", "studies.setpoint_steps.controllers=[mpc,pi,dqn]"
-    config = load("+experiment=setpoint_steps", *named, "replicates=2")
+    config = load(*STEPS)
     number = {cell: k for k, cell in enumerate(cells(config), 1)}
     trials: list[Trial] = [trial(config, cell, k) for cell, k in number.items()]
     summary = studies.summarise(config, trials)
@@ -356,3 +363,88 @@ def test_the_settling_time_beside_the_paper_s_is_that_of_the_policy_in_the_regul
     assert texts(out) == [
         "Settling at 0.5 from 0.7: 12.5 min (median of 5; paper: 10 min on average, start and band not stated)."
     ]
+
+
+def compared(
+    name: str, scenarios: tuple[str, ...], laws: tuple[str, ...], plants: tuple[str, ...]
+) -> tuple[BenchmarkConfig, list[Trial]]:
+    """A study of this name, in scenarios that are all the paper's steps, and its numbered trials."""
+    config = load(*STEPS)
+    same = dict.fromkeys(scenarios, config.scenarios["setpoint_steps"])
+    study = StudyConfig(scenarios, plants, laws)
+    config = replace(config, seed=7, scenarios=config.scenarios | same, studies={name: study})
+    return config, [trial(config, cell, k) for k, cell in enumerate(cells(config), 1)]
+
+
+def marks_of(axes: Any, law: str) -> list[float]:
+    """Where a law's marks stand, from the first plant to the last."""
+    colour, marker = figures.MARKS[law]
+    own = [line for line in axes.get_lines() if _dot(line) and line.get_marker() == marker]
+    own = sorted((line for line in own if to_hex(line.get_color()) == to_hex(colour)), key=lambda x: x.get_ydata()[0])
+    return [float(line.get_xdata()[0]) for line in own]
+
+
+def test_every_scenario_has_figures_of_its_own_numbers_against_the_adaptive_policy_where_there_is_one() -> None:
+    """Two scenarios whose errors differ, which are too many for curves."""
+    laws = ("pi", "dqn", "mpc", "dqn_adaptive", "hold")
+    config, trials = compared("mine", ("setpoint_steps", "again"), laws, ("bench",))
+    summary = studies.summarise(config, trials)
+    assert (summary["seed"], summary["replicates"], summary["loops"]) == (7, 2, 10)
+    assert {p["against"] for p in summary["paired"]} == {"dqn", "dqn_adaptive"}
+    drawn = {d.name: d for d in studies.draw(config, trials, summary)}
+    assert {name: d.title for name, d in drawn.items()} == {
+        "plants_setpoint_steps": "Every plant, setpoint_steps", "plants_again": "Every plant, again",
+        "differences_setpoint_steps": "Difference to dqn_adaptive, setpoint_steps",
+        "differences_again": "Difference to dqn_adaptive, again",
+    }  # fmt: skip
+    for scenario in ("setpoint_steps", "again"):
+        for metric, axes in zip(("ise", "itae"), drawn[f"plants_{scenario}"].figure.axes, strict=True):
+            own = [e for e in summary["totals"] if (e["scenario"], e["controller"]) == (scenario, "pi")]
+            assert marks_of(axes, "pi") == pytest.approx([e[f"{metric}_mean"] for e in own])
+        for metric, axes in zip(("ise", "itae"), drawn[f"differences_{scenario}"].figure.axes, strict=True):
+            assert axes.get_xlabel() == f"{metric.upper()} minus that of dqn_adaptive, %"
+            wanted = {"scenario": scenario, "controller": "mpc", "against": "dqn_adaptive", "metric": metric}
+            of = {p["plant"]: p["percent"] for p in summary["paired_totals"] if wanted.items() <= p.items()}
+            names = [text.get_text() for text in drawn[f"differences_{scenario}"].figure.axes[0].get_yticklabels()]
+            assert marks_of(axes, "mpc") == pytest.approx([of[plant] for plant in names])
+
+
+def test_a_study_of_the_paper_on_two_plants_leaves_a_file_of_each() -> None:
+    """Each vial is off by so many hundredths, half of a thousandth more in the mean."""
+    config, trials = compared("setpoint_steps", ("setpoint_steps",), ("pi", "mpc"), ("upset_pump", "bench"))
+    drawn = [d for d in studies.draw(config, trials, studies.summarise(config, trials)) if d.name != "table2"]
+    names = [f"setpoint_steps_setpoint_steps_{plant}" for plant in ("upset_pump", "bench")]
+    assert [d.name for d in drawn] == names
+    assert [d.caption.partition(",")[0] for d in drawn] == ["Plant upset_pump", "Plant bench"]
+    for k, each in enumerate(drawn):
+        for column, axes in enumerate(each.figure.axes[:2]):
+            assert axes.get_title() == f"{('pi', 'mpc')[column]}, n = 2"
+            asked, found = axes.lines[0].get_ydata()[0], axes.lines[1].get_ydata()[0]
+            assert found - asked == pytest.approx(0.01 * (2 * k + column + 1) + 0.0005)
+    alone = replace(config, studies={"setpoint_steps": replace(config.studies["setpoint_steps"], plants=("bench",))})
+    assert next(d.name for d in studies.draw(alone, trials, studies.summarise(alone, trials))) == "setpoint_steps"
+
+
+def test_a_page_says_how_much_was_run_and_has_the_words_of_its_own_signal(tmp_path: Path) -> None:
+    """Rows of a share in two scenarios; a figure belongs to the scenario that its title begins with."""
+    rows = [share_entry("steps", "one", law, k) for k, law in enumerate(("pi", "midpoint"), 3)]
+    rows.append(share_entry("steps_2", "one", "pi", 5.0))
+    shown = []
+    for name in ("steps", "steps_2"):
+        charts.save(charts.new_figure(2.0, 2.0)[0], tmp_path / "figures", name)
+        shown.append({"file": f"figures/{name}.svg", "title": f"{name}: drawn", "caption": f"of {name}"})
+    rest = {"beside_paper": [], "totals": [], "paired": [], "paired_totals": [], "agents": {}, "calibration": None}
+    numbers = {"loops": 12, "replicates": 3, "seed": 9, "details": [], "figures": shown, "rows": rows}
+    (tmp_path / "summary.json").write_text(json.dumps(numbers | rest))
+    out = page.of_benchmark(tmp_path)
+    assert out.title == "Composition of two species: comparison"
+    assert out.subtitle == "12 closed loops of 3 simulated replicates each, seed 9"
+    sections = dict(out.sections)
+    assert list(sections) == ["In short", "steps", "steps_2", "Definitions", "What was run"]
+    for name in ("steps", "steps_2"):
+        drawn = [content["caption"] for kind, content in sections[name] if kind == "figure"]
+        assert drawn == [f"of {name}"]
+    [(_, said)] = sections["In short"]
+    assert said["items"] == ["steps on one: pi 0.03, then midpoint 0.04"]
+    [(_, words)] = sections["Definitions"]
+    assert [term for term, _ in words["pairs"]] == list(page.SHARE)

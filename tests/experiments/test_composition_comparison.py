@@ -13,7 +13,7 @@ from envs.plant.plant import Plant
 from envs.scenario import Scenario
 from experiments.benchmark import _schema, benchmark
 from experiments.cli import frame
-from experiments.comparison import statistics, trials
+from experiments.comparison import statistics, studies, trials
 from experiments.comparison.config import BenchmarkConfig
 from experiments.comparison.run import policies_of, with_pair
 from experiments.comparison.trials import Cell, ShareTrial, calibrate, cells, run_cell
@@ -324,6 +324,33 @@ def test_each_law_follows_the_policy_that_is_named_for_it(tmp_path):
     assert found["dqn"][0].metadata["regret_pct"] == 12.5
     preview = policy.load(SHIPPED_COMPOSITION["dqn_preview"])
     assert found["dqn_preview"][0].metadata == preview.metadata
+
+
+def test_every_scenario_of_a_share_is_drawn_with_its_own_laws_on_its_own_first_plant():
+    """Seven laws are too many for curves: those stay that are always shown; the other scenario has two, and a plant."""
+    seven = ("pi", "receding", "proportional", "dqn", "midpoint", "dqn_preview", "optimum")
+    share = [[0.9, 0.6, 0.5, 0.5], [0.9, 0.5, 0.5, 0.4]]
+    trials = []
+    for scenario, plants, laws in (("steps", ("one", "two"), seven), ("sine", ("two",), ("receding", "pi"))):
+        for plant in plants:
+            for law in laws:
+                found = made_up(share, law=law)
+                found = replace(found, cell=Cell(law, plant, scenario, "share", "inverse"), foresight=law == "optimum")
+                trials.append(replace(found, temperature=np.full((2, 4), 30.0 + len(trials))))
+    drawn = {d.name: d for d in studies._shares(trials, statistics.rows(trials))}
+    assert {name: d.title for name, d in drawn.items()} == {
+        "composition_steps_laws": "steps: every law and plant", "composition_steps_shares": "steps: shares on one",
+        "composition_sine_laws": "sine: every law and plant", "composition_sine_shares": "sine: shares on two",
+    }  # fmt: skip
+    curves = {key: drawn[f"composition_{key}_shares"].figure.axes for key in ("steps", "sine")}
+    told = ["pi", "proportional", "dqn", "midpoint", "dqn_preview", "optimum, told ahead"]
+    assert [ax.get_title() for ax in curves["steps"][:6]] == told
+    assert [float(ax.lines[0].get_ydata()[0]) for ax in curves["steps"][6:]] == [30.0, 32.0, 33.0, 34.0, 35.0, 36.0]
+    assert [ax.get_title() for ax in curves["sine"][:2]] == ["receding", "pi"]
+    assert [float(ax.lines[0].get_ydata()[0]) for ax in curves["sine"][2:]] == [44.0, 45.0]
+    for key, plants in (("steps", ["one", "two"]), ("sine", ["two"])):
+        (axes,) = drawn[f"composition_{key}_laws"].figure.axes
+        assert [text.get_text() for text in axes.get_yticklabels()] == plants
 
 
 @pytest.mark.parametrize(

@@ -717,6 +717,10 @@ def test_a_long_run_is_drawn_by_the_means_of_its_blocks() -> None:
     one = trial(400.0)
     ax = figures.bands([replace(one, clean=0.001 * one.minute + SPREAD)]).axes[0]
     np.testing.assert_allclose(ax.lines[1].get_data(), [TENS, 0.001 * TENS])
+    every = 2.0 * np.arange(201.0)  # a decision every other minute: the mean of five
+    slow = {key: np.repeat(getattr(one, key)[:, :1], 201, axis=1) for key in ("od", "rate", "temperature")}
+    ax = figures.bands([replace(one, minute=every, clean=0.001 * every + SPREAD, **slow)]).axes[0]
+    np.testing.assert_allclose(ax.lines[1].get_data(), [TENS - 0.5, 0.001 * (TENS - 0.5)])
 
 
 def test_shares_of_two_laws_stand_in_the_column_of_their_own_name() -> None:
