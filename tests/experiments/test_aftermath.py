@@ -11,10 +11,14 @@ import numpy as np
 import pytest
 
 from dqn import policy as policies
+from envs.identification.agreement import Agreement, Compared
+from envs.identification.drift import Drift
+from envs.identification.model import Parameter
+from envs.identification.screening import Series
 from experiments import deploy, report
 from experiments.cli import frame
 from experiments.control import run
-from experiments.record.aftermath import believed, decisions
+from experiments.record.aftermath import _acted, _facts, _segments, _sure, believed, decisions
 from tests.experiments.test_deploy import inverse_policy
 
 pytestmark = pytest.mark.xdist_group("aftermath")  # its tests share runs, made once
@@ -187,3 +191,102 @@ def test_each_reactor_is_compared_with_the_model_of_its_own_volume(tmp_path):
     for gain, low, high in gains:
         assert float(gain) == pytest.approx(1.0, abs=0.12)
         assert float(low) < 1.0 < float(high)
+
+
+def parameter(value: float) -> Parameter:
+    """Whose interval is longer to one side."""
+    return Parameter(value, 0.9 * value, 1.3 * value)
+
+
+def along(name: str, found: tuple[float | None, ...], expected: float, line: Drift | None = None) -> Compared:
+    """Three segments, of 1.5, 2 and 2.5 h."""
+    edges = ((0.0, 90.0, 210.0), (90.0, 210.0, 360.0))
+    parts = tuple(None if value is None else parameter(value) for value in found)
+    return Compared(name, *edges, parts, expected, expected or 0.03, 2, line)
+
+
+def agreed(growth: Compared) -> Agreement:
+    series = Series(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.intp))
+    rest = along("gain", (1.1, None, 0.95), 1.0), along("net growth", (0.002, 0.001, None), 0.0)
+    return Agreement(series, growth, *rest, np.zeros(1), 0.0123, 0.0045, 360.0)
+
+
+def test_every_estimate_stands_beside_its_own_hours_and_under_its_own_heading():
+    """Hours, of minutes; the growth is known in the last two segments alone."""
+    table = _segments(agreed(along("growth", (None, 0.03, 0.02), 0.028)), "name", "M1")
+    assert table.columns == (
+        "hours", "growth rate, 1/min", "pump gain, 1 = the model's", "net growth beyond the model's, 1/min",
+    )  # fmt: skip
+    assert table.rows == (
+        ("0.0 to 1.5", "–", "1.1 (0.99 to 1.43)", "0.002 (0.0018 to 0.0026)"),
+        ("1.5 to 3.5", "0.03 (0.027 to 0.039)", "–", "0.001 (0.0009 to 0.0013)"),
+        ("3.5 to 6.0", "0.02 (0.018 to 0.026)", "0.95 (0.855 to 1.23)", "–"),
+    )
+    assert table.title.startswith("M1: ")
+
+
+def test_facts_of_a_run_are_the_last_estimates_since_when_they_left_the_model_s_and_how_they_drift():
+    """Growth is off by 10 % or more in the last two segments, that is since hour 1.5; a line through all falls."""
+    drift = Drift(0.05, 0.04, -20.0, Parameter(-0.002, -0.003, -0.001), 3)
+    growth, gain, net, missed = _facts(agreed(along("growth", (0.028, 0.05, 0.04), 0.028, drift)))
+    assert growth == (
+        "growth: last 0.04 (0.036 to 0.052), the model's 0.028, which has not held since hour 1.5; a line through the "
+        "segments changes by -20 %"
+    )
+    assert gain == "gain: last 0.95 (0.855 to 1.23), the model's 1"
+    assert net == (
+        "net growth: last 0.001 (0.0009 to 0.0013), the model's 0; its interval excludes that, but in too few segments "
+        "or by less than 10 %"
+    )
+    assert missed == "the next sample was predicted within 0.0123 OD; 0.0045 OD without the error of net growth (rms)"
+    level = replace(drift, slope_per_h=Parameter(-0.001, -0.003, 0.001))
+    assert "a line" not in _facts(agreed(along("growth", (0.028, 0.05, 0.04), 0.028, level)))[0]
+    assert _facts(agreed(along("growth", (None, None, None), 0.028)))[0] == "growth: not identifiable"
+
+
+def test_what_interlock_and_supervisor_did_is_counted_each_by_itself():
+    """Five decisions by the supervisor, two of them because of surprises; of four known errors three are within."""
+    minute = np.arange(30.0)
+    why = {
+        "minute": minute,
+        "supervised": 1.0 * ((minute >= 10) & (minute < 15)),
+        "alarm": 1.0 * (abs(minute - 12.5) < 1),
+    }
+    reasons = {
+        "stale": {"rows": 3, "first_min": 31.5, "last_min": 40.0},
+        "budget": {"rows": 6, "first_min": 5.0, "last_min": 8.0},
+    }
+    summary = {"interlock": 8, "rows": 300, "reasons": reasons}
+    assert _acted(summary, why) == (
+        "The interlock spoke in 8 of 300 rows: stale in 3 rows, minute 31.5 to 40; budget in 6 rows, minute 5 to 8. "
+        "A supervisor acted on 5 rows, minute 10 to 14, on 2 of them because readings did not fit the estimate."
+    )
+    errors = {"error": [0.0, 0.19, 0.21, -0.1, 0.0], "error_sd": [0.1] * 5, "true_error": [0.0] * 4 + [np.nan]}
+    shares = {"growth_share": [0.5] * 2, "growth_share_sd": [0.1] * 2, "true_growth_share": [0.6, 0.9]}
+    assert _sure({key: np.array(values) for key, values in errors.items()}) == [
+        "error e: within two of its own sd of the truth in 75 % of 4 decisions"
+    ]
+    assert _sure({key: np.array(values) for key, values in shares.items()}) == [
+        "growth share s: within two of its own sd of the truth in 50 % of 2 decisions"
+    ]
+
+
+def test_decisions_of_a_reactor_are_its_own_and_what_one_of_them_lacks_is_not_known(tmp_path):
+    """M1 had an estimate from its second decision on; a line that says nothing of a decision is none."""
+    told = [
+        ("M0", 1.0, {"mu": 0.01}),
+        ("M1", 2.5, {"supervised": True}),
+        ("M1", 3.5, {"mu": 0.03, "supervised": False}),
+    ]
+    rows = [{"n": 1, "kind": "sample", "reactor": "M1"}]
+    rows += [
+        {"n": k, "kind": "decision", "reactor": name, "row": {"time_min": minute}, "why": why}
+        for k, (name, minute, why) in enumerate(told)
+    ]
+    (tmp_path / "journal.jsonl").write_text("".join(json.dumps(row, separators=(",", ":")) + "\n" for row in rows))
+    found = decisions(tmp_path, "M1")
+    assert set(found) == {"minute", "mu", "supervised"}
+    for key, values in (("minute", [2.5, 3.5]), ("mu", [np.nan, 0.03]), ("supervised", [1.0, 0.0])):
+        np.testing.assert_array_equal(found[key], values)
+    assert set(decisions(tmp_path, "M0")) == {"minute", "mu"}
+    assert {key: values.size for key, values in decisions(tmp_path, "M7").items()} == {"minute": 0}

@@ -366,3 +366,32 @@ def test_marks_are_in_order_of_time_and_recordings_side_by_side_whoever_wrote_fi
     assert [(mark.time_min, mark.reactor) for mark in table.marks] == [(4.0, "M0"), (9.0, "M1")]
     np.testing.assert_array_equal(table.columns["time_min"], [[2.0, 3.0], [2.5, np.nan]])
     assert "interlock" not in table.columns
+
+
+def test_every_decision_is_journalled_for_its_own_reactor_in_the_units_of_the_recording(tmp_path: Path) -> None:
+    """M1 alone has a sample; of M0 the interlock says why it has none. The rate is what was let through."""
+    record = Record(tmp_path, ("M0", "M1"), fsync=False)
+    told = {"rows": [False, True], "od": [0.41, 0.82], "phase": [0, 2], "setpoint": [0.5, 0.8], "rate": [0.01, 0.004]}
+    told |= {"proposed": [0.02, 0.015], "volume_ml": [0.6, 0.24], "temperature": [33.0, 36.12345]}
+    told |= {"raw": [900.0, 1200.0], "blank": [80.0, 95.0], "pump": [1, 4], "believed": np.array([True, False])}
+    told |= {"reasons": ("no answer: for 90 s", "stale: as before"), "elapsed": [3.0, 5.5]}
+    told |= {"explanation": {"mu": np.array([0.02, 0.03])}, "position": ({"began": 1.0}, {"began": 2.0})}
+    now = replace(step(0.0, **told), minute=np.array([7.0, 8.23456]))
+    record.decided(now)
+    record.done(now, {"began": [1.0, 2.0]})
+    record.close()
+    trouble, decided = (json.loads(line) for line in (tmp_path / "journal.jsonl").read_text().splitlines())
+    assert (trouble["kind"], trouble["reactor"], trouble["interlock"]) == ("trouble", "M0", "no answer: for 90 s")
+    assert (decided["kind"], decided["reactor"], decided["why"]) == ("decision", "M1", {"mu": 0.03})
+    assert decided["position"] == {"began": 2.0}
+    expected = {
+        "time_min": 8.2346, "elapsed_min": 5.5, "phase": 2, "od": 0.82, "setpoint": 0.8, "pump_rate_ml_s": 0.004,
+        "proposed_ml_s": 0.015, "volume_ml": 0.24, "temperature_degc": 36.123, "interlock": "stale: as before",
+        "raw_counts": 1200.0, "blank_counts": 95.0, "feed_pump": 4, "believed": 0,
+    }  # fmt: skip
+    assert decided["row"] == expected
+    with open(tmp_path / "recordings" / "M1.csv", newline="") as f:
+        [row] = csv.DictReader(f)
+    assert {key: type(expected[key])(row[key]) for key in expected} == expected
+    assert rows(tmp_path) == []
+    assert json.loads((tmp_path / "state.json").read_text()) == {"journal_row": 2, "began": [1.0, 2.0]}

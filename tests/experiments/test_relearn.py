@@ -263,6 +263,52 @@ def test_the_policy_in_force_is_the_one_that_is_named(tmp_path: Path) -> None:
     assert "007.npz: no such file" in done.stderr
 
 
+def test_each_training_of_a_run_has_a_seed_of_its_own_and_its_answer_says_which_policy_erred_how(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The third one of a plan with seed 20, of which 1000 steps were asked; one that was cut is resumed."""
+    asked, shipped = replace(question((-0.2, 0.05), seed=20), number=3), policies.load(SHIPPED)
+    trained, resumed = [], []
+
+    def train(setup: Any, folder: Path) -> None:
+        trained.append((setup.seed, setup.env, setup.agent.total_steps, setup.eval_every, folder.name))
+        resumed.append(setup.resume)
+        policies.save(folder / "policy.npz", replace(shipped, metadata={**shipped.metadata, "regret_pct": 4.5}))
+
+    errors = {"old": [0.05, 0.06], "new": [0.03, 0.02], "midpoint": [0.04, 0.04]}
+    compared = []
+    monkeypatch.setattr(lesson, "train", train)
+    monkeypatch.setattr(lesson, "judged", lambda *given: (compared.append(given[1:]), errors)[1])
+    (tmp_path / "policies").mkdir()
+    policies.save(tmp_path / FIRST, shipped)
+    path = tmp_path / "policies" / "003.json"
+    path.write_text(asked.text())
+    lesson.answer(path)
+    env, _ = asked.task(shipped)
+    assert (trained, resumed) == ([(23, env, 1000, 25, "003")], [None])
+    written = json.loads((tmp_path / "policies" / "003" / "verdict.json").read_text())
+    assert written == {"errors": errors, "regret_pct": 4.5}
+    [(old, new)] = compared
+    assert (old.metadata.get("regret_pct"), new.metadata["regret_pct"]) == (shipped.metadata.get("regret_pct"), 4.5)
+    (path.with_suffix("") / "checkpoint.pt").touch()
+    lesson.answer(path)
+    assert resumed[1] == str(path.with_suffix(""))
+
+
+def test_vials_of_another_seed_are_others_and_those_of_several_laws_are_the_same_for_each() -> None:
+    asked = question((-0.2, 0.1))
+    one, again, other = (lesson.vials(asked, asked.estimators(4), seed, 2) for seed in (5, 5, 6))
+    for read in (
+        lambda plant: plant.culture.od,
+        lambda plant: plant.feed.gain_factor,
+        lambda plant: plant.culture.share,
+    ):
+        np.testing.assert_array_equal(read(one), read(again))
+        np.testing.assert_array_equal(read(one)[:4], read(one)[4:])
+        assert (read(one) != read(other)).all()
+        assert len(set(read(one)[:4])) == 4
+
+
 def test_curves_on_which_the_starts_disagree_are_not_known() -> None:
     one = estimator(sds=0.001)
     one.mean[0, :, BIAS_E] = np.linspace(-0.1, 0.1, one.mean.shape[1])
