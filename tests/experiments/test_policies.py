@@ -177,6 +177,30 @@ def test_the_demo_trains_until_the_policy_is_within_the_limits() -> None:
     assert config.stop_within == 1.0
 
 
+def test_each_step_of_the_demo_takes_what_the_step_before_it_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calibrated, trained on that, flown with both, reported as one; a step that fails is the last one."""
+    place = Path("runs/demo/now")
+    steps = {words[1]: dict(word.split("=", 1) for word in words[2:]) for words in demo.commands(place)}
+    folders = {f"experiments.{name}": f"{place}/{k}_{name}" for k, name in
+               enumerate(("calibrate", "train", "deploy", "report"), 1)}  # fmt: skip
+    assert {name: given["hydra.run.dir"] for name, given in steps.items()} == folders
+    calibrated = f"{place}/1_calibrate/calibrated.yaml"
+    assert [steps[f"experiments.{name}"]["env_file"] for name in ("train", "deploy")] == [calibrated] * 2
+    assert steps["experiments.deploy"]["policy"] == f"{place}/2_train/policy.npz"
+    assert steps["experiments.report"]["run"] == str(place)
+    ran: list[str] = []
+    status = {"experiments.deploy": 3}
+    monkeypatch.setattr(demo, "step", lambda words, signals: (ran.append(words[1]), status.get(words[1], 0))[1])
+    monkeypatch.setattr("sys.argv", ["demo"])
+    with pytest.raises(SystemExit) as ended:
+        demo.main()
+    assert (ended.value.code, ran) == (3, list(folders)[:3])
+    status.clear()
+    ran.clear()
+    demo.main()
+    assert ran == list(folders)
+
+
 def test_latest_is_what_train_or_demo_wrote_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Copies of policies that runs of a controller keep are none."""
     monkeypatch.chdir(tmp_path)

@@ -409,6 +409,67 @@ def test_errors_of_a_training_are_in_the_unit_of_its_task(env, unit, tmp_path):
     assert "<th>nodes</th>" in text
 
 
+def test_every_number_of_a_run_has_its_own_unit(tmp_path):
+    window = {"setpoint": 0.5, "start_min": 30.0, "temperature": 37.0, "ise": 0.2, "itae": 7.0, "ise_mean": 0.01}
+    window |= {"itae_mean": 0.3, "steady_abs_error": 0.02, "settling_min": 4.5, "ratio_abs_error_mean": 0.04}
+    window |= {"od_abs_error_mean": 0.006, "volume_ml": 8.0}
+    rates = {"mu": {"value": 0.03, "ci95": [0.02, 0.05], "n": 4}, "tau": {"value": 0.3}, "pmse_pct": 6.0}
+    run = run_folder(
+        tmp_path / "run", {"windows": [window], **rates, "hold_s": 1.5, "many": list(range(13)), "few": []}
+    )
+    text = report.write(run).read_text(encoding="utf-8")
+    with open(run / "tables" / "windows.csv", newline="") as f:
+        head, cells = csv.reader(f)
+    assert dict(zip(head, cells, strict=True)) == {
+        "setpoint, OD": "0.5", "start, min": "30", "temperature, °C": "37", "ise, OD² min": "0.2",
+        "itae, OD min²": "7", "ise_mean, OD²": "0.01", "itae_mean, OD min": "0.3", "steady_abs_error, OD": "0.02",
+        "settling, min": "4.5", "ratio_abs_error_mean": "0.04", "od_abs_error_mean, OD": "0.006", "volume, mL": "8",
+    }  # fmt: skip
+    said = dict(re.findall(r"<tr><th>([^<]+)</th><td>([^<]*)</td></tr>", text))
+    assert said.items() >= {
+        "mu.value, 1/min": "0.03", "mu.ci95, 1/min": "0.02, 0.05", "mu.n": "4", "tau.value": "0.3", "pmse, %": "6",
+        "hold, s": "1.5", "many": "13 values", "few": "none", "run folder": "run", "seed": "7",
+    }.items()  # fmt: skip
+
+
+def test_each_run_of_a_folder_has_its_own_seed_command_and_figures(tmp_path):
+    """Two runs of one command are called by their folders, and each figure stands in the section of its run."""
+    for k, name in enumerate(("1_train", "2_train")):
+        run = run_folder(tmp_path / "both" / name, {"value": k})
+        (run / "config.yaml").write_text(f"env:\n  seed: 99\nseed: {40 + k}\n")
+        (run / ".hydra").mkdir()
+        (run / ".hydra" / "overrides.yaml").write_text(f"- env.mu=0.0{k + 2}\n")
+        charts.save(figure(), run / "figures", f"drawn_{k}")
+    text = report.write(tmp_path / "both").read_text(encoding="utf-8")
+    sections = dict(re.findall(r"<h2>([^<]+)</h2>(.*?)</section>", text, re.DOTALL))
+    assert list(sections) == [f"{k}_train: {what}" for k in (1, 2) for what in ("results", "what was run")]
+    for k in (0, 1):
+        assert re.findall(r"drawn \d", sections[f"{k + 1}_train: results"]) == [f"drawn {k}"] * 2
+        ran = dict(re.findall(r"<tr><th>([^<]+)</th><td>([^<]*)</td>", sections[f"{k + 1}_train: what was run"]))
+        assert (ran["seed"], ran["overrides"], ran["run folder"]) == (
+            str(40 + k), f"env.mu=0.0{k + 2}", f"{k + 1}_train",
+        )  # fmt: skip
+
+
+def test_a_table_for_a_paper_has_its_units_in_symbols():
+    table = Table("t", "37 °C, 10⁻³ OD² min", ("law", "µL/s"), (("a~b", Best("−1 ± 2")), ("{c}", "–")))
+    assert table.latex().splitlines() == [
+        r"\begin{table}", r"\caption{37 $^\circ$C, 10$^-$$^3$ OD$^2$ min}\label{tab:t}", r"\begin{tabular}{lr}",
+        r"\toprule", r"law & $\mu$L/s \\", r"\midrule", r"a\textasciitilde{}b & \textbf{$-$1 $\pm$ 2} \\",
+        r"\{c\} & -- \\", r"\bottomrule", r"\end{tabular}", r"\end{table}",
+    ]  # fmt: skip
+
+
+def test_a_sweep_is_reported_in_place_of_a_run_where_one_is_named(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(report, "compare", lambda folder: seen.append(("compare", folder)))
+    monkeypatch.setattr(report, "write", lambda folder: seen.append(("write", folder)))
+    (tmp_path / "one").mkdir()
+    report.report(report.ReportConfig(run=str(tmp_path / "one")), tmp_path)
+    report.report(report.ReportConfig(run=str(tmp_path / "one"), runs=str(tmp_path / "many")), tmp_path)
+    assert seen == [("write", tmp_path / "one"), ("compare", tmp_path / "many")]
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

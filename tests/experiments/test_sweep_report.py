@@ -12,6 +12,8 @@ import pytest
 from experiments import report
 from experiments.cli import frame, sweep
 from experiments.reporting import sweep_page, sweep_results
+from experiments.reporting.page import Page
+from experiments.reporting.tables import Best
 
 
 def job(folder: Path, overrides: list[str], state: str = "finished", error: str = "", **summary: Any) -> None:
@@ -83,6 +85,7 @@ def test_jobs_without_a_result_are_named(trained: Path) -> None:
     assert [(row["job"], row["state"], row["error"]) for row in rows] == [
         ("2", "failed", "the disk is full"), ("5", "missing", "–"),
     ]  # fmt: skip
+    assert [row["overrides"] for row in rows] == ["agent=tuned seed=4 n_agents=2", "agent=paper seed=4 n_agents=2"]
     assert f"python -m experiments.train -m resume={trained}" in text
 
 
@@ -91,6 +94,53 @@ def test_curves_are_those_of_every_seed_of_every_job(trained: Path) -> None:
     steps, values = sweep_results.curve(jobs, "eval/regret_pct")
     np.testing.assert_array_equal(steps, [100, 200])
     np.testing.assert_array_equal(values, [[1, 2, 3, 10], [0.5, 1, 1.5, 5]])
+
+
+def test_seeds_that_were_evaluated_at_other_steps_leave_a_gap_and_keep_their_column(tmp_path: Path) -> None:
+    """Seed 7 at steps 100 and 300, seed 3 at 200 and 300; another tag and a torn line are none of them."""
+    for k, (seed, values) in enumerate(((7, {100: 4.0, 300: 2.0}), (3, {200: 9.0, 300: 8.0}))):
+        (tmp_path / str(k)).mkdir()
+        lines = [f"{at},{seed},eval/regret_pct,{value}" for at, value in values.items()]
+        lines += [f"100,{seed},train/loss,5.0", f"400,{seed},eval/reg"]
+        (tmp_path / str(k) / "progress.csv").write_text("\n".join(["step,seed,tag,value", *lines]))
+    jobs = [sweep_results.Result(tmp_path / str(k), {}, "finished") for k in range(3)]
+    steps, values = sweep_results.curve(jobs, "eval/regret_pct")
+    np.testing.assert_array_equal(steps, [100, 200, 300])
+    np.testing.assert_array_equal(values, [[4.0, np.nan], [np.nan, 9.0], [2.0, 8.0]])
+
+
+def test_the_first_of_the_ranking_stands_out_with_its_place_and_what_has_no_number_comes_last() -> None:
+    """Errors at rest differ in their order; one configuration has none, and one value has no interval."""
+    found = {"b": [3.0, 1.0, 2.0], "a": [5.0], "c": []}
+    jobs = [
+        sweep_results.Result(Path(name), {"agent": name, "seed": str(k)}, "finished", objective=value)
+        for name, values in (("c", found["c"]), ("a", found["a"]), ("b", found["b"]))
+        for k, value in enumerate(values or [None])
+    ]
+    ranked, _ = sweep_results.configurations(jobs)
+    out = Page("", "")
+    out.section("")
+    sweep_page._tables(out, ranked, lambda name: f"<{name}>", "note")
+    each, _ = out.tables
+    assert (each.title, each.columns) == (
+        "Configurations, the best first: <objective>", ("#", "agent", "n", "median", "IQM", "95 % of IQM", "worst"),
+    )  # fmt: skip
+    assert [(*row[:5], row[6]) for row in each.rows] == [
+        ("#1", "b", "3", "2", "2", "3"), ("#2", "a", "1", "5", "5", "5"), ("#3", "c", "–", "–", "–", "–"),
+    ]  # fmt: skip
+    assert [row[5] for row in each.rows[1:]] == ["–", "–"]
+    assert [[isinstance(cell, Best) for cell in row] for row in each.rows] == [[True] * 7, [False] * 7, [False] * 7]
+
+
+def test_a_sweep_of_another_task_has_its_unit_on_the_page(tmp_path: Path) -> None:
+    """The task of the jobs that finished; the first one failed and says nothing of it."""
+    job(tmp_path / "0", ["agent=a"], "failed", "no disk")
+    for k, agent in ((1, "b"), (2, "c")):
+        job(tmp_path / str(k), [f"agent={agent}"], seeds=[0], regret_pct=[1.0 * k], steady_abs_error=[0.1])
+        (tmp_path / str(k) / "config.yaml").write_text("env: {kind: coculture}\n")
+    text = report.compare(tmp_path).read_text(encoding="utf-8")
+    assert "steady error at the worst setpoint, of the share" in text
+    assert "2 of 3 jobs finished" in text
 
 
 def test_a_closed_loop_is_judged_by_its_worst_window(tmp_path: Path) -> None:

@@ -99,6 +99,32 @@ def test_the_page_explains_the_curves_that_runs_write_and_no_other(runs: Path) -
     assert not [tag for tag, unit in explained.items() if len(unit) > 25]  # the unit, and not the meaning
 
 
+def test_every_curve_has_the_unit_that_the_page_gives_it() -> None:
+    """Where a curve says more, of which task or law: before that."""
+    explained = dict(ROW.findall(PAGE.read_text(encoding="utf-8")))
+    assert {tag: re.split(" for |; ", CURVES[tag].unit)[0] for tag in explained} == explained
+    assert described("culture/od") == "optical density as measured. Unit: OD."
+    assert described("eval/regret_pct/min").endswith("selection grid. Unit: %. Lowest agent.")
+    assert described("eval/regret_pct/iqm").endswith("Mean of the middle half of the agents.")
+
+
+def test_a_population_is_told_by_the_mean_of_its_middle_half_and_by_its_ends(tmp_path: Path) -> None:
+    """Of 1, 2, 3, 6 and 100 one is cut at either end; a seed without a value counts for nothing."""
+    writer = PopulationWriter(tmp_path, [9, 4, 7, 5, 6])
+    writer.scalars(10, {"eval/regret_pct": np.array([100.0, 2.0, 1.0, 6.0, 3.0]), "train/epsilon": 0.25})
+    writer.scalars(20, {"eval/regret_pct": np.array([np.nan, 2.0, 1.0, 6.0, 3.0])})
+    writer.close()
+    whole = EventAccumulator(str(tmp_path), size_guidance={"tensors": 0}).Reload()
+    for end, values in (("iqm", (11.0 / 3.0, 2.5)), ("min", (1.0, 1.0)), ("max", (100.0, 6.0))):
+        np.testing.assert_allclose(
+            curve(whole, f"eval/regret_pct/{end}"), [[10.0, values[0]], [20.0, values[1]]], rtol=1e-6
+        )
+    assert curve(whole, "train/epsilon").tolist() == [[10.0, 0.25]]
+    for seed, value in ((9, 100.0), (4, 2.0), (7, 1.0), (5, 6.0), (6, 3.0)):
+        own = EventAccumulator(str(tmp_path / "agents" / f"seed000{seed}"), size_guidance={"tensors": 0}).Reload()
+        assert curve(own, "eval/regret_pct")[0].tolist() == [10.0, value]
+
+
 def test_every_curve_and_figure_says_what_it_is(runs: Path) -> None:
     for events in parts(runs):
         for tag in (*scalars(events), *scalars(events, "images")):

@@ -152,3 +152,47 @@ def test_the_page_begins_with_it_and_names_units_and_no_place_of_this_machine(tm
     assert "http://192.168.7.2:5000/x" in text
     for words in ("<th>volume, mL</th>", "<th>setpoint, OD</th>", "<th>steady_abs_error, OD</th>"):
         assert words in text
+
+
+def test_each_window_is_judged_by_its_own_setpoint_and_the_largest_error_is_named() -> None:
+    """0.03 OD is 6 % of 0.5 and less than 4 % of 0.8; medium and interlock are those of all reactors."""
+    windows = [WINDOW, {"setpoint": 0.8, "steady_abs_error": 0.03}, {"setpoint": 0.6, "steady_abs_error": 0.01}]
+    said = verdict(DEPLOYED | {"windows": windows}, LOOP)
+    assert said.items[0] == "largest error at rest 0.03 OD, the mean over the last 10 min of a window"
+    assert said.remark == "Good: 3 of 3 windows ended within 5 % of their setpoint."
+    windows[1] = {"setpoint": 0.5, "steady_abs_error": 0.03}
+    assert verdict(DEPLOYED | {"windows": windows}, LOOP).remark.startswith("Not good: 2 of 3 windows")
+
+
+def test_of_several_agents_the_worst_in_each_is_named_whichever_it_is() -> None:
+    """The first has the larger regret, the second the larger error; units are those of the task."""
+    found = TRAINED | {"regret_pct": [0.45, 0.3], "steady_abs_error": [0.001, 0.0025]}
+    said = verdict(found | {"myopic_regret_pct": 7.25, "myopic_steady_abs_error": 0.0175}, MODEL)
+    assert said.items == [
+        "regret of the worst agent 0.45 %: what the policy costs beyond the exact optimum",
+        "error at rest at its worst setpoint of the worst agent 0.0025 OD",
+        "the one-line law that looks one period ahead: regret 7.25 %, error 0.0175 OD",
+    ]
+    relative = verdict(found, {"env": {"kind": "relative"}})
+    assert relative.claim.startswith("Training: 2 agents learned the task env=relative for 20000 steps")
+    assert relative.items[1].endswith("0.0025 periods of full pump")
+
+
+def test_a_calibration_says_what_it_used_and_what_speaks_against_it() -> None:
+    pair = {"mu": {"value": 0.03, "ci95": [0.027, 0.039]}, "tau": {"value": 0.35, "ci95": [0.315, 0.455]}}
+    numbers = {"pmse_pct": 6.5, "n_used": 341, "n_rejected": 20, "doubling_min": 23.1}
+    said = verdict(
+        pair | numbers | {"verdict": {"word": "usable", "why": "both are known", "then": ""}, "warnings": ["a", "b"]},
+        {},
+    )
+    assert said.claim == "Calibration of the shipped recording: usable: both are known."
+    assert said.items[2] == "PMSE 6.5 % of the squared OD; 341 readings used, 20 rejected"
+    assert said.remark == "Against it: a; b."
+    alone = {"value": 0.021, "ci95": [0.019, 0.024], "rows": [40, 100]}
+    grown = {"value": 0.005, "ci95": [-0.001, 0.012], "rows": [7, 30]}
+    none = {"mu": None, "mu_alone": alone, "net_growth": grown, "notes": ["c"], "pmse_pct": None}
+    said = verdict(none | {"verdict": {"word": "w", "why": "x", "then": ""}}, {"data": "one.csv"})
+    assert said.items == [
+        "mu alone 0.021 1/min, 95 % interval 0.019 to 0.024, rows 40 to 99",
+        "net growth 0.005 1/min, 95 % interval -0.001 to 0.012, rows 7 to 29",
+    ]
