@@ -483,6 +483,9 @@ def test_a_learned_controller_follows_its_own_file_and_without_one_what_ships(tm
     }
     assert agents["dqn_adaptive"]["policy"] == "shipped"
     assert drawn == []
+    bounds = {name: bounds for name, (_, bounds) in found.items()}
+    assert (bounds["dqn"], bounds["dqn_paper"]) == (None, None)
+    assert bounds["dqn_adaptive"].full_pump == pytest.approx(0.06)  # 1 min of 0.02 mL/s over tau = 1/3 is certified
 
 
 def test_the_calibration_of_another_seed_is_of_another_recording(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -509,3 +512,17 @@ def test_a_trial_keeps_readings_and_what_they_were_taken_of_apart_and_the_vials_
     given = 60.0 * t.rate[:, :-1].sum(axis=1)
     assert len(set(np.round(t.media_ml[:, -1] / given, 3))) == 6  # each pump has a gain of its own
     np.testing.assert_allclose(t.media_ml[:, -1] / given, 1.0, atol=0.5)
+
+
+def test_a_vial_that_overflowed_is_told_by_its_own() -> None:
+    """The second of three, whatever it was for."""
+    c = config()
+
+    def make(vials: Plant) -> Any:
+        vials.vessel.overflowed[1] = True
+        return registry.build(c.controllers["hold"], model=c.env, plant=vials)
+
+    schedule = Scenario((0.5,), (3.0,), (37.0,))
+    t = run_trial(Cell("hold", "nominal", "s"), c.plants["nominal"], schedule, make, c.env, 3, 0)
+    assert t.overflowed.tolist() == [False, True, False]
+    assert comparison.details([t])[0]["overflowed"] == 1

@@ -313,6 +313,12 @@ def test_each_phase_of_a_share_has_its_own_density_and_temperature_and_each_vial
     assert [each[1].tolist() for each in given] == [pytest.approx([0.06, 0.12])] * 8
     assert [each[2].tolist() for each in given] == [[31.0] * 2] * 3 + [[36.0] * 2] * 5
     assert {key: values.shape for key, values in found.items()} == dict.fromkeys(found, (2, 8))
+    truth = Plant(config().plants["coculture"], 2, np.random.default_rng(1)).culture
+    np.testing.assert_allclose(found["od"][:, 0], truth.od)  # not as it is read
+    np.testing.assert_allclose(found["share"][:, 0], truth.share)
+    assert (found["low"] < found["estimate"]).all()
+    assert (found["estimate"] < found["high"]).all()
+    assert (np.abs(found["estimate"] - found["share"]).max(axis=1) > 1e-4).all()
 
 
 def test_each_law_follows_the_policy_that_is_named_for_it(tmp_path):

@@ -899,3 +899,36 @@ def test_a_seed_without_a_value_at_a_step_costs_the_others_nothing_and_wide_valu
     np.testing.assert_allclose([line.get_ydata() for line in ax.lines[:2]], [[6.0, 2.0], [9.0, 2.0]])
     narrow, wide = ({"a": np.array([1.0, 2.0]), "b": np.array([most])} for most in (29.0, 31.0))
     assert [sweep_charts.values(each, "").axes[0].get_xscale() for each in (narrow, wide)] == ["linear", "log"]
+
+
+def test_the_learned_policy_stands_left_of_the_optimum_and_both_are_on_one_scale() -> None:
+    """The optimum pumps up to 30 uL/s, and the learned policy never at all."""
+    x, y = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.5])
+    none, most = np.zeros((2, 3)), np.array([[0.0, 0.01, 0.02], [0.01, 0.02, 0.03]])
+    for drawn, scale, end in (
+        (charts.policy_map(x, y, none, most), 1000.0, 30.0),
+        (charts.relative_map(x, y, none, most), 1.0, 1.0),
+    ):
+        for ax, title, rates in zip(
+            drawn.axes, ("learned policy", "optimum (dynamic programming)"), (none, most), strict=False
+        ):
+            (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh))
+            assert ax.get_title() == title
+            np.testing.assert_allclose(np.asarray(mesh.get_array()), scale * rates)
+            assert mesh.get_clim() == (0.0, end)
+
+
+def test_each_episode_of_a_share_has_a_column_of_its_own_with_names_for_its_curves() -> None:
+    hours, first, second = np.array([1.0, 2.0]), np.array([0.4, 0.5]), np.array([0.7, 0.6])
+    wanted = np.stack([first, second], axis=1)
+    shares = wanted, wanted - 0.1, wanted - 0.2
+    axes = composition_charts.episodes(hours, *shares, 30.0 + wanted, 33.0 + wanted, "B. subtilis").axes
+    words = [text.get_text() for text in axes[0].get_legend().get_texts()]
+    assert words == ["setpoint", "learned", "optimum"]
+    for column, own in enumerate((first, second)):
+        for line, word, off in zip(axes[column].lines, words, (0.0, 0.1, 0.2), strict=True):
+            np.testing.assert_allclose(line.get_ydata(), own - off)
+            assert line.get_label() == word
+        np.testing.assert_allclose([line.get_ydata() for line in axes[2 + column].lines], [30.0 + own, 33.0 + own])
+        colours = [line.get_color() for line in axes[column].lines[1:]]
+        assert [line.get_color() for line in axes[2 + column].lines] == colours

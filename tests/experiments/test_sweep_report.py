@@ -132,6 +132,38 @@ def test_the_first_of_the_ranking_stands_out_with_its_place_and_what_has_no_numb
     assert [[isinstance(cell, Best) for cell in row] for row in each.rows] == [[True] * 7, [False] * 7, [False] * 7]
 
 
+def test_figures_have_the_best_eight_and_the_values_of_their_own_measure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten configurations, of which the third has no medium and the last two are in the table alone."""
+    ranked = [
+        sweep_results.Configuration(
+            {"agent": f"{k}"}, [], {"ise": np.array([k, k + 0.5]), "volume_ml": np.array([9.0 - k])}
+        )
+        for k in range(10)
+    ]
+    del ranked[2].measured["volume_ml"]
+    drawn: list[tuple[dict[str, list[float]], str]] = []
+    picture = tmp_path / "values.png"
+    picture.with_suffix(".svg").write_text("<svg")
+    monkeypatch.setattr(
+        sweep_page.sweep_charts, "values",
+        lambda measured, quantity: drawn.append(({k: v.tolist() for k, v in measured.items()}, quantity)),
+    )  # fmt: skip
+    monkeypatch.setattr(sweep_page.charts, "save", lambda figure, folder, name: picture)
+    out = Page("", "")
+    sweep_page._figures(out, tmp_path, ranked, lambda name: f"<{name}>")
+    assert drawn == [
+        ({f"agent {k}": [k, k + 0.5] for k in range(8)}, "<ise>"),
+        ({f"agent {k}": [9.0 - k] for k in range(8) if k != 2}, "<volume_ml>"),
+    ]
+    [(_, shown)] = out.sections
+    assert [(content["title"], content["caption"]) for _, content in shown] == [
+        (f"Every value: <{name}>", "The best 8 of 10 configurations. Bar: interquartile mean.")
+        for name in ("ise", "volume_ml")
+    ]
+
+
 def test_a_sweep_of_another_task_has_its_unit_on_the_page(tmp_path: Path) -> None:
     """The task of the jobs that finished; the first one failed and says nothing of it."""
     job(tmp_path / "0", ["agent=a"], "failed", "no disk")
