@@ -5,13 +5,17 @@ import re
 import subprocess
 import sys
 import urllib.request
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from experiments import blank as blanks
 from experiments.blank import BlankConfig, blank
-from experiments.calibrate_pump import CalibratePumpConfig, Series, calibrate, report, weigh
+from experiments.calibrate_pump import CalibratePumpConfig, Series, _number, calibrate, read_weighings, report, weigh
 from experiments.cli import frame
 from hardware.chibio.calibrations import load_calibrations, save_calibration
 from hardware.chibio.config import ChiBioConfig
@@ -136,6 +140,109 @@ def test_two_series_leave_the_spread_unknown_and_say_what_to_do() -> None:
     assert "flow 0.9000 mL/s, bias +0.100 s, smallest" in said(series[:2])
     assert "+- 0.0000 mL/s" in said(series)
     assert "unknown" not in said(series)
+
+
+def test_each_weighing_stands_beside_what_is_fitted_in_ml_of_one_of_its_doses() -> None:
+    """0.8 mL/s of what a pump runs beyond 0.1 s less than asked; 20, 8 and 5 doses were weighed."""
+    found = [Series(duty, n, n * 0.8 * (PERIOD_S * duty - 0.1)) for duty, n in ((0.01, 20), (0.02, 8), (0.05, 5))]
+    on_s, doses, grams = np.array([[PERIOD_S * s.duty, s.doses, s.grams] for s in found]).T
+    head, *lines = report(fit_pump(on_s, doses, grams), found).splitlines()
+    assert head.split() == ["asked", "s", "doses", "mL/dose", "fitted"]
+    assert [line.split() for line in lines[:3]] == [
+        ["0.630", "20", "0.4240", "0.4240"], ["1.260", "8", "0.9280", "0.9280"], ["3.150", "5", "2.4400", "2.4400"],
+    ]  # fmt: skip
+    assert lines[3].startswith("flow 0.8000 +- 0.0000 mL/s, bias -0.100 +- 0.000 s, ")
+
+
+def test_two_pumps_of_two_units_are_stored_apart_with_what_was_weighed(tmp_path: Path) -> None:
+    for reactor, pump, flow in (("M0", "feed", 0.9), ("M3", "waste", 1.4)):
+        rows = [f"{d},{n},{n * flow * (PERIOD_S * d + 0.1):.6f}" for d, n in ((0.01, 20), (0.02, 10), (0.04, 5))]
+        (tmp_path / "w.csv").write_text("doses,grams,duty\n" + "".join(
+            f"{n},{g},{d}\n" for d, n, g in (row.split(",") for row in rows)
+        ))  # fmt: skip
+        backend = ChiBioConfig(calibration=str(tmp_path / "c"))
+        calibrate(CalibratePumpConfig(backend, reactor, pump, csv=str(tmp_path / "w.csv")), tmp_path)
+        told = json.loads((tmp_path / "summary.json").read_text())
+        assert told["file"] == str(tmp_path / "c" / f"{reactor}_{pump}.yaml")
+        assert [(w["duty"], w["doses"]) for w in told["weighings"]] == [(0.01, 20), (0.02, 10), (0.04, 5)]
+        assert (told["flow_ml_s"], told["bias_s"]) == (pytest.approx(flow, rel=1e-4), pytest.approx(0.1, abs=1e-4))
+    first, second = load_calibrations(tmp_path / "c", ["M0", "M3"])
+    assert first.feed.flow_ml_s == pytest.approx(0.9, rel=1e-4)
+    assert second.waste.flow_ml_s == pytest.approx(1.4, rel=1e-4)
+    assert [first.waste.date, second.feed.date] == ["", ""]
+
+
+def test_an_answer_that_is_no_mass_is_asked_for_again(capsys: pytest.CaptureFixture[str]) -> None:
+    answers = iter(["", "-0.1", "10000", "nan", "12,5 g", " 12,75 "])
+    assert _number(lambda question: next(answers), "grams: ") == 12.75
+    assert capsys.readouterr().out.count("is no mass in grams; a number from 0 to 10000, please") == 5
+    assert _number(lambda question: "0", "grams: ") == 0.0
+
+
+@pytest.mark.parametrize("row", ["0,20,1", "1.01,20,1", "0.01,0,1", "0.01,20,-1", "0.01,20,10000", "0.01,2.5,1"])
+def test_a_weighing_that_cannot_be_is_named_with_its_line(row: str, tmp_path: Path) -> None:
+    (tmp_path / "w.csv").write_text(f"duty,doses,grams\n1,1,0\n{row}\n")
+    with pytest.raises(frame.UserError, match=r"w\.csv, line 3: .*columns duty,doses,grams"):
+        read_weighings(tmp_path / "w.csv")
+
+
+def test_duties_may_reach_both_ends_of_what_their_pump_takes() -> None:
+    assert CalibratePumpConfig(duties=(0.003, 0.05)).duties == (0.003, 0.05)
+    assert CalibratePumpConfig(pump="waste", duties=(0.5, 0.003)).duties == (0.5, 0.003)
+    for pump, duties in (("feed", (0.002, 0.05)), ("waste", (0.003, 0.51)), ("feed", (0.02, 0.02))):
+        with pytest.raises(ValueError, match="allowed at least two different ones from 0.003 to 0.0?5$"):
+            CalibratePumpConfig(pump=pump, duties=duties)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_each_vial_s_blank_is_stored_under_its_own_name_and_unit(
+    fails: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of M2 and M5; where the counts do not come, everything is switched off and nothing stored."""
+    ended: list[str] = []
+
+    class Two:
+        names = ("M2", "M5")
+        stations = tuple(SimpleNamespace(connection=SimpleNamespace(device_id=number)) for number in ("22", "55"))
+
+        def __init__(self, *given: Any) -> None:
+            self.begin = lambda: ended.append("begun")
+            self.end = lambda: ended.append("ended")
+            self.stop = lambda: ended.append("stopped")
+
+    @contextmanager
+    def linked(backend: ChiBioConfig) -> Any:
+        yield None, None
+
+    def measured(reactors: Two, samples: int) -> tuple[np.ndarray, np.ndarray]:
+        ended.append(f"{samples} samples")
+        if fails:
+            raise UnfitError("no light")
+        return np.array([14000.4, 15500.6]), np.array([12.4, 30.6])
+
+    warmed: list[tuple[float, float]] = []
+    monkeypatch.setattr(blanks, "linked", linked)
+    monkeypatch.setattr(blanks, "ChiBioReactors", Two)
+    monkeypatch.setattr(blanks, "warm_up", lambda reactors, within, limit: warmed.append((within, limit)) or [])
+    monkeypatch.setattr(blanks, "measure_blanks", measured)
+    backend = ChiBioConfig(reactors=("M2", "M5"), temperature=33.0, calibration=str(tmp_path / "c"))
+    config = BlankConfig(backend, warm_up=70.0, tolerance=0.5, samples=9)
+    if fails:
+        with pytest.raises(frame.UserError, match="^no light$"):
+            blank(config, tmp_path)
+        assert ended == ["begun", "9 samples", "stopped"]
+        assert list(tmp_path.iterdir()) == []
+        return
+    with caplog.at_level("INFO"):
+        blank(config, tmp_path)
+    assert (ended, warmed) == (["begun", "9 samples", "ended"], [(0.5, 70.0)])
+    told = json.loads((tmp_path / "summary.json").read_text())
+    assert {name: (r["blank"], r["sd"], r["samples"], r["device_id"]) for name, r in told.items()} == {
+        "M2": (14000.4, 12.4, 9, "22"), "M5": (15500.6, 30.6, 9, "55"),
+    }  # fmt: skip
+    assert [rig.blank for rig in load_calibrations(tmp_path / "c", ["M2", "M5"])] == [14000.4, 15500.6]
+    assert "clear medium in M2, M5: to 33 degC first, then 10 minutes" in caplog.text
+    assert f"M5: blank 15501 +- 31 counts, stored in {tmp_path}/c/M5_blank.yaml" in caplog.text
 
 
 def test_without_a_terminal_there_is_one_clear_line(tmp_path: Path) -> None:

@@ -14,17 +14,21 @@ import pytest
 from omegaconf import OmegaConf
 
 from envs.identification.calibration import Calibration, calibrate
+from envs.identification.drift import Drift
 from envs.identification.model import Parameter
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
+from envs.identification.validation import Validation
 from envs.task import EnvConfig
+from experiments import calibrate as command
 from experiments.calibration.config import CalibrateConfig
-from experiments.calibration.result import environment_yaml, summary
+from experiments.calibration.result import environment_yaml, report, summary
 from experiments.calibration.study import against_truth, simulated
 from experiments.cli import frame
 from experiments.cli.calibrated import read_plant_file
 from experiments.reporting.verdict import verdict
-from hardware.storage.recording_reader import read_recording
+from hardware.errors import RecordingError
+from hardware.storage.recording_reader import Recording, read_recording
 from tests.patience import PATIENCE_S
 from tests.real_recording import DITHER, needs_dither
 
@@ -66,6 +70,16 @@ def tidy(path: Path, od: np.ndarray, time: np.ndarray, pump_rate: np.ndarray) ->
 def recording() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     time, od, pump_rate = open_loop(OpenLoop(hours=4.0), np.random.default_rng(6))
     return time, od[0], pump_rate[0]
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Recording:
+    return read_recording(str(resources.files("experiments") / "data" / "open_loop.csv"))
+
+
+@pytest.fixture(scope="module")
+def real(shipped: Recording) -> Calibration:
+    return calibrate(Series(shipped.time_min, shipped.od, shipped.pump_rate, shipped.row))
 
 
 def test_shipped_recording_from_the_command_line(cli: Cli, tmp_path: Path) -> None:
@@ -324,10 +338,8 @@ def test_yaml_and_dataclass_hold_the_same_defaults() -> None:
     assert frame.load(frame.compose("calibrate", []), CalibrateConfig()) == CalibrateConfig()
 
 
-def test_environment_file_tells_its_origin() -> None:
-    r = read_recording(str(resources.files("experiments") / "data" / "open_loop.csv"))
-    result = calibrate(Series(r.time_min, r.od, r.pump_rate, r.row))
-    head = environment_yaml(result, "open_loop.csv").splitlines()[:3]
+def test_environment_file_tells_its_origin(real: Calibration) -> None:
+    head = environment_yaml(real, "open_loop.csv").splitlines()[:3]
     assert all(line.startswith("#") for line in head)
     assert "open_loop.csv, rows 0:361, 361 readings" in head[1]
 
@@ -366,10 +378,8 @@ def test_a_tuned_pi_is_tuned_for_the_protocol_s_period() -> None:
                 integral += 0.5 * 2.0 * z / 8.0
 
 
-def test_a_study_counts_what_is_wrong_of_all_and_what_holds_of_those_accepted() -> None:
+def test_a_study_counts_what_is_wrong_of_all_and_what_holds_of_those_accepted(real: Calibration) -> None:
     """Eight recordings, three refused; of the others each pair of intervals by hand, truth 0.03 and 0.3."""
-    r = read_recording(str(resources.files("experiments") / "data" / "open_loop.csv"))
-    real = calibrate(Series(r.time_min, r.od, r.pump_rate, r.row))
 
     def off(mu: float, tau: float) -> Calibration:
         """So many half widths, of 0.001 and of 0.01."""
@@ -386,3 +396,110 @@ def test_a_study_counts_what_is_wrong_of_all_and_what_holds_of_those_accepted() 
     assert numbers["coverage_pct"] == pytest.approx({"mu": 100.0 * 2 / 5, "tau": 100.0 * 3 / 5})
     assert numbers["median_bias_pct"] == pytest.approx({"mu": 100.0 * 0.0005 / 0.03, "tau": 0.0})
     assert against_truth(["flat"], np.ones(1), np.ones(1))["wrong_pct"] == 0.0
+
+
+@pytest.fixture(scope="module")
+def fitted(real: Calibration) -> Calibration:
+    """The shipped recording's calibration, in which every number is another one."""
+    faster, slower = Parameter(0.002, 0.001, 0.003), Parameter(-0.01, -0.02, -0.001)
+    return replace(
+        real, mu=Parameter(0.02, 0.018, 0.023), tau=Parameter(0.4, 0.35, 0.44), pmse_pct=1.25, pair_pmse_pct=2.5,
+        drift_mu=Drift(0.019, 0.022, 15.8, faster, 4), drift_tau=Drift(0.41, 0.37, -9.8, slower, 3),
+        validation=Validation(3.5, 0.75, 61, 4.25, 17), warnings=("it drifts", "it is noisy"),
+    )  # fmt: skip
+
+
+def test_the_screen_and_the_file_say_of_each_number_what_it_is(fitted: Calibration, shipped: Recording) -> None:
+    """Doubling in ln 2 / 0.02 = 34.7 min, dilution of 0.02 / 0.4 = 0.05 1/min at 0.02 mL/s."""
+    r = replace(shipped, notes=("a note",))
+    raw = Series(r.time_min, r.od, r.pump_rate, r.row)
+    content = summary(fitted, r, raw)
+    assert content["doubling_min"] == pytest.approx(np.log(2.0) / 0.02)
+    assert (content["mu"], content["tau"]) == (
+        {"value": 0.02, "ci95": [0.018, 0.023]}, {"value": 0.4, "ci95": [0.35, 0.44]},
+    )  # fmt: skip
+    assert (content["pmse_pct"], content["pair_pmse_pct"]) == (1.25, 2.5)
+    first = {"first": 0.019, "last": 0.022, "change_pct": 15.8, "significant": True, "segments": 4}
+    assert content["drift"]["mu"] == {**first, "per_hour": {"value": 0.002, "ci95": [0.001, 0.003]}}
+    assert (content["drift"]["tau"]["first"], content["drift"]["tau"]["segments"]) == (0.41, 3)
+    text = report(fitted, r, content)
+    for line in (
+        "  mu          0.02000 1/min   95 % 0.01800 to 0.02300   (doubling time 34.7 min)",
+        "  tau         0.4000          95 % 0.3500 to 0.4400   (dilution 0.0500 1/min at 0.02 mL/s)",
+        "  held out    PMSE 3.5 % over the window's last 30 % with the pair of the first 70 %, 0.75 % over its own",
+        "              PMSE 4.25 % on 17 readings outside the window, started afresh",
+        "  drift       mu 0.019 to 0.022 along the recording (+16 %)",
+        "  drift       tau 0.41 to 0.37 along the recording (-10 %)",
+        "  note        a note\n  against     it drifts\n  against     it is noisy",
+    ):
+        assert line in text
+    assert "  PMSE        1.25 %   (" in text
+    assert "as in the paper; 2.5 % with the returned pair)" in text
+    assert f"  window      rows 0:{content['rows_used'][1]}, {content['window']}" in text
+    head = environment_yaml(fitted, "mine.csv")
+    assert "# 95 % intervals: mu 0.018 to 0.023 1/min, tau 0.35 to 0.44.\n" in head
+    assert ", PMSE 1.25 %.\n" in head
+    assert "\n# Against it: it drifts.\n# Against it: it is noisy.\n" in head
+    model = OmegaConf.create(head)
+    assert (model.mu, model.tau, model.control_min) == (0.02, 0.4, 1.0)
+
+
+@pytest.mark.parametrize("method", ["free_run", "prediction_error"])
+def test_beside_the_pair_stands_that_of_the_other_method(method: str, fitted: Calibration, shipped: Recording) -> None:
+    assert fitted.free_run is not None
+    free = replace(fitted.free_run, mu=Parameter(0.021, 0.02, 0.022), tau=Parameter(0.3, 0.2, 0.5))
+    estimate = replace(fitted.estimate, mu=Parameter(0.031, 0.03, 0.032), tau=Parameter(0.33, 0.25, 0.37))
+    found = replace(fitted, method=method, sound=True, free_run=free, estimate=estimate)
+    (line,) = (line for line in report(found, shipped, {"doubling_min": 1.0}).splitlines() if "beside" in line)
+    assert line == (
+        "  beside      prediction_error: mu 0.03100 (0.03000 to 0.03200), tau 0.3300 (0.2500 to 0.3700)"
+        if method == "free_run"
+        else "  beside      free_run: mu 0.02100 (0.02000 to 0.02200), tau 0.3000 (0.2000 to 0.5000)"
+    )
+
+
+def test_a_proportional_law_is_asked_for_each_setpoint_as_long_and_rests_at_the_start_of_every_hour() -> None:
+    """u = 0.01 + 0.05 (x - r) between 0 and 0.02; three setpoints in three hours, ten minutes of rest in each hour."""
+    protocol = OpenLoop(start_od=0.5, hours=3.0, noise=0.02, control_min=1.0)
+    config = CalibrateConfig(law="proportional", setpoints=(0.4, 0.7, 0.5), rest_min=10.0, gain=0.05, protocol=protocol)
+    time, od, rate, _ = simulated(config, 2)
+    asked = np.where(time < 60.0, 0.4, np.where(time < 120.0, 0.7, 0.5))
+    by_hand = np.clip(0.01 + 0.05 * (od - asked), 0.0, 0.02) * (time % 60.0 >= 10.0)
+    np.testing.assert_allclose(rate[:, :-1], by_hand[:, :-1])
+    assert not np.allclose(rate[0], rate[1])
+
+
+def test_a_generated_recording_is_as_long_as_asked_and_says_what_it_is_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    protocol = OpenLoop(mu=0.021, tau=0.41, hours=2.0, control_min=2.0)
+    config = CalibrateConfig(generate=True, law="threshold", setpoints=(0.4,), protocol=protocol)
+    assert command.body(config, tmp_path) is None
+    content = json.loads((tmp_path / "summary.json").read_text())
+    assert content == {"file": str(tmp_path / "threshold.csv"), "rows": 61, "mu": 0.021, "tau": 0.41}
+    rows = (tmp_path / "threshold.csv").read_text().splitlines()
+    assert (len(rows), rows[0], rows[-1].split(",")[0]) == (62, "time_min,od,pump_rate_ml_s", "120.0")
+    assert f"61 rows (threshold; mu 0.021, tau 0.41) in {tmp_path}/threshold.csv" in capsys.readouterr().out
+    with pytest.raises(frame.UserError, match=r"threshold\.csv: exists; remove it or choose another file"):
+        command.body(config, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("rows", "given"), [(None, (0, None)), ("40:", (40, None)), (":700", (0, 700)), ("5:9", (5, 9)), (":", (0, None))]
+)
+def test_what_is_read_of_a_file_is_what_was_asked_for(
+    rows: str | None, given: tuple[int, int | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, object] = {}
+
+    def read(path: str, **words: object) -> None:
+        asked.update(words, path=path)
+        raise RecordingError("enough")
+
+    monkeypatch.setattr(command, "read_recording", read)
+    config = CalibrateConfig(data="a.csv", rows=rows, run=2, reactor="M3", pump_ml_s=0.02, pumps=(1, 3))
+    with pytest.raises(frame.UserError, match="^enough$"):
+        command.body(config, tmp_path)
+    assert asked == {
+        "path": "a.csv", "rows": given, "run": 2, "reactor": "M3", "pump_ml_s": 0.02, "pumps": (1, 3)
+    }  # fmt: skip

@@ -14,7 +14,7 @@ from envs.identification import curves
 from envs.identification.model import Parameter
 from envs.identification.screening import Series
 from envs.plant.plant import Plant, of_pair
-from experiments.calibrate_pair import CalibratePairConfig, _pigment, calibrate_pair
+from experiments.calibrate_pair import CalibratePairConfig, _growth, _pigment, _plateaus, _say, calibrate_pair
 from experiments.cli import frame
 from hardware.storage.marks import Mark, add_mark
 from tests.envs.test_plant import preset
@@ -236,3 +236,77 @@ def test_production_is_what_balances_dilution_by_hand() -> None:
     ]
     found = _pigment(points, CalibratePairConfig(factor=0.7, od_term=900.0))
     np.testing.assert_allclose(found.steady(t), growth * (light / 0.7 - 900.0), rtol=1e-9)
+
+
+def at(degc: float, growth: float, half: float = 0.01, light: float | None = None) -> curves.Plateau:
+    lit = None if light is None else Parameter(light, light, light)
+    return curves.Plateau(degc, Parameter(growth, growth - half, growth + half), lit, 0, 1)
+
+
+def test_points_count_by_their_own_band_and_by_how_far_cultures_differ() -> None:
+    """sd of 1/1.96 of half the band and of 2 % of the rate together; a line through four points."""
+    points = [at(28.0, 0.4, 0.01), at(30.0, 0.5, 0.05), at(32.0, 0.7, 0.002), at(34.0, 0.7, 0.02)]
+    found = _growth("alpha", points, 2.0, CalibratePairConfig(degree=1))
+    t, value = np.array([28.0, 30.0, 32.0, 34.0]), np.array([0.4, 0.5, 0.7, 0.7])
+    sd = np.sqrt((np.array([0.01, 0.05, 0.002, 0.02]) / 1.96) ** 2 + (0.02 * value) ** 2)
+    w = 1.0 / sd**2
+    mean = (w * t).sum() / w.sum(), (w * value).sum() / w.sum()
+    slope = (w * (t - mean[0]) * (value - mean[1])).sum() / (w * (t - mean[0]) ** 2).sum()
+    np.testing.assert_allclose(found.coefficients, [slope, mean[1] - slope * mean[0]], rtol=1e-6)
+    np.testing.assert_allclose(found.off, (value - mean[1] - slope * (t - mean[0])) / sd, rtol=1e-6)
+
+
+def test_too_few_temperatures_are_told_of_the_species_with_the_minutes_that_its_own_lag_asks_for(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Four lags of 60 min and an hour behind them; 30.2 and 30.4 degC are one temperature."""
+    few = [at(30.2, 0.5), at(30.4, 0.5), at(33.0, 0.6)]
+    for lag, minutes in ((60.0, 300), (2.0, 180)):
+        with pytest.raises(
+            frame.UserError, match=rf"^beta: growth at 2 temperature\(s\); .* each held for {minutes} min"
+        ):
+            _growth("beta", few, lag, CalibratePairConfig())
+    config = CalibratePairConfig(settle_min=200.0, least_min=45.0)
+    with pytest.raises(frame.UserError, match="held for 245 min"):
+        _growth("beta", few, 2.0, config)
+    assert caplog.text == ""
+    exact = _growth("beta", [*few, at(35.0, 0.9)], 2.0, CalibratePairConfig(degree=4))
+    assert len(exact.coefficients) == 3
+    assert "beta: a curve through all of its 3 points: nothing tells how good it is; record more" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("cells", "said"),
+    [
+        (["", ""], "no temperature in it; give a recording with a column temperature_degc"),
+        (["303", "300"], "temperatures of 300 to 303: allowed 4 to 60 degC; are they in degC"),
+        (["3.9", "31"], "temperatures of 3.9 to 31: allowed"), (["60.5", "31"], "temperatures of 31 to 60.5: allowed"),
+    ],
+)  # fmt: skip
+def test_a_recording_whose_temperatures_cannot_be_is_named(cells: list[str], said: str, tmp_path: Path) -> None:
+    path = tmp_path / "b.csv"
+    rows = "".join(f"{k},0.5,0.001,{cells[k % 2]}\n" for k in range(400))
+    path.write_text(f"time_min,od,pump_rate_ml_s,temperature_degc\n{rows}")
+    with pytest.raises(frame.UserError, match=rf"b\.csv: {said}"):
+        _plateaus((str(path),), 2.0, CalibratePairConfig())
+
+
+def test_the_screen_says_of_each_species_its_own_points_and_who_gains_where(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """0.06 T - 1.1 and -0.01 T^2 + 0.6 T - 8.1: at 27 degC 0.52 and 0.81 1/h, at 35 degC 1.0 and 0.65."""
+    points = [[at(27.0, 0.52), at(35.0, 1.0, 0.02)], [at(28.0, 0.86, 0.03, 4100.0)]]
+    found = [curves.Curve((1.0,), np.array([0.25, -1.5])), curves.Curve((1.0,), np.array([2.0]))]
+    told = {"first": 0.021, "first_sd": 0.004, "second": -0.104, "second_sd": 0.012, "even_c_alone": 32.126}
+    _say(CalibratePairConfig(names=("alpha", "beta")), TRUE, points, found, told, tmp_path)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "alpha: 1/h at degC, and its distance from the curve in sds"
+    assert lines[1:3] == ["   27.00  0.5200 (0.5100 to 0.5300)  +0.2", "   35.00  1.0000 (0.9800 to 1.0200)  -1.5"]
+    assert lines[4] == "   28.00  0.8600 (0.8300 to 0.8900)  +2.0   light per OD 4100"
+    assert lines[5] == (
+        "mixed: curves off by +0.021 +- 0.004 and -0.104 +- 0.012, corrected; they crossed at 32.13 degC"
+    )
+    crossing = (0.54 + np.sqrt(0.54**2 - 4 * 0.01 * 7.0)) / 0.02  # of the two curves, within 27 to 35 degC
+    gains = "beta gains +0.290 1/h at 27 degC and -0.350 at 35"
+    assert lines[6] == f"both grow alike at {crossing:.2f} degC; {gains}"
+    assert lines[7] == f"files {tmp_path}/pair.yaml, {tmp_path}/figures/pair.png"
