@@ -16,7 +16,8 @@ from dqn.config import DQNConfig
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
-from experiments.cli import frame, reference
+from experiments import __main__ as program
+from experiments.cli import completion, frame, reference
 from experiments.cli.calibrated import read_env_file
 from experiments.control.config import deploy_schema
 from experiments.train import main
@@ -463,3 +464,90 @@ def test_a_value_beside_resume_is_refused_wherever_it_is_typed(where, tmp_path, 
 
 def test_a_recipe_says_which_command_it_is_for():
     assert {presets.owner(f"experiment/{option}") for option in options("experiment")} == {"benchmark", "train"}
+
+
+def test_each_part_of_a_benchmark_is_the_preset_of_its_name():
+    """But the agent of `dqn`, which is the tuned one, and the controller that flies the paper's policy."""
+    said = [entry for entry in yaml.safe_load((CONF / "benchmark.yaml").read_text())["defaults"] if entry != "base"]
+    named = {part: option for entry in said if isinstance(entry, dict) for part, option in entry.items() if "@" in part}
+    assert len(named) > 40
+    other = {part: option for part, option in named.items() if part.rpartition(".")[2] != option}
+    assert other == {
+        "agent@agents.dqn": "tuned", "agent@agents.dqn_paper": "paper", "controller@controllers.dqn_paper": "dqn",
+    }  # fmt: skip
+    for part in named:
+        group, _, place = part.partition("@")
+        assert place.startswith(f"{reference.SINGULAR.get(group, group)}s.")
+
+
+def test_what_a_command_begins_with_when_nothing_is_chosen():
+    assert {name: {k: v for k, v in presets.chosen(name).items() if v} for name in COMMANDS} == {
+        "benchmark": {"env": "sim"}, "blank": {"backend": "chibio"}, "calibrate": {}, "calibrate_pair": {},
+        "calibrate_pump": {"backend": "chibio"}, "certify": {}, "mark": {}, "report": {},
+        "train": {"env": "sim", "agent": "tuned"},
+        "deploy": {
+            "backend": "sim", "plant": "nominal_noise", "safety": "default", "controller": "dqn",
+            "scenario": "setpoint_steps",
+        },
+    }  # fmt: skip
+
+
+def test_a_job_of_a_cluster_is_told_of_its_end_and_queued_again():
+    """Two hours of one core, told two minutes before their end; the search takes its trials one by one."""
+    slurm = yaml.safe_load((CONF / "hydra" / "launcher" / "slurm.yaml").read_text())
+    assert (slurm["timeout_min"], slurm["signal_delay_s"], slurm["max_num_timeout"]) == (120, 120, 100)
+    assert (slurm["cpus_per_task"], slurm["mem_gb"], slurm["defaults"]) == (1, 2, ["submitit_slurm"])
+    assert [word.partition("=")[2] for word in slurm["setup"][0].split()[1:]] == ["1"] * 3
+    search = yaml.safe_load((CONF / "hydra" / "sweeper" / "search.yaml").read_text())
+    assert (search["trials"], search["at_once"], search["space"]) == (20, 1, {})
+
+
+@pytest.mark.parametrize(
+    ("words", "understood"),
+    [
+        (["env=relative"], ["env=relative", "agent=relative"]), (["env=sim", "seed=1"], ["env=sim", "++seed=1"]),
+        (["+env=coculture_preview"], ["env=coculture_preview", "agent=coculture_preview"]),
+        (["env=relative", "agent=paper"], ["env=relative", "agent=paper"]),
+        (["agent=paper", "env=relative"], ["agent=paper", "env=relative"]),
+        (["env=relative,sim"], ["env=relative,sim"]),
+        (["resume=null", "seed=2"], ["++resume=null", "++seed=2"]),
+    ],
+)  # fmt: skip
+def test_with_a_task_comes_the_agent_that_belongs_to_it_unless_another_is_chosen(words, understood):
+    assert frame.normalise(words, "train") == understood
+
+
+def test_of_two_folders_to_resume_the_last_is_taken(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yaml").touch()
+    words = frame.normalise([f"resume={tmp_path}/a", f"resume={tmp_path}/b"], "train")
+    assert words[-2:] == [f"hydra.run.dir={tmp_path}/b", "hydra.output_subdir=null"]
+    with pytest.raises(frame.UserError, match=rf"^resume={tmp_path}/c: no run folder \(it holds no config\.yaml\)"):
+        frame.normalise([f"resume={tmp_path}/c"], "train")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("turbidostat completion z", ["zsh"]), ("turbidostat calibrate_", ["calibrate_pump ", "calibrate_pair "]),
+        ("turbidostat deploy force_policy=", ["force_policy=true ", "force_policy=false "]),
+        ("turbidostat deploy at_end=", ["at_end=hold ", "at_end=stop ", "at_end=regulate "]),
+        ("turbidostat deploy +scenario=ratio_s", ["+scenario=ratio_sine ", "+scenario=ratio_steps "]),
+        ("turbidostat deploy safety.responses.bud", ["safety.responses.budget="]), ("turbidostat nonsense ", []),
+        ("turbidostat deploy safety.resp", ["safety.responses."]), ("turbidostat demo ", ["--help"]),
+        ("turbidostat calibrate --", ["--help", "--help=all", "--cfg", "--multirun"]),
+    ],
+)  # fmt: skip
+def test_a_shell_is_offered_what_fits_where_the_line_stands(line, words):
+    assert completion.candidates(line, program.names()) == words
+
+
+def test_a_command_that_no_heading_lists_stands_below_others(monkeypatch):
+    monkeypatch.setattr(program, "commands", lambda: ["audit", "blank", "deploy"])
+    monkeypatch.setattr(program, "sentence", lambda name: f"What {name} does.")
+    page = list(program.page())
+    assert program.names()[-1] == "audit"
+    assert page[page.index("Others") + 1].split() == ["audit", "What", "audit", "does."]
+    assert page.count("  blank           What blank does.") == 1
+    assert page.index("At the device") < page.index("  mark            What mark does.") < page.index("Side by side")

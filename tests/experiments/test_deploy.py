@@ -5,9 +5,10 @@ import json
 import os
 import subprocess
 import sys
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,9 +20,11 @@ from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
-from experiments.control import assemble, notify, policies
+from experiments.cli import frame
+from experiments.control import assemble, notify, policies, timetable
 from experiments.control import run as control
 from experiments.control.config import DeployConfig
+from experiments.deploy import main as command
 from experiments.laws import registry
 from experiments.laws.density.learned import LearnedController
 from experiments.loop.loop import ClosedLoop
@@ -31,6 +34,7 @@ from experiments.record.summary import ChangeLog
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.resume import replay
 from hardware.errors import DeviceStateError
+from hardware.family import family_of
 from hardware.reactor import Command
 from hardware.safety.config import Responses, SafetyConfig
 from hardware.safety.interlock import Interlock
@@ -223,6 +227,72 @@ def test_a_run_says_which_reactor_was_stopped_and_what_each_of_them_was_given(tm
     assert "M0: the interlock told" not in caplog.text
     starts = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "start"]
     assert [(row["time_s"], row["pid"]) for row in starts] == [(0.0, os.getpid())]
+
+
+@pytest.mark.parametrize(
+    ("ends", "told", "raised"),
+    [
+        ("completed", "completed", None),
+        ("stopped by the interlock: M1", "stopped by the interlock: M1", None),
+        ("stopped by the operator", "stopped by the operator", None),
+        ("failed: disk", "failed: disk", (frame.UserError, "^failed: disk$")),
+        (DeviceStateError("unplugged"), "failed: unplugged", (frame.UserError, "^unplugged$")),
+        (frame.UserError("no policy"), "failed: no policy", (frame.UserError, "^no policy$")),
+        (RuntimeError("a bug"), "ended before its summary: see the log", (RuntimeError, "^a bug$")),
+    ],
+)
+def test_how_a_run_ended_is_told_once_and_a_failure_ends_the_command(ends, told, raised, tmp_path, monkeypatch):
+    heard = []
+
+    class Tell:
+        def __call__(self, event, text, reactor=""):
+            heard.append((event, text))
+
+        def close(self):
+            heard.append("closed")
+
+    def recorded(setup, folder, tell):
+        if isinstance(ends, Exception):
+            raise ends
+        return ends
+
+    asked = []
+    monkeypatch.setattr(notify, "opened", lambda target, run, resumed: asked.append((target, run, resumed)) or Tell())
+    monkeypatch.setattr(control, "_recorded", recorded)
+    config = DeployConfig(controller=registry.config("pi"), notify="mail lab")
+    with nullcontext() if raised is None else pytest.raises(raised[0], match=raised[1]):
+        control.deploy(config, tmp_path)
+    assert heard == [("end", told), "closed"]
+    assert asked == [("mail lab", tmp_path, False)]
+
+
+def test_reactors_around_which_no_loop_can_be_closed_are_stopped(tmp_path, monkeypatch):
+    """An overflow pump may run already."""
+    stopped = []
+    reactors = SimpleNamespace(stop=lambda: stopped.append("stopped"))
+    family = SimpleNamespace(open=lambda opening: nullcontext(reactors))
+    setup = replace(assemble.unpack(DeployConfig(controller=registry.config("pi")), tmp_path), family=family)
+
+    def no_loop(*given):
+        raise DeviceStateError("state.json: damaged")
+
+    monkeypatch.setattr(assemble, "close_loop", no_loop)
+    record = SimpleNamespace(journal=None, folder=tmp_path)
+    with pytest.raises(DeviceStateError, match="damaged"), assemble.opened(setup, record):
+        pass
+    assert stopped == ["stopped"]
+    with pytest.raises(frame.UserError, match="^preflight_only=true: a simulated reactor needs no preflight; use back"):
+        assemble.run_preflight(replace(setup, family=family_of(SimulatedConfig())), tmp_path)
+
+
+def test_a_timetable_names_the_last_folder_that_was_given(monkeypatch, capsys):
+    monkeypatch.setattr(timetable, "timetable", lambda config, place, now: f"{config.controller.kind} in {place}")
+    config = DeployConfig(controller=registry.config("pi"), dry_run=True)
+    monkeypatch.setattr(frame.Command, "config", lambda self, words: config)
+    words = ["dry_run=true", "controller=pi"]
+    command._answer([*words, "hydra.run.dir=a", "hydra.run.dir=b c"])
+    command._answer(words)
+    assert capsys.readouterr().out == "pi in b c\npi in a new folder of runs/deploy/\n"
 
 
 def test_the_perfect_plant_is_the_training_model():

@@ -213,6 +213,14 @@ def test_a_hook_of_the_environment_is_used_and_one_that_is_wrong_stops_no_run_th
     assert tell._hook is not None
     assert (tell._hook.name, tell._hook._command) == ("cat", ["cat", "-"])
     tell.close()
+    monkeypatch.setenv("MY_HOOK", " https://host/T0 ")
+    tell = notify.opened("env:MY_HOOK", tmp_path, resumed=False)
+    assert tell._hook is not None
+    assert (tell._hook.name, tell._hook._target) == ("https://host/…", "https://host/T0")
+    tell.close()
+    monkeypatch.setenv("MY_HOOK", "  ")
+    with pytest.raises(frame.UserError, match="notify=env:MY_HOOK: the environment has no MY_HOOK; set it to"):
+        notify.opened("env:MY_HOOK", tmp_path, resumed=False)
     with pytest.raises(frame.UserError, match="notify: there is no such command"):
         notify.opened("env:OTHER_HOOK", tmp_path, resumed=False)
     caplog.clear()
