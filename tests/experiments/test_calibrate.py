@@ -21,11 +21,13 @@ from envs.identification.screening import Series
 from envs.identification.validation import Validation
 from envs.task import EnvConfig
 from experiments import calibrate as command
+from experiments.calibration import study
 from experiments.calibration.config import CalibrateConfig
 from experiments.calibration.result import environment_yaml, report, summary
 from experiments.calibration.study import against_truth, simulated
 from experiments.cli import frame
 from experiments.cli.calibrated import read_plant_file
+from experiments.reporting import calibration_charts, charts, tensorboard
 from experiments.reporting.verdict import verdict
 from hardware.errors import RecordingError
 from hardware.storage.recording_reader import Recording, read_recording
@@ -503,3 +505,80 @@ def test_what_is_read_of_a_file_is_what_was_asked_for(
     assert asked == {
         "path": "a.csv", "rows": given, "run": 2, "reactor": "M3", "pump_ml_s": 0.02, "pumps": (1, 3)
     }  # fmt: skip
+
+
+def test_files_have_the_name_that_was_given_and_curves_the_numbers_of_each_segment(
+    fitted: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second segment's tau is not known."""
+    parts = (fitted.segments[0], replace(fitted.segments[0], middle_min=99.0, mu=Parameter(0.05, 0.04, 0.06), tau=None))
+    parts = (replace(parts[0], mu=Parameter(0.03, 0.02, 0.04), tau=Parameter(0.3, 0.2, 0.5)), parts[1])
+    found = replace(fitted, segments=parts)
+    written: list[tuple[object, ...]] = []
+
+    class Curves:
+        def __init__(self, folder: Path) -> None:
+            self.scalars = lambda values, step: written.append((values, step))
+            self.picture = lambda tag, path, step: written.append((tag, path, step))
+            self.close = lambda: written.append(("closed",))
+
+    for figure in ("fit_figure", "drift_figure", "twin_figure"):
+        monkeypatch.setattr(calibration_charts, figure, lambda *given, name=figure: (name, given[-1]))
+    monkeypatch.setattr(charts, "save", lambda figure, folder, key: (figure, folder, key))
+    monkeypatch.setattr(tensorboard, "Events", Curves)
+    monkeypatch.setattr(command, "calibrate", lambda raw, config, doubts: found)
+    monkeypatch.setattr(command, "twin", lambda raw, result, segment_min: segment_min)
+    monkeypatch.setattr(command, "twin_yaml", lambda behind, source: f"# {source}, {behind:g}\n")
+    identify = replace(CalibrateConfig().identify, segment_min=75.0)
+    assert command.body(CalibrateConfig(name="mine", identify=identify), tmp_path) == 1.25
+    content = json.loads((tmp_path / "summary.json").read_text())
+    assert content["env_file"] == f"{tmp_path}/mine.yaml"
+    assert Path(content["data"]).name == "open_loop.csv"
+    assert OmegaConf.load(tmp_path / "mine.yaml").tau == 0.4
+    assert (tmp_path / "twin.yaml").read_text() == "# open_loop.csv, 75\n"
+    assert not (tmp_path / "calibrated.yaml").exists()
+    out = capsys.readouterr().out
+    assert "reading the shipped recording\n" in out
+    assert f"  files       {tmp_path}/mine.yaml\n              {tmp_path}/twin.yaml\n" in out
+    results = {"mu_per_min": 0.02, "tau": 0.4, "pmse_pct": 1.25}
+    assert written[:3] == [
+        ({f"calibration/{key}": value for key, value in results.items()}, 0),
+        ({"drift/mu_per_min": 0.03, "drift/tau": 0.3}, 0), ({"drift/mu_per_min": 0.05}, 1),
+    ]  # fmt: skip
+    said = {"fit": "measured and model", "drift": "segments of about 75 min, fitted alone", "twin": "its twin"}
+    assert written[3:-1] == [
+        (f"calibration/{key}", ((f"{key}_figure", f"open_loop.csv: {title}"), tmp_path / "figures", key), 0)
+        for key, title in said.items()
+    ]
+    assert written[-1] == ("closed",)
+
+
+def test_a_study_returns_the_worse_share_of_both_and_says_each(
+    fitted: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Four recordings, one refused; mu is held by one of three intervals and tau by two."""
+    protocol = OpenLoop(tau=0.4, hours=5.0, noise=0.02, seed=4)
+    growth = np.array([0.02, 0.0175, 1.0, 0.024])
+    found = [fitted, fitted, "flat", replace(fitted, tau=Parameter(0.5, 0.45, 0.55))]
+    asked: list[int] = []
+    empty = np.zeros((4, 1))
+    monkeypatch.setattr(study, "simulated", lambda config, n: asked.append(n) or (empty[0], empty, empty, growth))
+    monkeypatch.setattr(study, "fitted", lambda time, od, rate, config, bar=False: found)
+    monkeypatch.setattr(calibration_charts, "coverage_figure", lambda mu, tau, truth, title: (mu[:, 0], truth, title))
+    drawn: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray], str]] = []
+    monkeypatch.setattr(charts, "save", lambda figure, folder, key: drawn.append(figure))
+    config = CalibrateConfig(coverage=4, law="pi", protocol=protocol)
+    assert command.body(config, tmp_path) == pytest.approx(100.0 / 3)
+    assert asked == [4]
+    content = json.loads((tmp_path / "summary.json").read_text())
+    assert content["coverage_pct"] == pytest.approx({"mu": 100.0 / 3, "tau": 200.0 / 3})
+    title = "4 simulated recordings of 5 h under pi, 2 % noise"
+    ((values, truth, figure_title),) = drawn
+    assert figure_title == f"{title} (seed 4)"
+    assert (values.tolist(), truth[0].tolist(), truth[1].tolist()) == ([0.02] * 3, [0.02, 0.0175, 0.024], [0.4] * 3)
+    out = capsys.readouterr().out
+    assert out.startswith(f"{title}\n")
+    # half widths: 0.0025 of 0.02, and 0.045 of 0.4 twice beside 0.05 of 0.5; biases of mu 0, +14.3 and -16.7 %
+    assert "mu: 95 % intervals hold the truth in 33.3 %, median bias +0.00 %, half width 12.5 %\n" in out
+    assert "tau: 95 % intervals hold the truth in 66.7 %, median bias +0.00 %, half width 11.3 %\n" in out
+    assert "refused: 1 of 4; the first: flat\n" in out

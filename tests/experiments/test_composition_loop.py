@@ -118,6 +118,23 @@ def test_where_no_share_is_asked_for_the_schedule_decides_and_the_controller_goe
     assert not keeper.asked[2].any()
 
 
+def test_the_law_is_asked_only_where_something_is_believed_of_the_culture() -> None:
+    """Of four cultures that are asked for a share one was never seen, one's reading is doubtful, one has no goal."""
+
+    class Half(Scripted):
+        begun = np.array([True, False, True, True])  # type: ignore[assignment]
+
+    keeper, n = Half(target=30.0), 4
+    share = held(keeper, [HOLD, HOLD, HOLD, replace(HOLD, ratios=(None,))])
+    at, yes = np.full(n, 5.0), np.ones(n, dtype=np.bool_)
+    believed = np.array([True, True, False, True])
+    m = Measurement(60.0 * at, np.full(n, 0.5), np.full(n, 33.0), yes, fluorescence=np.full(n, 900.0))
+    sample = Sample.of(m, Interlock(n), yes, believed, at, np.zeros(n, dtype=np.intp), at, at)
+    np.testing.assert_array_equal(share.decide(sample), [30.0, 30.0, 30.0, np.nan])
+    assert keeper.asked[2].tolist() == [True, False, False, False]
+    assert keeper.seen[0][4].tolist() == believed.tolist()
+
+
 def test_nothing_is_asked_for_before_the_schedule_begins() -> None:
     keeper = Scripted(target=30.0)
     composed = step(held(keeper, [HOLD]), 5.0, elapsed=np.nan)

@@ -276,6 +276,34 @@ def test_a_level_is_set_in_the_ledger_and_in_the_device_of_the_reactor_it_was_re
         turns(reactors, *[Scenario()] * 3)
 
 
+class Knows:
+    """Learns from counted shares, beside a law of the thermostat's."""
+
+    name, actuator, columns, memory = "share", "thermostat", (), None
+
+    def __init__(self) -> None:
+        self.told: list[object] = []
+
+    def counted(self, n: int, share: float, sd: float, minute: float) -> tuple[str, bool]:
+        self.told.append((n, share, sd, minute))
+        return "taken", False
+
+    def retell(self, rows: object, counted: object, light: object) -> None:
+        self.told.append((rows, counted, light))
+
+
+def test_a_share_is_counted_in_the_reactor_it_was_drawn_from_and_light_is_judged_by_the_run_s_limits() -> None:
+    """Spectrometer counts end at 65534; what is less than the run's own least light is none."""
+    knows, reactors = Knows(), Turns()
+    interlock = Interlock(2, SafetyConfig(light_min=40.0))
+    loop = ClosedLoop(reactors, Shown(), interlock, [Scenario()] * 2, further=[knows])  # type: ignore[list-item]
+    assert loop.counted("M1", 0.25, 0.02, 7.5) == ("taken", False)
+    loop.retell([{"od": [0.5]}], [(1, 0.25, 0.02, 7.5)])
+    assert knows.told == [(1, 0.25, 0.02, 7.5), ([{"od": [0.5]}], [(1, 0.25, 0.02, 7.5)], (40.0, 65534.0))]
+    nobody, _ = turns(reactors, *[Scenario()] * 2)
+    assert nobody.counted("M1", 0.25, 0.02, 7.5) == ("left out: nothing here estimates it", True)
+
+
 def test_a_spare_pump_s_dose_is_as_large_as_the_bench_allows_in_a_period() -> None:
     """0.03 mL/s over 40 s are 1.2 mL at most, so 3 mL come in three of 1 mL: 0.025 mL/s each."""
     bench = Bench(period_s=40.0, max_rate=0.03)

@@ -23,7 +23,7 @@ from experiments.deploy import main
 from experiments.laws import registry
 from experiments.loop.share import Share, ShareWarnings
 from experiments.record.record import Record
-from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig
 from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
@@ -218,6 +218,26 @@ def test_a_device_is_told_to_measure_light_only_where_a_share_is_held(tmp_path: 
     lights = replace(DEVICE.backend, fluorescence=replace(DEVICE.backend.fluorescence, measure=True))
     lit = assemble.unpack(replace(DEVICE, backend=lights), tmp_path)
     assert [signal.name for signal in lit.further] == ["fluorescence"]
+
+
+def test_an_emulated_device_gets_vials_of_the_run_s_two_species_and_keeps_those_that_were_chosen(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    plain = replace(TWO, backend=EmulatorConfig(reactors=("M0", "M1")), scenario=STEPS, pair="ecoli_psyringae")
+    with caplog.at_level("INFO"):
+        whole = assemble.completed(plain)
+    assert (whole.backend.plant, whole.backend.pair) == ("coculture", "ecoli_psyringae")
+    assert (whole.composition.kind, whole.plant) == ("midpoint", plain.plant)
+    said = "composition=midpoint backend.plant=coculture backend.pair=ecoli_psyringae"
+    assert f"the scenario asks for a share: {said}\n" in caplog.text
+    mixed = replace(plain, backend=replace(plain.backend, plant="coculture_mixed"))
+    assert assemble.completed(mixed).backend.plant == "coculture_mixed"
+    usual = build(PlantConfig(), presets.load("plant/nominal_noise"), "plant")
+    caplog.clear()
+    with caplog.at_level("INFO"):
+        simulated = assemble.completed(replace(TWO, **SHARES, plant=usual))
+    assert simulated.plant.second.present
+    assert "the scenario asks for a share: plant=coculture\n" in caplog.text
 
 
 def test_what_a_backend_does_not_take_over_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

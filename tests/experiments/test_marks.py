@@ -276,6 +276,23 @@ def test_what_was_measured_is_told_of_its_own_reactor_with_its_own_numbers(
     ]
 
 
+def test_what_was_counted_stands_before_the_note_which_is_cut_to_a_line(tmp_path: Path) -> None:
+    folder = _under_way(tmp_path / "run")
+    mark(MarkConfig(str(folder), "M0", "x" * 80, share=0.4, sd=0.012, minute=3.0))
+    mark(MarkConfig(str(folder), "M0", level_ml=0.0))
+    mark(MarkConfig(str(folder), "M0", level_ml=40.0, text="foam"))
+    first, second, third = read_marks(folder)
+    assert first == Mark(3.0, "M0", "share 0.4 +- 0.012, " + "x" * 60, None, 0.4, 0.012)
+    assert (second.text, second.level_ml, third.text, third.level_ml) == ("level 0 mL", 0.0, "level 40 mL, foam", 40.0)
+    with pytest.raises(ValueError, match=r"share = 0\.4: allowed null beside level_ml: mark them one after the other"):
+        MarkConfig(str(folder), "M0", share=0.4, level_ml=20.0)
+    with pytest.raises(ValueError, match=r"reactor = '': allowed the one in which level_ml or share was measured"):
+        MarkConfig(str(folder), share=0.4)
+    (folder / "journal.jsonl").write_text("")
+    with pytest.raises(frame.UserError, match=r"run=.*run: has not begun; wait for its first sample"):
+        mark(MarkConfig(str(folder), "M0"))
+
+
 def test_a_sample_may_be_of_any_minute_up_to_the_newest_row_of_any_reactor(tmp_path: Path) -> None:
     """M0 was given up at minute 7, M1 came to minute 93.5; the run is over."""
     over = _under_way(tmp_path / "over", "sim")

@@ -282,6 +282,10 @@ def test_the_command_line_is_cleaned_of_an_address() -> None:
     assert hidden(given, environment) == ["backend=sim", "notify=env:DEPLOY_HOOK"]
     assert environment == {"DEPLOY_HOOK": f"https://h/{SECRET}=1"}
     assert hidden(["notify=mail lab"], environment) == ["notify=mail lab"]
+    assert hidden([f"notify='HTTP://h/{SECRET}'", "pair=https://x"], environment) == [
+        "notify=env:DEPLOY_HOOK", "pair=https://x",
+    ]  # fmt: skip
+    assert environment == {"DEPLOY_HOOK": f"HTTP://h/{SECRET}"}
 
 
 def test_an_address_in_a_file_and_a_variable_that_is_missing_are_refused(tmp_path: Path, caplog) -> None:  # type: ignore[no-untyped-def]
