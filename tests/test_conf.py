@@ -551,3 +551,18 @@ def test_a_command_that_no_heading_lists_stands_below_others(monkeypatch):
     assert page[page.index("Others") + 1].split() == ["audit", "What", "audit", "does."]
     assert page.count("  blank           What blank does.") == 1
     assert page.index("At the device") < page.index("  mark            What mark does.") < page.index("Side by side")
+
+
+def test_a_preset_file_is_called_by_its_name_and_other_files_are_left_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(presets, "_added", {})
+    (tmp_path / "my-vials.2.yaml").write_text("start_od: 0.3\n", encoding="utf-8")
+    words = [f"+plant={tmp_path}/my-vials.2.yaml", "env_file=calibrated.yaml", "controller=pi"]
+    assert frame.normalise(words, "deploy") == ["plant=my_vials_2", "++env_file=calibrated.yaml", "controller=pi"]
+    assert presets.added()["plant/my_vials_2"] == presets.Added(
+        {"start_od": 0.3}, f"The file {tmp_path}/my-vials.2.yaml."
+    )  # fmt: skip
+    assert "my_vials_2" in presets.options("deploy", "plant")
+    with pytest.raises(ValueError, match="^plant = bench: there is a preset of this name already; choose another"):
+        presets.add("plant/bench", {}, "")
+    with pytest.raises(ValueError, match="^vials = mine: no such group; allowed .*, plant, "):
+        presets.add("vials/mine", {}, "")

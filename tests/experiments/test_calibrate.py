@@ -460,13 +460,18 @@ def test_beside_the_pair_stands_that_of_the_other_method(method: str, fitted: Ca
     )
 
 
-def test_a_proportional_law_is_asked_for_each_setpoint_as_long_and_rests_at_the_start_of_every_hour() -> None:
-    """u = 0.01 + 0.05 (x - r) between 0 and 0.02; three setpoints in three hours, ten minutes of rest in each hour."""
+@pytest.mark.parametrize("rest_min", [10.0, 0.0])
+def test_a_proportional_law_is_asked_for_each_setpoint_as_long_and_rests_at_the_start_of_every_hour(
+    rest_min: float,
+) -> None:
+    """u = 0.01 + 0.05 (x - r) between 0 and 0.02; three setpoints in three hours."""
     protocol = OpenLoop(start_od=0.5, hours=3.0, noise=0.02, control_min=1.0)
-    config = CalibrateConfig(law="proportional", setpoints=(0.4, 0.7, 0.5), rest_min=10.0, gain=0.05, protocol=protocol)
+    config = CalibrateConfig(
+        law="proportional", setpoints=(0.4, 0.7, 0.5), rest_min=rest_min, gain=0.05, protocol=protocol
+    )
     time, od, rate, _ = simulated(config, 2)
     asked = np.where(time < 60.0, 0.4, np.where(time < 120.0, 0.7, 0.5))
-    by_hand = np.clip(0.01 + 0.05 * (od - asked), 0.0, 0.02) * (time % 60.0 >= 10.0)
+    by_hand = np.clip(0.01 + 0.05 * (od - asked), 0.0, 0.02) * (time % 60.0 >= rest_min)
     np.testing.assert_allclose(rate[:, :-1], by_hand[:, :-1])
     assert not np.allclose(rate[0], rate[1])
 

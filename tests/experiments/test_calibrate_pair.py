@@ -14,8 +14,10 @@ from envs.identification import curves
 from envs.identification.model import Parameter
 from envs.identification.screening import Series
 from envs.plant.plant import Plant, of_pair
+from experiments import calibrate_pair as command
 from experiments.calibrate_pair import CalibratePairConfig, _growth, _pigment, _plateaus, _say, calibrate_pair
 from experiments.cli import frame
+from experiments.reporting import charts, pair_charts
 from hardware.storage.marks import Mark, add_mark
 from tests.envs.test_plant import preset
 
@@ -310,3 +312,52 @@ def test_the_screen_says_of_each_species_its_own_points_and_who_gains_where(
     gains = "beta gains +0.290 1/h at 27 degC and -0.350 at 35"
     assert lines[6] == f"both grow alike at {crossing:.2f} degC; {gains}"
     assert lines[7] == f"files {tmp_path}/pair.yaml, {tmp_path}/figures/pair.png"
+
+
+def test_a_pair_holds_where_both_were_recorded_and_says_by_what(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Points on both true curves, the second's over less than the first's; to a tenth of a degree within both."""
+    linear, parabola = np.poly1d([0.06, -1.1]), np.poly1d([-0.01, 0.6, -8.1])
+    first = [at(t, float(linear(t))) for t in (27.43, 30.0, 33.0, 35.08)]
+    second = [at(t, float(parabola(t)), 0.01, 4000.0) for t in (28.51, 30.5, 32.5, 34.97)]
+    read: list[tuple[object, ...]] = []
+
+    def plateaus(paths: tuple[str, ...], lag: float, config: CalibratePairConfig) -> list[curves.Plateau]:
+        read.append((paths, lag))
+        return first if paths == ("a.csv", "c.csv") else second
+
+    monkeypatch.setattr(command, "_plateaus", plateaus)
+    monkeypatch.setattr(pair_charts, "pair_figure", lambda pair, points: "drawn")
+    saved: list[tuple[object, ...]] = []
+    monkeypatch.setattr(charts, "save", lambda *given: saved.append(given))
+    config = CalibratePairConfig(("a.csv", "c.csv"), ("b.csv",), ("alpha", "beta"), lags_min=(5.0, 40.0))
+    calibrate_pair(config, tmp_path)
+    assert read == [(("a.csv", "c.csv"), 5.0), (("b.csv",), 40.0)]
+    assert saved == [("drawn", tmp_path / "figures", "pair")]
+    pair = named_pair(str(tmp_path / "pair.yaml"))
+    assert pair.temperatures == (28.6, 34.9)
+    assert (pair.first.name, pair.first.lag_min, pair.second.name, pair.second.lag_min) == ("alpha", 5.0, "beta", 40.0)
+    told = json.loads((tmp_path / "summary.json").read_text())
+    crossing = (0.54 + np.sqrt(0.54**2 - 4 * 0.01 * 7.0)) / 0.02
+    assert told["even_c"] == pytest.approx(crossing, abs=1e-3)
+    assert [[p["temperature"] for p in mine] for mine in told["plateaus"]] == [
+        [27.43, 30.0, 33.0, 35.08], [28.51, 30.5, 32.5, 34.97],
+    ]  # fmt: skip
+    np.testing.assert_allclose(told["off_sd"], np.zeros((2, 4)), atol=1e-6)
+    assert told["mixed"] is None
+    assert "mixed" not in capsys.readouterr().out
+    first[:] = [at(t, float(linear(t))) for t in (24.0, 26.0, 28.1)]
+    with pytest.raises(
+        frame.UserError, match=r"^recorded: alpha at 24\.0 to 28\.1 degC and beta at 28\.5 to 35\.0 degC; al"
+    ):
+        calibrate_pair(config, tmp_path)
+    for wrong, said in (
+        ({"names": ("x", "x")}, "names = .*: allowed two that differ"),
+        ({"names": ("x",)}, "names = .*: allowed two, of the first and of the second species"),
+        ({"lags_min": (60.0, 2.0)}, "lags_min = .*: allowed two of 0 to 600 min, the first not longer"),
+        ({"lags_min": (0.0, 601.0)}, "lags_min = .*: allowed two of 0 to 600 min"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            CalibratePairConfig(**wrong)
+    assert CalibratePairConfig(lags_min=(600.0, 600.0)).lags_min == (600.0, 600.0)

@@ -1,6 +1,7 @@
 """Deploying as a user does: a policy file, a scenario, a simulated reactor, and what is left in the run folder."""
 
 import csv
+import errno
 import json
 import os
 import subprocess
@@ -20,7 +21,7 @@ from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig, step_factors
-from experiments.cli import frame
+from experiments.cli import files, frame
 from experiments.control import assemble, notify, policies, timetable
 from experiments.control import run as control
 from experiments.control.config import DeployConfig
@@ -264,6 +265,24 @@ def test_how_a_run_ended_is_told_once_and_a_failure_ends_the_command(ends, told,
         control.deploy(config, tmp_path)
     assert heard == [("end", told), "closed"]
     assert asked == [("mail lab", tmp_path, False)]
+
+
+def test_a_summary_that_the_disk_refuses_fails_the_run_and_says_how_it_ended(tmp_path, monkeypatch):
+    write = files.write_json
+
+    def full(path, *given, **words):
+        if path.name == "summary.json":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, *given, **words)
+
+    monkeypatch.setattr(control.charts, "save", lambda figure, folder, name: folder / name)
+    monkeypatch.setattr(files, "write_json", full)
+    scenario = Scenario((0.5,), (2.0,), (37.0,))
+    config = DeployConfig(controller=registry.config("pi"), scenario=scenario, fsync=False)
+    why = "^failed: completed; figure and summary not written \\(No space left on device\\)$"
+    with pytest.raises(frame.UserError, match=why):
+        control.deploy(config, tmp_path)
+    assert len((tmp_path / "recordings" / "M0.csv").read_text().splitlines()) == 4
 
 
 def test_reactors_around_which_no_loop_can_be_closed_are_stopped(tmp_path, monkeypatch):

@@ -163,6 +163,7 @@ def test_every_phase_without_a_temperature_gets_that_at_which_both_species_grow_
     whole = assemble.completed(replace(TWO, **SHARES, each=own, pair=pair))
     assert [tuple(s.temperatures) for s in whole.schedules()] == [(degc,) * 4, (degc, 30.0, 31.5, degc)]
     assert whole.plant.pair.even_c == pytest.approx(degc, abs=0.06)
+    assert not whole.plant.second.present  # vials that somebody gave stay as they are
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from dqn import policy
+from envs.bench import Bench
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments import demo
@@ -216,6 +217,32 @@ def test_latest_is_what_train_or_demo_wrote_last(tmp_path: Path, monkeypatch: py
     assert find_policy("latest") == learned
     os.utime(swept, (2e9, 2e9))
     assert find_policy("latest") == swept
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "said", "remedy", "required"),
+    [
+        ("latest", {}, "policy=latest: no training run under runs/", "python -m experiments.train", False),
+        ("nowhere.npz", {}, "policy nowhere.npz: no such file", "give another policy=PATH", True),
+        ("given.npz", {"at_stake": True}, "its regret is 127 %, more than poor_regret_pct = 10 %",
+         "force_policy=true runs it all the same", True),
+        ("given.npz", {"at_stake": True, "forced": True}, "its regret is 127 %",
+         "a device refuses it without force_policy=true", False),
+        ("given.npz", {}, "its regret is 127 %", "a device refuses it without force_policy=true", False),
+    ],
+)  # fmt: skip
+def test_a_look_at_a_policy_says_what_is_wrong_with_it_and_whether_a_run_would_begin(
+    name: str, changes: dict[str, Any], said: str, remedy: str, required: bool, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    given = laws.law()
+    policy.save(tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, "regret_pct": 127.0}))
+    asked = policies.Wanted(name, Bench(), EnvConfig(), {}, (0.5,), 10.0, at_stake=False, forced=False)
+    found = policies.policy_check(replace(asked, **changes))
+    assert (found.name, found.remedy, found.required) == ("policy", remedy, required)
+    assert said in found.detail
+    assert not found.ok
 
 
 @pytest.fixture(scope="module")

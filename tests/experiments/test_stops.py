@@ -337,3 +337,23 @@ def test_the_demo_explains_itself_and_does_nothing_else(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert "calibrate, train" in done.stdout
     assert not list(tmp_path.iterdir())
+
+
+def test_signals_that_waited_go_each_once_to_whoever_listened_for_them(capsys: pytest.CaptureFixture[str]) -> None:
+    """A cluster may repeat its own; nothing is passed on twice."""
+    heard: list[int] = []
+    with stop.handled(lambda number, frame: heard.append(number), signal.SIGUSR1, signal.SIGTERM):
+        with stop.pausing("at the next step") as pause:
+            assert not pause()
+            for number in (signal.SIGUSR1, signal.SIGUSR1):
+                signal.raise_signal(number)
+            assert pause()
+            assert heard == []
+            pause.pass_on()
+            assert (heard, pause()) == ([signal.SIGUSR1], False)
+            signal.raise_signal(signal.SIGTERM)
+            pause.pass_on()
+        signal.raise_signal(signal.SIGTERM)  # as before
+    assert heard == [signal.SIGUSR1, signal.SIGTERM, signal.SIGTERM]
+    said = capsys.readouterr().out.splitlines()
+    assert said == ["stopping at the next step; once more stops at once"] * 2

@@ -252,6 +252,20 @@ def test_of_many_errors_three_are_told_each_with_three_of_its_jobs(tmp_path: Pat
     assert "other" not in sweep.errors(tmp_path, [[f"seed={k}"] for k in range(7)])
 
 
+def test_what_an_earlier_life_left_goes_aside_but_its_record_and_its_log(tmp_path: Path) -> None:
+    for name in (".hydra", "recordings", "stopped_1"):
+        (tmp_path / name).mkdir()
+    for name in ("job.json", ".lock", "deploy.log", "config.yaml", "journal.jsonl"):
+        (tmp_path / name).touch()
+    sweep.Job(tmp_path).put_aside()
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        ".hydra", ".lock", "deploy.log", "job.json", "stopped_1", "stopped_2",
+    ]  # fmt: skip
+    assert sorted(p.name for p in (tmp_path / "stopped_2").iterdir()) == ["config.yaml", "journal.jsonl", "recordings"]
+    sweep.Job(tmp_path).put_aside()
+    assert not (tmp_path / "stopped_3").exists()
+
+
 def test_a_job_at_work_elsewhere_is_waited_for_and_one_whose_process_is_gone_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
