@@ -566,3 +566,24 @@ def test_a_preset_file_is_called_by_its_name_and_other_files_are_left_alone(tmp_
         presets.add("plant/bench", {}, "")
     with pytest.raises(ValueError, match="^vials = mine: no such group; allowed .*, plant, "):
         presets.add("vials/mine", {}, "")
+
+
+@pytest.mark.parametrize(
+    ("words", "said", "status"),
+    [
+        (["completion", "fish"], "complete -c turbidostat -a ", None), (["completion", "zsh"], "compdef _turb", None),
+        (["completion", "ksh"], "error: completion: allowed bash, zsh, fish\n", 2),
+        (["completion"], "error: completion: allowed bash, zsh, fish\n", 2),
+        (["complete", "turbidostat", "blan"], "blank \n", None), (["-h"], "usage: turbidostat COMMAND", None),
+        (["calibrat"], "error: calibrat: no such command; did you mean calibrate?\n", 2),
+    ],
+)  # fmt: skip
+def test_the_console_script_answers_by_itself(words, said, status, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["turbidostat", *words])
+    if status is None:
+        program.main()
+    else:
+        with pytest.raises(SystemExit) as ended:
+            program.main()
+        assert ended.value.code == status
+    assert said in "".join(capsys.readouterr())

@@ -241,6 +241,17 @@ def test_a_reactor_whose_schedule_is_over_goes_on_or_rests_as_it_was_told() -> N
         assert loop.over
 
 
+def test_a_spare_pump_gives_nothing_any_more_once_its_schedule_is_over() -> None:
+    """20 mL/h owe half a millilitre every 1.5 min; M0's two steps are over at minute 4, M1's at minute 60."""
+    script = [(float(k), 0.5 + 1e-3 * k, 0.4 + 1e-3 * k) for k in range(8)]
+    short = Scenario((0.5, 0.5), (3.0, 1.0), (37.0, 37.0), outputs=("pump3 20 mL/h", "pump3 20 mL/h"))
+    long = Scenario((0.5,), (60.0,), (37.0,), outputs=("pump4 20 mL/h",))
+    loop, _ = turns(Turns(*script), short, long)
+    pumps = [step.pump.tolist() for step in (loop.step() for _ in range(8)) if step.pump is not None]
+    assert [pump for pump, _ in pumps] == [1, 1, 3, 1, 1, 1, 1, 1]  # what is owed at the end of a step is left out
+    assert [pump for _, pump in pumps] == [1, 1, 4, 1, 4, 1, 4, 1]
+
+
 def test_what_a_device_dosed_by_itself_is_in_the_next_row_of_its_own_and_off_what_its_step_owes() -> None:
     """0.7 mL by M1's third pump, of the 2 mL that its step gives, told between its samples."""
     schedules = [Scenario((0.5,), (60.0,), (37.0,)), Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 2 mL",))]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from envs.coculture.pair import named_pair
-from envs.coculture.task import CocultureConfig
+from envs.coculture.task import SCALES, CocultureConfig
 from experiments.cli import choices, extensions, files, frame, latest, start
 from experiments.cli.calibrated import read_curves
 from experiments.cli.help_page import shown
@@ -62,6 +62,13 @@ def test_curves_that_a_run_has_found_are_those_of_its_own_pair(pair: str | None,
     (own / "recordings").mkdir()
     env = read_curves(str(own / "recordings" / "M1.csv"), given)
     assert (env.scale_e, env.scale_p) == pytest.approx((1.0, 0.9))
+
+
+def test_curves_beyond_what_a_training_allows_are_taken_to_its_ends(tmp_path: Path) -> None:
+    """E. coli at three times its curve, the other at a hundredth; before, both were believed to be right."""
+    folder = left(tmp_path / "run", None, M0=[(0.0, 0.0), (2.0, -0.99)])
+    env = read_curves(folder, CocultureConfig())
+    assert (env.scale_e, env.scale_p) == (SCALES[1], SCALES[0])
 
 
 def test_files_of_the_environment_and_of_the_command_line_are_both_loaded(

@@ -103,3 +103,14 @@ def test_the_steady_error_is_that_of_the_last_ten_minutes_with_both_their_ends()
     od[0, 19], od[0, 20], od[1, 30] = 0.9, 0.63, 0.41
     m = window_metrics(minute, od, 0.5, 0.0, 30.0)
     np.testing.assert_allclose(m.steady_abs_error, [(0.13 + 10 * 0.02) / 11, (0.09 + 10 * 0.02) / 11])
+
+
+def test_a_window_whose_first_sample_is_missing_is_integrated_from_the_next_one() -> None:
+    """e = 0.1 from minute 2 on of 30, and to minute 28; |e| by time is half of 28^2 - 2^2, times 0.1."""
+    minute = np.arange(0.0, 31.0)[None]
+    od = np.full((1, 31), 0.6)
+    od[0, [0, 1, 29, 30]] = np.nan
+    m = window_metrics(minute, od, 0.5, 0.0, 30.0)
+    assert m.ise[0] == pytest.approx(26 * 0.01)
+    assert m.itae[0] == pytest.approx(0.1 * (28.0**2 - 2.0**2) / 2)
+    assert m.abs_error[0] == pytest.approx(26 * 0.1 / 30.0)
