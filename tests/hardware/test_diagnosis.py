@@ -9,6 +9,7 @@ import pytest
 
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.diagnosis import diagnose, fault_of
+from hardware.chibio.onboard_regulation import regulates
 from hardware.chibio.protocol import DeviceState, parse_state
 from hardware.errors import DeviceStateError, IdentityError, LinkError, ProtocolError, ReactorError
 from tests.hardware.script import state
@@ -94,3 +95,34 @@ def test_what_an_error_of_a_read_means(error: ReactorError, present: bool, kind:
 def test_who_stopped_an_experiment(ended: str, words: str) -> None:
     expected = EXPECTED | {"ended": ended}
     assert words in str(diagnose(replace(SOUND, running=False), CONFIG, age_s=0.0, **expected))
+
+
+def test_a_sample_is_stalled_by_the_age_that_is_set_and_a_restart_by_another() -> None:
+    slow = ChiBioConfig(stale_s=150.0, lost_s=420.0)
+    assert diagnose(SOUND, slow, age_s=149.0, **EXPECTED) is None
+    fault = diagnose(SOUND, slow, age_s=151.0, **EXPECTED)
+    assert fault is not None
+    assert (fault.kind, fault.detail) == ("stalled", "no new sample for 151 s, cycles 5")
+    assert "after 420 s its experiment is restarted" in fault.remedy
+
+
+@pytest.mark.parametrize(("on", "target", "as_left"), [(1, 0.5, True), (1, 0.503, False), (0, 0.5, False)])
+def test_a_device_regulates_at_the_setpoint_it_was_left_with_and_at_no_other(
+    on: int, target: float, as_left: bool
+) -> None:
+    found = read(OD__ON=on, OD__target=target)
+    assert regulates(found, 0.5) is as_left
+    assert not regulates(found, math.nan)
+
+
+def test_a_pump_that_is_on_late_is_told_from_one_that_somebody_switched_on() -> None:
+    two = replace(SOUND, pumps_on=(True, False, False, True))
+    alone = replace(SOUND, pumps_on=(False, False, True, False))
+    for found, late, words in (
+        (alone, "Pump3", "pumps on: Pump3, by a command of this program that was heard late"),
+        (alone, "Pump1", "pumps on: Pump3, not by this program"),
+        (two, "Pump1", "pumps on: Pump1, Pump4, not by this program"),
+    ):
+        fault = diagnose(found, CONFIG, age_s=0.0, late=late, **EXPECTED)
+        assert fault is not None
+        assert fault.detail == words

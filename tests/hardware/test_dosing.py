@@ -1,12 +1,27 @@
 """Volume to duty and back: by formula, by property, and from weighed doses."""
 
+import math
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware.chibio.dosing import DosingConfig, PumpCalibration, ReactorCalibration, fit_pump, plan_dose
+from hardware.chibio.calibrations import load_calibrations, save_calibration
+from hardware.chibio.config import ChiBioConfig
+from hardware.chibio.dosing import (
+    DosingConfig,
+    PumpCalibration,
+    ReactorCalibration,
+    SupplyConfig,
+    fit_pump,
+    plan_dose,
+)
+from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import PERIOD_S
+from hardware.errors import UnfitError
 
 CONFIG = DosingConfig()
 
@@ -225,3 +240,87 @@ def test_a_stored_calibration_reads_back() -> None:
     for wrong in (70.0, None, "fast"):
         with pytest.raises(ValueError, match=r"flow_ml_s|pump calibration.*weigh|fast"):
             PumpCalibration.from_dict({"flow_ml_s": wrong})
+
+
+def test_spare_pumps_have_each_their_own_flow_and_both_the_same_bias() -> None:
+    """63 s of a duty of 0.05 are 3.15 s; the motor runs 0.1 s longer."""
+    supply = SupplyConfig(pump3_ml_s=0.9, pump4_ml_s=0.4, bias_s=0.1)
+    flows = [supply.flow_ml_s(pump) for pump in ("Pump1", "Pump2", "Pump3", "Pump4")]
+    assert flows == [0.0, 0.0, 0.9, 0.4]
+    assert [supply.most_ml(pump) for pump in ("Pump3", "Pump4")] == pytest.approx([0.9 * 3.25, 0.4 * 3.25])
+    assert supply.calibration("Pump4").volume(1.0) == pytest.approx(0.44)
+    assert (supply.pumps, SupplyConfig(pump4_ml_s=0.3).pumps) == (("Pump3", "Pump4"), ("Pump4",))
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"pump4_ml_s": 0.19}, "backend.supply.pump4_ml_s = 0.19: allowed 0 or 0.2 to 1.5 mL/s"),
+        ({"pump3_ml_s": 1.5, "bias_s": 0.1}, "backend.supply.pump3_ml_s = 1.5: allowed so much that .* at most 0.5 mL"),
+        ({"pump3_ml_s": 1.5, "bias_s": 0.03}, None),
+        ({"pump4_ml_s": 0.2}, None),
+    ],
+)
+def test_a_spare_pump_can_give_the_smallest_dose(values: dict[str, float], words: str | None) -> None:
+    if words is None:
+        SupplyConfig(**values)
+    else:
+        with pytest.raises(ValueError, match=words):
+            SupplyConfig(**values)
+
+
+def test_each_reactor_s_pumps_and_blank_are_those_of_its_own_files(tmp_path: Path) -> None:
+    feeds = {"M0": PumpCalibration(0.8, 0.02, date="2026-01-01"), "M3": PumpCalibration(0.6, date="2026-01-02")}
+    waste = PumpCalibration(1.3, -0.05, 0.2, 0.5, "2026-01-03", "77")
+    for name, feed in feeds.items():
+        assert save_calibration(tmp_path / "new", name, "feed", feed.as_dict()).name == f"{name}_feed.yaml"
+    save_calibration(tmp_path / "new", "M3", "waste", waste.as_dict())
+    save_calibration(tmp_path / "new", "M3", "blank", {"blank": 14250.5, "sd": 30.0})
+    first, third, seventh = load_calibrations(tmp_path / "new", ("M0", "M3", "M7"))
+    assert (first.feed, first.waste) == (feeds["M0"], PumpCalibration())
+    assert (third.feed, third.waste, third.blank) == (feeds["M3"], waste, 14250.5)
+    assert [math.isnan(c.blank) for c in (first, third, seventh)] == [True, False, True]
+    assert [c.calibrated for c in (first, third, seventh)] == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("blank: 60001", r"calibration of M3 in .*: blank = 60001.0: allowed 3000 to 60000 counts"),
+        ("blank: 2999", "blank = 2999.0"),
+        ("blank: dark", "calibration of M3"),
+        ("- 1", "M3_blank.yaml: no keys and values"),
+        ("blank: {", "M3_blank.yaml: not readable"),
+        ("blank: 60000", None),
+        ("", None),
+    ],
+)
+def test_a_blank_that_is_none_names_its_reactor(tmp_path: Path, content: str, words: str | None) -> None:
+    save_calibration(tmp_path, "M0", "blank", {"blank": 12000.0})
+    (tmp_path / "M3_blank.yaml").write_text(content)
+    if words is None:
+        assert load_calibrations(tmp_path, ("M0", "M3"))[0].blank == 12000.0
+    else:
+        with pytest.raises(UnfitError, match=words):
+            load_calibrations(tmp_path, ("M0", "M3"))
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"stale_s": 180.0}, "backend.lost_s = 180.0 s: allowed more than stale_s = 180.0 s"),
+        ({"stale_s": 179.0}, None),
+        (
+            {"overflow_pump": OverflowPumpConfig("Pump4", 0.5), "supply": SupplyConfig(pump4_ml_s=0.5)},
+            "backend.supply = Pump4: allowed another pump than the overflow pump",
+        ),
+        ({"overflow_pump": OverflowPumpConfig("Pump3", 0.5), "supply": SupplyConfig(pump4_ml_s=0.5)}, None),
+    ],
+)
+def test_settings_that_forbid_one_another_are_named(values: dict[str, Any], words: str | None) -> None:
+    if words is None:
+        permitted = ChiBioConfig(**values).permitted
+        assert permitted.reactors == ("M0",)
+    else:
+        with pytest.raises(ValueError, match=words):
+            ChiBioConfig(**values)

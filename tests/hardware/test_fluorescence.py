@@ -21,6 +21,7 @@ from hardware.errors import DeviceStateError
 from hardware.simulated import SimulatedConfig, SimulatedReactors
 from tests.hardware.driver_lab import DriverLab
 from tests.hardware.emulator_lab import Lab
+from tests.hardware.script import state
 
 ON = FluorescenceSlotConfig(measure=True)
 COMMAND = "/SetFPMeasurement/FP1/LEDA/CLEAR/nm440/OFF/x10"
@@ -150,6 +151,21 @@ def test_settings_that_somebody_changes_are_put_right_in_one_go() -> None:
     assert (slot(bench)["ON"], slot(bench)["LED"], toggles(bench)) == (1, "LEDA", before + 2)
     assert station.fluorescence.trouble == ""
     assert "was found set to LEDB, CLEAR, nm440, x10 and put right" in bench.of("note")[-1]["note"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("LED", "LEDC"), ("BaseBand", "nm670"), ("Emit1Band", "nm510"), ("Gain", "x4")]
+)
+def test_any_setting_of_the_slot_that_somebody_changes_is_seen(key: str, value: str) -> None:
+    def wrong(**changes: Any) -> str:
+        settings = {"ON": 1, "LED": "LEDA", "BaseBand": "CLEAR", "Emit1Band": "nm440", "Gain": "x10"} | changes
+        read = state(**{f"FP2__{name}": setting for name, setting in settings.items()})
+        return replace(ON, slot="FP2").wrong(parse_state(json.dumps(read).encode()))
+
+    assert (wrong(), wrong(ON=0)) == ("", "off")
+    said = wrong(**{key: value})
+    assert said.startswith("set to ")
+    assert value in said
 
 
 def test_a_toggle_selects_its_reactor_itself() -> None:

@@ -68,13 +68,21 @@ def test_values_out_of_range_name_key_value_and_range(values: dict[str, Any], me
 
 
 @pytest.mark.parametrize(
-    ("on", "target", "seen"), [(1, 0.5, ""), (0, 0.5, "off"), (1, 0.1, "at a duty of 0.1"), (1, math.nan, "at a duty")]
+    ("on", "target", "seen"),
+    [
+        (1, 0.5, ""),
+        (0, 0.5, "off"),
+        (1, 0.1, "at a duty of 0.1"),
+        (1, 0.49, "at a duty of 0.49"),
+        (1, math.nan, "at a"),
+    ],
 )
 def test_what_a_read_shows_of_it(on: int, target: float, seen: str) -> None:
     found = parse_state(json.dumps(state(Pump3__ON=on, Pump3__target=target)).encode())
     assert PUMP.wrong(found).startswith(seen)
     assert bool(PUMP.wrong(found)) == bool(seen)
     assert not OverflowPumpConfig().wrong(found)
+    assert OverflowPumpConfig("Pump4", 0.5).wrong(found) == "off"  # it looks at its own pump
     assert (OverflowPumpConfig("Pump3", 0.5, 2.0).removes_ml_s, OverflowPumpConfig().removes_ml_s) == (1.0, 0.0)
 
 

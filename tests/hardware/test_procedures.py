@@ -1,10 +1,15 @@
 """Work on the bench in virtual time: what becomes of the counts that are averaged to a blank."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from hardware.chibio.procedures import measure_blanks, warm_up
-from hardware.errors import DeviceStateError
+from hardware.chibio.procedures import dose_series, measure_blanks, warm_up
+from hardware.clock import VirtualClock
+from hardware.errors import DeviceStateError, SensorError
+from hardware.reactor import Measurement, Vitals
 from tests.hardware.driver_lab import DriverLab
 
 
@@ -43,3 +48,100 @@ def test_no_blank_is_taken_while_something_is_wrong() -> None:
     with pytest.raises(DeviceStateError, match="M0: pump"):
         measure_blanks(lab.reactors, 5)
     assert lab.device.apps["M0"].data["OD0"]["target"] == before
+
+
+class Told:
+    """Two reactors whose counts and temperatures are told minute by minute; `blanks` are those that were set."""
+
+    def __init__(
+        self, counts: list[tuple[float, float]], degc: list[tuple[float, float]], target: float = 33.0
+    ) -> None:
+        self.names, self.config = ("M0", "M6"), SimpleNamespace(temperature=target)
+        self.counts, self.degc, self.minute, self.blanks = counts, degc, 0, dict[str, float]()
+        self.stations = [
+            SimpleNamespace(set_blank=lambda v, name=name: self.blanks.update({name: v})) for name in self.names
+        ]
+
+    def elapsed(self) -> float:
+        return 60.0 * self.minute
+
+    def measure(self) -> Measurement:
+        k, self.minute = min(self.minute, len(self.counts) - 1), self.minute + 1
+        vitals = Vitals(np.zeros(2), np.array(self.counts[k]), (None, None))
+        degc = np.array(self.degc[min(k, len(self.degc) - 1)])
+        return Measurement(np.full(2, self.elapsed()), np.full(2, 0.0), degc, np.ones(2, bool), vitals)
+
+
+@pytest.mark.parametrize(
+    ("counts", "refused"),
+    [
+        ((3000.0, 3004.0), None),
+        ((2990.0, 3000.0), r"M6: blank 2995 \+- 7 counts"),
+        ((59990.0, 60000.0), None),
+        ((60000.0, 60010.0), r"M6: blank 60005 \+- 7 counts"),
+        ((14000.0, 14380.0), None),  # their sd is 1.9 % of their mean
+        ((14000.0, 14420.0), r"M6: blank 14210 \+- 297 counts, allowed 3000 to 60000 with a scatter under 2 %"),
+    ],
+)
+def test_a_blank_that_none_can_be_is_refused_and_no_reactor_is_set(counts: Any, refused: str | None) -> None:
+    told = Told([(12000.0, counts[0]), (12010.0, counts[1]), (99.0, 99.0)], [(33.0, 33.0)])
+    if refused is None:
+        mean, _ = measure_blanks(told, 2)  # type: ignore[arg-type]
+        assert told.blanks == {"M0": 12005.0, "M6": pytest.approx(sum(counts) / 2.0)}
+        assert mean[1] == told.blanks["M6"]
+    else:
+        with pytest.raises(SensorError, match=refused):
+            measure_blanks(told, 2)  # type: ignore[arg-type]
+        assert told.blanks == {}
+
+
+def test_a_vial_that_does_not_become_warm_is_named_with_its_temperature() -> None:
+    """The first is within 0.5 degC of its 33 all along, the second warms by half a degree a minute."""
+    warming = [(33.4, 25.0 + 0.5 * k) for k in range(60)]
+    told = Told([(9000.0, 9000.0)] * 60, warming)
+    with pytest.raises(SensorError, match=r"M6: 28\.0 degC after 7 min, wanted 33 \+- 0\.5; check heater"):
+        list(warm_up(told, 0.5, 6.5))  # type: ignore[arg-type]
+    told = Told([(9000.0, 9000.0)] * 60, warming)
+    said = list(warm_up(told, 0.5, 30.0, every_min=5.0))  # type: ignore[arg-type]
+    assert said == [(1.0, 25.0), (6.0, 27.5), (11.0, 30.0), (16.0, 32.5)]
+    assert told.minute == 17  # 32.5 and 33 degC are two samples in a row
+
+
+class Pump:
+    """A connection that remembers when it was asked for what."""
+
+    name = "M2"
+
+    def __init__(self, clock: VirtualClock, running: bool = False) -> None:
+        self.clock, self.running, self.asked = clock, running, list[tuple[Any, ...]]()
+
+    def read(self) -> Any:
+        return SimpleNamespace(running=self.running)
+
+    def pumps_off(self) -> None:
+        self.asked.append((self.clock.now(), "off"))
+
+    def target(self, pump: str, duty: float) -> None:
+        self.asked.append((self.clock.now(), pump, duty))
+
+    def switch(self, pump: str, on: bool) -> None:
+        self.asked.append((self.clock.now(), pump, on))
+
+
+def test_doses_that_are_weighed_last_as_long_as_the_device_takes_for_them() -> None:
+    """63 s of a duty of 0.02, and 2 s in which the motor may start late; then 2 s of rest."""
+    clock = VirtualClock()
+    pump = Pump(clock)
+    assert list(dose_series(pump, clock, "Pump2", 0.02, 3)) == [1, 2, 3]  # type: ignore[arg-type]
+    assert pump.asked[:2] == [(0.0, "off"), (0.0, "Pump2", 0.02)]
+    on, off = ([at for at, *what in pump.asked[2:] if what == words] for words in (["Pump2", True], ["off"]))
+    assert on == pytest.approx([0.0, 5.26, 10.52])
+    assert off[:3] == pytest.approx([3.26, 8.52, 13.78])
+    assert off[3:] == [clock.now()]
+    series = dose_series(pump, clock, "Pump1", 0.02, 9)  # type: ignore[arg-type]
+    next(series)
+    before = len(pump.asked)
+    series.close()  # somebody has seen enough
+    assert [what for _, *what in pump.asked[before:]] == [["off"]]
+    with pytest.raises(DeviceStateError, match="M2: an experiment is running"):
+        next(dose_series(Pump(clock, running=True), clock, "Pump1", 0.02, 1))  # type: ignore[arg-type]

@@ -689,6 +689,31 @@ def test_handing_over_leaves_a_culture_that_regulates_itself() -> None:
     assert lab.reactors.stations[0].book.fault is None
 
 
+def test_control_that_is_taken_back_is_on_record_and_stays_so_when_resumed() -> None:
+    lab = DriverLab(("M0", "M1"))
+    lab.reactors.begin()
+    lab.run(2)
+    assert lab.reactors.regulate(np.array([False, True]), np.array([0.4, 0.6])) == []
+    assert lab.reactors.handed_over.tolist() == [False, True]
+    assert lab.device.apps["M1"].data["OD"]["target"] == 0.6
+    assert replay(lab.rows)["M1"].handed_over == 0.6
+    assert lab.reactors.give_up(np.array([False, True])) == []
+    assert [(row["reactor"], row["setpoint"]) for row in lab.of("regulate")] == [("M1", 0.6), ("M1", None)]
+    assert math.isnan(replay(lab.rows)["M1"].handed_over)
+    assert lab.device.apps["M1"].data["OD"]["ON"] == 0
+
+
+def test_each_device_is_heated_stirred_and_told_its_volume_as_the_run_has_it() -> None:
+    lab = DriverLab(("M0", "M1"), temperature=33.5, stir=0.7)
+    bench = Bench(volume_ml=18.0, volumes_ml={"M1": 23.0})
+    lab.reactors = ChiBioReactors(lab.wire, lab.clock, lab.config, [SOUND] * 2, lab.log, bench)
+    lab.reactors.begin()
+    for name, volume_ml in (("M0", 18.0), ("M1", 23.0)):
+        data = lab.device.apps[name].data
+        assert [data[item]["target"] for item in ("Thermostat", "Stir", "Volume")] == [33.5, 0.7, volume_ml]
+    assert [row["temperature"] for row in lab.of("device")] == [33.5, 33.5]
+
+
 # -- end and resume --------------------------------------------------------------------------------------------------
 
 

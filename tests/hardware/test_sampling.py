@@ -182,3 +182,24 @@ def test_what_was_known_of_the_clocks_before_a_restart_says_nothing_of_a_sample_
     clock.sleep(80.0)
     take(sampling, clock, sample(60.0, 2))
     assert sampling.late_s == math.inf
+
+
+def test_looks_are_as_far_apart_as_is_set() -> None:
+    clock = VirtualClock(500.0)
+    sampling = Sampling(replace(CONFIG, poll_s=7.0, retry_s=11.0), clock)
+    sampling.look(sample(math.nan, 0), 500.0)
+    assert sampling.next_poll == 507.0
+    sampling.retry_later()
+    assert sampling.next_poll == 511.0
+    clock.sleep(40.0)
+    sampling.wait_from_now()
+    assert (sampling.next_poll, sampling.arrived_s) == (540.0, 540.0)
+
+
+def test_a_sample_is_made_of_its_own_numbers() -> None:
+    clock = VirtualClock(70.0)
+    sampling = Sampling(CONFIG, clock)
+    seen = replace(STATE, sample_s=60.0, cycles=2, sample_od=0.41, sample_temperature=36.2, raw=8123.0, blank=14321.0)
+    take(sampling, clock, seen)
+    found = (sampling.od, sampling.temperature, sampling.raw, sampling.blank, sampling.at, sampling.key)
+    assert found == (0.41, 36.2, 8123.0, 14321.0, 70.0, (60.0, 2))
