@@ -712,6 +712,41 @@ def test_a_policy_is_proven_on_the_model_that_was_calibrated(tmp_path: Path, mon
     assert [config.env_file for config in asked] == [None] * 3
 
 
+def test_a_certificate_that_finds_no_room_elsewhere_is_said_and_stays_in_the_run_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    write, to = files.write_json, tmp_path / "to.json"
+
+    def full(path: Path, *given: Any, **named: Any) -> None:
+        if path == to:
+            raise OSError(28, "No space left on device")
+        write(path, *given, **named)
+
+    monkeypatch.setattr(files, "write_json", full)
+    monkeypatch.setattr(command, "_summary", lambda source, content, found: {"passed": content["passed"]})
+    for name in (
+        "certification.figure.figure",
+        "reporting.charts.save",
+        "reporting.page.save",
+        "reporting.page.of_runs",
+    ):
+        monkeypatch.setattr(f"experiments.{name}", lambda *given: "drawn")
+    told: list[tuple[Any, ...]] = []
+
+    def tell(*given: Any) -> None:
+        told.append(given)
+
+    events = SimpleNamespace(picture=tell, text=tell, close=lambda: None)
+    monkeypatch.setattr("experiments.reporting.tensorboard.Events", lambda folder: events)
+    found: Any = SimpleNamespace(told=lambda: ["pass  one", "FAIL  two"], quick=False)
+    with caplog.at_level("WARNING"):
+        command._write(tmp_path, tmp_path / "policy.npz", {"passed": False}, to, found)
+    assert caplog.messages == [f"{to}: not written (No space left on device); {tmp_path}/certificate.json is the same"]
+    assert json.loads((tmp_path / "certificate.json").read_text()) == {"passed": False}
+    assert json.loads((tmp_path / "summary.json").read_text()) == {"passed": False}
+    assert told == [("figures/certificate", "drawn", 0), ("run/summary", "- pass  one\n- FAIL  two")]
+
+
 def test_the_summary_of_a_certificate_has_a_row_for_every_case_that_can_be_held(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

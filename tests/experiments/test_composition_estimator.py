@@ -397,3 +397,19 @@ def test_an_od_that_a_dose_does_not_explain_widens_the_spread_of_doses_of_its_ow
     estimator._judge_dose(np.arange(4), off, expected, od, np.array([[True], [True], [False], [True]]))
     wider = (1e4 * 0.01 + 312.5 * 0.06) / (1e4 + 312.5)
     np.testing.assert_allclose(estimator.explain()["dose_spread"], np.sqrt([wider, 0.01, 0.01, 0.01]))
+
+
+def test_the_flow_of_a_pump_is_learned_for_so_many_hours_of_each_culture_s_own_clock():
+    """Half an hour: that of minute 100 learns at 129 and no more at 131, that of minute 110 goes on."""
+    estimator = CompositionEstimator(replace(QUIET, gain_sd=0.05, gain_h=0.5, od_sd=0.05))
+    estimator.reset(2)
+    shown = {100: [True, False], 110: [False, True], 129: [True, True], 131: [True, True]}
+    gains = []
+    for minute, rows in shown.items():
+        od = np.full(2, 0.5 if minute < 120 else 0.7)
+        estimator.watch(od, np.full(2, NAN), np.full(2, 33.2), np.full(2, float(minute)), np.array(rows))
+        estimator.dosed(np.full(2, 1.0))
+        gains.append(estimator.mean[:, 0, GAIN].copy())
+    assert (gains[1] == 1.0).all()
+    assert (gains[2] != 1.0).all()
+    assert (gains[3] == gains[2]).tolist() == [True, False]

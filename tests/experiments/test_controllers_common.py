@@ -134,6 +134,22 @@ def test_a_constant_rate_of_nothing_is_one() -> None:
     assert hold.act(np.ones(1), np.ones(1), np.zeros(1), np.ones(1, dtype=bool))[0] == 0.0
 
 
+def test_what_a_device_can_run_and_what_a_law_is_made_from() -> None:
+    assert registry.on_device("pi_tuned") == "pi_tuned"
+    with pytest.raises(
+        ValueError, match=r"controller_kind = oracle: allowed dqn, pi, pi_tuned, mpc, inverse, threshold, hold$"
+    ):
+        registry.on_device("oracle")
+    taken = {part: [kind for kind in CONFIGS if registry.takes(kind, part)] for part in ("volume_ml", "policy")}
+    assert taken == {"volume_ml": ["pi"], "policy": []}
+    assert registry.takes("dqn", "policy")
+    assert not registry.takes("pi", "policy", registry.SHARE)
+    with pytest.raises(ValueError, match=r"density, law mine: no part models; allowed model, policy, plant"):
+        registry.add("mine", HoldConfig, Hold, "of no use", ["model", "models"])
+    with pytest.raises(ValueError, match=r"controller\.kind = mine: allowed dqn"):
+        registry.config("mine")
+
+
 def test_two_volumes_two_gains_of_the_devices_law() -> None:
     """0.7 ln(x / r) / (240 / V): a vial of 10 mL gets half of what one of 20 mL gets, in whatever order they are."""
     device = registry.build(registry.config("pi"), volume_ml=np.array([10.0, 20.0, 15.0]))
