@@ -20,6 +20,7 @@ from experiments.record import summary
 from experiments.record.curves import Curves, _results, _table
 from experiments.record.record import Record, Table
 from experiments.record.recovery import COLUMNS, Rows, _caught_up, _put_off, load_state
+from experiments.reporting import charts
 from hardware.errors import RecordingError
 from hardware.storage.doses import Ending
 from hardware.storage.marks import Mark, add_mark
@@ -395,3 +396,34 @@ def test_every_decision_is_journalled_for_its_own_reactor_in_the_units_of_the_re
     assert {key: type(expected[key])(row[key]) for key in expected} == expected
     assert rows(tmp_path) == []
     assert json.loads((tmp_path / "state.json").read_text()) == {"journal_row": 2, "began": [1.0, 2.0]}
+
+
+def test_what_a_share_adds_to_a_run_has_curves_of_its_own_names(tmp_path: Path) -> None:
+    """No two values are alike; a reactor that is alone has its curves in the run folder, with figures and outcome."""
+    tags = {
+        "fluorescence": "share/fluorescence", "ratio_setpoint": "share/setpoint", "ratio": "share/estimate",
+        "ratio_low": "share/low", "ratio_high": "share/high", "true_ratio": "share/true",
+        "temperature_target_degc": "culture/temperature_target_degc",
+    }  # fmt: skip
+    values = {key: 10.0 + k for k, key in enumerate(tags)}
+    curves = Curves(tmp_path, ("M0",), True, 0, 1e9)
+    columns = {key: np.array([value, 99.0]) for key, value in values.items()}
+    curves.step(step(4.0, rows=[True, False], columns=columns))
+    pictures = {}
+    for k, name in enumerate(("closed_loop", "composition"), 1):
+        pictures[name] = charts.save(charts.new_figure(1.0, float(k))[0], tmp_path, name)
+    windows = [{"reactor": "M0", "setpoint": 0.5, "ise": 0.25}]
+    curves.end({"outcome": "stopped by you", "windows": windows, "volume_ml": 6.5}, {"seed": 3.0}, pictures)
+    curves.close()
+    found = curves_of(tmp_path)
+    assert {tags[key]: value for key, value in values.items()}.items() <= {
+        tag: points[0][2] for tag, points in found.items()
+    }.items()
+    assert found["result/ise"] == [(4, 1e9 + 240.0, 0.25)]
+    assert found["result/medium_ml"] == [(4, 1e9 + 240.0, 6.5)]
+    assert "result/share_abs_error" not in found
+    events = EventAccumulator(str(tmp_path), size_guidance={"tensors": 0}).Reload()
+    for name, path in pictures.items():
+        assert events.Tensors(f"figures/{name}")[0].tensor_proto.string_val[2] == path.read_bytes()
+    [said] = events.Tensors("run/summary")
+    assert said.tensor_proto.string_val[0].decode().startswith("stopped by you\n\n| reactor | setpoint, OD | ISE")
