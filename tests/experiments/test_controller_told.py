@@ -16,8 +16,8 @@ from experiments.loop.signals import Density, Sample
 from hardware.emulator.device import DeviceOptions
 from hardware.emulator.vial import VialConfig
 from hardware.reactor import Command, Measurement, Receipt
-from hardware.safety.config import SafetyConfig
-from hardware.safety.interlock import Interlock
+from hardware.safety.config import Response, SafetyConfig
+from hardware.safety.interlock import Interlock, Verdict
 from tests.hardware.driver_lab import DriverLab, Law
 
 QUIET = DeviceOptions(vial=VialConfig(outlier_rate=0.0))
@@ -275,6 +275,33 @@ def test_the_heater_of_the_vial_that_is_too_warm_goes_off_and_that_of_the_other_
     assert last.notes == ("M1: cold",)
     assert "hot" in str(last.reasons[1])
     assert last.reasons[0] is None
+
+
+def test_what_the_interlock_demands_is_done_to_its_own_reactor_and_what_failed_is_told_before_the_doses() -> None:
+    """M0's pumps go off, M1 is handed over at its setpoint; one that could not be given up is tried again."""
+    done: list[tuple[object, ...]] = []
+    reactors, n = Turns((0.0, 0.5, 0.4)), 2
+    for name in ("pumps_off", "give_up"):
+        setattr(reactors, name, lambda rows, name=name: done.append((name, rows.tolist())) or [f"M0: {name}"])
+    reactors.regulate = lambda rows, setpoint: done.append((rows.tolist(), setpoint.tolist())) or []  # type: ignore[attr-defined]
+    loop, _ = turns(reactors, *[Scenario()] * 2)
+    none = np.zeros(n, dtype=bool)
+
+    def asked(*codes: Response, left: np.ndarray = none) -> list[str]:
+        done.clear()
+        lines, setpoint = [None] * n, np.array([0.3, 0.6])
+        return loop._respond(Verdict(np.zeros(n), np.array(codes), lines, ((), ()), none, setpoint), left)
+
+    assert asked(Response.PUMPS_OFF, Response.REGULATE) == ["M0: pumps_off"]
+    assert done == [("pumps_off", [True, False]), ([False, True], [0.3, 0.6])]
+    assert asked(Response.HOLD, Response.PASS, left=np.array([False, True])) == []
+    assert done == [([False, True], [0.3, 0.6])]
+    assert asked(Response.STOP, Response.STOP) == ["M0: give_up"]
+    assert loop.stopped.tolist() == [False, True]
+    assert asked(Response.STOP, Response.STOP) == ["M0: give_up"]
+    assert done == [("give_up", [True, False])]
+    assert asked(Response.HOLD, Response.HOLD) == []
+    assert done == []
 
 
 def test_a_level_is_set_in_the_ledger_and_in_the_device_of_the_reactor_it_was_read_in() -> None:
