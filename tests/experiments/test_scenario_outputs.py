@@ -130,6 +130,14 @@ def test_reactors_in_different_steps_are_given_what_each_one_s_step_says() -> No
     assert sorted(doses) == sorted([*hers, (10, 1, 3, 0.5), (20, 1, 3, 0.5)])
 
 
+def test_what_a_step_owes_at_its_end_is_left_out_also_where_the_next_one_gives_by_the_same_pump() -> None:
+    """0.1 mL a minute: 0.4 are owed at minute 4, where the second step begins, which owes a dose at minute 9."""
+    steps = Scenario((0.4, 0.4), (4.0, 60.0), (37.0,) * 2, outputs=("pump3 6 mL/h", "pump3 6 mL/h"))
+    supply = Supply([steps], 1.2)
+    assert given(supply, range(4)) == []
+    assert given(supply, range(4, 15), phase=1) == [(9.0, 3, 0.5), (14.0, 3, 0.5)]
+
+
 def test_of_two_pumps_that_owe_the_one_that_owes_more_gives_first() -> None:
     both = Scenario((0.4,), (60.0,), (37.0,), outputs=("pump3 0.6 mL, pump4 1.1 mL",))
     assert given(Supply([both], 1.2), range(4)) == [(0.0, 4, 1.1), (1.0, 3, 0.6)]
