@@ -187,3 +187,27 @@ def test_after_two_time_outs_the_off_commands_of_a_dead_link_are_given_up_until_
     with pytest.raises(LinkError):
         m0.pumps_off(tries=1)
     script.close()
+
+
+def test_what_a_switch_on_the_way_did_is_told_of_this_reactor_alone() -> None:
+    m0, script = connection([])
+    for said, own in (
+        ({"M1": {"Pump1": 3.0}, "M0": {"Pump2": 8.0}}, {"Pump2": 8.0}),
+        ({"M1": {"Pump1": 3.0}}, {}),
+        ({}, {}),
+        (None, None),
+    ):
+        script.switched_off = lambda said=said: said  # type: ignore[method-assign, misc]
+        assert m0.switched_off() == own
+
+
+def test_a_pump_that_stays_on_ends_its_experiment_and_then_the_bus_is_touched_whatever_the_first_did() -> None:
+    for first in (DONE, LOST):
+        rows: list[Any] = []
+        steps = [("POST /Experiment/0/M0", first)]
+        steps += [("GET /getSysdata/", answer(state()))] if first is LOST else []
+        m0, script = connection([*read(state()), *steps, *posts(PROBE)], rows)
+        m0.read()
+        m0.escalate()
+        assert script.steps == []
+        assert [kind for kind, _ in rows].count("escalation") == (1 if first is LOST else 0)

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import count
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -194,6 +195,40 @@ def test_one_client_per_device(server: Server) -> None:
         pass
     with open_transport(TransportConfig(), server.url):
         pass
+
+
+def test_an_answer_is_waited_for_as_long_as_the_device_may_take_and_an_agent_tells_in_its_time(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Twenty seconds of a device at four times real time; what its agent switched off two real seconds ago."""
+    asked: list[tuple[str, str, float]] = []
+
+    def fetch(_client: Any, method: str, url: str, wait_s: float, body: bytes | None = None) -> Any:
+        asked.append((method, url, wait_s))
+        return 200, b'{"switched_off": {"M0": {"Pump1": 2.0}, "M1": {"Pump2": 0.5}}}', {}
+
+    monkeypatch.setattr("hardware.link.http.fetch", fetch)
+    token = tmp_path / "token"
+    token.write_text("t" * 40)
+    token.chmod(0o600)
+    config = TransportConfig(connect_s=3.0, read_s=20.0, floor_s=0.5, token_file=str(token))
+    link = HttpTransport("http://board:5000/", 4.0, config)
+    link.get("/getSysdata/")
+    assert link.switched_off() == {"M0": {"Pump1": 8.0}, "M1": {"Pump2": 2.0}}
+    link.disarm()
+    board = "http://board:5000"
+    assert asked == [
+        ("GET", f"{board}/getSysdata/", 5.0),
+        ("GET", f"{board}/_agent/status", 5.0),
+        ("POST", f"{board}/_agent/bye", 5.0),
+    ]
+    plain = HttpTransport(board, 100.0, TransportConfig(read_s=20.0, floor_s=0.5))
+    plain.get("/x")
+    assert plain.switched_off() == {}
+    plain.disarm()
+    assert asked[3:] == [("GET", f"{board}/x", 0.5)]
+    plain.close()
+    link.close()
 
 
 def test_time_outs_shrink_with_speed_down_to_a_floor() -> None:

@@ -1,17 +1,28 @@
 """Preflight: every check passes on a sound device and fails with a remedy on the trouble it is for."""
 
+import json
 import math
 from dataclasses import replace
+from datetime import UTC, datetime
+from email.utils import format_datetime
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from envs.bench import Bench
 from hardware.check import Check
+from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import PumpCalibration, ReactorCalibration
 from hardware.chibio.overflow_pump import OverflowPumpConfig
-from hardware.chibio.preflight import preflight
+from hardware.chibio.preflight import _board_clock, _disk, _link, _reactor, preflight
+from hardware.chibio.protocol import parse_state
+from hardware.clock import VirtualClock
+from hardware.link.transport import Reply
 from tests.campaigns.rehearsal import SOUND
 from tests.hardware.driver_lab import DriverLab
+from tests.hardware.script import state
 
 
 def checks(lab: DriverLab, rig: ReactorCalibration = SOUND) -> dict[str, Check]:
@@ -141,3 +152,117 @@ def test_slow_answers_end_a_run_on_a_bench_and_none_in_fast_motion(speed: float,
     assert (found.ok, found.required) == (False, required)
     assert found.detail == "2.40 s per answer"
     assert remedy in found.remedy
+
+
+# -- each check by itself, from its limit on --------------------------------------------------------------------------
+
+
+def pump(flow_ml_s: float = 1.0, date: str = "2026-02-03", device_id: str = "") -> PumpCalibration:
+    return PumpCalibration(flow_ml_s, date=date, device_id=device_id)
+
+
+SEEN = parse_state(json.dumps(state()).encode())
+
+
+@pytest.mark.parametrize(
+    ("name", "right", "wrong", "detail"),
+    [
+        ("temperature", {"temperature": 44.9}, {"temperature": 45.1}, "45.1 degC"),
+        ("temperature", {"temperature": 10.1}, {"temperature": 9.9}, "9.9 degC"),
+        ("light sensor", {"raw": 5.0, "cycles": 1}, {"raw": 4.0, "cycles": 1}, "raw 4 after 1 cycles"),
+        ("light sensor", {"raw": 1.0, "cycles": 0}, {"raw": 1.0, "cycles": 7}, "raw 1 after 7 cycles"),
+        ("blank", {"blank": 60000.0}, {"blank": 60001.0}, "60001 counts (of the device)"),
+        ("blank", {"blank": 3000.0}, {"blank": 2999.0}, "2999 counts (of the device)"),
+        ("modes", {"modes": ()}, {"modes": ("Zigzag", "FP2")}, "Zigzag, FP2"),
+        ("modes", {"regulating": False}, {"regulating": True}, "OD regulation"),
+        (
+            "pumps", {"pumps_on": (False, False, True, False)}, {"pumps_on": (False, True, True, False)}, "Pump2 on",
+        ),
+    ],
+)  # fmt: skip
+def test_what_a_reactor_shows_is_judged_from_its_limit_on(
+    name: str, right: dict[str, Any], wrong: dict[str, Any], detail: str
+) -> None:
+    config = ChiBioConfig(overflow_pump=OverflowPumpConfig("Pump3"))
+    for shown, ok in ((right, True), (wrong, False)):
+        found = _reactor("M4", replace(SEEN, **shown), ReactorCalibration(pump(), pump()), config)
+        (check,) = (check for check in found if check.name == f"M4 {name}")
+        assert check.ok is ok
+    assert check.detail == detail
+
+
+@pytest.mark.parametrize(
+    ("rig", "weighed", "strong", "detail"),
+    [
+        (ReactorCalibration(pump(2.0), pump(0.75)), True, True, "waste moves 1.5 times the feed in its on-time"),
+        (ReactorCalibration(pump(2.0), pump(0.7)), True, False, "waste moves 1.4 times the feed"),
+        (ReactorCalibration(pump(0.8), pump(date="")), False, True, "feed 2026-02-03, waste never weighed"),
+        (ReactorCalibration(pump(device_id="7"), pump()), False, True, "on another unit"),
+        (ReactorCalibration(pump(), pump(device_id="7")), False, True, "on another unit"),
+    ],
+)
+def test_both_pumps_of_a_reactor_are_judged(rig: ReactorCalibration, weighed: bool, strong: bool, detail: str) -> None:
+    found = {check.name: check for check in _reactor("M4", replace(SEEN, device_id="9"), rig, ChiBioConfig())}
+    pumps, waste = found["M4 pump calibration"], found["M4 waste over feed"]
+    assert (pumps.ok, waste.ok) == (weighed, strong)
+    assert detail in f"{pumps.detail} {waste.detail}"
+    assert f"until then {rig.feed.flow_ml_s:g} mL/s is assumed" in pumps.remedy
+
+
+def test_a_stored_blank_comes_before_the_device_s() -> None:
+    found = {c.name: c for c in _reactor("M4", SEEN, ReactorCalibration(blank=13123.0), ChiBioConfig())}
+    assert found["M4 blank"].detail == "13123 counts (stored)"
+
+
+class Board:
+    """A board whose clock runs by so many seconds in one real second; an answer takes `takes_s` of device time."""
+
+    def __init__(self, clock: VirtualClock, runs: float, takes_s: float = 0.0) -> None:
+        self.clock, self.runs, self.takes_s = clock, runs, takes_s
+
+    def get(self, path: str) -> Reply:
+        self.clock.sleep(self.takes_s)
+        shown = datetime(2026, 1, 5, tzinfo=UTC).timestamp() + self.runs * self.clock.now()
+        return Reply(200, b"{}", format_datetime(datetime.fromtimestamp(shown, UTC), usegmt=True))
+
+
+@pytest.mark.parametrize(
+    ("speed", "runs", "ok", "seen"),
+    [
+        (1.0, 1.0, True, "+0.0 s"),
+        (1.0, 1.4, True, "+2.0 s"),
+        (1.0, 1.6, False, "+3.0 s"),
+        (1.0, 0.4, False, "-3.0 s"),
+        (0.25, 4.0, True, "+0.0 s"),  # 5 s of the device are 20 s here, and on the board
+        (0.25, 1.0, False, "-15.0 s"),
+    ],
+)
+def test_a_board_s_clock_runs_as_this_computer_s_does(speed: float, runs: float, ok: bool, seen: str) -> None:
+    clock = VirtualClock(100.0)
+    check = _board_clock(Board(clock, runs), clock, ChiBioConfig(speed=speed))  # type: ignore[arg-type]
+    assert (check.ok, check.detail) == (ok, f"{seen} against this computer")
+
+
+@pytest.mark.parametrize(
+    ("takes_s", "speed", "ok", "required"), [(1.9, 1.0, True, True), (2.1, 1.0, False, True), (2.1, 5.0, False, False)]
+)
+def test_an_answer_takes_less_than_two_seconds(takes_s: float, speed: float, ok: bool, required: bool) -> None:
+    clock = VirtualClock()
+    check = _link(Board(clock, 1.0, takes_s), clock, speed)  # type: ignore[arg-type]
+    assert (check.ok, check.required, check.detail) == (ok, required, f"{takes_s:.2f} s per answer")
+
+
+@pytest.mark.parametrize(("free_mb", "ok"), [(1001.0, True), (999.0, False)])
+def test_a_disk_has_a_gigabyte_left(monkeypatch: pytest.MonkeyPatch, free_mb: float, ok: bool) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=free_mb * 1e6))
+    check = _disk(Path("runs"))
+    assert (check.ok, check.detail) == (ok, f"{free_mb:.0f} MB free")
+    assert check.remedy == "free at least 1000 MB under runs"
+
+
+def test_the_fullest_vial_overflows_first() -> None:
+    lab = DriverLab(("M0", "M1"))
+    bench = Bench(volume_ml=14.0, volumes_ml={"M0": 26.0})
+    found = preflight(lab.wire, lab.clock, lab.config, [SOUND] * 2, None, bench)
+    (check,) = (check for check in found if check.name == "overflow pump")
+    assert "a vial overflows after about 4 mL of feed" in check.detail

@@ -30,6 +30,22 @@ def test_a_running_reactor() -> None:
     assert not found.modes
 
 
+def test_each_number_of_a_state_is_read_from_its_own_field() -> None:
+    data = state(
+        OD0__raw=9123.0, OD0__target=14567.0, ThermometerIR__current=36.4, ThermometerIR__record=[35.9],
+        Thermostat__target=33.5, Thermostat__ON=0, Stir__target=0.6, OD__target=0.45, OD__ON=1, OD__Measuring=1,
+        Volume__target=17.0, Pump1__target=0.01, Pump2__target=0.2, Pump3__target=0.3, Pump4__target=0.04, Pump4__ON=1,
+        Experiment__cycles=7, time__record=[123.5], OD__record=[0.51], Experiment__startTime="2026-02-03 04:05:06",
+    )  # fmt: skip
+    found = parse(data)
+    assert (found.raw, found.blank, found.temperature, found.temperature_target) == (9123.0, 14567.0, 36.4, 33.5)
+    assert (found.sample_s, found.sample_od, found.sample_temperature) == (123.5, 0.51, 35.9)
+    assert (found.heating, found.stirring, found.stir_target, found.volume_ml) == (False, True, 0.6, 17.0)
+    assert (found.regulating, found.regulation_target, found.measuring, found.cycles) == (True, 0.45, True, 7)
+    assert (found.pump_targets, found.running_pumps) == ((0.01, 0.2, 0.3, 0.04), ("Pump4",))
+    assert found.start_time == "2026-02-03 04:05:06"
+
+
 def test_lists_that_are_just_being_replaced_hold_no_sample() -> None:
     data = state(time__record=[0.07, 60.1])
     assert math.isnan(parse(data).sample_s)
@@ -129,6 +145,11 @@ def test_damaged_bytes_parse_or_are_refused(data: st.DataObject) -> None:
         "/SetOutputTarget/Pump1/M0/0.05",
         "/SetOutputTarget/Pump2/M0/0.5",
         "/SetOutputTarget/Thermostat/M0/37.0",
+        "/SetOutputTarget/Volume/M0/30.0",
+        "/SetOutputTarget/Volume/M0/10.0",
+        "/SetOutputTarget/OD/M0/0.01",
+        "/SetOutputTarget/OD/M0/1.5",
+        "/SetOutputTarget/Stir/M0/1",
         "/SetOutputOn/Pump1/1/M0",
         "/SetOutputOn/Pump4/0/M0",
         "/SetOutputOn/Heat/0/M0",
@@ -156,6 +177,13 @@ def test_allowed(path: str) -> None:
         "/SetOutputTarget/Pump1/0/0.01",
         "/SetOutputTarget/Pump1/M1/0.01",
         "/SetOutputTarget/Thermostat/M0/42.1",
+        "/SetOutputTarget/Volume/M0/30.1",
+        "/SetOutputTarget/Volume/M0/9.9",
+        "/SetOutputTarget/OD/M0/0.009",
+        "/SetOutputTarget/OD/M0/1.51",
+        "/SetOutputTarget/Stir/M0/1.1",
+        "/CalibrateOD/OD0/M0/2999/0",
+        "/CalibrateOD/OD0/M0/60001/0",
         "/SetOutputTarget/UV/M0/0.5",
         "/SetOutputOn/Pump1/2/M0",
         "/SetOutputOn/Pump3/1/M0",

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from hardware.errors import RecordingError
+from hardware.storage.marks import Mark, add_mark, read_marks
 from hardware.storage.recorder import Recorder
 from hardware.storage.recording_reader import Recording, read_recording
 from tests.patience import PATIENCE_S
@@ -159,6 +161,7 @@ def test_misuse_is_named(tmp_path: Path) -> None:
         pytest.param("\ufeff" + tidy(header="Time (min),OD,Pump rate (mL/s)").replace(",", ";"), id="tidy-semicolon"),
         pytest.param("# a comment\n\n" + tidy().replace(",", "\t"), id="tidy-tab"),
         pytest.param(tidy(t=60 * T, header="time_s,od,pump_rate"), id="seconds"),
+        pytest.param(tidy(t=T / 60, header="time_h,od,pump_rate"), id="hours"),
     ],
 )
 def test_every_layout_reads_alike(read: Callable[..., object], content: str) -> None:
@@ -194,6 +197,40 @@ def test_another_pump_that_ran_is_named_and_can_be_counted(read: Callable[..., o
     assert any("pump 2 ran" in n for n in second.notes)  # type: ignore[attr-defined]
     with pytest.raises(RecordingError, match=r"pumps = \[5\]: allowed is a selection of 1, 2, 3, 4"):
         read(chibio(), pumps=(5,))
+
+
+def test_of_two_runs_the_one_that_was_asked_for_is_told_from_the_longest(read: Callable[..., Recording]) -> None:
+    lines = tidy().splitlines()
+    both = "\n".join([*lines[:15], *lines]) + "\n"
+    for asked, words in (
+        (None, "run 1 is used (the longest)"),
+        (0, "run 0 is used (as asked)"),
+        (1, "run 1 is used (as"),
+    ):
+        r = read(both, run=asked)
+        assert any(words in note for note in r.notes), r.notes
+        assert len(r.od) == (14 if asked == 0 else len(lines) - 1)
+
+
+def test_a_row_that_is_amended_takes_the_place_of_the_last_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    with Recorder(path, ("time_min", "od")) as recorder:
+        for minute in range(3):
+            recorder.write({"time_min": float(minute), "od": 0.5 + minute})
+        recorder.amend({"time_min": 2.0, "od": 9.25})
+        recorder.write({"time_min": 3.0, "od": 0.75})
+    assert path.read_text().splitlines() == ["time_min,od", "0.0,0.5", "1.0,1.5", "2.0,9.25", "3.0,0.75"]
+
+
+def test_a_mark_is_one_that_measures_where_a_level_or_a_share_was(tmp_path: Path) -> None:
+    marks = [
+        Mark(12.3456, "M3", "moved"), Mark(60.0, "M0", "read", level_ml=17.5),
+        Mark(61.5, "", 'counted, "twice"', share=0.3, sd=0.02),
+    ]  # fmt: skip
+    assert [mark.measured for mark in marks] == [False, True, True]
+    for mark in marks:
+        add_mark(tmp_path, mark)
+    assert read_marks(tmp_path) == [replace(marks[0], time_min=12.346), *marks[1:]]
 
 
 def test_a_file_cut_by_a_power_loss_is_read_up_to_there(read: Callable[..., object]) -> None:
