@@ -6,6 +6,7 @@ from scipy.optimize import minimize
 
 from envs.growth import DilutedCulture, Exponential
 from envs.identification.calibration import Calibration, IdentifyConfig, calibrate
+from envs.identification.curves import plateaus
 from envs.identification.drift import Segment
 from envs.identification.free_run import _sum_variance, fit
 from envs.identification.model import NotIdentifiable, Parameter, pmse, trajectory
@@ -431,6 +432,27 @@ def test_a_dose_of_which_half_is_seen_late_is_in_the_reading_after_the_next() ->
     assert rate[0, 10] == 0.02
     np.testing.assert_allclose(od[0, [10, 11, 12]] / plain[[10, 11, 12]], np.exp([0.0, -0.025, -0.05]))
     assert growth[0] == pytest.approx(0.02)
+
+
+def test_growth_and_light_are_those_of_each_temperature_that_was_held() -> None:
+    """0.3 1/h at 30 degC for 300 min, 0.6 at 34 for 240, then 40 min at 36, a row every 2 min; light of the first:
+    214 counts, and 2000 more of an OD of 1, but for a reading at full scale."""
+    time = np.arange(0.0, 580.0, 2.0)
+    phase = np.searchsorted([300.0, 540.0], time, side="right")
+    degc, mu = np.array([30.0, 34.0, 36.0])[phase], np.array([0.3, 0.6, 0.3])[phase] / 60.0
+    rate = np.where(time % 40.0 < 20.0, 0.01, 0.002)
+    log_od = np.concatenate([[0.0], np.cumsum((mu - rate / 0.8)[:-1] * 2.0)])
+    od = 0.5 * np.exp(log_od) * (1.0 + 0.002 * np.random.default_rng(6).standard_normal(time.size))
+    light = np.where(phase == 0, 214.0 + 2000.0 * od, np.nan)
+    light[140] = 65535.0
+    found, left = plateaus(series(time, od, rate), degc, light, 0.8, 60.0, 120.0, 214.0)
+    assert [(p.first, p.end, p.temperature) for p in found] == [(30, 150, 30.0), (180, 270, 34.0)]
+    assert [p.growth.value for p in found] == pytest.approx([0.3, 0.6], rel=0.02)
+    assert all(p.growth.low < p.growth.value < p.growth.high for p in found)
+    assert found[0].light is not None
+    assert found[0].light.value == pytest.approx(2000.0)
+    assert found[1].light is None
+    assert left == ["36.0 degC from minute 540 on: held for 40 min, it takes 180"]
 
 
 # ---------------------------------------------------------------- the real recording

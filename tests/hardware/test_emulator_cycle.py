@@ -320,3 +320,25 @@ def test_a_heater_warms_alike_whatever_the_thermometer_shows(offset_c: float) ->
     cooled = 2.0 * (begun - thermal.ambient_c) / thermal.cooling_min
     risen = lab.device.truth("M0")["temperature"] - begun
     assert risen == pytest.approx(2.0 * thermal.heating_c_per_min - cooled, abs=0.1)
+
+
+def test_each_record_has_its_own_value_and_nothing_of_what_is_off() -> None:
+    data = fresh_sysdata("77", "M0")
+    data["OD"].update(current=0.41, target=0.6, ON=1)
+    data["Thermostat"].update(target=35.5, ON=1)
+    for k, is_on in ((1, 1), (2, 0), (3, 1), (4, 1)):
+        data[f"Pump{k}"].update(target=0.01 * k, ON=is_on)
+    for k, name in enumerate(("IR", "Internal", "External")):
+        data[f"Thermometer{name}"]["current"] = 30.0 + k
+    data["FP2"].update(ON=1, Base=200, Emit1=0.5, Emit2=0.25)
+    data["FP3"].update(ON=0, Base=9, Emit1=9, Emit2=9)
+    append_records(data, 120.5)
+    last = {name: [entry["record"]] for name, entry in data.items() if isinstance(entry, dict) and "record" in entry}
+    assert {name: record for name, (record,) in last.items() if record and any(record)} == {
+        "time": [120.5], "OD": [0.41], "Thermostat": [35.5], "Pump1": [0.01], "Pump3": [0.03], "Pump4": [0.04],
+        "ThermometerIR": [30.0], "ThermometerInternal": [31.0], "ThermometerExternal": [32.0],
+    }  # fmt: skip
+    assert data["OD"]["targetrecord"] == [0.6]
+    assert data["Pump2"]["record"] == [0.0]
+    for name, values in (("FP1", [0, 0, 0]), ("FP2", [200, 0.5, 0.25]), ("FP3", [0, 0, 0])):
+        assert [data[name][f"{key}Record"][0] for key in ("Base", "Emit1", "Emit2")] == values

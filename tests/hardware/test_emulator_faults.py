@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hardware.emulator.device import plant_preset
-from hardware.emulator.faults import FAULTS, inject
+from hardware.emulator.faults import FAULTS, PLANT, inject
 from hardware.emulator.transport import EmulatorTransport
 from hardware.errors import LinkError
 from tests.hardware.emulator_lab import Lab, quiet
@@ -403,6 +403,26 @@ def test_every_fault_changes_what_a_client_sees_or_what_is_true(name: str) -> No
     differs = [k for k, (a, b) in enumerate(zip(one, other, strict=True)) if a != b]
     assert differs
     assert differs[0] >= 8 * (8 if before else 4)
+
+
+@pytest.mark.parametrize("name", sorted(name for name, (kind, *_) in FAULTS.items() if kind in ("vial", "plant")))
+def test_a_fault_of_one_reactor_is_not_its_neighbour_s(name: str) -> None:
+    device = Lab(options=replace(quiet(), plant=plant_preset("coculture"))).device
+
+    def switches(reactor: str) -> list[object]:
+        vial = device.vials[reactor]
+        plant = [getattr(getattr(vial.plant, part), switch)[0] for part, switch in PLANT.values()]
+        return [*vars(vial.faults).values(), *plant]
+
+    before = switches("M0")
+    assert before == switches("M1")
+    value = 0.7 if "factor" in name or name.endswith("_ml") else 1.0
+    inject(device, name, "M1", value)
+    assert switches("M0") == before
+    changed = [now for was, now in zip(before, switches("M1"), strict=True) if was != now]
+    assert changed == [value]
+    inject(device, name, "all", value)
+    assert switches("M0") == switches("M1")
 
 
 def test_timeout_must_be_positive() -> None:

@@ -333,3 +333,24 @@ def test_two_hours_of_eight_reactors_dosed_every_minute() -> None:
         assert truth["volume_ml"] == pytest.approx(20.0)
         minutes = lab.clock.now() / 60.0
         assert truth["od"] == pytest.approx(0.5 * np.exp(0.02 * minutes - 120 * 0.4 / 20.0), rel=0.02)
+
+
+def test_spare_pumps_supply_by_their_own_flow_for_as_long_as_they_run_forward() -> None:
+    """Ten seconds of 0.3 mL/s by Pump3, of which the last four beside 0.5 mL/s of Pump4; then Pump3 backwards."""
+    lab = Lab(options=quiet(pump3_ml_s=0.3, pump4_ml_s=0.5))
+    vial = lab.device.vials["M1"]
+    for at, pump, direction in ((0.0, "Pump3", 1), (6.0, "Pump4", 1), (10.0, "Pump3", 0), (10.0, "Pump4", 0)):
+        vial.drive(pump, direction, at)
+    assert vial.supplied_ml == pytest.approx({"Pump3": 3.0, "Pump4": 2.0})
+    vial.drive("Pump3", -1, 20.0)
+    vial.drive("Pump3", 0, 25.0)
+    assert vial.supplied_ml == pytest.approx({"Pump3": 3.0, "Pump4": 2.0})
+    assert vial.on_s == pytest.approx({"Pump1": 0.0, "Pump2": 0.0, "Pump3": 15.0, "Pump4": 4.0})
+    told = [(d.pump, d.start_s, d.seconds, d.direction) for d in vial.doses]
+    assert sorted(told) == [("Pump3", 0.0, 10.0, 1), ("Pump3", 20.0, 5.0, -1), ("Pump4", 6.0, 4.0, 1)]
+    truth = vial.truth(25.0)
+    assert truth["volume_ml"] == pytest.approx(25.0)
+    assert truth["feed_ml"] == 0.0
+    assert truth["motors"] == dict.fromkeys(("Pump1", "Pump2", "Pump3", "Pump4"), 0)
+    vial.set_fault("waste_stuck_open", True, 30.0)
+    assert [vial.motor(pump) for pump in truth["motors"]] == [0, 1, 0, 0]

@@ -399,3 +399,23 @@ def test_a_bench_is_such_as_units_may_have(bench, words):
     else:
         with pytest.raises(UnfitError, match=words):
             PioreactorFamily().doses(backend, given)
+
+
+def test_who_else_controls_a_unit_is_named_with_what_clears_it_and_nobody_of_another_unit():
+    link = Cluster.__new__(Cluster)
+    link._boxes, link._lock, link._others = {"pio02": mailbox()}, f"{LOCKS}us", {}
+
+    def said(name, *units):
+        return json.dumps({"host": f"lab-{name}", "pid": 7, "units": units}).encode() if units else b""
+
+    for name, units in (("us", ["pio02"]), ("they", ["pio01", "pio02"]), ("others", ["pio09"])):
+        link._message(f"{LOCKS}{name}", said(name, *units), True)
+    assert link.holder("pio02") == (
+        "process 7 on lab-they controls pio02: one client per unit; if it is not there any more: "
+        f"mosquitto_pub -r -n -t {LOCKS}they"
+    )
+    assert link.holder("pio09").startswith("process 7 on lab-others controls pio09")
+    link._message(f"{LOCKS}they", said("they", "pio01"), True)
+    assert (link.holder("pio02"), bool(link.holder("pio01"))) == ("", True)
+    link._message(f"{LOCKS}others", said("others"), True)  # it left, or died: the broker clears it
+    assert link.holder("pio09") == ""
