@@ -704,6 +704,7 @@ def test_each_law_has_its_own_column_and_colour_and_a_switch_stands_where_the_te
         assert panels[0].get_title() == f"{law}, n = 3"
         np.testing.assert_allclose(panels[0].lines[0].get_xdata(), [0.0, 30.0, 70.0, 90.0])
         np.testing.assert_allclose(panels[0].lines[0].get_ydata(), [0.5, 0.4, 0.6, 0.6])
+        assert panels[0].lines[0].get_drawstyle() == "steps-post"
         for ax, mean in zip(panels, values, strict=True):
             (line,) = (line for line in ax.lines if len(line.get_xdata()) == 90)
             np.testing.assert_allclose(line.get_ydata(), mean)

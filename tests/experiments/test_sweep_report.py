@@ -111,7 +111,7 @@ def test_seeds_that_were_evaluated_at_other_steps_leave_a_gap_and_keep_their_col
 
 def test_the_first_of_the_ranking_stands_out_with_its_place_and_what_has_no_number_comes_last() -> None:
     """Errors at rest differ in their order; one configuration has none, and one value has no interval."""
-    found = {"b": [3.0, 1.0, 2.0], "a": [5.0], "c": []}
+    found = {"b": [4.0, 1.0, 1.0, 3.0, 1.0], "a": [5.0], "c": []}
     jobs = [
         sweep_results.Result(Path(name), {"agent": name, "seed": str(k)}, "finished", objective=value)
         for name, values in (("c", found["c"]), ("a", found["a"]), ("b", found["b"]))
@@ -126,7 +126,7 @@ def test_the_first_of_the_ranking_stands_out_with_its_place_and_what_has_no_numb
         "Configurations, the best first: <objective>", ("#", "agent", "n", "median", "IQM", "95 % of IQM", "worst"),
     )  # fmt: skip
     assert [(*row[:5], row[6]) for row in each.rows] == [
-        ("#1", "b", "3", "2", "2", "3"), ("#2", "a", "1", "5", "5", "5"), ("#3", "c", "–", "–", "–", "–"),
+        ("#1", "b", "5", "1", "1.67", "4"), ("#2", "a", "1", "5", "5", "5"), ("#3", "c", "–", "–", "–", "–"),
     ]  # fmt: skip
     assert [row[5] for row in each.rows[1:]] == ["–", "–"]
     assert [[isinstance(cell, Best) for cell in row] for row in each.rows] == [[True] * 7, [False] * 7, [False] * 7]
