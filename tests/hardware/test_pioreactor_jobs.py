@@ -11,7 +11,7 @@ import pytest
 
 from envs.bench import Bench
 from hardware.clock import VirtualClock
-from hardware.errors import DeviceStateError
+from hardware.errors import DeviceStateError, LinkError
 from hardware.pioreactor import reactors as pioreactors
 from hardware.pioreactor.config import PioreactorConfig, RigBackendConfig, UnitConfig
 from hardware.pioreactor.jobs import flow, regulates, request
@@ -433,3 +433,34 @@ def test_each_check_of_a_unit_says_what_it_saw_and_what_helps() -> None:
     assert pumps == ["0.700 mL/s at its calibrated duty", "1.600 mL/s at its calibrated duty"]
     assert "ours is 1.2 mL" in checks["dead man"].detail
     assert checks["volume"].detail == "not set mL in its settings, 14 here"
+
+
+def test_a_reader_that_the_broker_takes_for_lost_is_there_as_long_as_it_reads(monkeypatch):
+    """Ten times faster: a reading a second of the unit, every ten of the culture."""
+    lab = Lab(monkeypatch, speed=10.0, reading_s=1.0)
+    lab.world.od_s = 1.0
+    lab.begin()
+    lab.sample()
+    lab.world.say("od_reading/$state", "lost")
+    for _ in range(5):
+        lab.wait(5.0)
+        assert lab.fault is None
+    assert len(started(lab, "od_reading")) == 1
+
+
+def test_a_broker_that_does_not_answer_is_waited_for_half_a_minute_and_one_that_refuses_not_at_all(monkeypatch):
+    lab = Lab(monkeypatch, broker="lead.local", broker_port=1884)
+    lab.world.broker = False
+    began = lab.world.now()
+    with pytest.raises(LinkError, match=r"MQTT broker lead\.local:1884: no answer in 30 s; check backend\.username"):
+        lab.reactors.connect()
+    assert lab.world.now() - began == pytest.approx(30.0, abs=0.2)
+    lab.reactors.mqtt.refusal, began = "Not authorized", lab.world.now()
+    with pytest.raises(LinkError, match=r"lead\.local:1884: Not authorized; check"):
+        lab.reactors.connect()
+    assert lab.world.now() == began
+
+
+def test_the_pins_to_look_at_are_those_of_one_s_own_board(monkeypatch):
+    lab = Lab(monkeypatch, pump_pins=(5, 6, 9))
+    assert "pwm_locks PIN --as-int (pins 5, 6, 9)" in lab.station._pumps.locks

@@ -199,6 +199,15 @@ def test_another_pump_that_ran_is_named_and_can_be_counted(read: Callable[..., o
         read(chibio(), pumps=(5,))
 
 
+def test_a_waste_pump_is_compared_with_the_feed_in_the_flow_that_both_are_taken_to_have(
+    read: Callable[..., Recording],
+) -> None:
+    """In 0.9 of the feed's time it moves less than that brings, whatever a second at full power gives."""
+    r = read(chibio(pump_1_rate=U, pump_2_rate=0.9 * U), pump_ml_s=0.8)
+    assert r.doubts == (("pump 2 ran and is not counted", "say pumps=[1,2]"),)
+    np.testing.assert_allclose(r.pump_rate, 0.8 * U)
+
+
 def test_of_two_runs_the_one_that_was_asked_for_is_told_from_the_longest(read: Callable[..., Recording]) -> None:
     lines = tidy().splitlines()
     both = "\n".join([*lines[:15], *lines]) + "\n"
