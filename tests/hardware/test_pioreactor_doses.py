@@ -628,3 +628,22 @@ def test_a_dose_has_the_name_of_its_run_its_unit_and_its_number(lab):
     assert [row["id"] for row in lab.of("dose_end")] == [first, second]
     assert {row["id"] for row in lab.of("task")} == {first, second}
     assert [row["job"] for row in lab.of("task")] == ["add_media", "remove_waste"] * 2
+
+
+def test_after_a_crash_of_a_fast_run_a_dose_is_late_by_real_time(monkeypatch):
+    """Five times faster: 20 s of the run are 4 s, and 12 s are allowed until its pump is seen to run."""
+    lab = Lab(monkeypatch, speed=5.0)
+    lab.begin()
+    lab.sample()
+    lab.world.queue = False
+    lab.dose(0.8)
+    lab.wait(0.5)
+    rows, world = list(lab.rows), lab.world
+    again = Lab(monkeypatch, world, speed=5.0)
+    again.rows = rows
+    again.begin(replay(rows)[UNIT], lab.of("intent")[0]["on_s"] + 20.0)
+    again.wait(4.0)
+    assert again.fault is None
+    again.wait(6.0)
+    assert again.fault is not None
+    assert "the fate of a dose of 0.80 mL (add_media) is unknown" in again.fault.detail
