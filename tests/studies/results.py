@@ -30,7 +30,7 @@ BLOCK = re.compile(r"(<!-- result (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 def leave(
     folder: Path, module: str, columns: Iterable[str], rows: Iterable[Iterable[object]], name: str = "table"
 ) -> None:
-    """A table of a run: NAME.md to read, and NAME.json with command, commit and date for a page.
+    """A table of a run: Markdown to read, and JSON with command, commit and date for a page.
 
     Args: folder: of the run. module: file of the command.
     """
