@@ -262,6 +262,9 @@ def test_what_was_measured_is_told_of_its_own_reactor_with_its_own_numbers(
         assert len(told) == 6
         add_mark(tmp_path, Mark(9.4, "M1", "share", None, 0.25, 0.02))
         marks.take(loop)
+    assert len(told) == 8
+    journal.rows = [{"kind": kind} for kind in ("level", "share", "sample", "level", "share", "share")]
+    BenchMarks(record).take(loop)  # a resumed run knows what its earlier life has taken
     assert told == [
         ("level", {"reactor": "M1", "level_ml": 23.46}), ("M1", 23.46),
         ("share", {"reactor": "M0", "share": 0.4, "sd": 0.05, "minute": 7.0}), ("M0", 0.4, 0.05, 7.0),

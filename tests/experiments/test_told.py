@@ -1,6 +1,7 @@
 """How often an estimate was as near to the truth as it said: truth of a vial, two standard deviations, the counts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,14 @@ def test_a_smaller_vial_rests_at_the_same_share_of_its_own_largest_rate(flow: fl
     error, share = density.truth(np.array([0.4, 0.6]))
     np.testing.assert_allclose(share, 0.5, rtol=1e-9)
     np.testing.assert_allclose(error, np.log(plant.apparent_od / [0.4, 0.6]) / 0.06, rtol=1e-9)
+
+
+def test_a_dose_is_told_by_what_it_is_of_the_bench_s_vial() -> None:
+    """.7 mL into 14 mL dilute as 1 mL into 20; what a tube kept counts as well."""
+    told: list[Any] = []
+    law: Any = SimpleNamespace(dosed=lambda ml: told.append(ml.tolist()), restore=None)
+    Density(law, np.array([0.7, 1.0])).dosed(np.array([0.7, 0.7]), np.array([0.14, 0.2]))
+    assert told == [pytest.approx([1.2, 0.9])]
 
 
 def test_another_period_has_another_full_pump() -> None:
