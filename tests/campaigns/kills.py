@@ -17,6 +17,7 @@ from hardware.chibio.calibrations import save_calibration
 from tests.campaigns.killed_run import Findings, KillConfig, killed_run
 from tests.campaigns.rehearsal import SOUND
 from tests.entry import command
+from tests.studies.results import leave
 
 __all__ = ["kill_campaign"]
 
@@ -55,6 +56,8 @@ def kill_campaign(config: KillConfig, folder: Path) -> None:
     total |= {"pumps_off": all(f.pumps_off for f in found), "overflowed": any(f.overflowed for f in found)}
     total["wall_s"] = round(time.monotonic() - began, 1)
     files.write_json(folder / "summary.json", {**total, "runs": [asdict(f) for f in found]})
+    rows = [(k.replace("_", " "), f"{v:.4g}" if isinstance(v, float) else v) for k, v in total.items()]
+    leave(folder, __file__, ("of all runs", ""), rows)
     for f in found:
         for line in f.trouble:
             log.warning("%s", line)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.cli import files, frame
-from experiments.reporting.tables import markdown
 from tests.campaigns.endurance import Day, SoakConfig, growth, soak_run
 from tests.entry import command
+from tests.studies.results import leave
 
 __all__ = ["soak"]
 
@@ -21,9 +21,10 @@ ASTRAY_MIN = 5.0  # an outlying reading costs a dose, two in a row cost two
 
 
 def write_table(days: list[Day], folder: Path) -> None:
-    """table.md: a line per day."""
-    table = markdown(list(asdict(days[0])), (list(asdict(d).values()) for d in days))
-    (folder / "table.md").write_text(table, encoding="utf-8")
+    """A line per day."""
+    each = [asdict(day) for day in days]
+    rows = [[f"{value:.4g}" if isinstance(value, float) else value for value in day.values()] for day in each]
+    leave(folder, __file__, [key.replace("_", " ") for key in each[0]], rows)
 
 
 def soak(config: SoakConfig, folder: Path) -> None:
