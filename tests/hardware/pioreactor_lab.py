@@ -477,7 +477,9 @@ class Lab:
         monkeypatch.setattr(reactors, "Web", lambda *_given: self.web)
         monkeypatch.setattr(reactors, "Cluster", FakeCluster)
         self.rows: list[dict[str, Any]] = []
-        self.bench = Bench(**{key: values.pop(key) for key in ("period_s", "bottle_ml", "volume_ml") if key in values})
+        self.bench = Bench(
+            **{key: values.pop(key) for key in ("period_s", "bottle_ml", "volume_ml", "volumes_ml") if key in values}
+        )
         config = PioreactorConfig(**{"thermostat": False, **values})
         self.reactors = PioreactorReactors(config, self.world, self._log, "run", self.bench)
         self.station = self.reactors.stations[0]

@@ -288,6 +288,11 @@ def test_a_sample_that_is_due_while_pumps_are_switched_off_is_kept_for_whoever_d
     assert len(lab.of("sample")) == before + 1
 
 
+def test_two_units_are_driven_as_what_their_vials_hold(monkeypatch):
+    lab = Lab(monkeypatch, reactors=("pio01", "pio02"), volume_ml=35.0, volumes_ml={"pio02": 14.0})
+    assert [station.unit.volume_ml for station in lab.reactors.stations] == [35.0, 14.0]
+
+
 def test_two_units_have_their_own_values(monkeypatch):
     units = {"pio02": UnitConfig(channel="1", od_zero=0.2, od_scale=3.0)}
     config = PioreactorConfig(reactors=("pio01", "pio02"), units=units)
