@@ -518,6 +518,13 @@ def test_a_calibrated_pump_stays_calibrated_on_another_bench() -> None:
         assert found.tau == pytest.approx(tau)
 
 
+def test_a_policy_of_every_pump_is_proven_anew_for_the_one_it_will_run_with(relative: Path) -> None:
+    """Calibrated to tau .25 on a bench of 12 mL, whose nominal one is .2."""
+    bench, model = Bench(volume_ml=12.0), EnvConfig(tau=0.25)
+    asked = certificate.on_bench(policy.load(relative), ASKED, bench, model)
+    assert (asked.bench, asked.env, asked.full_pumps) == (bench, model, ())
+
+
 def test_a_certificate_that_asks_for_less_than_usual_is_refused_and_says_what(relative: Path, tmp_path: Path) -> None:
     """It passes by its own limits; every value that is laxer is named, those that are stricter are not."""
     given = policy.load(relative)

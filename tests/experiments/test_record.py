@@ -23,6 +23,7 @@ from experiments.record.recovery import COLUMNS, Rows, _caught_up, _put_off, loa
 from experiments.reporting import charts
 from hardware.errors import RecordingError
 from hardware.storage.doses import Ending
+from hardware.storage.journal import Journal
 from hardware.storage.marks import Mark, add_mark
 
 
@@ -296,15 +297,16 @@ def test_each_reactor_has_curves_of_its_own_dated_by_the_minute_of_its_sample(tm
     }  # fmt: skip
 
 
-def test_the_points_of_a_resumed_run_are_dated_by_the_beginning_of_its_first_life(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = itertools.count(1e9, 500.0)  # every row of the journal is 500 s and more after the one before it
-    monkeypatch.setattr("time.time", lambda: next(clock))
-    killed_after(tmp_path, ("sample", sample(2.0)), ("decision", decision(2.0)))
+def test_the_points_of_a_resumed_run_are_dated_by_the_beginning_of_its_first_life(tmp_path: Path) -> None:
+    clock = itertools.count(1e9, 500.0)
+    killed_after(tmp_path)
+    earlier = Journal(tmp_path / "journal.jsonl", lambda: next(clock))
+    earlier.append("sample", sample(2.0))
+    earlier.append("decision", decision(2.0))
+    earlier.close()
     record = Record(tmp_path, ("M0",), fsync=False)
     began = record.journal.rows[0]["wall"]
-    assert record.journal.rows[1]["wall"] > began
+    assert record.journal.rows[1]["wall"] == began + 500.0
     record.curves.step(step(150.0, rows=[True, False]))
     record.close()
     [(minute, wall, _)] = curves_of(tmp_path)["culture/od"]

@@ -216,6 +216,15 @@ def test_a_dose_of_somebody_else_is_counted_once_as_what_it_is_and_holds_ours(la
     assert given["at_s"] == pytest.approx(lab.reactors.elapsed(), abs=1.5)
 
 
+def test_each_dose_of_somebody_else_is_counted_once_however_many_there_were(lab):
+    for ml in (0.5, 0.3, 0.2, 0.7):
+        lab.world.event("add_media", ml, "UI")
+        lab.wait(1.0)
+    given = [row["feed_ml"] for row in lab.of("given")]
+    assert given == pytest.approx([0.5, 0.3, 0.2, 0.7])
+    assert [receipt.volume_ml[0] for _, receipt in lab.reactors.repeated()] == pytest.approx(given)
+
+
 @pytest.mark.parametrize("retained", [False, True])
 def test_a_retained_duty_of_another_experiment_is_no_pump_of_ours(monkeypatch, retained):
     lab = Lab(monkeypatch)
