@@ -65,9 +65,9 @@ def spike() -> Policy:
     return law(add=_add(2, 16, 50.0))
 
 
-def low_corner() -> Policy:
-    """Full dose where x + r < 0.5."""
-    return law(add=_add(3, 16, 100.0))
+def low_corner(action: int = 16) -> Policy:
+    """Full dose, or another one, where x + r < 0.5."""
+    return law(add=_add(3, action, 100.0))
 
 
 def high_corner() -> Policy:

@@ -393,6 +393,16 @@ def test_a_planted_fault_fails(make: Callable[[], Policy], failing: str) -> None
     assert not certificate.passed
 
 
+@pytest.mark.parametrize(("action", "exact", "off"), [(6, True, False), (0, True, True), (9, False, False)])
+def test_a_low_culture_grows_only_if_it_does_at_its_slowest(action: int, exact: bool, off: bool) -> None:
+    """.03 - 3 * .0075 > 0, but with 30 % less growth and 30 % more flow .021 - 3 * .0075 / .7 < 0."""
+    policy, line = laws.low_corner(action), loop(0.4, 0.4)
+    regions = partition(Network.of(policy), BOX)[1]
+    for share, grows in ((0.0, exact), (0.3, off)):
+        proof = prove(line, points_in_strips(regions, line.low, line.high), regions.action, OdCase("", share, 0.0))
+        assert proof.grows.tolist() == [grows]
+
+
 def test_a_million_samples_do_not_see_the_spike() -> None:
     points = np.random.default_rng(4).uniform([0.05, 0.4], [1.5, 0.8], (1_000_000, 2))
     near = points[np.abs(points[:, 1] - laws.SPIKE) < 1e-5]  # all others are alike by construction
