@@ -15,10 +15,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from dqn import policy as policies
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments.cli import files
-from experiments.control.policies import load_policy
+from experiments.control.policies import SHIPPED_COMPOSITION, load_policy
 from experiments.laws import registry
 from experiments.laws.share.estimator import CompositionEstimator
 from experiments.laws.share.recall import Recall
@@ -32,10 +33,17 @@ SCHEDULES = [
     Scenario((0.5, 0.4), (30.0, 40.0), (37.0, 37.0), until=("settled", None), outputs=("pump3 2 mL/h", None)),
     Scenario((0.5, 0.4, 0.3), (30.0, 40.0, 5.0), (37.0, 37.0, 37.0)),
 ]
-LAWS = {"pi": "pi", "pi_tuned": "proportional", "mpc": "midpoint", "inverse": "pi", "dqn": "pi", "threshold": "pi"}
+LAWS = {
+    "pi": "pi",
+    "pi_tuned": "proportional",
+    "mpc": "midpoint",
+    "inverse": "pi",
+    "dqn": "dqn_preview",
+    "threshold": "pi",
+}
 ANEW = {"_fresh_s"}  # of the interlock: begins anew in a resumed run
 BOUND = {"edges", "_latched", "_hold_kind", "rngs"}  # more is asked of them than type and shape
-LATER = {"_helpless_od", "_eased", "_since_low_ml", "_light", "_light_repeats", "_light_s"}
+LATER = {"one_line", "_helpless_od", "_eased", "_since_low_ml", "_light", "_light_repeats", "_light_s"}
 STREAM: dict[str, Any] = dict(np.random.default_rng(0).bit_generator.state)
 PATH = tuple[Any, ...]
 ONCE = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
@@ -57,11 +65,17 @@ def policy() -> Any:
     return load_policy("shipped", 1.0, 0.02)
 
 
+@cache
+def preview() -> Any:
+    return policies.load(SHIPPED_COMPOSITION["dqn_preview"])
+
+
 def unused(kind: str) -> ClosedLoop:
     """A loop in which everything that can remember does."""
     law = registry.build(registry.config(kind), model=EnvConfig(), policy=policy())
     config = registry.config(LAWS[kind], registry.SHARE)
-    share = Share(Recall(CompositionEstimator(config.estimator)), registry.build(config, registry.SHARE), SCHEDULES)
+    ratio = registry.build(config, registry.SHARE, policy=preview())
+    share = Share(Recall(CompositionEstimator(config.estimator)), ratio, SCHEDULES)
     reactors: Any = SimpleNamespace(names=("M0", "M1"))
     return ClosedLoop(reactors, law, Interlock(2), SCHEDULES, further=[share])
 
