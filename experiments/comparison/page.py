@@ -35,7 +35,7 @@ DENSITY = {
     "noise-free": "the same metrics on the OD that a sensor without noise would have shown.",
     "interlock": "stands between every controller and the pumps, with the limits of a bench; a reading it does not "
     "believe gets no dose, whoever proposed one.",
-    "control effort": "mean change of the pump rate from one minute to the next, µL/s.",
+    "control effort": "mean change of the pump rate from one decision to the next, µL/s.",
     "paired difference": "controller minus the other, replicate by replicate: both meet the same vials, pumps, sensors "
     "and noise. 95 % interval: Student's t of the mean over replicates, without correction for the number of "
     "comparisons.",
@@ -289,7 +289,7 @@ def every_plant(out: Page, summary: Row, scenario: str) -> None:
         ("clean_ise", "ISE of the noise-free OD (OD² min), sum over the windows", True),
         ("clean_itae", "ITAE of the noise-free OD (OD min²), sum over the windows", True),
         ("clean_steady_abs_error", "Steady error of the noise-free OD", True),
-        ("effort_ul_s", "Control effort (µL/s per minute)", False),
+        ("effort_ul_s", "Control effort (µL/s per decision)", False),
         ("media_ml", "Fresh medium used (mL per vial)", False),
         ("held", "Samples on which the interlock allowed no dose, per vial", False),
     )

@@ -465,7 +465,7 @@ def test_every_further_measure_of_a_plant_stands_under_its_own_title_and_law() -
         "ITAE of the measured OD (OD min²), sum over the windows, median over vials",
         "ISE of the noise-free OD (OD² min), sum over the windows",
         "ITAE of the noise-free OD (OD min²), sum over the windows", "Steady error of the noise-free OD",
-        "Control effort (µL/s per minute)", "Fresh medium used (mL per vial)",
+        "Control effort (µL/s per decision)", "Fresh medium used (mL per vial)",
         "Samples on which the interlock allowed no dose, per vial",
     )  # fmt: skip
     assert found == {

@@ -537,17 +537,23 @@ def test_each_unit_is_handed_over_at_its_own_setpoint_and_has_its_own_level(lab)
     assert [unit.level_ml for unit in units] == [0.0, 14.5]
 
 
-def test_after_a_crash_medium_that_still_waits_in_the_queue_is_waited_for(monkeypatch):
-    lab = Lab(monkeypatch)
+def crashed(monkeypatch, first_s, speed=1.0):
+    """The lab before and the lab after a crash `first_s` behind a dose of .8 mL that no pump took; not begun again."""
+    lab = Lab(monkeypatch, speed=speed)
     lab.begin()
     lab.sample()
     lab.world.queue = False
     lab.dose(0.8)
-    lab.wait(0.6)
-    rows, world = list(lab.rows), lab.world
-    again = Lab(monkeypatch, world)
-    again.rows = rows
-    again.begin(replay(rows)[UNIT], 60.0)
+    lab.wait(first_s)
+    again = Lab(monkeypatch, lab.world, speed=speed)
+    again.rows = list(lab.rows)
+    return lab, again
+
+
+def test_after_a_crash_medium_that_still_waits_in_the_queue_is_waited_for(monkeypatch):
+    _, again = crashed(monkeypatch, 0.6)
+    world = again.world
+    again.begin(replay(again.rows)[UNIT], 60.0)
     again.wait(30.0)
     assert not again.of("dose_end")
     world.revive()
@@ -641,16 +647,8 @@ def test_a_dose_has_the_name_of_its_run_its_unit_and_its_number(lab):
 
 def test_after_a_crash_of_a_fast_run_a_dose_is_late_by_real_time(monkeypatch):
     """Five times faster: 20 s of the run are 4 s, and 12 s are allowed until its pump is seen to run."""
-    lab = Lab(monkeypatch, speed=5.0)
-    lab.begin()
-    lab.sample()
-    lab.world.queue = False
-    lab.dose(0.8)
-    lab.wait(0.5)
-    rows, world = list(lab.rows), lab.world
-    again = Lab(monkeypatch, world, speed=5.0)
-    again.rows = rows
-    again.begin(replay(rows)[UNIT], lab.of("intent")[0]["on_s"] + 20.0)
+    lab, again = crashed(monkeypatch, 0.5, speed=5.0)
+    again.begin(replay(again.rows)[UNIT], lab.of("intent")[0]["on_s"] + 20.0)
     again.wait(4.0)
     assert again.fault is None
     again.wait(6.0)

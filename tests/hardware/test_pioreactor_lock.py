@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -36,14 +37,24 @@ def real_broker(folder: Path, settings: str) -> Iterator[int]:
     pytest.importorskip("paho.mqtt.client", reason="pip install 'paho-mqtt>=2'")
     if (program := broker()) is None:
         pytest.skip("no MQTT broker: apt-get install mosquitto")
-    number, conf = _free_port(), folder / "mosquitto.conf"
-    conf.write_text(f"listener {number} 127.0.0.1\n{settings}\n", encoding="utf-8")
-    with (folder / "log").open("wb") as log, subprocess.Popen([program, "-c", str(conf)], stdout=log, stderr=log) as p:
-        try:
-            assert holds(lambda: _listens("127.0.0.1", number))
-            yield number
-        finally:
-            p.kill()
+    conf = folder / "mosquitto.conf"
+    for _ in range(5):  # a port that is free now may be taken by another suite a moment later: that broker ends itself
+        number = _free_port()
+        conf.write_text(f"listener {number} 127.0.0.1\n{settings}\n", encoding="utf-8")
+        with (folder / "log").open("wb") as log, subprocess.Popen([program, "-c", conf], stdout=log, stderr=log) as p:
+            try:
+                assert holds(partial(ended_or_listens, p, number))
+                time.sleep(0.2)
+                if p.poll() is None:
+                    yield number
+                    return
+            finally:
+                p.kill()
+    pytest.fail((folder / "log").read_text())
+
+
+def ended_or_listens(broker: "subprocess.Popen[bytes]", port: int) -> bool:
+    return broker.poll() is not None or _listens("127.0.0.1", port)
 
 
 @pytest.fixture
