@@ -3,11 +3,13 @@
   python -m tests.studies.results --check            every table equals its file
   python -m tests.studies.results NAME=RUN           RUN/table.json becomes docs/results/NAME.json, and the pages follow
   python -m tests.studies.results NAME=RUN/week.json the same of another table of the run
+  python -m tests.studies.results NAME=RUN/tables/X.csv  the same of a table of a report
 
 A table stands between `<!-- result NAME -->` and `<!-- end -->`; its file holds columns and rows as they are shown,
 and command, commit and date of the run.
 """
 
+import csv
 import json
 import re
 import subprocess
@@ -64,13 +66,26 @@ def differences(docs: Path) -> list[str]:
     return found + [f"docs/results/{name}.json: on no page" for name in stored if name not in used]
 
 
+def of_report(path: Path) -> dict[str, Any]:
+    """A table of RUN/tables as a study would have left it; its commit is the newest one when the run began."""
+    run = path.parents[1]
+    (entry,) = re.findall(r"^    name: (.+)$", (run / ".hydra" / "hydra.yaml").read_text("utf-8"), re.MULTILINE)
+    began = (run / ".hydra" / "config.yaml").stat().st_mtime
+    newest = ["git", "-C", str(ROOT), "rev-list", "-1", "--abbrev-commit", f"--before={began:.0f}", "HEAD"]
+    commit = subprocess.run(newest, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+    command = " ".join([f"python -m experiments.{entry}", *(word for word in given(run) if "hydra." not in word)])
+    columns, *rows = csv.reader(path.read_text("utf-8").splitlines())
+    date = time.strftime("%Y-%m-%d", time.gmtime(began))
+    return {"command": command, "commit": commit, "date": date, "columns": columns, "rows": rows}
+
+
 def adopt(docs: Path, name: str, run: Path) -> None:
     """The table of a run becomes the result of this name, on every page that shows it.
 
     Raises: OSError, ValueError or LookupError for a run that left no table.
     """
-    path = run if run.suffix == ".json" else run / "table.json"
-    table = json.loads(path.read_text("utf-8"))
+    path = run if run.suffix in (".json", ".csv") else run / "table.json"
+    table = of_report(path) if path.suffix == ".csv" else json.loads(path.read_text("utf-8"))
     content = {key: table[key] for key in ("command", "commit", "date", "columns", "rows")}
     (docs / "results").mkdir(exist_ok=True)
     files.write_json(docs / "results" / f"{name}.json", content)

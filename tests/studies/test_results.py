@@ -38,5 +38,17 @@ def test_a_run_s_table_comes_to_its_place_and_what_differs_is_named(
     page.write_text("# A\n<!-- result one -->\n<!-- end -->\n")
     assert results.main([f"one={other}"], docs) == 0
     assert "| day | 1 |" in page.read_text()
+    report = run / "tables" / "ise.csv"
+    report.parent.mkdir()
+    report.write_text('law,"error, OD"\npi,0.25 ± 0.1\n')
+    (run / ".hydra").mkdir()
+    (run / ".hydra" / "overrides.yaml").write_text("- experiment=paper\n- ++replicates=7\n- hydra.run.dir=x\n")
+    (run / ".hydra" / "hydra.yaml").write_text("hydra:\n  job:\n    name: benchmark\n")
+    (run / ".hydra" / "config.yaml").write_text("{}\n")
+    assert results.main([f"one={report}"], docs) == 0
+    stood = page.read_text()
+    assert "| law | error, OD |\n|---|---|\n| pi | 0.25 ± 0.1 |\n" in stood
+    newest = left["commit"][:7]
+    assert f"`python -m experiments.benchmark experiment=paper replicates=7`, commit {newest}" in stood
     assert results.main([f"two={docs}"], docs) == 1
     assert "no table.json of a study" in capsys.readouterr().out
