@@ -18,8 +18,8 @@ REGRET, STEADY = 0.5, 0.003
 recording, and 0.003 OD is the noise of the sensor."""
 
 REMEDY = (
-    "policy=shipped, which is certified for every growth rate and pump and needs no training; or train with another "
-    "seed (train seed=1), since seeds differ at the ends of the range, and certify that one"
+    "policy=shipped, which is certified for every growth rate and pump and needs no training; or train with "
+    "the same words and another seed (seed=1), since seeds differ at the ends of the range, and certify that one"
 )
 """Against a certificate that fails."""
 SHOWN = 3  # requirements that fail, at first sight

@@ -85,7 +85,8 @@ def ended(
     log.info("policy %s; figures %s", path, folder / "figures")
     if task.tried:
         file = shlex.quote(str(path))
-        if task.provable and whole:  # seldom proven of a policy that was good enough, and no better
+        good = (kept.regret_pct <= task.regret_unit) & (kept.steady_abs_error <= task.steady_unit)
+        if task.provable and whole and good.any():  # seldom proven of one beyond the limits, or stopped at them
             log.info("next, prove its closed loop: python -m experiments.certify policy=%s", file)
         pair_words = "" if pair is None else f"pair={shlex.quote(pair)} "
         log.info("next, try it: python -m experiments.deploy %s%s", pair_words, task.tried.format(file))

@@ -47,15 +47,26 @@ def scored(regret: list[float], steady: list[list[float]]) -> Score:
     return Score(one, np.array(regret), np.array(steady), one)
 
 
-@pytest.mark.parametrize("whole", [True, False])
-def test_a_training_that_stopped_once_it_was_good_enough_is_not_sent_to_a_proof(
-    whole: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    score = scored([0.1], [[0.002]])
+@pytest.mark.parametrize(
+    ("whole", "regret", "steady", "sent"),
+    [
+        (True, [0.1], [[0.002]], True),
+        (False, [0.1], [[0.002]], False),  # stopped once it was good enough
+        (True, [3.8], [[0.002]], False),
+        (True, [0.1], [[0.02]], False),
+        (True, [3.8, 0.1], [[0.002], [0.002]], True),  # the second one is kept
+        (True, [3.8, 0.1], [[0.002], [0.02]], False),
+    ],
+)
+def test_only_a_policy_that_was_trained_to_the_end_and_is_good_is_sent_to_a_proof(
+    whole: bool, regret: list[float], steady: list[list[float]], sent: bool, tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    score = scored(regret, steady)
     with caplog.at_level("INFO"):
         announcements.ended(tmp_path, Density(EnvConfig()), score, score, "", tmp_path / "policy.npz", whole=whole)
     assert any("next, try it: python -m experiments.deploy" in line for line in caplog.messages)
-    assert any("experiments.certify" in line for line in caplog.messages) == whole
+    assert any("experiments.certify" in line for line in caplog.messages) == sent
 
 
 def test_a_policy_is_scored_by_the_first_episode_that_ends_behind_each_multiple(tmp_path: Path) -> None:
