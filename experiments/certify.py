@@ -46,20 +46,23 @@ def body(config: CertifyConfig, folder: Path) -> None:
         log.info("%s", line)
     for line in found.cannot_hold():
         log.info("said, not judged: %s", line)
-    _write(folder, source, certificate.content(policy, beside, config, found), to, found)
+    unwritten = _write(folder, source, certificate.content(policy, beside, config, found), to, found)
     if failed := [check for check in found.checks if not check.holds]:
         of = f"{len(failed)} of {len(found.checks)} requirements fail"
         log.info("what helps: %s", REMEDY)
         raise frame.UserError(f"policy {source}: not certified, {of}, the first: {failed[0]}")
+    if unwritten and config.to:  # it was asked for there
+        raise frame.UserError(unwritten)
 
 
-def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None, found: Certificate) -> None:
-    """The certificate, here and where else it goes; summary, figure and page."""
+def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None, found: Certificate) -> str:
+    """The certificate, here and where else it goes; summary, figure and page. Returns: what could not be written."""
     from experiments.certification.figure import figure
     from experiments.reporting import charts, page
     from experiments.reporting.tensorboard import Events
 
     files.write_json(folder / "certificate.json", content, indent=None)
+    unwritten = ""
     if to is None:
         why = "a quick one stands nowhere else" if found.quick else f"{source} is part of the program, whose own stays"
         log.info("the certificate is in the run folder alone: %s; to=FILE writes it elsewhere, too", why)
@@ -68,7 +71,8 @@ def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None,
             files.write_json(to, content, indent=None)
             log.info("certificate %s", to)
         except OSError as error:
-            log.warning("%s: not written (%s); %s/certificate.json is the same", to, error.strerror, folder)
+            unwritten = f"{to}: not written ({error.strerror}); {folder}/certificate.json is the same"
+            log.warning("%s", unwritten)
     drawn = charts.save(figure(found), folder / "figures", "certificate")
     files.write_json(folder / "summary.json", _summary(source, content, found))
     with closing(Events(folder)) as events:
@@ -77,6 +81,7 @@ def _write(folder: Path, source: Path, content: dict[str, Any], to: Path | None,
     log.info(
         "certificate %s; report %s", folder / "certificate.json", page.save(page.of_runs(folder, [folder]), folder)
     )
+    return unwritten
 
 
 def _place(config: CertifyConfig, source: Path) -> Path | None:

@@ -48,7 +48,9 @@ def step(arguments: list[str], signals: list[int]) -> int:
 def main() -> None:
     """Entry point; exits with the status of the first step that fails."""
     parser = argparse.ArgumentParser(prog="python -m experiments.demo", description=__doc__)
-    parser.parse_args()
+    _, others = parser.parse_known_args()
+    if others:
+        sys.exit(f"error: {others[0]}: the demo takes nothing but --help; values go to calibrate, train and deploy")
     folder = Path("runs") / "demo" / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"  # two demos never meet
     signals: list[int] = []
     with stop.handled(lambda number, _: signals.append(number), *stop.SIGNALS):

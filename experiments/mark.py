@@ -28,7 +28,7 @@ USUAL_SD = 0.03
 class MarkConfig:
     """What happened, to which reactor of which run, and when."""
 
-    run: str = setting("", "folder of a deployment, running or over")
+    run: str = setting("", "folder of a deployment, running or over; or `latest`")
     reactor: str = setting("", "which one; empty: all of them")
     text: str = setting("inoculated", "what happened, in one line of at most 80 characters")
     level_ml: float | None = setting(

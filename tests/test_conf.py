@@ -354,6 +354,11 @@ def test_every_argument_has_the_form_that_hydra_takes(given, understood):
         ("device=tpu", ["device", "tpu", "cpu, cuda"]),
         ("env=null", ["group"]),
         ("agent.hidden=[", ["["]),
+        (
+            "seed=range(0,4)",
+            ["seed=range(0,4): several values are a sweep, which begins with -m (-m 'seed=range(0,4)')"],
+        ),
+        ("seed=1,2", ["seed=1,2: several values are a sweep, which begins with -m (-m 'seed=1,2')"]),
     ],
 )
 def test_a_wrong_override_is_one_line_with_key_value_and_what_is_allowed(override, parts):
@@ -363,6 +368,48 @@ def test_a_wrong_override_is_one_line_with_key_value_and_what_is_allowed(overrid
     assert "\n" not in message
     for part in parts:
         assert part in message
+
+
+@pytest.mark.parametrize(
+    ("word", "line"),
+    [
+        ("--foo", "--foo: no such option; values are given as foo=VALUE"),
+        ("--seed=3", "values are given as seed=3; see"),
+    ],
+)
+def test_a_wrong_option_is_one_line(word, line, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["train", "-m", "seed=1,2", word])
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module("experiments.train").main()
+    told = capsys.readouterr().err
+    assert (ended.value.code, told.count("\n"), line in told) == (1, 1, True)
+
+
+@pytest.mark.parametrize("word", ["foo", "--foo", "env.mu=0.02"])
+def test_the_demo_takes_no_words(word, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["demo", word])
+    with pytest.raises(SystemExit, match=f"^error: {word}: the demo takes nothing but --help; values go to"):
+        importlib.import_module("experiments.demo").main()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["backend=chibio", "backend.url=notaurl"], "backend.url = 'notaurl': allowed http://host:port, for instance"),
+        (["backend=chibio", "backend.url=http://x/y"], "backend.url = 'http://x/y': allowed"),
+        (["backend=pioreactor", "backend.broker=mqtt://x"], "backend.broker = 'mqtt://x': allowed the name of a host;"),
+        (["backend=pioreactor", "backend.leader=x.local"], "backend.leader = x.local: allowed http://host:port"),
+        (
+            ["backend=pioreactor", "backend.units.pio01.address=10.4.4.4"],
+            "address = 10.4.4.4: allowed http://host:port",
+        ),
+    ],
+)
+def test_an_address_that_cannot_be_one_is_refused_with_the_config(words, line):
+    with pytest.raises(frame.UserError, match=re.escape(line)):
+        importlib.import_module("experiments.deploy").main.config(words)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -70,9 +70,21 @@ REFUSALS = {
 """What a disk answers that will not take a file, and the remedy."""
 
 
+OPTIONS = frozenset((
+    "-h", "--help", "--hydra-help", "--version", "-c", "--cfg", "--resolve", "-p", "--package", "-r", "--run", "-m",
+    "--multirun", "-sc", "--shell-completion", "-cp", "--config-path", "-cn", "--config-name", "-cd", "--config-dir",
+    "--experimental-rerun", "-i", "--info",
+))  # fmt: skip
+"""Words that begin with a dash: ours and Hydra's."""
+SEVERAL = re.compile(r"(?:Sweep parameters|Ambiguous value for argument) '\+*(.+?)'(?:,| |$)")
+
+
 def _one_line(error: Exception) -> str:
     """A message on one line."""
     lines = [line.strip() for line in str(error).splitlines()]
+    if several := SEVERAL.match(lines[0] if lines else ""):
+        word = several[1]
+        return f"{word}: several values are a sweep, which begins with -m (-m '{word}'); a list is written [1,2]"
     kept = [s for s in lines if s and not s.startswith(("object_type", "reference_type", "Config search path"))]
     return " ".join(kept[:6])
 
@@ -215,6 +227,9 @@ class Command(Generic[T]):
         with refusing(ValueError):
             given = [latest.resolved(arg, self.name) for arg in given]
         flags = {a for a in given if a.startswith("-")}
+        if unknown := sorted(flag for flag in flags if flag.partition("=")[0] not in OPTIONS):
+            key, _, value = unknown[0].lstrip("-").partition("=")
+            raise UserError(f"{unknown[0]}: no such option; values are given as {key}={value or 'VALUE'}; see --help")
         about = next((a.removeprefix("--help=") for a in flags if a.startswith("--help=")), "")
         plain = [a for a in given if not a.startswith("-")]
         if about or flags & {"--help", "-h"}:

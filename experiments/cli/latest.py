@@ -10,9 +10,10 @@ WRITTEN = {
     "env_file": (("calibrate/**/calibrated.yaml", "demo/*/1_calibrate/calibrated.yaml"), "calibrate"),
     "plant_file": (("calibrate/**/twin.yaml", "demo/*/1_calibrate/twin.yaml"), "calibrate"),
     "runs": (("*/*/sweep.json",), "train -m 'seed=range(0,4)'"),
+    "run": (("deploy/*/recordings", "demo/*/3_deploy/recordings"), "deploy"),
 }
 """Key -> where its files are below runs/, and the command that writes them."""
-FOLDERS = ("resume", "runs")  # keys that are given the folder of the file that is found
+FOLDERS = ("resume", "runs", "run")  # keys that are given the folder of the file that is found
 
 
 def newest(patterns: Sequence[str]) -> Path | None:
@@ -29,11 +30,12 @@ def resolved(arg: str, command: str) -> str:
     """
     key, _, value = arg.partition("=")
     name = key.lstrip("+")
-    if value != "latest" or name not in (*WRITTEN, "resume"):
-        return arg
+    if value != "latest" or name not in (*WRITTEN, "resume") or (name == "run" and command != "mark"):
+        return arg  # report finds the newest run of any command by itself
     runs = tuple(f"{command}/*/{name}" for name in ("checkpoint.pt", "state.json", "sweep.json"))
     patterns, writer = WRITTEN.get(name, (runs, command))
     path = newest(patterns)
     if path is None:
-        raise ValueError(f"{arg}: nothing under {ROOT}/; run python -m experiments.{writer} first, or give a path")
+        what = "no sweep" if name == "runs" else "nothing of the kind"
+        raise ValueError(f"{arg}: {what} under {ROOT}/; run python -m experiments.{writer} first, or give a path")
     return f"{key}={path.parent if name in FOLDERS else path}"

@@ -8,7 +8,7 @@ from hardware.chibio.dosing import DosingConfig, SupplyConfig
 from hardware.chibio.fluorescence import FluorescenceSlotConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import POSITIONS, Permitted
-from hardware.link.transport import TransportConfig
+from hardware.link.transport import WEB_ADDRESS, TransportConfig, web_address
 
 __all__ = ["ChiBioConfig", "EmulatorConfig"]
 
@@ -60,6 +60,7 @@ class ChiBioConfig:
 
     def __post_init__(self) -> None:
         check(self, "backend")
+        require(web_address(self.url), "backend.url", repr(self.url), WEB_ADDRESS)
         unique = len(set(self.reactors)) == len(self.reactors)
         require(unique, "backend.reactors", self.reactors, "1 to 8 different ones of M0 to M7")
         both = self.overflow_pump.pump in self.supply.pumps

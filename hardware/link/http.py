@@ -12,10 +12,21 @@ from urllib.parse import urlsplit
 
 import httpx
 
+from conf.schema import require
 from hardware.clock import DeviceClock
 from hardware.errors import LinkError, ProtocolError, ReactorError
 from hardware.link.secret import read_secret
-from hardware.link.transport import MAX_BODY, Reply, SwitchedOff, Transport, TransportConfig, new_session, switched_off
+from hardware.link.transport import (
+    MAX_BODY,
+    WEB_ADDRESS,
+    Reply,
+    SwitchedOff,
+    Transport,
+    TransportConfig,
+    new_session,
+    switched_off,
+    web_address,
+)  # fmt: skip
 
 __all__ = ["HttpTransport", "fetch"]
 
@@ -123,14 +134,7 @@ class HttpTransport(Transport):
         self, url: str, speed: float = 1.0, config: TransportConfig | None = None, session: int | None = None
     ) -> None:
         config = config or TransportConfig()
-        try:
-            parts = urlsplit(url)
-            valid = parts.scheme in ("http", "https") and parts.hostname and parts.path in ("", "/")
-            _ = parts.port
-        except ValueError:
-            valid = False
-        if not valid:
-            raise ValueError(f"url = {url!r}: allowed http://host:port, for instance http://192.168.7.2:5000")
+        require(web_address(url), "url", repr(url), WEB_ADDRESS)
         self.url = url.rstrip("/")
         self._clock = DeviceClock(speed)
         self._read_s = config.timeout(config.read_s, self._clock)

@@ -9,13 +9,15 @@ import random
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
+from urllib.parse import urlsplit
 
 from conf.schema import check, setting
 from hardware.clock import Clock, DeviceClock
 from hardware.errors import LinkError, ProtocolError
 
 __all__ = [
-    "MAX_BODY", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session", "switched_off",
+    "MAX_BODY", "WEB_ADDRESS", "Reply", "SharedLink", "SwitchedOff", "Transport", "TransportConfig", "new_session",
+    "switched_off", "web_address",
 ]  # fmt: skip
 
 SwitchedOff = Mapping[str, Mapping[str, float]]
@@ -23,6 +25,19 @@ SwitchedOff = Mapping[str, Mapping[str, float]]
 
 MAX_BODY = 262_144
 """Bytes of the longest answer; a full state is 36 KB (docs/device.md, Routes), the board agent carries at most this."""
+
+
+WEB_ADDRESS = "http://host:port, for instance http://192.168.7.2:5000"
+
+
+def web_address(url: str) -> bool:
+    """Whether a server can be reached under it: `WEB_ADDRESS`, with https too, without a path."""
+    try:
+        parts = urlsplit(url)
+        _ = parts.port
+    except ValueError:
+        return False
+    return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.path in ("", "/")
 
 
 def new_session() -> int:

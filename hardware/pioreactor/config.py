@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from conf.schema import check, part, require, setting
 from hardware.clock import DeviceClock
 from hardware.link.secret import read_secret
+from hardware.link.transport import WEB_ADDRESS, web_address
 
 __all__ = ["PASSWORD", "PUBLISHED", "PioreactorConfig", "RigBackendConfig", "RigConfig", "UnitConfig", "vial_ml"]
 
@@ -35,6 +36,7 @@ class UnitConfig:
 
     def __post_init__(self) -> None:
         check(self, "backend.units.NAME")
+        require(not self.address or web_address(self.address), "backend.units.NAME.address", self.address, WEB_ADDRESS)
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,9 @@ class PioreactorConfig:
 
     def __post_init__(self) -> None:
         check(self, "backend")
+        require(not self.leader or web_address(self.leader), "backend.leader", self.leader, WEB_ADDRESS)
+        host = bool(self.broker) and not set(self.broker) & set(" /")
+        require(host, "backend.broker", repr(self.broker), "the name of a host; its port is broker_port")
         unique = len(set(self.reactors)) == len(self.reactors)
         require(unique, "backend.reactors", self.reactors, "one or more unique names")
         least = f"min_dose_ml = {self.min_dose_ml} or more"

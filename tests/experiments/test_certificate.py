@@ -747,8 +747,9 @@ def test_a_certificate_that_finds_no_room_elsewhere_is_said_and_stays_in_the_run
     monkeypatch.setattr("experiments.reporting.tensorboard.Events", lambda folder: events)
     found: Any = SimpleNamespace(told=lambda: ["pass  one", "FAIL  two"], quick=False)
     with caplog.at_level("WARNING"):
-        command._write(tmp_path, tmp_path / "policy.npz", {"passed": False}, to, found)
-    assert caplog.messages == [f"{to}: not written (No space left on device); {tmp_path}/certificate.json is the same"]
+        unwritten = command._write(tmp_path, tmp_path / "policy.npz", {"passed": False}, to, found)
+    assert unwritten == f"{to}: not written (No space left on device); {tmp_path}/certificate.json is the same"
+    assert caplog.messages == [unwritten]
     assert json.loads((tmp_path / "certificate.json").read_text()) == {"passed": False}
     assert json.loads((tmp_path / "summary.json").read_text()) == {"passed": False}
     assert told == [("figures/certificate", "drawn", 0), ("run/summary", "- pass  one\n- FAIL  two")]
