@@ -78,6 +78,17 @@ def test_the_device_s_own_law_is_told_the_volume_of_each_vial(tmp_path: Path) ->
         assert first[name]["why"]["p"] == pytest.approx(by_hand, rel=1e-3)
 
 
+def test_the_growth_that_a_law_learns_is_the_culture_s_in_vials_of_every_volume(tmp_path: Path) -> None:
+    """All grow by 3 % a minute on calibrated pumps; doses taken for another vial's leave it 2.7 % in 14 mL."""
+    words = ["plant=nominal", "plant.start_od=0.55", "backend.reactors=[M0,M1,M2]", "controller=inverse"]
+    error(tmp_path / "run", *words, "bench.volumes_ml.M1=14", "bench.volumes_ml.M2=27")
+    rows = [row for row in read_journal(tmp_path / "run" / "journal.jsonl")[0] if row["kind"] == "decision"]
+    last = {row["reactor"]: row["why"] for row in rows}
+    assert {name: why["mu"] for name, why in last.items()} == pytest.approx(dict.fromkeys(last, 0.03), rel=0.01)
+    assert {name: why["gain"] for name, why in last.items()} == pytest.approx(dict.fromkeys(last, 1.0), rel=0.01)
+    assert len(last) == 3
+
+
 def test_no_rate_for_a_larger_volume_passes_the_cap() -> None:
     law = SimpleNamespace(act=lambda *_given: np.array([0.004, 0.015, 0.02]))
     yes, none = np.ones(3, dtype=bool), np.zeros(3)
