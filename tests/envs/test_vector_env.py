@@ -307,6 +307,12 @@ def test_an_episode_begins_where_it_is_told_and_says_where_it_is():
         np.testing.assert_allclose(observation, list(info.values()), rtol=1e-6)
         assert truncated is ended
     assert one.reset()[1]["od"] != 0.3  # told once, not for good
+    for _ in range(2):
+        one.step(0)
+    assert one.reset(options={"od": 0.35, "setpoint": 0.6})[1] == {
+        "od": 0.35,
+        "setpoint": 0.6,
+    }  # of a later episode, too
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,19 @@ def test_the_first_dose_after_a_pause_is_expected_smaller_and_not_blamed_on_the_
     assert 0.0 <= moved[known] < 0.3 * moved[unknown]
 
 
+@pytest.mark.parametrize(("rest", "share"), [((2, 4, 6, 8, 10, 12), 0.5), ((5, 12), 0.5), ((2, 4, 6, 8), 1.0)])
+def test_a_pause_is_counted_in_minutes_whatever_the_period(rest: tuple[int, ...], share: float) -> None:
+    """Nothing grows. 12 min without a dose are a pause, read every 2 min or with samples lost; 8 min are none."""
+    e = estimator(replace(BARE, first_dose=0.5, pulse_cv=0.0, mu_walk=0.0, gain_walk=0.0))
+    e.mean[0, MU] = 0.0
+    shown(e, 0.5, -2.0, 1e-9)
+    for minute in (0, *rest):
+        shown(e, 0.5, float(minute), 1.0 if minute == rest[-1] else 0.0)
+    mean = e.mean.copy()
+    e._predict(np.array([0]), np.array([2.0]), np.zeros(1))
+    assert mean[0, LOG_OD] - e.mean[0, LOG_OD] == pytest.approx(share * mean[0, GAIN] * 1.0 / 20.0, rel=1e-3)
+
+
 def test_growth_is_carried_over_a_change_of_temperature() -> None:
     """2.5 % of mu a degree are believed at first: 37 to 33 degC make 0.025 to 0.0225 at once, without a reading."""
     e, blind = estimator(), estimator(replace(DEFAULT, warmth=0.0, warmth_sd=0.0))
