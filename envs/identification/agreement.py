@@ -109,7 +109,7 @@ class Agreement:
                 f"{SHORTEST_WINDOW_MIN:.0f} are needed."
             )
         if self.left:
-            head = "Recalibrate: " if planned else f"{UNUSED}, and the culture was another one: "
+            head = "Recalibrate: " if planned else f"{UNUSED}, and its culture is not the model: "
             return f"{head}{'; '.join(_words(c) for c in self.left)}{self._which()}."
         unknown = " and ".join(c.name for c in (self.growth, self.gain) if c.latest is None)
         but = f"; {unknown} cannot be told from these readings alone" if unknown else ""
@@ -124,7 +124,7 @@ class Agreement:
         return f"; the culture grows {faster} or the pump is {weaker}, which this run alone cannot tell"
 
 
-UNUSED = "No calibration decided anything here"
+UNUSED = "This run needs no calibration"
 
 
 def _words(c: Compared) -> str:

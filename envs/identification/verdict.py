@@ -32,7 +32,7 @@ def judged(
     mu, tau = (100.0 * p.half_width / p.value for p in (result.mu, result.tau))
     known = f"mu is known within +-{mu:.2g} % and tau within +-{tau:.2g} %"
     if not against:
-        return Verdict("use", f"{known}, and nothing speaks against them", ""), ()
+        return Verdict("use", f"{known}; no check objects", ""), ()
     what, then = against[0]
     more = f" ({len(against) - 1} more below)" if len(against) > 1 else ""
     return Verdict("use with care", f"{known}; {what}{more}", then), tuple("; ".join(a) for a in against)

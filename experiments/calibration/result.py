@@ -182,7 +182,7 @@ def _disturbances(result: Calibration) -> list[str]:
         for p in (q.dose_spread, q.growth_spread, q.late_share)
     )
     return [
-        f"  bench       doses spread by {doses}, {late} of one is not seen by the next reading; "
+        f"  bench       doses spread by {doses}; {late} of a dose shows one reading late; "
         f"readings by {100 * q.noise:.1f} %",
         f"  culture     growth wanders by {growth} from hour to hour",
     ]

@@ -371,8 +371,8 @@ def _beside_paper(out: Page, summary: Row) -> None:
     certain = len({loss.cell for loss in lost if loss.certain})
     if lost:
         claim = (
-            f"Of {cells} cells here, the learned policy (dqn) loses {cells_lost}, {certain} of them with a 95 % "
-            "interval of the paired difference that excludes 0:"
+            f"Of {cells} cells here, the learned policy (dqn) loses {cells_lost}, {certain} of them for certain "
+            "(the 95 % interval of the paired difference is above 0):"
         )
     elif any(r["controller"] == "dqn" for r in rows):
         claim = f"The learned policy (dqn) is lowest in all {cells} cells here."

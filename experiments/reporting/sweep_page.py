@@ -80,8 +80,8 @@ def _headline(ranked: Sequence[Configuration], jobs: Sequence[Result], called: C
         if len(ranked) > 1
         else f"One configuration, {best.name}"
     )
-    middle = f", with an interquartile mean of {number(s.iqm)} over {s.n}" if s.n > 1 else ""
-    text = f"{head}: {what}, {number(s.worst)} at its worst{middle}"
+    middle = f"; the middle half of its {s.n} seeds has {number(s.iqm)} on average" if s.n > 1 else ""
+    text = f"{head}: {what}, is {number(s.worst)} at its worst{middle}"
     if len(ranked) > 1:
         other = statistics(ranked[1].measured[name])
         apart = s.n < 2 or other.n < 2 or s.interval[1] < other.interval[0]

@@ -129,10 +129,12 @@ class Session:
     @property
     def ended(self) -> str:
         """Why training ended, in announcements."""
-        if not self.met():
+        within = self.config.stop_within
+        if within is None or not self.met():
             return "agent.total_steps"
-        limits = f"{self.task.regret_unit:g} % regret and {self.task.steady_unit:g} {self.task.unit} steady error"
-        return f"every kept policy is within {self.config.stop_within:g} times {limits} on the selection grid"
+        regret, steady = (within * unit for unit in (self.task.regret_unit, self.task.steady_unit))
+        limits = f"{regret:g} % regret and {steady:g} {self.task.unit} steady error"
+        return f"every kept policy is within {limits} on the selection grid"
 
     def _news(self, record: TrainRecord) -> str:
         """Medians over agents on the selection grid, now and of what is kept; nothing is scored before an update."""

@@ -70,7 +70,7 @@ def test_growth_that_rises_is_told_from_the_hour_on_at_which_it_matters() -> Non
         assert found.net.latest.value == pytest.approx(0.03 * 0.04 * 7.0, rel=0.15)  # mean of the last two hours
         assert found.verdict().startswith("Recalibrate: ")
         unused = found.verdict(planned=False)
-        assert unused.startswith("No calibration decided anything here, and the culture was another one: ")
+        assert unused.startswith("This run needs no calibration, and its culture is not the model: ")
         assert unused.endswith(found.verdict().removeprefix("Recalibrate"))
         assert "the predicted net growth is off by 10 % or more since hour " in found.verdict()
         assert found.attainable < 0.95 * found.rms

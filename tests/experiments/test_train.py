@@ -186,7 +186,8 @@ def test_training_ends_when_every_agent_has_met_the_limits(whole, tmp_path):
     assert summary["env_steps"] == full["history"][k][0]
     assert summary["updates"] == 4 * (summary["env_steps"] - 100)
     assert summary["ended"] == (
-        f"every kept policy is within {within:g} times 0.5 % regret and 0.003 OD steady error on the selection grid"
+        f"every kept policy is within {0.5 * within:g} % regret and {0.003 * within:g} OD steady error "
+        "on the selection grid"
     )
     assert json.loads((whole / "summary.json").read_text())["ended"] == "agent.total_steps"
     assert len(summary["regret_pct"]) == len(summary["regret_pct_last"]) == 2  # on the reported grid, as always

@@ -114,7 +114,7 @@ def test_a_training_of_several_ends_when_the_last_of_them_is_good_enough(
     one.writer.close()
     one.best.merit[:] = merits
     assert one.met() == met
-    assert one.ended.startswith("every kept policy is within 1 times" if met else "agent.total_steps")
+    assert one.ended.startswith("every kept policy is within 0.5 % regret" if met else "agent.total_steps")
 
 
 def test_the_policy_that_flies_is_of_least_merit_also_where_another_seed_has_less_regret(tmp_path: Path) -> None:
