@@ -48,6 +48,18 @@ def test_a_deployment_has_the_plant_of_the_file(file: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
+    ("volume", "ml"), [([], 20.0), (["plant.vessel.volume_ml=14"], 14.0), (["bench.volume_ml=28"], 28.0)]
+)
+def test_a_calibrated_model_dilutes_the_simulated_vial_as_it_says(volume: list[str], ml: float, tmp_path: Path) -> None:
+    """tau = .25: 1 mL/s for a minute takes 1 / .25 off ln OD, so 60 g / V = 4 a minute in a vial of any volume."""
+    model = tmp_path / "calibrated.yaml"
+    model.write_text("mu: 0.02\ntau: 0.25\n")
+    config = main.config([f"env_file={model}", "controller=pi", "plant=nominal", *volume])
+    plant = assemble.unpack(config, tmp_path / "run").plant
+    assert (plant.growth.mu, 60.0 * plant.pump.gain_ml_s / ml) == pytest.approx((0.02, 4.0))
+
+
+@pytest.mark.parametrize(
     ("overrides", "message"),
     [
         (["env_file=calibrated.yaml"], "env_file = calibrated.yaml: allowed null beside plant_file"),

@@ -263,6 +263,26 @@ def test_the_log_of_a_run_says_of_each_reactor_what_changes_and_how_well_its_own
     ]
 
 
+def test_what_goes_wrong_without_a_new_sample_is_told_and_a_refusal_lasts_until_the_next_one(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """M0 is refused its sample, then has none for two minutes; M1 falls silent; then both are well."""
+    reactors, told = SimpleNamespace(names=("M0", "M1"), handed_over=np.zeros(2, dtype=bool)), []
+    run = SimpleNamespace(reactors=reactors, progress=Progress((SCHEDULES[0], SCHEDULES[0])))
+    changes = summary.ChangeLog(run, lambda *words: told.append(words))
+    none = {"rows": [False, False]}
+    changes(step(0.0, reasons=("jump: 0.5 to 3", None)))
+    changes(step(1.0, reasons=(None, "lost: no sample for 3 min"), **none))
+    changes(step(2.0, reasons=("pumps stopped earlier in this run", "lost: no sample for 4 min"), **none))
+    changes(step(3.0))
+    assert told == [
+        ("alarm", "jump: 0.5 to 3", "M0"),
+        ("alarm", "lost: no sample for 3 min", "M1"),
+        ("alarm", "interlock: all well again", "M0"),
+        ("alarm", "interlock: all well again", "M1"),
+    ]
+
+
 def curves_of(folder: Path) -> dict[str, list[tuple[int, float, float]]]:
     """Step, seconds since 1970 and value of every point, by its tag."""
     events = EventAccumulator(str(folder), size_guidance={"tensors": 0}).Reload()

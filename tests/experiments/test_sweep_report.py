@@ -96,6 +96,14 @@ def test_curves_are_those_of_every_seed_of_every_job(trained: Path) -> None:
     np.testing.assert_array_equal(values, [[1, 2, 3, 10], [0.5, 1, 1.5, 5]])
 
 
+def test_a_seed_that_two_jobs_trained_has_a_curve_of_each(tmp_path: Path) -> None:
+    for k, regret in enumerate((4.0, 9.0)):
+        (tmp_path / str(k)).mkdir()
+        learned(tmp_path / str(k), [5], [regret])
+    jobs = [sweep_results.Result(tmp_path / str(k), {}, "finished") for k in range(2)]
+    np.testing.assert_array_equal(sweep_results.curve(jobs, "eval/regret_pct")[1], [[4.0, 9.0], [2.0, 4.5]])
+
+
 def test_seeds_that_were_evaluated_at_other_steps_leave_a_gap_and_keep_their_column(tmp_path: Path) -> None:
     """Seed 7 at steps 100 and 300, seed 3 at 200 and 300; another tag and a torn line are none of them."""
     for k, (seed, values) in enumerate(((7, {100: 4.0, 300: 2.0}), (3, {200: 9.0, 300: 8.0}))):
