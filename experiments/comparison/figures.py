@@ -15,6 +15,7 @@ from experiments.comparison.page import law_of
 from experiments.comparison.published import TABLE_2
 from experiments.comparison.trials import DensityTrial, ShareTrial
 from experiments.reporting.charts import COLOURS, new_figure, pump_end
+from experiments.reporting.tables import clock
 
 __all__ = ["LONG_MIN", "bands", "differences", "plants", "published_and_ours", "share_errors", "shares"]
 
@@ -61,13 +62,13 @@ def _estimate(
     ax.plot(value, y, marker, color=colour, markersize=5, markerfacecolor="white" if hollow else colour)
 
 
-def _band(ax: Axes, minute: Array, values: Array, colour: str) -> None:
+def _band(ax: Axes, time: Array, values: Array, colour: str) -> None:
     """Mean over replicates and one standard deviation around it; values (N, K)."""
     mean = values.mean(axis=0)
     if values.shape[0] > 1:
         sd = values.std(axis=0, ddof=1)
-        ax.fill_between(minute, mean - sd, mean + sd, color=colour, alpha=0.28, linewidth=0)
-    ax.plot(minute, mean, color=colour, linewidth=1.3)
+        ax.fill_between(time, mean - sd, mean + sd, color=colour, alpha=0.28, linewidth=0)
+    ax.plot(time, mean, color=colour, linewidth=1.3)
 
 
 def _curves(trial: DensityTrial) -> tuple[Array, Array, Array, Array]:
@@ -90,27 +91,28 @@ def bands(trials: Sequence[DensityTrial]) -> Figure:
     first = trials[0]
     switched = len(set(first.schedule.temperatures)) > 1
     rows, ratios = (3, [2.2, 1.1, 0.9]) if switched else (2, [2.2, 1.1])
-    width = max(5.2, 3.2 * len(trials))
+    width, (unit, sign) = max(5.2, 3.2 * len(trials)), clock(first.schedule.total_min)
     figure, axes = new_figure(
         width, 3.9 + 0.9 * switched, rows, len(trials), sharex=True, sharey="row", height_ratios=ratios
     )
     for column, trial in enumerate(trials):
         top, middle = axes[column], axes[len(trials) + column]
         colour, _ = _mark(trial.cell.controller)
-        edges = trial.schedule.edges
+        edges = trial.schedule.edges / unit
         goals = np.append(trial.schedule.setpoints, trial.schedule.setpoints[-1])
         top.step(edges, goals, where="post", color="black", linewidth=1.0, linestyle="--")
         minute, od, rate, temperature = _curves(trial)
-        _band(top, minute, od, colour)
-        _band(middle, minute, 1000.0 * rate, colour)
+        time = minute / unit
+        _band(top, time, od, colour)
+        _band(middle, time, 1000.0 * rate, colour)
         if switched:
             bottom = axes[2 * len(trials) + column]
-            _band(bottom, minute, temperature, colour)
+            _band(bottom, time, temperature, colour)
             for edge, (before, after) in zip(edges[1:-1], pairwise(trial.schedule.temperatures), strict=True):
                 for ax in (top, middle, bottom) if after != before else ():
                     ax.axvline(edge, color="#888888", linewidth=0.8, linestyle=":")
         top.set_title(f"{trial.cell.controller}, n = {trial.od.shape[0]}")
-        axes[(rows - 1) * len(trials) + column].set_xlabel("time, min")
+        axes[(rows - 1) * len(trials) + column].set_xlabel(f"time, {sign}")
     axes[0].set_ylabel("OD")
     axes[len(trials)].set(ylabel="pump rate, µL/s", ylim=(-0.8, 0.5 + pump_end(*(trial.rate for trial in trials))))
     if switched:

@@ -23,7 +23,7 @@ from experiments.loop.signals import ESTIMATED, within_2sd
 from experiments.reporting.agreement_chart import agreement_figure
 from experiments.reporting.charts import save
 from experiments.reporting.page import Page
-from experiments.reporting.tables import Table, number
+from experiments.reporting.tables import Table, number, span
 from hardware.errors import RecordingError
 from hardware.storage.recording_reader import read_recording
 
@@ -203,14 +203,14 @@ def _acted(summary: Mapping[str, Any], why: Mapping[str, Array]) -> str:
     supervised = why["minute"][why["supervised"] > 0.0] if "supervised" in why else np.empty(0)
     reasons = summary.get("reasons")
     kinds = "; ".join(
-        f"{kind} in {t['rows']} rows, minute {number(t['first_min'])} to {number(t['last_min'])}"
+        f"{kind} in {t['rows']} rows, {span(t['first_min'], t['last_min'])}"
         for kind, t in (reasons.items() if isinstance(reasons, Mapping) else ())
         if isinstance(t, Mapping) and {"rows", "first_min", "last_min"} <= t.keys()
     )
     interlock = f"The interlock spoke in {summary.get('interlock', 0)} of {summary.get('rows', 0)} rows"
     acted = f"A supervisor acted on {len(supervised)} rows"
     if len(supervised):
-        acted += f", minute {supervised[0]:.0f} to {supervised[-1]:.0f}"
+        acted += f", {span(supervised[0], supervised[-1])}"
         if (alarmed := int((why.get("alarm", np.zeros(1)) > 0.0).sum())) > 0:
             acted += f", on {alarmed} of them because readings did not fit the estimate"
     return f"{interlock}{': ' if kinds else ''}{kinds}. {acted}."

@@ -19,6 +19,7 @@ from experiments.record.record import Table
 from experiments.record.recovery import Array, Rows
 from experiments.reporting import charts
 from experiments.reporting.composition_charts import composition_figure
+from experiments.reporting.tables import span
 from hardware.safety.interlock import kinds_of
 
 __all__ = [
@@ -138,9 +139,7 @@ def _cell(value: float) -> str:
 def reasons_line(rows: Rows) -> str:
     """What the interlock said in a run, most frequent first; "" if it had nothing to say."""
     often = sorted(rows.reasons.items(), key=lambda item: -item[1].rows)
-    return "; ".join(
-        f"{kind} in {t.rows} of {len(rows)} rows, minute {t.first_min:.0f} to {t.last_min:.0f}" for kind, t in often
-    )
+    return "; ".join(f"{kind} in {t.rows} of {len(rows)} rows, {span(t.first_min, t.last_min)}" for kind, t in often)
 
 
 def summarise(

@@ -15,6 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
+from experiments.reporting.tables import clock
+
 __all__ = [
     "COLOURS", "closed_loop", "learning", "new_figure", "policy_map", "pump_end", "relative_map",
     "relative_trajectories", "save", "trajectories",
@@ -140,22 +142,19 @@ def trajectories(minutes: Array, od: Array, best: Array, setpoint: Array, rates:
       minutes: (K + 1,). od, best: OD including the start, (K + 1, G). setpoint: (G,).
       rates, best_rates: pump rates in mL/s, (K, G).
     """
-    goals = np.unique(setpoint)
+    goals, (unit, sign) = np.unique(setpoint), clock(minutes[-1])
+    time = minutes / unit
     figure, axes = new_figure(3.4 * goals.size, 4.6, 2, goals.size, sharex=True, sharey="row", height_ratios=[2, 1])
     for column, goal in enumerate(goals):
         top, bottom = axes[column], axes[goals.size + column]
         top.axhline(goal, color="black", linewidth=0.8, linestyle="--", label="setpoint")
         for k, g in enumerate(np.flatnonzero(setpoint == goal)):
-            top.plot(minutes, od[:, g], color=COLOURS[k], linewidth=1.5, label=f"learned, from {od[0, g]:g}")
-            top.plot(
-                minutes, best[:, g], color="black", linewidth=1.0, linestyle=":", label="optimum" if k == 0 else None
-            )
-            bottom.step(minutes[:-1], rates[:, g] * 1000.0, where="post", color=COLOURS[k], linewidth=1.0)
-            bottom.step(
-                minutes[:-1], best_rates[:, g] * 1000.0, where="post", color="black", linewidth=0.8, linestyle=":"
-            )
+            top.plot(time, od[:, g], color=COLOURS[k], linewidth=1.5, label=f"learned, from {od[0, g]:g}")
+            top.plot(time, best[:, g], color="black", linewidth=1.0, linestyle=":", label="optimum" if k == 0 else None)
+            bottom.step(time[:-1], rates[:, g] * 1000.0, where="post", color=COLOURS[k], linewidth=1.0)
+            bottom.step(time[:-1], best_rates[:, g] * 1000.0, where="post", color="black", linewidth=0.8, linestyle=":")
         top.set_title(f"setpoint {goal:g}")
-        bottom.set(xlabel="time, min", ylim=(-0.5, pump_end(rates, best_rates)))
+        bottom.set(xlabel=f"time, {sign}", ylim=(-0.5, pump_end(rates, best_rates)))
     axes[0].legend()
     axes[0].set_ylabel("OD")
     axes[goals.size].set_ylabel("pump rate, µL/s")
@@ -220,28 +219,29 @@ def closed_loop(
     Args: minutes, od, setpoint, rate, temperature: (K, N), nan where a reactor has no sample. names: N labels.
       marks: minute and text of vertical lines. refused: OD that was not believed, (K, N); at the edge where it is far.
     """
-    rows = 2 if temperature is None else 3
+    unit, sign = clock(float(np.nanmax(minutes, initial=0.0)))
+    time, rows = minutes / unit, 2 if temperature is None else 3
     ratios = [2.2, 1.0] if temperature is None else [2.2, 1.0, 0.8]
     figure, axes = new_figure(8.0, 4.6 + 0.9 * (rows - 2), rows, 1, sharex=True, height_ratios=ratios)
     for n, name in enumerate(names):
         colour = COLOURS[n % len(COLOURS)]
-        axes[0].plot(minutes[:, n], od[:, n], color=colour, linewidth=1.2, label=name)
+        axes[0].plot(time[:, n], od[:, n], color=colour, linewidth=1.2, label=name)
         axes[0].step(
-            minutes[:, n], setpoint[:, n], where="post", color="black" if n == 0 else colour, linewidth=0.9,
+            time[:, n], setpoint[:, n], where="post", color="black" if n == 0 else colour, linewidth=0.9,
             linestyle="--", label="setpoint" if n == 0 else None,
         )  # fmt: skip
-        axes[1].step(minutes[:, n], rate[:, n] * 1000.0, where="post", color=colour, linewidth=1.0)
+        axes[1].step(time[:, n], rate[:, n] * 1000.0, where="post", color=colour, linewidth=1.0)
         if temperature is not None:
-            axes[2].plot(minutes[:, n], temperature[:, n], color=colour, linewidth=1.0)
+            axes[2].plot(time[:, n], temperature[:, n], color=colour, linewidth=1.0)
     for minute, text in marks:
         for ax in axes:
-            ax.axvline(minute, color="#7f7f7f", linewidth=0.9, linestyle=":")
+            ax.axvline(minute / unit, color="#7f7f7f", linewidth=0.9, linestyle=":")
         place: dict[str, Any] = {"rotation": 90, "fontsize": 7, "va": "bottom", "ha": "right", "color": "#4d4d4d"}
-        axes[0].text(minute, 0.02, text, transform=axes[0].get_xaxis_transform(), **place).set_in_layout(False)
+        axes[0].text(minute / unit, 0.02, text, transform=axes[0].get_xaxis_transform(), **place).set_in_layout(False)
     if refused is not None and np.isfinite(refused).any():
         low, high = axes[0].get_ylim()
         axes[0].plot(
-            minutes, np.clip(refused, low, high), "x", color="#7f7f7f", markersize=4, clip_on=False,
+            time, np.clip(refused, low, high), "x", color="#7f7f7f", markersize=4, clip_on=False,
             label=["not believed", *[None] * (len(names) - 1)],
         )  # fmt: skip
         axes[0].set_ylim(low, high)
@@ -251,5 +251,5 @@ def closed_loop(
     axes[1].set(ylabel="pump rate, µL/s", ylim=(-0.5, pump_end(rate)))
     if temperature is not None:
         axes[2].set_ylabel("temperature, °C")
-    axes[-1].set_xlabel("time, min")
+    axes[-1].set_xlabel(f"time, {sign}")
     return figure

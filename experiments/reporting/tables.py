@@ -7,7 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Best", "Table", "markdown", "number", "plus_minus", "typeset", "write"]
+__all__ = ["Best", "Table", "clock", "markdown", "number", "plus_minus", "span", "typeset", "write"]
+
+LONG_MIN = 180.0  # what lasts longer is told in hours
 
 
 class Best(str):
@@ -31,6 +33,17 @@ def plus_minus(mean: float | None, sd: float | None, digits: int = 3) -> str:
     if mean is None or sd is None or not sd > 1e-6 * abs(mean):
         return number(mean, digits)
     return f"{number(mean, digits)} ± {number(sd, 2)}"
+
+
+def clock(last: float) -> tuple[float, str]:
+    """How long the unit of time is, min, and its sign, where the last minute to be told is `last`."""
+    return (60.0, "h") if last > LONG_MIN else (1.0, "min")
+
+
+def span(first: float, last: float) -> str:
+    """From when to when, given in minutes."""
+    unit, sign = clock(last)
+    return f"{'hour' if sign == 'h' else 'minute'} {round(first / unit, 1):g} to {round(last / unit, 1):g}"
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

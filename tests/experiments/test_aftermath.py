@@ -261,6 +261,8 @@ def test_what_interlock_and_supervisor_did_is_counted_each_by_itself():
         "The interlock spoke in 8 of 300 rows: stale in 3 rows, minute 31.5 to 40; budget in 6 rows, minute 5 to 8. "
         "A supervisor acted on 5 rows, minute 10 to 14, on 2 of them because readings did not fit the estimate."
     )
+    day = {**summary, "reasons": {"falls": {"rows": 5, "first_min": 41.0, "last_min": 1345.0}}}
+    assert ": falls in 5 rows, hour 0.7 to 22.4." in _acted(day, why)
     errors = {"error": [0.0, 0.19, 0.21, -0.1, 0.0], "error_sd": [0.1] * 5, "true_error": [0.0] * 4 + [np.nan]}
     shares = {"growth_share": [0.5] * 2, "growth_share_sd": [0.1] * 2, "true_growth_share": [0.6, 0.9]}
     assert _sure({key: np.array(values) for key, values in errors.items()}) == [

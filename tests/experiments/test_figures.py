@@ -309,16 +309,16 @@ STEPS = [100.0, 200.0]
 Drawn = tuple[int, str, str, str, Any, Any]
 DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
     "closed loop": (closed_loop, [
-        (0, "line 0", MIN, "OD", MINUTES, OD),
-        (0, "line 1", MIN, "OD", MINUTES, np.full(12, 0.45)),
-        (0, "line 2", MIN, "OD", LATER, np.where(MINUTES == 90.0, np.nan, 2 * OD)),
-        (0, "line 3", MIN, "OD", LATER, np.full(12, 0.9)),
-        (0, "line 4", MIN, "OD", [45, 45], [0, 1]),
-        (0, "line 6", MIN, "OD", LATER, np.where(MINUTES == 90.0, 2 * OD, np.nan)),
-        (1, "line 0", MIN, PUMP, MINUTES, FED),
-        (1, "line 1", MIN, PUMP, LATER, TWICE),
-        (2, "line 0", MIN, WARM, MINUTES, 37 - HOURS),
-        (2, "line 1", MIN, WARM, LATER, 74 - 2 * HOURS),
+        (0, "line 0", H, "OD", HOURS, OD),
+        (0, "line 1", H, "OD", HOURS, np.full(12, 0.45)),
+        (0, "line 2", H, "OD", LATER / 60, np.where(MINUTES == 90.0, np.nan, 2 * OD)),
+        (0, "line 3", H, "OD", LATER / 60, np.full(12, 0.9)),
+        (0, "line 4", H, "OD", [0.75, 0.75], [0, 1]),
+        (0, "line 6", H, "OD", LATER / 60, np.where(MINUTES == 90.0, 2 * OD, np.nan)),
+        (1, "line 0", H, PUMP, HOURS, FED),
+        (1, "line 1", H, PUMP, LATER / 60, TWICE),
+        (2, "line 0", H, WARM, HOURS, 37 - HOURS),
+        (2, "line 1", H, WARM, LATER / 60, 74 - 2 * HOURS),
     ]),
     "composition": (composition, [
         (0, "line 0", H, "share of B", HOURS, OD),
@@ -416,8 +416,9 @@ DRAWN: dict[str, tuple[Callable[[], Figure], list[Drawn]]] = {
         (2, "band 0", MIN, "vial, °C", ONES, [[32.0] * 90, [34.0] * 90]),
     ]),
     "bands of a long run": (lambda: figures.bands([trial(400.0)]), [
-        (0, "line 1", MIN, "OD", TENS, np.full(40, 0.6)),
-        (1, "line 0", MIN, PUMP, TENS, np.full(40, 8.0)),
+        (0, "line 1", H, "OD", TENS / 60, np.full(40, 0.6)),
+        (1, "line 0", H, PUMP, TENS / 60, np.full(40, 8.0)),
+        (2, "line 1", H, "vial, °C", [200 / 60] * 2, [0.0, 1.0]),
     ]),
     "shares": (lambda: figures.shares([share_trial()]), [
         (0, "line 0", "hours", "share of the second species", np.arange(0, 121, 5) / 60, np.full(25, 0.3)),
@@ -713,15 +714,31 @@ def test_each_law_has_its_own_column_and_colour_and_a_switch_stands_where_the_te
         assert panels[1].get_ylim()[1] > 60.0
 
 
+@pytest.mark.parametrize(("last", "unit", "said"), [(180.0, 1.0, MIN), (1440.0, 60.0, H)])
+def test_what_lasts_longer_than_three_hours_is_drawn_in_hours(last: float, unit: float, said: str) -> None:
+    """Its axis never ends at 1440; a mark and the steps of the setpoint stand where the axis says."""
+    minutes = np.linspace(0.0, last, 10)
+    column = minutes[:, None]
+    loop = charts.closed_loop(column, column, column, column, ["M0"], marks=[(90.0, "looked")], refused=column)
+    curves = np.ones((10, 1))
+    example = charts.trajectories(minutes, curves, curves, np.array([0.5]), curves[1:], curves[1:])
+    for drawn in (loop, example, figures.bands([trial(last)])):
+        ends = [line.get_xdata()[-1] for ax in drawn.axes for line in ax.lines if len(line.get_xdata()) > 2]
+        assert max(ends) == pytest.approx(last / unit)
+        assert label(drawn.axes[0], "x") == said
+    assert loop.axes[1].lines[1].get_xdata() == [90.0 / unit] * 2
+    assert loop.axes[0].texts[0].get_position()[0] == 90.0 / unit
+
+
 def test_a_long_run_is_drawn_by_the_means_of_its_blocks() -> None:
     """An OD that rises by 0.001 a minute: the mean of ten minutes is that of the minute in their middle."""
     one = trial(400.0)
     ax = figures.bands([replace(one, clean=0.001 * one.minute + SPREAD)]).axes[0]
-    np.testing.assert_allclose(ax.lines[1].get_data(), [TENS, 0.001 * TENS])
+    np.testing.assert_allclose(ax.lines[1].get_data(), [TENS / 60, 0.001 * TENS])
     every = 2.0 * np.arange(201.0)  # a decision every other minute: the mean of five
     slow = {key: np.repeat(getattr(one, key)[:, :1], 201, axis=1) for key in ("od", "rate", "temperature")}
     ax = figures.bands([replace(one, minute=every, clean=0.001 * every + SPREAD, **slow)]).axes[0]
-    np.testing.assert_allclose(ax.lines[1].get_data(), [TENS - 0.5, 0.001 * (TENS - 0.5)])
+    np.testing.assert_allclose(ax.lines[1].get_data(), [(TENS - 0.5) / 60, 0.001 * (TENS - 0.5)])
 
 
 def test_shares_of_two_laws_stand_in_the_column_of_their_own_name() -> None:
