@@ -97,9 +97,12 @@ def _place(config: CertifyConfig, source: Path) -> Path | None:
 
 def _summary(source: Path, content: dict[str, Any], found: Certificate) -> dict[str, Any]:
     """What a page shows: the verdict, every requirement, and a row per case."""
-    kept = ("passed", "of", "observation", "setpoints", "bounds", "checks", "cannot_hold", "not_monotone")
+    kept = ("passed", "of", "observation", "setpoints", "bounds", "checks", "cannot_hold")
     cases = [_row(found.question.loop, proof) for proof in found.proofs if proof.holdable.any()]
-    return {"policy": str(source), **{key: content[key] for key in kept}, "cases": cases}
+    heads = (*content["observation"][:2], "from action", "to action")
+    drops = [dict(zip(heads, drop.values(), strict=True)) for drop in content["not_monotone"]]
+    told = {"a_higher_reading_gets_a_smaller_dose": drops, "cases": cases}
+    return {"policy": str(source), **{key: content[key] for key in kept}, **told}
 
 
 def _row(loop: Any, proof: Proof) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from experiments.comparison.published import TABLE_2
 from experiments.reporting.page import Page, provenance
-from experiments.reporting.tables import Best, Table, number, plus_minus
+from experiments.reporting.tables import Best, Table, count, number, plus_minus
 
 __all__ = ["SECTIONS", "law_of", "losses", "matrix", "of_benchmark", "published_losses", "table_2"]
 
@@ -30,7 +30,7 @@ DENSITY = {
     "sensor-noise floor": "the score of the sensor's own error, reading minus what it would show without noise: what a "
     "culture exactly on the setpoint would be given.",
     "oracle": "dynamic programming on each vial's own growth rate, pump and volume, seeing the OD without noise and "
-    "not knowing setpoints ahead. On `nominal` nothing that starts a window from the same OD has a lower ISE; "
+    "not knowing setpoints ahead. On the plant nominal nothing that starts a window from the same OD has a lower ISE; "
     "elsewhere it shows what full knowledge of the present is worth.",
     "noise-free": "the same metrics on the OD that a sensor without noise would have shown.",
     "interlock": "stands between every controller and the pumps, with the limits of a bench; a reading it does not "
@@ -53,8 +53,8 @@ OUT_OF_COMPETITION = ("oracle", "optimum")
 SHARE = {
     "error": "mean over the scenario of |r - setpoint|, r the true share of the second species, wherever one is asked "
     "for.",
-    "told ahead": "changes of the setpoint are announced, as early as the scenario's announce_min; `optimum` knows the "
-    "whole program in either case.",
+    "told ahead": "changes of the setpoint are announced, as early as the scenario's announce_min; the optimum knows "
+    "the whole program in either case.",
     "calibrated": "the estimator knows each reactor's factor and offset of the light sensor, with errors of 2 % and "
     "5 counts; otherwise it begins from the mean of 17 real reactors.",
     "paired": "law minus the vendor's PI, reactor by reactor: both meet the same vials, sensors and noise.",
@@ -344,17 +344,36 @@ def _in_short(out: Page, summary: Row) -> None:
     places: dict[tuple[str, str], dict[str, list[float]]] = {}
     for entry in (*summary["totals"], *(r for r in summary["rows"] if r["signal"] == "share")):
         key, _ = RANKED[str(entry["signal"])]
-        if entry.get(key) is not None and entry["controller"] not in OUT_OF_COMPETITION:
+        if entry.get(key) is not None and _runs(entry):
             laws = places.setdefault((entry["scenario"], entry["plant"]), {})
             laws.setdefault(law_of(entry), []).append(float(entry[key]))
     unit = dict.fromkeys(RANKED[s][1] for s in dict.fromkeys(str(r["signal"]) for r in summary["rows"]))
     items = [f"{scenario} on {plant}: {_first(laws)}" for (scenario, plant), laws in places.items() if len(laws) > 1]
-    if items or summary["beside_paper"]:
+    alone = [] if items or summary["beside_paper"] else [_alone(summary, e) for e in summary["totals"] if _runs(e)]
+    if items or alone or summary["beside_paper"]:
         out.section("In short")
     if summary["beside_paper"]:
         _beside_paper(out, summary)
     if items:
         out.add("verdict", claim=f"Lowest {' and '.join(unit)}, mean of the replicates:", items=items, remark="")
+    if alone:
+        claim = "Mean ± standard deviation over the replicates, beside what the sensor's noise alone is given:"
+        out.add("verdict", claim=claim, items=alone, remark="")
+
+
+def _runs(entry: Row) -> bool:
+    return entry["controller"] not in OUT_OF_COMPETITION
+
+
+def _alone(summary: Row, entry: Row) -> str:
+    """A law that met no other one: what it scored, beside the oracle where that was run, and the sensor's noise."""
+    oracle = _find(summary["totals"], controller="oracle", plant=entry["plant"], scenario=entry["scenario"])
+    scores = []
+    for metric in METRICS:
+        least = f"oracle {number(oracle[f'{metric}_mean'])}, " if oracle else ""
+        own = plus_minus(entry[f"{metric}_mean"], entry[f"{metric}_sd"])
+        scores.append(f"{metric.upper()} {own} {UNITS[metric]} ({least}noise {number(entry[f'floor_{metric}'])})")
+    return f"{entry['controller']}, {entry['scenario']} on {entry['plant']}: {', '.join(scores)}"
 
 
 def _first(laws: Mapping[str, Sequence[float]]) -> str:
@@ -545,7 +564,8 @@ def of_benchmark(run: Path) -> Page:
     parts = [SECTIONS[s] for s in dict.fromkeys(r["signal"] for r in summary["rows"])] or [SECTIONS["density"]]
     out = Page(
         parts[0].title,
-        f"{summary['loops']} closed loops of {summary['replicates']} simulated replicates each, seed {summary['seed']}",
+        f"{count(summary['loops'], 'closed loop')} of {count(summary['replicates'], 'simulated replicate')}"
+        f"{' each' if summary['loops'] > 1 else ''}, seed {summary['seed']}",
     )
     _in_short(out, summary)
     for part in parts:
@@ -555,7 +575,7 @@ def of_benchmark(run: Path) -> Page:
     out.add("definitions", pairs=[pair for part in parts for pair in part.definitions.items()])
     if summary["details"]:
         out.section("All numbers")
-        out.table(all_rows(summary), folded=f"{len(summary['details'])} rows; also in tables/rows.csv")
+        out.table(all_rows(summary), folded=f"{count(len(summary['details']), 'row')}; also in tables/rows.csv")
     out.section("What was run")
     provenance(out, run)
     return out

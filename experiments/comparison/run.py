@@ -22,6 +22,7 @@ from experiments.control.policies import composition_policy, find_policy, load_p
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from experiments.reporting import charts, page
+from experiments.reporting.tables import count
 from experiments.training.config import TrainConfig
 
 __all__ = ["benchmark", "policies_of", "with_pair", "with_seeds", "with_twin"]
@@ -177,4 +178,5 @@ def benchmark(config: BenchmarkConfig, folder: Path) -> None:
         _store([t for t in trials if isinstance(t, DensityTrial)], folder)
     files.write_json(folder / "summary.json", summary | {"figures": shown})
     report = page.save(pages.of_benchmark(folder), folder)
-    log.info("%d closed loops of %d replicates; report %s", len(trials), config.replicates, report)
+    loops_of = f"{count(len(trials), 'closed loop')} of {count(config.replicates, 'replicate')}"
+    log.info("%s; report %s", loops_of, report)

@@ -198,14 +198,19 @@ def _told(runs: Iterable[Path]) -> list[Verdict]:
 
 
 def _results(page: Page, run: Path, prefix: str) -> None:
-    """summary.json as tables, whose names begin with `prefix`, and every figure of a run folder."""
+    """summary.json as tables, whose names begin with `prefix`, and every figure of a run folder.
+
+    What a verdict has told in words is folded: its dozens of keys are those of a file.
+    """
     summary, config = _read(run)
     leaves = dict(flat(summary if isinstance(summary, Mapping) else {"summary": summary}))
     lists = {k: v for k, v in leaves.items() if isinstance(v, list) and v and all(isinstance(e, Mapping) for e in v)}
     env = config.get("env")
     kind = str(env.get("kind", "")) if isinstance(env, Mapping) and "regret_pct" in leaves else ""
     _figures(page, run)
-    page.add("keys", pairs=[(_labelled(k, kind), _show(v)) for k, v in leaves.items() if k not in lists])
+    shown = [(_labelled(k, kind), typeset(_show(v))) for k, v in leaves.items() if k not in lists and v != ""]
+    told = isinstance(summary, Mapping) and verdict(summary, config) is not None
+    page.add("keys", pairs=shown, folded="Every number" if told else "")
     for key, value in lists.items():
         entries = [dict(flat(entry)) for entry in value]
         columns = tuple(dict.fromkeys(c for entry in entries for c in entry))

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Best", "Table", "clock", "markdown", "number", "plus_minus", "span", "typeset", "write"]
+__all__ = ["Best", "Table", "clock", "count", "markdown", "number", "plus_minus", "span", "typeset", "write"]
 
 LONG_MIN = 180.0  # what lasts longer is told in hours
 
@@ -44,6 +44,11 @@ def span(first: float, last: float) -> str:
     """From when to when, given in minutes."""
     unit, sign = clock(last)
     return f"{'hour' if sign == 'h' else 'minute'} {round(first / unit, 1):g} to {round(last / unit, 1):g}"
+
+
+def count(n: int, one: str) -> str:
+    """So many of what is called `one` where it is alone."""
+    return f"{n} {one}{'' if n == 1 else 's'}"
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

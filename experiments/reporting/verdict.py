@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from experiments.reporting.curves import BAND, ERROR_UNITS
-from experiments.reporting.tables import number
+from experiments.reporting.tables import count, number
 
 __all__ = ["REMEDY", "Verdict", "verdict"]
 
@@ -88,7 +88,7 @@ def _deployment(summary: Summary, config: Mapping[str, Any]) -> Verdict:
     )
     steady = [w["steady_abs_error"] / w["setpoint"] for w in windows if w["steady_abs_error"] is not None]
     items = [f"fresh medium {number(summary['volume_ml'])} mL"]
-    items += [f"interlock spoke in {sum(r['interlock'] for r in summary['reactors'].values())} samples"]
+    items += [f"interlock spoke in {count(sum(r['interlock'] for r in summary['reactors'].values()), 'sample')}"]
     shares = [w["ratio_abs_error_mean"] for w in windows if w.get("ratio_abs_error_mean") is not None]
     if shares:
         items.append(f"mean error of the share {number(float(np.mean(shares)))}, as estimated")

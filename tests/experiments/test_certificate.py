@@ -761,9 +761,14 @@ def test_the_summary_of_a_certificate_has_a_row_for_every_case_that_can_be_held(
     monkeypatch.setattr(command, "_row", lambda loop, proof: proof.case)
     proofs = [SimpleNamespace(case=k, holdable=np.array(held)) for k, held in enumerate(([1, 1], [0, 0], [0, 1]))]
     content = {name: name.upper() for name in ("passed", "of", "observation", "setpoints", "bounds", "checks")}
-    content |= {"cannot_hold": ["x"], "not_monotone": [], "strips": [0.0], "cases": ["of the certificate"]}
+    drop = {"first": -0.01, "second": 0.96, "from": 1, "to": 0}
+    content |= {"observation": ["od", "setpoint"], "not_monotone": [drop]}
+    content |= {"cannot_hold": ["x"], "strips": [0.0], "cases": ["of the certificate"]}
     found: Any = SimpleNamespace(proofs=proofs, question=SimpleNamespace(loop=None))
     summary = command._summary(Path("a/policy.npz"), content, found)
     assert summary.pop("cases") == [0, 2]
     assert summary.pop("policy") == "a/policy.npz"
-    assert summary == {name: value for name, value in content.items() if name not in ("strips", "cases")}
+    (named,) = summary.pop("a_higher_reading_gets_a_smaller_dose")
+    assert named == {"od": -0.01, "setpoint": 0.96, "from action": 1, "to action": 0}
+    left_out = ("strips", "cases", "not_monotone")
+    assert summary == {name: value for name, value in content.items() if name not in left_out}

@@ -25,7 +25,7 @@ from experiments.comparison import page as comparison
 from experiments.comparison.published import TABLE_2
 from experiments.reporting import charts
 from experiments.reporting.page import Page
-from experiments.reporting.tables import Best, Table, number, plus_minus, typeset
+from experiments.reporting.tables import Best, Table, count, number, plus_minus, typeset
 from tests.experiments.test_deploy import inverse_policy
 from tests.patience import PATIENCE_S
 
@@ -236,9 +236,57 @@ def test_in_short_the_lowest_of_each_plant_is_named_and_the_oracle_is_not():
     assert "<li>density on p: mpc 8.5, then dqn 9</li>" in text
     assert "<li>share on p: midpoint, told ahead 0.04, then pi 0.045</li>" in text
     assert "Lowest mean |r - setpoint| and ITAE, OD min², mean of the replicates:" in text
-    alone = one_section()
-    comparison._in_short(alone, {"beside_paper": [], "totals": totals[:1], "rows": rows[3:4]})
-    assert "Lowest" not in alone.html()
+
+
+@pytest.mark.parametrize("oracle", [True, False])
+def test_in_short_a_law_without_rival_stands_beside_the_oracle_and_the_noise(oracle):
+    """`+experiment=regulation` runs one law on one plant; it is held to the oracle, if any, and to the noise."""
+    own = {"signal": "density", "controller": "dqn", "plant": "p", "scenario": "s", "ise_sd": 0.02, "itae_sd": 2.0}
+    own |= {"ise_mean": 0.17, "itae_mean": 12.6, "floor_ise": 0.001, "floor_itae": 4.9}
+    best = own | {"controller": "oracle", "ise_mean": 0.16, "itae_mean": 9.0}
+    page = one_section()
+    comparison._in_short(page, {"beside_paper": [], "totals": [own, best][: 1 + oracle], "rows": [own]})
+    text = page.html()
+    ise, itae = ("oracle 0.16, ", "oracle 9, ") if oracle else ("", "")
+    said = f"ISE 0.17 ± 0.02 OD² min ({ise}noise 0.001), ITAE 12.6 ± 2 OD min² ({itae}noise 4.9)"
+    assert f"<li>dqn, s on p: {said}</li>" in text
+    assert "Lowest" not in text
+
+
+def test_one_of_a_thing_is_not_told_as_many(benchmark, tmp_path):
+    assert [count(n, "row") for n in (0, 1, 2)] == ["0 rows", "1 row", "2 rows"]
+    summary = json.loads((benchmark / "summary.json").read_text())
+    single = {**summary, "loops": 1, "replicates": 1, "rows": summary["rows"][:1], "details": summary["details"][:1]}
+    single |= {"totals": [], "paired_totals": [], "beside_paper": [], "figures": []}
+    (tmp_path / "summary.json").write_text(json.dumps(single), encoding="utf-8")
+    text = report.write(tmp_path).read_text(encoding="utf-8")
+    assert "1 closed loop of 1 simulated replicate, seed" in text
+    assert "<summary>1 row; also in tables/rows.csv" in text
+
+
+def test_no_markup_of_another_kind_is_left_on_a_page(text):
+    """Backticks are Markdown's, and stood as characters around the names of laws and plants."""
+    assert "`" not in re.sub(r"<pre>.*?</pre>", "", text, flags=re.DOTALL)
+
+
+def test_numbers_that_a_verdict_has_told_are_folded_without_empty_rows_and_typeset_as_it(tmp_path):
+    """A calibration has sixty keys of a file; who has no verdict shows its numbers at once."""
+    estimate = {"value": 0.03, "ci95": [0.029, 0.031]}
+    found = {
+        "verdict": {"word": "use", "why": "mu is known within +-3 %", "then": ""}, "mu": estimate, "tau": estimate,
+        "doubling_min": 23.0, "pmse_pct": 1.0, "n_used": 90, "n_rejected": 0, "warnings": [], "notes": [],
+    }  # fmt: skip
+    run_folder(tmp_path / "run", found)
+    text = report.write(tmp_path / "run").read_text(encoding="utf-8")
+    rows = re.search(r"<details><summary>Every number</summary>(.*?)</details>", text, re.DOTALL)[1]
+    assert "<th>mu.value, 1/min</th><td>0.03</td>" in rows
+    assert "<th>verdict.why</th><td>mu is known within ±3 %</td>" in rows
+    assert "verdict.then" not in text
+    assert "+-" not in text
+    run_folder(tmp_path / "other", {"answer": 42})
+    text = report.write(tmp_path / "other").read_text(encoding="utf-8")
+    assert "Every number" not in text
+    assert "<th>answer</th><td>42</td>" in text
 
 
 def test_published_losses_are_the_papers():
