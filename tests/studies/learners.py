@@ -7,8 +7,10 @@ own defaults and normalised observations; `dqn_paper` has what the paper states,
 
 import json
 import logging
+import math
 import statistics
 import time
+from collections.abc import Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from functools import cache
@@ -233,8 +235,25 @@ def table(c: LearnersConfig, found: dict[Job, dict[str, float]]) -> list[list[st
     return [row for k, row in enumerate(ranked) if row[:3] not in (other[:3] for other in ranked[:k])]
 
 
+def by_task(rows: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows of the same regrets, a column for each task and the worst seed's in brackets.
+
+    What has no regret in the last task, the hardest, comes last. Our agent's own number of steps differs by task.
+    """
+    names = {name: task for task, name in TASKS.items()}
+    tasks = list(dict.fromkeys(row[0] for row in rows))
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    for task, name, steps, regret, worst, *_ in rows:
+        own = name.startswith(OURS) and steps == f"{train.config([f'env={names[task]}']).agent.total_steps}"
+        for label in dict.fromkeys(["its own"] * own + [steps] * (not own or name == OURS)):
+            found.setdefault((name, label), {})[task] = regret if worst == "–" else f"{regret} ({worst})"
+    last = {key: float(cells[tasks[-1]].split()[0]) if tasks[-1] in cells else math.inf for key, cells in found.items()}
+    kinds = [key for key in sorted(found, key=last.__getitem__) if key[0] != OURS or len(found[key]) == len(tasks)]
+    return ["policy", "steps", *tasks], [[*key, *(found[key].get(task, "–") for task in tasks)] for key in kinds]
+
+
 def learners(c: LearnersConfig, folder: Path) -> None:
-    """All trainings that have no result yet, and the table of those that have."""
+    """All trainings that have no result yet, and the tables of those that have."""
     kept = folder / "jobs"
     kept.mkdir(parents=True, exist_ok=True)
     wanted = jobs(c)
@@ -245,7 +264,9 @@ def learners(c: LearnersConfig, folder: Path) -> None:
             job = running[done]
             found[job] = done.result()
             log.info("%d of %d, %s: regret %.3g %%", len(found), len(wanted), job.name, found[job]["regret_pct"])
-    leave(folder, __file__, COLUMNS, table(c, found))
+    rows = table(c, found)
+    leave(folder, __file__, COLUMNS, rows)
+    leave(folder, __file__, *by_task(rows), "by_task")
 
 
 main = command(__file__, LearnersConfig(), learners)

@@ -44,3 +44,26 @@ def test_rows_are_medians_in_order_of_regret_and_one_that_lacks_a_seed_is_left_o
         ["CoculturePreview-v0", "this program's DQN without hindsight", "2000", "8", "9"],
     ]
     assert rows[2][5:] == ["0.02", "7"]
+
+
+def test_regrets_stand_beside_each_other_by_task_and_the_hardest_task_orders_them() -> None:
+    """Our agent's own steps are 10,000 for the density and 20,000 with a preview; the law has no seeds."""
+    ours, sim, preview = learners.OURS, "Bioreactor-v0", "CoculturePreview-v0"
+    rows = [
+        [sim, "law", "–", "0", "–", "0.1", "–"],
+        [sim, ours, "10000", "0.5", "0.9", "0.1", "7"],
+        [sim, "PPO", "10000", "30", "40", "0.1", "7"],
+        [preview, f"{ours} without hindsight", "20000", "8", "9", "0.1", "7"],
+        [preview, "PPO", "10000", "20", "21", "0.1", "7"],
+        [preview, ours, "10000", "4", "5", "0.1", "7"],
+        [preview, ours, "20000", "3", "4", "0.1", "7"],
+    ]
+    head, found = learners.by_task(rows)
+    assert head == ["policy", "steps", sim, preview]
+    assert found == [
+        [ours, "its own", "0.5 (0.9)", "3 (4)"],
+        [ours, "10000", "0.5 (0.9)", "4 (5)"],
+        [f"{ours} without hindsight", "its own", "–", "8 (9)"],
+        ["PPO", "10000", "30 (40)", "20 (21)"],
+        ["law", "–", "0", "–"],
+    ]
