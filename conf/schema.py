@@ -201,12 +201,13 @@ def _built(default: T, values: Mapping[str, Any], prefix: str) -> T:
         key = f"{prefix}.{name}" if prefix else str(name)
         if name not in of:
             raise _NoSuchKey(key, list(of))
-        given[name] = _converted(entry, hints[name], getattr(default, name), key)
+        said = of[name].metadata.get("meaning", Meaning(""))
+        given[name] = _converted(entry, hints[name], getattr(default, name), key, said)
     return replace(cast(Any, default), **given)  # type: ignore[no-any-return]
 
 
-def _converted(given: Any, hint: Any, default: Any, key: str) -> Any:
-    """A plain value as the type of its field. Raises: ValueError naming the key."""
+def _converted(given: Any, hint: Any, default: Any, key: str, said: Meaning) -> Any:
+    """A plain value as the type of its field. Args: said: of the field. Raises: ValueError naming the key."""
     if get_origin(hint) in (Union, types.UnionType):
         if given is None:
             return None
@@ -219,18 +220,18 @@ def _converted(given: Any, hint: Any, default: Any, key: str) -> Any:
         return _built(default if is_dataclass(default) else hint(), given, key)
     if origin is dict:
         of, own = (inner[1] if inner else Any), default or {}
-        return own | {str(k): _converted(v, of, own.get(k), f"{key}.{k}") for k, v in given.items()}
+        return own | {str(k): _converted(v, of, own.get(k), f"{key}.{k}", said) for k, v in given.items()}
     if origin in (tuple, list):
         require(isinstance(given, list | tuple), key, given, "a list, as [1,2]")
         of = inner[0] if inner else Any
         return origin(  # a matrix may be given row by row
-            _converted(v, hint if of is float and isinstance(v, list | tuple) else of, None, f"{key}[{i}]")
+            _converted(v, hint if of is float and isinstance(v, list | tuple) else of, None, f"{key}[{i}]", said)
             for i, v in enumerate(given)
         )
-    return _scalar(given, hint, key)
+    return _scalar(given, hint, key, said)
 
 
-def _scalar(given: Any, hint: Any, key: str) -> Any:
+def _scalar(given: Any, hint: Any, key: str, said: Meaning) -> Any:
     """A number, text or switch as the type of its field."""
     if hint is bool:
         word = str(given).lower()
@@ -242,7 +243,9 @@ def _scalar(given: Any, hint: Any, key: str) -> Any:
                 return hint(given)
         except ValueError:
             pass
-        require(False, key, given, "a whole number" if hint is int else "a number")
+        name = (said.unit or "value") if key.endswith("]") else key.rpartition(".")[2]
+        within = "" if said.interval else replace(said, some=False).allowed(name)
+        require(False, key, given, ", ".join(filter(None, ("a whole number" if hint is int else "a number", within))))
     if hint is str:
         require(given is not None and not isinstance(given, Mapping | list | tuple), key, given, "text")
         return str(given)

@@ -64,13 +64,12 @@ class Scenario:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ratios", tuple(None if r is None or r != r else r for r in self.ratios))
-        lists = (self.setpoints, self.minutes, self.temperatures)
-        lengths = {len(phases) for phases in lists}
+        phases, *beside = lengths = [len(each) for each in (self.setpoints, self.minutes, self.temperatures)]
         require(
-            len(lengths) == 1 and lengths != {0},
+            phases > 0 and set(beside) == {phases},
             "scenario.setpoints, minutes, temperatures",
-            lists,
-            "three lists of the same length, one entry per phase",
+            "lists of {}, {} and {}".format(*lengths),
+            "one or more setpoints, and an entry of minutes and of temperatures for each of them",
         )
         object.__setattr__(self, "until", tuple(None if u is None or u != u else str(u) for u in self.until))
         object.__setattr__(self, "outputs", tuple(None if o is None or o != o else str(o) for o in self.outputs))

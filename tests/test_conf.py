@@ -335,7 +335,7 @@ def test_every_argument_has_the_form_that_hydra_takes(given, understood):
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
-        ("env.mu=abc", ["env.mu", "abc", "a number"]),
+        ("env.mu=abc", ["env.mu", "abc", "a number, 0 < mu"]),
         ("env.mu=-1", ["env.mu", "-1", "allowed 0 < mu"]),
         ("env.mu=nan", ["env.mu", "nan", "allowed"]),
         ("env.nois=1", ["env.nois", "no such key", "mu, tau"]),

@@ -130,6 +130,8 @@ def find_policy(name: str) -> Path:
 
     Raises: UserError saying what to give instead.
     """
+    if not name.strip():
+        raise frame.UserError("policy is empty: give policy=latest, shipped, a run folder or a policy.npz")
     if name == "shipped":
         return SHIPPED
     if name == "latest":

@@ -19,14 +19,15 @@ SETTLE_S = 0.3
 """A pump command is answered before its thread has written to the bus (docs/device.md, Pumps)."""
 
 
-def identity(transport: Transport, clock: Clock) -> str:
+def identity(transport: Transport, clock: Clock, where: str) -> str:
     """Identity of the first reactor that is present: the same by whatever name or link a device is reached.
 
+    Args: where: address of the link, for a message.
     Raises: LinkError, ProtocolError; DeviceStateError if there is no reactor.
     """
     reply = transport.get("/getSysdata/")
     if reply.status != 200:
-        raise ProtocolError(f"GET /getSysdata/: status {reply.status}, expected 200; check the address")
+        raise ProtocolError(f"{where}: GET /getSysdata/: status {reply.status}, expected 200; check the address")
     present = parse_state(reply.body).present
     if not present:
         raise DeviceStateError("the device has no reactor; plug one in with the server stopped")

@@ -39,7 +39,8 @@ def linked(backend: ChiBioConfig, own_url: str = "") -> Iterator[Link]:
         transport = stack.enter_context(open_transport(backend.transport, url, backend.speed))
         clock = DeviceClock(backend.speed)
         if not own_url:
-            stack.enter_context(closing(DeviceLock(f"the device with reactor {identity(transport, clock)}")))
+            where = backend.transport.port if backend.transport.kind == "serial" else url
+            stack.enter_context(closing(DeviceLock(f"the device with reactor {identity(transport, clock, where)}")))
         yield transport, clock
 
 

@@ -88,6 +88,18 @@ def test_a_phase_has_its_own_temperature_and_the_even_one_only_where_it_gives_no
     assert (STEPS.resting(33.2).temperatures, mixed.resting(33.2).ratios) == (STEPS.temperatures, mixed.ratios)
 
 
+def test_a_list_that_is_too_short_is_told_by_its_length():
+    """`scenario.setpoints=[5]` alone, beside three minutes and temperatures of a preset."""
+    with pytest.raises(ValueError, match=r".") as caught:
+        Scenario((5.0,), (30.0,) * 3, (37.0,) * 3)
+    assert str(caught.value) == (
+        "scenario.setpoints, minutes, temperatures = lists of 1, 3 and 3: "
+        "allowed one or more setpoints, and an entry of minutes and of temperatures for each of them"
+    )
+    with pytest.raises(ValueError, match="lists of 0, 0 and 0"):
+        Scenario((), (), ())
+
+
 def test_each_reactor_s_step_ends_by_its_own_condition():
     """Two reactors that are both settled at an OD of 0.5, of which each asks for something else in its two steps."""
     conditions = Conditions([["od >= 0.6", "settled"], ["settled", "od <= 0.5"], [None, None]])

@@ -405,6 +405,8 @@ def test_a_policy_that_fails_ends_the_command_with_one_line_and_its_certificate_
 def test_a_policy_that_is_none_or_says_no_model_ends_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"no such file; give the policy\.npz"):
         command.body(CertifyConfig(policy=str(tmp_path / "none.npz")), tmp_path)
+    with pytest.raises(UserError, match="^policy is empty: give policy=latest, shipped, a run folder or a policy"):
+        command.body(CertifyConfig(policy=""), tmp_path)
     given = laws.law()
     policy.save(tmp_path / "policy.npz", replace(given, metadata={**given.metadata, "model": {}}))
     with pytest.raises(UserError, match=r"policy\.npz: it does not say which model .*; give env\.mu=MU env\.tau=TAU"):

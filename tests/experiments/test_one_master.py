@@ -4,8 +4,10 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ import pytest
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.family import linked
 from hardware.emulator.process import EmulatorProcess
-from hardware.errors import DeviceStateError
+from hardware.errors import DeviceStateError, ProtocolError
 from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -38,6 +40,16 @@ def test_two_devices_may_have_a_master_each() -> None:
         linked(ChiBioConfig(url=other.url, speed=100.0)),
     ):
         pass
+
+
+def test_a_server_that_is_another_one_is_told_by_its_address() -> None:
+    with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as other:  # which answers 501 to every GET
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{other.server_port}"
+        said = f"^{url}: GET /getSysdata/: status 501, expected 200; check the address$"
+        with pytest.raises(ProtocolError, match=said), linked(ChiBioConfig(url=url)):
+            pass
+        other.shutdown()
 
 
 @pytest.mark.parametrize("command", ["blank", "deploy"])

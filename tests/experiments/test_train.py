@@ -336,7 +336,7 @@ def test_a_culture_that_outgrows_the_pump_is_said_before_it_is_trained_on(mu, ta
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["env.mu=abc"], "env.mu = abc: allowed a number"),
+        (["env.mu=abc"], "env.mu = abc: allowed a number, 0 < mu"),
         (["resume=nowhere"], "resume=nowhere: no run folder"),
         (["+env=simm"], "env=simm: no such option; allowed: coculture, coculture_preview, relative, sim"),
     ],
