@@ -23,7 +23,7 @@ REGISTERED: dict[str, tuple[str, str, dict[str, float]]] = {
 class EpisodeEnv(EpisodeSpec, gymnasium.Env[Any, Any]):
     """A vector environment with N = 1 and no autoreset; observation, action and reward are specified there.
 
-    Args: config: the task; overrides: values of it. render_mode: None, there is nothing to draw.
+    Args: config: the task; overrides: values of it. render_mode: None, there is nothing to draw; `render` says so.
     `info` holds the observation's numbers by name in full precision, as far as the model knows them: {"od": ...}.
     Raises: ValueError naming what is not allowed; TypeError for a `render_mode`.
     """

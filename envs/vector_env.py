@@ -3,17 +3,17 @@
 import reprlib
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from gymnasium import spaces
+from gymnasium import logger, spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from conf.schema import require
+from conf.schema import build, require
 from envs.task import MAX_OD, EnvConfig, step_factors, tracking_reward
 
 __all__ = ["BioreactorVectorEnv", "EpisodeSpec", "EpisodeStreams", "EpisodeVectorEnv", "checked_actions"]
@@ -35,7 +35,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...], n_actions: int) -> NDA
 
 
 class EpisodeSpec:
-    """`spec` of an environment with a `config`: what Gymnasium registers, with how long episodes are.
+    """`spec` of an environment with a `config`: what Gymnasium registers, with how long episodes are; no pictures.
 
     Environments truncate by themselves, so no time limit is registered.
     """
@@ -51,6 +51,10 @@ class EpisodeSpec:
     @spec.setter
     def spec(self, value: EnvSpec | None) -> None:
         self._spec = None if value is None else replace(value, max_episode_steps=self.config.episode_steps)
+
+    def render(self) -> None:
+        """None and a warning, as Gymnasium's environments do without a `render_mode`: there is nothing to draw."""
+        logger.warn("this environment has nothing to draw; plot what `reset` and `step` return")
 
 
 class EpisodeStreams:
@@ -106,7 +110,8 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
       num_envs: N >= 1. config: the task; overrides: values of it, `episode_steps=50`.
       autoreset_mode: SAME_STEP or NEXT_STEP, as `gymnasium.vector.AutoresetMode` or its value.
       render_mode: None, there is nothing to draw. max_episode_steps: Gymnasium's name; ends episodes that are longer.
-    Raises: ValueError naming what is not allowed; TypeError for a `render_mode`.
+    Raises: ValueError naming what is not allowed, or a value that the task does not have and those it has; TypeError
+      for a `render_mode`.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012  (Gymnasium's contract)
@@ -128,7 +133,10 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         max_episode_steps: int | None = None,
         **overrides: Any,
     ) -> None:
-        config = self.default(**overrides) if config is None else config
+        if config is None:
+            known = {field.name for field in fields(self.default)}
+            build(self.default(), {key: value for key, value in overrides.items() if key not in known})  # refuses any
+            config = self.default(**overrides)
         steps = min(config.episode_steps, max_episode_steps or config.episode_steps)
         self.config = replace(config, episode_steps=steps)
         if render_mode is not None:  # a TypeError: Stable-Baselines3 asks for a picture, and goes on without

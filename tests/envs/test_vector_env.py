@@ -1,5 +1,6 @@
 """The native vector environment against Gymnasium's own machinery and against a plain loop."""
 
+import re
 import warnings
 
 import gymnasium
@@ -139,6 +140,29 @@ def test_gymnasiums_own_time_limit_shortens_episodes():
 def test_a_way_to_draw_that_does_not_exist_is_refused(make):
     with pytest.raises(TypeError, match="render_mode = human: allowed None"):
         make(ID, render_mode="human")
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_who_asks_for_a_picture_is_told_that_there_is_none(make):
+    env = make(ID)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="this environment has nothing to draw"):
+        assert env.render() is None
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+@pytest.mark.parametrize(
+    ("name", "given", "said"),
+    [
+        ("Relative-v0", {"nokey": 3}, "nokey: no such key; allowed here: kind, n_actions, episode_steps, growth_sha"),
+        ("Relative-v0", {"mu": 0.02, "n_actions": 5}, "mu: no such key; allowed here: kind, n_actions"),
+        ("Bioreactor-v0", {"episode_step": 5}, "episode_step: no such key; did you mean episode_steps?; allowed here"),
+        ("Coculture-v0", {"nokey": 3}, "nokey: no such key; allowed here: "),
+    ],
+)
+def test_a_value_that_a_task_does_not_have_is_named_beside_those_it_has(make, name, given, said):
+    with pytest.raises(ValueError, match=f"^{re.escape(said)}"):
+        make(f"envs:{name}", **given)
 
 
 def test_the_last_reward_of_an_episode_is_weighted_and_no_other():
