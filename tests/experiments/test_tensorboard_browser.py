@@ -12,12 +12,15 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from matplotlib.image import imread
 
+from experiments.reporting.curves import TRAINING
+from experiments.reporting.tensorboard import Events
 from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -65,6 +68,13 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def address(logs: Path) -> Iterator[str]:
     """TensorBoard on these runs, once it has read them."""
+    with served(logs, "result/ise", "result/regret_pct") as url:
+        yield url
+
+
+@contextmanager
+def served(logs: Path, *tags: str) -> Iterator[str]:
+    """TensorBoard on a folder, once it has read these tags."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -74,7 +84,7 @@ def address(logs: Path) -> Iterator[str]:
         process = subprocess.Popen([sys.executable, *words], env=ENVIRONMENT, cwd=logs, stdout=f, stderr=f)
     url, deadline = f"http://127.0.0.1:{port}", time.monotonic() + 120.0
     try:
-        while not has_read(url):
+        while not has_read(url, tags):
             assert process.poll() is None, said.read_text(encoding="utf-8")
             assert time.monotonic() < deadline, "TensorBoard does not answer"
             time.sleep(0.1)
@@ -84,13 +94,13 @@ def address(logs: Path) -> Iterator[str]:
         process.wait(timeout=PATIENCE_S)
 
 
-def has_read(url: str) -> bool:
+def has_read(url: str, tags: tuple[str, ...]) -> bool:
     try:
         with urllib.request.urlopen(f"{url}/data/plugin/scalars/tags", timeout=5) as answer:
             text = answer.read().decode()
     except OSError:
         return False
-    return "result/ise" in text and "result/regret_pct" in text
+    return all(tag in text for tag in tags)
 
 
 @pytest.fixture(scope="module")
@@ -162,6 +172,21 @@ def test_custom_scalars_show_the_culture_with_its_band(address: str, browser: An
     titles = ("OD and setpoint with its band of 5 %", "Pump rate, mL/s", "Temperature, °C", "Interlock and warnings")
     page = show(browser, f"{address}/#custom_scalars", *DEPLOYMENT, *titles)
     draw(page, "deployment", "deployment", (LEARNING,))
+
+
+def test_of_more_runs_than_tensorboard_selects_an_address_shows_those_of_a_day(tmp_path: Path, browser: Any) -> None:
+    """As docs/tensorboard.md has it: 41 runs are none at first sight."""
+    for k in range(41):
+        with closing(Events(tmp_path / f"2026-11-{1 + k % 20:02d}_{k:02d}")) as events:
+            events.layout(TRAINING)
+            events.scalars({"eval/regret_pct": 1.0 + k, "last/one" if k == 40 else "some/other": 1.0}, 0)
+    with served(tmp_path, "last/one") as url:
+        for words, picked in (("", 0), ("&regexInput=2026-11-05", 2)):
+            page = show(browser, f"{url}/#custom_scalars{words}", "2026-11-05_04", "2026-11-05_24")
+            boxes = page.locator("tf-multi-checkbox paper-checkbox")
+            assert boxes.count() == (picked or 41)
+            assert sum(box.get_attribute("aria-checked") == "true" for box in boxes.all()) == picked
+            page.close()
 
 
 def test_hparams_show_what_was_varied_and_what_came_out(address: str, browser: Any) -> None:
