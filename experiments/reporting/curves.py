@@ -189,6 +189,7 @@ PARAMETERS = {
     "command": Column("command", "train or deploy"),
     "scenario": Column("scenario", "what a deployment was asked for"),
     "steps": Column("steps", "of training", number=True),
+    "given": Column("given", "keys and values of the command line; a run whose columns are shown may lack some"),
 }
 """The same columns for every command: TensorBoard reads them from one run and shows all runs under them, the first five
 unasked.

@@ -107,11 +107,14 @@ class Events:
         """A row of TensorBoard's HPARAMS table; its results are the last values of the tags in `METRICS`.
 
         Whatever else was given on the command line is a column of its own, so that a sweep has one for what it varies.
+        TensorBoard shows the columns of one run alone, the first that it meets: in one column are all of them.
 
         Args: values: by the names in `PARAMETERS`, or by names of one's own. folder: run folder, whose last two names
           are those of the row; rows of one name would be averaged. part: of it, where a run has several rows.
         """
-        values = {**_varied(folder), **values}
+        varied = _varied(folder)
+        listed = {"given": " ".join(f"{key}={value}" for key, value in varied.items())} if varied else {}
+        values = {**{key: _number(value) for key, value in varied.items()}, **values, **listed}
         name = "/".join([*folder.resolve().parts[-2:], *([part] if part else [])])
         own = {
             key: Column(key, "of the task or the command line", not isinstance(value, str))
@@ -148,11 +151,11 @@ def _chart(title: str, chart: Chart) -> layout_pb2.Chart:
     return layout_pb2.Chart(title=title, multiline=layout_pb2.MultilineChartContent(tag=tags))
 
 
-def _varied(folder: Path) -> dict[str, float | str]:
+def _varied(folder: Path) -> dict[str, str]:
     """Values of a run's command line by their keys; presets and where it is written are no values."""
     words = (word.partition("=") for word in given(folder))
     found = {key: value for key, sign, value in words if sign and key not in groups() and key != "seed"}
-    return {k: _number(v) for k, v in found.items() if not k.startswith(("hydra.", "hydra/", "~")) and k != "extend"}
+    return {k: v for k, v in found.items() if not k.startswith(("hydra.", "hydra/", "~")) and k != "extend"}
 
 
 def _number(text: str) -> float | str:

@@ -7,16 +7,22 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 from tensorboard.backend.event_processing import plugin_event_accumulator as shown
+from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
+from tensorboard.context import RequestContext
+from tensorboard.plugins.base_plugin import TBContext
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.custom_scalar import metadata as custom
 from tensorboard.plugins.hparams import metadata as hparams
+from tensorboard.plugins.hparams.backend_context import Context
 
 from experiments.cli import frame
 from experiments.control import run as control
@@ -214,6 +220,7 @@ def test_hparams_has_a_row_for_each_policy_with_seed_model_and_results(runs: Pat
     assert set(rows) == {*RUNS, "population/seed0000", "population/seed0001"} - {"population"}
     given, _ = rows["pi"]
     assert (given["bench.period_s"], given["safety.ml_per_run"], given["scenario.minutes"]) == (120.0, 3.0, "[20]")
+    assert {"bench.period_s=120", "safety.ml_per_run=3", "scenario.minutes=[20]"} <= set(given["given"].split())
     assert not {"controller", "backend.seed"} & given.keys()  # a preset has its own column; nobody gave the other here
     given, events = rows["learning"]
     summary = json.loads((runs / "learning" / "summary.json").read_text())
@@ -225,6 +232,33 @@ def test_hparams_has_a_row_for_each_policy_with_seed_model_and_results(runs: Pat
     assert (given["agent or controller"], given["seed"]) == ("dqn", 5.0)
     assert curve(events, "result/steady_abs_error")[-1, 1] == pytest.approx(summary["windows"][0]["steady_abs_error"])
     assert curve(events, "result/medium_ml")[-1, 1] == pytest.approx(summary["volume_ml"])
+
+
+def test_what_a_sweep_varied_is_seen_beside_runs_of_other_words(tmp_path: Path) -> None:
+    """TensorBoard takes its columns from one run: here those of a deployment, which was begun before the sweep."""
+    words = {"deploy/1": [], "train/2/0": ["agent.learning_rate=0.01"], "train/2/1": ["agent.learning_rate=0.02"]}
+    for name, overrides in words.items():
+        folder = tmp_path / name
+        (folder / ".hydra").mkdir(parents=True)
+        (folder / ".hydra" / "overrides.yaml").write_text("".join(f"- {word}\n" for word in overrides))
+        with closing(Events(folder)) as events:
+            events.hyper_parameters({"decides": "dqn", "seed": 1.0}, folder)
+            events.scalars({"result/ise": 0.1}, 0)
+    multiplexer = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
+    board = TBContext(data_provider=MultiplexerDataProvider(multiplexer, str(tmp_path)), multiplexer=multiplexer)
+    context, ask = Context(board), RequestContext()
+    contents = context.hparams_metadata(ask, "")
+    first = {name: contents[name] for name in sorted(contents)}
+    experiment = context.experiment_from_metadata(ask, "", True, first, [])
+    columns = {c.display_name: c.name for c in experiment.hparam_infos}
+    assert "agent.learning_rate" not in columns
+    told = [
+        hparams.parse_session_start_info_plugin_data(content[hparams.SESSION_START_INFO_TAG]).hparams
+        for content in first.values()
+    ]
+    seen = [row[columns["given"]].string_value if columns["given"] in row else "" for row in told]
+    assert seen == ["", *(word for name in ("train/2/0", "train/2/1") for word in words[name])]
+    assert {m.name.tag: m.display_name for m in experiment.metric_infos} == METRICS
 
 
 def test_configuration_and_results_stand_as_text(runs: Path) -> None:

@@ -190,7 +190,8 @@ def test_of_more_runs_than_tensorboard_selects_an_address_shows_those_of_a_day(t
 
 
 def test_hparams_show_what_was_varied_and_what_came_out(address: str, browser: Any) -> None:
-    columns = ("agent or controller", "model or plant", "seed", "mu, 1/min", "tau", "command", "scenario", "steps")
+    columns = ("agent or controller", "model or plant", "seed", "mu, 1/min", "tau", "command", "scenario", "steps",
+               "given")  # fmt: skip
     results = ("regret, %", "worst-setpoint error, OD", "ISE, OD² min", "error of the share")
     page = show(browser, f"{address}/#hparams", *columns, *results)
     draw(page, "hparams")
