@@ -50,7 +50,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m experiments.demo", description=__doc__)
     _, others = parser.parse_known_args()
     if others:
-        sys.exit(f"error: {others[0]}: the demo takes nothing but --help; values go to calibrate, train and deploy")
+        text = f"error: {others[0]}: the demo takes nothing but --help; values go to calibrate, train and deploy"
+        print(text, file=sys.stderr)
+        sys.exit(1)
     folder = Path("runs") / "demo" / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"  # two demos never meet
     signals: list[int] = []
     with stop.handled(lambda number, _: signals.append(number), *stop.SIGNALS):
