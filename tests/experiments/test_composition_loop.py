@@ -478,9 +478,9 @@ def test_the_figure_shows_of_each_reactor_its_own_announcements_and_counts_at_th
     told = [line.get_xydata().tolist() for line in share.lines if line.get_marker() == ">"]
     assert told == [[[(70.0 + 40.0) / 60.0, 0.7]], [[(40.0 + 25.0) / 60.0, 0.5]]]
     alone = figure_of(table, scenarios, "").axes[0]
-    for ax, unit in ((density, 60.0), (alone, 1.0)):  # while a culture recovers it has no setpoint
+    for ax in (density, alone):  # while a culture recovers it has no setpoint
         asked = [line.get_xydata() for line in ax.lines if line.get_linestyle() == "--"]
-        assert [xy[np.isfinite(xy[:, 1]), 0].min() * unit for xy in asked] == pytest.approx([40.0, 26.0])
+        assert [60.0 * xy[np.isfinite(xy[:, 1]), 0].min() for xy in asked] == pytest.approx([40.0, 26.0])
     ended = {key: values[:, :34] for key, values in columns.items()}  # at minute 66, before the first one's
     early = composition_figure_of(Table(("M0", "M1"), ended, [[], []], [], []), scenarios, "B. subtilis", "").axes[0]
     told = [line.get_xydata().tolist() for line in early.lines if line.get_marker() == ">"]
