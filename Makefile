@@ -8,6 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 EXTRAS := dev,bench,sweep,docs
+unexport PYTHONDONTWRITEBYTECODE  # else every process compiles the project, and pytest its tests, anew
 
 ROOMS := conf dqn envs experiments hardware $(sort $(patsubst %/,%,$(dir $(wildcard experiments/*/*.py hardware/*/*.py))))
 
