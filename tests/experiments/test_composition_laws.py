@@ -324,7 +324,10 @@ def test_settings_of_ones_own_are_those_that_decide():
 
 
 def test_a_policy_is_shown_of_each_culture_its_own_numbers_and_each_thermostat_its_own_error():
-    """True temperatures are what was learned from; a thermostat goes by its thermometer, which is off by another."""
+    """True temperatures are what was learned from; a thermostat goes by its thermometer, which is off by another.
+
+    The policy was trained with .8 of the first species' growth: a culture that has .75 is shown a larger m_p.
+    """
     shown = []
 
     class Watched(Policy):
@@ -333,17 +336,22 @@ def test_a_policy_is_shown_of_each_culture_its_own_numbers_and_each_thermostat_i
             return np.where(observation[:, 0] > 0.0, 35.0, 31.0)
 
     given = Watched(**vars(linear_policy(COCULTURE_PREVIEW, "rate")))
+    given.metadata["model"]["scale_e"] = 0.8
     found = law("dqn_preview", policy=given)
     found.reset(3)
     one = seen([0.3, -0.2, 9.0])
     one = replace(
         one, temperature=np.array([30.5, 34.0, 29.0]), rate=np.array([0.7, 0.8, 0.9]),
-        thermometer=np.array([0.25, -0.5, 0.0]),
+        thermometer=np.array([0.25, -0.5, 0.0]), error_e=np.array([-0.25, -0.2, 0.0]),
     )  # fmt: skip
     asked_for = Wanted(np.array([0.4, 0.6, 0.5]), np.array([0.7, 0.2, 0.5]), np.array([90.0, 400.0, 0.0]))
     target = found.act(one, asked_for, np.zeros(3), np.array([True, True, False]))
     np.testing.assert_allclose(
-        shown[0], [[0.3, 30.5, 0.7, logit(0.4), logit(0.7), 90.0], [-0.2, 34.0, 0.8, logit(0.6), logit(0.6), 0.0]]
+        shown[0],
+        [
+            [0.3, 30.5, 0.7 + 0.05 * e_coli_rate(EQUAL_RATES_C), logit(0.4), logit(0.7), 90.0],
+            [-0.2, 34.0, 0.8, logit(0.6), logit(0.6), 0.0],
+        ],
     )
     np.testing.assert_allclose(target, [34.75, 31.5, EQUAL_RATES_C])
 
