@@ -11,51 +11,9 @@ from envs.coculture.optimum import Grid, best_action, cost_to_go, transitions
 from envs.coculture.task import CocultureConfig, CocultureVectorEnv, advance, at_rest, limits, logit, passed, share
 from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Evaluation
-from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
+from tests.two_species import EQUAL_RATES_C, p_putida_rate
 
 PREVIEW = CocultureConfig(control_min=30.0, episode_steps=24, preview_min=360.0)
-
-
-def test_the_rates_are_those_of_the_public_model() -> None:
-    """mu_p - mu_e per hour as its authors' code gives it, and what lies outside their fits."""
-    temperature = np.array([29.0, 30.0, 31.0, 32.0, 33.0, 34.0, 35.0, 36.0])
-    published = [0.298, 0.298, 0.253, 0.164, 0.031, -0.146, -0.367, -0.632]
-    np.testing.assert_allclose(p_putida_rate(temperature) - e_coli_rate(temperature), published, atol=6e-4)
-    assert abs(p_putida_rate(EQUAL_RATES_C) - e_coli_rate(EQUAL_RATES_C)) < 1e-3
-    assert e_coli_rate(40.0) == e_coli_rate(36.0)
-    assert p_putida_rate(20.0) == p_putida_rate(29.0)
-
-
-@pytest.mark.parametrize("temperature", [29.0, 31.5, 36.0])
-def test_at_rest_the_logit_moves_at_the_difference_of_the_rates(temperature: float) -> None:
-    start = at_rest(PREVIEW, logit(np.array([0.2, 0.7])), temperature)
-    after = advance(PREVIEW, start, np.float64(temperature), 90.0)
-    rate = -0.02208 * temperature**2 + 1.3796 * temperature - 20.56996 - (0.07727 * temperature - 1.66954)
-    np.testing.assert_allclose(after[:, 0] - start[:, 0], 1.5 * rate, atol=1e-9)
-    np.testing.assert_allclose(after[:, 1:], start[:, 1:], atol=1e-9)
-
-
-def test_heat_is_fast_cold_is_passive_and_the_rate_follows_in_an_hour() -> None:
-    start = at_rest(PREVIEW, np.zeros(1), 36.0)
-    minutes = next(m for m in range(60) if advance(PREVIEW, start, np.float64(29.0), m)[0, 1] <= 29.0)
-    assert minutes == np.ceil(39.0 * np.log(12.0 / 5.0))  # from 36 to 29 in surroundings of 24 degC
-    cold = at_rest(PREVIEW, np.zeros(1), 29.0)
-    assert advance(PREVIEW, cold, np.float64(36.0), 3.0)[0, 1] < 35.1
-    assert advance(PREVIEW, cold, np.float64(36.0), 5.0)[0, 1] == 36.0
-    warm = advance(PREVIEW, cold, np.float64(36.0), 240.0)[0, 2]
-    later = advance(PREVIEW, cold, np.float64(36.0), 300.0)[0, 2]
-    goal = p_putida_rate(36.0)
-    assert (later - goal) / (warm - goal) == pytest.approx(np.exp(-1.0), rel=1e-6)
-
-
-def test_the_share_is_an_integrator_and_copies_are_independent() -> None:
-    rng = np.random.default_rng(0)
-    state = np.stack([rng.normal(0, 1, 9), rng.uniform(29, 36, 9), rng.uniform(0.5, 0.95, 9)], axis=1)
-    target = rng.uniform(29, 36, 9)
-    after = advance(PREVIEW, state, target, 30.0)
-    shifted = advance(PREVIEW, state + np.array([0.7, 0.0, 0.0]), target, 30.0)
-    np.testing.assert_allclose(shifted - after, np.broadcast_to([0.7, 0.0, 0.0], after.shape), atol=1e-12)
-    np.testing.assert_array_equal(advance(PREVIEW, state[4:5], target[4:5], 30.0)[0], after[4])
 
 
 def test_an_announced_change_comes_nearer_and_is_then_the_setpoint() -> None:
@@ -101,13 +59,6 @@ def test_gymnasium_knows_it(name: str) -> None:
         np.testing.assert_array_equal(one[0], two[0])
     episode = 72 if name == "Coculture-v0" else 24
     assert gymnasium.make(name).spec.max_episode_steps == episode  # type: ignore[union-attr]
-
-
-def test_bad_values_are_named() -> None:
-    with pytest.raises(ValueError, match=r"env\.preview_min = 365.*multiple of env\.control_min = 10"):
-        CocultureConfig(preview_min=365.0)
-    with pytest.raises(ValueError, match=r"env\.temperatures.*25"):
-        CocultureConfig(temperatures=(25.0, 36.0))
 
 
 def minutes_of_two(state: np.ndarray, target: np.ndarray, minutes: float, step: float = 0.1) -> np.ndarray:
