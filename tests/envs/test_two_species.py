@@ -139,7 +139,7 @@ def test_pigment_settles_where_production_meets_dilution() -> None:
     alike = SecondSpeciesConfig((0.4, 0.4), mu=0.02)
     p = plant(pair(second=alike, start_temperature=33.0, thermal=replace(STEADY, medium_c=33.0)))
     p.fluorescence.pigment[:] = 0.0
-    for _ in range(1500):
+    for _ in range(800):
         p.advance(1.0, np.array([0.02 * 20.0]))
     f = float(steady_production(33.0)) * 0.2 / (60.0 * 0.02)
     assert p.culture.od[0] == pytest.approx(0.5, rel=1e-6)

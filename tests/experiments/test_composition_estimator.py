@@ -135,6 +135,7 @@ def closed_loop(plant_name, calibrated, n=32, flow=1.0):
     return found, estimator
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "calibrated", "most", "rms"),
     [
@@ -152,6 +153,7 @@ def test_its_band_covers_the_truth_as_often_as_it_says(plant, calibrated, most, 
     assert np.sqrt(np.square(found["estimate"] - found["share"])[:, after].mean()) < rms
 
 
+@pytest.mark.slow
 def test_errors_of_both_growth_curves_are_found():
     _, estimator = closed_loop("coculture_growth_both", calibrated=True, n=8)
     told = estimator.explain()
@@ -159,6 +161,7 @@ def test_errors_of_both_growth_curves_are_found():
     np.testing.assert_allclose(told["bias_p"].mean(), -0.10, atol=0.02)
 
 
+@pytest.mark.slow
 def test_a_pump_that_gives_a_tenth_less_is_found_and_does_not_mislead():
     found, estimator = closed_loop("coculture", calibrated=True, flow=0.9)
     np.testing.assert_allclose(estimator.explain()["dose_gain"].mean(), 0.9, atol=0.02)
