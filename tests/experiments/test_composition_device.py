@@ -81,6 +81,7 @@ def test_a_day_and_three_hours_of_steps(tmp_path: Path) -> None:
     run.close()
 
 
+@pytest.mark.slow
 def test_the_program_is_killed_twice_and_loses_nothing(tmp_path: Path) -> None:
     """Each time the device goes on by itself for a while, at the temperature that it was left at."""
     run = rehearsal(tmp_path, SHORT, ("M0", "M1"))
@@ -172,6 +173,7 @@ def test_a_sample_that_was_not_decided_on_keeps_its_light(tmp_path: Path) -> Non
     assert row["ratio"] == ""
 
 
+@pytest.mark.slow
 def test_processes_killed_and_resumed_lose_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     words = ("scenario.ratios=[0.3]", "scenario.temperatures=[33.2]", "composition=proportional")
@@ -198,6 +200,7 @@ def two_species(tmp_path: Path) -> Iterator[Cable]:
         yield line
 
 
+@pytest.mark.slow
 def test_over_the_serial_line(two_species: Cable, tmp_path: Path) -> None:
     line = two_species
     folder = tmp_path / "run"
@@ -222,6 +225,7 @@ def test_over_the_serial_line(two_species: Cable, tmp_path: Path) -> None:
     assert np.isfinite(column(folder, "ratio")[1:]).all()
 
 
+@pytest.mark.slow
 def test_a_share_that_was_counted_is_taken_over_once_also_over_a_kill(tmp_path: Path) -> None:
     """Marked at minute 60 for minute 40; the program is killed before its state is saved, and resumed."""
     run = rehearsal(tmp_path, SHORT, ("M0", "M1"))
