@@ -13,7 +13,6 @@ is read, too: it has `pump_rates` for `actions` and no limits of the observation
 """
 
 import hashlib
-import io
 import json
 import zipfile
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "ABSOLUTE", "COCULTURE", "COCULTURE_PREVIEW", "FORMAT", "RELATIVE", "Policy", "PolicyError", "fingerprints", "load",
-    "packed", "save",
+    "save",
 ]  # fmt: skip
 
 FORMAT = 2
@@ -114,17 +113,10 @@ def fingerprints(policy: Policy) -> dict[str, str]:
 
 def save(path: Path, policy: Policy) -> None:
     """Write policy.npz atomically."""
-    temporary = path.with_suffix(".part.npz")
-    temporary.write_bytes(packed(policy))
-    temporary.replace(path)
-
-
-def packed(policy: Policy) -> bytes:
-    """The content of policy.npz."""
     arrays = {**_arrays(policy), "metadata": np.array(json.dumps(policy.metadata, sort_keys=True))}
-    content = io.BytesIO()
-    np.savez(content, **arrays)  # type: ignore[arg-type]
-    return content.getvalue()
+    temporary = path.with_suffix(".part.npz")
+    np.savez(temporary, **arrays)  # type: ignore[arg-type]
+    temporary.replace(path)
 
 
 def load(path: Path) -> Policy:

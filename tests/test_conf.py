@@ -232,7 +232,7 @@ def test_help_shows_usage_and_every_value(name, capsys, monkeypatch):
 
 def test_help_of_a_part_that_there_is_not_names_those_that_there_are():
     command = importlib.import_module("experiments.deploy").main
-    with pytest.raises(frame.UserError, match=r"^--help = plnat: allowed all, backend, plant, .*relearn"):
+    with pytest.raises(frame.UserError, match=r"^--help = plnat: allowed all, backend, plant, .*share_warnings"):
         command._answer(["--help=plnat"])
 
 

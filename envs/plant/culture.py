@@ -134,10 +134,6 @@ class Culture:
         self._adapted = self._phi(np.broadcast_to(temperature, (self._n,)))
         self._log_drift, self._settled = np.zeros(self._n), np.zeros(self._n)
 
-    def adapted_to(self, relative: Array) -> None:
-        """Growth that is behind the temperature stands so, relative to 37 degC and before any factor, (N, S)."""
-        self._adapted = relative.copy()
-
     @property
     def od(self) -> Array:
         """True suspended biomass of all species, OD, shape (N,)."""

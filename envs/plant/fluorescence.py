@@ -87,13 +87,6 @@ class Fluorescence:
         self.pigment: Array = np.divide(made, growth, out=np.zeros_like(made), where=growth > 0.0)
         self._last = np.full(producers.size, np.nan)
 
-    def stand(self, pigment: Array, production: Array, past: Array) -> None:
-        """Pigment, counts, and its production, counts per hour and OD, stand so, (N,).
-
-        Args: past: production of each minute that it still feels, oldest first, (delay, N).
-        """
-        self.pigment, self.production, self._past = pigment.copy(), production.copy(), past.copy()
-
     def new_minute(self, temperature: Array) -> None:
         """A minute begins at `temperature`, degC, shape (N,): production takes its step."""
         pigment = self._pair.pigment

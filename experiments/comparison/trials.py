@@ -284,30 +284,25 @@ def run_share(
     setpoints: Array,
     temperatures: Array,
     announce_min: float,
-    hours: tuple[float, float] | None = None,
-    limits: tuple[float, float] | None = None,
 ) -> dict[str, Array]:
     """Read, decide and dose once a minute to the end of the program: the fields of a `ShareTrial` that are (N, K).
 
     There is no interlock: the plants of these comparisons have no faults, and every law meets the same vials, sensors
     and noise.
 
-    Args: estimator, law: reset for the plant's vials; an estimator that has seen them goes on. setpoints, temperatures:
-      OD and degC of each phase, (phases,); the latter where no share is asked for. hours: of the program, from and to;
-      None: all of it. limits: of the thermostat's target, degC; None: those of the pair.
+    Args: estimator, law: reset for the plant's vials. setpoints, temperatures: OD and degC of each phase, (phases,);
+      the latter where no share is asked for.
     """
-    first, last = (0, round(program.total_min)) if hours is None else (round(60.0 * h) for h in hours)
-    n, low_high = plant.n, limits or estimator.pair.temperatures
-    clock = np.where(estimator.begun, estimator.since, 0.0)
+    n, last, low_high = plant.n, round(program.total_min), estimator.pair.temperatures
     density.reset(n)
     rows = np.ones(n, dtype=np.bool_)
     fields = ("share", "estimate", "low", "high", "temperature", "od")
-    stored: dict[str, Any] = {key: np.empty((n, last - first + 1), dtype=np.float32) for key in fields}
-    for k in range(last - first + 1):
-        minute = np.full(n, float(first + k))
-        phase = min(int(np.searchsorted(program.edges[1:], first + k + 1e-9, side="right")), len(setpoints) - 1)
+    stored: dict[str, Any] = {key: np.empty((n, last + 1), dtype=np.float32) for key in fields}
+    for k in range(last + 1):
+        minute = np.full(n, float(k))
+        phase = min(int(np.searchsorted(program.edges[1:], k + 1e-9, side="right")), len(setpoints) - 1)
         od, warm = plant.read_od(), plant.thermal.read()
-        estimator.watch(od, plant.read_fluorescence(), warm, clock + k, rows)
+        estimator.watch(od, plant.read_fluorescence(), warm, minute, rows)
         wanted = program.wanted(minute, announce_min)
         asked = np.isfinite(wanted.setpoint)
         chosen = law.act(estimator.estimate(), wanted, minute, asked & estimator.begun)

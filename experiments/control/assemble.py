@@ -30,7 +30,6 @@ from experiments.cli.calibrated import read_env_file, read_pair, read_plant_file
 from experiments.cli.choices import choices
 from experiments.control.config import DeployConfig
 from experiments.control.policies import Wanted, admit, composition_policy, policy_check, run_policy
-from experiments.control.question import Relearn
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from experiments.laws.share.estimator import CompositionEstimator
@@ -54,7 +53,7 @@ __all__ = ["Setup", "close_loop", "completed", "opened", "run_preflight", "unpac
 
 log = logging.getLogger(__name__)
 
-COMPOSITION, PREVIEW, VIALS, USUAL_VIALS = "midpoint", "dqn_preview", "coculture", "nominal_noise"  # presets
+COMPOSITION, VIALS, USUAL_VIALS = "midpoint", "coculture", "nominal_noise"  # presets
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,6 @@ class Setup:
     law: config of what decides the pump rate. wanted: the policy that controller=dqn asks for, None for another.
     policy: as read, None for a preflight. bounds: of its certificate.
     further: signals that are held beside the density, which have seen nothing yet.
-    relearn: when the policy of a share is learned anew during the run.
     species: of two the second one, whose share may be held.
     fsync: of the record. title: who controls what. row: of the run in TensorBoard's table, but its results.
     resumed: an earlier life of the run is continued.
@@ -88,7 +86,6 @@ class Setup:
     policy: Policy | None
     bounds: EstimateBounds | None
     further: list[Signal]
-    relearn: Relearn
     species: str
     fsync: bool
     title: str
@@ -111,10 +108,9 @@ def with_pair(config: DeployConfig, folder: Path) -> DeployConfig:
 
 
 def completed(config: DeployConfig) -> DeployConfig:
-    """What was left as it is for one species, where a scenario asks for a share: who controls it, and the vials.
+    """Fill in the composition controller and the vials where a scenario asks for a composition.
 
-    And of all simulated vials, the two species of the run; and whether a run learns. Raises: UserError for a schedule
-    that is not allowed.
+    All simulated vials get the two species of the run. Raises: UserError for a schedule that is not allowed.
     """
     with frame.refusing(ValueError):
         composed = any(s.composed for s in config.schedules())
@@ -123,10 +119,7 @@ def completed(config: DeployConfig) -> DeployConfig:
         config = _composed(config, pair)
     if family_of(config.backend).simulated and config.plant.pair == PairConfig():  # another one differs on purpose
         config = replace(config, plant=of_pair(config.plant, pair))
-    announced = config.composition is not None and config.composition.kind == PREVIEW
-    longest_min = max(s.total_min for s in config.schedules())
-    learns = announced and not family_of(config.backend).simulated
-    return replace(config, relearn=config.relearn.settled(learns, longest_min))
+    return config
 
 
 def _composed(config: DeployConfig, pair: PairConfig) -> DeployConfig:
@@ -201,7 +194,6 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
     if not family.simulated and config.plant not in usual:
         log.warning("plant: backend=%s has vials of its own, plant.* changes nothing there", config.backend.kind)
     _check_fit(config, family, scenarios, ends)
-    _check_learning(config, family)
     further = _further(config, plant, folder, scenarios)
     if any(not isinstance(signal, Light) for signal in further):  # the device has to measure what an estimate may need
         backend = family.seeing_fluorescence(backend)
@@ -221,8 +213,8 @@ def unpack(config: DeployConfig, folder: Path) -> Setup:
         bounds = certificate.bounds(policy, own, folder / "policy.npz", model)
     return Setup(
         family, backend, bench, safety, scenarios, ends, config.roles(), plant, model, config.controller, wanted,
-        policy, bounds, further, config.relearn, read_pair(config.pair).second.name, config.fsync,
-        *_named(config, family, folder), resumed,
+        policy, bounds, further, read_pair(config.pair).second.name, config.fsync, *_named(config, family, folder),
+        resumed,
     )  # fmt: skip
 
 
@@ -252,19 +244,6 @@ def _check_fit(config: DeployConfig, family: Family, scenarios: list[Scenario], 
     with frame.refusing(ReactorError):
         family.fits(config.backend, config.bench, scenarios, ends)
         _check_room(config, family)
-
-
-def _check_learning(config: DeployConfig, family: Family) -> None:
-    """Whether this run can learn. Raises: UserError."""
-    if not config.relearn.every_h:
-        return
-    said = f"relearn.every_h = {config.relearn.every_h:g}"
-    if config.composition is None or not registry.takes(config.composition.kind, "policy", registry.SHARE):
-        found = "no share is held" if config.composition is None else f"composition={config.composition.kind}"
-        raise frame.UserError(f"{said}: {found}, which follows no policy; give composition=dqn_preview, or 0")
-    if family.simulated:
-        why = f"backend={config.backend.kind} is over in seconds, a training takes minutes"
-        raise frame.UserError(f"{said}: {why}; give 0, or backend=emulator")
 
 
 def _check_room(config: DeployConfig, family: Family) -> None:

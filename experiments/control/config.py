@@ -8,7 +8,6 @@ from conf.schema import check, part, require, setting
 from envs.bench import Bench
 from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
-from experiments.control.question import Relearn
 from experiments.laws import registry
 from experiments.laws.density.learned import LearnedConfig
 from experiments.loop.share import ShareWarnings
@@ -63,10 +62,9 @@ class DeployConfig:
     )
     composition_policy: str = setting(
         "shipped",
-        "of composition=dqn and dqn_preview: `shipped`, a policy.npz, or a run folder: of a deployment the policy that "
-        "flew last",
+        "of composition=dqn and dqn_preview: `shipped`, a policy.npz, or a run folder: of a training its policy, of a "
+        "deployment the policy that it used",
     )
-    relearn: Relearn = part(Relearn, "when composition=dqn or dqn_preview learns during the run, from the run")
     share_warnings: ShareWarnings = part(ShareWarnings, "when a share is said to be out of control")
     signals: dict[str, Any] = setting(
         {}, "further signals that are held, brought by extend=FILE.py: signals.NAME.kind=LAW signals.NAME.KEY=VALUE"
@@ -78,8 +76,7 @@ class DeployConfig:
     plant_file: str | None = setting(None, "a twin.yaml of calibrate, or `latest`, in place of `plant`; backend=sim")
     notify: str = setting(
         "",
-        "who is told of start, alarms, hand-overs, learned policies and end: a command that reads lines of JSON, or "
-        "env:NAME, a variable "
+        "who is told of start, alarms, hand-overs and end: a command that reads lines of JSON, or env:NAME, a variable "
         "with a command or an address; an address on the command line goes on as env:DEPLOY_HOOK; empty: nobody",
     )
     fsync: bool = setting(True, "every row on the disk before the next command")

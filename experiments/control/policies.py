@@ -20,13 +20,11 @@ from experiments.cli.latest import ROOT, newest
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from hardware.check import Check
-from hardware.errors import ReactorError
 from hardware.storage import atomic
-from hardware.storage.journal import read_journal
 
 __all__ = [
-    "FIRST", "LEARNT", "SHIPPED", "SHIPPED_COMPOSITION", "Training", "Wanted", "admit", "composition_policy",
-    "find_policy", "flown", "load_policy", "named", "policy_check", "run_policy",
+    "COMPOSITION_POLICY", "SHIPPED", "SHIPPED_COMPOSITION", "Training", "Wanted", "admit", "composition_policy",
+    "find_policy", "load_policy", "policy_check", "run_policy",
 ]  # fmt: skip
 
 log = logging.getLogger(__name__)
@@ -37,8 +35,7 @@ SHIPPED_COMPOSITION = {
     "dqn_preview": SHIPPED.with_name("coculture_preview.npz"),
 }
 """The policy of each learned composition controller that comes with the program."""
-FIRST = "composition_policy.npz"  # in a run folder: what all its reactors begin with
-LEARNT = "policies"  # folder of those that a run has learned
+COMPOSITION_POLICY = "composition_policy.npz"  # in a run folder: the copy that all its reactors use
 TRAINED = ("train/**/policy.npz", "demo/*/2_train/policy.npz")  # below runs/; other commands keep copies of policies
 FORCE = "force_policy=true runs it all the same"
 
@@ -143,16 +140,6 @@ def find_policy(name: str) -> Path:
     return path / "policy.npz" if path.is_dir() else path
 
 
-def named(number: int) -> str:
-    """File of a policy that a run has learned, from its folder."""
-    return f"{LEARNT}/{number:03d}.npz"
-
-
-def flown(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """Of each reactor the number of the policy in force, by the rows of a journal; none that follows the first."""
-    return {row["reactor"]: row["number"] for row in rows if row["kind"] == "judged" and row["flies"]}
-
-
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
     """Reading a policy. Raises: UserError naming the file and what is wrong with it."""
@@ -252,18 +239,9 @@ def _keep(policy: Policy, kept: Path, proof: Path | None = None) -> None:
 
 
 def _share_policy(name: str) -> Path:
-    """As `find_policy`; of the folder of a deployment the policy of a share that was the last to fly there."""
+    """Return the path as `find_policy`; for the folder of a deployment, that of its composition policy."""
     run = Path(name)
-    if not (run / "journal.jsonl").is_file():
-        return find_policy(name)
-    with frame.refusing(ReactorError):
-        flew = flown(read_journal(run / "journal.jsonl")[0])
-    reactors = sorted(path.stem for path in (run / "recordings").glob("*.csv"))
-    files = {reactor: run / (named(flew[reactor]) if reactor in flew else FIRST) for reactor in reactors}
-    if len(set(files.values())) > 1:
-        each = ", ".join(f"{file} of {reactor}" for reactor, file in files.items())
-        raise frame.UserError(f"composition_policy={name}: its reactors flew different policies; give one: {each}")
-    return next(iter(files.values()), run / FIRST)
+    return run / COMPOSITION_POLICY if (run / "journal.jsonl").is_file() else find_policy(name)
 
 
 def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Policy | None:
@@ -274,7 +252,7 @@ def composition_policy(kind: str, name: str, folder: Path, resumed: bool) -> Pol
     """
     if not registry.takes(kind, "policy", registry.SHARE):
         return None
-    kept = folder / FIRST
+    kept = folder / COMPOSITION_POLICY
     again = resumed and kept.is_file()
     path = SHIPPED_COMPOSITION.get(kind, Path("shipped")) if name == "shipped" or again else _share_policy(name)
     if not again and name == "shipped" and not path.is_file():

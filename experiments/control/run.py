@@ -3,10 +3,8 @@
 import logging
 import os
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -19,8 +17,6 @@ from experiments.control.assemble import Setup
 from experiments.control.bench_marks import BenchMarks
 from experiments.control.config import DeployConfig
 from experiments.control.notify import Notifier
-from experiments.control.policies import flown
-from experiments.control.relearn import Relearning
 from experiments.loop.loop import ClosedLoop
 from experiments.record.record import Record
 from experiments.record.summary import (
@@ -48,7 +44,7 @@ def _began(setup: Setup, folder: Path) -> None:
     log.info("writes to %s; watch it with: tensorboard --logdir %s", folder, shlex.quote(str(folder)))
 
 
-def _run(loop: ClosedLoop, record: Record, tell: Notifier, learning: Relearning | None) -> str:
+def _run(loop: ClosedLoop, record: Record, tell: Notifier) -> str:
     """The loop until its end or trouble; returns the outcome. Pumps are verified off, whatever happens."""
     log_changes, marks, reactors = ChangeLog(loop, tell), BenchMarks(record), loop.reactors
     outcome = "failed: see the log"
@@ -59,8 +55,6 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier, learning: Relearning 
                 record.done(step, loop.state())
                 log_changes(step)
                 marks.take(loop)
-                if learning is not None:
-                    learning.take(step)
                 bar.update(int(step.rows.sum()))
         given_up = [name for name, s in zip(reactors.names, loop.stopped, strict=True) if s]
         outcome = f"stopped by the interlock: {', '.join(given_up)}" if given_up else "completed"
@@ -82,7 +76,7 @@ def _run(loop: ClosedLoop, record: Record, tell: Notifier, learning: Relearning 
     return outcome
 
 
-def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str, learned: Sequence[Mapping[str, Any]]) -> str:
+def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str) -> str:
     """Figure and summary.json, whatever the outcome; returns the outcome, failed if they could not be written."""
     folder = record.folder
     if not outcome.startswith(("completed", "stopped by the interlock")):
@@ -93,12 +87,11 @@ def _finish(record: Record, setup: Setup, loop: ClosedLoop, outcome: str, learne
         table = record.table()
         figures = {"closed_loop": figure_of(table, setup.scenarios, title)}
         if "ratio" in table.columns:
-            figures["composition"] = composition_figure_of(table, setup.scenarios, setup.species, title, learned)
+            figures["composition"] = composition_figure_of(table, setup.scenarios, setup.species, title)
         pictures = {name: charts.save(figure, folder / "figures", name) for name, figure in figures.items()}
         summary = {
             **summarise(table, setup.scenarios, setup.roles, outcome, loop.progress),
             "figure": str(folder / "figures" / "closed_loop.png"),
-            **({"learned": learned} if learned else {}),
         }
         files.write_json(folder / "summary.json", summary)
         record.curves.end(summary, setup.row, pictures)
@@ -149,18 +142,7 @@ def _recorded(setup: Setup, folder: Path, tell: Notifier) -> str:
         for repair in record.repairs:
             log.warning("%s", repair)
         _began(setup, folder)
-        with assemble.opened(setup, record) as loop, _learning(setup, loop, record, tell) as learning:
+        with assemble.opened(setup, record) as loop:
             tell("start", f"{'resumed' if setup.resumed else 'started'}: {', '.join(loop.reactors.names)}")
-            outcome = _run(loop, record, tell, learning)
-        return _finish(record, setup, loop, outcome, learning.learned if learning else ())
-
-
-@contextmanager
-def _learning(setup: Setup, loop: ClosedLoop, record: Record, tell: Notifier) -> Iterator[Relearning | None]:
-    """What learns during the run, or has learned; no training outlives the run. Raises: UserError."""
-    if not setup.relearn.every_h and not flown(record.journal.rows):
-        yield None
-        return
-    limits = setup.safety.composition_low, setup.safety.composition_high
-    with closing(Relearning(setup.relearn, loop, record, limits, tell)) as learning:
-        yield learning
+            outcome = _run(loop, record, tell)
+        return _finish(record, setup, loop, outcome)

@@ -14,8 +14,6 @@ from experiments.cli import frame
 from experiments.control import assemble
 from experiments.control.assemble import Setup
 from experiments.control.config import DeployConfig
-from experiments.control.question import Relearn
-from experiments.laws.share.learned import ONE_LINE
 from hardware.errors import ReactorError
 
 __all__ = ["Expected", "expected", "timetable"]
@@ -91,7 +89,7 @@ def timetable(config: DeployConfig, place: str, now: datetime) -> str:
         raise frame.UserError("dry_run=true: a resumed run goes on where it was; drop dry_run or resume")
     with tempfile.TemporaryDirectory() as scratch:
         setup = assemble.unpack(whole := assemble.completed(config), Path(scratch))
-    lines = [_deciders(whole, setup), *_learns(setup.relearn), *_device(setup)]
+    lines = [_deciders(whole, setup), *_device(setup)]
     for name, role, scenario in zip(setup.backend.reactors, setup.roles, setup.scenarios, strict=True):
         lines += _reactor(setup, name, role, scenario, now)
     return "\n".join([*lines, f"would record in {place}; nothing was asked of a device and nothing was written"])
@@ -104,15 +102,6 @@ def _deciders(c: DeployConfig, setup: Setup) -> str:
     share = "" if c.composition is None else f"; share: {c.composition.kind}"
     own = "".join(f"; {name}: {law.kind}" for name, law in c.signals.items())
     return f"controller {c.controller.kind}{policy}{share}{own}; at_end {c.at_end}"
-
-
-def _learns(plan: Relearn) -> Iterator[str]:
-    if plan.every_h:
-        yield (
-            f"learns every {plan.every_h:g} h, where both growth curves are known to {plan.sd:g} and one has moved by "
-            f"{plan.moved:g}: {plan.steps} steps, then {plan.vials} vials of {plan.hours:g} h; what is best on "
-            f"them flies, old policy, new one or {ONE_LINE}; one training at a time, at most {plan.limit_min:g} min"
-        )
 
 
 def _device(setup: Setup) -> Iterator[str]:

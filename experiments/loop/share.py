@@ -11,7 +11,6 @@ from conf.schema import check, setting
 from envs.coculture.task import logit
 from envs.scenario import Scenario
 from experiments.laws.share.base import Array, Law, Mask, ShareEstimator, Wanted
-from experiments.laws.share.learned import LearnedLaw
 from experiments.laws.share.program import Program
 from experiments.loop.signals import THERMOSTAT, Answer, Count, Findings, Sample, Span
 from hardware.memory import Remembers
@@ -139,8 +138,6 @@ class Share:
         if self.simulated:
             found[TRUE] = self.truth()
         why = {key: value for key, value in believed.items() if key not in ESTIMATE}
-        if isinstance(self.law, LearnedLaw):
-            why["policy"] = self.law.number.astype(np.float64)
         low, high = sample.limits
         inside = (given > low + EDGE_C) & (given < high - EDGE_C)
         goal = np.where(wanted.minutes > 0.0, wanted.following, wanted.setpoint)

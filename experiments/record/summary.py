@@ -244,13 +244,8 @@ def figure_of(table: Table, scenarios: Sequence[Scenario], title: str) -> Figure
     return charts.closed_loop(*series, table.names, temperature, title, marks, table.od(refused=True).T)
 
 
-def composition_figure_of(
-    table: Table, scenarios: Sequence[Scenario], species: str, title: str, learned: Sequence[Mapping[str, Any]] = ()
-) -> Figure:
-    """Share of a species, temperature, OD, pump and light of all reactors, of a run that controlled a composition.
-
-    Args: learned: what it learned, rows of its summary.
-    """
+def composition_figure_of(table: Table, scenarios: Sequence[Scenario], species: str, title: str) -> Figure:
+    """Share of a species, temperature, OD, pump and light of all reactors, of a run that controlled a composition."""
     announced, counted = [], []
     for n, (name, scenario) in enumerate(zip(table.names, scenarios, strict=True)):
         began = np.nanmin(table.columns["time_min"][n] - table.columns["elapsed_min"][n], initial=np.inf)
@@ -259,6 +254,5 @@ def composition_figure_of(
         announced.append((minute[known] + began, share[known]))
         mine = [(m.time_min, m.share, m.sd) for m in table.marks if m.reactor == name and m.share is not None]
         counted.append(tuple(np.array(mine, dtype=np.float64).reshape(-1, 3).T))
-    flew = [(table.names.index(r["reactor"]), r["minute"], f"policy {r['number']:03d}") for r in learned if r["flies"]]
     columns = {**table.columns, "od": table.od(), "setpoint": _setpoint(table)}
-    return composition_figure(columns, table.names, species, title, announced, counted, flew)
+    return composition_figure(columns, table.names, species, title, announced, counted)

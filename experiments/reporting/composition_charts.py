@@ -53,7 +53,6 @@ def composition_figure(
     title: str = "",
     announced: Sequence[Points] = (),
     counted: Sequence[Points] = (),
-    flew: Sequence[tuple[int, float, str]] = (),
 ) -> Figure:
     """Share with its setpoint and the estimate's 95 % band, temperature with its target, OD, pump rate, fluorescence.
 
@@ -62,7 +61,7 @@ def composition_figure(
         ratio_high, ratio_setpoint, temperature_degc, temperature_target_degc, od, setpoint, pump_rate_ml_s,
         fluorescence; true_ratio where it is known. names: N labels. species: whose share it is.
       announced: of each reactor, minutes at which a change was made known, and to which share. counted: minutes, shares
-        that somebody counted in a sample, and their sds. flew: reactor, minute and name of a policy from then on.
+        that somebody counted in a sample, and their sds.
     """
     figure, axes = new_figure(8.0, 9.0, 5, 1, sharex=True, height_ratios=[2.4, 1.2, 1.0, 0.8, 1.0])
     share, heat, density, pump, light = axes
@@ -92,9 +91,6 @@ def composition_figure(
         density.step(hours, own["setpoint"], where="post", **dashed)
         pump.step(hours, 1000.0 * own["pump_rate_ml_s"], where="post", color=colour, linewidth=0.8)
         light.plot(hours, own["fluorescence"], color=colour, linewidth=0.8)
-    for n, minute, policy in flew:
-        share.axvline(minute / 60.0, color=COLOURS[n % len(COLOURS)], linewidth=0.9, linestyle="-.")
-        share.text(minute / 60.0, 0.02, f" {policy}", color=COLOURS[n % len(COLOURS)], fontsize="small")
     share.set(ylabel=f"share of {species}", ylim=(0.0, 1.0))
     share.set_title(title)
     share.legend(ncols=2)

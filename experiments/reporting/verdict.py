@@ -92,11 +92,6 @@ def _deployment(summary: Summary, config: Mapping[str, Any]) -> Verdict:
     shares = [w["ratio_abs_error_mean"] for w in windows if w.get("ratio_abs_error_mean") is not None]
     if shares:
         items.append(f"mean error of the share {number(float(np.mean(shares)))}, as estimated")
-    items += [
-        f"learned during the run, from minute {row['minute']:.0f}: {row['reactor']}, policy {row['number']:03d} "
-        f"{'flies' if row['flies'] else 'does not fly'}, {row['why']}"
-        for row in summary.get("learned", ())
-    ]
     if not steady:
         return Verdict(claim, items, "No window was long enough to say how well its setpoint was held.")
     worst = max(w["steady_abs_error"] for w in windows if w["steady_abs_error"] is not None)

@@ -18,11 +18,9 @@ TAIL = 20_000_000  # bytes; about 16 h of eight reactors
 REMEDY = "the file was changed by hand: put it back as the run wrote it, or start a new run"
 BEGUN, ENDED, REACTOR = b'"kind":"intent"', b'"kind":"dose_end"', re.compile(rb'"reactor":"([^"]+)"')
 LANDMARKS = tuple(
-    f'"kind":"{kind}"'.encode()
-    for kind in ("device", "temperature", "regulate", "guard", "level", "share", "learn", "judged")
+    f'"kind":"{kind}"'.encode() for kind in ("device", "temperature", "regulate", "guard", "level", "share")
 )
-"""Identities, blanks, thermostat targets, hand-overs, overflow pumps, levels, counted shares and trainings: valid for
-days."""
+"""Identities, blanks, thermostat targets, hand-overs, overflow pumps, levels and counted shares: valid for days."""
 
 
 def _plain(value: Any) -> Any:

@@ -18,19 +18,20 @@ WARM = PairConfig(  # the second gains where it is warm
 
 
 def test_the_default_is_the_published_pair() -> None:
-    assert named_pair("ecoli_pputida") == PairConfig()
-    np.testing.assert_allclose(
-        PairConfig().rates(33.2),
-        [
-            0.07727 * 33.2 - 1.66954,
-            0.8954,
-        ],
-        atol=1e-3,
-    )
-    assert PairConfig().even_c == pytest.approx(33.197, abs=1e-3)
-    np.testing.assert_allclose(
-        PairConfig().production(np.array([20.0, 29.0, 33.2, 36.0])), [3495, 3495, 5270, 20], atol=1
-    )
+    """mu_p - mu_e, 1/h, as its authors' code gives it; beyond 29 to 36 degC the rate of the nearer end holds.
+
+    Pigment at 33.2, x = 0.7: 44.4957 x^4 + 31.8205 x^3 - 917.586 x^2 - 886.685 x + 6318.71.
+    """
+    pair = PairConfig()
+    assert named_pair("ecoli_pputida") == pair
+    assert pair.even_c == pytest.approx(33.197, abs=1e-3)
+    degrees = np.array([20.0, 29.0, 30.0, 31.0, 32.0, 33.0, pair.even_c, 34.0, 35.0, 36.0, 40.0])
+    published = [0.298, 0.298, 0.298, 0.253, 0.164, 0.031, 0.0, -0.146, -0.367, -0.632, -0.632]
+    rates = pair.rates(degrees)
+    np.testing.assert_allclose(rates[:, 1] - rates[:, 0], published, atol=6e-4)
+    np.testing.assert_allclose(rates[[1, 4, 9], 0], 0.07727 * degrees[[1, 4, 9]] - 1.66954)
+    production = pair.production(np.array([20.0, 29.0, 32.5, 33.2, 35.0, 36.0, 40.0]))
+    np.testing.assert_allclose(production, [3495, 3495, 6318.7, 5270, 602, 20, 20], rtol=1e-3)
 
 
 def test_cardinal_temperatures_by_hand() -> None:
@@ -89,6 +90,7 @@ def test_warmth_may_make_the_second_gain() -> None:
         (lambda: replace(PairConfig(), first=replace(PairConfig().first, name="P. putida")), "pair, names = P. putida"),
         (lambda: replace(PairConfig(), first=replace(PairConfig().first, lag_min=61.0)), "at most pair.second.lag_min"),
         (lambda: CocultureConfig(temperatures=(28.0, 36.0)), "29 to 36 degC, where the curves of the pair hold"),
+        (lambda: CocultureConfig(preview_min=365.0), r"env\.preview_min = 365"),
         (lambda: CocultureConfig(ambient_c=30.0), "less than the coldest target, 29 degC"),
         (lambda: named_pair("yeasts"), "pair = yeasts: allowed ecoli_pputida, ecoli_psyringae, a pair.yaml, or a run"),
         (lambda: named_pair("nowhere.yaml"), "pair = nowhere.yaml: No such file or directory; give the pair.yaml"),

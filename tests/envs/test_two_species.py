@@ -34,14 +34,6 @@ def logit(share):
     return np.log(share / (1.0 - share))
 
 
-def test_the_curves_differ_as_published() -> None:
-    degrees = np.array([29.0, 30, 31, 32, 33, EQUAL_RATES_C, 34, 35, 36, 40])
-    difference = [0.298, 0.298, 0.253, 0.164, 0.031, 0.0, -0.146, -0.367, -0.632, -0.632]
-    np.testing.assert_allclose(p_putida_rate(degrees) - e_coli_rate(degrees), difference, atol=1e-3)
-    assert e_coli_rate(36.0) == pytest.approx(1.11218)
-    assert p_putida_rate(20.0) == p_putida_rate(29.0)
-
-
 @pytest.mark.parametrize("temperature", [29.0, 31.0, EQUAL_RATES_C, 35.0, 36.0])
 def test_the_preset_grows_by_the_published_curves(temperature) -> None:
     p = plant(build(PlantConfig(), load("plant/coculture")))
@@ -134,19 +126,6 @@ def test_expected_od_is_the_sum_of_both() -> None:
     assert grown[0] == pytest.approx(0.25 * (np.exp(0.02) + np.exp(0.01)), rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "allowed"),
-    [
-        ("start_share", (0.2, 1.2), r"plant\.second\.start_share = \[0\.2, 1\.2\]: allowed \[low, high\]"),
-        ("temperature_law", "yeast", r"plant\.second\.temperature_law = yeast: allowed none, arrhenius"),
-        ("mu", 0.5, r"plant\.second\.mu = 0\.5 1/min: allowed 0 to 0\.1"),
-    ],
-)
-def test_what_is_out_of_range_is_named(key, value, allowed) -> None:
-    with pytest.raises(ValueError, match=allowed):
-        SecondSpeciesConfig(**{key: value})
-
-
 def test_a_share_outside_its_range_is_refused() -> None:
     with pytest.raises(ValueError, match=r"start share = 1\.5: allowed 0 to 1"):
         plant(pair()).reset(share=1.5)
@@ -155,18 +134,12 @@ def test_a_share_outside_its_range_is_refused() -> None:
 # -- pyoverdine and its light ------------------------------------------------------------------------------------------
 
 
-def test_production_is_as_published() -> None:
-    """Worked out by hand: at 33.2, x = 0.7: 44.4957 x^4 + 31.8205 x^3 - 917.586 x^2 - 886.685 x + 6318.71."""
-    degrees = np.array([29.0, 32.5, 33.2, 35.0, 36.0, 40.0])
-    np.testing.assert_allclose(steady_production(degrees), [3495, 6318.7, 5270, 602, 20, 20], rtol=1e-3)
-
-
 def test_pigment_settles_where_production_meets_dilution() -> None:
     """At a held composition and constant dilution f = g p / D, with D the growth of both."""
     alike = SecondSpeciesConfig((0.4, 0.4), mu=0.02)
     p = plant(pair(second=alike, start_temperature=33.0, thermal=replace(STEADY, medium_c=33.0)))
     p.fluorescence.pigment[:] = 0.0
-    for _ in range(1500):
+    for _ in range(800):
         p.advance(1.0, np.array([0.02 * 20.0]))
     f = float(steady_production(33.0)) * 0.2 / (60.0 * 0.02)
     assert p.culture.od[0] == pytest.approx(0.5, rel=1e-6)

@@ -67,6 +67,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     return str(folder / "a.csv"), str(folder / "b.csv")
 
 
+@pytest.mark.slow
 def test_curves_pigment_and_crossing_are_found(
     alone: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -91,15 +92,7 @@ def test_curves_pigment_and_crossing_are_found(
     assert np.abs(found["off_sd"]).max() < 3.0
 
 
-def test_a_pump_that_gives_more_scales_both_curves_and_leaves_the_crossing(tmp_path: Path) -> None:
-    recorded(tmp_path / "a.csv", 0.0, gain=1.1)
-    recorded(tmp_path / "b.csv", 1.0, gain=1.1, seed=1)
-    calibrate_pair(CalibratePairConfig((f"{tmp_path}/a.csv",), (f"{tmp_path}/b.csv",)), tmp_path)
-    pair = named_pair(str(tmp_path / "pair.yaml"))
-    assert pair.even_c == pytest.approx(TRUE.even_c, abs=0.25)
-    np.testing.assert_allclose(pair.rates(31.0) / TRUE.rates(31.0), 1.0 / 1.1, rtol=0.04)
-
-
+@pytest.mark.slow
 def test_shares_that_were_counted_in_a_mixed_run_correct_the_curves(tmp_path: Path) -> None:
     """The mixed culture grows by other rates than each alone: the second by a tenth less. A row every 2 min, 12 mL."""
     true = replace(TRUE, second=replace(TRUE.second, polynomial=tuple(0.9 * c for c in TRUE.second.polynomial)))
@@ -134,6 +127,7 @@ def test_shares_that_were_counted_in_a_mixed_run_correct_the_curves(tmp_path: Pa
     assert pair.even_c == pytest.approx(true.even_c, abs=0.25)
 
 
+@pytest.mark.slow
 def test_a_mixed_run_leaves_curves_alone_that_are_right(alone: tuple[str, str], tmp_path: Path) -> None:
     """A thermometer that is as it was, and counts with noise: the crossing stays."""
     minutes, shares = recorded(
@@ -152,6 +146,7 @@ def test_a_mixed_run_leaves_curves_alone_that_are_right(alone: tuple[str, str], 
     assert even[False] == pytest.approx(TRUE.even_c, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_lag_of_growth_biases_nothing_whichever_way_the_temperature_goes(order: int, tmp_path: Path) -> None:
     steps = dict(list({27.5: 6.0, 31.0: 5.5, 34.5: 5.5}.items())[::order])
@@ -172,17 +167,22 @@ def test_what_is_left_out_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixtu
     assert "it takes 180" in caplog.text
 
 
-def test_other_sensor_other_period_other_temperatures(tmp_path: Path) -> None:
-    """A factor of .7, rows every 2 min, and the second species over a narrower range than the first."""
-    recorded(tmp_path / "a.csv", 0.0, every=2)
+@pytest.mark.slow
+def test_other_sensor_other_pump_other_period_other_temperatures(tmp_path: Path) -> None:
+    """A factor of .7, rows every 2 min, and the second species over a narrower range than the first.
+
+    A pump that gives a tenth more than it is thought to scales both curves and leaves where they cross.
+    """
+    recorded(tmp_path / "a.csv", 0.0, every=2, gain=1.1)
     narrow = {28.5: 5.5, 31.0: 6.0, 34.0: 6.5}
-    recorded(tmp_path / "b.csv", 1.0, narrow, seed=1, factor=0.7, every=2)
+    recorded(tmp_path / "b.csv", 1.0, narrow, seed=1, factor=0.7, every=2, gain=1.1)
     calibrate_pair(CalibratePairConfig((f"{tmp_path}/a.csv",), (f"{tmp_path}/b.csv",), factor=0.7), tmp_path)
     pair = named_pair(str(tmp_path / "pair.yaml"))
     assert pair.temperatures == pytest.approx((28.5, 34.0), abs=0.11)
     t = np.array([29.0, 31.0, 33.5])
-    np.testing.assert_allclose(pair.rates(t), TRUE.rates(t), rtol=0.05)
-    np.testing.assert_allclose(pair.production(t), TRUE.production(t), rtol=0.06)
+    np.testing.assert_allclose(pair.rates(t), TRUE.rates(t) / 1.1, rtol=0.05)
+    np.testing.assert_allclose(pair.production(t), TRUE.production(t) / 1.1, rtol=0.06)
+    assert pair.even_c == pytest.approx(TRUE.even_c, abs=0.25)
     plateaus = json.loads((tmp_path / "summary.json").read_text())["plateaus"]
     assert len(plateaus[1]) == 3
 
@@ -210,14 +210,6 @@ def test_light_is_that_of_the_last_hour_whatever_the_period() -> None:
 def test_what_cannot_be_calibrated_is_one_line(config: CalibratePairConfig, words: str, tmp_path: Path) -> None:
     with pytest.raises(frame.UserError, match=words):
         calibrate_pair(config, tmp_path)
-
-
-def test_one_temperature_makes_no_curve(tmp_path: Path) -> None:
-    recorded(tmp_path / "a.csv", 0.0, {30.0: 5.0})
-    with pytest.raises(
-        frame.UserError, match=r"first: growth at 1 temperature\(s\); record 3 at least, each .* 180 min"
-    ):
-        calibrate_pair(CalibratePairConfig((f"{tmp_path}/a.csv",), (f"{tmp_path}/a.csv",)), tmp_path)
 
 
 def test_a_weighted_polynomial_goes_through_what_is_known_best() -> None:

@@ -141,6 +141,7 @@ def test_every_law_meets_the_same_reactors_and_nothing_happens_before_a_share_is
     assert one.temperature[:, 5] == pytest.approx(33.2, abs=0.05)
 
 
+@pytest.mark.slow
 def test_who_is_told_and_who_is_calibrated_makes_a_difference():
     assert trial("receding").foresight
     assert not trial("receding", announced=False).foresight
@@ -197,6 +198,7 @@ def test_another_pair_grows_in_all_vials_of_two_species_and_in_no_other():
     assert 0.07727 * t - 1.66954 == pytest.approx(0.546 * over / under, rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_command_leaves_numbers_figures_and_a_page(tmp_path):
     c = load(
         *SHORT, "studies.composition.plants=[coculture]", "studies.composition.controllers=[inverse]",
@@ -218,7 +220,7 @@ def test_the_command_leaves_numbers_figures_and_a_page(tmp_path):
     assert {e["signal"] for e in summary["rows"] + summary["paired"]} == {"share"}
     assert [p["controller"] for p in summary["paired"]] == ["proportional", "dqn_preview"]
     page = (tmp_path / "report.html").read_text()
-    assert "Mean |r - setpoint|" in page or "Mean |r − setpoint|" in page
+    assert all(law in page for law in ("pi", "proportional", "dqn_preview"))
     assert (tmp_path / "tables" / "ratio_steps_ratio_abs_error_mean.csv").is_file()
     for figure in summary["figures"]:
         assert (tmp_path / figure["file"]).is_file()

@@ -38,7 +38,7 @@ from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 STEPS = build(Scenario(), presets.load("scenario/ratio_steps"), "scenario")
-SHORT = replace(STEPS, minutes=(20.0, 100.0, 100.0, 20.0))
+SHORT = replace(STEPS, minutes=(20.0, 60.0, 60.0, 20.0))
 PLANT = replace(plant_preset("coculture"), pump=plant_preset("healthy").pump)  # pumps as `SOUND` has them
 TWO = DeviceOptions(vial=VialConfig(outlier_rate=0.0), plant=PLANT)
 
@@ -63,7 +63,7 @@ def error(run: Rehearsal, n: int = 0) -> Iterator[float]:
             yield abs(float(run.device.vials[run.names[n]].plant.culture.share[0]) - asked)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_day_and_three_hours_of_steps(tmp_path: Path) -> None:
     run = rehearsal(tmp_path, STEPS)
     run.begin()
@@ -81,11 +81,12 @@ def test_a_day_and_three_hours_of_steps(tmp_path: Path) -> None:
     run.close()
 
 
+@pytest.mark.slow
 def test_the_program_is_killed_twice_and_loses_nothing(tmp_path: Path) -> None:
     """Each time the device goes on by itself for a while, at the temperature that it was left at."""
     run = rehearsal(tmp_path, SHORT, ("M0", "M1"))
     kept: list[dict[str, Any]] = []
-    for minute, away_s in ((61.3, 400.0), (131.02, 900.0)):
+    for minute, away_s in ((41.3, 400.0), (91.02, 900.0)):
         run.begin()
         if kept:
             now = json.loads(json.dumps(run.loop.state()))["composition"]
@@ -108,7 +109,7 @@ def test_the_program_is_killed_twice_and_loses_nothing(tmp_path: Path) -> None:
         assert np.isfinite(estimate[1:]).all()
         setpoint = column(tmp_path, "ratio_setpoint", name)
         elapsed = column(tmp_path, "elapsed_min", name)
-        for start, end, asked in ((20.0, 120.0, 0.3), (120.0, 220.0, 0.7), (220.0, 240.0, 0.3)):
+        for start, end, asked in ((20.0, 80.0, 0.3), (80.0, 140.0, 0.7), (140.0, 160.0, 0.3)):
             inside = (elapsed >= start) & (elapsed < end - 1.0) & np.isfinite(setpoint)
             assert set(setpoint[inside]) == {asked}
         fed = float(run.truth(name)["feed_ml"])
@@ -172,6 +173,7 @@ def test_a_sample_that_was_not_decided_on_keeps_its_light(tmp_path: Path) -> Non
     assert row["ratio"] == ""
 
 
+@pytest.mark.slow
 def test_processes_killed_and_resumed_lose_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     words = ("scenario.ratios=[0.3]", "scenario.temperatures=[33.2]", "composition=proportional")
@@ -198,6 +200,7 @@ def two_species(tmp_path: Path) -> Iterator[Cable]:
         yield line
 
 
+@pytest.mark.slow
 def test_over_the_serial_line(two_species: Cable, tmp_path: Path) -> None:
     line = two_species
     folder = tmp_path / "run"
@@ -222,6 +225,7 @@ def test_over_the_serial_line(two_species: Cable, tmp_path: Path) -> None:
     assert np.isfinite(column(folder, "ratio")[1:]).all()
 
 
+@pytest.mark.slow
 def test_a_share_that_was_counted_is_taken_over_once_also_over_a_kill(tmp_path: Path) -> None:
     """Marked at minute 60 for minute 40; the program is killed before its state is saved, and resumed."""
     run = rehearsal(tmp_path, SHORT, ("M0", "M1"))

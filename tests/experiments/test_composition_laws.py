@@ -30,13 +30,8 @@ def law(kind, program=STEPS, policy=None, **values):
 def seen(x, temperature=33.2, rate=None):
     x = np.atleast_1d(np.asarray(x, dtype=float))
     warm = np.broadcast_to(float(temperature), x.shape)
-    return Estimate(
-        x,
-        np.full(x.shape, 0.1),
-        warm,
-        p_putida_rate(warm) if rate is None else np.full(x.shape, rate),
-        *np.zeros((3, x.size)),
-    )
+    lagged = p_putida_rate(warm) if rate is None else np.full(x.shape, rate)
+    return Estimate(x, np.full(x.shape, 0.1), warm, lagged, *np.zeros((3, x.size)))
 
 
 def asked(s, following=None, minutes=0.0, n=1):
@@ -119,16 +114,6 @@ def test_a_law_keeps_its_target_until_its_period_is_over_and_decides_at_its_mult
     assert found.act(seen(1.0), asked(0.5), *at(10))[0] != first
 
 
-def test_rows_without_a_new_estimate_keep_their_target():
-    found = law("pi")
-    found.reset(2)
-    both, first = np.array([True, True]), np.array([True, False])
-    before = found.act(seen([-0.1, -0.1]), asked(0.5, n=2), np.zeros(2), both)
-    after = found.act(seen([0.1, 0.1]), asked(0.5, n=2), np.ones(2), first)
-    assert after[0] != before[0]
-    assert after[1] == before[1]
-
-
 @pytest.mark.parametrize(("now", "following"), [(0.3, 0.7), (0.7, 0.3), (0.2, 0.5), (0.8, 0.6)])
 def test_the_midpoint_law_is_half_way_at_the_change(now, following):
     program = Program((now, following), (480.0, 480.0))
@@ -170,6 +155,7 @@ def test_the_midpoint_law_is_inverse_dynamics_where_nothing_is_announced():
     np.testing.assert_allclose(shares, other)
 
 
+@pytest.mark.slow
 def test_nothing_beats_the_optimum_over_the_program_and_foresight_pays():
     """With the tolerance of its grid."""
     best = error(on_the_model("optimum", STEPS), STEPS)
@@ -181,8 +167,9 @@ def test_nothing_beats_the_optimum_over_the_program_and_foresight_pays():
     assert blind > 1.5 * best
 
 
+@pytest.mark.slow
 def test_a_sine_is_followed_better_when_it_is_told_ahead():
-    sine = Program((), (2400.0,), (0.5, 0.4, 1200.0))
+    sine = Program((), (1200.0,), (0.5, 0.4, 1200.0))
     for kind in ("midpoint", "receding"):
         told, blind = (error(on_the_model(kind, sine, announce_min=m), sine) for m in (360.0, 0.0))
         assert told < 0.75 * blind
@@ -260,11 +247,12 @@ def test_what_cannot_be_built_is_said_in_one_line():
 
 @pytest.mark.parametrize("kind", [*BLIND, "midpoint"])
 def test_reactors_with_other_programs_and_clocks_are_as_if_alone(kind):
-    """Samples every 1, 2 and 3 min; another program each; the third begins later."""
+    """Samples every 1, 2 and 3 min; another program each; the third begins later. Without a sample a target stays."""
     programs = [Program((0.4, 0.7), (200.0, 200.0)), Program((0.6, 0.3), (90.0, 310.0)), STEPS]
     periods, begins = np.array([1, 2, 3]), np.array([0, 0, 70])
     together, each = law(kind), [law(kind) for _ in programs]
     together.reset(3)
+    before = np.full(3, EQUAL_RATES_C)
     for k in range(150):
         rows = (k >= begins) & ((k - begins) % periods == 0)
         minute = np.maximum(k - begins, 0).astype(float)
@@ -275,6 +263,8 @@ def test_reactors_with_other_programs_and_clocks_are_as_if_alone(kind):
         rows &= np.isfinite(joined.setpoint)
         known = seen(0.3 * np.sin(k / 20.0 + np.arange(3)))
         target = together.act(known, joined, minute, rows)
+        np.testing.assert_allclose(target[~rows], before[~rows])
+        before = target
         for n in np.flatnonzero(rows):
             mine = each[n].act(known.of(np.array([n])), wanted[n], minute[n : n + 1], np.ones(1, dtype=bool))
             assert target[n] == mine[0], (k, n)
@@ -324,7 +314,10 @@ def test_settings_of_ones_own_are_those_that_decide():
 
 
 def test_a_policy_is_shown_of_each_culture_its_own_numbers_and_each_thermostat_its_own_error():
-    """True temperatures are what was learned from; a thermostat goes by its thermometer, which is off by another."""
+    """True temperatures are what was learned from; a thermostat goes by its thermometer, which is off by another.
+
+    The policy was trained with .8 of the first species' growth: a culture that has .75 is shown a larger m_p.
+    """
     shown = []
 
     class Watched(Policy):
@@ -333,17 +326,22 @@ def test_a_policy_is_shown_of_each_culture_its_own_numbers_and_each_thermostat_i
             return np.where(observation[:, 0] > 0.0, 35.0, 31.0)
 
     given = Watched(**vars(linear_policy(COCULTURE_PREVIEW, "rate")))
+    given.metadata["model"]["scale_e"] = 0.8
     found = law("dqn_preview", policy=given)
     found.reset(3)
     one = seen([0.3, -0.2, 9.0])
     one = replace(
         one, temperature=np.array([30.5, 34.0, 29.0]), rate=np.array([0.7, 0.8, 0.9]),
-        thermometer=np.array([0.25, -0.5, 0.0]),
+        thermometer=np.array([0.25, -0.5, 0.0]), error_e=np.array([-0.25, -0.2, 0.0]),
     )  # fmt: skip
     asked_for = Wanted(np.array([0.4, 0.6, 0.5]), np.array([0.7, 0.2, 0.5]), np.array([90.0, 400.0, 0.0]))
     target = found.act(one, asked_for, np.zeros(3), np.array([True, True, False]))
     np.testing.assert_allclose(
-        shown[0], [[0.3, 30.5, 0.7, logit(0.4), logit(0.7), 90.0], [-0.2, 34.0, 0.8, logit(0.6), logit(0.6), 0.0]]
+        shown[0],
+        [
+            [0.3, 30.5, 0.7 + 0.05 * e_coli_rate(EQUAL_RATES_C), logit(0.4), logit(0.7), 90.0],
+            [-0.2, 34.0, 0.8, logit(0.6), logit(0.6), 0.0],
+        ],
     )
     np.testing.assert_allclose(target, [34.75, 31.5, EQUAL_RATES_C])
 

@@ -1,6 +1,7 @@
 """The composition in the loop: what is shown to its controller, what comes of its targets, what is warned of."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from experiments.laws import registry
 from experiments.laws.share.base import Array, Estimate, Mask, Wanted
 from experiments.laws.share.estimator import CompositionEstimator
 from experiments.loop.loop import ClosedLoop, Step
-from experiments.loop.share import COLUMNS, Share, ShareWarnings, program_of
+from experiments.loop.share import COLUMNS, Share, ShareWarnings
 from experiments.loop.signals import Sample, Signal
 from experiments.record.record import Table
 from experiments.record.summary import composition_figure_of, figure_of
@@ -105,12 +106,15 @@ def test_the_limits_are_the_interlocks_and_a_target_at_one_of_them_may_be_stuck(
     assert step(composition, 200.0, **limits).warnings[0].startswith("share_stuck")
 
 
-@pytest.mark.parametrize("schedule", [replace(HOLD, ratios=()), replace(HOLD, ratios=(None,))])
+@pytest.mark.parametrize(
+    ("schedule", "elapsed"), [(replace(HOLD, ratios=()), 5.0), (replace(HOLD, ratios=(None,)), 5.0), (HOLD, np.nan)]
+)
 def test_where_no_share_is_asked_for_the_schedule_decides_and_the_controller_goes_on_watching(
-    schedule: Scenario,
+    schedule: Scenario, elapsed: float
 ) -> None:
+    """Neither where the schedule asks for none nor before it begins."""
     keeper = Scripted(target=30.0)
-    composed = step(held(keeper, [schedule]), 5.0)
+    composed = step(held(keeper, [schedule]), 5.0, elapsed=elapsed)
     assert composed.target == 33.2
     assert np.isnan(composed.columns["ratio_setpoint"]).all()
     od, fluorescence, temperature, minute, rows = keeper.seen[0]
@@ -135,14 +139,6 @@ def test_the_law_is_asked_only_where_something_is_believed_of_the_culture() -> N
     assert keeper.seen[0][4].tolist() == believed.tolist()
 
 
-def test_nothing_is_asked_for_before_the_schedule_begins() -> None:
-    keeper = Scripted(target=30.0)
-    composed = step(held(keeper, [HOLD]), 5.0, elapsed=np.nan)
-    assert composed.target == 33.2
-    assert np.isnan(keeper.asked[0].setpoint)
-    assert len(keeper.seen) == 1
-
-
 def test_each_reactor_has_its_own_program_and_is_told_its_changes_as_far_ahead_as_its_scenario_says() -> None:
     phases = {"setpoints": (0.5, 0.5), "minutes": (100.0, 100.0), "temperatures": (33.2, 33.2)}
     steps = [Scenario(**phases, ratios=(0.3, 0.7), announce_min=ahead) for ahead in (60.0, 20.0)]
@@ -154,12 +150,6 @@ def test_each_reactor_has_its_own_program_and_is_told_its_changes_as_far_ahead_a
     assert wanted.following.tolist() == [0.7, 0.3, 0.4]
     assert wanted.minutes.tolist() == [50.0, 0.0, 0.0]
     assert minute.tolist() == [50.0] * 3  # since the program began
-
-
-def test_a_sine_falls_first() -> None:
-    sine = program_of(Scenario((0.5,), (1200.0,), (33.2,), ratio_sine=(0.5, 0.4, 1200.0)))
-    found = sine.setpoint(np.array([0.0, 300.0, 600.0, 900.0]))
-    np.testing.assert_allclose(found, [0.5, 0.1, 0.5, 0.9], atol=1e-12)
 
 
 def test_a_share_that_comes_no_nearer_at_full_authority_is_stuck_until_it_moves() -> None:
@@ -181,49 +171,46 @@ def test_a_share_that_comes_no_nearer_at_full_authority_is_stuck_until_it_moves(
     assert warned(composition, 470.0) == []
 
 
-def test_a_share_that_is_too_large_comes_nearer_by_falling() -> None:
-    keeper = Scripted(ratio=0.9, target=36.0)
-    composition = held(keeper, [HOLD])
-    assert not warned(composition, 0.0)
-    keeper.ratio = 0.93
-    assert not warned(composition, 100.0)
-    assert warned(composition, 180.0) == ["share_stuck"]
-    keeper.ratio = 0.87
-    assert warned(composition, 190.0) == []
+def phases(minutes: tuple[float, ...], ratios: tuple[float | None, ...], announce_min: float = 0.0) -> Scenario:
+    n = len(minutes)
+    return Scenario((0.5,) * n, minutes, (33.2,) * n, ratios=ratios, announce_min=announce_min)
 
 
-@pytest.mark.parametrize(("ratio", "target"), [(0.61, 29.0), (0.5, 29.2), (0.5, 35.9)])
-def test_a_share_that_is_near_or_a_target_inside_the_limits_is_not_stuck(ratio: float, target: float) -> None:
-    composition = held(Scripted(ratio=ratio, target=target), [HOLD])
-    assert not any(warned(composition, minute) for minute in np.arange(0.0, 600.0, 10.0))
+def until(end: float, *begins: float) -> list[float]:
+    """Every tenth minute up to `end`, from the last of `begins` on, and the others as they are."""
+    return [*begins[:-1], *np.arange(begins[-1], end, 10.0)]
 
 
-def test_another_setpoint_begins_anew_also_for_a_share_that_is_stuck() -> None:
-    schedule = Scenario((0.5, 0.5), (200.0, 400.0), (33.2, 33.2), ratios=(0.7, 0.9), announce_min=0.0)
-    composition = held(Scripted(ratio=0.5), [schedule])
-    told = [minute for minute in np.arange(0.0, 600.0, 10.0) if warned(composition, minute)]
-    assert told == [180.0, 190.0, *np.arange(380.0, 600.0, 10.0)]
+HISTORIES: dict[str, tuple[Scenario, Callable[[float], float], float, float, list[float]]] = {
+    "too large: nearer is less": (HOLD, lambda t: 0.9 if t < 100 else 0.93 if t < 190 else 0.87, 36.0, 300, [180.0]),
+    "near": (HOLD, lambda t: 0.61, 29.0, 600, []),
+    "colder than the upper limit": (HOLD, lambda t: 0.5, 35.9, 600, []),
+    "warmer than the lower limit": (HOLD, lambda t: 0.5, 29.2, 600, []),
+    "another setpoint": (phases((200, 400), (0.7, 0.9)), lambda t: 0.5, 29.0, 600, until(600, 180, 190, 380)),
+    "the same after a pause": (
+        phases((200, 100, 400), (0.7, None, 0.7)), lambda t: 0.5, 29.0, 600, until(600, 180, 190, 480)
+    ),
+    "towards what is announced, and lost again after it": (
+        phases((400, 400), (0.3, 0.7), 360),
+        lambda t: 0.3 if t < 100 else min(0.3 + 0.001 * (t - 100), 0.7) if t < 700 else 0.45, 29.0, 1000,
+        until(1000, 870),
+    ),
+    "towards what is asked, away from what is announced": (
+        phases((400, 400), (0.9, 0.3), 360), lambda t: 0.5 + 0.0008 * t, 29.0, 400, [],
+    ),
+}  # fmt: skip
 
 
-def test_a_share_on_its_way_to_one_that_is_announced_is_not_stuck() -> None:
-    schedule = Scenario((0.5, 0.5), (400.0, 400.0), (33.2, 33.2), ratios=(0.3, 0.7), announce_min=360.0)
-    keeper = Scripted(ratio=0.3)
+@pytest.mark.parametrize("name", HISTORIES)
+def test_stuck_is_what_came_no_nearer_for_three_hours_at_full_authority(name: str) -> None:
+    schedule, share, target, end, expected = HISTORIES[name]
+    keeper, told = Scripted(target=target), []
     composition = held(keeper, [schedule])
-    for minute in np.arange(0.0, 700.0, 10.0):
-        keeper.ratio = 0.3 if minute < 100.0 else min(0.3 + 0.001 * (minute - 100.0), 0.7)
-        assert not warned(composition, minute)
-    keeper.ratio = 0.45  # lost again, for whatever reason
-    assert next(minute for minute in np.arange(700.0, 1000.0, 10.0) if warned(composition, minute)) == 870.0
-
-
-def test_a_share_that_comes_nearer_to_what_is_asked_for_is_not_stuck_before_the_one_announced() -> None:
-    """A law that follows the setpoint in force moves away from the next one, at full authority."""
-    schedule = Scenario((0.5, 0.5), (400.0, 400.0), (33.2, 33.2), ratios=(0.9, 0.3), announce_min=360.0)
-    keeper = Scripted(ratio=0.5)
-    composition = held(keeper, [schedule])
-    for minute in np.arange(0.0, 400.0, 10.0):
-        keeper.ratio = 0.5 + 0.0008 * minute
-        assert not warned(composition, minute)
+    for minute in np.arange(0.0, end, 10.0):
+        keeper.ratio = share(minute)
+        if warned(composition, minute):
+            told.append(minute)
+    assert told == expected
 
 
 @pytest.mark.parametrize(("per_h", "stuck"), [(0.01, False), (0.0, True)])
@@ -378,28 +365,11 @@ def test_a_resumed_run_decides_what_one_without_a_pause_decides(kind: str) -> No
     assert told(steps + [second.step() for _ in range(LENGTH - CUT)]) == expected
     assert [bool(reasons[0]) for _, _, reasons in expected] == [False] * 30 + [True] * (LENGTH - 30)
     cold = fresh(vials(2))
-    for key in ("goal", "best", "nearer_min", "narrow_min", "controller"):
+    for key in ("goal", "best", "nearer_min", "narrow_min", "controller", ""):
         wrong = json.loads(json.dumps(state))
-        del wrong["composition"][key]
+        del (wrong["composition"] if key else wrong)[key or "composition"]
         with pytest.raises(ValueError, match=rf"^(controller\.{key}|composition)"):
             cold.restore(wrong)
-
-
-def test_a_state_without_the_compositions_is_refused() -> None:
-    run = loop(vials(1), Reckoning(), HOLD)
-    state = run.state()
-    del state["composition"]
-    with pytest.raises(ValueError, match="^composition: missing, expected keys and values"):
-        run.restore(state)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"far": 0.0}, {"stuck_h": 0.0}, {"wide": 2.0}, {"wide_h": -1.0}],
-)
-def test_warnings_out_of_range_are_named(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=rf"^share_warnings\.{next(iter(wrong))} = .*allowed"):
-        ShareWarnings(**wrong)
 
 
 def test_a_fluorescence_that_no_sensor_gives_is_recorded_and_not_shown() -> None:
@@ -424,13 +394,6 @@ class Recorded(Reckoning):
     def watch(self, od: Array, fluorescence: Array, temperature: Array, minute: Array, rows: Mask) -> None:
         self.light.append(fluorescence)
         super().watch(od, fluorescence, temperature, minute, rows)
-
-
-def test_the_same_share_after_a_pause_without_one_begins_anew() -> None:
-    timed = {"setpoints": (0.5,) * 3, "minutes": (200.0, 100.0, 400.0), "temperatures": (33.2,) * 3}
-    composition = held(Scripted(ratio=0.5), [Scenario(**timed, ratios=(0.7, None, 0.7))])
-    told = [minute for minute in np.arange(0.0, 600.0, 10.0) if warned(composition, minute)]
-    assert told == [180.0, 190.0, *np.arange(480.0, 600.0, 10.0)]
 
 
 def test_what_is_said_of_a_counted_share_is_that_reactors() -> None:

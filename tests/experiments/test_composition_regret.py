@@ -26,6 +26,7 @@ def regret() -> Callable[[str, CocultureConfig], float]:
     return of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "expected"), [("proportional", 0.106), ("inverse_dynamics", 0.094), ("bang_bang", 0.134), ("pi", 2.33)]
 )
@@ -33,12 +34,13 @@ def test_without_preview_simple_laws_are_close(regret, name: str, expected: floa
     assert regret(name, CocultureConfig()) == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "expected"), [("midpoint", 13.0), ("proportional", 375.5)])
 def test_with_preview_the_time_to_begin_decides(regret, name: str, expected: float) -> None:
     assert regret(name, PREVIEW) == pytest.approx(expected, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize(("hours", "expected"), [(1, 283.4), (2, 149.4), (3, 75.1)])
 def test_how_far_a_plan_must_reach(hours: int, expected: float) -> None:
     task = Coculture(PREVIEW)

@@ -158,16 +158,9 @@ def test_a_device_s_culture_is_taken_to_begin_at_its_first_setpoint() -> None:
     assert "recovery grows undiluted to OD 0.45, at most 75 min; the times below count from its end" in text
 
 
-def test_what_a_run_would_learn_and_who_would_hold_the_share_is_told() -> None:
-    learns = {"every_h": 6, "sd": 0.02, "moved": 0.05, "steps": 5000, "vials": 48, "hours": 12, "limit_min": 90}
-    words = "backend=emulator", "scenario=ratio_steps", "composition=dqn_preview", "controller=pi"
-    text = told(*words, *(f"relearn.{key}={value}" for key, value in learns.items()))
-    assert text.splitlines()[:2] == [
-        "controller pi; share: dqn_preview; at_end hold",
-        "learns every 6 h, where both growth curves are known to 0.02 and one has moved by 0.05: 5000 steps, then 48 "
-        "vials of 12 h; what is best on them flies, old policy, new one or midpoint; one training at a time, at most "
-        "90 min",
-    ]
+def test_who_would_hold_the_share_is_told() -> None:
+    text = told("backend=emulator", "scenario=ratio_steps", "composition=dqn_preview", "controller=pi")
+    assert text.splitlines()[0] == "controller pi; share: dqn_preview; at_end hold"
     shares = [line.partition("its time")[2] for line in table(text)["M1"] if " its time" in line]
     assert shares == ["", *(f"; share {share}, which decides the temperature" for share in ("0.3", "0.7", "0.3"))]
 

@@ -472,17 +472,6 @@ def test_what_is_drawn_is_in_the_unit_of_its_axis(name: str) -> None:
             np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9, err_msg=where)
 
 
-def test_a_policy_that_was_learned_on_the_way_is_named_at_its_hour_and_one_that_does_not_fly_is_not() -> None:
-    each = [("M1", 90.0, 1, True), ("M0", 150.0, 2, False), ("M0", 240.0, 3, True)]
-    learned = [dict(zip(("reactor", "minute", "number", "flies"), row, strict=True)) for row in each]
-    share = composition_figure_of(table(), [SCENARIO, SCENARIO], "B", "", learned).axes[0]
-    lines = {float(line.get_xdata()[0]): line.get_color() for line in share.lines if line.get_linestyle() == "-."}
-    assert lines == {1.5: charts.COLOURS[1], 4.0: charts.COLOURS[0]}
-    assert [(text.get_position()[0], text.get_text().strip()) for text in share.texts] == [
-        (1.5, "policy 001"), (4.0, "policy 003"),
-    ]  # fmt: skip
-
-
 def drawn_as(figure: Figure, panel: int) -> list[str]:
     """How the lines of a panel go from one point to the next."""
     return [line.get_drawstyle() for line in figure.axes[panel].lines if len(line.get_xdata()) > 1]

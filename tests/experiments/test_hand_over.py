@@ -87,7 +87,7 @@ def handed_over(folder: Path, dead_s: float = 300.0) -> Losable:
     """A run that handed over its first reactor, went on, and was killed."""
     run = Losable(folder)
     run.begin()
-    run.live(20)
+    run.live(10)
     assert run.reactors.handed_over.tolist() == [True, False]
     run.close()
     run.wait(dead_s)
@@ -97,7 +97,7 @@ def handed_over(folder: Path, dead_s: float = 300.0) -> Losable:
 def regulated_at(run: Losable, target: float = 0.5) -> None:
     """It regulates itself, was verified, is not dosed beside it, and the interlock knows."""
     since = len(run.record.journal.rows)
-    run.live(30)
+    run.live(12)
     data = run.data()
     assert (data["OD"]["ON"], data["OD"]["target"]) == (1, target)
     assert run.reactors.handed_over.tolist() == [True, False]
@@ -136,6 +136,7 @@ def test_a_resumed_run_leaves_it_to_the_regulation_it_was_handed_over_to(tmp_pat
     assert run.data()["OD"]["ON"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["/SetOutputOn/OD/0/M0", "/SetOutputTarget/OD/M0/1.2", "/Experiment/0/M0", "wipe"])
 def test_a_resumed_run_hands_over_again_what_lost_its_regulation_meanwhile(tmp_path: Path, what: str) -> None:
     run = handed_over(tmp_path)
@@ -151,6 +152,7 @@ def test_a_resumed_run_hands_over_again_what_lost_its_regulation_meanwhile(tmp_p
     assert len([note for note in notes if "handed over again, because its on-board OD regulation is" in note]) == 1
 
 
+@pytest.mark.slow
 def test_a_regulation_that_does_not_come_back_is_told_not_believed_and_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -172,6 +174,7 @@ def test_a_regulation_that_does_not_come_back_is_told_not_believed_and_tried_aga
     assert run.reactors.stations[0].book.fault is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dies_at", range(1, 17))
 def test_killed_in_the_middle_of_handing_over_it_is_dosed_or_regulated(tmp_path: Path, dies_at: int) -> None:
     run = Losable(tmp_path, dies_at)
@@ -183,7 +186,7 @@ def test_killed_in_the_middle_of_handing_over_it_is_dosed_or_regulated(tmp_path:
     run.sound = True
     run.begin()
     resumed = len(run.record.journal.rows)
-    run.live(30)
+    run.live(20)
     regulated = bool(run.data()["OD"]["ON"])
     assert regulated == run.reactors.handed_over[0] == bool(run.journaled("regulate"))
     dosed = [row for row in run.journaled("intent", resumed) if row["feed_ml"] > 0.0]
@@ -193,6 +196,7 @@ def test_killed_in_the_middle_of_handing_over_it_is_dosed_or_regulated(tmp_path:
     assert run.truth("M0")["od"] == pytest.approx(0.5, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_new_run_takes_control_back_and_says_so(tmp_path: Path) -> None:
     run = handed_over(tmp_path)
     (tmp_path / "new").mkdir()
@@ -207,6 +211,7 @@ def test_a_new_run_takes_control_back_and_says_so(tmp_path: Path) -> None:
     assert not run.reactors.handed_over.any()
 
 
+@pytest.mark.slow
 def test_giving_a_reactor_up_ends_its_regulation_too(tmp_path: Path) -> None:
     """Pumps that are switched off under a regulation that is on would run again with its next cycle."""
     run = handed_over(tmp_path)
@@ -228,6 +233,7 @@ def test_giving_a_reactor_up_ends_its_regulation_too(tmp_path: Path) -> None:
     assert run.device.vials["M1"].on_s["Pump1"] > 0.0
 
 
+@pytest.mark.slow
 def test_a_run_of_an_earlier_version_hands_over_again(tmp_path: Path) -> None:
     """Its journal does not tell of the hand-over, its state does."""
     run = handed_over(tmp_path)
@@ -240,6 +246,7 @@ def test_a_run_of_an_earlier_version_hands_over_again(tmp_path: Path) -> None:
     regulated_at(run)
 
 
+@pytest.mark.slow
 def test_kill_9_and_resume_of_a_real_run(tmp_path: Path) -> None:
     folder = tmp_path / "run"
 

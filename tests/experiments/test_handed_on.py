@@ -62,6 +62,9 @@ def test_curves_that_a_run_has_found_are_those_of_its_own_pair(pair: str | None,
     (own / "recordings").mkdir()
     env = read_curves(str(own / "recordings" / "M1.csv"), given)
     assert (env.scale_e, env.scale_p) == pytest.approx((1.0, 0.9))
+    for path, word in ((own, "several reactors"), (own / "recordings" / "M7.csv", "env_file"), (tmp_path, "env_file")):
+        with pytest.raises(frame.UserError, match=word):
+            read_curves(str(path), given)
 
 
 def test_curves_beyond_what_a_training_allows_are_taken_to_its_ends(tmp_path: Path) -> None:

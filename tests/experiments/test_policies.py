@@ -1,6 +1,5 @@
 """Which policy a run finds, and which ones it lets near a culture."""
 
-import json
 import os
 import re
 from collections.abc import Iterator
@@ -22,7 +21,7 @@ from experiments.cli import files, frame
 from experiments.cli.frame import UserError
 from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
-from experiments.control.policies import FIRST, composition_policy, find_policy, load_policy, named
+from experiments.control.policies import COMPOSITION_POLICY, composition_policy, find_policy, load_policy
 from experiments.laws import registry
 from experiments.laws.density.learned import settings
 from experiments.training.config import TrainConfig
@@ -130,19 +129,11 @@ def test_a_policy_that_pumps_faster_than_the_bench_allows_is_refused_with_both_r
     assert load_policy("shipped", 0.5, 0.001).actions.max() == 1.0
 
 
-def test_a_share_s_policy_of_a_deployment_is_the_one_that_flew_last(tmp_path: Path) -> None:
-    """Nothing was learned: what all began with. M0 and M1 flew number 2, whatever was judged and not flown since."""
-    (tmp_path / "recordings").mkdir()
-    for name in ("M0", "M1"):
-        (tmp_path / "recordings" / f"{name}.csv").touch()
-    judged = [("M0", 1, True), ("M1", 2, True), ("M0", 2, True), ("M1", 3, False)]
-    rows: list[dict[str, Any]] = [{"kind": "start"}]
-    for upto, file in ((0, FIRST), (4, named(2))):
-        rows += [{"kind": "judged", "reactor": r, "number": n, "flies": flies} for r, n, flies in judged[:upto]]
-        lines = [json.dumps({"n": n, "wall": 1.0, "mono": 1.0, **row}) for n, row in enumerate(rows)]
-        (tmp_path / "journal.jsonl").write_text("\n".join(lines) + "\n")
-        assert policies._share_policy(str(tmp_path)) == tmp_path / file
-    assert policies._share_policy(str(tmp_path / "recordings")) == tmp_path / "recordings" / "policy.npz"
+def test_a_share_s_policy_of_a_deployment_is_its_composition_policy(tmp_path: Path) -> None:
+    """Any other folder is a training's; a deployment has the policy of its density as policy.npz."""
+    assert policies._share_policy(str(tmp_path)) == tmp_path / "policy.npz"
+    (tmp_path / "journal.jsonl").touch()
+    assert policies._share_policy(str(tmp_path)) == tmp_path / COMPOSITION_POLICY
 
 
 def test_each_learned_law_of_a_share_has_a_policy_of_its_own_that_ships(tmp_path: Path) -> None:
@@ -151,10 +142,15 @@ def test_each_learned_law_of_a_share_has_a_policy_of_its_own_that_ships(tmp_path
         flies = composition_policy(kind, "shipped", tmp_path / kind, False)
         assert flies is not None
         assert len(flies.observation) == sees
-        kept = policy.load(tmp_path / kind / FIRST)
+        kept = policy.load(tmp_path / kind / COMPOSITION_POLICY)
         assert kept.observation == flies.observation
     assert composition_policy("midpoint", "shipped", tmp_path, False) is None
-    assert not (tmp_path / FIRST).exists()
+    other = tmp_path / "dqn" / COMPOSITION_POLICY  # whatever is asked for, a resumed run goes on with its copy
+    for resumed, sees in ((True, 6), (False, 4)):
+        goes_on = composition_policy("dqn_preview", str(other), tmp_path / "dqn_preview", resumed)
+        assert goes_on is not None
+        assert len(goes_on.observation) == sees
+    assert not (tmp_path / COMPOSITION_POLICY).exists()
 
 
 def test_a_file_of_an_earlier_version_runs_and_says_what_is_not_known(

@@ -202,7 +202,6 @@ def test_a_long_journal_keeps_what_a_naive_reader_keeps(tmp_path: Path, monkeypa
         assert [row["k"] for row in reader.rows] == kept
         assert (reader.cut, reader.next_row) == (0, 12)
     assert all(
-        json.loads(b"{" + mark + b"}")["kind"]
-        in ("device", "temperature", "regulate", "guard", "level", "share", "learn", "judged")
+        json.loads(b"{" + mark + b"}")["kind"] in ("device", "temperature", "regulate", "guard", "level", "share")
         for mark in LANDMARKS
     )

@@ -142,26 +142,6 @@ class CompositionEstimator:
         return np.where(self.begun, self._minute, -np.inf)
 
     @property
-    def measured(self) -> Array:
-        """Newest temperature by the thermometer, degC, (N,)."""
-        return self._temperature
-
-    def lagging(self, thermometer: Array) -> tuple[Array, Array, Array]:
-        """What is behind the temperature, for errors of the thermometer (N,): rates of both species by their curves,
-        1/h, (N, 2); production of pigment, (N,), and of each minute that it still feels, (N, delay), counts/OD/h."""
-        weight, _ = _through(thermometer)
-        rates, made = np.einsum("nsc,nc->ns", self._lagged, weight), np.einsum("nc,nc->n", self._production, weight)
-        return rates, made, np.einsum("ndc,nc->nd", self._past, weight)
-
-    def of(self, idx: Rows) -> "CompositionEstimator":
-        """A copy that knows these cultures, each as often as it is named."""
-        other = CompositionEstimator(self.config, self.volumes_ml[idx], self.pair)
-        for key in self.remembers:
-            name = f"_{key}" if hasattr(self, f"_{key}") else key
-            setattr(other, name, getattr(self, name)[idx].copy())
-        return other
-
-    @property
     def volumes_ml(self) -> Array:
         """V of each culture, mL, (N,)."""
         return np.broadcast_to(np.asarray(self._volume_ml, dtype=np.float64), self._given_ml.shape)

@@ -9,11 +9,9 @@ from dqn.policy import COCULTURE, COCULTURE_PREVIEW, Policy
 from envs.coculture.pair import PairConfig
 from envs.coculture.task import logit
 from experiments.laws.share.base import Array, Estimate, Wanted
-from experiments.laws.share.laws import Index, LawConfig, Midpoint, MidpointConfig, Periodic
+from experiments.laws.share.laws import Index, LawConfig, Periodic
 
-__all__ = ["ONE_LINE", "LearnedLaw", "LearnedLawConfig", "PreviewLawConfig", "one_line"]
-
-ONE_LINE = "midpoint"  # the best law without a policy
+__all__ = ["LearnedLaw", "LearnedLawConfig", "PreviewLawConfig"]
 
 
 @dataclass(frozen=True)
@@ -32,11 +30,6 @@ class PreviewLawConfig(LearnedLawConfig):
     control_min: float = setting(5.0, "between decisions; the target is kept in between", "min", within=(1, 240))
 
 
-def one_line(policy: Policy) -> bool:
-    """Whether a run found `ONE_LINE` better than this policy, so that it decides where the policy would."""
-    return bool(policy.metadata.get("learned", {}).get("law") == ONE_LINE)
-
-
 def _unnamed(pair: PairConfig) -> PairConfig:
     """A pair whose species are called by numbers."""
     return replace(pair, first=replace(pair.first, name="1"), second=replace(pair.second, name="2"))
@@ -50,21 +43,14 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
     trained with, moves the share as much as that of m_p does. A change further ahead than the policy was trained for is
     not shown to it yet. It may decide more often than in training, as a receding horizon does: an action is worth what
     it is worth for a whole period, and is thought over before.
-    Args: policy: with one of these observations, which all cultures follow until `follow` gives one another.
-    Where the policy that a culture follows was beaten by `ONE_LINE` (`one_line`), that law decides in its place.
-    Attributes: number, of the policy that each culture follows, 0 for that, (N,).
+    Args: policy: with one of these observations, which all cultures follow.
     Raises: ValueError for a policy of another task.
     """
 
-    remembers = ("target", "next", "one_line")
-    added = ("one_line",)
-
     def __init__(self, config: LearnedLawConfig, policy: Policy, pair: PairConfig | None = None) -> None:
-        self._policies: dict[int, Policy] = {}
-        self._one_line = Midpoint(MidpointConfig(control_min=config.control_min), pair)
         super().__init__(config, pair)
         self._check(policy)
-        self.policy = self._policies[0] = policy
+        self.policy = policy
         self.preview_min = float(policy.metadata["model"]["preview_min"])
 
     def _check(self, policy: Policy) -> None:
@@ -79,38 +65,12 @@ class LearnedLaw(Periodic[LearnedLawConfig]):
         allowed = "the run's own: train one with pair=... of the run, or give a law without a policy"
         require(_unnamed(known) == _unnamed(self.pair), "policy's pair", said, allowed)
 
-    def reset(self, n: int) -> None:
-        """See `Law.reset`; every culture follows the first policy."""
-        super().reset(n)
-        self._one_line.reset(n)
-        self.number = np.zeros(n, dtype=np.int64)
-
-    def follow(self, n: int, number: int, policy: Policy) -> None:
-        """From now on culture n follows a policy of its own, of a number > 0, like the first one in task and timing.
-
-        Raises: ValueError for a policy that is not.
-        """
-        self._check(policy)
-        for key in ("control_min", "preview_min"):
-            found, mine = (float(p.metadata["model"][key]) for p in (policy, self.policy))
-            require(found == mine, f"policy's {key}", found, f"{mine:g}, as of the policy before it")
-        self._policies[number], self.number[n] = policy, number
-
     def _decide(self, estimate: Estimate, wanted: Wanted, minute: Array, idx: Index) -> Array:
         now = logit(wanted.setpoint)
-        following = self.number[idx]
-        known = np.array([self._policies[k].metadata["model"].get("scale_e", 1.0) for k in following])
+        known = self.policy.metadata["model"].get("scale_e", 1.0)
         rate = estimate.rate - (1.0 + estimate.error_e - known) * self.pair.rates(self._even_c)[0]
         columns = [estimate.logit, estimate.temperature, rate, now]
         if self.policy.observation == COCULTURE_PREVIEW:
             shown = wanted.minutes <= self.preview_min
             columns += [np.where(shown, logit(wanted.following), now), np.where(shown, wanted.minutes, 0.0)]
-        observation, chosen = np.stack(columns, axis=1), np.empty(idx.size)
-        for k in np.unique(following):
-            rows, policy = following == k, self._policies[int(k)]
-            if one_line(policy):
-                asked = Wanted(wanted.setpoint[rows], wanted.following[rows], wanted.minutes[rows])
-                chosen[rows] = self._one_line._decide(estimate.of(np.flatnonzero(rows)), asked, minute[rows], idx[rows])
-            else:
-                chosen[rows] = policy.chosen(observation[rows])
-        return chosen
+        return self.policy.chosen(np.stack(columns, axis=1))
