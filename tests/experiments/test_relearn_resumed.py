@@ -1,6 +1,5 @@
 """A run that learns and is killed now and then knows of each reactor what one knows that was never interrupted."""
 
-from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
