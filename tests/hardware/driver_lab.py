@@ -1,5 +1,6 @@
 """The program's closed loop with a simple controller around the emulated device, on a virtual clock."""
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from experiments.loop.loop import ClosedLoop, Step
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.reactors import ChiBioReactors
+from hardware.chibio.resume import replay
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions
 from hardware.emulator.faults import inject
@@ -105,6 +107,13 @@ class DriverLab:
         if self._state:
             self.loop.restore(self._state)
 
+    def resume(self, dead_s: float = 0.0) -> None:
+        """Go on by the journal with a new driver and loop, so long after the program was killed."""
+        began, rows = self.reactors.elapsed(), json.loads(json.dumps(self.rows))
+        self.clock.sleep(dead_s)
+        self.client()
+        self.reactors.begin(replay(rows), began + dead_s)
+
     def log(self, kind: str, fields: Mapping[str, Any]) -> None:
         self.rows.append({"kind": kind, **fields})
 
@@ -145,3 +154,12 @@ class DriverLab:
 
     def motors_off(self) -> bool:
         return not any(any(self.truth(n)["motors"].values()) for n in self.names)
+
+
+def begun(*args: Any, rate: float | None = None, minutes: float = 0.0, **config: Any) -> DriverLab:
+    """A lab whose run began `minutes` ago. Args: rate: asked for throughout, mL/s."""
+    lab = DriverLab(*args, **config)
+    lab.law.rate = rate
+    lab.reactors.begin()
+    lab.run(minutes)
+    return lab

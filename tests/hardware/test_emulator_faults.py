@@ -48,8 +48,7 @@ def wiped(state: dict) -> bool:  # type: ignore[type-arg]
 def test_touching_an_absent_reactor_ends_everything() -> None:
     c = Client()
     c.link.post("/Experiment/1/M0")
-    c.link.post("/SetOutputTarget/Pump3/M1/1")
-    c.link.post("/SetOutputOn/Pump3/1/M1")
+    c.lab.pump("Pump3", 1, reactor="M1")
     c.lab.wait(30.0)
     assert c.device.truth("M1")["motors"]["Pump3"] == 1
     message, took = c.fails(lambda: c.link.post("/MeasureTemp/IR/M5"))
@@ -167,8 +166,7 @@ def test_stuck_bus_lies_with_204_and_the_temperature_probe_is_the_kill_switch() 
     c.link.post("/Experiment/1/M0")
     c.lab.wait(70.0)
     inject(c.device, "bus_stuck_when_pumping")
-    c.link.post("/SetOutputTarget/Pump1/M0/0.05")
-    c.link.post("/SetOutputOn/Pump1/1/M0")
+    c.lab.pump("Pump1", 0.05)
     c.lab.wait(10.0)
     assert c.link.post("/SetOutputOn/Pump1/0/M0").status == 204
     state = c.state()
@@ -208,8 +206,7 @@ def test_a_reactor_marked_absent_by_a_glitch_is_killed_by_its_own_threads() -> N
 
 def test_after_a_power_cut_the_clock_starts_again_and_everything_is_off() -> None:
     c = Client()
-    c.link.post("/SetOutputTarget/Pump3/M0/1")
-    c.link.post("/SetOutputOn/Pump3/1/M0")
+    c.lab.pump("Pump3", 1)
     c.lab.wait(1000.0)
     inject(c.device, "power_cut")
     assert set(c.device.truth("M0")["motors"].values()) == {0}
@@ -323,8 +320,7 @@ def test_clock_set_forward_gives_one_short_cycle() -> None:
 
 def test_clock_set_back_during_a_dose_lengthens_the_pause_not_the_dose() -> None:
     c = Client()
-    c.link.post("/SetOutputTarget/Pump1/M0/0.05")
-    c.link.post("/SetOutputOn/Pump1/1/M0")
+    c.lab.pump("Pump1", 0.05)
     c.lab.wait(1.0)
     inject(c.device, "clock_step", value=-300.0)
     c.lab.wait(350.0)

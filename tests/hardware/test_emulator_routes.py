@@ -10,7 +10,7 @@ import pytest
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice
 from hardware.emulator.faults import inject
-from tests.hardware.emulator_lab import BLANK, Lab
+from tests.hardware.emulator_lab import BLANK, Lab, running
 
 SAMPLE = Path(__file__).parents[2].parent / "shared" / "samples" / "chibio_sysdata.json"
 
@@ -89,9 +89,7 @@ def test_status_codes(method: str, path: str, status: int) -> None:
 def test_the_state_has_every_field_of_a_recorded_answer_with_its_type_and_sorted_keys() -> None:
     if not SAMPLE.exists():
         pytest.skip(f"no recorded answer at {SAMPLE}")
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
-    lab.wait(9 * 60.07 + 20.0)
+    lab = running(wait=9 * 60.07 + 20.0)
     lab.post("/changeDevice/M0")
     body = lab.device.handle("GET", "/getSysdata/")[1]
     recorded, mine = json.loads(SAMPLE.read_text()), json.loads(body)
@@ -264,9 +262,7 @@ def test_forks() -> None:
 
 
 def test_a_newer_app_names_the_reactor_in_its_log() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
-    lab.wait(1.0)
+    lab = running(wait=1.0)
     lab.post("/Experiment/0/M0")
     lab.wait(80.0)
     plain = lab.state()["Terminal"]["text"]
@@ -306,8 +302,7 @@ def test_thousands_of_random_requests_leave_a_device_that_answers() -> None:
     verbs |= {"getSysdata": 0, "getSysdata/": 0, "ExperimentReset": 0}
     arguments = ["Pump1", "Pump2", "Stir", "OD", "OD0", "Thermostat", "Heat", "Zigzag", "Light", "FP1", "LASER650"]
     arguments += ["M0", "M1", "0", "1", "2", "-1", "0.5", "nan", "inf", "1e400", "", "%00", "x", "IR", "Internal", "é"]
-    lab = Lab(blanked=True, od=0.5)
-    lab.post("/Experiment/1/M0")
+    lab = running(blanked=True, od=0.5)
     seen = set()
     for _ in range(4000):
         verb = str(rng.choice(list(verbs)))

@@ -37,7 +37,7 @@ from hardware.link.open import open_transport
 from hardware.link.transport import Reply, TransportConfig
 from hardware.logbook import no_log
 from hardware.reactor import Command
-from tests.hardware.driver_lab import DriverLab
+from tests.hardware.driver_lab import begun
 from tests.hardware.script import answer, state
 
 FUZZ_CASES = int(os.environ.get("FUZZ_CASES", "100"))
@@ -278,9 +278,7 @@ def test_fuzz_whatever_comes_back_ends_in_an_answer_or_an_error_of_ours(
 
 def test_fuzz_no_dose_on_garbage() -> None:
     """Damaged states and failing POSTs in a run: never two doses for a sample, never more than was asked."""
-    lab = DriverLab()
-    lab.reactors.begin()
-    lab.run(2)
+    lab = begun(minutes=2)
     inner, rng = lab.wire.inner, np.random.default_rng(0)
     real = inner._request
 

@@ -11,21 +11,28 @@ import pytest
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import parse_state
-from hardware.chibio.resume import replay
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.server import build, parser
 from hardware.emulator.vial import VialConfig
 from hardware.errors import DeviceStateError
-from tests.hardware.driver_lab import DriverLab
+from tests.hardware.driver_lab import DriverLab, begun
 from tests.hardware.script import state
 
 PUMP = OverflowPumpConfig("Pump3", 0.5)
 
 
+def tubed(pump: OverflowPumpConfig = PUMP) -> DeviceOptions:
+    return DeviceOptions(vial=VialConfig(overflow_pump=pump.pump))
+
+
 def plumbed(pump: OverflowPumpConfig = PUMP, **config: Any) -> DriverLab:
     """Driver and emulated device with a second waste tube."""
-    options = DeviceOptions(vial=VialConfig(overflow_pump=pump.pump))
-    return DriverLab(options=options, overflow_pump=pump, **config)
+    return DriverLab(options=tubed(pump), overflow_pump=pump, **config)
+
+
+def guarded(rate: float | None = None, minutes: float = 0.0) -> DriverLab:
+    """Such a lab whose run began `minutes` ago."""
+    return begun(options=tubed(), overflow_pump=PUMP, rate=rate, minutes=minutes)
 
 
 def posts(lab: DriverLab) -> list[str]:
@@ -44,9 +51,7 @@ def runs(lab: DriverLab) -> bool:
 def test_there_is_none_by_default() -> None:
     assert ChiBioConfig().overflow_pump == OverflowPumpConfig()
     assert not OverflowPumpConfig().pump
-    lab = DriverLab()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = begun(minutes=3)
     lab.reactors.stop()
     assert set(posts(lab)) == {"/SetOutputOn/Pump3/0/M0"}
 
@@ -90,8 +95,7 @@ def test_what_a_read_shows_of_it(on: int, target: float, seen: str) -> None:
 
 
 def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_the_end() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
+    lab = guarded()
     assert runs(lab)
     assert [(row["pump"], row["duty"], row["found"]) for row in lab.of("guard")] == [("Pump3", 0.5, "off")]
     lab.run(20)
@@ -110,10 +114,7 @@ def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_t
 
 
 def test_a_trip_switches_the_others_off_and_leaves_it_on() -> None:
-    lab = plumbed()
-    lab.law.rate = 0.02
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(rate=0.02, minutes=3)
     while not lab.step().rows[0]:
         pass
     lab.clock.sleep(0.5)
@@ -131,9 +132,7 @@ def test_a_trip_switches_the_others_off_and_leaves_it_on() -> None:
     ("path", "found"), [("/SetOutputOn/Pump3/0/M0", "found off"), ("/SetOutputTarget/Pump3/M0/0.1", "a duty of 0.1")]
 )
 def test_another_client_that_changes_it_is_told_of_and_set_right(path: str, found: str) -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(minutes=3)
     lab.device.handle("POST", path)
     lab.run(2)
     assert runs(lab)
@@ -145,10 +144,7 @@ def test_another_client_that_changes_it_is_told_of_and_set_right(path: str, foun
 
 
 def test_a_pump_beside_it_that_someone_switches_on_is_still_found() -> None:
-    lab = plumbed()
-    lab.law.rate = 0.0
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(rate=0.0, minutes=3)
     for path in ("/SetOutputTarget/Pump4/M0/0.1", "/SetOutputOn/Pump4/1/M0"):
         lab.device.handle("POST", path)
     lab.run(3)
@@ -158,10 +154,7 @@ def test_a_pump_beside_it_that_someone_switches_on_is_still_found() -> None:
 
 
 def test_one_that_cannot_be_verified_on_is_an_alarm_with_a_remedy_and_no_dose_is_given() -> None:
-    lab = plumbed()
-    lab.law.rate = 0.0
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(rate=0.0, minutes=3)
     lab.device.handle("POST", "/SetOutputOn/Pump3/0/M0")
     lab.fault("lying", -1)
     lab.law.rate = 0.01
@@ -249,9 +242,7 @@ def test_a_start_that_fails_and_cannot_switch_it_off_again_says_so() -> None:
 
 
 def test_a_device_that_lost_its_memory_gets_it_back() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(5)
+    lab = guarded(minutes=5)
     lab.fault("worker_wipe")
     lab.run(4)
     assert "restarted" in lab.kinds()
@@ -260,9 +251,7 @@ def test_a_device_that_lost_its_memory_gets_it_back() -> None:
 
 
 def test_a_stopped_experiment_keeps_it() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(minutes=3)
     lab.device.handle("POST", "/Experiment/0/M0")
     lab.run(5)  # its last cycle ends with everything off
     assert "stopped" in lab.kinds()
@@ -271,9 +260,7 @@ def test_a_stopped_experiment_keeps_it() -> None:
 
 def test_a_start_of_its_own_that_switches_it_off_is_no_change_by_somebody_else() -> None:
     """A cycle thread that died: the experiment is ended and started again, which switches every pump off."""
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(5)
+    lab = guarded(minutes=5)
     before = len(posts(lab))
     lab.fault("cycle_dead")
     lab.run(20)
@@ -284,9 +271,7 @@ def test_a_start_of_its_own_that_switches_it_off_is_no_change_by_somebody_else()
 
 
 def test_one_that_a_new_run_found_on_is_told_of_too_when_somebody_switches_it_off() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(minutes=3)
     lab.client()
     lab.reactors.begin()
     lab.run(3)
@@ -298,9 +283,7 @@ def test_one_that_a_new_run_found_on_is_told_of_too_when_somebody_switches_it_of
 
 
 def test_a_reactor_handed_over_to_its_own_regulation_keeps_it_beyond_the_end_of_the_run() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(5)
+    lab = guarded(minutes=5)
     assert lab.reactors.regulate(np.array([True]), np.array([0.5])) == []
     lab.run(10)
     assert runs(lab)
@@ -314,19 +297,10 @@ def test_a_reactor_handed_over_to_its_own_regulation_keeps_it_beyond_the_end_of_
 # -- resume ----------------------------------------------------------------------------------------------------------
 
 
-def resume(lab: DriverLab, dead_s: float) -> None:
-    began, rows = lab.reactors.elapsed(), json.loads(json.dumps(lab.rows))
-    lab.clock.sleep(dead_s)
-    lab.client()
-    lab.reactors.begin(replay(rows), began + dead_s)
-
-
 def test_a_resumed_run_finds_it_on_and_does_not_interrupt_it() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(minutes=3)
     before = posts(lab)
-    resume(lab, 500.0)
+    lab.resume(500.0)
     lab.run(5)
     assert posts(lab) == before
     assert runs(lab)
@@ -337,12 +311,10 @@ def test_a_resumed_run_finds_it_on_and_does_not_interrupt_it() -> None:
 
 
 def test_a_resumed_run_tells_that_it_was_off_meanwhile() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(minutes=3)
     for k in (1, 2, 3, 4):  # what the board agent does when nobody asks for two minutes
         lab.device.handle("POST", f"/SetOutputOn/Pump{k}/0/M0")
-    resume(lab, 300.0)
+    lab.resume(300.0)
     lab.run(2)
     assert runs(lab)
     assert ["the overflow pump was found off" in row["note"] for row in lab.of("note")][-1]
@@ -370,9 +342,9 @@ def test_a_feed_motor_stuck_at_full_power_needs_one_that_is_the_stronger_pump(
     pump = OverflowPumpConfig("Pump3", 0.95, flow_ml_s)
     plant = plant_preset("healthy")
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=flow_ml_s))
-    lab = DriverLab(options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), overflow_pump=pump)
-    lab.reactors.begin()
-    lab.run(3)
+    lab = begun(
+        options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), overflow_pump=pump, minutes=3
+    )
     lab.fault("feed_stuck_open")
     lab.run(60)
     assert "falls" in lab.kinds()

@@ -21,7 +21,7 @@ from hardware.chibio.protocol import parse_state
 from hardware.clock import VirtualClock
 from hardware.link.transport import Reply
 from tests.campaigns.rehearsal import SOUND
-from tests.hardware.driver_lab import DriverLab
+from tests.hardware.driver_lab import DriverLab, begun
 from tests.hardware.script import state
 
 
@@ -130,8 +130,7 @@ def test_an_absent_reactor_a_dead_sensor_a_lost_link() -> None:
     lab.config = type(lab.config)(reactors=("M0", "M5"))
     found = preflight(lab.wire, lab.clock, lab.config, [SOUND] * 2)
     assert [c.ok for c in found if c.name == "M5 present"] == [False]
-    lab = DriverLab()
-    lab.reactors.begin()
+    lab = begun()
     lab.fault("spectrometer_dead")
     lab.run(2)
     assert not checks(lab)["M0 light sensor"].ok
