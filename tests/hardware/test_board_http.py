@@ -24,7 +24,7 @@ from hardware.errors import LinkError, ProtocolError
 from hardware.link.http import HttpTransport
 from hardware.link.open import open_transport
 from hardware.link.transport import TransportConfig, switched_off
-from tests.hardware.test_board_agent import PYTHON, SOURCE, TOKEN, AgentLab, Recorder, make_token
+from tests.hardware.test_board_agent import TOKEN, AgentLab, Recorder, make_token
 from tests.hardware.test_http_transport import Server
 from tests.patience import PATIENCE_S
 
@@ -140,6 +140,7 @@ def test_reading_needs_the_token_too(guarded: HttpLab, path: str) -> None:
     assert ask(guarded.port, "GET", path, BEARER, "X-Session: 1")[0] == 200
 
 
+@pytest.mark.slow
 def test_what_is_refused_is_no_sign_of_life(tmp_path: Path) -> None:
     lab = HttpLab(tmp_path, 1.0)
     try:
@@ -175,6 +176,7 @@ def test_only_what_is_carried_gets_the_constant_header_and_the_token_stays_here(
     device.close()
 
 
+@pytest.mark.slow
 def test_http_mode(tmp_path: Path) -> None:
     one = HttpLab(tmp_path, 1.0)
 
@@ -208,29 +210,6 @@ def test_http_mode(tmp_path: Path) -> None:
         assert ask(one.port, "GET", "/getSysdata/", BEARER)[0] == 502
     finally:
         one.end()
-
-
-@pytest.mark.parametrize(
-    ("text", "mode", "words"),
-    [
-        (None, 0o600, "without token-file"),
-        ("", 0o600, "32 to 256"),
-        ("short", 0o600, "32 to 256"),
-        (TOKEN + " " + TOKEN, 0o600, "32 to 256"),
-        (TOKEN, 0o644, "chmod 600"),
-        (TOKEN, 0o620, "chmod 600"),
-    ],
-)
-def test_without_a_token_it_does_not_listen(text: str | None, mode: int, words: str, tmp_path: Path) -> None:
-    given = [] if text is None else ["--token-file", str(make_token(tmp_path, text, mode))]
-    command = [PYTHON, str(SOURCE), "--http", "127.0.0.1:0", *given]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
-    assert done.returncode == 2
-    assert done.stderr.startswith("board_agent: ")
-    assert words in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert "short" not in done.stderr
-    assert TOKEN not in done.stderr
 
 
 # -- what a request looks like ---------------------------------------------------------------------------------------
@@ -387,6 +366,7 @@ def test_serial_and_http_at_once_until_one_hands_over(tmp_path: Path) -> None:
         lab.end()
 
 
+@pytest.mark.slow
 def test_after_silence_the_next_client_finds_the_pumps_off(tmp_path: Path) -> None:
     lab = HttpLab(tmp_path, 1.0)
     try:
@@ -479,6 +459,7 @@ def test_a_client_without_the_right_token_is_told_what_to_do(
         HttpTransport(url, config=TransportConfig(token_file=str(tmp_path / "nothing")))
 
 
+@pytest.mark.slow
 def test_a_run_through_the_agent_writes_the_token_nowhere(tmp_path: Path) -> None:
     lab = HttpLab(tmp_path, 60.0)
     run = tmp_path / "run"
