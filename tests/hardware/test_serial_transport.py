@@ -35,7 +35,8 @@ HELLO = b'{"agent": "board_agent", "protocol": 2}'
 
 
 def config(port: Path, **values: float) -> TransportConfig:
-    return TransportConfig(kind="serial", port=str(port), **({"connect_s": 0.3, "read_s": 0.3, "floor_s": 0.1} | values))  # type: ignore[arg-type]
+    quick = {"connect_s": 0.3, "read_s": 0.3, "floor_s": 0.1}
+    return TransportConfig(kind="serial", port=str(port), **(quick | values))  # type: ignore[arg-type]
 
 
 class Board:
