@@ -140,23 +140,17 @@ def test_reading_needs_the_token_too(guarded: HttpLab, path: str) -> None:
     assert ask(guarded.port, "GET", path, BEARER, "X-Session: 1")[0] == 200
 
 
-@pytest.mark.slow
-def test_what_is_refused_is_no_sign_of_life(tmp_path: Path) -> None:
-    lab = HttpLab(tmp_path, 1.0)
-    try:
-        for path in ("/SetOutputTarget/Pump1/M0/1", PUMP):
-            assert ask(lab.port, "POST", path, BEARER, "X-Session: 1")[0] == 204
-        lab.until(lambda: lab.motors() == {"M0/Pump1"})
-
-        def off() -> bool:
-            assert ask(lab.port, "POST", "/_agent/heartbeat")[0] == 401
-            assert ask(lab.port, "GET", "/getSysdata/")[0] == 401
-            assert ask(lab.port, "POST", "/_agent/bye", BEARER, "X-Session: 2")[0] in (204, 409)  # 204: hand-over
-            return not lab.motors()
-
-        lab.until(off)
-    finally:
-        lab.end()
+def test_what_is_refused_is_no_sign_of_life(door: tuple[Proxy, Recorder]) -> None:
+    proxy, _ = door
+    port, agent = proxy.server_address[1], proxy.agent
+    assert ask(port, "POST", "/x", BEARER, "X-Session: 1")[0] == 204
+    heard = agent._beats
+    assert ask(port, "POST", "/_agent/heartbeat")[0] == 401
+    assert ask(port, "GET", "/getSysdata/")[0] == 401
+    assert ask(port, "POST", "/_agent/bye", BEARER, "X-Session: 2")[0] == 409
+    assert (agent._beats, agent.armed) == (heard, True)
+    assert ask(port, "POST", "/_agent/heartbeat", BEARER, "X-Session: 1")[0] == 204
+    assert agent._beats == heard + 1
 
 
 def test_only_what_is_carried_gets_the_constant_header_and_the_token_stays_here() -> None:
@@ -346,24 +340,6 @@ def test_a_connection_that_is_cut_at_any_point_leaves_no_trace(
 
 
 # -- one client in charge --------------------------------------------------------------------------------------------
-
-
-def test_serial_and_http_at_once_until_one_hands_over(tmp_path: Path) -> None:
-    lab = HttpLab(tmp_path, 60.0, tty_line=True)
-    try:
-        assert lab.ask("POST", "/SetOutputTarget/Pump1/M0/1")[0] == 204
-        for path in (PUMP, "/_agent/heartbeat", "/_agent/bye"):
-            status, body = ask(lab.port, "POST", path, BEARER)
-            assert (status, b"on the serial line" in body) == (409, True)
-        assert json.loads(ask(lab.port, "GET", "/_agent/status", BEARER)[1])["armed"] is True
-        assert lab.motors() == set()
-        assert lab.ask("BYE", "/")[0] == 200
-        assert ask(lab.port, "POST", PUMP, BEARER)[0] == 204
-        lab.until(lambda: lab.motors() == {"M0/Pump1"})
-        status, body = lab.ask("POST", "/SetOutputOn/Pump1/0/M0")
-        assert (status, b"on HTTP" in body) == (21, True)
-    finally:
-        lab.end()
 
 
 @pytest.mark.slow

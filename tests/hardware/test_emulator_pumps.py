@@ -301,32 +301,6 @@ def test_dose_log_agrees_with_on_time_and_volume() -> None:
         assert truth["feed_ml"] == pytest.approx(truth["on_s"]["Pump1"])
 
 
-def test_two_hours_of_eight_reactors_dosed_every_minute() -> None:
-    """The load of a full rig: every dose once, volumes at the waste level, cultures diluted as computed."""
-    names = tuple(f"M{k}" for k in range(8))
-    lab = Lab(names, mu=0.02, od=0.5, blanked=True)
-    for m in names:
-        lab.post(f"/Experiment/1/{m}")
-        lab.post(f"/SetOutputTarget/Pump1/{m}/{(0.4 - BIAS_S) / 63}")
-        lab.post(f"/SetOutputTarget/Pump2/{m}/{6.0 / 63}")
-    for minute in range(120):
-        lab.wait_until(60.07 * minute + 15.0)
-        for m in names:
-            assert lab.state(m)["Experiment"]["cycles"] == minute + 1
-            lab.post(f"/SetOutputOn/Pump2/1/{m}")
-            lab.post(f"/SetOutputOn/Pump1/1/{m}")
-        lab.wait(10.0)
-        for m in names:
-            lab.post(f"/SetOutputOn/Pump1/0/{m}")
-            lab.post(f"/SetOutputOn/Pump2/0/{m}")
-    for m in names:
-        truth = lab.device.truth(m)
-        assert truth["feed_ml"] == pytest.approx(120 * 0.4)
-        assert truth["volume_ml"] == pytest.approx(20.0)
-        minutes = lab.clock.now() / 60.0
-        assert truth["od"] == pytest.approx(0.5 * np.exp(0.02 * minutes - 120 * 0.4 / 20.0), rel=0.02)
-
-
 def test_spare_pumps_supply_by_their_own_flow_for_as_long_as_they_run_forward() -> None:
     """Ten seconds of 0.3 mL/s by Pump3, of which the last four beside 0.5 mL/s of Pump4; then Pump3 backwards."""
     lab = Lab(options=quiet(pump3_ml_s=0.3, pump4_ml_s=0.5))
