@@ -15,7 +15,7 @@ from hardware.errors import DeviceStateError, RecordingError
 from hardware.reactor import Command
 from tests.campaigns.rehearsal import SOUND
 from tests.hardware.driver_lab import DriverLab, begun
-from tests.hardware.emulator_lab import BIAS_S, START_S, quiet
+from tests.hardware.emulator_lab import BIAS_S, quiet
 
 
 def doses(lab: DriverLab, name: str = "M0", pump: str = "Pump1") -> list[tuple[float, float]]:
@@ -55,33 +55,6 @@ def test_three_reactors_are_held_without_a_missed_or_doubled_minute() -> None:
     assert lab.motors_off()
     assert lab.of("fault") == []
     assert "undosed" not in lab.kinds()
-
-
-def test_the_requests_of_one_dose_are_those_of_single_shot_dosing() -> None:
-    lab = begun(options=quiet(), rate=0.0125)
-    lab.step()
-    before = len(lab.wire.posts)
-    lab.run(0.5)
-    posts = [(t, path) for t, path in lab.wire.posts[before - 6 :] if not path.startswith("/changeDevice")]
-    feed, waste = 0.75 - 0.06, 4.0 * (0.75 - 0.06) + 4.4  # seconds
-    assert [path.rsplit("/", 1)[0] for _, path in posts[:2]] == [
-        "/SetOutputTarget/Pump2/M0",
-        "/SetOutputTarget/Pump1/M0",
-    ]
-    assert [63.0 * float(path.rsplit("/", 1)[1]) for _, path in posts[:2]] == pytest.approx([waste, feed], abs=1e-3)
-    assert [path for _, path in posts[2:4]] == ["/SetOutputOn/Pump2/1/M0", "/SetOutputOn/Pump1/1/M0"]
-    waste_on_s, on_s = posts[2][0], posts[3][0]
-    assert on_s - waste_on_s == pytest.approx(1.0, abs=0.1)
-    off = [t for t, path in posts[4:] if path == "/SetOutputOn/Pump1/0/M0"]
-    assert off[0] - on_s == pytest.approx(feed + 2.0, abs=0.1)
-    assert [path for _, path in posts[5:10]] == [
-        *(f"/SetOutputOn/Pump{k}/0/M0" for k in (1, 2, 3, 4)),
-        "/MeasureTemp/IR/M0",
-    ]
-    assert posts[5][0] - waste_on_s == pytest.approx(waste + 2.0, abs=0.1)
-    assert doses(lab) == [(pytest.approx(on_s + START_S, abs=0.1), pytest.approx(feed + BIAS_S, abs=0.01))]
-    [(_, length)] = doses(lab, pump="Pump2")
-    assert length == pytest.approx(waste + BIAS_S, abs=0.01)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.4, 0.6, 0.9])
@@ -256,26 +229,6 @@ def test_a_stored_blank_replaces_the_devices() -> None:
 
 
 # -- samples ---------------------------------------------------------------------------------------------------------
-
-
-def test_one_sample_is_acted_on_once() -> None:
-    lab = begun()
-    m = lab.reactors.measure()
-    command = Command(m.fresh, np.array([0.02]), np.array([37.0]))
-    assert lab.reactors.actuate(command).volume_ml[0] == pytest.approx(1.2, abs=0.01)
-    again = lab.reactors.actuate(command)
-    assert again.volume_ml[0] == 0.0
-    assert "no new sample" in again.notes[0]
-
-
-def test_a_decision_that_comes_too_late_doses_nothing() -> None:
-    lab = begun()
-    m = lab.reactors.measure()
-    lab.clock.sleep(33.0)
-    receipt = lab.reactors.actuate(Command(m.fresh, np.array([0.02]), np.array([37.0])))
-    assert receipt.volume_ml[0] == 0.0
-    assert "before the next measurement" in receipt.notes[0]
-    assert not doses(lab)
 
 
 def test_without_samples_measure_returns_after_100_s_and_says_how_old_the_newest_is() -> None:
@@ -732,19 +685,3 @@ def test_a_dose_left_open_and_ended_by_something_else_is_booked_as_long_as_that_
     assert sum(most for most, _ in again) == pytest.approx(0.6, rel=1e-3)
     assert sum(least for _, least in again) == pytest.approx(-0.6, rel=1e-3)
     assert lab.reactors.repeated() == []
-
-
-def test_what_the_journal_says_of_a_reactor() -> None:
-    rows = [
-        {"kind": "device", "reactor": "M0", "device_id": "7", "blank": 14000.0, "temperature": 37.0},
-        {"kind": "intent", "reactor": "M0", "sample": [60.0, 2], "feed_ml": 0.5, "waste_ml": 6.0, "carry_ml": 0.0,
-         "doses": 1, "on_s": 75.0, "feed_duty": 0.01, "waste_duty": 0.1},
-        {"kind": "dose_end", "reactor": "M0", "verified_off": True},
-        {"kind": "temperature", "reactor": "M0", "temperature": 30.0},
-        {"kind": "intent", "reactor": "M0", "sample": [120.0, 3], "feed_ml": 0.4, "waste_ml": 6.0, "carry_ml": 0.0,
-         "doses": 2, "on_s": 135.0, "feed_duty": 0.01, "waste_duty": 0.1},
-        {"kind": "command", "reactor": "M0", "time_s": 136.0, "path": "/SetOutputOn/Pump1/1/M0", "answer": 204},
-    ]  # fmt: skip
-    saved = replay(rows)["M0"]
-    assert (saved.device_id, saved.blank, saved.sample, saved.doses) == ("7", 14000.0, (120.0, 3), 2)
-    assert (saved.temperature, saved.open, saved.feed_ml, saved.on_s) == (30.0, True, 0.4, 135.0)

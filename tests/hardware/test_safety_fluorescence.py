@@ -31,20 +31,13 @@ class Bench:
         return believed, self.interlock.check(m, zero, setpoint, np.full(self.n, 33.0), 60.0 * self.minute)
 
 
-def test_where_it_is_not_measured_nothing_is_said() -> None:
-    believed, verdict = Bench().step(None)
-    assert believed is None
-    assert verdict.reasons == [None]
-
-
-def test_a_plausible_reading_passes() -> None:
+@pytest.mark.parametrize(("counts", "seen"), [(0.0, "0 counts"), (65535.0, "65535 counts"), (NAN, "no counts")])
+def test_what_no_working_sensor_gives_is_not_believed_and_said(counts, seen) -> None:
+    believed, verdict = Bench().step(None)  # where it is not measured nothing is said
+    assert (believed, verdict.reasons) == (None, [None])
     believed, verdict = Bench(2).step(1500.0, 1.0)
     np.testing.assert_array_equal(believed, [1500.0, 1.0])
     assert verdict.reasons == [None, None]
-
-
-@pytest.mark.parametrize(("counts", "seen"), [(0.0, "0 counts"), (65535.0, "65535 counts"), (NAN, "no counts")])
-def test_what_no_working_sensor_gives_is_not_believed_and_said(counts, seen) -> None:
     believed, verdict = Bench(2).step(1500.0, counts)
     np.testing.assert_array_equal(believed, [1500.0, NAN])
     assert verdict.kinds == ((), ("fluorescence",))
