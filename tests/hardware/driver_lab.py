@@ -1,7 +1,7 @@
 """The program's closed loop with a simple controller around the emulated device, on a virtual clock."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -116,6 +116,11 @@ class DriverLab:
 
     def log(self, kind: str, fields: Mapping[str, Any]) -> None:
         self.rows.append({"kind": kind, **fields})
+
+    def on_post(self, act: Callable[[str, Callable[[str], Reply]], Reply]) -> None:
+        """From now on let `act` carry out each POST. Args: act: gets the path, and what carries it out in truth."""
+        real = self.wire.inner.post
+        self.wire.inner.post = lambda path: act(path, real)  # type: ignore[method-assign]
 
     def fault(self, name: str, value: float = 1.0, reactor: str = "all") -> None:
         inject(self.device, name, reactor, value)

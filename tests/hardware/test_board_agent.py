@@ -434,6 +434,7 @@ def test_resynchronises_after_garbage_and_executes_nothing_of_it(lab: AgentLab) 
     assert json.loads(lab.ask("GET", "/getSysdata/")[1])["Stir"]["target"] == 0.7
 
 
+@pytest.mark.slow
 def test_what_became_of_a_request_without_answer(lab: AgentLab) -> None:
     lab.emulator.fault("reset_after/all/1")
     status, body = lab.ask("POST", "/SetOutputTarget/Stir/M0/0.7")

@@ -167,14 +167,12 @@ def test_a_run_does_not_begin_without_it_and_leaves_no_pump_on() -> None:
     lab = plumbed()
     lab.device.handle("POST", "/Experiment/1/M0")
     lab.clock.sleep(90.0)
-    inner = lab.wire.inner
-    real = inner.post
 
-    def deaf(path: str) -> Any:
+    def deaf(path: str, real: Any) -> Any:
         lab.fault("lying", int(path == "/SetOutputOn/Pump3/1/M0"))
         return real(path)
 
-    inner.post = deaf  # type: ignore[method-assign]
+    lab.on_post(deaf)
     with pytest.raises(DeviceStateError, match="Pump3, is off after it was set to 0.5 and on; run the preflight"):
         lab.reactors.begin()
     assert lab.motors_off()
@@ -193,16 +191,14 @@ def test_a_start_that_is_interrupted_or_fails_leaves_it_on_nowhere(moment: str, 
     """Nobody looks at the bench any more, and it would suck air, or more, for days."""
     lab = DriverLab(("M0", "M1"), options=tubed(), overflow_pump=PUMP)
     lab.device.handle("POST", f"/SetOutputOn/Zigzag/{int(not moment)}/M1")
-    inner = lab.wire.inner
-    real = inner.post
 
-    def interrupted(path: str) -> Any:
+    def interrupted(path: str, real: Any) -> Any:
         reply = real(path)
         if path == moment:
             raise KeyboardInterrupt
         return reply
 
-    inner.post = interrupted  # type: ignore[method-assign]
+    lab.on_post(interrupted)
     with pytest.raises(error):
         lab.reactors.begin()
     assert lab.device.apps["M0"].data["Pump3"]["target"] == 0.5  # it had been on
@@ -216,16 +212,14 @@ def test_a_start_that_fails_and_cannot_switch_it_off_again_says_so() -> None:
     lab = plumbed()
     lab.device.handle("POST", "/Experiment/1/M0")
     lab.clock.sleep(90.0)
-    inner = lab.wire.inner
-    real = inner.post
 
-    def dying(path: str) -> Any:
+    def dying(path: str, real: Any) -> Any:
         reply = real(path)
         if path == "/SetOutputOn/Pump3/1/M0":
             lab.fault("reset_before", -1)
         return reply
 
-    inner.post = dying  # type: ignore[method-assign]
+    lab.on_post(dying)
     with pytest.raises(DeviceStateError, match="reset; pumps not verified off: M0: .*reset.*by hand now"):
         lab.reactors.begin()
 

@@ -122,7 +122,7 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
     given = (c, bench, TUBES, TUBES + 5.0)
     budget, twins, now = FeedBudget(*given), [Ledger(c, bench, tube) for tube in TUBES.tolist()], 0.0
     order = {"controller": 0, "controller_lost": 1, "limit": 2, "undosed": 3, "budget": 4, "bottle": 5, "overflow": 6}
-    for _ in range(200):
+    for _ in range(120):
         now += float(
             rng.choice([5.0, 30.0, 60.0, 61.0, 200.0, 1500.0, 9000.0], p=[0.1, 0.2, 0.4, 0.2, 0.08, 0.01, 0.01])
         )
@@ -382,7 +382,7 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
     """Cultures that grow, are fed, stand still or die, pumps that give half or twice, steps, bubbles, gaps."""
     rng = np.random.default_rng(2)
     seen: set[str] = set()
-    for _ in range(10):
+    for _ in range(6):
         change, twins = UnexplainedChange(C, 0.02, TUBES), [Culture(tube) for tube in TUBES.tolist()]
         minute = 0.0
         true = rng.choice([0.04, 0.055, 0.3, 0.5, 1.2], N)
@@ -749,18 +749,3 @@ def test_what_was_fed_at_least_is_booked_beside_what_was_fed_at_most() -> None:
     assert state["_since_ml"] == pytest.approx([1.3, 0.8, 0.7])
     assert state["_since_low_ml"] == pytest.approx([0.4, 0.8, 0.3])
     assert state["fed_ml"] == pytest.approx([1.3, 0.8, 0.7])
-
-
-@pytest.mark.parametrize("case", [{"light_min": 50.0}, {"frozen_light": 3}])
-def test_limits_of_the_light_are_settings(case: dict[str, float]) -> None:
-    interlock = Interlock(2, SafetyConfig(**case))  # type: ignore[arg-type]
-    believed = []
-    for k in range(4):
-        light = np.array([1500.0 + k, 40.0 if "light_min" in case else 700.0])
-        m = Measurement(
-            np.full(2, 60.0 * k), np.full(2, 0.5 + 0.001 * k), np.full(2, 33.0), np.ones(2, bool), None, light
-        )
-        believed.append(np.isfinite(interlock.fluorescence(m)).tolist())
-        interlock.check(m, np.zeros(2), np.full(2, 0.5), np.full(2, np.nan), 60.0 * k)
-    assert [first for first, _ in believed] == [True] * 4
-    assert [second for _, second in believed] == ([False] * 4 if "light_min" in case else [True, True, False, False])

@@ -25,6 +25,15 @@ def take(sampling: Sampling, clock: VirtualClock, seen: DeviceState) -> str:
     return sampling.take(seen, clock.now())
 
 
+def started() -> tuple[VirtualClock, Sampling]:
+    """An experiment that was just started, at 1000 s, whose first sample is there now."""
+    clock = VirtualClock(1000.0)
+    sampling = Sampling(CONFIG, clock)
+    sampling.expect_first()
+    clock.sleep(FIRST_SAMPLE_S)
+    return clock, sampling
+
+
 def test_a_sample_is_new_once_and_never_goes_back() -> None:
     clock = VirtualClock()
     sampling = Sampling(CONFIG, clock)
@@ -119,29 +128,21 @@ def test_lateness_is_measured_against_the_earliest_of_the_last_three_that_were_w
 
 @pytest.mark.parametrize(("step_s", "told"), [(64.9, False), (65.0, True), (-29.9, False), (-30.0, True)])
 def test_how_much_lateness_is_a_step_of_a_clock(step_s: float, told: bool) -> None:
-    clock = VirtualClock(1000.0)
-    sampling = Sampling(CONFIG, clock)
-    sampling.expect_first()
-    clock.sleep(FIRST_SAMPLE_S)
+    clock, sampling = started()
     take(sampling, clock, sample(0.0, 1))
     clock.sleep(60.0)
     assert (take(sampling, clock, sample(60.0 - step_s, 2)) != "") == told
 
 
 def test_the_first_sample_of_an_experiment_just_started_has_a_known_age_too() -> None:
-    clock = VirtualClock(1000.0)
-    sampling = Sampling(CONFIG, clock)
-    sampling.expect_first()
-    clock.sleep(FIRST_SAMPLE_S + 1.5)
+    clock, sampling = started()
+    clock.sleep(1.5)
     take(sampling, clock, sample(0.0, 1))
     assert sampling.late_s == 1.5
 
 
 def test_a_step_of_the_boards_clock_is_noted_and_forgotten() -> None:
-    clock = VirtualClock(1000.0)
-    sampling = Sampling(CONFIG, clock)
-    sampling.expect_first()
-    clock.sleep(FIRST_SAMPLE_S)
+    clock, sampling = started()
     assert take(sampling, clock, sample(0.0, 1)) == ""
     clock.sleep(60.0)
     assert take(sampling, clock, sample(360.0, 2)) == "the board's clock moved by 300 s against this computer's"
@@ -173,10 +174,7 @@ def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_tim
 
 def test_what_was_known_of_the_clocks_before_a_restart_says_nothing_of_a_sample_after_it() -> None:
     """Its records begin anew: by the time before, this one would be 20 s old, and a dose fall into a measurement."""
-    clock = VirtualClock(1000.0)
-    sampling = Sampling(CONFIG, clock)
-    sampling.expect_first()
-    clock.sleep(FIRST_SAMPLE_S)
+    clock, sampling = started()
     take(sampling, clock, sample(0.0, 1))
     sampling.pass_over(sample(math.nan, 1))
     clock.sleep(80.0)
