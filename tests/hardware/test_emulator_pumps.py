@@ -27,32 +27,22 @@ def test_a_pump_left_on_doses_63_s_times_target_every_63_s_for_ever() -> None:
     np.testing.assert_allclose(lengths, 63 * 0.02 + BIAS_S, atol=1e-6)
 
 
-def test_single_shot_dose_is_one_dose() -> None:
+@pytest.mark.parametrize(
+    ("target", "off_s", "lengths"),
+    [
+        (0.05, START_S + 63 * 0.05 + BIAS_S, [3.15 + BIAS_S]),  # a single shot
+        (0.5, START_S + 2.0, [2.0 + STOP_S]),  # ended in its progress
+        (0.5, 0.5 * START_S, []),  # before the motor turns
+    ],
+)
+def test_off_leaves_what_was_dosed_until_then(target: float, off_s: float, lengths: list[float]) -> None:
     lab = Lab()
-    lab.pump("Pump1", 0.05)
-    lab.wait(START_S + 63 * 0.05 + BIAS_S)
+    lab.pump("Pump1", target)
+    lab.wait(off_s)
     lab.post("/SetOutputOn/Pump1/0/M0")
     lab.wait(300.0)
-    assert [length for _, length in lab.doses()] == pytest.approx([3.15 + BIAS_S])
-    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(3.15 + BIAS_S)  # 1 mL/s, perfect head
-
-
-def test_off_ends_a_dose_in_progress() -> None:
-    lab = Lab()
-    lab.pump("Pump1", 0.5)
-    lab.wait(START_S + 2.0)
-    lab.post("/SetOutputOn/Pump1/0/M0")
-    lab.wait(200.0)
-    assert [length for _, length in lab.doses()] == pytest.approx([2.0 + STOP_S], abs=0.02)
-
-
-def test_off_before_the_motor_turns_is_no_dose() -> None:
-    lab = Lab()
-    lab.pump("Pump1", 0.5)
-    lab.wait(0.5 * START_S)
-    lab.post("/SetOutputOn/Pump1/0/M0")
-    lab.wait(200.0)
-    assert lab.doses() == []
+    assert [length for _, length in lab.doses()] == pytest.approx(lengths, abs=0.02)
+    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(sum(lengths), abs=0.02)  # 1 mL/s, perfect head
 
 
 def test_the_motor_starts_after_a_delay_of_its_own_each_time() -> None:
@@ -83,12 +73,6 @@ def test_the_emulated_plant_is_the_preset_dosed_in_pulses(name: str) -> None:
     device = build(parser().parse_args(["--plant", name]))
     assert device.vials["M0"].plant.config == replace(preset, pump=replace(preset.pump, dosing="pulse"))
     assert EmulatorConfig(plant=name).plant == name
-
-
-@pytest.mark.parametrize(("low", "high"), [(-0.1, 0.7), (0.5, 0.2), (0.0, 9.0)])
-def test_a_delay_out_of_range_is_named(low: float, high: float) -> None:
-    with pytest.raises(ValueError, match=r"vial\.pump_start_(low|high)_s = .*allowed"):
-        quiet(pump_start_low_s=low, pump_start_high_s=high)
 
 
 def test_rewriting_the_target_while_on_doses_at_once_and_restarts_the_period() -> None:

@@ -249,12 +249,6 @@ def test_a_newer_app_names_the_reactor_in_its_log() -> None:
     ]
 
 
-@pytest.mark.parametrize("reactors", [(), ("M8",), ("M0", "M0"), ("m0",)])
-def test_impossible_reactor_lists_are_refused(reactors: tuple[str, ...]) -> None:
-    with pytest.raises(ValueError, match="M0 to M7"):
-        ChiBioDevice(reactors, VirtualClock(), np.random.default_rng(0))
-
-
 def test_same_seed_same_readings_another_seed_others() -> None:
     def records(seed: int, reactors: tuple[str, ...]) -> list[float]:
         device = ChiBioDevice(reactors, VirtualClock(), np.random.default_rng(seed), blanked=True)

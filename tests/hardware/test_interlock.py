@@ -395,37 +395,6 @@ def test_a_state_of_an_earlier_version_is_taken() -> None:
         Interlock(2).restore(state)
 
 
-def test_what_happened_a_while_ago_counts_in_its_own_minute_and_hour() -> None:
-    """In whatever order reactors tell of it."""
-    interlock = Interlock(2, SafetyConfig(ml_per_hour=10.0))
-    first, second = np.array([1.0, 0.0]), np.array([0.0, 1.0])
-
-    def book(feed: np.ndarray, at_s: float) -> None:
-        interlock.confirm(Receipt(feed, (), 9.0 * feed), at_s)
-
-    book(first, 7200.0)
-    for k in range(8):
-        book(second, 3661.0 + 63.0 * k)
-    book(second, 3540.0)  # an hour and a minute ago
-    book(first, 7200.0)
-    hour = np.array(interlock.budget._hour)
-    assert hour.sum(axis=1).tolist() == [2.0, 8.0]
-    assert hour[0, 0] == 2.0
-    assert hour[1].max() == 1.0
-    assert interlock.budget.fed_ml.tolist() == [2.0, 9.0]
-    verdict = interlock.check(
-        Measurement(np.full(2, 7260.0), np.full(2, 0.5), np.full(2, 37.0), np.ones(2, bool)),
-        np.full(2, 0.02), np.full(2, 0.4), np.full(2, 37.0), 7260.0,
-    )  # fmt: skip
-    assert verdict.rate.tolist() == [0.02, 0.02]
-    interlock.confirm(Receipt(1.2 * second, (), 9.0 * second), 7260.0)
-    verdict = interlock.check(
-        Measurement(np.full(2, 7320.0), np.full(2, 0.5), np.full(2, 37.0), np.ones(2, bool)),
-        np.full(2, 0.02), np.full(2, 0.4), np.full(2, 37.0), 7320.0,
-    )  # fmt: skip
-    assert verdict.rate.tolist() == [0.02, 0.02]  # what was fed at 3661 s is an hour old by now
-
-
 def test_the_kinds_in_a_line_of_reasons() -> None:
     line = "jump: OD 0.5 to 0.9; no dose; check | cannot_hold: full feed: weak; reported; see"
     assert kinds_of(line) == ["jump", "cannot_hold"]

@@ -325,7 +325,7 @@ def test_a_feed_motor_stuck_at_full_power_needs_one_that_is_the_stronger_pump(
         options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), overflow_pump=pump, minutes=3
     )
     lab.fault("feed_stuck_open")
-    lab.run(60)
+    lab.run(15)
     assert "falls" in lab.kinds()
     assert lab.truth()["overflowed"] == overflows
 

@@ -77,13 +77,6 @@ def test_an_overflow_pump_is_judged_by_the_strongest_feed_pump() -> None:
         assert f"feed pump {0.8 if covers else 1.5:.2f} mL/s" in check.detail
 
 
-def test_a_guard_that_runs_already_is_no_pump_left_on() -> None:
-    lab = DriverLab(overflow_pump=OverflowPumpConfig("Pump3"))
-    for path in ("/SetOutputTarget/Pump3/M0/0.1", "/SetOutputOn/Pump3/1/M0"):
-        lab.device.handle("POST", path)
-    assert checks(lab)["M0 pumps"].ok
-
-
 def test_an_uncalibrated_device_and_a_stored_blank() -> None:
     lab = DriverLab(blanked=False)
     assert not checks(lab)["M0 blank"].ok

@@ -229,20 +229,6 @@ def test_a_stored_blank_replaces_the_devices() -> None:
 # -- samples ---------------------------------------------------------------------------------------------------------
 
 
-def test_without_samples_measure_returns_after_100_s_and_says_how_old_the_newest_is() -> None:
-    lab = begun(recover=False, minutes=3)
-    last = lab.clock.now()
-    lab.fault("cycle_dead")
-    while (m := lab.reactors.measure()).fresh.any():
-        last = lab.clock.now()
-    assert m.vitals is not None
-    assert 100.0 <= lab.clock.now() - last < 125.0
-    assert m.vitals.age_s[0] >= 100.0
-    fault = lab.reactors.measure().vitals.faults[0]  # type: ignore[union-attr]
-    assert fault is not None
-    assert fault.kind == "stalled"
-
-
 def test_a_lost_link_is_a_fault_not_an_exception_and_hours_of_it_does_no_harm() -> None:
     lab = begun(minutes=5)
     lab.fault("crash")

@@ -190,19 +190,6 @@ def test_a_waste_pump_is_compared_with_the_feed_in_the_flow_that_both_are_taken_
     np.testing.assert_allclose(r.pump_rate, 0.8 * U)
 
 
-def test_of_two_runs_the_one_that_was_asked_for_is_told_from_the_longest(read: Callable[..., Recording]) -> None:
-    lines = tidy().splitlines()
-    both = "\n".join([*lines[:15], *lines]) + "\n"
-    for asked, words in (
-        (None, "run 1 is used (the longest)"),
-        (0, "run 0 is used (as asked)"),
-        (1, "run 1 is used (as"),
-    ):
-        r = read(both, run=asked)
-        assert any(words in note for note in r.notes), r.notes
-        assert len(r.od) == (14 if asked == 0 else len(lines) - 1)
-
-
 def test_a_row_that_is_amended_takes_the_place_of_the_last_one(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     with Recorder(path, ("time_min", "od")) as recorder:

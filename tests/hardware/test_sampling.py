@@ -75,19 +75,6 @@ def test_a_sample_seen_so_late_that_the_next_cycle_had_begun_does_not_hide_the_n
     assert not sampling.look(sample(0.0, 2), 0.0)
 
 
-def test_when_the_next_look_is() -> None:
-    clock = VirtualClock(500.0)
-    sampling = Sampling(CONFIG, clock)
-    assert sampling.next_poll == sampling.arrived_s == 500.0
-    sampling.look(sample(60.0, 2), 510.0)
-    assert sampling.next_poll == 510.0 + CONFIG.poll_s
-    clock.sleep(20.0)
-    sampling.retry_later()
-    assert sampling.next_poll == 520.0 + CONFIG.retry_s
-    sampling.wait_from_now()
-    assert sampling.next_poll == sampling.arrived_s == 520.0
-
-
 def test_lateness_is_measured_against_the_earliest_of_the_last_three_that_were_waited_for() -> None:
     clock = VirtualClock(0.0)
     sampling = Sampling(CONFIG, clock)
@@ -141,14 +128,6 @@ def test_the_first_sample_of_an_experiment_just_started_has_a_known_age_too() ->
     assert sampling.late_s == 1.5
 
 
-def test_a_step_of_the_boards_clock_is_noted_and_forgotten() -> None:
-    clock, sampling = started()
-    assert take(sampling, clock, sample(0.0, 1)) == ""
-    clock.sleep(60.0)
-    assert take(sampling, clock, sample(360.0, 2)) == "the board's clock moved by 300 s against this computer's"
-    assert sampling.appeared_s == -math.inf
-
-
 def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_time() -> None:
     """By the time before a step a sample would be minutes late, and no dose would be given any more."""
     clock, zero_s = VirtualClock(1000.0), 1000.0 + FIRST_SAMPLE_S
@@ -185,6 +164,7 @@ def test_what_was_known_of_the_clocks_before_a_restart_says_nothing_of_a_sample_
 def test_looks_are_as_far_apart_as_is_set() -> None:
     clock = VirtualClock(500.0)
     sampling = Sampling(replace(CONFIG, poll_s=7.0, retry_s=11.0), clock)
+    assert sampling.next_poll == sampling.arrived_s == 500.0
     sampling.look(sample(math.nan, 0), 500.0)
     assert sampling.next_poll == 507.0
     sampling.retry_later()

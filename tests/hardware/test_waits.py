@@ -127,7 +127,7 @@ def test_waits_at_the_start_are_on_the_screen(caplog: pytest.LogCaptureFixture) 
 # -- one link ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n", [1, 3, 8])
+@pytest.mark.parametrize("n", [2, pytest.param(8, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("silent", ["lost_request", "lost_reply"])
 def test_a_link_that_accepts_and_never_answers_is_told_of_every_reactor_within_100_s(n: int, silent: str) -> None:
     names = tuple(f"M{k}" for k in range(n))
