@@ -1,6 +1,7 @@
 """The program's closed loop with a simple controller around the emulated device, on a virtual clock."""
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from experiments.loop.loop import ClosedLoop, Step
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.dosing import ReactorCalibration
 from hardware.chibio.reactors import ChiBioReactors
+from hardware.chibio.resume import replay
 from hardware.clock import VirtualClock
 from hardware.emulator.device import ChiBioDevice, DeviceOptions
 from hardware.emulator.faults import inject
@@ -105,8 +107,20 @@ class DriverLab:
         if self._state:
             self.loop.restore(self._state)
 
+    def resume(self, dead_s: float = 0.0) -> None:
+        """Go on by the journal with a new driver and loop, so long after the program was killed."""
+        began, rows = self.reactors.elapsed(), json.loads(json.dumps(self.rows))
+        self.clock.sleep(dead_s)
+        self.client()
+        self.reactors.begin(replay(rows), began + dead_s)
+
     def log(self, kind: str, fields: Mapping[str, Any]) -> None:
         self.rows.append({"kind": kind, **fields})
+
+    def on_post(self, act: Callable[[str, Callable[[str], Reply]], Reply]) -> None:
+        """From now on let `act` carry out each POST. Args: act: gets the path, and what carries it out in truth."""
+        real = self.wire.inner.post
+        self.wire.inner.post = lambda path: act(path, real)  # type: ignore[method-assign]
 
     def fault(self, name: str, value: float = 1.0, reactor: str = "all") -> None:
         inject(self.device, name, reactor, value)
@@ -145,3 +159,12 @@ class DriverLab:
 
     def motors_off(self) -> bool:
         return not any(any(self.truth(n)["motors"].values()) for n in self.names)
+
+
+def begun(*args: Any, rate: float | None = None, minutes: float = 0.0, **config: Any) -> DriverLab:
+    """A lab whose run began `minutes` ago. Args: rate: asked for throughout, mL/s."""
+    lab = DriverLab(*args, **config)
+    lab.law.rate = rate
+    lab.reactors.begin()
+    lab.run(minutes)
+    return lab

@@ -48,6 +48,12 @@ class Lab:
         """Status of a POST."""
         return self.device.handle("POST", path)[0]
 
+    def pump(self, pump: str, target: float, on: bool = True, reactor: str = "M0") -> None:
+        """Set a pump's target and switch it on."""
+        self.post(f"/SetOutputTarget/{pump}/{reactor}/{target}")
+        if on:
+            self.post(f"/SetOutputOn/{pump}/1/{reactor}")
+
     def state(self, reactor: str = "M0") -> dict[str, Any]:
         """sysData of a reactor, as a client gets it."""
         assert self.post(f"/changeDevice/{reactor}") == 204
@@ -75,3 +81,11 @@ class Lab:
         """(start, length) of what the pump's motor did, s."""
         self.device.run_until(self.clock.now())
         return [(d.start_s, d.seconds) for d in self.device.vials[reactor].doses if d.pump == pump]
+
+
+def running(*args: Any, wait: float = 0.0, **kwargs: Any) -> Lab:
+    """A lab whose first reactor's experiment began `wait` seconds ago."""
+    lab = Lab(*args, **kwargs)
+    lab.post("/Experiment/1/M0")
+    lab.wait(wait)
+    return lab

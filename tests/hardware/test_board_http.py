@@ -24,7 +24,7 @@ from hardware.errors import LinkError, ProtocolError
 from hardware.link.http import HttpTransport
 from hardware.link.open import open_transport
 from hardware.link.transport import TransportConfig, switched_off
-from tests.hardware.test_board_agent import PYTHON, SOURCE, TOKEN, AgentLab, Recorder, make_token
+from tests.hardware.test_board_agent import TOKEN, AgentLab, Recorder, make_token
 from tests.hardware.test_http_transport import Server
 from tests.patience import PATIENCE_S
 
@@ -140,22 +140,17 @@ def test_reading_needs_the_token_too(guarded: HttpLab, path: str) -> None:
     assert ask(guarded.port, "GET", path, BEARER, "X-Session: 1")[0] == 200
 
 
-def test_what_is_refused_is_no_sign_of_life(tmp_path: Path) -> None:
-    lab = HttpLab(tmp_path, 1.0)
-    try:
-        for path in ("/SetOutputTarget/Pump1/M0/1", PUMP):
-            assert ask(lab.port, "POST", path, BEARER, "X-Session: 1")[0] == 204
-        lab.until(lambda: lab.motors() == {"M0/Pump1"})
-
-        def off() -> bool:
-            assert ask(lab.port, "POST", "/_agent/heartbeat")[0] == 401
-            assert ask(lab.port, "GET", "/getSysdata/")[0] == 401
-            assert ask(lab.port, "POST", "/_agent/bye", BEARER, "X-Session: 2")[0] in (204, 409)  # 204: hand-over
-            return not lab.motors()
-
-        lab.until(off)
-    finally:
-        lab.end()
+def test_what_is_refused_is_no_sign_of_life(door: tuple[Proxy, Recorder]) -> None:
+    proxy, _ = door
+    port, agent = proxy.server_address[1], proxy.agent
+    assert ask(port, "POST", "/x", BEARER, "X-Session: 1")[0] == 204
+    heard = agent._beats
+    assert ask(port, "POST", "/_agent/heartbeat")[0] == 401
+    assert ask(port, "GET", "/getSysdata/")[0] == 401
+    assert ask(port, "POST", "/_agent/bye", BEARER, "X-Session: 2")[0] == 409
+    assert (agent._beats, agent.armed) == (heard, True)
+    assert ask(port, "POST", "/_agent/heartbeat", BEARER, "X-Session: 1")[0] == 204
+    assert agent._beats == heard + 1
 
 
 def test_only_what_is_carried_gets_the_constant_header_and_the_token_stays_here() -> None:
@@ -175,62 +170,26 @@ def test_only_what_is_carried_gets_the_constant_header_and_the_token_stays_here(
     device.close()
 
 
-def test_http_mode(tmp_path: Path) -> None:
-    one = HttpLab(tmp_path, 1.0)
+@pytest.mark.slow
+def test_what_the_agent_answers_over_http(guarded: HttpLab) -> None:
+    def own(path: str, method: str = "POST") -> tuple[int, bytes]:
+        return ask(guarded.port, method, path, BEARER, "X-Session: 1")
 
-    def post(path: str) -> tuple[int, bytes]:
-        return ask(one.port, "POST", path, BEARER)
-
-    def status() -> dict[str, object]:
-        return dict(json.loads(ask(one.port, "GET", "/_agent/status", BEARER)[1]))
-
-    try:
-        assert post("/SetOutputTarget/Pump1/M0/1") == (204, b"")
-        assert post(PUMP) == (204, b"")
-        found, body = ask(one.port, "GET", "/getSysdata/", BEARER)
-        assert (found, "AS7341" in json.loads(body)) == (200, True)  # not reduced
-        assert post("/changeDevice/M9")[0] == 500
-        for _ in range(8):
-            assert post("/_agent/heartbeat") == (204, b"")
-            time.sleep(0.2)
-        assert one.motors() == {"M0/Pump1"}
-        one.until(lambda: not one.motors())
-        one.until(lambda: "pumps verified off" in one.log.read_text())  # the pass has ended, nothing else asks
-        assert status()["trips"] == 1
-        assert post("/_agent/bye")[0] == 204
-        assert status()["armed"] is False
-        assert ask(one.port, "GET", "/_agent/other", BEARER)[0] == 404
-        assert ask(one.port, "GET", "/_agent/bye", BEARER)[0] == 404
-        one.emulator.fault("lost_reply/all/1")
-        assert post("/changeDevice/M0")[0] == 504
-        one.emulator.fault("crash")
-        time.sleep(0.2)
-        assert ask(one.port, "GET", "/getSysdata/", BEARER)[0] == 502
-    finally:
-        one.end()
-
-
-@pytest.mark.parametrize(
-    ("text", "mode", "words"),
-    [
-        (None, 0o600, "without token-file"),
-        ("", 0o600, "32 to 256"),
-        ("short", 0o600, "32 to 256"),
-        (TOKEN + " " + TOKEN, 0o600, "32 to 256"),
-        (TOKEN, 0o644, "chmod 600"),
-        (TOKEN, 0o620, "chmod 600"),
-    ],
-)
-def test_without_a_token_it_does_not_listen(text: str | None, mode: int, words: str, tmp_path: Path) -> None:
-    given = [] if text is None else ["--token-file", str(make_token(tmp_path, text, mode))]
-    command = [PYTHON, str(SOURCE), "--http", "127.0.0.1:0", *given]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
-    assert done.returncode == 2
-    assert done.stderr.startswith("board_agent: ")
-    assert words in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert "short" not in done.stderr
-    assert TOKEN not in done.stderr
+    found, body = own("/getSysdata/", "GET")
+    assert (found, "AS7341" in json.loads(body)) == (200, True)  # not reduced
+    assert own("/SetOutputTarget/Pump1/M0/1") == (204, b"")
+    assert own("/changeDevice/M9")[0] == 500
+    assert own("/_agent/heartbeat") == (204, b"")
+    for path in ("/_agent/other", "/_agent/bye"):
+        assert own(path, "GET")[0] == 404
+    guarded.emulator.fault("lost_reply/all/1")
+    assert own("/changeDevice/M0")[0] == 504
+    guarded.emulator.fault("crash")
+    guarded.until(lambda: guarded.emulator.server._web is None)
+    assert own("/getSysdata/", "GET")[0] == 502
+    guarded.emulator.fault("restart")
+    guarded.until(lambda: guarded.emulator.server._web is not None)
+    assert own("/SetOutputTarget/Pump1/M0/1") == (204, b"")
 
 
 # -- what a request looks like ---------------------------------------------------------------------------------------
@@ -341,7 +300,7 @@ def test_who_dribbles_is_sent_away_and_keeps_nobody_out(
         assert ask(port, "GET", "/x", BEARER)[0] == 204  # in the place of the first of them
         assert oldest.recv(65536) == b""
     with ExitStack() as open_:
-        slow, until = dribbling(4, 1.0), time.monotonic() + 60.0
+        slow, until = dribbling(4, 0.3), time.monotonic() + 60.0
         while slow:  # no pause between two bytes is as long as the time for all of them
             assert time.monotonic() < until
             for line in select.select(slow, [], [], 0.05)[0]:
@@ -369,24 +328,7 @@ def test_a_connection_that_is_cut_at_any_point_leaves_no_trace(
 # -- one client in charge --------------------------------------------------------------------------------------------
 
 
-def test_serial_and_http_at_once_until_one_hands_over(tmp_path: Path) -> None:
-    lab = HttpLab(tmp_path, 60.0, tty_line=True)
-    try:
-        assert lab.ask("POST", "/SetOutputTarget/Pump1/M0/1")[0] == 204
-        for path in (PUMP, "/_agent/heartbeat", "/_agent/bye"):
-            status, body = ask(lab.port, "POST", path, BEARER)
-            assert (status, b"on the serial line" in body) == (409, True)
-        assert json.loads(ask(lab.port, "GET", "/_agent/status", BEARER)[1])["armed"] is True
-        assert lab.motors() == set()
-        assert lab.ask("BYE", "/")[0] == 200
-        assert ask(lab.port, "POST", PUMP, BEARER)[0] == 204
-        lab.until(lambda: lab.motors() == {"M0/Pump1"})
-        status, body = lab.ask("POST", "/SetOutputOn/Pump1/0/M0")
-        assert (status, b"on HTTP" in body) == (21, True)
-    finally:
-        lab.end()
-
-
+@pytest.mark.slow
 def test_after_silence_the_next_client_finds_the_pumps_off(tmp_path: Path) -> None:
     lab = HttpLab(tmp_path, 1.0)
     try:
@@ -479,6 +421,7 @@ def test_a_client_without_the_right_token_is_told_what_to_do(
         HttpTransport(url, config=TransportConfig(token_file=str(tmp_path / "nothing")))
 
 
+@pytest.mark.slow
 def test_a_run_through_the_agent_writes_the_token_nowhere(tmp_path: Path) -> None:
     lab = HttpLab(tmp_path, 60.0)
     run = tmp_path / "run"

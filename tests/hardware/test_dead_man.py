@@ -1,5 +1,6 @@
 """When the board agent's dead-man switch trips, on a clock that moves only while it waits."""
 
+import json
 import threading
 from types import SimpleNamespace
 
@@ -9,6 +10,8 @@ import pytest
 from hardware.board import board_agent
 from hardware.board.board_agent import Agent, Device
 from hardware.link.serial import encode_request
+from tests.hardware.emulator_lab import Lab
+from tests.hardware.test_board_agent import Recorder
 
 
 class Wait(threading.Event):
@@ -28,18 +31,6 @@ class Wait(threading.Event):
         return self.now >= self._end_s
 
 
-class Asked(Device):
-    """A device that carries out what it is asked, and remembers it."""
-
-    def __init__(self) -> None:
-        super().__init__("http://127.0.0.1:1", 1.0)
-        self.paths: list[str] = []
-
-    def request(self, method: str, path: str, timeout_s: float | None = None) -> tuple[int, bytes, str]:
-        self.paths.append(path)
-        return 204, b"", "text/html"
-
-
 class Watched:
     """An agent and its clock. unverified: of the passes, which one by one cannot be verified; all others are.
 
@@ -51,7 +42,7 @@ class Watched:
     ) -> None:
         clock = SimpleNamespace(monotonic=lambda: 0.0, strftime=lambda form: "")
         monkeypatch.setattr(board_agent, "time", clock)
-        self.agent, self.seen = Agent(Asked(), 120.0), list[float]()
+        self.agent, self.seen = Agent(Recorder(), 120.0), list[float]()
         wait = Wait(end_s, meanwhile, self.agent)
         self.agent._stop, clock.monotonic = wait, lambda: wait.now
 
@@ -106,15 +97,39 @@ def test_the_same_request_is_carried_out_again_after_a_trip_which_undid_it(monke
     """An answer from memory would tell a client that a pump runs which the switch has switched off."""
     watched = Watched(monkeypatch, 130.0, {})
     device = watched.agent.device
-    assert isinstance(device, Asked)
+    assert isinstance(device, Recorder)
     line = encode_request(1 << 16 | 5, "POST", "/SetOutputOn/Pump1/1/M0")[:-1]
     answers = [watched.agent.answer_line(line) for _ in range(2)]
-    assert len(device.paths) == 1  # a client that heard no answer asks the same again
+    assert len(device.asked) == 1  # a client that heard no answer asks the same again
     watched.agent._watch()
     assert watched.agent.trips == 1
     answers.append(watched.agent.answer_line(line))
-    assert len(device.paths) == 2
+    assert len(device.asked) == 2
     assert len(set(answers)) == 1
+
+
+class Emulated(Device):
+    """The requests of an agent, carried out on an emulated device."""
+
+    def __init__(self, lab: Lab) -> None:
+        super().__init__("http://127.0.0.1:9", 1.0)
+        self.lab = lab
+
+    def request(self, method: str, path: str, timeout_s: float | None = None) -> tuple[int, bytes, str]:
+        return (*self.lab.device.handle(method, path), "")
+
+
+def test_a_pass_switches_every_pump_off_and_remembers_each_that_it_found_on() -> None:
+    lab = Lab()
+    for pump, reactor in (("Pump1", "M0"), ("Pump2", "M0"), ("Pump4", "M1")):
+        lab.pump(pump, 1.0, reactor=reactor)
+    lab.wait(2.0)
+    agent = Agent(Emulated(lab), 120.0)
+    assert agent.sweep(agent._beats) == []
+    lab.wait(1.0)
+    assert not any(any(lab.device.truth(m)["motors"].values()) for m in ("M0", "M1"))
+    found = json.loads(agent.status())["switched_off"]
+    assert {m: sorted(pumps) for m, pumps in found.items()} == {"M0": ["Pump1", "Pump2"], "M1": ["Pump4"]}
 
 
 def test_the_allowed_silence_is_two_minutes_unless_said_otherwise() -> None:

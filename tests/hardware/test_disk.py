@@ -175,6 +175,7 @@ def test_the_head_of_a_journal_row(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         (b'{"n":0,"wall":NaN,"kind":"a"}', "without a usable wall"),
         (b'{"n":0,"wall":1}', "without a usable kind"),
         (b"[1]", "line 2: not a row"),
+        (b"hello", "line 2"),
     ],
 )
 def test_a_row_that_lacks_what_all_rows_have_is_named(tmp_path: Path, line: bytes, words: str) -> None:
@@ -192,15 +193,16 @@ def test_a_long_journal_keeps_what_a_naive_reader_keeps(tmp_path: Path, monkeypa
         journal.append("device" if k in (3, 7, 8) else "sample", {"k": k, "pad": "x" * (k % 5)})
     journal.close()
     lines = path.read_bytes().splitlines(keepends=True)
-    begins = np.cumsum([0, *map(len, lines)])
-    for tail in range(len(lines[-1]) + 1, begins[-1] + 20, 5):
+    begins, torn = np.cumsum([0, *map(len, lines)]), b'{"n":12,"ki'
+    for tail in range(len(lines[-1]) + len(torn) + 1, begins[-1] + 40, 5):
         monkeypatch.setattr("hardware.storage.journal.TAIL", tail)
-        cut = max(begins[-1] - tail, 0)
+        path.write_bytes(b"".join(lines) + torn)
+        cut = max(begins[-1] + len(torn) - tail, 0)
         kept = [k for k in range(12) if k in (0, 3, 7, 8) or begins[k] > cut or cut == 0]
         reader = Journal(path, fsync=False)
         reader.close()
         assert [row["k"] for row in reader.rows] == kept
-        assert (reader.cut, reader.next_row) == (0, 12)
+        assert (reader.cut, reader.next_row) == (len(torn), 12)
     assert all(
         json.loads(b"{" + mark + b"}")["kind"] in ("device", "temperature", "regulate", "guard", "level", "share")
         for mark in LANDMARKS

@@ -11,7 +11,7 @@ from hardware.chibio.config import EmulatorConfig
 from hardware.emulator import family
 from hardware.emulator.faults import inject
 from hardware.emulator.sysdata import append_records, fresh_sysdata, thin_records
-from tests.hardware.emulator_lab import Lab, quiet
+from tests.hardware.emulator_lab import Lab, quiet, running
 
 
 def cycle_start(lab: Lab, cycles: int) -> float:
@@ -44,8 +44,7 @@ def test_start_turns_everything_off_and_the_thermostat_on() -> None:
 
 
 def test_timetable_of_one_cycle() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
+    lab = running()
     zero = cycle_start(lab, 2)
     seen: dict[str, float] = {}
     was = {"Measuring": 0, "Stir": 0, "records": 1}
@@ -66,9 +65,7 @@ def test_timetable_of_one_cycle() -> None:
 
 
 def test_period_is_60_07_s_and_time_record_is_the_start_of_the_cycle() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
-    lab.wait(150 * 60.07 + 20.0)
+    lab = running(wait=150 * 60.07 + 20.0)
     times = np.array(lab.state()["time"]["record"])
     periods = np.diff(times)
     assert np.median(periods) == pytest.approx(60.07, abs=0.02)
@@ -79,8 +76,7 @@ def test_period_is_60_07_s_and_time_record_is_the_start_of_the_cycle() -> None:
 
 
 def test_od_current_shows_single_readings_while_measuring_then_the_mean_of_their_ods() -> None:
-    lab = Lab(options=quiet(noise_fraction=0.05), blanked=True)
-    lab.post("/Experiment/1/M0")
+    lab = running(options=quiet(noise_fraction=0.05), blanked=True)
     lab.wait_until(5.0)
     singles: list[float] = []
     while lab.clock.now() < 12.0:
@@ -152,9 +148,7 @@ def test_371_cycles_leave_186_records() -> None:
 
 
 def test_terminal_is_emptied_every_tenth_cycle_newest_line_first() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
-    lab.wait(8 * 60.07 + 5.0)
+    lab = running(wait=8 * 60.07 + 5.0)
     text = lab.state()["Terminal"]["text"]
     assert text.startswith("2026-01-01 00:08:00  - Cycle 9 Started</br>")
     assert "Experiment Started" in text
@@ -165,8 +159,7 @@ def test_terminal_is_emptied_every_tenth_cycle_newest_line_first() -> None:
 
 
 def test_start_time_raw_is_0_for_an_instant_in_cycles_1_11_21() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
+    lab = running()
     hits = set()
     while lab.clock.now() < 12 * 60.07:
         lab.wait(0.05)
@@ -177,18 +170,14 @@ def test_start_time_raw_is_0_for_an_instant_in_cycles_1_11_21() -> None:
 
 
 def test_second_start_stops() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
-    lab.wait(30.0)
+    lab = running(wait=30.0)
     lab.post("/Experiment/1/M0")
     state = lab.state()
     assert (state["Experiment"]["ON"], state["Thermostat"]["ON"], state["Stir"]["ON"]) == (0, 0, 0)
 
 
 def test_stop_switches_pumps_1_and_2_off_at_once_3_and_4_later() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
-    lab.wait(20.0)
+    lab = running(wait=20.0)
     for pump in (1, 2, 3, 4):
         lab.post(f"/SetOutputTarget/Pump{pump}/M0/0.3")
         lab.post(f"/SetOutputOn/Pump{pump}/1/M0")
@@ -204,9 +193,7 @@ def test_stop_switches_pumps_1_and_2_off_at_once_3_and_4_later() -> None:
 
 
 def test_the_end_of_a_stopped_cycle_switches_off_what_was_started_meanwhile() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
-    lab.wait(20.0)
+    lab = running(wait=20.0)
     lab.post("/Experiment/0/M0")
     lab.post("/SetOutputOn/Stir/1/M0")
     lab.post("/SetOutputOn/Thermostat/1/M0")
@@ -217,8 +204,7 @@ def test_the_end_of_a_stopped_cycle_switches_off_what_was_started_meanwhile() ->
 
 
 def test_stop_in_the_first_five_seconds_takes_the_cycle_back() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
+    lab = running()
     zero = cycle_start(lab, 3)
     lab.post("/Experiment/0/M0")
     lab.wait_until(zero + 6.0)
@@ -228,9 +214,7 @@ def test_stop_in_the_first_five_seconds_takes_the_cycle_back() -> None:
 
 
 def test_restart_within_the_old_cycle_loses_the_thermostat_and_may_be_repaired() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
-    lab.wait(30.0)
+    lab = running(wait=30.0)
     lab.post("/Experiment/0/M0")
     lab.wait(5.0)
     lab.post("/Experiment/1/M0")
@@ -247,9 +231,7 @@ def test_restart_within_the_old_cycle_loses_the_thermostat_and_may_be_repaired()
 
 
 def test_restart_after_the_old_cycle_has_ended_is_clean() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
-    lab.wait(30.0)
+    lab = running(wait=30.0)
     lab.post("/Experiment/0/M0")
     lab.wait(70.0)
     first = lab.state()["Experiment"]["startTime"]
@@ -262,9 +244,7 @@ def test_restart_after_the_old_cycle_has_ended_is_clean() -> None:
 
 
 def test_a_dead_cycle_thread_leaves_a_plausible_picture() -> None:
-    lab = Lab(mu=0.03, blanked=True)
-    lab.post("/Experiment/1/M0")
-    lab.wait(100.0)
+    lab = running(mu=0.03, blanked=True, wait=100.0)
     inject(lab.device, "cycle_dead", "M0")
     before = lab.state()
     lab.wait(600.0)
@@ -281,9 +261,7 @@ def test_a_dead_cycle_thread_leaves_a_plausible_picture() -> None:
 
 
 def test_two_reactors_cycle_independently() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
-    lab.wait(25.0)
+    lab = running(wait=25.0)
     lab.post("/Experiment/1/M1")
     lab.wait(300.0)
     assert lab.state("M0")["Experiment"]["cycles"] == 6
@@ -300,8 +278,7 @@ def test_a_pair_that_a_run_is_for_is_its_devices() -> None:
 def test_the_thermostat_holds_what_its_thermometer_shows() -> None:
     options = quiet(mu=0.01)
     off = replace(options.plant, thermal=replace(options.plant.thermal, offset_c=(0.6, 0.6)))
-    lab = Lab(options=replace(options, plant=off))
-    lab.post("/Experiment/1/M0")
+    lab = running(options=replace(options, plant=off))
     lab.post("/SetOutputTarget/Thermostat/M0/35")
     lab.wait(3600.0)
     shown = float(lab.state()["ThermometerIR"]["current"])

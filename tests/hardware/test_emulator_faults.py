@@ -48,8 +48,7 @@ def wiped(state: dict) -> bool:  # type: ignore[type-arg]
 def test_touching_an_absent_reactor_ends_everything() -> None:
     c = Client()
     c.link.post("/Experiment/1/M0")
-    c.link.post("/SetOutputTarget/Pump3/M1/1")
-    c.link.post("/SetOutputOn/Pump3/1/M1")
+    c.lab.pump("Pump3", 1, reactor="M1")
     c.lab.wait(30.0)
     assert c.device.truth("M1")["motors"]["Pump3"] == 1
     message, took = c.fails(lambda: c.link.post("/MeasureTemp/IR/M5"))
@@ -102,31 +101,24 @@ def test_harmless_calls_for_an_absent_reactor(path: str) -> None:
     assert c.device.supervisor.alive
 
 
-def test_unplugging_a_running_reactor_takes_all_down() -> None:
+@pytest.mark.parametrize(("fault", "scanned"), [("unplugged", False), ("unplugged", True), ("marked_absent", False)])
+def test_a_running_reactor_that_is_unplugged_or_taken_for_absent_takes_all_down(fault: str, scanned: bool) -> None:
+    """By its own threads, also where a scan or a glitch has marked it."""
     c = Client()
     for m in ("M0", "M1"):
         c.link.post(f"/Experiment/1/{m}")
     c.lab.wait(100.0)
-    inject(c.device, "unplugged", "M1")
+    inject(c.device, fault, "M1")
+    if scanned:
+        assert c.link.post("/scanDevices/M1").status == 204
+    assert c.state("M0")["presentDevices"]["M1"] == int(fault == "unplugged" and not scanned)
     c.lab.wait(60.0)
     assert not c.device.supervisor.alive
     assert not c.device.truth("M0")["powered"]
     inject(c.device, "restart")
     c.lab.wait(20.0)
-    assert c.state("M0")["presentDevices"]["M1"] == 0
-    assert c.state("M0")["presentDevices"]["M0"] == 1
-
-
-def test_a_scan_marks_an_unplugged_reactor_absent_and_then_its_threads_kill() -> None:
-    c = Client()
-    c.link.post("/Experiment/1/M1")
-    c.lab.wait(40.0)
-    inject(c.device, "unplugged", "M1")
-    assert c.link.post("/scanDevices/M1").status == 204
-    state = c.state("M0")
-    assert state["presentDevices"]["M1"] == 0
-    c.lab.wait(60.0)
-    assert not c.device.supervisor.alive
+    present = c.state("M0")["presentDevices"]
+    assert (present["M0"], present["M1"]) == (1, int(fault != "unplugged"))
 
 
 def test_a_slow_request_delays_everybody_and_is_answered_after_all() -> None:
@@ -167,8 +159,7 @@ def test_stuck_bus_lies_with_204_and_the_temperature_probe_is_the_kill_switch() 
     c.link.post("/Experiment/1/M0")
     c.lab.wait(70.0)
     inject(c.device, "bus_stuck_when_pumping")
-    c.link.post("/SetOutputTarget/Pump1/M0/0.05")
-    c.link.post("/SetOutputOn/Pump1/1/M0")
+    c.lab.pump("Pump1", 0.05)
     c.lab.wait(10.0)
     assert c.link.post("/SetOutputOn/Pump1/0/M0").status == 204
     state = c.state()
@@ -196,20 +187,9 @@ def test_a_full_disk_stalls_the_cycles_of_all_reactors_while_the_server_answers(
     assert c.state()["Experiment"]["ON"] == 1
 
 
-def test_a_reactor_marked_absent_by_a_glitch_is_killed_by_its_own_threads() -> None:
-    c = Client()
-    c.link.post("/Experiment/1/M1")
-    c.lab.wait(20.0)
-    inject(c.device, "marked_absent", "M1")
-    assert c.state("M0")["presentDevices"]["M1"] == 0
-    c.lab.wait(60.0)
-    assert not c.device.supervisor.alive
-
-
 def test_after_a_power_cut_the_clock_starts_again_and_everything_is_off() -> None:
     c = Client()
-    c.link.post("/SetOutputTarget/Pump3/M0/1")
-    c.link.post("/SetOutputOn/Pump3/1/M0")
+    c.lab.pump("Pump3", 1)
     c.lab.wait(1000.0)
     inject(c.device, "power_cut")
     assert set(c.device.truth("M0")["motors"].values()) == {0}
@@ -323,8 +303,7 @@ def test_clock_set_forward_gives_one_short_cycle() -> None:
 
 def test_clock_set_back_during_a_dose_lengthens_the_pause_not_the_dose() -> None:
     c = Client()
-    c.link.post("/SetOutputTarget/Pump1/M0/0.05")
-    c.link.post("/SetOutputOn/Pump1/1/M0")
+    c.lab.pump("Pump1", 0.05)
     c.lab.wait(1.0)
     inject(c.device, "clock_step", value=-300.0)
     c.lab.wait(350.0)
@@ -423,11 +402,6 @@ def test_a_fault_of_one_reactor_is_not_its_neighbour_s(name: str) -> None:
     assert changed == [value]
     inject(device, name, "all", value)
     assert switches("M0") == switches("M1")
-
-
-def test_timeout_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="timeout_s = 0"):
-        EmulatorTransport(Lab().device, 0.0)
 
 
 def test_every_fault_is_documented() -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from envs.plant.sensor import density
 from hardware.emulator.faults import inject
-from tests.hardware.emulator_lab import BLANK, Lab, quiet
+from tests.hardware.emulator_lab import BLANK, Lab, quiet, running
 
 A, B = 0.226, 1.833
 
@@ -103,8 +103,7 @@ def test_stirred_reading_is_several_times_smaller() -> None:
 
 
 def test_a_rival_measurement_spoils_the_one_of_the_cycle() -> None:
-    lab = Lab(od=0.5, blanked=True)
-    lab.post("/Experiment/1/M0")
+    lab = running(od=0.5, blanked=True)
     lab.wait_until(5.5)
     for _ in range(3):
         lab.post("/MeasureOD/M0")
@@ -116,9 +115,7 @@ def test_a_rival_measurement_spoils_the_one_of_the_cycle() -> None:
 
 
 def test_noise_of_a_reading_and_of_the_mean() -> None:
-    lab = Lab(options=quiet(noise_fraction=0.003, common_fraction=0.004), od=0.5, blanked=True)
-    lab.post("/Experiment/1/M0")
-    lab.wait(180 * 60.07)
+    lab = running(options=quiet(noise_fraction=0.003, common_fraction=0.004), od=0.5, blanked=True, wait=180 * 60.07)
     records = np.array(lab.state()["OD"]["record"])
     assert records.mean() == pytest.approx(0.5, abs=0.002)
     assert records.std() == pytest.approx(0.0036, rel=0.2)  # median of public logs at this OD
@@ -137,8 +134,7 @@ def test_blanks_are_in_the_range_seen_on_real_devices() -> None:
 
 
 def test_sensor_faults_frozen_offset_jump() -> None:
-    lab = Lab(mu=0.02, od=0.3, blanked=True)
-    lab.post("/Experiment/1/M0")
+    lab = running(mu=0.02, od=0.3, blanked=True)
     lab.wait_until(200.0)
     inject(lab.device, "od_frozen", "M0")
     lab.wait_until(560.0)

@@ -11,20 +11,14 @@ from envs.plant.plant import PlantConfig
 from hardware.chibio.config import EmulatorConfig
 from hardware.emulator.faults import inject
 from hardware.emulator.server import build, parser
-from tests.hardware.emulator_lab import BIAS_S, START_S, STOP_S, Lab, quiet
+from tests.hardware.emulator_lab import BIAS_S, START_S, STOP_S, Lab, quiet, running
 
 PERIOD_S = 63.0 + 0.8 * START_S  # it counts from when the registers are off, four of the five writes of a start
 
 
-def set_pump(lab: Lab, pump: str, target: float, on: bool = True, reactor: str = "M0") -> None:
-    lab.post(f"/SetOutputTarget/{pump}/{reactor}/{target}")
-    if on:
-        lab.post(f"/SetOutputOn/{pump}/1/{reactor}")
-
-
 def test_a_pump_left_on_doses_63_s_times_target_every_63_s_for_ever() -> None:
     lab = Lab()
-    set_pump(lab, "Pump1", 0.02)
+    lab.pump("Pump1", 0.02)
     lab.wait(10.0 * PERIOD_S + 5.0)
     starts, lengths = zip(*lab.doses(), strict=True)
     assert len(starts) == 11
@@ -33,40 +27,29 @@ def test_a_pump_left_on_doses_63_s_times_target_every_63_s_for_ever() -> None:
     np.testing.assert_allclose(lengths, 63 * 0.02 + BIAS_S, atol=1e-6)
 
 
-def test_single_shot_dose_is_one_dose() -> None:
+@pytest.mark.parametrize(
+    ("target", "off_s", "lengths"),
+    [
+        (0.05, START_S + 63 * 0.05 + BIAS_S, [3.15 + BIAS_S]),  # a single shot
+        (0.5, START_S + 2.0, [2.0 + STOP_S]),  # ended in its progress
+        (0.5, 0.5 * START_S, []),  # before the motor turns
+    ],
+)
+def test_off_leaves_what_was_dosed_until_then(target: float, off_s: float, lengths: list[float]) -> None:
     lab = Lab()
-    set_pump(lab, "Pump1", 0.05)
-    lab.wait(START_S + 63 * 0.05 + BIAS_S)
+    lab.pump("Pump1", target)
+    lab.wait(off_s)
     lab.post("/SetOutputOn/Pump1/0/M0")
     lab.wait(300.0)
-    assert [length for _, length in lab.doses()] == pytest.approx([3.15 + BIAS_S])
-    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(3.15 + BIAS_S)  # 1 mL/s, perfect head
-
-
-def test_off_ends_a_dose_in_progress() -> None:
-    lab = Lab()
-    set_pump(lab, "Pump1", 0.5)
-    lab.wait(START_S + 2.0)
-    lab.post("/SetOutputOn/Pump1/0/M0")
-    lab.wait(200.0)
-    assert [length for _, length in lab.doses()] == pytest.approx([2.0 + STOP_S], abs=0.02)
-
-
-def test_off_before_the_motor_turns_is_no_dose() -> None:
-    lab = Lab()
-    set_pump(lab, "Pump1", 0.5)
-    lab.wait(0.5 * START_S)
-    lab.post("/SetOutputOn/Pump1/0/M0")
-    lab.wait(200.0)
-    assert lab.doses() == []
+    assert [length for _, length in lab.doses()] == pytest.approx(lengths, abs=0.02)
+    assert lab.device.truth("M0")["feed_ml"] == pytest.approx(sum(lengths), abs=0.02)  # 1 mL/s, perfect head
 
 
 def test_the_motor_starts_after_a_delay_of_its_own_each_time() -> None:
     lab = Lab(options=quiet(pump_start_low_s=0.2, pump_start_high_s=0.7))
     delays = []
     for _ in range(200):
-        lab.post("/SetOutputTarget/Pump1/M0/0.05")
-        lab.post("/SetOutputOn/Pump1/1/M0")
+        lab.pump("Pump1", 0.05)
         answered = lab.clock.now()
         lab.wait(10.0)
         lab.post("/SetOutputOn/Pump1/0/M0")
@@ -92,17 +75,11 @@ def test_the_emulated_plant_is_the_preset_dosed_in_pulses(name: str) -> None:
     assert EmulatorConfig(plant=name).plant == name
 
 
-@pytest.mark.parametrize(("low", "high"), [(-0.1, 0.7), (0.5, 0.2), (0.0, 9.0)])
-def test_a_delay_out_of_range_is_named(low: float, high: float) -> None:
-    with pytest.raises(ValueError, match=r"vial\.pump_start_(low|high)_s = .*allowed"):
-        quiet(pump_start_low_s=low, pump_start_high_s=high)
-
-
 def test_rewriting_the_target_while_on_doses_at_once_and_restarts_the_period() -> None:
     lab = Lab()
-    set_pump(lab, "Pump1", 0.02)
+    lab.pump("Pump1", 0.02)
     lab.wait_until(30.0)
-    set_pump(lab, "Pump1", 0.05, on=False)
+    lab.pump("Pump1", 0.05, on=False)
     lab.wait_until(120.0)
     starts = [start for start, _ in lab.doses()]
     lengths = [length for _, length in lab.doses()]
@@ -112,10 +89,10 @@ def test_rewriting_the_target_while_on_doses_at_once_and_restarts_the_period() -
 
 def test_writing_every_60_07_s_gives_1_049_times_the_nominal_flow() -> None:
     lab = Lab()
-    set_pump(lab, "Pump1", 0.02)
+    lab.pump("Pump1", 0.02)
     for k in range(1, 200):
         lab.wait_until(60.07 * k)
-        set_pump(lab, "Pump1", 0.02, on=False)
+        lab.pump("Pump1", 0.02, on=False)
     lab.wait_until(60.07 * 200)
     per_second = (lab.device.truth("M0")["on_s"]["Pump1"] - 200 * BIAS_S) / (200 * 60.07)
     assert per_second / 0.02 == pytest.approx(63 / 60.07, rel=2e-3)
@@ -123,9 +100,9 @@ def test_writing_every_60_07_s_gives_1_049_times_the_nominal_flow() -> None:
 
 def test_writing_later_than_63_s_gives_two_doses() -> None:
     lab = Lab()
-    set_pump(lab, "Pump1", 0.05)
+    lab.pump("Pump1", 0.05)
     lab.wait_until(68.0)
-    set_pump(lab, "Pump1", 0.05, on=False)
+    lab.pump("Pump1", 0.05, on=False)
     lab.wait_until(76.0)
     assert sum(length for _, length in lab.doses()) == pytest.approx(3 * (3.15 + BIAS_S))
 
@@ -133,7 +110,7 @@ def test_writing_later_than_63_s_gives_two_doses() -> None:
 @pytest.mark.parametrize("target", [1.0, -1.0])
 def test_full_duty_is_continuous(target: float) -> None:
     lab = Lab()
-    set_pump(lab, "Pump3", target)
+    lab.pump("Pump3", target)
     lab.wait(400.0)
     assert lab.device.vials["M0"].motor("Pump3") == int(target)
     assert lab.doses(pump="Pump3") == []  # never switched off between periods
@@ -147,7 +124,7 @@ def test_target_0_refuses_to_go_on_and_stays_off_when_a_target_comes() -> None:
     lab = Lab()
     lab.post("/SetOutputOn/Pump1/1/M0")
     assert lab.state()["Pump1"]["ON"] == 0
-    set_pump(lab, "Pump1", 0.1)
+    lab.pump("Pump1", 0.1)
     assert lab.state()["Pump1"]["ON"] == 1
     lab.wait(10.0)
     lab.post("/SetOutputTarget/Pump1/M0/0")
@@ -160,7 +137,7 @@ def test_target_0_refuses_to_go_on_and_stays_off_when_a_target_comes() -> None:
 
 def test_nan_target_moves_nothing() -> None:
     lab = Lab()
-    set_pump(lab, "Pump1", float("nan"))
+    lab.pump("Pump1", float("nan"))
     lab.wait(200.0)
     assert lab.doses() == []
     assert lab.device.vials["M0"].motor("Pump1") == 0
@@ -168,7 +145,7 @@ def test_nan_target_moves_nothing() -> None:
 
 def test_negative_target_runs_backwards_and_draws_culture_out() -> None:
     lab = Lab()
-    set_pump(lab, "Pump1", -0.05)
+    lab.pump("Pump1", -0.05)
     lab.wait(10.0)
     assert [d.direction for d in lab.device.vials["M0"].doses] == [-1]
     truth = lab.device.truth("M0")
@@ -178,7 +155,7 @@ def test_negative_target_runs_backwards_and_draws_culture_out() -> None:
 
 def test_direction_before_the_thread_reads_it_reverses_the_dose() -> None:
     lab = Lab()
-    set_pump(lab, "Pump1", 0.05)
+    lab.pump("Pump1", 0.05)
     lab.post("/Direction/Pump1/M0")
     lab.wait(10.0)
     assert [d.direction for d in lab.device.vials["M0"].doses] == [-1]
@@ -198,32 +175,31 @@ def test_set_output_on_returns_before_the_motor_turns() -> None:
 
 
 def test_record_shows_a_pump_only_if_it_is_on_when_the_cycle_records() -> None:
-    lab = Lab()
-    lab.post("/Experiment/1/M0")
+    lab = running()
     lab.wait_until(20.0)
-    set_pump(lab, "Pump1", 0.02)  # single shot, over long before the next record
+    lab.pump("Pump1", 0.02)  # single shot, over long before the next record
     lab.wait_until(23.0)
     lab.post("/SetOutputOn/Pump1/0/M0")
     lab.wait_until(80.0)
-    set_pump(lab, "Pump1", 0.02)  # left on
+    lab.pump("Pump1", 0.02)  # left on
     lab.wait_until(140.0)
     assert lab.state()["Pump1"]["record"] == [0.0, 0.0, 0.02]
 
 
 def test_volume_balance_waste_level_and_overflow() -> None:
     lab = Lab()
-    set_pump(lab, "Pump1", 0.02)
+    lab.pump("Pump1", 0.02)
     lab.wait(5.0)
     lab.post("/SetOutputOn/Pump1/0/M0")
     truth = lab.device.truth("M0")
     assert truth["volume_ml"] == pytest.approx(20.0 + 1.26 + BIAS_S)
-    set_pump(lab, "Pump2", 0.15)
+    lab.pump("Pump2", 0.15)
     lab.wait(15.0)
     assert lab.device.truth("M0")["volume_ml"] == pytest.approx(20.0)  # down to the waste tube, not below
     lab.post("/SetOutputOn/Pump2/0/M0")
     inject(lab.device, "waste_gain_factor", "M0", 0.0)
-    set_pump(lab, "Pump2", 1.0)
-    set_pump(lab, "Pump1", 0.5)
+    lab.pump("Pump2", 1.0)
+    lab.pump("Pump1", 0.5)
     lab.wait(9.0)
     assert not lab.device.truth("M0")["overflowed"]
     lab.wait(3.0)
@@ -236,22 +212,22 @@ def test_volume_balance_waste_level_and_overflow() -> None:
 def test_a_spare_pump_moves_liquid_only_if_it_has_a_tube(overflow_pump: str, level: float) -> None:
     options = quiet()
     lab = Lab(options=replace(options, vial=replace(options.vial, overflow_pump=overflow_pump)))
-    set_pump(lab, "Pump3", 0.5)
-    set_pump(lab, "Pump1", 5.0 / 63.0)
+    lab.pump("Pump3", 0.5)
+    lab.pump("Pump1", 5.0 / 63.0)
     lab.wait(8.0)
     lab.post("/SetOutputOn/Pump1/0/M0")
     assert lab.device.truth("M0")["motors"]["Pump3"] == 1
     assert lab.device.truth("M0")["volume_ml"] == pytest.approx(level)
     inject(lab.device, "overflow_gain_factor", "M0", 0.0)
-    set_pump(lab, "Pump1", 1.0 / 63.0)
+    lab.pump("Pump1", 1.0 / 63.0)
     lab.wait(5.0)
     assert lab.device.truth("M0")["volume_ml"] == pytest.approx(level + 1.0 + BIAS_S)
 
 
 def test_feed_dilutes_by_what_it_adds() -> None:
     lab = Lab(od=0.8)
-    set_pump(lab, "Pump2", 1.0)
-    set_pump(lab, "Pump1", 2.0 / 63.0)
+    lab.pump("Pump2", 1.0)
+    lab.pump("Pump1", 2.0 / 63.0)
     lab.wait(20.0)
     assert lab.device.truth("M0")["od"] == pytest.approx(0.8 * np.exp(-(2.0 + BIAS_S) / 20.0), rel=1e-6)
 
@@ -263,7 +239,7 @@ def test_feed_dilutes_by_what_it_adds() -> None:
 def test_pump_faults_change_what_arrives_not_what_the_device_says(fault: str, value: float, delivered: float) -> None:
     lab = Lab()
     inject(lab.device, fault, "M0", value)
-    set_pump(lab, "Pump1", (1.0 - BIAS_S) / 63.0)
+    lab.pump("Pump1", (1.0 - BIAS_S) / 63.0)
     lab.wait(5.0)
     assert lab.state()["Pump1"]["ON"] == 1
     assert lab.device.truth("M0")["feed_ml"] == pytest.approx(delivered)
@@ -272,7 +248,7 @@ def test_pump_faults_change_what_arrives_not_what_the_device_says(fault: str, va
 def test_back_leak_takes_from_every_pulse() -> None:
     lab = Lab()
     inject(lab.device, "back_leak_ml", "M0", 0.2)
-    set_pump(lab, "Pump1", (1.0 - BIAS_S) / 63.0)
+    lab.pump("Pump1", (1.0 - BIAS_S) / 63.0)
     lab.wait(70.0)
     assert lab.device.truth("M0")["feed_ml"] == pytest.approx(2 * 0.8)
 
@@ -294,7 +270,7 @@ def test_dose_log_agrees_with_on_time_and_volume() -> None:
     rng = np.random.default_rng(1)
     for _ in range(300):
         m = rng.choice(["M0", "M1", "M2"])
-        set_pump(lab, "Pump1", float(rng.uniform(0.0, 0.1)), on=bool(rng.random() < 0.7), reactor=m)
+        lab.pump("Pump1", float(rng.uniform(0.0, 0.1)), on=bool(rng.random() < 0.7), reactor=m)
         if rng.random() < 0.4:
             lab.post(f"/SetOutputOn/Pump1/{rng.integers(0, 2)}/{m}")
         lab.wait(float(rng.exponential(8.0)))
@@ -307,32 +283,6 @@ def test_dose_log_agrees_with_on_time_and_volume() -> None:
         assert sum(d.seconds for d in doses) == pytest.approx(truth["on_s"]["Pump1"])
         assert sum(d.feed_ml for d in doses) == pytest.approx(truth["feed_ml"])
         assert truth["feed_ml"] == pytest.approx(truth["on_s"]["Pump1"])
-
-
-def test_two_hours_of_eight_reactors_dosed_every_minute() -> None:
-    """The load of a full rig: every dose once, volumes at the waste level, cultures diluted as computed."""
-    names = tuple(f"M{k}" for k in range(8))
-    lab = Lab(names, mu=0.02, od=0.5, blanked=True)
-    for m in names:
-        lab.post(f"/Experiment/1/{m}")
-        lab.post(f"/SetOutputTarget/Pump1/{m}/{(0.4 - BIAS_S) / 63}")
-        lab.post(f"/SetOutputTarget/Pump2/{m}/{6.0 / 63}")
-    for minute in range(120):
-        lab.wait_until(60.07 * minute + 15.0)
-        for m in names:
-            assert lab.state(m)["Experiment"]["cycles"] == minute + 1
-            lab.post(f"/SetOutputOn/Pump2/1/{m}")
-            lab.post(f"/SetOutputOn/Pump1/1/{m}")
-        lab.wait(10.0)
-        for m in names:
-            lab.post(f"/SetOutputOn/Pump1/0/{m}")
-            lab.post(f"/SetOutputOn/Pump2/0/{m}")
-    for m in names:
-        truth = lab.device.truth(m)
-        assert truth["feed_ml"] == pytest.approx(120 * 0.4)
-        assert truth["volume_ml"] == pytest.approx(20.0)
-        minutes = lab.clock.now() / 60.0
-        assert truth["od"] == pytest.approx(0.5 * np.exp(0.02 * minutes - 120 * 0.4 / 20.0), rel=0.02)
 
 
 def test_spare_pumps_supply_by_their_own_flow_for_as_long_as_they_run_forward() -> None:

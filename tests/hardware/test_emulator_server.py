@@ -11,12 +11,14 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.client import HTTPConnection, IncompleteRead
 from pathlib import Path
 
 import pytest
 
+from hardware.emulator.server import EmulatorServer, build, main, parser
+from hardware.rig import __main__ as rig
 from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -60,24 +62,48 @@ class Process:
         return self.process.returncode, output
 
 
+def until(condition: Callable[[], object], timeout: float = PATIENCE_S) -> None:
+    """Wait until `condition()` holds."""
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+class Served(Process):
+    """The same in a thread of this process, which starts in no time."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.server = EmulatorServer(build(parser().parse_args(arguments)), "127.0.0.1", 0, 0)
+        self.port, self.control_port = self.server.port, self.server.control_port
+        self._thread = threading.Thread(target=self.server.run)
+        self._thread.start()
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+        self.server.stop()
+        self._thread.join()
+        return 0, ""
+
+
 @pytest.fixture
-def emulator() -> Iterator[Process]:
-    process = Process("--reactors", "M0,M1", "--speed", "60")
-    yield process
-    if process.process.poll() is None:
-        code, output = process.end()
-        assert (code, output) == (0, "")
+def emulator() -> Iterator[Served]:
+    served = Served("--reactors", "M0,M1", "--speed", "60")
+    yield served
+    served.end()
 
 
-def test_an_experiment_over_http(emulator: Process) -> None:
-    assert emulator.ready.count("\n") == 1
+def test_an_experiment_over_http() -> None:
+    emulator = Served("--reactors", "M0,M1", "--speed", "600")
+    try:
+        _an_experiment(emulator)
+    finally:
+        emulator.end()
+
+
+def _an_experiment(emulator: Served) -> None:
     assert emulator.ask("POST", "/Experiment/1/M0") == (204, b"")
-    deadline = time.monotonic() + 10.0
-    state: dict = {}  # type: ignore[type-arg]
-    while time.monotonic() < deadline and state.get("Experiment", {}).get("cycles", 0) < 4:
-        time.sleep(0.1)
-        state = json.loads(emulator.ask("GET", "/getSysdata/")[1])
-    assert state["Experiment"]["cycles"] == 4
+    until(lambda: json.loads(emulator.ask("GET", "/getSysdata/")[1])["Experiment"]["cycles"] >= 4)
+    state = json.loads(emulator.ask("GET", "/getSysdata/")[1])
     assert state["OD"]["record"][0] == pytest.approx(0.3, abs=0.05)  # started with a blank
     stored = json.loads(emulator.ask("GET", "/_emulator/samples/M0", emulator.control_port)[1])
     assert [s["sample_s"] for s in stored[: len(state["time"]["record"])]] == state["time"]["record"]
@@ -90,12 +116,13 @@ def test_an_experiment_over_http(emulator: Process) -> None:
     assert emulator.ask("POST", "/changeDevice/M11")[0] == 500
 
 
-def test_requests_are_served_one_at_a_time(emulator: Process) -> None:
+def test_requests_are_served_one_at_a_time(emulator: Served) -> None:
+    """Four at once of 3 device seconds each: k of them take at least 3 k."""
     emulator.ask("POST", "/SetOutputTarget/Stir/M0/0.9")
     spans: list[float] = []
 
     def kick() -> None:
-        emulator.ask("POST", "/SetOutputOn/Stir/1/M0", timeout=10.0)  # 3 device seconds
+        emulator.ask("POST", "/SetOutputOn/Stir/1/M0", timeout=PATIENCE_S)
         spans.append(time.monotonic() - began)
 
     threads = [threading.Thread(target=kick) for _ in range(4)]
@@ -104,13 +131,11 @@ def test_requests_are_served_one_at_a_time(emulator: Process) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert max(spans) >= 4 * 3.0 / 60.0
-    assert sorted(spans) == pytest.approx([0.05, 0.1, 0.15, 0.2], abs=0.15)
     for k, span in enumerate(sorted(spans), start=1):
         assert span >= k * 3.0 / 60.0 - 0.01
 
 
-def test_socket_faults(emulator: Process) -> None:
+def test_socket_faults(emulator: Served) -> None:
     emulator.fault("reset_after/all/1")
     with pytest.raises(ConnectionResetError):
         emulator.ask("POST", "/SetOutputTarget/Stir/M0/0.7")
@@ -128,27 +153,29 @@ def test_socket_faults(emulator: Process) -> None:
         assert json.loads(emulator.ask("GET", "/getSysdata/")[1])["Stir"]["target"] == 0.7
 
 
-def test_death_refuses_connections_until_somebody_restarts_it(emulator: Process) -> None:
-    with pytest.raises((ConnectionResetError, ConnectionError)):
+def test_death_refuses_connections_until_somebody_restarts_it(emulator: Served) -> None:
+    with pytest.raises(ConnectionError):
         emulator.ask("POST", "/MeasureOD/M7")
-    time.sleep(0.2)
+    until(lambda: not emulator.truth()["alive"])
+    until(lambda: emulator.server._web is None)
     with pytest.raises(ConnectionRefusedError):
         emulator.ask("GET", "/getSysdata/")
-    truth = emulator.truth()
-    assert truth["alive"] is False
-    assert truth["M0"]["powered"] is False
+    until(lambda: not emulator.truth()["M0"]["powered"])
     emulator.fault("restart")
-    time.sleep(0.3)
+    until(lambda: emulator.server._web is not None)
     assert json.loads(emulator.ask("GET", "/getSysdata/")[1])["OD0"]["target"] == 65000.0
 
 
-def test_truth_doses_and_list_of_faults(emulator: Process) -> None:
+def test_truth_doses_and_list_of_faults(emulator: Served) -> None:
     emulator.ask("POST", "/SetOutputTarget/Pump1/M1/0.02")
     emulator.ask("POST", "/SetOutputOn/Pump1/1/M1")
-    time.sleep(0.2)
+
+    def told() -> list[dict[str, float]]:
+        return list(json.loads(emulator.ask("GET", "/_emulator/doses/M1", emulator.control_port)[1]))
+
+    until(told)
     emulator.ask("POST", "/SetOutputOn/Pump1/0/M1")
-    time.sleep(0.1)
-    doses = json.loads(emulator.ask("GET", "/_emulator/doses/M1", emulator.control_port)[1])
+    doses = told()
     assert [d["pump"] for d in doses] == ["Pump1"]
     assert doses[0]["seconds"] == pytest.approx(1.26, abs=0.25)
     assert emulator.truth()["M1"]["feed_ml"] == pytest.approx(doses[0]["feed_ml"])
@@ -160,7 +187,7 @@ def test_truth_doses_and_list_of_faults(emulator: Process) -> None:
     assert emulator.ask("GET", "/_emulator/nonsense")[0] == 404
 
 
-def test_httpx_and_urllib_can_talk_to_it(emulator: Process) -> None:
+def test_httpx_and_urllib_can_talk_to_it(emulator: Served) -> None:
     import httpx
 
     with httpx.Client(base_url=f"http://127.0.0.1:{emulator.port}") as client:
@@ -171,7 +198,7 @@ def test_httpx_and_urllib_can_talk_to_it(emulator: Process) -> None:
         assert json.load(answer)["UIDevice"] == "M1"
 
 
-def test_garbage_on_the_socket_does_not_end_it(emulator: Process) -> None:
+def test_garbage_on_the_socket_does_not_end_it(emulator: Served) -> None:
     for data in (
         b"",
         b"\x00\xff\xfe\n\n",
@@ -184,11 +211,15 @@ def test_garbage_on_the_socket_does_not_end_it(emulator: Process) -> None:
     assert emulator.ask("GET", "/getSysdata/")[0] == 200
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_signals_end_it_cleanly(number: int) -> None:
-    assert Process().end(number) == (0, "")
+def test_signals_end_it_cleanly_and_it_says_one_line_when_it_is_ready(number: int) -> None:
+    process = Process()
+    assert process.ready.count("\n") == 1
+    assert process.end(number) == (0, "")
 
 
+@pytest.mark.slow
 def test_it_ends_with_the_process_that_started_it_however_that_ends() -> None:
     """A client that is killed by -9 leaves no device behind."""
     client = subprocess.Popen(
@@ -214,52 +245,44 @@ def test_it_ends_with_the_process_that_started_it_however_that_ends() -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("arguments", "named"),
     [
-        ["--reactors", "M9"],
-        ["--reactors", ""],
-        ["--speed", "0"],
-        ["--speed", "nan"],
-        ["--od", "0.3,0.4", "--reactors", "M0"],
-        ["--od", "-1"],
-        ["--od", "much"],
-        ["--port", "70000"],
-        ["--pump-start", "0.7", "0.2"],
-        ["--host", "203.0.113.1"],
+        (["--reactors", "M9"], "M9"), (["--reactors", ""], "reactors"), (["--reactors", "m0"], "m0"),
+        (["--reactors", "M0,M0"], "M0"), (["--speed", "0"], "speed = 0"),
+        (["--speed", "nan"], "speed = nan"), (["--od", "0.3,0.4", "--reactors", "M0"], "od"),
+        (["--od", "-1"], "-1"),
+        (["--od", "much"], "od = much"), (["--port", "70000"], "port = 70000"),
+        (["--pump-start", "0.7", "0.2"], "pump_start_high_s = 0.2"), (["--host", "203.0.113.1"], "203.0.113.1:0"),
     ],
-)
-def test_bad_arguments_give_one_line(arguments: list[str]) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "hardware.emulator", "--port", "0", *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=20,
-    )
-    assert done.returncode == 2
-    assert done.stdout.startswith("emulator: ")
-    assert done.stdout.count("\n") == 1
-    assert done.stderr == ""
+)  # fmt: skip
+def test_bad_arguments_give_one_line(arguments: list[str], named: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["--port", "0", *arguments]) == 2
+    said, error = capfd.readouterr()
+    assert said.startswith("emulator: ")
+    assert said.count("\n") == 1
+    assert named in said
+    assert error == ""
 
 
-def test_a_port_in_use_gives_one_line(emulator: Process) -> None:
+def test_a_port_in_use_gives_one_line(emulator: Served, capfd: pytest.CaptureFixture[str]) -> None:
     for port in (["--port", str(emulator.port)], ["--port", "0", "--control-port", str(emulator.control_port)]):
-        done = subprocess.run(
-            [sys.executable, "-m", "hardware.emulator", *port], cwd=ROOT, capture_output=True, text=True, timeout=20
-        )
-        assert (done.returncode, done.stderr, done.stdout.count("\n")) == (2, "", 1)
-        assert "in use" in done.stdout
-        assert port[-1] in done.stdout
+        assert main(port) == 2
+        said, error = capfd.readouterr()
+        assert (error, said.count("\n")) == ("", 1)
+        assert port[-1] in said
 
 
-@pytest.mark.parametrize("program", ["hardware.emulator", "hardware.rig"])
-def test_a_wrong_word_is_two_lines_and_help_says_all(program: str) -> None:
-    words = [sys.executable, "-m", program]
-    done = subprocess.run(
-        [*words, "--reactor-speed=x"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    usage, error = done.stderr.splitlines()
-    assert usage.endswith(f"python -m {program} --help says all")
-    assert error == f"python -m {program}: error: unrecognized arguments: --reactor-speed=x"
-    shown = subprocess.run([*words, "--help"], capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
-    assert "--seed" in shown
+@pytest.mark.parametrize("program", ["emulator", "rig"])
+def test_a_wrong_word_is_two_lines_and_help_says_all(
+    program: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def said(word: str) -> tuple[str, str]:
+        monkeypatch.setattr(sys, "argv", [program, word])
+        with pytest.raises(SystemExit):
+            {"emulator": main, "rig": rig.main}[program]()
+        return capsys.readouterr()
+
+    usage, error = said("--reactor-speed=x")[1].splitlines()
+    assert usage.endswith(f"python -m hardware.{program} --help says all")
+    assert error.endswith("--reactor-speed=x")
+    assert "--seed" in said("--help")[0]

@@ -73,7 +73,8 @@ class Hostile(Transport):
     def post(self, path: str) -> Reply:
         if self.angry and path.startswith(("/SetOutputOn/Pump1/1", "/SetOutputOn/Pump2/1")):
             self.switched_on.append(path)
-        return self.inner.post(path)
+        reply = self.inner.post(path)
+        return Reply(500, b"") if self.angry and not self.torn and self.rng.random() < 0.1 else reply
 
     def disarm(self) -> None:
         self.inner.disarm()
@@ -82,18 +83,24 @@ class Hostile(Transport):
         self.inner.close()
 
 
-def lab(names: tuple[str, ...], rng: random.Random) -> tuple[VirtualClock, ChiBioDevice, Hostile, ChiBioReactors]:
+Rows = list[dict[str, Any]]
+
+
+def lab(names: tuple[str, ...], rng: random.Random) -> tuple[VirtualClock, ChiBioDevice, Hostile, ChiBioReactors, Rows]:
     clock = VirtualClock()
     device = ChiBioDevice(names, clock, np.random.default_rng(0), od=0.5, temperature=37.0, blanked=True)
     wire = Hostile(EmulatorTransport(device), rng)
-    reactors = ChiBioReactors(wire, clock, ChiBioConfig(reactors=names))
+    rows: Rows = []
+    reactors = ChiBioReactors(
+        wire, clock, ChiBioConfig(reactors=names), log=lambda kind, row: rows.append({"kind": kind, **row})
+    )
     reactors.begin()
-    return clock, device, wire, reactors
+    return clock, device, wire, reactors, rows
 
 
 def test_no_traceback_and_no_overdose_on_mutilated_answers() -> None:
     """Answers to a whole run are mutilated: it goes on, within its limits, and the pumps are off in the end."""
-    clock, device, wire, reactors = lab(("M0", "M1"), random.Random(1))
+    clock, device, wire, reactors, rows = lab(("M0", "M1"), random.Random(1))
     wire.angry = True
     while wire.cases < CASES:
         m = reactors.measure()
@@ -105,6 +112,8 @@ def test_no_traceback_and_no_overdose_on_mutilated_answers() -> None:
     reactors.stop()
     device.run_until(clock.now())
     for name in ("M0", "M1"):
+        acted = [tuple(row["sample"]) for row in rows if row["kind"] == "intent" and row["reactor"] == name]
+        assert len(set(acted)) == len(acted) > 0
         truth = device.truth(name)
         assert not any(truth["motors"].values())
         assert not truth["overflowed"]
@@ -114,7 +123,7 @@ def test_no_traceback_and_no_overdose_on_mutilated_answers() -> None:
 def test_no_dose_is_begun_when_the_read_back_is_garbage() -> None:
     """Every read-back between targets and switch-on is mutilated: the pumps are never switched on."""
     rng = random.Random(2)
-    _, _, wire, reactors = lab(("M0",), rng)
+    _, _, wire, reactors, _ = lab(("M0",), rng)
     for _ in range(max(CASES // 10, 5)):
         while not (m := reactors.measure()).fresh[0]:
             pass

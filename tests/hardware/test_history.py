@@ -50,7 +50,7 @@ def test_what_was_given_beside_says_by_which_pump_and_how_little_and_earlier_jou
 def test_a_resumed_run_counts_its_doses_on_and_knows_what_it_put_off() -> None:
     rows = [
         row(1, "intent", **INTENT, on_s=75.0),
-        row(2, "intent", **INTENT | {"doses": 7, "carry_ml": 0.25}, on_s=135.0),
+        row(2, "intent", **INTENT | {"doses": 7, "carry_ml": 0.25, "sample": [120.0, 3]}, on_s=135.0),
         row(3, "temperature", temperature=33.5),
         row(4, "sample", doses=99, carry_ml=9.0),
         row(5, "intent", "M1", **INTENT | {"doses": 2}, on_s=140.0),
@@ -58,6 +58,11 @@ def test_a_resumed_run_counts_its_doses_on_and_knows_what_it_put_off() -> None:
     for family in (replay(rows), units([entry | {"id": "run/1"} for entry in rows])):
         assert (family["M0"].doses, family["M0"].carry_ml, family["M0"].temperature) == (7, 0.25, 33.5)
         assert (family["M1"].doses, family["M1"].carry_ml) == (2, 0.1)
+
+
+def test_a_resumed_run_knows_the_sample_and_the_start_of_its_newest_dose() -> None:
+    known = replay([row(k, "intent", **INTENT | {"sample": [60.0 * k, k]}, on_s=75.0 * k) for k in (1, 2)])["M0"]
+    assert (known.sample, known.on_s, known.open) == ((120.0, 2), 150.0, True)
 
 
 def test_a_resumed_run_knows_when_a_unit_was_started_and_which_task_a_dose_was() -> None:

@@ -14,7 +14,7 @@ from envs.plant.plant import Plant, PlantConfig
 from envs.plant.sensor import SensorConfig
 from hardware.emulator.device import plant_preset
 from hardware.reactor import Fault, Measurement, Receipt, Vitals
-from hardware.safety.config import REMEDIES, RESPONSES, Response, Responses, SafetyConfig
+from hardware.safety.config import DONE, REMEDIES, RESPONSES, Response, Responses, SafetyConfig
 from hardware.safety.interlock import Interlock, Verdict, kinds_of
 
 
@@ -55,213 +55,74 @@ class Drive:
             self(od=0.5 + 0.0036 * rng.standard_normal(), **values)
 
 
+def filed(interlock: Interlock) -> Any:
+    """Its state as the file has it."""
+    return json.loads(json.dumps(interlock.state()).replace("-Infinity", "null").replace("NaN", "null"))
+
+
 def only(verdict: Verdict) -> tuple[str, ...]:
     return verdict.kinds[0]
 
 
 # -- every reason ----------------------------------------------------------------------------------------------------
 
+EMPTY, TUBE = {"rate": 0.02}, {"rate": 0.02, "waste_ml": np.zeros(1)}
+TRIGGERS: dict[str, tuple[list[dict[str, Any]], Response]] = {
+    "setpoint": ([{"setpoint": 5.0}], Response.HOLD),
+    "controller": (4 * [{"rate": -0.001}], Response.HOLD),
+    "controller_lost": (5 * [{"rate": np.nan}], Response.REGULATE),
+    "limit": ([{"rate": 0.5}], Response.PASS),
+    "budget": (2 * [EMPTY], Response.HOLD),
+    "bottle": (3 * [EMPTY], Response.HOLD),
+    "overflow": (5 * [TUBE], Response.PUMPS_OFF),
+    "undosed": (4 * [{"rate": 0.02, "dosed": False}], Response.PASS),
+    "impossible": ([{"od": np.nan}], Response.HOLD),
+    "spectrometer": ([{"od": 14.06, "raw": 1.0}], Response.PUMPS_OFF),
+    "frozen": (3 * [{"od": 0.51234567}], Response.HOLD),
+    "jump": ([{"od": 0.65}], Response.HOLD),
+    "falls": ([{"od": 0.2}], Response.PUMPS_OFF),
+    "stale": (2 * [{"fresh": False}], Response.HOLD),
+    "lost": (4 * [{"fresh": False}], Response.PUMPS_OFF),
+    "silent": (12 * [{"fresh": False}], Response.STOP),
+    "hot": ([{"temperature": 45.5, "target": 42.0}], Response.HOLD),
+    "thermometer": (3 * [{"temperature": np.nan}], Response.PASS),
+}
+OF_DEVICES = {
+    **dict.fromkeys(("link", "selection", "absent", "restarted", "stalled", "mode", "blank"), Response.HOLD),
+    **dict.fromkeys(("stopped", "pump"), Response.PUMPS_OFF), "overflow_pump": Response.HOLD, "identity": Response.STOP,
+}  # fmt: skip
+LIMITS = {"budget": (SafetyConfig(ml_per_hour=2.0), None), "bottle": (None, Bench(bottle_ml=2.5)),
+          "silent": (SafetyConfig(silent=10.0), None)}  # fmt: skip
 
-def test_a_healthy_minute_passes_untouched() -> None:
-    drive = Drive()
+
+@pytest.mark.parametrize("kind", TRIGGERS | OF_DEVICES)
+def test_every_reason_is_told_and_answered_as_declared_and_forgotten_unless_it_is_for_good(kind: str) -> None:
+    steps, response = TRIGGERS.get(kind) or ([{"fault": Fault(kind, "seen", "do this")}], OF_DEVICES[kind])
+    drive = Drive(*LIMITS.get(kind, (None, None)))
     verdict = drive()
-    assert verdict.rate[0] == 0.008
-    assert verdict.response[0] == Response.PASS
-    assert verdict.reasons == [None]
-
-
-@pytest.mark.parametrize("setpoint", [5.0, 1.51, 0.0, -0.3, np.nan, np.inf])
-def test_setpoint_typing_error(setpoint: float) -> None:
-    verdict = Drive()(setpoint=setpoint)
-    assert only(verdict) == ("setpoint",)
-    assert verdict.rate[0] == 0.0
+    assert (verdict.rate[0], verdict.response[0], verdict.reasons) == (0.008, Response.PASS, [None])
+    for k, values in enumerate(steps):
+        verdict = drive(**{"od": 0.501 + 0.001 * (k % 7), **values})
+    assert only(verdict)[-1] == kind
+    assert verdict.response[0] == response
+    expected = {"limit": 0.02, "undosed": 0.02, "thermometer": 0.008}
+    assert verdict.rate[0] == expected.get(kind, 0.0)
+    assert verdict.heat_off[0] == (kind in ("hot", "thermometer"))
     assert 0.0 < verdict.setpoint[0] <= 1.5
+    line = str(verdict.reasons[0])
+    assert line.startswith(f"{kind}: ")
+    assert line.endswith("seen; do this; " + DONE[response] if kind in OF_DEVICES else REMEDIES[kind])
+    later = drive(od=0.512, raw=9000.0)
+    assert later.heat_off[0] == verdict.heat_off[0]  # for good
+    if response >= Response.REGULATE:
+        assert later.response[0] == response
+    else:
+        assert later.rate[0] > 0.0 or kind in ("overflow", "bottle", "budget")
 
 
-def test_too_large_a_rate_is_cut_and_told() -> None:
-    verdict = Drive()(rate=0.5)
-    assert verdict.rate[0] == 0.02
-    assert only(verdict) == ("limit",)
-
-
-@pytest.mark.parametrize("rate", [np.nan, np.inf, -np.inf, -0.001])
-def test_a_controller_that_loses_its_mind_is_held_and_then_replaced(rate: float) -> None:
-    drive = Drive()
-    od = iter(0.5 + 0.001 * np.arange(20))
-    for _ in range(4):
-        assert only(drive(od=next(od), rate=rate)) == ("controller",)
-    verdict = drive(od=next(od), rate=rate)
-    assert only(verdict) == ("controller_lost",)
-    assert verdict.response[0] == Response.REGULATE
-    assert drive(od=next(od)).response[0] == Response.REGULATE  # for good
-    assert drive(od=next(od)).rate[0] == 0.0
-
-
-def test_budgets() -> None:
-    hour = Drive(SafetyConfig(ml_per_hour=6.0))
-    fed = sum(60.0 * hour(od=0.5 + 0.001 * (k % 7), rate=0.02).rate[0] for k in range(20))
-    assert fed == pytest.approx(6.0)
-    bottle = Drive(bench=Bench(bottle_ml=2.5))
-    kinds = [only(bottle(od=0.5 + 0.001 * (k % 7), rate=0.02)) for k in range(4)]
-    assert kinds == [(), (), ("bottle",), ("bottle",)]
-    minute = Drive(SafetyConfig(ml_per_minute=2.0))
-    minute(rate=0.02)
-    minute.minute -= 1  # a second sample in the same minute
-    assert only(minute(od=0.501, rate=0.02)) == ("budget",)
-    minute.interlock.budget.book(np.ones(1), np.ones(1), 60.0 * minute.minute)  # a repetition that overdraws it
-    minute.minute -= 1
-    assert only(minute(od=0.502, rate=0.0)) == ()  # nothing was asked
-
-
-def test_the_hour_rolls() -> None:
-    drive = Drive(SafetyConfig(ml_per_hour=12.0))
-    fed = np.array([60.0 * drive(od=0.5 + 0.001 * (k % 7), rate=0.02).rate[0] for k in range(300)])
-    sliding = np.convolve(fed, np.ones(60), mode="valid")
-    assert sliding.max() == pytest.approx(12.0)
-    assert fed[61:].sum() > 40.0
-
-
-def test_feed_without_waste_stops_before_the_vial_is_full() -> None:
-    drive = Drive()
-    verdicts = [drive(od=0.5 + 0.001 * (k % 7), rate=0.02, waste_ml=np.zeros(1)) for k in range(20)]
-    assert drive.interlock.budget.volume_ml[0] <= 25.0
-    assert "overflow" in only(verdicts[-1])
-    assert verdicts[-1].response[0] == Response.PUMPS_OFF
-
-
-@pytest.mark.parametrize(
-    ("values", "kind"),
-    [
-        ({"od": 14.06, "raw": 1.0}, "spectrometer"),
-        ({"od": 11.7}, "spectrometer"),
-        ({"od": 0.0, "raw": 0.0}, "spectrometer"),
-        ({"od": np.nan}, "impossible"),
-        ({"od": np.inf}, "spectrometer"),
-        ({"od": -0.2}, "impossible"),
-        ({"od": 5.0}, "impossible"),
-        ({"od": 0.3, "raw": 65535.0}, "impossible"),
-        ({"od": 0.3, "raw": float("nan")}, "impossible"),
-    ],
-)
-def test_a_reading_no_sensor_gives_never_pumps(values: dict[str, float], kind: str) -> None:
-    drive = Drive()
-    drive()
-    verdict = drive(**values, rate=0.02)
-    assert kind in only(verdict)
-    assert verdict.rate[0] == 0.0
-    assert drive(od=0.505).rate[0] > 0.0  # and is forgotten at the next good one
-
-
-def test_three_equal_readings_are_a_dead_thread() -> None:
-    drive = Drive()
-    kinds = [only(drive(od=0.51234567)) for _ in range(4)]
-    assert kinds == [(), (), ("frozen",), ("frozen",)]
-
-
-def test_a_bubble_is_held_and_a_lasting_step_is_believed_in_the_end() -> None:
-    rng = np.random.default_rng(0)
-    drive = Drive()
-    drive.noisy(10, rng)
-    bubble = [drive(od=0.65 + 0.003 * rng.standard_normal(), rate=0.02) for _ in range(5)]
-    assert all(only(v) == ("jump",) and v.rate[0] == 0.0 for v in bubble)
-    assert drive(od=0.502).rate[0] > 0.0
-    step = [drive(od=0.75 + 0.003 * rng.standard_normal(), rate=0.02) for _ in range(7)]
-    assert [v.rate[0] > 0.0 for v in step] == 6 * [False] + [True]
-
-
-def test_a_pump_that_runs_on_shows_as_an_od_that_falls() -> None:
-    rng = np.random.default_rng(0)
-    drive = Drive()
-    drive.noisy(10, rng)
-    verdict = drive(od=0.2)
-    assert only(verdict) == ("falls",)
-    assert verdict.response[0] == Response.PUMPS_OFF
-    slow = Drive()
-    slow.noisy(30, rng)
-    kinds = [only(slow(od=0.5 * np.exp(-0.03 * k) + 0.003 * rng.standard_normal(), rate=0.0)) for k in range(15)]
-    assert ("falls",) in kinds
-
-
-def test_age_of_the_newest_sample() -> None:
-    drive = Drive(SafetyConfig(silent=10.0))
-    drive()
-    kinds, responses = [], []
-    for _ in range(12):
-        verdict = drive(fresh=False)
-        kinds.append(only(verdict)[0] if only(verdict) else "")
-        responses.append(int(verdict.response[0]))
-        assert verdict.rate[0] == 0.0
-    assert kinds[:4] == ["", "stale", "stale", "lost"]
-    assert kinds[-1] == "silent"
-    assert responses[-1] == Response.STOP
-    assert drive().response[0] == Response.STOP  # given up means given up
-
-
-@pytest.mark.parametrize(
-    "kind",
-    ["link", "selection", "identity", "absent", "restarted", "stopped", "stalled", "mode", "blank", "pump"],
-)
-def test_every_fault_of_a_device_has_a_response_and_never_doses(kind: str) -> None:
-    drive = Drive()
-    verdict = drive(fault=Fault(kind, "seen", "do this"))
-    assert only(verdict) == (kind,)
-    assert verdict.rate[0] == 0.0
-    assert verdict.response[0] >= Response.HOLD
-    assert "seen" in str(verdict.reasons[0])
-    assert "do this" in str(verdict.reasons[0])
-
-
-def test_every_reason_names_what_was_done_and_a_remedy() -> None:
-    text = Drive()(setpoint=5.0).reasons[0]
-    assert text is not None
-    reason, done, remedy = text.split("; ")
-    assert (reason, done, remedy) == ("setpoint: setpoint 5", "no dose", REMEDIES["setpoint"])
-
-
-# -- heat ------------------------------------------------------------------------------------------------------------
-
-
-def test_three_samples_above_target_switch_the_heating_off_for_good() -> None:
-    drive = Drive()
-    off = [bool(drive(od=0.5 + 0.001 * k, temperature=t).heat_off[0]) for k, t in enumerate([37, 39.2, 39.3, 39.5, 37])]
-    assert off == [False, False, False, True, True]
-
-
-def test_42_degrees_twice_or_45_once() -> None:
-    twice, once = Drive(), Drive()
-    assert [bool(twice(od=0.5 + 0.001 * k, temperature=42.5, target=42.0).heat_off[0]) for k in range(2)] == [
-        False,
-        True,
-    ]
-    assert bool(once(temperature=45.5, target=42.0).heat_off[0])
-
-
-def test_a_vial_that_cools_slowly_to_a_lower_target_is_no_alarm_and_a_stuck_heater_is() -> None:
-    cooling, stuck = Drive(), Drive()
-    rng = np.random.default_rng(0)
-    cooling.noisy(5, rng)
-    stuck.noisy(5, rng)
-    for k in range(120):
-        od = 0.5 + 0.0036 * rng.standard_normal()
-        verdict = cooling(od=od, temperature=max(24.0 + 13.0 * np.exp(-k / 53.0), 30.0), target=30.0)
-        assert not verdict.heat_off[0]
-        hot = stuck(od=od, temperature=37.0 + 0.1 * rng.standard_normal(), target=30.0)
-    assert hot.heat_off[0]
-
-
-@pytest.mark.parametrize("reading", [-1.0, 0.0, np.nan, np.inf, 300.0])
-def test_a_thermometer_that_reads_nonsense_or_falls_silent(reading: float) -> None:
-    drive = Drive()
-    drive()
-    verdicts = [drive(od=0.501 + 0.001 * k, temperature=reading) for k in range(3)]
-    assert only(verdicts[-1]) == ("thermometer",)
-    assert verdicts[-1].heat_off[0]
-    assert verdicts[-1].rate[0] > 0.0
-
-
-def test_without_a_thermometer_nothing_is_said() -> None:
-    drive = Drive()
-    assert only(drive(temperature=np.nan, target=np.nan)) == ()
+def test_every_declared_reason_is_tried() -> None:
+    elsewhere = {"no_dilution", "cannot_hold", "fluorescence", "fluorescence_lost", "temperature_limit"}
+    assert set(TRIGGERS) | set(OF_DEVICES) | elsewhere == set(RESPONSES)
 
 
 # -- against a plant -------------------------------------------------------------------------------------------------
@@ -301,6 +162,7 @@ def count(verdicts: list[Verdict], kind: str) -> int:
     return sum(kind in kinds for verdict in verdicts for kinds in verdict.kinds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mu", [0.014, 0.025, 0.031])
 def test_thirty_healthy_reactors_for_a_day_are_left_alone(mu: float) -> None:
     """Only outliers and bubbles are held back: 1.5 % of the minutes at most, nothing latches, no flow alarm."""
@@ -340,7 +202,7 @@ def test_a_pump_at_a_third_is_found_when_the_culture_outgrows_it() -> None:
 # -- attacked --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n, c, bench = 8, SafetyConfig(ml_per_hour=30.0, silent=1e5), Bench(bottle_ml=150.0)
@@ -354,7 +216,7 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> N
         odd = rng.random(n) < 0.15
         return np.where(odd, rng.choice([np.nan, np.inf, -np.inf, 0.0, -1.0, 14.0, 1e300, 5.0], n), values)
 
-    for _ in range(2000):
+    for _ in range(500):
         now += float(rng.choice([0.0, 1.0, 30.0, 60.0, 61.0, 150.0, 5000.0], p=[0.05, 0.1, 0.1, 0.5, 0.2, 0.04, 0.01]))
         fresh, od, rate, setpoint = rng.random(n) < 0.8, strange(0.45, 0.55), strange(0.0, 0.03), strange(0.3, 0.8)
         faults = tuple(Fault("link", "x", "y") if rng.random() < 0.05 else None for _ in range(n))
@@ -383,10 +245,10 @@ def test_thousands_of_random_steps_never_get_a_dose_past_a_limit(seed: int) -> N
         assert np.all(sum(f for t, f in doses if now - t < 60.0) <= 3.0 + 1e-9)
         assert np.all(sum(f for t, f in doses[-200:] if now - t < 3540.0) <= c.ml_per_hour + 1e-9)
         if rng.random() < 0.01:  # the program dies and comes back
-            state = json.loads(json.dumps(interlock.state()).replace("-Infinity", "null").replace("NaN", "null"))
+            state = filed(interlock)
             interlock = Interlock(n, c, bench)
             interlock.restore(state)
-    assert fed.sum() > 10.0
+    assert fed.sum() > 2.0
 
 
 def test_the_saved_state_has_the_fields_that_earlier_runs_wrote() -> None:
@@ -405,7 +267,7 @@ def test_the_saved_state_has_the_fields_that_earlier_runs_wrote() -> None:
 
 def test_one_reactor_of_eight_is_the_same_as_one_alone() -> None:
     rng = np.random.default_rng(3)
-    od = 0.5 + 0.02 * rng.standard_normal((200, 8))
+    od = 0.5 + 0.02 * rng.standard_normal((60, 8))
     od[rng.random(od.shape) < 0.05] = 12.0
     together, alone = Interlock(8), [Interlock(1) for _ in range(8)]
     for k, row in enumerate(od):
@@ -431,7 +293,7 @@ def test_after_a_resume_a_reactor_is_stale_only_once_it_had_its_chance() -> None
 
     before, after = Interlock(2), Interlock(2)
     check(before, 600.0, [True, True], [0.0, 0.0])
-    after.restore(json.loads(json.dumps(before.state()).replace("-Infinity", "null").replace("NaN", "null")))
+    after.restore(filed(before))
     assert check(after, 3000.0, [True, False], [0.0, 20.0]) == ((), ())
     assert check(after, 3060.0, [True, False], [0.0, 80.0]) == ((), ())
     assert check(after, 3105.0, [True, False], [0.0, 125.0]) == ((), ("stale",))
@@ -465,16 +327,6 @@ def test_words_and_ranges_are_checked() -> None:
         Responses(jump="ignore")
     with pytest.raises(ValueError, match=r"safety.responses.falls = report: allowed hold, pumps_off, stop"):
         Responses(falls="report")
-    for key, value in (
-        ("overflow_ml", 11.0),
-        ("lost_s", 1e5),
-        ("drift", 0.0),
-    ):
-        with pytest.raises(ValueError, match=rf"safety\.{key} = .*: allowed"):
-            SafetyConfig(**{key: value})
-    for key, value in (("max_rate", 0.5), ("volume_ml", 4.0), ("bottle_ml", 0.0), ("period_s", 0.0)):
-        with pytest.raises(ValueError, match=rf"bench\.{key} = .*: allowed"):
-            Bench(**{key: value})
     with pytest.raises(ValueError, match=r"bench\.volumes_ml\.M1 = 40.0 mL: allowed 5 to 38"):
         Bench(volumes_ml={"M1": 40.0})
 
@@ -511,8 +363,7 @@ def test_a_pump_too_weak_for_the_setpoint_is_told_for_as_long_as_that_lasts() ->
     first = kinds.index(("cannot_hold",))
     assert first < 40
     assert all(kind == ("cannot_hold",) for kind in kinds[first:])
-    state = json.loads(json.dumps(drive.interlock.state()).replace("-Infinity", "null").replace("NaN", "null"))
-    drive.interlock = Interlock(1)
+    state, drive.interlock = filed(drive.interlock), Interlock(1)
     drive.interlock.restore(state)
     live(10, 0.5, 0.5)
     assert kinds[-8:] == [("cannot_hold",)] * 8
@@ -536,43 +387,12 @@ def test_full_feed_at_the_setpoint_is_no_trouble() -> None:
 
 
 def test_a_state_of_an_earlier_version_is_taken() -> None:
-    state = json.loads(json.dumps(Interlock(2).state()).replace("-Infinity", "null").replace("NaN", "null"))
+    state = filed(Interlock(2))
     del state["_helpless_od"], state["_eased"]
     Interlock(2).restore(state)
     del state["_mu"]
     with pytest.raises(ValueError, match="other fields: _mu"):
         Interlock(2).restore(state)
-
-
-def test_what_happened_a_while_ago_counts_in_its_own_minute_and_hour() -> None:
-    """In whatever order reactors tell of it."""
-    interlock = Interlock(2, SafetyConfig(ml_per_hour=10.0))
-    first, second = np.array([1.0, 0.0]), np.array([0.0, 1.0])
-
-    def book(feed: np.ndarray, at_s: float) -> None:
-        interlock.confirm(Receipt(feed, (), 9.0 * feed), at_s)
-
-    book(first, 7200.0)
-    for k in range(8):
-        book(second, 3661.0 + 63.0 * k)
-    book(second, 3540.0)  # an hour and a minute ago
-    book(first, 7200.0)
-    hour = np.array(interlock.budget._hour)
-    assert hour.sum(axis=1).tolist() == [2.0, 8.0]
-    assert hour[0, 0] == 2.0
-    assert hour[1].max() == 1.0
-    assert interlock.budget.fed_ml.tolist() == [2.0, 9.0]
-    verdict = interlock.check(
-        Measurement(np.full(2, 7260.0), np.full(2, 0.5), np.full(2, 37.0), np.ones(2, bool)),
-        np.full(2, 0.02), np.full(2, 0.4), np.full(2, 37.0), 7260.0,
-    )  # fmt: skip
-    assert verdict.rate.tolist() == [0.02, 0.02]
-    interlock.confirm(Receipt(1.2 * second, (), 9.0 * second), 7260.0)
-    verdict = interlock.check(
-        Measurement(np.full(2, 7320.0), np.full(2, 0.5), np.full(2, 37.0), np.ones(2, bool)),
-        np.full(2, 0.02), np.full(2, 0.4), np.full(2, 37.0), 7320.0,
-    )  # fmt: skip
-    assert verdict.rate.tolist() == [0.02, 0.02]  # what was fed at 3661 s is an hour old by now
 
 
 def test_the_kinds_in_a_line_of_reasons() -> None:

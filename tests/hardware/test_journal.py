@@ -60,7 +60,7 @@ def test_a_torn_end_is_cut_and_told(tmp_path: Path, torn: bytes) -> None:
     assert [row["kind"] for row in read_journal(path)[0]] == ["a", "b", "c"]
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.integers(0, 400))
 def test_a_file_cut_anywhere_keeps_every_whole_row(tmp_path: Path, cut: int) -> None:
     path = tmp_path / "j"
@@ -75,13 +75,6 @@ def test_a_file_cut_anywhere_keeps_every_whole_row(tmp_path: Path, cut: int) -> 
     assert [row["k"] for row in again.rows] == list(range(data.count(b"\n")))
     assert again.cut == len(data) - (data.rfind(b"\n") + 1)
     again.close()
-
-
-def test_a_line_changed_by_hand_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "j"
-    path.write_bytes(b'{"n":0}\nhello\n{"n":2}\n')
-    with pytest.raises(RecordingError, match="line 2"):
-        Journal(path)
 
 
 def test_a_missing_folder_or_file_says_what_to_do(tmp_path: Path) -> None:
@@ -133,30 +126,6 @@ def test_kill_9_loses_no_row_that_was_confirmed(tmp_path: Path) -> None:
         rows, _ = read_journal(path)
         assert [row["k"] for row in rows[: confirmed + 1]] == list(range(confirmed + 1))
         assert json.loads(path.read_bytes().splitlines()[0])["n"] == 0
-
-
-def test_a_long_journal_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Days of eight reactors are hundreds of MB: only landmarks and the end are taken into memory."""
-    journal = Journal(tmp_path / "j", fsync=False)
-    for k in range(500):
-        journal.append("device" if k in (3, 250) else "command", {"k": k})
-    journal.close()
-    with (tmp_path / "j").open("ab") as f:
-        f.write(b'{"n":500,"ki')
-    whole = (tmp_path / "j").stat().st_size
-    monkeypatch.setattr("hardware.storage.journal.TAIL", 4000)
-    again = Journal(tmp_path / "j")
-    kept = [row["k"] for row in again.rows]
-    assert kept[:3] == [0, 3, 250]
-    assert kept[3:] == list(range(kept[3], 500))
-    assert 30 < len(kept) < 60
-    assert (again.cut, again.next_row) == (12, 500)
-    again.append("sample", {"k": 500})
-    again.close()
-    rows, torn = read_journal(tmp_path / "j")
-    assert [row["k"] for row in rows] == list(range(501))
-    assert torn == 0
-    assert (tmp_path / "j").stat().st_size > whole
 
 
 PUMP = "/SetOutputOn/Pump1/1/M4"

@@ -46,7 +46,7 @@ BOUND = {"edges", "_latched", "_hold_kind", "rngs"}  # more is asked of them tha
 LATER = {"one_line", "_helpless_od", "_eased", "_since_low_ml", "_light", "_light_repeats", "_light_s"}
 STREAM: dict[str, Any] = dict(np.random.default_rng(0).bit_generator.state)
 PATH = tuple[Any, ...]
-ONCE = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+ONCE = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 
 NUMBERS = st.one_of(st.integers(), st.just(10**400), st.floats(), st.booleans(), st.none(), st.text(max_size=3))
 JSON = st.recursive(
@@ -129,6 +129,8 @@ def test_what_never_fits_is_refused_by_its_name(place: tuple[str, PATH], value: 
 def test_what_is_missing_is_named(kind: str) -> None:
     whole = written(unused(kind))
     for path in leaves(whole):
+        if kind != "pi" and path[0] != "controller":
+            continue  # all else is the same whoever controls
         state = copy.deepcopy(whole)
         del at(state, path[:-1])[path[-1]]
         if path[-1] in LATER:
@@ -153,6 +155,7 @@ def test_any_value_is_put_back_as_it_is_or_refused(place: tuple[str, PATH], valu
     assert written(loop) == files.plain(expected)
 
 
+@pytest.mark.slow
 @given(st.data())
 @ONCE
 def test_a_memory_of_any_numbers_comes_back_to_the_bit(data: st.DataObject) -> None:
@@ -215,6 +218,7 @@ def test_there_is_one_row_for_each_reactor(key: str) -> None:
         refused("pi", state | {key: rows}, f"{key}: ")
 
 
+@pytest.mark.slow
 def test_every_class_that_remembers_is_tried_here() -> None:
     seen: set[str] = set()
 

@@ -11,21 +11,28 @@ import pytest
 from hardware.chibio.config import ChiBioConfig
 from hardware.chibio.overflow_pump import OverflowPumpConfig
 from hardware.chibio.protocol import parse_state
-from hardware.chibio.resume import replay
 from hardware.emulator.device import DeviceOptions, plant_preset
 from hardware.emulator.server import build, parser
 from hardware.emulator.vial import VialConfig
 from hardware.errors import DeviceStateError
-from tests.hardware.driver_lab import DriverLab
+from tests.hardware.driver_lab import DriverLab, begun
 from tests.hardware.script import state
 
 PUMP = OverflowPumpConfig("Pump3", 0.5)
 
 
+def tubed(pump: OverflowPumpConfig = PUMP) -> DeviceOptions:
+    return DeviceOptions(vial=VialConfig(overflow_pump=pump.pump))
+
+
 def plumbed(pump: OverflowPumpConfig = PUMP, **config: Any) -> DriverLab:
     """Driver and emulated device with a second waste tube."""
-    options = DeviceOptions(vial=VialConfig(overflow_pump=pump.pump))
-    return DriverLab(options=options, overflow_pump=pump, **config)
+    return DriverLab(options=tubed(pump), overflow_pump=pump, **config)
+
+
+def guarded(rate: float | None = None, minutes: float = 0.0) -> DriverLab:
+    """Such a lab whose run began `minutes` ago."""
+    return begun(options=tubed(), overflow_pump=PUMP, rate=rate, minutes=minutes)
 
 
 def posts(lab: DriverLab) -> list[str]:
@@ -44,27 +51,15 @@ def runs(lab: DriverLab) -> bool:
 def test_there_is_none_by_default() -> None:
     assert ChiBioConfig().overflow_pump == OverflowPumpConfig()
     assert not OverflowPumpConfig().pump
-    lab = DriverLab()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = begun(minutes=3)
     lab.reactors.stop()
     assert set(posts(lab)) == {"/SetOutputOn/Pump3/0/M0"}
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"pump": "Pump2"}, "overflow_pump.pump = Pump2: allowed Pump3, Pump4, or '' for none"),
-        ({"pump": "3"}, "overflow_pump.pump = 3: allowed"),
-        ({"pump": "Pump3", "duty": 1.0}, "overflow_pump.duty = 1.0: allowed 0.1 to 0.95"),
-        ({"duty": 0.05}, "overflow_pump.duty = 0.05: allowed"),
-        ({"duty": math.nan}, "overflow_pump.duty = nan: allowed"),
-        ({"flow_ml_s": 0.0}, "overflow_pump.flow_ml_s = 0.0 mL/s: allowed"),
-    ],
-)
-def test_values_out_of_range_name_key_value_and_range(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        OverflowPumpConfig(**values)
+@pytest.mark.parametrize("pump", ["Pump2", "3"])
+def test_only_a_spare_pump_can_be_one(pump: str) -> None:
+    with pytest.raises(ValueError, match=f"overflow_pump.pump = {pump}: allowed Pump3, Pump4, or"):
+        OverflowPumpConfig(pump)
 
 
 @pytest.mark.parametrize(
@@ -90,8 +85,7 @@ def test_what_a_read_shows_of_it(on: int, target: float, seen: str) -> None:
 
 
 def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_the_end() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
+    lab = guarded()
     assert runs(lab)
     assert [(row["pump"], row["duty"], row["found"]) for row in lab.of("guard")] == [("Pump3", 0.5, "off")]
     lab.run(20)
@@ -110,10 +104,7 @@ def test_it_is_verified_on_before_the_first_dose_and_stays_on_over_doses_until_t
 
 
 def test_a_trip_switches_the_others_off_and_leaves_it_on() -> None:
-    lab = plumbed()
-    lab.law.rate = 0.02
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(rate=0.02, minutes=3)
     while not lab.step().rows[0]:
         pass
     lab.clock.sleep(0.5)
@@ -131,9 +122,7 @@ def test_a_trip_switches_the_others_off_and_leaves_it_on() -> None:
     ("path", "found"), [("/SetOutputOn/Pump3/0/M0", "found off"), ("/SetOutputTarget/Pump3/M0/0.1", "a duty of 0.1")]
 )
 def test_another_client_that_changes_it_is_told_of_and_set_right(path: str, found: str) -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(minutes=3)
     lab.device.handle("POST", path)
     lab.run(2)
     assert runs(lab)
@@ -145,10 +134,7 @@ def test_another_client_that_changes_it_is_told_of_and_set_right(path: str, foun
 
 
 def test_a_pump_beside_it_that_someone_switches_on_is_still_found() -> None:
-    lab = plumbed()
-    lab.law.rate = 0.0
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(rate=0.0, minutes=3)
     for path in ("/SetOutputTarget/Pump4/M0/0.1", "/SetOutputOn/Pump4/1/M0"):
         lab.device.handle("POST", path)
     lab.run(3)
@@ -158,10 +144,7 @@ def test_a_pump_beside_it_that_someone_switches_on_is_still_found() -> None:
 
 
 def test_one_that_cannot_be_verified_on_is_an_alarm_with_a_remedy_and_no_dose_is_given() -> None:
-    lab = plumbed()
-    lab.law.rate = 0.0
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(rate=0.0, minutes=3)
     lab.device.handle("POST", "/SetOutputOn/Pump3/0/M0")
     lab.fault("lying", -1)
     lab.law.rate = 0.01
@@ -184,44 +167,39 @@ def test_a_run_does_not_begin_without_it_and_leaves_no_pump_on() -> None:
     lab = plumbed()
     lab.device.handle("POST", "/Experiment/1/M0")
     lab.clock.sleep(90.0)
-    inner = lab.wire.inner
-    real = inner.post
 
-    def deaf(path: str) -> Any:
+    def deaf(path: str, real: Any) -> Any:
         lab.fault("lying", int(path == "/SetOutputOn/Pump3/1/M0"))
         return real(path)
 
-    inner.post = deaf  # type: ignore[method-assign]
+    lab.on_post(deaf)
     with pytest.raises(DeviceStateError, match="Pump3, is off after it was set to 0.5 and on; run the preflight"):
         lab.reactors.begin()
     assert lab.motors_off()
 
 
-def test_a_start_that_fails_at_one_reactor_leaves_no_guard_on_at_another() -> None:
-    options = DeviceOptions(vial=VialConfig(overflow_pump="Pump3"))
-    lab = DriverLab(("M0", "M1"), options=options, overflow_pump=PUMP)
-    lab.device.handle("POST", "/SetOutputOn/Zigzag/1/M1")
-    with pytest.raises(DeviceStateError, match="Zigzag"):
-        lab.reactors.begin()
-    assert lab.device.apps["M0"].data["Pump3"]["target"] == 0.5  # it had been on
-    assert lab.motors_off()
-
-
-@pytest.mark.parametrize("moment", ["/SetOutputOn/Pump3/1/M0", "/Experiment/1/M1", "/SetOutputOn/Pump3/1/M1"])
-def test_ctrl_c_in_the_midst_of_a_start_leaves_it_on_nowhere(moment: str) -> None:
+@pytest.mark.parametrize(
+    ("moment", "error"),
+    [
+        ("/SetOutputOn/Pump3/1/M0", KeyboardInterrupt),
+        ("/Experiment/1/M1", KeyboardInterrupt),
+        ("/SetOutputOn/Pump3/1/M1", KeyboardInterrupt),
+        ("", DeviceStateError),  # the second reactor is in another mode
+    ],
+)
+def test_a_start_that_is_interrupted_or_fails_leaves_it_on_nowhere(moment: str, error: type[BaseException]) -> None:
     """Nobody looks at the bench any more, and it would suck air, or more, for days."""
-    lab = DriverLab(("M0", "M1"), options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3")), overflow_pump=PUMP)
-    inner = lab.wire.inner
-    real = inner.post
+    lab = DriverLab(("M0", "M1"), options=tubed(), overflow_pump=PUMP)
+    lab.device.handle("POST", f"/SetOutputOn/Zigzag/{int(not moment)}/M1")
 
-    def interrupted(path: str) -> Any:
+    def interrupted(path: str, real: Any) -> Any:
         reply = real(path)
         if path == moment:
             raise KeyboardInterrupt
         return reply
 
-    inner.post = interrupted  # type: ignore[method-assign]
-    with pytest.raises(KeyboardInterrupt):
+    lab.on_post(interrupted)
+    with pytest.raises(error):
         lab.reactors.begin()
     assert lab.device.apps["M0"].data["Pump3"]["target"] == 0.5  # it had been on
     assert lab.motors_off()
@@ -234,46 +212,34 @@ def test_a_start_that_fails_and_cannot_switch_it_off_again_says_so() -> None:
     lab = plumbed()
     lab.device.handle("POST", "/Experiment/1/M0")
     lab.clock.sleep(90.0)
-    inner = lab.wire.inner
-    real = inner.post
 
-    def dying(path: str) -> Any:
+    def dying(path: str, real: Any) -> Any:
         reply = real(path)
         if path == "/SetOutputOn/Pump3/1/M0":
             lab.fault("reset_before", -1)
         return reply
 
-    inner.post = dying  # type: ignore[method-assign]
+    lab.on_post(dying)
     with pytest.raises(DeviceStateError, match="reset; pumps not verified off: M0: .*reset.*by hand now"):
         lab.reactors.begin()
 
 
-def test_a_device_that_lost_its_memory_gets_it_back() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
+@pytest.mark.parametrize("trouble", ["restarted", "stopped"])
+def test_a_device_that_lost_its_memory_or_ended_its_experiment_gets_it_back(trouble: str) -> None:
+    lab = guarded(minutes=5)
+    if trouble == "restarted":
+        lab.fault("worker_wipe")
+    else:
+        lab.device.handle("POST", "/Experiment/0/M0")  # its last cycle ends with everything off
     lab.run(5)
-    lab.fault("worker_wipe")
-    lab.run(4)
-    assert "restarted" in lab.kinds()
+    assert trouble in lab.kinds()
     assert runs(lab)
-    assert lab.reactors.stations[0].book.fault is None
-
-
-def test_a_stopped_experiment_keeps_it() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(3)
-    lab.device.handle("POST", "/Experiment/0/M0")
-    lab.run(5)  # its last cycle ends with everything off
-    assert "stopped" in lab.kinds()
-    assert runs(lab)
+    assert (lab.reactors.stations[0].book.fault is None) == (trouble == "restarted")
 
 
 def test_a_start_of_its_own_that_switches_it_off_is_no_change_by_somebody_else() -> None:
     """A cycle thread that died: the experiment is ended and started again, which switches every pump off."""
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(5)
+    lab = guarded(minutes=5)
     before = len(posts(lab))
     lab.fault("cycle_dead")
     lab.run(20)
@@ -284,9 +250,7 @@ def test_a_start_of_its_own_that_switches_it_off_is_no_change_by_somebody_else()
 
 
 def test_one_that_a_new_run_found_on_is_told_of_too_when_somebody_switches_it_off() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(minutes=3)
     lab.client()
     lab.reactors.begin()
     lab.run(3)
@@ -298,9 +262,7 @@ def test_one_that_a_new_run_found_on_is_told_of_too_when_somebody_switches_it_of
 
 
 def test_a_reactor_handed_over_to_its_own_regulation_keeps_it_beyond_the_end_of_the_run() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(5)
+    lab = guarded(minutes=5)
     assert lab.reactors.regulate(np.array([True]), np.array([0.5])) == []
     lab.run(10)
     assert runs(lab)
@@ -314,19 +276,10 @@ def test_a_reactor_handed_over_to_its_own_regulation_keeps_it_beyond_the_end_of_
 # -- resume ----------------------------------------------------------------------------------------------------------
 
 
-def resume(lab: DriverLab, dead_s: float) -> None:
-    began, rows = lab.reactors.elapsed(), json.loads(json.dumps(lab.rows))
-    lab.clock.sleep(dead_s)
-    lab.client()
-    lab.reactors.begin(replay(rows), began + dead_s)
-
-
 def test_a_resumed_run_finds_it_on_and_does_not_interrupt_it() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(minutes=3)
     before = posts(lab)
-    resume(lab, 500.0)
+    lab.resume(500.0)
     lab.run(5)
     assert posts(lab) == before
     assert runs(lab)
@@ -337,12 +290,10 @@ def test_a_resumed_run_finds_it_on_and_does_not_interrupt_it() -> None:
 
 
 def test_a_resumed_run_tells_that_it_was_off_meanwhile() -> None:
-    lab = plumbed()
-    lab.reactors.begin()
-    lab.run(3)
+    lab = guarded(minutes=3)
     for k in (1, 2, 3, 4):  # what the board agent does when nobody asks for two minutes
         lab.device.handle("POST", f"/SetOutputOn/Pump{k}/0/M0")
-    resume(lab, 300.0)
+    lab.resume(300.0)
     lab.run(2)
     assert runs(lab)
     assert ["the overflow pump was found off" in row["note"] for row in lab.of("note")][-1]
@@ -370,11 +321,11 @@ def test_a_feed_motor_stuck_at_full_power_needs_one_that_is_the_stronger_pump(
     pump = OverflowPumpConfig("Pump3", 0.95, flow_ml_s)
     plant = plant_preset("healthy")
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=flow_ml_s))
-    lab = DriverLab(options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), overflow_pump=pump)
-    lab.reactors.begin()
-    lab.run(3)
+    lab = begun(
+        options=DeviceOptions(vial=VialConfig(overflow_pump="Pump3"), plant=plant), overflow_pump=pump, minutes=3
+    )
     lab.fault("feed_stuck_open")
-    lab.run(60)
+    lab.run(15)
     assert "falls" in lab.kinds()
     assert lab.truth()["overflowed"] == overflows
 

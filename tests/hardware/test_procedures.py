@@ -10,12 +10,11 @@ from hardware.chibio.procedures import dose_series, measure_blanks, warm_up
 from hardware.clock import VirtualClock
 from hardware.errors import DeviceStateError, SensorError
 from hardware.reactor import Measurement, Vitals
-from tests.hardware.driver_lab import DriverLab
+from tests.hardware.driver_lab import begun
 
 
 def test_a_blank_is_the_mean_of_the_counts_of_its_own_reactor() -> None:
-    lab = DriverLab(("M0", "M1"), od=0.001, blanked=False)
-    lab.reactors.begin()
+    lab = begun(("M0", "M1"), od=0.001, blanked=False)
     mean, sd = measure_blanks(lab.reactors, 5)
     for i, name in enumerate(lab.names):
         counts = [row["raw"] for row in lab.of("sample") if row["reactor"] == name][:5]
@@ -28,8 +27,7 @@ def test_a_blank_is_the_mean_of_the_counts_of_its_own_reactor() -> None:
 @pytest.mark.parametrize("cold", ["M0", "M1"])
 def test_a_blank_waits_for_the_coldest_vial(cold: str) -> None:
     """One at 37 degC from the start, and one at 27 that its heater warms by 2 degC/min."""
-    lab = DriverLab(("M0", "M1"), od=0.001, blanked=False)
-    lab.reactors.begin()
+    lab = begun(("M0", "M1"), od=0.001, blanked=False)
     lab.device.vials[cold].plant.thermal.reset(27.0)
     lab.device.vials[cold].plant.thermal.set_target(37.0)
     farthest = [degc for _, degc in warm_up(lab.reactors, 0.7, 20.0, every_min=1.0)]
@@ -39,8 +37,7 @@ def test_a_blank_waits_for_the_coldest_vial(cold: str) -> None:
 
 
 def test_no_blank_is_taken_while_something_is_wrong() -> None:
-    lab = DriverLab(od=0.001, blanked=False)
-    lab.reactors.begin()
+    lab = begun(od=0.001, blanked=False)
     before = lab.device.apps["M0"].data["OD0"]["target"]
     lab.clock.sleep(5.0)
     lab.device.handle("POST", "/SetOutputTarget/Pump1/M0/0.01")

@@ -31,20 +31,13 @@ class Bench:
         return believed, self.interlock.check(m, zero, setpoint, np.full(self.n, 33.0), 60.0 * self.minute)
 
 
-def test_where_it_is_not_measured_nothing_is_said() -> None:
-    believed, verdict = Bench().step(None)
-    assert believed is None
-    assert verdict.reasons == [None]
-
-
-def test_a_plausible_reading_passes() -> None:
+@pytest.mark.parametrize(("counts", "seen"), [(0.0, "0 counts"), (65535.0, "65535 counts"), (NAN, "no counts")])
+def test_what_no_working_sensor_gives_is_not_believed_and_said(counts, seen) -> None:
+    believed, verdict = Bench().step(None)  # where it is not measured nothing is said
+    assert (believed, verdict.reasons) == (None, [None])
     believed, verdict = Bench(2).step(1500.0, 1.0)
     np.testing.assert_array_equal(believed, [1500.0, 1.0])
     assert verdict.reasons == [None, None]
-
-
-@pytest.mark.parametrize(("counts", "seen"), [(0.0, "0 counts"), (65535.0, "65535 counts"), (NAN, "no counts")])
-def test_what_no_working_sensor_gives_is_not_believed_and_said(counts, seen) -> None:
     believed, verdict = Bench(2).step(1500.0, counts)
     np.testing.assert_array_equal(believed, [1500.0, NAN])
     assert verdict.kinds == ((), ("fluorescence",))
@@ -53,14 +46,20 @@ def test_what_no_working_sensor_gives_is_not_believed_and_said(counts, seen) -> 
     assert verdict.response.tolist() == [Response.PASS, Response.PASS]
 
 
-def test_the_same_reading_is_believed_until_the_fifth() -> None:
-    bench = Bench()
-    seen = [bench.step(1500.0) for _ in range(6)]
-    assert [bool(np.isfinite(believed[0])) for believed, _ in seen] == [True] * 4 + [False] * 2
-    assert "1500 counts, the same in 5 samples" in str(seen[4][1].reasons[0])
-    believed, verdict = bench.step(1501.0)
-    assert believed[0] == 1501.0
-    assert verdict.reasons == [None]
+@pytest.mark.parametrize(("config", "n"), [({}, 5), *(({"frozen_light": n}, n) for n in (2, 3, 9))])
+def test_the_same_reading_is_believed_until_the_nth(config: dict[str, int], n: int) -> None:
+    bench = Bench(2, **config)
+    seen = [bench.step(1500.0, 700.0 + k) for k in range(n + 1)]
+    assert [np.isfinite(believed).tolist() for believed, _ in seen] == [[True, True]] * (n - 1) + [[False, True]] * 2
+    assert f"1500 counts, the same in {n} samples" in str(seen[n - 1][1].reasons[0])
+    believed, verdict = bench.step(1501.0, 701.0)
+    assert believed.tolist() == [1501.0, 701.0]
+    assert verdict.reasons == [None, None]
+
+
+def test_the_least_light_is_that_which_is_set() -> None:
+    for least, passes in ((1.0, True), (50.0, False)):
+        assert np.isfinite(Bench(light_min=least).step(40.0)[0][0]) == passes
 
 
 def test_a_row_that_is_not_fresh_is_neither_believed_nor_counted() -> None:

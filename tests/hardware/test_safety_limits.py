@@ -122,7 +122,7 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
     given = (c, bench, TUBES, TUBES + 5.0)
     budget, twins, now = FeedBudget(*given), [Ledger(c, bench, tube) for tube in TUBES.tolist()], 0.0
     order = {"controller": 0, "controller_lost": 1, "limit": 2, "undosed": 3, "budget": 4, "bottle": 5, "overflow": 6}
-    for _ in range(200):
+    for _ in range(120):
         now += float(
             rng.choice([5.0, 30.0, 60.0, 61.0, 200.0, 1500.0, 9000.0], p=[0.1, 0.2, 0.4, 0.2, 0.08, 0.01, 0.01])
         )
@@ -154,6 +154,7 @@ def test_the_ledger_is_that_of_a_list_of_doses(limit: str, period_s: float) -> N
     [
         (-0.1, 9000.0, "impossible"), (-0.0999, 9000.0, ""), (3.999, 9000.0, ""), (4.0, 9000.0, "impossible"),
         (10.0, 9000.0, "impossible"), (10.01, 9000.0, "spectrometer"), (0.5, 4.99, "spectrometer"), (0.5, 5.0, ""),
+        (np.inf, 9000.0, "spectrometer"), (0.0, 0.0, "spectrometer"), (14.06, 1.0, "spectrometer"),
         (0.5, 65534.0, ""), (0.5, 65535.0, "impossible"), (0.5, np.nan, "impossible"), (np.nan, 9000.0, "impossible"),
     ],
 )  # fmt: skip
@@ -381,7 +382,7 @@ def test_changes_are_judged_as_sample_by_sample() -> None:
     """Cultures that grow, are fed, stand still or die, pumps that give half or twice, steps, bubbles, gaps."""
     rng = np.random.default_rng(2)
     seen: set[str] = set()
-    for _ in range(10):
+    for _ in range(6):
         change, twins = UnexplainedChange(C, 0.02, TUBES), [Culture(tube) for tube in TUBES.tolist()]
         minute = 0.0
         true = rng.choice([0.04, 0.055, 0.3, 0.5, 1.2], N)
@@ -551,7 +552,8 @@ def test_the_worst_reason_counts_and_what_a_device_says_is_passed_on() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "sound", "target"), [(1.5, True, 1.5), (1.51, False, 0.5), (0.0, False, 0.5), (0.01, True, 0.05)]
+    ("given", "sound", "target"),
+    [(1.5, True, 1.5), (0.01, True, 0.05), *((given, False, 0.5) for given in (1.51, 0.0, -0.3, np.nan, np.inf))],
 )
 def test_the_target_for_the_regulation_on_board_is_a_sane_one(given: float, sound: bool, target: float) -> None:
     interlock = Interlock(1)
@@ -573,11 +575,6 @@ def test_what_is_latched_is_never_loosened_and_only_the_rows_meant() -> None:
     other.latch(Response.REGULATE, np.array([False, True]))
     verdict = other.check(m, np.full(2, 0.01), np.full(2, 0.5), np.full(2, 37.0), 0.0)
     assert verdict.reasons == [None, "handed over to the on-board regulation earlier in this run"]
-
-
-def test_doses_that_are_allowed_and_never_given_are_told() -> None:
-    _, check = one()
-    assert [check(k, 0.5 + 0.001 * k, rate=0.02)[2] for k in range(4)] == [(), (), (), ("undosed",)]
 
 
 def test_plain_lists_will_do() -> None:
@@ -752,18 +749,3 @@ def test_what_was_fed_at_least_is_booked_beside_what_was_fed_at_most() -> None:
     assert state["_since_ml"] == pytest.approx([1.3, 0.8, 0.7])
     assert state["_since_low_ml"] == pytest.approx([0.4, 0.8, 0.3])
     assert state["fed_ml"] == pytest.approx([1.3, 0.8, 0.7])
-
-
-@pytest.mark.parametrize("case", [{"light_min": 50.0}, {"frozen_light": 3}])
-def test_limits_of_the_light_are_settings(case: dict[str, float]) -> None:
-    interlock = Interlock(2, SafetyConfig(**case))  # type: ignore[arg-type]
-    believed = []
-    for k in range(4):
-        light = np.array([1500.0 + k, 40.0 if "light_min" in case else 700.0])
-        m = Measurement(
-            np.full(2, 60.0 * k), np.full(2, 0.5 + 0.001 * k), np.full(2, 33.0), np.ones(2, bool), None, light
-        )
-        believed.append(np.isfinite(interlock.fluorescence(m)).tolist())
-        interlock.check(m, np.zeros(2), np.full(2, 0.5), np.full(2, np.nan), 60.0 * k)
-    assert [first for first, _ in believed] == [True] * 4
-    assert [second for _, second in believed] == ([False] * 4 if "light_min" in case else [True, True, False, False])

@@ -25,6 +25,15 @@ def take(sampling: Sampling, clock: VirtualClock, seen: DeviceState) -> str:
     return sampling.take(seen, clock.now())
 
 
+def started() -> tuple[VirtualClock, Sampling]:
+    """An experiment that was just started, at 1000 s, whose first sample is there now."""
+    clock = VirtualClock(1000.0)
+    sampling = Sampling(CONFIG, clock)
+    sampling.expect_first()
+    clock.sleep(FIRST_SAMPLE_S)
+    return clock, sampling
+
+
 def test_a_sample_is_new_once_and_never_goes_back() -> None:
     clock = VirtualClock()
     sampling = Sampling(CONFIG, clock)
@@ -64,19 +73,6 @@ def test_a_sample_seen_so_late_that_the_next_cycle_had_begun_does_not_hide_the_n
     take(sampling, clock, sample(60.0, 3))
     assert sampling.look(sample(120.0, 3), 0.0)
     assert not sampling.look(sample(0.0, 2), 0.0)
-
-
-def test_when_the_next_look_is() -> None:
-    clock = VirtualClock(500.0)
-    sampling = Sampling(CONFIG, clock)
-    assert sampling.next_poll == sampling.arrived_s == 500.0
-    sampling.look(sample(60.0, 2), 510.0)
-    assert sampling.next_poll == 510.0 + CONFIG.poll_s
-    clock.sleep(20.0)
-    sampling.retry_later()
-    assert sampling.next_poll == 520.0 + CONFIG.retry_s
-    sampling.wait_from_now()
-    assert sampling.next_poll == sampling.arrived_s == 520.0
 
 
 def test_lateness_is_measured_against_the_earliest_of_the_last_three_that_were_waited_for() -> None:
@@ -119,33 +115,17 @@ def test_lateness_is_measured_against_the_earliest_of_the_last_three_that_were_w
 
 @pytest.mark.parametrize(("step_s", "told"), [(64.9, False), (65.0, True), (-29.9, False), (-30.0, True)])
 def test_how_much_lateness_is_a_step_of_a_clock(step_s: float, told: bool) -> None:
-    clock = VirtualClock(1000.0)
-    sampling = Sampling(CONFIG, clock)
-    sampling.expect_first()
-    clock.sleep(FIRST_SAMPLE_S)
+    clock, sampling = started()
     take(sampling, clock, sample(0.0, 1))
     clock.sleep(60.0)
     assert (take(sampling, clock, sample(60.0 - step_s, 2)) != "") == told
 
 
 def test_the_first_sample_of_an_experiment_just_started_has_a_known_age_too() -> None:
-    clock = VirtualClock(1000.0)
-    sampling = Sampling(CONFIG, clock)
-    sampling.expect_first()
-    clock.sleep(FIRST_SAMPLE_S + 1.5)
+    clock, sampling = started()
+    clock.sleep(1.5)
     take(sampling, clock, sample(0.0, 1))
     assert sampling.late_s == 1.5
-
-
-def test_a_step_of_the_boards_clock_is_noted_and_forgotten() -> None:
-    clock = VirtualClock(1000.0)
-    sampling = Sampling(CONFIG, clock)
-    sampling.expect_first()
-    clock.sleep(FIRST_SAMPLE_S)
-    assert take(sampling, clock, sample(0.0, 1)) == ""
-    clock.sleep(60.0)
-    assert take(sampling, clock, sample(360.0, 2)) == "the board's clock moved by 300 s against this computer's"
-    assert sampling.appeared_s == -math.inf
 
 
 def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_time() -> None:
@@ -173,10 +153,7 @@ def test_after_every_step_of_the_boards_clock_lateness_is_counted_by_its_new_tim
 
 def test_what_was_known_of_the_clocks_before_a_restart_says_nothing_of_a_sample_after_it() -> None:
     """Its records begin anew: by the time before, this one would be 20 s old, and a dose fall into a measurement."""
-    clock = VirtualClock(1000.0)
-    sampling = Sampling(CONFIG, clock)
-    sampling.expect_first()
-    clock.sleep(FIRST_SAMPLE_S)
+    clock, sampling = started()
     take(sampling, clock, sample(0.0, 1))
     sampling.pass_over(sample(math.nan, 1))
     clock.sleep(80.0)
@@ -187,6 +164,7 @@ def test_what_was_known_of_the_clocks_before_a_restart_says_nothing_of_a_sample_
 def test_looks_are_as_far_apart_as_is_set() -> None:
     clock = VirtualClock(500.0)
     sampling = Sampling(replace(CONFIG, poll_s=7.0, retry_s=11.0), clock)
+    assert sampling.next_poll == sampling.arrived_s == 500.0
     sampling.look(sample(math.nan, 0), 500.0)
     assert sampling.next_poll == 507.0
     sampling.retry_later()

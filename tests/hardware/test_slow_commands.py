@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,16 +38,15 @@ def check_booked(lab: DriverLab) -> None:
 
 def delayed(lab: DriverLab, seconds: float, path: str, before: bool) -> None:
     """From now on requests of a kind are that slow on their way there, or the answer on its way back."""
-    real = lab.wire.inner.post
 
-    def post(asked: str) -> Reply:
+    def post(asked: str, real: Any) -> Reply:
         late = asked.startswith(path)
         lab.clock.sleep(seconds * late * before)
         reply = real(asked)
         lab.clock.sleep(seconds * late * (not before))
         return reply
 
-    lab.wire.inner.post = post  # type: ignore[method-assign]
+    lab.on_post(post)
 
 
 def cable(lab: DriverLab, out: Callable[[], bool]) -> None:
@@ -197,16 +197,15 @@ def test_one_reactor_that_is_slow_or_silent_does_not_take_its_neighbours_time(se
     lab.law.rate = 0.012
     lab.reactors.begin()
     lab.run(4)
-    real = lab.wire.inner.post
 
-    def post(path: str) -> Reply:
+    def post(path: str, real: Any) -> Reply:
         if path.endswith("/M0"):
             lab.clock.sleep(seconds)
             if fails:
                 raise LinkError(f"{path}: no answer")
         return real(path)
 
-    lab.wire.inner.post = post  # type: ignore[method-assign]
+    lab.on_post(post)
     began, given = lab.clock.now(), [lab.truth(name)["feed_ml"] for name in ("M1", "M2")]
     lab.run(12)
     minutes = (lab.clock.now() - began) / 60.0
