@@ -335,20 +335,6 @@ def test_small_irregular_steps_give_the_same_plant() -> None:
     np.testing.assert_allclose(cut.read_od(), whole.read_od(), rtol=3e-3)
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_vial_i_is_the_same_whatever_n_is(name: str) -> None:
-    config = preset(name)
-    many = plant(config, 8, seed=3)
-    one = Plant(config, 1, [np.random.default_rng(3).spawn(8)[5]])
-    for minute in range(40):
-        on = 0.3 + 0.5 * (minute % 3)
-        many.advance(1.0, on)
-        one.advance(1.0, on)
-        assert many.read_od()[5] == pytest.approx(one.read_od()[0], rel=1e-12)
-    for key, value in many.draws.items():
-        assert value[5] == one.draws[key][0], key
-
-
 def test_noise_does_not_depend_on_what_the_pump_is_told() -> None:
     config = PlantConfig(
         growth=GrowthConfig(drift_sd_per_h=0.1),

@@ -191,17 +191,6 @@ def test_copies_follow_the_model_and_the_reward():
     assert not truncated.any()
 
 
-def test_copy_i_is_the_same_whatever_the_number_of_copies():
-    many, one = BioreactorVectorEnv(8), BioreactorVectorEnv(1)
-    many.reset(seed=5)
-    one.reset(seed=5 + 3)
-    for _ in range(350):
-        many.step(np.full(8, 4))
-        one.step(np.full(1, 4))
-        assert many.od[3] == one.od[0]
-        assert many.setpoint[3] == one.setpoint[0]
-
-
 def test_copies_may_have_seeds_of_their_own():
     """The third with none has a start that differs from time to time."""
     many, one = BioreactorVectorEnv(3), BioreactorVectorEnv(1)
