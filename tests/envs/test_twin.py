@@ -14,7 +14,7 @@ from envs.identification.found import Calibration
 from envs.identification.model import pmse
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
-from envs.identification.twin import Twin, twin
+from envs.identification.twin import Twin, _outliers, _Rows, twin
 from envs.plant.culture import GrowthConfig
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.pump import PumpConfig
@@ -163,11 +163,18 @@ def test_a_pause_in_the_recording_is_not_bridged() -> None:
     np.testing.assert_allclose(own.mu.value, 0.02 + 0.008 * own.knot_min / MINUTES, rtol=0.2)
 
 
-def test_outliers_are_counted_only_where_they_are_far() -> None:
-    time, od, rate = record(replace(TRUTH, sensor=replace(TRUTH.sensor, outlier_rate=0.0)), "threshold", 4)
-    assert found(time, od[0], rate[0])[1].noise.outlier_rate == 0.0
-    od[0, 50:840:100] += 0.1
-    assert found(time, od[0], rate[0])[1].noise.outlier_rate == pytest.approx(8 / 841)
+@pytest.mark.parametrize("every", [2, 3, 5])
+def test_outliers_are_a_share_of_the_readings_and_counted_only_where_they_are_far(every: int) -> None:
+    """One row of `every` holds no reading; the screening has rejected some that are far and some that are near."""
+    od = 0.5 * np.exp(0.002 * np.arange(300.0))
+    od[::every] = np.nan
+    readings = np.flatnonzero(np.isfinite(od))
+    od[readings[7::40]] += 0.05
+    od[readings[20::40]] -= 0.03
+    raw = Series(np.arange(300.0), od, np.zeros(300), np.arange(300))
+    rejected = np.isin(np.arange(300), np.concatenate([readings[7::40], readings[20::40]]))
+    rows = _Rows(raw.rejecting(rejected), [0], np.array([0.0, 299.0]))
+    assert _outliers(rows, np.full(2, 3.0), raw) == pytest.approx(len(readings[7::40]) / len(readings))
 
 
 def test_a_recording_without_noise_has_the_truth_as_its_twin() -> None:
