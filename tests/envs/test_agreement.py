@@ -56,15 +56,13 @@ def test_the_next_reading_is_what_the_model_makes_of_this_one() -> None:
     assert found.rms == pytest.approx(np.sqrt(np.nanmean(error**2)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("hours", [1.5, 8.0])
+@pytest.mark.parametrize("hours", [1.5, pytest.param(8.0, marks=pytest.mark.slow)])
 def test_a_model_that_holds_is_left_alone(hours: float) -> None:
     for found in compared(SOUND, hours, 20):
         assert found.verdict().startswith("No need to recalibrate: the model held to the end of the run")
         assert found.attainable == pytest.approx(found.rms, rel=0.02)
 
 
-@pytest.mark.slow
 def test_growth_that_rises_is_told_from_the_hour_on_at_which_it_matters() -> None:
     """By 4 % an hour: 10 % are reached after 2.5 h, in the second segment of two hours; at the end it is 32 %."""
     for found in compared(replace(SOUND, growth=GrowthConfig(ramp_per_h=0.04)), 8.0):
@@ -79,7 +77,6 @@ def test_growth_that_rises_is_told_from_the_hour_on_at_which_it_matters() -> Non
         assert found.attainable < 0.95 * found.rms
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("flow", "sign"), [(0.7, 1.0), (1.4, -1.0)])
 def test_a_pump_of_another_flow_is_told_throughout(flow: float, sign: float) -> None:
     for found in compared(replace(SOUND, pump=replace(SOUND.pump, gain_ml_s=flow)), 6.0):

@@ -246,6 +246,7 @@ def test_dead_sensor_is_refused(level: float) -> None:
         calibrate(series(s.time, np.full(361, level), s.pump_rate))
 
 
+@pytest.mark.slow
 def test_any_mutilated_recording_ends_in_a_result_or_in_a_reason() -> None:
     """Random cuts, holes, jumps, frozen and wild stretches; warnings are errors here, so NumPy may not even mutter."""
     time, od, pump_rate = open_loop(OpenLoop(), np.random.default_rng(0), 20)

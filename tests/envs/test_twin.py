@@ -35,6 +35,9 @@ TRUTH = PlantConfig(
 )
 LAWS = {"threshold": (0.5,), "pi": (0.6, 0.4, 0.7, 0.5, 0.65, 0.45, 0.6)}  # setpoints, each for an equal time
 SEEDS = 4
+each_law = pytest.mark.parametrize(
+    "law", [pytest.param(law, marks=[pytest.mark.slow, pytest.mark.xdist_group(f"twin_{law}")]) for law in LAWS]
+)
 
 
 def record(config: PlantConfig, law: str, seed: int, n: int = 1) -> tuple[Array, Array, Array]:
@@ -64,7 +67,7 @@ def twins(law: str) -> list[Twin]:
     return [found(time, y, u)[1] for y, u in zip(od, rate, strict=True)]
 
 
-@pytest.mark.parametrize("law", LAWS)
+@each_law
 def test_growth_and_pump_drift_as_the_plants_did(law: str) -> None:
     held = {"mu": [], "tau": []}
     for each in twins(law):
@@ -80,7 +83,7 @@ def test_growth_and_pump_drift_as_the_plants_did(law: str) -> None:
     assert np.mean(held["tau"]) > 0.8
 
 
-@pytest.mark.parametrize("law", LAWS)
+@each_law
 def test_noise_is_the_plants(law: str) -> None:
     noise = [each.noise for each in twins(law)]
     true_sd = np.hypot(0.0033, 0.003 * 0.5)
@@ -90,7 +93,7 @@ def test_noise_is_the_plants(law: str) -> None:
     assert np.mean([n.outlier_rate for n in noise]) == pytest.approx(0.006, abs=0.002)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@each_law
 def test_the_twin_fed_as_the_recording_was_runs_along_it(law: str) -> None:
     """Fourteen hours from one start: an error of 1 % in mu alone would end 20 % off."""
     time, od, rate = record(TRUTH, law, 1)
@@ -104,7 +107,7 @@ def test_the_twin_fed_as_the_recording_was_runs_along_it(law: str) -> None:
     assert pmse(result.screened.series.od, seen) < 1.0
 
 
-@pytest.mark.parametrize("law", LAWS)
+@each_law
 def test_a_twin_of_a_twin_is_the_twin(law: str) -> None:
     time, od, rate = record(TRUTH, law, 2)
     _, first = found(time, od[0], rate[0])
@@ -123,7 +126,8 @@ def test_a_twin_of_a_twin_is_the_twin(law: str) -> None:
 
 
 def test_the_file_is_the_plant_with_its_bands_beside_it() -> None:
-    own = twins("threshold")[0]
+    time, od, rate = record(TRUTH, "threshold", 1)
+    _, own = found(time, od[0], rate[0])
     text = twin_yaml(own, "some.csv")
     assert build(PlantConfig(), yaml.safe_load(text), "plant") == plant_of(own)
     assert max(map(len, text.splitlines()[:8])) <= 120

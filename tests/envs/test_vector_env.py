@@ -23,6 +23,7 @@ def test_gymnasium_checks_the_single_environment():
     check_env(gymnasium.make(ID).unwrapped)
 
 
+@pytest.mark.slow
 def test_stable_baselines_checks_the_single_environment():
     checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs the extra [bench]")
     checker.check_env(gymnasium.make(ID).unwrapped, warn=True)
@@ -331,6 +332,7 @@ def test_a_start_that_there_is_not_is_refused_and_changes_nothing(options, words
     np.testing.assert_array_equal(env.unwrapped.state.astype(np.float32), before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(REGISTERED))
 def test_stable_baselines_opens_every_task_by_its_name(name):
     """It asks for a way to draw first, and does without one only after a TypeError."""
