@@ -53,10 +53,6 @@ def test_nominal_is_the_training_model() -> None:
     np.testing.assert_array_equal(p.vessel.volume_ml, 20.0)
 
 
-def test_nominal_preset_equals_the_defaults() -> None:
-    assert preset("nominal") == PlantConfig()
-
-
 @pytest.mark.parametrize("minutes", [0.5, 1.0, 1.5, 4.5])
 def test_an_even_feed_dilutes_as_fast_in_an_interval_of_any_length(minutes: float) -> None:
     """x' = (mu - u / tau) x at 0.02 mL/s: 0.06 1/min are washed out while 0.03 grow."""
