@@ -40,12 +40,12 @@ each_law = pytest.mark.parametrize(
 )
 
 
-def record(config: PlantConfig, law: str, seed: int, n: int = 1) -> tuple[Array, Array, Array]:
+def record(config: PlantConfig, law: str, seed: int, n: int = 1, minutes: int = MINUTES) -> tuple[Array, Array, Array]:
     """Minutes (T,), OD and pump rate (N, T) of vials under a law, as a device would record them."""
     plant, goals = Plant(config, n, np.random.default_rng(seed)), LAWS[law]
     controller = ChiBioPI(ChiBioPIConfig()) if law == "pi" else Threshold(ThresholdConfig())
     controller.reset(n)
-    time = np.arange(MINUTES + 1.0)
+    time = np.arange(minutes + 1.0)
     od, rate = np.empty((n, time.size)), np.empty((n, time.size))
     for i, minute in enumerate(time):
         goal = goals[min(i * len(goals) // MINUTES, len(goals) - 1)]
@@ -125,6 +125,7 @@ def test_a_twin_of_a_twin_is_the_twin(law: str) -> None:
     assert ratio == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.slow
 def test_the_file_is_the_plant_with_its_bands_beside_it() -> None:
     time, od, rate = record(TRUTH, "threshold", 1)
     _, own = found(time, od[0], rate[0])
@@ -140,8 +141,8 @@ def test_the_file_is_the_plant_with_its_bands_beside_it() -> None:
 
 def test_a_twin_begins_at_the_od_and_the_rows_of_its_recording() -> None:
     """Five hours from 0.15, not from the OD that plants have by default; in a file they stand at rows 50 to 349."""
-    time, od, rate = record(replace(TRUTH, start_od=0.15), "threshold", 1)
-    raw = Series(time[:300], od[0, :300], rate[0, :300], 50 + np.arange(300))
+    time, od, rate = record(replace(TRUTH, start_od=0.15), "threshold", 1, minutes=299)
+    raw = Series(time, od[0], rate[0], 50 + np.arange(300))
     own = twin(raw, calibrate(raw), 120.0)
     text = twin_yaml(own, "a.csv")
     assert build(PlantConfig(), yaml.safe_load(text), "plant").start_od == pytest.approx(0.15, rel=0.04)
@@ -149,8 +150,8 @@ def test_a_twin_begins_at_the_od_and_the_rows_of_its_recording() -> None:
 
 
 def test_a_short_recording_has_one_tau_and_says_so() -> None:
-    time, od, rate = record(TRUTH, "threshold", 1)
-    result, own = found(time[:300], od[0, :300], rate[0, :300])
+    time, od, rate = record(TRUTH, "threshold", 1, minutes=299)
+    result, own = found(time, od[0], rate[0])
     assert not own.drifts
     np.testing.assert_allclose(own.tau.value, result.tau.value)
     assert "does not show its drift" in twin_yaml(own, "a.csv").replace("\n# ", " ")
@@ -159,7 +160,7 @@ def test_a_short_recording_has_one_tau_and_says_so() -> None:
 
 def test_a_pause_in_the_recording_is_not_bridged() -> None:
     """Eight hours, of which nobody recorded the fifth: the culture was diluted by half meanwhile."""
-    time, od, rate = record(TRUTH, "threshold", 3)
+    time, od, rate = record(TRUTH, "threshold", 3, minutes=540)
     kept = (time < 240.0) | ((time >= 300.0) & (time < 540.0))
     od = np.where(time < 300.0, od[0], 0.5 * od[0])[kept]
     _, own = found(time[kept], od, rate[0][kept])
@@ -191,7 +192,7 @@ def test_a_recording_without_noise_has_the_truth_as_its_twin() -> None:
 
 
 def test_a_clock_that_does_not_begin_at_zero_changes_nothing() -> None:
-    time, od, rate = record(TRUTH, "threshold", 3)
+    time, od, rate = record(TRUTH, "threshold", 3, minutes=300)
     _, own = found(time, od[0], rate[0])
     _, late = found(time + 1234.0, od[0], rate[0])
     np.testing.assert_allclose(late.tau.value, own.tau.value, rtol=1e-6)
