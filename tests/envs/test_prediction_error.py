@@ -178,7 +178,13 @@ def test_noise_model_of_the_prior() -> None:
     assert (z.mixing <= np.minimum(z.late, 0.7)).all()
 
 
-@pytest.mark.parametrize(("law", "hours"), [("threshold", 6.0), ("pi", 24.0), ("threshold", 72.0)])
+@pytest.mark.parametrize(
+    ("law", "hours"),
+    [
+        ("threshold", 6.0),
+        *(pytest.param(*long, marks=pytest.mark.slow) for long in (("pi", 24.0), ("threshold", 72.0))),
+    ],
+)
 def test_points_carry_the_average_at_any_length(law: str, hours: float) -> None:
     """A second seed moves the ends by a quarter of a half width at most."""
     draw = regulated(1, law, hours, dose_cv=0.1, growth_cv=0.1)
@@ -189,6 +195,7 @@ def test_points_carry_the_average_at_any_length(law: str, hours: float) -> None:
         assert moved < 0.25 * first.inverse_tau.half_width
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stirring", [20.0, 60.0])
 def test_a_vial_that_mixes_slowly_moves_nothing(stirring: float) -> None:
     """The sensor sees what first-order mixing has brought to it, simulated here in steps of a second."""
@@ -286,6 +293,7 @@ def test_mean_growth_is_that_of_the_rows() -> None:
 # ---------------------------------------------------------------- refusals and warnings
 
 
+@pytest.mark.slow
 def test_a_proportional_law_is_refused_with_the_remedy() -> None:
     """Dose response and correlation of the readings are one here: mu would be several times too high."""
     refused = 0
@@ -296,6 +304,7 @@ def test_a_proportional_law_is_refused_with_the_remedy() -> None:
     assert refused == 8
 
 
+@pytest.mark.slow
 def test_stopping_the_pump_for_ten_minutes_every_hour_is_a_remedy() -> None:
     protocol = OpenLoop(mu=MU, tau=TAU, start_od=0.5, dose_cv=0.1, growth_cv=0.05, seed=9)
     time, od, pump_rate, _ = simulated(CalibrateConfig(law="proportional", rest_min=10.0, protocol=protocol), 10)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from envs.identification.screening import GAP_MIN, Screened, Series, row_spans, screen
+from envs.identification.screening import GAP_MIN, WEEK_MIN, Screened, Series, merged, row_spans, screen
 
 ROWS = 200
 
@@ -92,3 +92,21 @@ def test_ten_readings_above_zero_are_needed(left: int, enough: bool) -> None:
 )
 def test_rows_as_text(rows: list[int], text: str) -> None:
     assert row_spans(np.array(list(rows), dtype=np.int64)) == text
+
+
+@pytest.mark.parametrize(("per_minute", "lost"), [(3, 0.0), (3, 0.4), (5, 0.3), (8, 0.9)])
+def test_a_merged_minute_holds_the_median_of_the_readings_it_has(per_minute: int, lost: float) -> None:
+    """Of an even number the lower one of the two; no reading where there is none; volume and times are kept."""
+    rng, n = np.random.default_rng(per_minute), 2 * WEEK_MIN - 1
+    od = np.where(rng.random(n) < lost, np.nan, rng.uniform(0.1, 1.0, n))
+    rate = rng.choice([0.0, 0.01, 0.02], n)
+    found = merged(Series(90.0 + np.arange(n) / per_minute, od, rate, 11 + np.arange(n)))
+    minutes = [slice(k, k + per_minute) for k in range(0, n, per_minute)]
+    for i, of_minute in enumerate(minutes):
+        known = sorted(od[of_minute][np.isfinite(od[of_minute])])
+        np.testing.assert_equal(found.od[i], known[(len(known) - 1) // 2] if known else np.nan)
+        held = range(n)[of_minute]
+        assert (found.row[i], found.time[i]) == (11 + held[0], 90.0 + held[(len(held) - 1) // 2] / per_minute)
+    first, last = ((range(n)[m][0] + range(n)[m][-1]) // 2 for m in (minutes[0], minutes[-1]))
+    moved = np.sum(found.pump_rate[:-1] * np.diff(found.time))
+    assert moved == pytest.approx(rate[first:last].sum() / per_minute)

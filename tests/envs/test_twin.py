@@ -14,7 +14,7 @@ from envs.identification.found import Calibration
 from envs.identification.model import pmse
 from envs.identification.open_loop import OpenLoop, open_loop
 from envs.identification.screening import Series
-from envs.identification.twin import Twin, twin
+from envs.identification.twin import Twin, _outliers, _Rows, twin
 from envs.plant.culture import GrowthConfig
 from envs.plant.plant import Plant, PlantConfig
 from envs.plant.pump import PumpConfig
@@ -35,14 +35,17 @@ TRUTH = PlantConfig(
 )
 LAWS = {"threshold": (0.5,), "pi": (0.6, 0.4, 0.7, 0.5, 0.65, 0.45, 0.6)}  # setpoints, each for an equal time
 SEEDS = 4
+each_law = pytest.mark.parametrize(
+    "law", [pytest.param(law, marks=[pytest.mark.slow, pytest.mark.xdist_group(f"twin_{law}")]) for law in LAWS]
+)
 
 
-def record(config: PlantConfig, law: str, seed: int, n: int = 1) -> tuple[Array, Array, Array]:
+def record(config: PlantConfig, law: str, seed: int, n: int = 1, minutes: int = MINUTES) -> tuple[Array, Array, Array]:
     """Minutes (T,), OD and pump rate (N, T) of vials under a law, as a device would record them."""
     plant, goals = Plant(config, n, np.random.default_rng(seed)), LAWS[law]
     controller = ChiBioPI(ChiBioPIConfig()) if law == "pi" else Threshold(ThresholdConfig())
     controller.reset(n)
-    time = np.arange(MINUTES + 1.0)
+    time = np.arange(minutes + 1.0)
     od, rate = np.empty((n, time.size)), np.empty((n, time.size))
     for i, minute in enumerate(time):
         goal = goals[min(i * len(goals) // MINUTES, len(goals) - 1)]
@@ -64,7 +67,7 @@ def twins(law: str) -> list[Twin]:
     return [found(time, y, u)[1] for y, u in zip(od, rate, strict=True)]
 
 
-@pytest.mark.parametrize("law", LAWS)
+@each_law
 def test_growth_and_pump_drift_as_the_plants_did(law: str) -> None:
     held = {"mu": [], "tau": []}
     for each in twins(law):
@@ -80,7 +83,7 @@ def test_growth_and_pump_drift_as_the_plants_did(law: str) -> None:
     assert np.mean(held["tau"]) > 0.8
 
 
-@pytest.mark.parametrize("law", LAWS)
+@each_law
 def test_noise_is_the_plants(law: str) -> None:
     noise = [each.noise for each in twins(law)]
     true_sd = np.hypot(0.0033, 0.003 * 0.5)
@@ -90,7 +93,7 @@ def test_noise_is_the_plants(law: str) -> None:
     assert np.mean([n.outlier_rate for n in noise]) == pytest.approx(0.006, abs=0.002)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@each_law
 def test_the_twin_fed_as_the_recording_was_runs_along_it(law: str) -> None:
     """Fourteen hours from one start: an error of 1 % in mu alone would end 20 % off."""
     time, od, rate = record(TRUTH, law, 1)
@@ -104,7 +107,7 @@ def test_the_twin_fed_as_the_recording_was_runs_along_it(law: str) -> None:
     assert pmse(result.screened.series.od, seen) < 1.0
 
 
-@pytest.mark.parametrize("law", LAWS)
+@each_law
 def test_a_twin_of_a_twin_is_the_twin(law: str) -> None:
     time, od, rate = record(TRUTH, law, 2)
     _, first = found(time, od[0], rate[0])
@@ -122,8 +125,10 @@ def test_a_twin_of_a_twin_is_the_twin(law: str) -> None:
     assert ratio == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.slow
 def test_the_file_is_the_plant_with_its_bands_beside_it() -> None:
-    own = twins("threshold")[0]
+    time, od, rate = record(TRUTH, "threshold", 1)
+    _, own = found(time, od[0], rate[0])
     text = twin_yaml(own, "some.csv")
     assert build(PlantConfig(), yaml.safe_load(text), "plant") == plant_of(own)
     assert max(map(len, text.splitlines()[:8])) <= 120
@@ -136,8 +141,8 @@ def test_the_file_is_the_plant_with_its_bands_beside_it() -> None:
 
 def test_a_twin_begins_at_the_od_and_the_rows_of_its_recording() -> None:
     """Five hours from 0.15, not from the OD that plants have by default; in a file they stand at rows 50 to 349."""
-    time, od, rate = record(replace(TRUTH, start_od=0.15), "threshold", 1)
-    raw = Series(time[:300], od[0, :300], rate[0, :300], 50 + np.arange(300))
+    time, od, rate = record(replace(TRUTH, start_od=0.15), "threshold", 1, minutes=299)
+    raw = Series(time, od[0], rate[0], 50 + np.arange(300))
     own = twin(raw, calibrate(raw), 120.0)
     text = twin_yaml(own, "a.csv")
     assert build(PlantConfig(), yaml.safe_load(text), "plant").start_od == pytest.approx(0.15, rel=0.04)
@@ -145,8 +150,8 @@ def test_a_twin_begins_at_the_od_and_the_rows_of_its_recording() -> None:
 
 
 def test_a_short_recording_has_one_tau_and_says_so() -> None:
-    time, od, rate = record(TRUTH, "threshold", 1)
-    result, own = found(time[:300], od[0, :300], rate[0, :300])
+    time, od, rate = record(TRUTH, "threshold", 1, minutes=299)
+    result, own = found(time, od[0], rate[0])
     assert not own.drifts
     np.testing.assert_allclose(own.tau.value, result.tau.value)
     assert "does not show its drift" in twin_yaml(own, "a.csv").replace("\n# ", " ")
@@ -155,7 +160,7 @@ def test_a_short_recording_has_one_tau_and_says_so() -> None:
 
 def test_a_pause_in_the_recording_is_not_bridged() -> None:
     """Eight hours, of which nobody recorded the fifth: the culture was diluted by half meanwhile."""
-    time, od, rate = record(TRUTH, "threshold", 3)
+    time, od, rate = record(TRUTH, "threshold", 3, minutes=540)
     kept = (time < 240.0) | ((time >= 300.0) & (time < 540.0))
     od = np.where(time < 300.0, od[0], 0.5 * od[0])[kept]
     _, own = found(time[kept], od, rate[0][kept])
@@ -163,11 +168,18 @@ def test_a_pause_in_the_recording_is_not_bridged() -> None:
     np.testing.assert_allclose(own.mu.value, 0.02 + 0.008 * own.knot_min / MINUTES, rtol=0.2)
 
 
-def test_outliers_are_counted_only_where_they_are_far() -> None:
-    time, od, rate = record(replace(TRUTH, sensor=replace(TRUTH.sensor, outlier_rate=0.0)), "threshold", 4)
-    assert found(time, od[0], rate[0])[1].noise.outlier_rate == 0.0
-    od[0, 50:840:100] += 0.1
-    assert found(time, od[0], rate[0])[1].noise.outlier_rate == pytest.approx(8 / 841)
+@pytest.mark.parametrize("every", [2, 3, 5])
+def test_outliers_are_a_share_of_the_readings_and_counted_only_where_they_are_far(every: int) -> None:
+    """One row of `every` holds no reading; the screening has rejected some that are far and some that are near."""
+    od = 0.5 * np.exp(0.002 * np.arange(300.0))
+    od[::every] = np.nan
+    readings = np.flatnonzero(np.isfinite(od))
+    od[readings[7::40]] += 0.05
+    od[readings[20::40]] -= 0.03
+    raw = Series(np.arange(300.0), od, np.zeros(300), np.arange(300))
+    rejected = np.isin(np.arange(300), np.concatenate([readings[7::40], readings[20::40]]))
+    rows = _Rows(raw.rejecting(rejected), [0], np.array([0.0, 299.0]))
+    assert _outliers(rows, np.full(2, 3.0), raw) == pytest.approx(len(readings[7::40]) / len(readings))
 
 
 def test_a_recording_without_noise_has_the_truth_as_its_twin() -> None:
@@ -180,7 +192,7 @@ def test_a_recording_without_noise_has_the_truth_as_its_twin() -> None:
 
 
 def test_a_clock_that_does_not_begin_at_zero_changes_nothing() -> None:
-    time, od, rate = record(TRUTH, "threshold", 3)
+    time, od, rate = record(TRUTH, "threshold", 3, minutes=300)
     _, own = found(time, od[0], rate[0])
     _, late = found(time + 1234.0, od[0], rate[0])
     np.testing.assert_allclose(late.tau.value, own.tau.value, rtol=1e-6)

@@ -76,6 +76,7 @@ def test_a_window_ends_where_growth_steps() -> None:
     assert result.verdict.word == "use with care"
 
 
+@pytest.mark.slow
 def test_growth_that_wanders_is_no_step() -> None:
     for seed in range(4):
         result = calibrate(recorded("threshold", seed, hours=14.0, wander=0.1))
@@ -90,6 +91,7 @@ def test_doses_that_spread_and_a_vial_that_mixes_slowly_are_told() -> None:
     assert late.estimate.quality.late_share.low <= 0.9 <= late.estimate.quality.late_share.high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wander", [0.0, 0.1])
 def test_the_report_has_the_spread_of_doses_and_growth(wander: float) -> None:
     """The mean over an hour of growth that forgets in 30 min has the sd of its formula."""
@@ -381,6 +383,7 @@ def test_seed_of_the_average_is_a_setting() -> None:
     assert other.tau.value == pytest.approx(again.tau.value, abs=0.25 * again.tau.half_width)
 
 
+@pytest.mark.slow
 def test_protocol_of_the_first_simulator_is_the_second_ones() -> None:
     """Two simulators of one law that share no code: the same estimate on average."""
     from experiments.calibration.config import CalibrateConfig
