@@ -25,6 +25,8 @@ from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.web import NotHeard
 from hardware.reactor import Command, Measurement
+from hardware.safety.budget import FeedBudget
+from hardware.safety.config import SafetyConfig
 
 UNIT, EXPERIMENT, MEDIA_PIN, WASTE_PIN = "pio01", "turbidostat", 13, 12
 PINS = {"add_media": MEDIA_PIN, "remove_waste": WASTE_PIN}
@@ -536,3 +538,11 @@ class Lab:
         """Least and most medium by the journal, mL."""
         rows = [row for row in self.rows if row["kind"] in ("dose_end", "given")]
         return sum(row["feed_low_ml"] for row in rows), sum(row["feed_ml"] for row in rows)
+
+    def ledger(self, planned_ml: float) -> FeedBudget:
+        """What the interlock has booked: a dose when it began, with all that the driver said of it since."""
+        budget = FeedBudget(SafetyConfig(), self.bench, np.full(1, self.bench.volume_ml), np.full(1, 1e3))
+        budget.book(np.array([planned_ml]), np.array([2.0 * planned_ml]), 0.0)
+        for at, receipt in self.reactors.repeated():
+            budget.book(receipt.volume_ml, receipt.waste_ml, at)
+        return budget

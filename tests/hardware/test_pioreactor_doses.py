@@ -6,11 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from envs.bench import Bench
 from hardware.errors import DeviceStateError, LinkError, RecordingError
+from hardware.pioreactor.pumps import LATE_ML
 from hardware.pioreactor.resume import History, replay
-from hardware.safety.budget import FeedBudget
-from hardware.safety.config import SafetyConfig
 from hardware.storage.doses import dosed
 from hardware.storage.journal import Journal
 from tests.hardware.pioreactor_lab import FLOW, MEDIA_PIN, UNIT, WASTE_PIN, Lab, World
@@ -64,13 +62,15 @@ def test_a_rate_that_is_none_is_refused(lab, rate):
 # -- the list of what is odd -------------------------------------------------------------------------------------------
 
 
-def test_samples_go_on_while_the_fate_of_a_dose_is_open(lab):
+def test_samples_go_on_while_the_fate_of_a_dose_is_open(monkeypatch):
+    lab = Lab(monkeypatch, period_s=30.0)
+    lab.begin()
+    lab.sample()
     lab.world.queue = False
     lab.dose(0.5)
     before = len(lab.of("sample"))
-    for _ in range(30):
+    for _ in range(10):
         lab.reactors.measure()
-        lab.wait(10.0)
     assert not lab.of("dose_end")
     assert len(lab.of("sample")) >= before + 4
     assert len(lab.asked("add_media")) == 1
@@ -190,10 +190,13 @@ def test_stop_ends_jobs_is_verified_and_tells_how_much_was_moved(lab, pin):
     assert end["waste_high_ml"] == pytest.approx(truth["remove_waste"], abs=0.2)
 
 
-def test_stop_that_cannot_be_verified_says_which_plug(lab):
+@pytest.mark.parametrize("broker", [True, False])
+def test_stop_that_cannot_be_verified_says_which_plug(lab, broker):
     lab.world.kill_after_s = 0.2
     lab.dose(0.5)
     lab.wait(1.0)
+    if not broker:
+        lab.world.lose_broker(1e6)
     with pytest.raises(DeviceStateError, match="pull the plug"):
         lab.reactors.stop()
     assert not lab.asked("remove_waste"), "no pump is started by a stop, and none goes on after it"
@@ -219,13 +222,18 @@ def test_what_a_media_pump_gave_too_much_is_drained_also_while_pumps_are_off_and
 
 @pytest.mark.parametrize("version", ["25.11.19", "26.7.2"])
 @pytest.mark.parametrize("away_s", [0.5, 90.0, 9 * 3600.0])
-def test_a_dose_left_open_is_counted_at_most_whole_and_never_sent_again(monkeypatch, version, away_s):
-    """Whatever time passed: not by the time that nobody watched."""
+@pytest.mark.parametrize("pin", [MEDIA_PIN, WASTE_PIN])
+def test_a_dose_left_open_is_counted_at_most_whole_and_never_sent_again(monkeypatch, version, away_s, pin):
+    """Whatever time passed: not by the time that nobody watched. In its waste the unit loses its power, too."""
     lab = Lab(monkeypatch, World(version))
     lab.begin()
     lab.sample()
     lab.dose(0.8)
-    lab.wait(0.6)
+    lab.until(lambda: pin in lab.world.since, 10.0)
+    lab.wait(0.2)
+    if pin == WASTE_PIN:
+        lab.world.cut()
+        lab.world.power()
     rows, world = list(lab.rows), lab.world
     assert replay(rows)[UNIT].open
     world.box = None
@@ -237,6 +245,7 @@ def test_a_dose_left_open_is_counted_at_most_whole_and_never_sent_again(monkeypa
     assert took <= 100.0
     (end,) = again.of("dose_end")
     assert end["feed_low_ml"] <= world.truth["add_media"] <= end["feed_ml"] + 0.02
+    assert end["waste_ml"] <= world.truth["remove_waste"] + 1e-6
     assert end["feed_ml"] <= 0.85
     assert len(again.asked("add_media")) == 1
     assert again.fault is None
@@ -429,18 +438,48 @@ def test_after_a_stop_the_ledger_of_a_flooded_vial_stands_at_its_rim(monkeypatch
     lab.begin()
     lab.sample()
     lab.world.freeze_after_s, lab.world.frozen_s = 0.6, 29.0
-    budget = FeedBudget(SafetyConfig(), lab.bench, np.full(1, volume_ml), np.full(1, 50.0))
     planned = lab.dose(0.7)
-    budget.book(np.array([planned]), np.array([2.0 * planned]), 0.0)
     lab.until(lambda: bool(lab.world.since), 5.0)
     lab.wait(0.8)
     lab.reactors.config = replace(lab.reactors.config, stop_s=60.0)
     lab.reactors.stop()
-    for at, receipt in lab.reactors.repeated():
-        budget.book(receipt.volume_ml, receipt.waste_ml, at)
+    ledger = lab.ledger(planned)
     assert lab.world.truth["add_media"] > 15.0
-    assert float(budget.fed_ml[0]) >= lab.world.truth["add_media"] - 0.1
-    assert float(budget.volume_ml[0]) == pytest.approx(rim_ml, abs=0.01)
+    assert float(ledger.fed_ml[0]) >= lab.world.truth["add_media"] - 0.1
+    assert float(ledger.volume_ml[0]) == pytest.approx(rim_ml, abs=0.01)
+
+
+def test_a_drain_that_the_broker_and_then_the_end_of_a_run_cut_is_booked_with_the_least_that_it_took(lab):
+    lab.world.freeze_after_s, lab.world.frozen_s = 0.6, 4.0
+    planned = lab.dose(0.7)
+    lab.until(lambda: WASTE_PIN in lab.world.since, 20.0)
+    lab.wait(0.5)
+    lab.world.lose_broker(2.0)
+    lab.reactors.stop()
+    assert lab.world.level_ml > 21.5
+    assert float(lab.ledger(planned).volume_ml[0]) >= lab.world.level_ml - 0.1
+
+
+@pytest.mark.parametrize("of", ["media", "waste", "drain"])
+def test_an_event_that_comes_after_the_end_of_its_pump_is_booked_as_far_as_it_was_not(lab, of):
+    """Of medium what was booked is the most that it gave, of waste the least that it took; somebody had stopped it."""
+    world, pump = lab.world, "add_media" if of == "media" else "remove_waste"
+    if of == "drain":
+        world.freeze_after_s, world.frozen_s = 0.6, 4.0
+    lab.dose(1.4)
+    lab.until(lambda: any(of != "drain" or "drain" in o["source-of-event"] for o in lab.asked(pump)), 20.0)
+    lab.until(lambda: pump in world.run_now, 5.0)
+    lab.wait(0.8)
+    world.run_now[pump][0] = True
+    source = lab.asked(pump)[-1]["source-of-event"]
+    lab.until(lambda: not lab.station.doses.running, 30.0)
+    (end,), reported = lab.of("dose_end"), lab.station._pumps.reported[pump, source]
+    booked = {"media": end["feed_ml"], "waste": end["waste_ml"], "drain": reported - LATE_ML}[of]
+    volume, before = "feed_ml" if of == "media" else "waste_ml", len(lab.of("given"))
+    for ml in (0.3, 0.9):
+        world.event(pump, ml, source)
+        lab.wait(1.0)
+    assert sum(row[volume] for row in lab.of("given")[before:]) == pytest.approx(reported + 1.2 - booked)
 
 
 def test_each_pump_s_flow_is_that_of_its_own_calibration_and_on_record(lab):

@@ -11,9 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from envs.bench import Bench
-from hardware.safety.budget import FeedBudget
-from hardware.safety.config import SafetyConfig
 from tests.hardware.pioreactor_lab import BEGIN_S, FLOW, MEDIA_PIN, PINS, WASTE_PIN, Lab, World
 
 MEDIA_S, SLACK_ML = 1.4 / FLOW["add_media"], 0.1
@@ -187,13 +184,10 @@ def test_every_way_back(monkeypatch, name, version, stirring):
         assert lab.of("dose_end")[-1]["waste_high_ml"] >= wasted - SLACK_ML, "the most"
     if name.startswith(("power cut", "broker")):
         assert high <= 1.5, "a job ends with its power or its broker, or in its time"
-    budget = FeedBudget(SafetyConfig(), Bench(), np.full(1, 20.0), np.full(1, 1e3))
-    budget.book(np.array([planned]), np.array([2.0 * planned]), 0.0)
-    for at, receipt in lab.reactors.repeated():
-        budget.book(receipt.volume_ml, receipt.waste_ml, at)
-    level = float(budget.volume_ml[0])
+    ledger = lab.ledger(planned)
+    level = float(ledger.volume_ml[0])
     assert level <= 20.0 + 1.5, "by the interlock's ledger the vial is no higher than by a dose"
-    assert float(budget.fed_ml[0]) == pytest.approx(high, abs=SLACK_ML)
+    assert float(ledger.fed_ml[0]) == pytest.approx(high, abs=SLACK_ML)
     assert len(lab.asked("add_media")) <= int(planned > 0.0), "never asked for again"
     shorts = [row["feed_ml"] for row in lab.of("given") if "to end with its pin off" in row["why"]]
     assert sum(shorts) <= 3.01 * 0.1 * FLOW["add_media"]
