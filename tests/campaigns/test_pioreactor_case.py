@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 
 from hardware.rig.vials import Pulse
-from tests.campaigns.fault import REAL
-from tests.campaigns.fault_table import by_name
 from tests.campaigns.faults import Case, FaultsConfig, all_cases
 from tests.campaigns.outcome import judged, table
 from tests.campaigns.pioreactor_case import found_in
@@ -147,16 +145,6 @@ def test_every_fault_goes_as_declared_with_the_vendor_s_software(case: Case, pac
     need_the_rig(PACKAGES[package])
     found = case.run(FaultsConfig(families=("pioreactor",), package=PACKAGES[package], kills=1), tmp_path)
     assert found.wrong == []
-
-
-def test_every_fault_says_what_is_expected_and_when_it_comes() -> None:
-    names = [fault.name for fault in FAULTS]
-    assert len(names) == len(set(names)) >= 26
-    assert all(set(fault.moments) <= set(REAL) for fault in FAULTS)
-    with pytest.raises(ValueError, match="faults = nothing: no such fault; allowed feed blocked.*client_killed"):
-        by_name(["nothing"])
-    with pytest.raises(ValueError, match="either"):
-        replace(FAULT, why_not="and a reason")
 
 
 def test_faults_of_both_families_are_cases_of_one_command() -> None:

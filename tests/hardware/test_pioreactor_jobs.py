@@ -210,29 +210,23 @@ class Said:
         return done
 
 
-@pytest.mark.parametrize(("channel", "ok"), [("1", True), ("2", False), (None, False)])
-def test_a_photodiode_is_judged_by_the_channel_of_its_own_unit(channel: str | None, ok: bool) -> None:
-    """Which sees the culture by 1, and has the reference at 2, that of all other units."""
-    config = PioreactorConfig(reactors=("pio01", "pio02"), units={"pio02": UnitConfig(channel=channel)}, channel="2")
-    web: Any = Said({"1": "90", "2": "REF", "3": "", "4": ""}, "13.8")
-    unit = SimpleNamespace(web=web, config=config.of("pio02"), volume_ml=14.0)
-    mqtt = SimpleNamespace(holder=lambda name: "")
-    found = _unit(SimpleNamespace(name="pio02", unit=unit), SimpleNamespace(config=config, mqtt=mqtt), web)  # type: ignore[arg-type]
-    checks = {check.name: check for check in found}
-    assert (checks["pio02 photodiode"].ok, checks["pio02 volume"].ok) == (ok, True)
-    assert checks["pio02 photodiode"].detail == f"{channel or '2'} of 1 at 90 degrees"
-
-
-@pytest.mark.parametrize(("tube", "ok"), [("13.8", True), ("30", False)])
-def test_a_tube_is_judged_by_the_volume_of_its_own_unit(tube: str, ok: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    web: Any = Said({"1": "90", "2": "REF"}, tube)
+@pytest.mark.parametrize(
+    ("channel", "tube", "ok"), [("1", "13.8", (True, True)), ("2", "30", (False, False)), (None, "13.8", (False, True))]
+)
+def test_photodiode_and_tube_are_judged_by_channel_and_volume_of_their_own_unit(channel, tube, ok, monkeypatch):
+    """Which sees the culture by 1, and has the reference at 2, that of all other units, whose vials are larger."""
+    web: Any = Said({"1": "90", "2": "REF", "3": "", "4": ""}, tube)
     monkeypatch.setattr(pioreactors, "Web", lambda *_given: web)
     monkeypatch.setattr(pioreactors, "Cluster", lambda *_given: SimpleNamespace(holder=lambda name: ""))
-    bench = Bench(volume_ml=30.0, volumes_ml={"pio02": 14.0})
-    units = PioreactorReactors(PioreactorConfig(reactors=("pio01", "pio02")), VirtualClock(), bench=bench)
+    config = PioreactorConfig(reactors=("pio01", "pio02"), units={"pio02": UnitConfig(channel=channel)}, channel="2")
+    units = PioreactorReactors(config, VirtualClock(), bench=Bench(volume_ml=30.0, volumes_ml={"pio02": 14.0}))
     checks = {check.name: check for check in _unit(units.stations[1], units, web)}
-    found = checks["pio02 volume"]
-    assert (found.ok, found.detail) == (ok, f"{tube} mL in its settings, 14 here")
+    light, volume = checks["pio02 photodiode"], checks["pio02 volume"]
+    assert (light.ok, volume.ok) == ok
+    assert (light.detail, volume.detail) == (
+        f"{channel or '2'} of 1 at 90 degrees",
+        f"{tube} mL in its settings, 14 here",
+    )
 
 
 def test_a_rig_has_vials_of_the_volume_of_each_unit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
