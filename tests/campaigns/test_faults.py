@@ -206,7 +206,8 @@ def test_what_was_told_late_or_not_at_all_is_in_the_table() -> None:
 
 @pytest.mark.slow
 def test_the_campaign_writes_cases_sums_and_a_figure(tmp_path: Path) -> None:
-    faults(FaultsConfig(faults=("OD frozen", "disk full"), moments=("dose",), controls=1, workers=1), tmp_path)
+    named = {"faults": ("OD frozen", "disk full"), "moments": ("dose",), "scenario": SCHEDULE}
+    faults(FaultsConfig(controls=1, workers=1, seed=3, **named), tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["cases"], summary["undetected"], summary["not_as_declared"]) == (3, 0, 0)
     with open(tmp_path / "cases.csv", newline="") as f:

@@ -22,9 +22,8 @@ from envs.plant.plant import Plant
 from hardware.pioreactor.config import RigConfig, vial_ml
 from hardware.pioreactor.versions import TESTED, Facts, facts
 from hardware.rig.files import LOGIN, flows
-from hardware.rig.processes import Rig
 from hardware.rig.vials import HEATER, MEDIA, _Vial, vial_preset
-from tests.hardware.pioreactor_bench import EACH_ML, PACKAGES, UNIT, need_the_rig
+from tests.hardware.pioreactor_bench import EACH_ML, PACKAGES, UNIT, need_the_rig, started
 
 pytestmark = [pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(300)]  # one rig at a time
 rig = pytest.mark.slow
@@ -44,7 +43,7 @@ class Asked:
     """A unit in the rig, its culture in a small vial; `known` is the table's word on it."""
 
     def __init__(self, package: str) -> None:
-        self.rig = Rig({UNIT: 14.0}, RigConfig(package=package, od=0.5), experiment="e1")
+        self.rig = started({UNIT: 14.0}, RigConfig(package=package, od=0.5), experiment="e1")
         self.known, self.vial = facts(self.rig.version), self.rig.vials.vials[UNIT]
 
     def ask(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
