@@ -24,7 +24,7 @@ from tests.campaigns.audit import Served, audit_doses, fed_by, rows_per_sample
 from tests.campaigns.client import Client
 from tests.campaigns.tracking import reachable
 
-__all__ = ["Findings", "KillConfig", "Stopped", "killed_run"]
+__all__ = ["Clients", "Comparison", "Findings", "KillConfig", "Stopped", "killed_run"]
 
 CLOCKS_S = 0.05  # real seconds by which the clocks of client and emulator, compared over HTTP, are apart at least
 PATIENCE_S = 60.0  # real seconds for a client to start
@@ -138,13 +138,13 @@ def killed_run(
     arguments |= {"plant": config.plant, "pump3-flow": 1.0}  # a second fluid, for overrides that ask for it
     with EmulatorProcess([word for k, v in arguments.items() for word in (f"--{k}", str(v))]) as device:
         rng = np.random.default_rng([config.seed, seed])
-        clients = _Clients(config, device, folder, rng, findings, stop or threading.Event())
+        clients = Clients(config, device, folder, rng, findings, stop or threading.Event())
         killed = [clients.start_and_kill(k) for k in range(kills)]
-        _Comparison(config, device, folder, killed, clients.end(), findings).run()
+        Comparison(config, device, folder, killed, clients.end(), findings).run()
     return findings
 
 
-class _Clients:
+class Clients:
     """The client processes of one run, one after another. What goes wrong with them is added to `findings`."""
 
     def __init__(
@@ -159,9 +159,10 @@ class _Clients:
         self.config, self.device, self.folder, self.findings = config, device, folder, findings
         self._rng, self._stop = rng, stop
 
-    def _client(self, first: bool) -> Client:
+    def start(self) -> Client:
+        """A client: the first, or one that resumes the run."""
         c, command = self.config, []
-        if first:
+        if not (self.folder / "state.json").exists():
             scenario = ["scenario=hold", f"scenario.setpoints=[{SETPOINT}]", "scenario.minutes=[100000]"]
             backend = ["backend=chibio", f"backend.url={self.device.url}", f"backend.speed={c.speed}"]
             names = [f"backend.reactors=[{','.join(c.reactors)}]", f"hydra.run.dir={self.folder}"]
@@ -190,7 +191,7 @@ class _Clients:
         Args: k: number of the kill. Returns: its wall time, s. Raises: Stopped.
         """
         has_state = (self.folder / "state.json").exists()
-        client = self._client(first=not has_state)
+        client = self.start()
         early = has_state and self._rng.random() < self.config.early
         if early:
             self._stop.wait(float(self._rng.uniform(0.5, 3.0)))
@@ -208,7 +209,7 @@ class _Clients:
 
     def end(self) -> float:
         """Resume once more, run ten minutes, end as an operator would; returns the wall time of that, s."""
-        client = self._client(first=False)
+        client = self.start()
         if self._until_it_writes(client, self._size()):
             self._stop.wait(LAST_S / self.config.speed)
         ended = time.time()
@@ -217,7 +218,7 @@ class _Clients:
         return ended
 
 
-class _Comparison:
+class Comparison:
     """What the emulator knows against journal and recordings.
 
     Args: killed: wall time of every kill. ended: when the last client was asked to end. findings: are filled in.

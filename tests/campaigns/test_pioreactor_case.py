@@ -1,20 +1,22 @@
 """The judge of faults at the Pioreactor rig: a sound trial by hand passes, and every planted fault of it does not."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from hardware.rig.vials import Pulse
-from tests.campaigns.fault import REAL, Fault
-from tests.campaigns.fault_table import by_name
-from tests.campaigns.faults import FaultsConfig, all_cases
-from tests.campaigns.outcome import Outcome, judged, table
+from tests.campaigns.faults import Case, FaultsConfig, all_cases
+from tests.campaigns.outcome import judged, table
 from tests.campaigns.pioreactor_case import found_in
 from tests.campaigns.pioreactor_faults import FAULTS, rig
 from tests.campaigns.pioreactor_trial import FAULTED, WELL, Seen
+from tests.hardware.pioreactor_bench import PACKAGES, need_the_rig
 
 STRUCK = 30.0
+CASES = all_cases(FaultsConfig(families=("pioreactor",)))
 FAULT = rig("made_up", "", lambda t: None, by=("a word",))
 
 
@@ -42,14 +44,6 @@ def sound() -> Seen:
     return Seen(tuple(journal), rows, tuple(pulses), vials, "", 0, 5.0)
 
 
-def outcome(seen: Seen, fault: Fault = FAULT) -> Outcome:
-    return judged(found_in(seen, fault, "between", [STRUCK]), fault)
-
-
-def wrong(seen: Seen, fault: Fault = FAULT) -> list[str]:
-    return outcome(seen, fault).wrong
-
-
 def changed(seen: Seen, kind: str, number: int, **values: Any) -> Seen:
     """The same with other values in the n-th row of a kind of the sick unit's journal."""
     at = [i for i, row in enumerate(seen.journal) if row["kind"] == kind and row["reactor"] == FAULTED][number]
@@ -64,99 +58,106 @@ def vial(seen: Seen, unit: str, first: int, **values: Any) -> Seen:
 
 
 def test_a_sound_trial_passes_and_is_counted() -> None:
-    found = outcome(sound())
+    found = judged(found_in(sound(), FAULT, "between", [STRUCK]), FAULT)
     assert found.ok, found.wrong
     assert (found.doses, found.doses_doubled, found.rows, found.rows_lost) == (10, 0, 10, 0)
     assert found.detected_s == pytest.approx(6.0)  # from second 30 to the sample at 36
     assert (found.low_ml, found.high_ml, found.fed_ml) == pytest.approx((5.0, 5.0, 5.0))
 
 
-def test_a_run_of_the_pump_without_a_request_is_seen() -> None:
-    seen = sound()
-    twice = replace(seen, pulses=(*seen.pulses, Pulse(FAULTED, "media", 26.0, 0.5, 0.5)))
-    assert wrong(twice) == ["doses doubled"]
-    assert not wrong(twice, replace(FAULT, foreign=1))
-    cycled = replace(seen, pulses=(*seen.pulses, Pulse(FAULTED, "media", 26.0, 0.1, 0.1)))
-    assert not wrong(cycled)
+def pulse(seen: Seen, start: float, seconds: float) -> Seen:
+    return replace(seen, pulses=(*seen.pulses, Pulse(FAULTED, "media", start, seconds, 0.5)))
 
 
-def test_a_request_while_another_is_open_is_seen() -> None:
-    assert "dosed in doubt" in wrong(changed(sound(), "dose_end", 4, id="other"))
-    assert "dose without an end" in wrong(changed(sound(), "dose_end", 9, id="other"))
-    assert "an id twice" in wrong(changed(changed(sound(), "feed_on", 5, id="r/4"), "dose_end", 5, id="r/4"))
+def recorded(seen: Seen, unit: str, rows: list[tuple[float, float]]) -> Seen:
+    return replace(seen, rows={**seen.rows, unit: rows})
 
 
-def test_the_truth_outside_the_record_is_seen() -> None:
-    assert "volume not as booked" in wrong(vial(sound(), FAULTED, 100, fed_ml=6.0))
-    assert "volume not as booked" in wrong(vial(sound(), FAULTED, 100, fed_ml=3.5))
-    bounded = changed(sound(), "dose_end", 3, feed_ml=1.5)  # what is not known is counted whole
-    assert not wrong(vial(bounded, FAULTED, 100, fed_ml=6.0))
-    assert not wrong(vial(sound(), FAULTED, 100, fed_ml=6.0), replace(FAULT, flow=True))
+def one_id_twice(seen: Seen) -> Seen:
+    return changed(changed(seen, "feed_on", 5, id="r/4"), "dose_end", 5, id="r/4")
 
 
-def test_what_somebody_else_dosed_is_booked_in_a_row_of_its_own() -> None:
-    more = vial(sound(), FAULTED, 100, fed_ml=5.5)
-    given = {"kind": "given", "reactor": FAULTED, "wall": 40.0, "feed_ml": 0.5, "feed_low_ml": 0.5}
-    assert wrong(more) == ["volume not as booked"]
-    assert not wrong(replace(more, journal=[*more.journal, given]))
+def given(seen: Seen) -> Seen:
+    """Half a mL more in the vial, that somebody else dosed by the journal."""
+    row = {"kind": "given", "reactor": FAULTED, "wall": 40.0, "feed_ml": 0.5, "feed_low_ml": 0.5}
+    return replace(vial(seen, FAULTED, 100, fed_ml=5.5), journal=[*seen.journal, row])
 
 
-def test_a_lost_row_and_a_row_too_many_are_seen() -> None:
-    seen = sound()
-    without = replace(seen, rows={**seen.rows, FAULTED: seen.rows[FAULTED][:4] + seen.rows[FAULTED][5:]})
-    assert wrong(without) == ["rows lost"]
-    more = replace(seen, rows={**seen.rows, WELL: [*seen.rows[WELL], (9.5, 0.5)]})
-    assert wrong(more) == ["rows doubled"]
+def refused(seen: Seen, **values: Any) -> Seen:
+    return replace(seen, **{"status": 1, "told": "INFO pass\nerror: a word; remedy\n", "journal": ()} | values)
 
 
-def test_silence_is_seen() -> None:
-    assert "not detected" in wrong(changed(sound(), "note", 0, note="something else"))
-    assert "detected late" in wrong(sound(), replace(FAULT, within_s=-7.0))
-    silent = replace(sound(), rows={unit: [(0.0, 0.5), (60.0, 0.5)] for unit in (FAULTED, WELL)})
-    assert "no rows" in wrong(silent, replace(FAULT, minutes=1.0 / 60.0))
+REFUSED = {"refused": True}
+PLANTED: dict[str, tuple[Callable[[Seen], Seen], dict[str, Any], list[str]]] = {
+    # what is done to a sound trial, what is declared of its fault, and what is wrong then
+    "one run more": (lambda s: pulse(s, 26.0, 0.5), {}, ["doses doubled"]),
+    "one run more, of somebody": (lambda s: pulse(s, 26.0, 0.5), {"foreign": 1}, []),
+    "a pin switched on and off": (lambda s: pulse(s, 26.0, 0.1), {}, []),
+    "an end of another": (lambda s: changed(s, "dose_end", 4, id="other"), {}, ["dosed in doubt"]),
+    "no last end": (lambda s: changed(s, "dose_end", 9, id="other"), {}, ["dose without an end"]),
+    "one id twice": (one_id_twice, {}, ["an id twice"]),
+    "more in the vial": (lambda s: vial(s, FAULTED, 100, fed_ml=6.0), {}, ["volume not as booked"]),
+    "less in the vial": (lambda s: vial(s, FAULTED, 100, fed_ml=3.5), {}, ["volume not as booked"]),
+    "more, pump not as told": (lambda s: vial(s, FAULTED, 100, fed_ml=6.0), {"flow": True}, []),
+    "more, counted whole": (
+        lambda s: vial(changed(s, "dose_end", 3, feed_ml=1.5), FAULTED, 100, fed_ml=6.0), {}, [],
+    ),
+    "more, booked as given": (given, {}, []),
+    "a row lost": (lambda s: recorded(s, FAULTED, [*s.rows[FAULTED][:4], *s.rows[FAULTED][5:]]), {}, ["rows lost"]),
+    "a row doubled": (lambda s: recorded(s, WELL, [*s.rows[WELL], (9.5, 0.5)]), {}, ["rows doubled"]),
+    "rows far apart": (
+        lambda s: recorded(s, FAULTED, [(0.0, 0.5), (60.0, 0.5)]), {"minutes": 1 / 60}, ["rows lost", "no rows"],
+    ),
+    "another word": (lambda s: changed(s, "note", 0, note="something else"), {}, ["not detected"]),
+    "a word too late": (lambda s: s, {"within_s": -7.0}, ["detected late"]),
+    "sick one astray at last": (lambda s: vial(s, FAULTED, 100, od=0.6), {}, ["not held"]),
+    "well one astray once": (
+        lambda s: vial(vial(s, WELL, 50, od=0.6), WELL, 60, od=0.5), {}, ["neighbour strayed"],
+    ),
+    "a pump on": (lambda s: vial(s, WELL, 119, duty={"12": 100.0, "13": 0.0}), {}, ["pumps not off"]),
+    "too full": (lambda s: vial(s, FAULTED, 50, peak_ml=25.0), {}, ["overflow"]),
+    "client failed": (lambda s: replace(s, status=1), {}, ["client failed"]),
+    "nothing on record": (
+        lambda s: replace(s, journal=()), {}, ["nothing is on record", "pumps not off", "not detected"],
+    ),
+    "refused": (refused, REFUSED, []),
+    "refused for another reason": (lambda s: refused(s, told="error: something\n"), REFUSED, ["not detected"]),
+    "let in": (lambda s: refused(s, status=0), REFUSED, ["not refused"]),
+    "refused with a traceback": (
+        lambda s: refused(s, told="Traceback\nerror: a word\n"), REFUSED, ["not refused"],
+    ),
+    "refused, and dosed": (lambda s: refused(s, journal=s.journal), REFUSED, ["dosed though refused"]),
+}  # fmt: skip
 
 
-def test_cultures_and_pumps_are_judged_by_the_vials() -> None:
-    assert "not held" in wrong(vial(sound(), FAULTED, 100, od=0.6))
-    assert "neighbour strayed" in wrong(vial(vial(sound(), WELL, 50, od=0.6), WELL, 60, od=0.5))
-    assert "pumps not off" in wrong(vial(sound(), WELL, 119, duty={"12": 100.0, "13": 0.0}))
-    assert "overflow" in wrong(vial(sound(), FAULTED, 50, peak_ml=25.0))
-    assert "client failed" in wrong(replace(sound(), status=1))
-    assert "nothing is on record" in wrong(replace(sound(), journal=()))
+@pytest.mark.parametrize("name", PLANTED)
+def test_what_is_planted_in_a_sound_trial_is_wrong(name: str) -> None:
+    plant, declares, said = PLANTED[name]
+    fault = replace(FAULT, **declares)
+    assert set(judged(found_in(plant(sound()), fault, "between", [STRUCK]), fault).wrong) == set(said)
 
 
-def test_what_must_not_start_is_refused_with_one_line() -> None:
-    fault = replace(FAULT, refused=True)
-    refused = replace(sound(), status=1, told="INFO pass\nerror: a word; remedy\n", journal=())
-    assert not wrong(refused, fault)
-    assert "not detected" in wrong(replace(refused, told="error: something\n"), fault)
-    assert "not refused" in wrong(replace(refused, status=0), fault)
-    assert "not refused" in wrong(replace(refused, told="Traceback\nerror: a word\n"), fault)
-    assert "dosed though refused" in wrong(replace(refused, journal=sound().journal), fault)
-
-
-def test_every_fault_says_what_is_expected_and_when_it_comes() -> None:
-    names = [fault.name for fault in FAULTS]
-    assert len(names) == len(set(names)) >= 26
-    assert all(set(fault.moments) <= set(REAL) for fault in FAULTS)
-    with pytest.raises(ValueError, match="faults = nothing: no such fault; allowed feed blocked.*client_killed"):
-        by_name(["nothing"])
-    with pytest.raises(ValueError, match="either"):
-        replace(FAULT, why_not="and a reason")
+@pytest.mark.campaign
+@pytest.mark.xdist_group("pioreactor")  # one rig at a time
+@pytest.mark.parametrize("package", PACKAGES)
+@pytest.mark.parametrize("case", CASES, ids=[f"{case.fault}-{case.moment}" for case in CASES])
+def test_every_fault_goes_as_declared_with_the_vendor_s_software(case: Case, package: str, tmp_path: Path) -> None:
+    need_the_rig(PACKAGES[package])
+    found = case.run(FaultsConfig(families=("pioreactor",), package=PACKAGES[package], kills=1), tmp_path)
+    assert found.wrong == []
 
 
 def test_faults_of_both_families_are_cases_of_one_command() -> None:
     config = FaultsConfig(faults=("feed blocked", "queue_killed"), moments=("dose", "in"), controls=0)
     cases = [(case.fault, case.moment, case.guarded) for case in all_cases(config)]
     assert cases == [("feed blocked", "dose", True), ("queue_killed", "in", False)]
-    every = all_cases(FaultsConfig(families=("pioreactor",)))
-    assert {case.fault for case in every} == {fault.name for fault in FAULTS}
-    assert len(every) == sum(len(fault.moments) for fault in FAULTS)  # no healthy runs
+    assert {case.fault for case in CASES} == {fault.name for fault in FAULTS}
+    assert len(CASES) == sum(len(fault.moments) for fault in FAULTS)  # no healthy runs
     assert sum(fault.often for fault in FAULTS) == 6
 
 
 def test_the_table_of_the_rig_says_what_was_fed() -> None:
-    head, _, row = table([outcome(sound())]).splitlines()
+    head, _, row = table([judged(found_in(sound(), FAULT, "between", [STRUCK]), FAULT)]).splitlines()
     cells = dict(zip(head.split(" | "), row.split(" | "), strict=True))
     assert (cells["told after, s"], cells["doses"], cells["times"]) == ("6.0", "10", "1")
     assert (cells["fed on record, mL"], cells["true, mL"]) == ("5.00 to 5.00", "5.00")

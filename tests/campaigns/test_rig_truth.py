@@ -1,6 +1,9 @@
 """The judge of a deployment on the Pioreactor rig, on rows made by hand: what it measures, and what it must see."""
 
 import copy
+import math
+from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import pytest
@@ -62,6 +65,12 @@ class Run:
     def of(self, kind: str, k: int) -> Row:
         return [row for row in self.journal if row["kind"] == kind][k]
 
+    def run_at(self, start: float) -> Row:
+        return next(row for row in self.truth if row.get("start") == start)
+
+    def account(self) -> dict[str, Any]:
+        return asdict(rig_truth.account(self.journal, self.truth, self.events, UNIT))
+
 
 @pytest.fixture
 def run() -> Run:
@@ -90,139 +99,116 @@ def test_an_error_to_both_sides_is_no_bias(run: Run) -> None:
     assert (last.last_error_od, last.last_bias_od) == pytest.approx((0.008, 0.0))
 
 
-def test_every_dose_is_matched_with_its_run_of_the_pump(run: Run) -> None:
-    a = run.judged().account
-    assert a is not None
-    assert (a.asked, a.runs, a.without_intent, a.twice, a.missing) == (20, 20, 0, 0, 0)
-    assert (a.error_mean_ml, a.error_max_ml, a.outside_ml) == pytest.approx((0.003, 0.003, 0.003))
-    assert (a.given_ml, a.booked_ml) == pytest.approx((24.06, 24.0))
-    assert a.total_pct == pytest.approx(0.06 / 24.06 * 100.0)
-    assert (a.ids_repeated, a.ids_untold, a.foreign_events) == (0, 0, 0)
+def test_every_dose_of_a_sound_run_is_matched_and_only_its_first_window_is_not_held(run: Run) -> None:
+    assert run.account() == pytest.approx(
+        {"asked": 20, "runs": 20, "without_intent": 0, "twice": 0, "missing": 0, "cut": 0, "error_mean_ml": 0.003}
+        | {"error_max_ml": 0.003, "outside_ml": 0.003, "given_ml": 24.06, "booked_ml": 24.0}
+        | {"total_pct": 0.06 / 24.06 * 100.0, "ids_repeated": 0, "ids_untold": 0, "foreign_events": 0}
+    )
+    (line,) = run.trouble()
+    assert "0.0200" in line
 
 
-def test_a_sound_run_keeps_every_limit_but_that_of_its_first_window(run: Run) -> None:
-    said = "pio01: mean |OD - setpoint| of the last 10 min at 0.8 is 0.0200 (allowed 0.01)"
-    assert run.trouble() == [said]
-
-
-def test_a_decision_without_a_dose_and_other_pumps_and_units_are_no_doses(run: Run) -> None:
+def others(run: Run) -> None:
+    """A decision without a dose, and rows of other pumps and units."""
     run.say("intent", 1299.0, feed_ml=0.0, id="turbidostat/run/pio01/20")
     run.pump(1299.0, 2.4, "waste")
     run.truth.append({**run.truth[-1], "pump": "media", "unit": "vendor"})
     run.events.append({**run.events[0], "unit": "vendor", "source_of_event": "dosing_automation:turbidostat"})
     run.events.append({**run.events[0], "event": "remove_waste"})
     run.truth.append({"wall": 1299.5, "error": "KeyError: 'unit'"})
-    assert len(run.trouble()) == 1
 
 
-def test_a_dose_that_runs_twice(run: Run) -> None:
-    run.pump(1001.5, 1.2)
-    account = run.judged().account
-    assert account is not None
-    assert (account.twice, account.without_intent) == (1, 0)
-    assert "pio01: doses given twice: 1" in run.trouble()
+def never_given(run: Run) -> None:
+    run.truth.remove(run.run_at(1015.2))
 
 
-@pytest.mark.parametrize("start", [990.0, 1010.0, 1299.0])  # before all, between two, after the last
-def test_a_run_of_the_pump_without_an_intent(run: Run, start: float) -> None:
-    run.pump(start, 0.2)
-    account = run.judged().account
-    assert account is not None
-    assert (account.twice, account.without_intent) == (0, 1)
-    assert "pio01: runs of the media pump without an intent: 1" in run.trouble()
-
-
-def test_a_dose_that_was_never_given(run: Run) -> None:
-    run.truth = [row for row in run.truth if row.get("start") != 1015.2]
-    assert "pio01: doses of the journal without a run of the pump: 1" in run.trouble()
-
-
-def test_a_dose_that_the_journal_knows_was_not_given_is_not_missed(run: Run) -> None:
-    run.truth = [row for row in run.truth if row.get("start") != 1015.2]
+def known_as_not_given(run: Run) -> None:
+    never_given(run)
     run.of("dose_end", 1).update(feed_ml=0.0, feed_low_ml=0.0)
-    account = run.judged().account
-    assert account is not None
-    assert (account.missing, account.runs) == (0, 19)
-    assert account.booked_ml == pytest.approx(19 * 1.2)
 
 
-def test_a_dose_that_is_too_large_and_outside_of_the_driver_s_bound(run: Run) -> None:
-    next(row for row in run.truth if row.get("start") == 1015.2)["ml"] = 1.27
-    found = run.trouble()
-    assert "pio01: a dose is 0.070 mL off (allowed 0.05)" in found
-    assert "pio01: a dose is 0.070 mL outside of the driver's bound (allowed 0.05)" in found
+def uncertain(ml: float, end: str = "") -> Callable[[Run], None]:
+    """The second dose by the journal: 0.2 to 1.2 mL; what it really was."""
+
+    def act(run: Run) -> None:
+        run.of("dose_end", 1).update(feed_low_ml=0.2, end=end)
+        run.run_at(1015.2)["ml"] = ml
+
+    return act
 
 
-def test_a_dose_of_uncertain_volume_inside_of_the_bound_is_off_all_the_same(run: Run) -> None:
-    run.of("dose_end", 1)["feed_low_ml"] = 0.2
-    next(row for row in run.truth if row.get("start") == 1015.2)["ml"] = 0.7
-    found = [line for line in run.trouble() if "a dose is" in line]
-    assert found == ["pio01: a dose is 0.500 mL off (allowed 0.05)"]
-
-
-def test_a_dose_that_ended_early_by_the_journal_is_held_against_its_bound_alone(run: Run) -> None:
-    run.of("dose_end", 1).update(feed_low_ml=0.2, end="0.70 of 1.20 mL told: ended early")
-    run_of_it = next(row for row in run.truth if row.get("start") == 1015.2)
-    run_of_it["ml"] = 0.7
-    account = run.judged().account
-    assert account is not None
-    assert account.cut == 1
-    assert (account.error_mean_ml, account.error_max_ml, account.outside_ml) == pytest.approx((0.003,) * 3)
-    run_of_it["ml"] = 0.1
-    assert "pio01: a dose is 0.100 mL outside of the driver's bound (allowed 0.05)" in run.trouble()
-    run.of("dose_end", 1).update(feed_ml=1.5)  # and one that gave too much is off, whatever the journal says
-    run_of_it["ml"] = 1.5
-    assert "pio01: a dose is 0.300 mL off (allowed 0.05)" in run.trouble()
-
-
-def test_every_dose_a_little_off_is_a_wrong_total(run: Run) -> None:
+def each_a_little_off(run: Run) -> None:
     for row in run.journal:
         if row["kind"] in ("intent", "dose_end"):
-            row["feed_ml"] = 0.6
-            row["feed_low_ml"] = 0.6
+            row |= {"feed_ml": 0.6, "feed_low_ml": 0.6}
     for row in run.truth:
-        if "pump" in row:
-            row["ml"] = 0.645  # 7 % of it, each within 0.05 mL
-    found = run.trouble()
-    assert "pio01: 12.90 mL were given and 12.00 mL booked, +7.0 % (allowed 5)" in found
-    assert not any("a dose is" in line for line in found)
+        row |= {"ml": 0.645} if "pump" in row else {}  # 7 % of it, each within 0.05 mL
 
 
-def test_what_the_journal_books_beyond_its_doses_counts_in_the_total(run: Run) -> None:
-    run.say("dose_end", 1299.0, feed_ml=6.0, feed_times=1, source="somebody")
-    account = run.judged().account
-    assert account is not None
-    assert account.booked_ml == pytest.approx(30.0)
-    assert any("30.00 mL booked" in line for line in run.trouble())
-
-
-def test_an_open_dose_is_booked_whole_and_may_have_given_nothing(run: Run) -> None:
-    run.say("intent", 1299.0, feed_ml=1.0, id="turbidostat/run/pio01/21")
-    account = run.judged().account
-    assert account is not None
-    assert account.missing == 0
-    assert (account.outside_ml, account.booked_ml) == pytest.approx((0.003, 25.0))
-    run.pump(1299.5, 1.0)
-    account = run.judged().account
-    assert account is not None
-    assert (account.without_intent, account.runs) == (0, 21)
-
-
-def test_an_id_that_the_vendor_s_software_never_told(run: Run) -> None:
-    seventh = next(row for row in run.events if row["source_of_event"].endswith("/7"))
-    seventh["event"] = "remove_waste"  # its waste alone was
-    assert "pio01: doses whose id is in none of the vendor's dosing events: 1" in run.trouble()
-
-
-def test_an_event_with_an_id_of_no_dose(run: Run) -> None:
-    run.events.append({**run.events[0], "source_of_event": "turbidostat/run/pio01/99"})
-    assert "pio01: dosing events with an id of no dose: 1" in run.trouble()
-
-
-def test_an_id_that_was_given_out_twice(run: Run) -> None:
+def one_id_twice(run: Run) -> None:
     for kind in ("intent", "dose_end"):
         run.of(kind, 5)["id"] = run.of(kind, 4)["id"]
-    assert "pio01: ids given to more than one dose: 1" in run.trouble()
+
+
+def open_dose(run: Run) -> None:
+    run.say("intent", 1299.0, feed_ml=1.0, id="turbidostat/run/pio01/21")
+
+
+def open_dose_that_ran(run: Run) -> None:
+    open_dose(run)
+    run.pump(1299.5, 1.0)
+
+
+def after_the_hand_over(run: Run) -> None:
+    run.say("regulate", 1298.0, setpoint=0.5)
+    run.pump(1299.0, 1.0)
+
+
+CUT = "0.70 of 1.20 mL told: ended early"
+VOLUMES = ("error_mean_ml", "given_ml", "booked_ml", "total_pct")  # which most of these change a little
+PLANTED: dict[str, tuple[Callable[[Run], None], dict[str, Any], int]] = {
+    # what is done to a sound run: what differs in its account, and how many lines of trouble that gives
+    "others": (others, {}, 0),
+    "twice": (lambda run: run.pump(1001.5, 1.2), {"runs": 21, "twice": 1}, 1),
+    "before all": (lambda run: run.pump(990.0, 0.2), {"runs": 21, "without_intent": 1}, 1),
+    "between two": (lambda run: run.pump(1010.0, 0.2), {"runs": 21, "without_intent": 1}, 1),
+    "after the last": (lambda run: run.pump(1299.0, 0.2), {"runs": 21, "without_intent": 1}, 1),
+    "never given": (never_given, {"runs": 19, "missing": 1}, 2),
+    "known as not given": (known_as_not_given, {"runs": 19, "booked_ml": 19 * 1.2}, 0),
+    "too large": (lambda run: run.run_at(1015.2).update(ml=1.27), {"error_max_ml": 0.07, "outside_ml": 0.07}, 2),
+    "inside of its bound": (uncertain(0.7), {"error_max_ml": 0.5}, 1),
+    "cut short": (uncertain(0.7, CUT), {"cut": 1, "error_mean_ml": 0.003}, 0),
+    "below its bound": (uncertain(0.1, CUT), {"cut": 1, "outside_ml": 0.1}, 1),
+    "cut, and too large": (uncertain(1.5, CUT), {"error_max_ml": 0.3, "outside_ml": 0.3}, 2),
+    "each a little off": (
+        each_a_little_off, {"error_max_ml": 0.045, "outside_ml": 0.045, "given_ml": 12.9, "booked_ml": 12.0}, 1,
+    ),
+    "booked beside doses": (
+        lambda run: run.say("dose_end", 1299.0, feed_ml=6.0, feed_times=1, source="somebody"), {"booked_ml": 30.0}, 1,
+    ),
+    "open": (open_dose, {"asked": 21, "booked_ml": 25.0}, 0),
+    "open, and ran": (open_dose_that_ran, {"asked": 21, "runs": 21, "cut": 1, "ids_untold": 1}, 1),
+    "untold": (lambda run: run.events[6].update(event="remove_waste"), {"ids_untold": 1}, 1),
+    "event of no dose": (
+        lambda run: run.events.append({**run.events[0], "source_of_event": "turbidostat/run/pio01/99"}),
+        {"foreign_events": 1}, 1,
+    ),
+    "one id twice": (one_id_twice, {"ids_repeated": 1, "foreign_events": 1}, 2),
+    "after the hand-over": (after_the_hand_over, {}, 0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_what_is_planted_is_in_the_account_alone_and_told_where_it_is_wrong(run: Run, name: str) -> None:
+    plant, differs, lines = PLANTED[name]
+    sound = run.account()
+    plant(run)
+    found = run.account()
+    assert {key: found[key] for key in differs} == pytest.approx(differs)
+    rest = found.keys() - differs.keys() - {*VOLUMES}
+    assert {key: found[key] for key in rest} == pytest.approx({key: sound[key] for key in rest})
+    assert len(run.trouble()) == 1 + lines, run.trouble()
 
 
 def test_without_recorded_events_nothing_is_said_of_them(run: Run) -> None:
@@ -230,40 +216,28 @@ def test_without_recorded_events_nothing_is_said_of_them(run: Run) -> None:
     assert (account.ids_untold, account.foreign_events) == (None, None)
 
 
-def test_an_offset_of_the_true_od(run: Run) -> None:
+def test_an_offset_of_the_true_od_and_a_window_that_no_truth_covers_are_not_held(run: Run) -> None:
     for row in run.truth:
         if "od" in row:
             row["od"] += 0.0061
-    assert "pio01: mean |OD - setpoint| of the last 10 min at 0.5 is 0.0101 (allowed 0.01)" in run.trouble()
+    assert run.judged().held[1].last_error_od == pytest.approx(0.0101)
+    assert len(run.trouble()) == 2
+    run.truth = [row for row in run.truth if not ("od" in row and row["wall"] >= 1110)]
+    assert math.isnan(run.judged().held[1].last_error_od)
+    assert len(run.trouble()) == 2
 
 
 def test_a_vial_that_fills_and_a_pump_that_is_on(run: Run) -> None:
     run.truth.append({**run.vial(1301), "peak_ml": 22.1, "duty": {"13": 100.0}})
-    found = run.trouble()
-    assert "pio01: 22.10 mL in the vial (allowed 20 + 2)" in found
-    assert "pio01: a pump is on at the end" in found
+    assert (run.judged().vial.peak_ml, run.judged().vial.pumps_off) == (22.1, False)
+    assert len(run.trouble()) == 3
 
 
 def test_a_unit_of_which_nothing_is_on_record_keeps_nothing(run: Run) -> None:
     account = rig_truth.account(run.journal, run.truth, run.events, "pio02")
     found = UnitTruth("pio02", (), rig_truth.vial(run.truth, "pio02"), account)
-    said = " ".join(rig_truth.trouble(found, LIMITS, 20.0))
-    assert "no window" in said
-    assert "no dose" in said
-    assert "nan mL in the vial" in said
-
-
-def test_a_window_that_no_truth_covers_is_not_kept(run: Run) -> None:
-    run.truth = [row for row in run.truth if not ("od" in row and row["wall"] >= 1110)]
-    assert any("at 0.5 is nan" in line for line in run.trouble())
-
-
-def test_what_the_vendor_s_turbidostat_gives_after_the_hand_over_is_its_own(run: Run) -> None:
-    run.say("regulate", 1298.0, setpoint=0.5)
-    run.pump(1299.0, 1.0)
-    account = run.judged().account
-    assert account is not None
-    assert (account.without_intent, account.runs) == (0, 20)
+    assert math.isnan(found.vial.peak_ml)
+    assert len(rig_truth.trouble(found, LIMITS, 20.0)) == 4  # no window, no dose, no volume, no pump known to be off
 
 
 def test_the_vendor_s_windows_are_those_of_its_targets() -> None:

@@ -25,24 +25,27 @@ from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.resume import History
 from hardware.pioreactor.web import NotHeard
 from hardware.reactor import Command, Measurement
+from hardware.safety.budget import FeedBudget
+from hardware.safety.config import SafetyConfig
 
 UNIT, EXPERIMENT, MEDIA_PIN, WASTE_PIN = "pio01", "turbidostat", 13, 12
 PINS = {"add_media": MEDIA_PIN, "remove_waste": WASTE_PIN}
 FLOW = {"add_media": 0.7, "remove_waste": 1.6}  # mL/s
 BEGIN_S = 0.25  # from the answer 202 to the pin
 STIR_S, OD_S = 26.0, 5.0
+TUBE_ML, RIM_ML = 20.0, 40.0  # of the vial
 
 
 class World(VirtualClock):
     """Time, the unit's processes and its pumps; `sleep` lets happen what is due.
 
     Switches: web, queue, broker (up or not); stirs (stirring runs, and says all pins); locks, of pins; heard (how a
-    POST of a dose is answered); kill_after_s, freeze_after_s (after its pump began; frozen for frozen_s), stop_after_s
-    (somebody stops it); late_s (a job ends its pump so much late); mute (a pin that goes on is not told by its job);
+    POST of a dose is answered); kill_after_s, freeze_after_s (after the pump of `strikes` began; frozen for frozen_s),
+    stop_after_s (somebody stops it); late_s (a job ends its pump so much late); mute (a pin that goes on is not told);
     dies (a job is over at once); barred (jobs beside the readings do not start); begin_s; unkept (a job that is
     killed had not yet written down that its pin is on: the chip is told first).
 
-    Attributes: truth, mL by job; asked, what was asked for; waste, when the waste pump ran.
+    Attributes: truth, mL by job; level_ml, in the vial when a pump last went on or off; asked, what was asked for.
     """
 
     def __init__(self, version: str = "26.7.2") -> None:
@@ -55,13 +58,13 @@ class World(VirtualClock):
         self.web = self.queue = self.broker = self.stirs = True
         self.dies = self.mute = self.barred = self.deaf = self.stands = self.unkept = False
         self.locks: set[int] = set()
-        self.heard, self.holder, self.begin_s = "yes", "", BEGIN_S
+        self.heard, self.holder, self.begin_s, self.strikes = "yes", "", BEGIN_S, "add_media"
         self.kill_after_s = self.freeze_after_s = self.stop_after_s = np.inf
         self.frozen_s = self.late_s = 0.0
         self.reading, self.od_alive, self.od_s = 0.5, False, OD_S
         self.cache: dict[int, float] = {}  # what every message about pins says
         self.since: dict[int, float] = {}  # when a pin really went on
-        self.truth = dict.fromkeys(PINS, 0.0)
+        self.truth, self.level_ml, self._level_s = dict.fromkeys(PINS, 0.0), TUBE_ML, self.now()
         self.rows: dict[str, int] = {"monitor": 1}  # listed jobs
         self.run_now: dict[str, list[Any]] = {}  # running pump jobs by name: [stopped, options]
         self.before: list[str] = []
@@ -125,7 +128,9 @@ class World(VirtualClock):
 
     def pin(self, job: str, on: bool, told: bool = True) -> None:
         """A pin really goes on or off."""
-        number = PINS[job]
+        number, flows = PINS[job], {MEDIA_PIN: FLOW["add_media"], WASTE_PIN: -FLOW["remove_waste"]}
+        rise_ml = sum(flows[pin] for pin in self.since) * (self.now() - self._level_s)
+        self.level_ml, self._level_s = min(max(self.level_ml + rise_ml, TUBE_ML), RIM_ML), self.now()
         if on:
             self.cache[number] = 100.0
             self.since.setdefault(number, self.now())
@@ -162,10 +167,11 @@ class World(VirtualClock):
                 late = thawed[0] - self.now() - 1e-3
                 self.pins() if late <= 0.0 else self.later(late, tell)
 
-        kill = np.inf if short or job != "add_media" else self.kill_after_s
+        kill = np.inf if short or job != self.strikes else self.kill_after_s
         if kill < np.inf and self.unkept:
             self.cache.pop(PINS[job])
-        freeze = np.inf if short or job != "add_media" else self.freeze_after_s
+        freeze = np.inf if short or job != self.strikes else self.freeze_after_s
+        stop = np.inf if job != self.strikes else self.stop_after_s
 
         def slice_() -> None:
             nonlocal freeze
@@ -178,8 +184,8 @@ class World(VirtualClock):
                 ends = passed + self.frozen_s > seconds
                 self.later(self.frozen_s, (lambda: self._thaws(job, me)) if ends else slice_)
                 return
-            if me[0] or passed >= seconds + self.late_s - 1e-9 or passed >= self.stop_after_s - 1e-9:
-                self._ends(job, me, flow * min(passed, seconds) if me[0] or self.stop_after_s < seconds else None, told)
+            if me[0] or passed >= seconds + self.late_s - 1e-9 or passed >= stop - 1e-9:
+                self._ends(job, me, flow * min(passed, seconds) if me[0] or stop < seconds else None, told)
                 return
             if passed >= kill:
                 self.killed(job)
@@ -189,9 +195,7 @@ class World(VirtualClock):
                 told[0] += part
                 told.append(part)
                 self.event(job, part, source)
-            stops = (
-                x for x in (seconds + self.late_s, kill, freeze, self.stop_after_s, 0.5 * len(told[1:])) if x > passed
-            )
+            stops = (x for x in (seconds + self.late_s, kill, freeze, stop, 0.5 * len(told[1:])) if x > passed)
             self.later(max(min(min(stops) - passed, 0.1), 1e-3), slice_)
 
         slice_()
@@ -534,3 +538,11 @@ class Lab:
         """Least and most medium by the journal, mL."""
         rows = [row for row in self.rows if row["kind"] in ("dose_end", "given")]
         return sum(row["feed_low_ml"] for row in rows), sum(row["feed_ml"] for row in rows)
+
+    def ledger(self, planned_ml: float) -> FeedBudget:
+        """What the interlock has booked: a dose when it began, with all that the driver said of it since."""
+        budget = FeedBudget(SafetyConfig(), self.bench, np.full(1, self.bench.volume_ml), np.full(1, 1e3))
+        budget.book(np.array([planned_ml]), np.array([2.0 * planned_ml]), 0.0)
+        for at, receipt in self.reactors.repeated():
+            budget.book(receipt.volume_ml, receipt.waste_ml, at)
+        return budget

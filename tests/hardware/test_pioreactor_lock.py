@@ -7,7 +7,6 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from hardware.errors import DeviceStateError
 from hardware.pioreactor.config import PioreactorConfig
 from hardware.pioreactor.mailbox import Cluster, Mailbox
 from hardware.rig.build import broker
-from hardware.rig.processes import _free_port, _listens
+from hardware.rig.processes import _free_port
 from tests.hardware.pioreactor_lab import UNIT, Lab
 from tests.patience import PATIENCE_S
 
@@ -37,24 +36,19 @@ def real_broker(folder: Path, settings: str) -> Iterator[int]:
     pytest.importorskip("paho.mqtt.client", reason="pip install 'paho-mqtt>=2'")
     if (program := broker()) is None:
         pytest.skip("no MQTT broker: apt-get install mosquitto")
-    conf = folder / "mosquitto.conf"
-    for _ in range(5):  # a port that is free now may be taken by another suite a moment later: that broker ends itself
+    conf, log = folder / "mosquitto.conf", folder / "log"
+    for _ in range(20):  # a port that is free now may be another program's a moment later: that broker ends itself
         number = _free_port()
         conf.write_text(f"listener {number} 127.0.0.1\n{settings}\n", encoding="utf-8")
-        with (folder / "log").open("wb") as log, subprocess.Popen([program, "-c", conf], stdout=log, stderr=log) as p:
+        with log.open("wb") as out, subprocess.Popen([program, "-c", conf], stdout=out, stderr=out) as process:
             try:
-                assert holds(partial(ended_or_listens, p, number))
-                time.sleep(0.2)
-                if p.poll() is None:
+                assert holds(lambda: process.poll() is not None or b" running" in log.read_bytes())
+                if process.poll() is None:
                     yield number
                     return
             finally:
-                p.kill()
-    pytest.fail((folder / "log").read_text())
-
-
-def ended_or_listens(broker: "subprocess.Popen[bytes]", port: int) -> bool:
-    return broker.poll() is not None or _listens("127.0.0.1", port)
+                process.kill()
+    pytest.fail(log.read_text())
 
 
 @pytest.fixture
@@ -89,6 +83,7 @@ def killable(port: int) -> Iterator[int]:
         process.join()
 
 
+@pytest.mark.slow
 def test_a_unit_is_held_until_its_client_leaves_or_dies_and_its_own_run_may_come_back(port: int) -> None:
     other = client(port, "run2", "pio01", "pio02")
     first = client(port, "run1", "pio01")
@@ -114,6 +109,7 @@ def test_a_unit_is_held_until_its_client_leaves_or_dies_and_its_own_run_may_come
     other.close()
 
 
+@pytest.mark.slow
 def test_a_connection_that_was_lost_holds_its_units_again(port: int) -> None:
     other, first = client(port, "run2", "pio01"), client(port, "run1", "pio01")
     first.hold()

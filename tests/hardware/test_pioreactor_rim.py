@@ -3,10 +3,12 @@
 import getpass
 import json
 import os
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -18,7 +20,6 @@ from hardware.pioreactor.config import PASSWORD, PioreactorConfig
 from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.web import NotHeard, Web
 from hardware.rig.build import broker
-from hardware.rig.processes import _free_port
 from tests.hardware.test_pioreactor_lock import real_broker
 from tests.patience import PATIENCE_S
 
@@ -45,7 +46,7 @@ class Handler(BaseHTTPRequestHandler):
         said = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         server.asked.append((self.command, self.path, said))
         if server.status == 0:  # silent until the test lets it speak
-            server.silent.wait(2.0)
+            server.silent.wait(PATIENCE_S)
         self.send_response(server.status or 200)
         self.send_header("Content-Length", str(len(server.body)))
         self.end_headers()
@@ -57,32 +58,35 @@ class Handler(BaseHTTPRequestHandler):
         pass
 
 
-@pytest.fixture
-def server() -> Iterator[Server]:
+@contextmanager
+def serving() -> Iterator[Server]:
     made = Server()
-    threading.Thread(target=made.serve_forever, daemon=True).start()
+    threading.Thread(target=made.serve_forever, args=(0.01,), daemon=True).start()
     yield made
     made.silent.set()
     made.shutdown()
     made.server_close()
 
 
+@pytest.fixture
+def server() -> Iterator[Server]:
+    with serving() as made:
+        yield made
+
+
 def test_a_proxy_of_the_environment_sees_no_request(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    proxy = Server()
-    proxy.status = 403
-    threading.Thread(target=proxy.serve_forever, daemon=True).start()
-    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
-        monkeypatch.setenv(name, proxy.url)
     server.status, server.body = 202, b'{"task_id": "t1"}'
-    assert Web(server.url, "an experiment").run("add_media", {"ml": 0.5}) == "t1"
+    with serving() as proxy:
+        proxy.status = 403
+        for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+            monkeypatch.setenv(name, proxy.url)
+        assert Web(server.url, "an experiment").run("add_media", {"ml": 0.5}) == "t1"
+        assert proxy.asked == []
     ((method, path, said),) = server.asked
     assert (method, path) == ("POST", "/unit_api/jobs/run/job_name/add_media")
     asked = json.loads(said)
     assert asked["options"] == {"ml": 0.5}
     assert asked["env"]["EXPERIMENT"] == "an experiment"
-    assert proxy.asked == []
-    proxy.shutdown()
-    proxy.server_close()
 
 
 @pytest.mark.parametrize(
@@ -105,9 +109,10 @@ def test_an_answer_that_is_none_is_named_and_may_have_been_heard(server, body):
 
 
 def test_nobody_there_was_not_heard_and_one_who_is_silent_may_have(server):
-    port = _free_port()
-    with pytest.raises(NotHeard):
-        Web(f"http://127.0.0.1:{port}").run("add_media", {"ml": 0.5})
+    with socket.socket() as taken:  # bound, and nobody listens
+        taken.bind(("127.0.0.1", 0))
+        with pytest.raises(NotHeard):
+            Web(f"http://127.0.0.1:{taken.getsockname()[1]}").run("add_media", {"ml": 0.5})
     server.status = 0
     with pytest.raises(LinkError) as found:
         Web(server.url, timeout_s=0.3).run("add_media", {"ml": 0.5})
@@ -115,17 +120,14 @@ def test_nobody_there_was_not_heard_and_one_who_is_silent_may_have(server):
 
 
 def test_a_unit_that_hangs_does_not_make_another_wait(server):
-    hanging, well = Server(), server
-    hanging.status = 0
-    threading.Thread(target=hanging.serve_forever, daemon=True).start()
-    first, second = Web(hanging.url), Web(well.url)
-    slow = first.ask(first.get, "/health")
-    assert second.ask(second.get, "/health").result(10.0) == {}
-    assert not slow.done()
-    hanging.silent.set()
-    slow.result(10.0)
-    hanging.shutdown()
-    hanging.server_close()
+    with serving() as hanging:
+        hanging.status = 0
+        first, second = Web(hanging.url, timeout_s=PATIENCE_S), Web(server.url, timeout_s=PATIENCE_S)
+        slow = first.ask(first.get, "/health")
+        assert second.ask(second.get, "/health").result(PATIENCE_S) == {}
+        assert not slow.done()
+        hanging.silent.set()
+        slow.result(PATIENCE_S)
 
 
 # -- the broker's password ---------------------------------------------------------------------------------------------
@@ -152,6 +154,7 @@ def connected(port: int, **values: str) -> bool:
         reactors.close()
 
 
+@pytest.mark.slow
 def test_a_password_comes_from_the_environment_or_a_file_that_only_its_owner_reads(port, tmp_path, monkeypatch):
     monkeypatch.delenv(PASSWORD, raising=False)
     with pytest.raises(LinkError, match=r"Not authorized.*backend.password_file or the environment"):
@@ -171,6 +174,7 @@ def test_a_password_comes_from_the_environment_or_a_file_that_only_its_owner_rea
         connected(port, password_file=str(tmp_path / "none"))
 
 
+@pytest.mark.slow
 def test_a_password_stands_in_no_file_of_a_run_and_a_refusal_is_a_line_of_the_preflight(port, tmp_path):
     given = [f"backend.broker_port={port}", "backend.broker=127.0.0.1", "backend.username=ada"]
     given += ["backend.units.pio01.address=http://127.0.0.1:9", "backend.leader=http://127.0.0.1:9"]

@@ -20,7 +20,7 @@ from hardware.pioreactor.reactors import PioreactorReactors
 from hardware.pioreactor.versions import facts
 from tests.hardware.pioreactor_bench import PACKAGES, UNIT, UnitBench, need_the_rig
 
-pytestmark = [pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(300)]  # one rig
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pioreactor"), pytest.mark.timeout(300)]  # one rig
 
 LATE_ML = 0.3  # messages on a computer whose cores are all taken
 LONG_S = 120.0

@@ -217,6 +217,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Look]]:
     return on_app(list(SEQUENCES), tmp_path_factory.mktemp("boards"))
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("vendor")
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_the_emulator_shows_what_the_app_shows(name: str, seen: dict[str, list[Look]]) -> None:
