@@ -13,6 +13,8 @@ from dqn.replay import Transition
 from dqn.trainer import Trainer
 from tests.dqn.problems import IdentityEnv, streams
 
+pytestmark = pytest.mark.numeric
+
 SMALL = DQNConfig(
     hidden=(16, 16),
     gamma=0.5,

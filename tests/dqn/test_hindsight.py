@@ -8,6 +8,8 @@ from dqn.config import DQNConfig
 from dqn.hindsight import GoalRelabel, ProgramRelabel, ShiftRelabel
 from dqn.replay import Transition
 
+pytestmark = pytest.mark.numeric
+
 AGENTS, BATCH = 4, 500
 
 

@@ -6,6 +6,8 @@ import torch
 
 from dqn.network import QNetwork, action_basis, initial_weights
 
+pytestmark = pytest.mark.numeric
+
 SIZES = (3, 7, 5, 4)
 AGENTS, BATCH = 3, 6
 

@@ -1,8 +1,11 @@
 """The optimiser against torch's own."""
 
+import pytest
 import torch
 
 from dqn.optimiser import Adam
+
+pytestmark = pytest.mark.numeric
 
 
 def _gradients(seed: int) -> list[torch.Tensor]:

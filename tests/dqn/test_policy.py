@@ -16,6 +16,8 @@ from dqn.export import export
 from dqn.network import QNetwork, action_basis, initial_weights
 from tests.patience import PATIENCE_S
 
+pytestmark = pytest.mark.numeric
+
 SIZES = (3, 64, 64, 17)
 RATES = np.linspace(0.0, 0.02, 17)
 ANY = (np.full(2, -np.inf), np.full(2, np.inf))

@@ -14,6 +14,8 @@ from dqn.trainer import Trainer, TrainRecord
 from tests.dqn.problems import IdentityEnv, streams
 from tests.dqn.test_agent import SMALL
 
+pytestmark = pytest.mark.numeric
+
 GROUPS = (range(4), range(4, 7), range(7, 8))
 
 

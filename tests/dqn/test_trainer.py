@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from numpy.typing import NDArray
 
@@ -10,6 +11,8 @@ from dqn.agent import DQNAgent
 from dqn.config import DQNConfig
 from dqn.trainer import Trainer
 from tests.dqn.problems import streams
+
+pytestmark = pytest.mark.numeric
 
 Array = NDArray[Any]
 

@@ -11,6 +11,8 @@ from experiments.training.density import Density
 from experiments.training.evaluation import Evaluation
 from experiments.training.session import merit
 
+pytestmark = pytest.mark.numeric
+
 
 @pytest.fixture(scope="module")
 def evaluation():

@@ -13,6 +13,8 @@ from envs.task import EnvConfig, step_factors
 from experiments.training.evaluation import Evaluation
 from experiments.training.relative import Relative
 
+pytestmark = pytest.mark.numeric
+
 CONFIG = RelativeConfig()
 
 

@@ -43,6 +43,8 @@ from hardware import memory
 from hardware.storage.journal import Journal, read_journal
 from tests.patience import PATIENCE_S
 
+pytestmark = pytest.mark.numeric
+
 SHIPPED = SHIPPED_COMPOSITION["dqn_preview"]
 BIAS_E, BIAS_P, GAIN, FACTOR, THERMOMETER = 4, 5, 6, 7, 9
 WORDS = ("plant=coculture", "scenario=ratio_steps", "composition=dqn_preview", "fsync=false")

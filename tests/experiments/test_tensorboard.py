@@ -56,7 +56,7 @@ RUNS = {
     "pi_tuned": [*TEN, "controller=pi_tuned"],
     "shares": [*TEN, "plant=coculture", "composition=dqn_preview", "scenario.ratios=[0.4]"],
 }
-pytestmark = pytest.mark.xdist_group("curves")  # its tests share these runs
+pytestmark = [pytest.mark.xdist_group("curves"), pytest.mark.numeric]  # its tests share these runs
 
 
 @pytest.fixture(scope="module")

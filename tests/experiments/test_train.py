@@ -46,7 +46,7 @@ SHORT = [
 TWO = ["n_agents=2", "seed=2"]  # of which the second becomes the better one, and is best before the end
 KILL_SEED = int(os.environ.get("KILL_SEED", "0"))
 ROOT = Path(__file__).parents[2]
-pytestmark = pytest.mark.xdist_group("train")  # its tests share a run, made once
+pytestmark = [pytest.mark.xdist_group("train"), pytest.mark.numeric]  # its tests share a run, made once
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 
 

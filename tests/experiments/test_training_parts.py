@@ -34,6 +34,8 @@ from experiments.training.session import Best, Session, merit
 from tests.experiments.test_deploy import inverse_policy
 from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
 
+pytestmark = pytest.mark.numeric
+
 SMALL = DQNConfig(hidden=(8,), total_steps=100, learn_start=40, batch_size=8)
 
 

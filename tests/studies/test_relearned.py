@@ -28,6 +28,8 @@ from tests.studies.relearned import (
 )
 from tests.studies.second_vials import draw
 
+pytestmark = pytest.mark.numeric
+
 SMALL = RelearnedConfig(vials=3, special=2, steps=1000, hours=5.0, seed=4)
 
 

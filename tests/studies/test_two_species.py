@@ -18,6 +18,8 @@ from tests.studies.two_species import (
     two_species,
 )
 
+pytestmark = pytest.mark.numeric
+
 
 def test_a_day_and_a_few_hours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tests.studies.two_species.CELLS", {key: CELLS[key] for key in ("nominal", "mu_e x 1.2")})
