@@ -1,6 +1,7 @@
 # make run    calibrate on the shipped recording, train on the result, deploy on the simulated reactor, report
-# make test   style, types and the whole test suite
-# make coverage   which share of each package's lines the last `PYTEST_ADDOPTS=--cov make test` executed
+# make test   style, types, and the tests to run after each change: a few minutes
+# make verify   style, types and all tests
+# make coverage   which share of each package's lines the last `PYTEST_ADDOPTS=--cov make verify` executed
 # make docs   the pages and the API reference as a site, build/docs/index.html, whole without a network; a warning is an error
 PYTHON ?= python3
 VENV := .venv
@@ -10,7 +11,7 @@ EXTRAS := dev,bench,sweep,docs
 
 ROOMS := conf dqn envs experiments hardware $(sort $(patsubst %/,%,$(dir $(wildcard experiments/*/*.py hardware/*/*.py))))
 
-.PHONY: run test lint coverage docs clean
+.PHONY: run test verify lint coverage docs clean
 .DELETE_ON_ERROR:
 
 $(STAMP): pyproject.toml constraints.txt
@@ -31,6 +32,9 @@ lint: $(STAMP)
 
 test: $(STAMP) lint
 	$(BIN)/python -m pytest
+
+verify: $(STAMP) lint
+	$(BIN)/python -m pytest -m 'not campaign'
 
 coverage:
 	@for room in $(ROOMS); do \

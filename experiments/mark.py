@@ -4,7 +4,6 @@ A level that was read off a vial is more: the run under way sets its ledger to i
 counted in a sample: the run under way estimates with it.
 """
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from omegaconf import OmegaConf
 
 from conf.schema import check, require, setting
 from experiments.cli import files, frame
-from hardware.clock import DeviceClock
 from hardware.errors import RecordingError
 from hardware.storage.journal import read_journal
 from hardware.storage.marks import Mark, add_mark
@@ -66,7 +64,7 @@ class MarkConfig:
 
 def _minute_now(folder: Path, stored: Any) -> float:
     """The minute of a run that is under way. Raises: UserError for one that is over, or has not begun."""
-    from hardware.family import family, known  # and with it the plant, only for this
+    from hardware.family import elapsed_s, family, known  # and with it the plant, only for this
 
     kind = str(OmegaConf.select(stored, "backend.kind"))
     over = frame.UserError(f"run={folder}: not under way; give minute=MINUTE of the run")
@@ -77,8 +75,8 @@ def _minute_now(folder: Path, stored: Any) -> float:
         raise over
     if not rows:
         raise frame.UserError(f"run={folder}: has not begun; wait for its first sample")
-    speed = float(OmegaConf.select(stored, "backend.speed") or 1.0)  # an emulated device may run faster
-    return DeviceClock(speed).of_real(time.time() - float(rows[0]["wall"])) / 60.0
+    speed = OmegaConf.select(stored, "backend.speed")  # an emulated device may run faster
+    return elapsed_s(rows, 1.0 if speed is None else float(speed)) / 60.0
 
 
 def _latest(folder: Path, stored: Any) -> float:

@@ -27,7 +27,7 @@ from hardware.errors import ReactorError, RecordingError, UnfitError
 from hardware.reactor import Array, Reactor
 from hardware.storage.journal import Journal
 
-__all__ = ["Can", "Family", "Opening", "add", "family", "family_of", "known", "not_looked_at"]
+__all__ = ["Can", "Family", "Opening", "add", "elapsed_s", "family", "family_of", "known", "not_looked_at"]
 
 log = logging.getLogger(__name__)
 
@@ -45,6 +45,16 @@ class Can:
     thermostat: bool = False
     regulation: bool = False
     resume: bool = False
+
+
+def elapsed_s(rows: Sequence[Mapping[str, Any]], speed: float = 1.0) -> float:
+    """Return the run time that has passed, s, by the rows of the run's journal; 0 without rows.
+
+    Args: speed: device seconds per real second; 0: virtual time, which stands still while no program runs.
+    """
+    if not rows or not speed:
+        return max((float(row.get("time_s") or 0.0) for row in rows), default=0.0)
+    return DeviceClock(speed).of_real(time.time() - float(rows[0]["wall"]))
 
 
 @dataclass(frozen=True)
@@ -75,8 +85,8 @@ class Opening:
         return float(self.journal.rows[0]["wall"]) if self.journal.rows else time.time()
 
     def elapsed_s(self, speed: float = 1.0) -> float:
-        """Run time that has passed, s; 0 in a new run. Args: speed: device seconds per real second."""
-        return DeviceClock(speed).of_real(time.time() - self.began) if self.journal.rows else 0.0
+        """Return the run time that has passed, s; 0 in a new run. Args: speed: as of `elapsed_s`."""
+        return elapsed_s(self.journal.rows, speed)
 
 
 class Family:

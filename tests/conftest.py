@@ -2,7 +2,9 @@
 
 import os
 import signal
+from collections.abc import Iterator
 
+import pytest
 from hypothesis import settings
 
 settings.register_profile("busy", deadline=None)  # a machine may be busy with other things; the mutants have their own
@@ -16,3 +18,32 @@ for _number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
 def pytest_xdist_auto_num_workers() -> int:
     """One more than there are cores: a quarter of the tests' time is waiting, for a device or for another process."""
     return (os.cpu_count() or 1) + 1
+
+
+FAST_CPU_S = 5.0  # of a test that is not marked slow, with its fixtures and the programs that it starts
+FAST = "not slow"  # in the expression of `make test`
+_began = pytest.StashKey[float]()
+
+
+def _cpu_s() -> float:
+    """Return the processor time of this process and of those that it has waited for, s."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Take the time before the first fixture."""
+    item.stash[_began] = _cpu_s()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
+    """Fail a test that is too slow for `make test`, so that those who run it after each change keep doing so."""
+    report = yield
+    used = _cpu_s() - item.stash.get(_began, _cpu_s())
+    fast = item.get_closest_marker("slow") is None and item.get_closest_marker("campaign") is None
+    if report.when == "call" and report.passed and fast and used > FAST_CPU_S and FAST in item.config.option.markexpr:
+        report.outcome = "failed"
+        report.longrepr = f"{used:.1f} s of processor time, allowed {FAST_CPU_S:g}: make it faster, or mark it slow"
+    return report

@@ -80,7 +80,10 @@ class EmulatorConfig(ChiBioConfig):
 
     kind: str = setting("emulator", "which backend")
     speed: float = setting(
-        60.0, "device seconds per real second: ninety minutes pass in one and a half", within=(0.1, 1000)
+        60.0,
+        "device seconds per real second: ninety minutes pass in one and a half; 0: virtual time, as fast as the "
+        "computer can, without sockets",
+        within=(0, 1000),
     )
     od: float = setting(0.3, "of the emulated cultures at the start", "OD", within=(0, 4))
     plant: str = setting(

@@ -15,7 +15,7 @@ from hardware.chibio.preflight import preflight
 from hardware.chibio.protocol import CONTROL_S, LEAST_ML
 from hardware.chibio.reactors import ChiBioReactors
 from hardware.chibio.resume import replay
-from hardware.clock import DeviceClock
+from hardware.clock import Clock, DeviceClock
 from hardware.errors import UnfitError
 from hardware.family import Can, Family, Opening, not_looked_at
 from hardware.link.open import DeviceLock, open_transport
@@ -24,7 +24,7 @@ from hardware.reactor import Array, Reactor, left_off
 
 __all__ = ["FAMILY", "ChiBioFamily", "linked"]
 
-Link = tuple[Transport, DeviceClock]
+Link = tuple[Transport, Clock]
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A Chi.Bio in software as a family: the same driver before a device that the run starts for itself."""
+"""A Chi.Bio in software as a family: the same driver in front of a device that the run starts for itself."""
 
 import logging
 from collections.abc import Iterator
@@ -10,8 +10,11 @@ from envs.coculture.pair import named_pair
 from envs.plant.plant import PlantConfig, of_pair
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.chibio.family import ChiBioFamily, Link, linked
+from hardware.clock import VirtualClock
 from hardware.emulator.device import plant_preset
 from hardware.emulator.process import EmulatorProcess
+from hardware.emulator.server import build, parser
+from hardware.emulator.transport import EmulatorTransport
 
 __all__ = ["FAMILY", "EmulatorFamily"]
 
@@ -39,8 +42,16 @@ class EmulatorFamily(ChiBioFamily):
 
     @contextmanager
     def linked(self, backend: ChiBioConfig, bench: Bench) -> Iterator[Link]:
-        """A device started for as long as the run lasts. Raises: ReactorError."""
+        """Start a device for as long as the run lasts: a process, or at speed 0 an object on a virtual clock.
+
+        Raises: ReactorError.
+        """
         assert isinstance(backend, EmulatorConfig)
+        if not backend.speed:
+            log.info("emulated device inside this program, in virtual time")
+            clock = VirtualClock()
+            yield EmulatorTransport(build(parser().parse_args(_words(backend, bench)), clock)), clock
+            return
         with EmulatorProcess(_words(backend, bench)) as device:
             url, control = device.url, device.control
             log.info("emulated device at %s, %g times real time; faults at %s", url, backend.speed, control)
