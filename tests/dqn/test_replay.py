@@ -97,18 +97,3 @@ def test_minibatch_is_a_copy() -> None:
 def test_empty_memory_is_refused() -> None:
     with pytest.raises(ValueError, match="replay memory is empty"):
         Replay(AGENTS, 4, OBSERVATIONS, CPU).sample(np.zeros((AGENTS, 1)))
-
-
-@pytest.mark.parametrize("added", [3, 11])
-def test_state_continues(added: int) -> None:
-    rng = np.random.default_rng(4)
-    one, other = (Replay(AGENTS, 5, OBSERVATIONS, CPU) for _ in range(2))
-    for _ in range(added):
-        one.add(**_step(rng))
-    other.load_state_dict(one.state_dict())
-    step = _step(rng)
-    one.add(**step)
-    other.add(**step)
-    uniform = rng.random((AGENTS, 8))
-    for a, b in zip(one.sample(uniform), other.sample(uniform), strict=True):
-        assert torch.equal(a, b)

@@ -763,33 +763,24 @@ def test_learning_curves_are_drawn_of_every_agent_and_every_episode_that_ended(
     assert writer.events.picture.call_args.args == ("figures/learning", tmp_path / "figures" / "learning.png", 120)
 
 
-def test_what_is_said_at_the_start_names_all_seeds_and_where_a_resumed_run_goes_on(
+def test_start_and_end_are_told_with_all_seeds_their_worst_and_the_command_that_follows(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    task = Coculture(CocultureConfig(preview_min=60.0, control_min=20.0))
-    config = TrainConfig(env=task.config, agent=SMALL)
-    with caplog.at_level("INFO"):
-        announcements.began(config, task, range(5, 8), tmp_path, 40)
-    assert caplog.messages[0].endswith("; 3 agents, seeds 5 to 7, goes on at step 40 of 100 steps")
-    assert caplog.messages[0].startswith("learns env=coculture agent=given: shares of two species")
-    assert caplog.messages[1].startswith("good is a policy within 5 % regret and 0.02 of the share at rest")
-
-
-def test_what_is_said_at_the_end_is_of_all_seeds_the_worst_and_of_two_species_their_pair(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    kept, myopic = scored([0.1, 0.9, 0.2], [[0.001], [0.002], [0.02]]), scored([-7.0], [[0.3]])
+    """Of two species, resumed at step 40; the following command runs the policy with the pair it is for."""
     task, path = Coculture(CocultureConfig(preview_min=60.0, control_min=20.0)), tmp_path / "policy.npz"
+    kept, myopic = scored([0.1, 0.9, 0.2], [[0.001], [0.002], [0.02]]), scored([-7.0], [[0.3]])
     with caplog.at_level("INFO"):
+        announcements.began(TrainConfig(env=task.config, agent=SMALL), task, range(5, 8), tmp_path, 40)
         announcements.ended(tmp_path, task, kept, myopic, "spent", path, "pair.yaml")
-    spent, reached, compared, where, *following = caplog.messages
-    assert (spent, where) == ("spent", f"policy {path}; figures {tmp_path / 'figures'}")
-    assert "0.20 % regret, 0.0020 of the share steady error; the worst of 3: 0.90 %, 0.0200: within" in reached
-    assert compared.endswith("one period ahead: 7.00 % regret, 0.3000 of the share steady error")
-    assert following == [
-        "next, try it: python -m experiments.deploy pair=pair.yaml plant=coculture scenario=ratio_steps "
-        f"composition=dqn_preview composition_policy={path}"
-    ]
+    learns, good, where, spent, reached, compared, written, *following = caplog.messages
+    for line, told in (
+        (learns, ("coculture", "3 agents", "seeds 5 to 7", "step 40 of 100 steps")), (good, ("5 %", "0.02 ")),
+        (where, (str(tmp_path),)), (spent, ("spent",)), (reached, ("0.20 %", "0.0020", "0.90 %", "0.0200")),
+        (compared, ("7.00 %", "0.3000")), (written, (str(path),)),
+        (following.pop(), ("pair=pair.yaml", "composition=dqn_preview", f"composition_policy={path}")),
+    ):  # fmt: skip
+        assert not [word for word in told if word not in line], line
+    assert not following
 
 
 def test_the_table_of_runs_has_of_each_seed_its_own_numbers() -> None:
