@@ -21,6 +21,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from conf import presets
 from dqn import checkpoint, policy
 from dqn.checkpoint import CheckpointError
+from envs.coculture.optimum import Grid
 from envs.optimum import solve_episode
 from envs.task import EnvConfig, step_factors
 from experiments.cli.frame import UserError
@@ -228,7 +229,11 @@ def test_a_task_comes_with_the_agent_that_belongs_to_it(words, agent):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["coculture", "coculture_preview"])
 def test_a_composition_is_trained_scored_and_exported(tmp_path, name, monkeypatch):
-    """A few hundred steps: what is written, that the file says what the summary says, the figure what was measured."""
+    """A few hundred steps: what is written, that the file says what the summary says, the figure what was measured.
+
+    The optimum is found on a coarse grid of shares.
+    """
+    monkeypatch.setattr("experiments.training.coculture.FINE", Grid(logits=41))
     drawn, save = {}, train_run.charts.save
 
     def kept(figure, folder, name):
