@@ -65,10 +65,8 @@ def test_maps_of_inputs_and_outputs_stay_with_other_weights_and_are_reported_as_
     matrix, offset = torch.tensor([[3.0, -3.0], [0.0, 2.0], [1.0, 0.5]]), torch.tensor([0.0, -1.2, 0.25])
     sizes, basis, observation = (3, 4, 2), action_basis(2, 1.0), torch.rand(AGENTS, BATCH, 2)
     plain = QNetwork(_flat(sizes), sizes)
-    for network in (
-        first := QNetwork(0.5 * _flat(sizes), sizes, matrix, offset, basis),
-        first.with_weights(plain.flat),
-    ):
+    first = QNetwork(0.5 * _flat(sizes), sizes, matrix.clone(), offset.clone(), basis.clone())
+    for network in (first, first.with_weights(plain.flat)):
         for array, expected in zip((*network.input_map(), network.output_map()), (matrix, offset, basis), strict=True):
             np.testing.assert_array_equal(array, expected.numpy())
             array += 1.0
