@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
-from tensorboard.backend.event_processing.plugin_event_accumulator import EventAccumulator
 
 from dqn import checkpoint, policy
 from dqn.checkpoint import CheckpointError
@@ -267,9 +266,10 @@ def same(one: Any, other: Any) -> bool:
 def test_what_is_resumed_from_a_checkpoint_is_the_uninterrupted_training_to_the_bit(
     env: str, agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every task with its agents: from amid an episode before the first update, from among them, and near the end.
+    """Every task with its agents: from amid an episode before the first update, and twice from among them.
 
-    Two groups of agents; the second life has another number of threads.
+    Two groups of agents; the second life has another number of threads. Records at steps 102 and 119 tell of the same
+    look at the loss.
     """
     monkeypatch.setattr(build, "GROUP", 2)
     whole, records = population(env, agent, (3, 4, 9), 17, threads=2), []
@@ -277,7 +277,7 @@ def test_what_is_resumed_from_a_checkpoint_is_the_uninterrupted_training_to_the_
         checkpoint.save(tmp_path / f"{record.step}.pt", whole.state_dict())
         records.append(asdict(record))
     assert [record["step"] for record in records] == [17, 34, 51, 68, 85, 102, 119, 130]
-    for k in (2, 5, 7):
+    for k in (2, 5, 6):
         resumed = population(env, agent, (3, 4, 9), 17)
         resumed.load_state_dict(checkpoint.load(tmp_path / f"{17 * k}.pt"))
         assert resumed.steps == 17 * k
@@ -300,7 +300,7 @@ def test_an_agent_of_a_population_is_the_same_seed_alone(env: str, agent: str) -
 
 
 def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    """Killed after step 96, before that was saved: it goes on at 72, and has every point of its curves once."""
+    """Killed after step 96, before that was saved: it goes on at 72, and has every line of its progress once."""
     config: dict[str, Any] = {**THREE, "checkpoint_every": 72}
     agent = config.pop("agent")
     first = session(tmp_path / "a", agent=agent, **config)
@@ -320,12 +320,11 @@ def test_a_resumed_session_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     assert torch.equal(first.agents.weights(), third.agents.weights())
     assert first.best.history == third.best.history
     assert [step for step, _, _ in first.best.history] == [48, 72, 96, 120]
-    whole, resumed = (EventAccumulator(str(tmp_path / name), {"tensors": 0}).Reload() for name in "ab")
-    tags = [tag for tag in whole.Tags()["tensors"] if tag.partition("/")[0] in ("train", "eval", "kept", "q", "limit")]
-    for tag in tags:
-        ours, theirs = ([(e.step, *e.tensor_proto.float_val) for e in x.Tensors(tag)] for x in (whole, resumed))
-        assert (tag, ours) == (tag, theirs)
-    assert [e.step for e in resumed.Tensors("train/return/min")] == [24, 48, 72, 96, 120]
+    whole, resumed = (
+        [line for line in (tmp_path / name / "progress.csv").read_text().splitlines() if ",speed/" not in line]
+        for name in "ab"
+    )
+    assert whole == resumed
 
 
 @pytest.mark.parametrize(
@@ -369,24 +368,6 @@ def test_episodes_with_a_change_are_grouped_by_the_share_at_which_they_rest() ->
     assert {int((asked == goal).sum()) for goal in np.unique(asked)} == {8}
     plain = Coculture(CocultureConfig())
     np.testing.assert_allclose(plain.asked(plain.report_grid()), plain.report_grid()[:, 3], atol=1e-9)
-
-
-@pytest.mark.parametrize("control_min", [1.0, 2.5])
-def test_trajectories_are_drawn_over_minutes(control_min: float) -> None:
-    """The culture is on the line where the model has it, decision by decision."""
-    env = EnvConfig(control_min=control_min, episode_steps=20, setpoints=(0.3, 0.5, 0.8))
-    drawn = Density(env).figures(inverse_policy(control_min))["trajectories"]
-    top, bottom = drawn.axes[1], drawn.axes[4]
-    lines = {str(line.get_label()): line for line in top.get_lines()}
-    for start in env.start_od:
-        minutes, od = lines[f"learned, from {start:g}"].get_data()
-        np.testing.assert_allclose(minutes, control_min * np.arange(21))
-        u = np.clip(0.01 + 0.1 * (start - 0.5), 0.0, 0.02)
-        levels = env.pump_rates()
-        nearest = int(np.abs(levels - u).argmin())
-        assert np.asarray(od)[1] == pytest.approx(start * step_factors(env)[nearest], rel=0.01)
-    for line in bottom.get_lines():
-        np.testing.assert_allclose(np.asarray(line.get_xdata()), control_min * np.arange(20))
 
 
 def test_growth_shares_that_are_scored_are_those_that_are_trained() -> None:
@@ -664,7 +645,7 @@ def test_maps_and_trajectories_of_a_density_are_drawn_with_learned_first_and_the
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drawn = captured(monkeypatch, "policy_map", "trajectories")
-    env = EnvConfig(mu=0.03, tau=0.4, episode_steps=60, setpoints=(0.2, 0.3, 0.6, 0.9))
+    env = EnvConfig(mu=0.03, tau=0.4, control_min=2.5, episode_steps=60, setpoints=(0.2, 0.3, 0.6, 0.9))
     Density(env).figures(still(lambda seen: 10.0 * seen[:, 0] + seen[:, 1]))
     od, setpoint, learned, best = drawn["policy_map"]
     assert (setpoint[0], setpoint[-1]) == (0.2, 0.9)
@@ -672,10 +653,10 @@ def test_maps_and_trajectories_of_a_density_are_drawn_with_learned_first_and_the
     assert (best[0, -1], best[-1, 0]) == (0.02, 0.0)  # far above its setpoint, and far below
     minutes, ours, theirs, goals, rates, best_rates = drawn["trajectories"]
     assert goals.tolist() == [0.2, 0.6, 0.9] * 2
-    assert (minutes[-1], minutes.size, rates.shape) == (60.0, 61, (60, 6))
+    assert (minutes[-1], minutes.size, rates.shape) == (150.0, 61, (60, 6))
     np.testing.assert_allclose(ours, ours[0] * step_factors(env)[0] ** np.arange(61)[:, None])
     np.testing.assert_array_equal(theirs[0], ours[0])
-    np.testing.assert_allclose(theirs[-1, :2], [0.2, 0.6], rtol=0.01)  # in an hour from 0.1
+    np.testing.assert_allclose(theirs[-1, :2], [0.2, 0.6], rtol=0.01)  # in two hours and a half from 0.1
     assert not rates.any()
     np.testing.assert_allclose(theirs[1:] / theirs[:-1], np.interp(best_rates, env.pump_rates(), step_factors(env)))
 
