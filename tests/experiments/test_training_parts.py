@@ -462,6 +462,7 @@ def test_a_relative_policy_sees_the_edge_of_its_training_beyond_it() -> None:
 
 def test_the_share_that_is_drawn_as_asked_for_is_that_of_the_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Decision by decision, also at that in which the change comes."""
+    monkeypatch.setattr("experiments.training.coculture.FINE", Grid(logits=41))
     drawn: list[Any] = []
     monkeypatch.setattr("experiments.reporting.composition_charts.episodes", lambda *given: drawn.append(given))
     task = Coculture(CocultureConfig(preview_min=120.0, episode_steps=12, control_min=30.0))
