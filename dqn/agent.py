@@ -175,7 +175,7 @@ class DQNAgent:
             self.q_range = torch.stack([q.amin((1, 2)), q.amax((1, 2))], dim=1)
 
     def state_dict(self) -> dict[str, Any]:
-        """The complete learning state. A new agent of the same config that loads it continues to the bit."""
+        """The complete learning state. A new agent of the same config continues to the bit on one processor."""
         tensors = {"online": self.online.flat, "target": self.target.flat, "loss": self.loss, "q_range": self.q_range}
         counts = {"steps": self.steps, "updates": self.updates}
         parts = {name: part.state_dict() for name, part in self._parts.items()}

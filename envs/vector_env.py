@@ -268,7 +268,7 @@ class EpisodeVectorEnv(EpisodeSpec, VectorEnv[Any, Any, Any], Generic[C]):
         return {**infos, **{f"_{key}": truncated.copy() for key in infos}}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue to the bit; plain numbers and lists."""
+        """Everything needed to continue to the bit on one processor; plain numbers and lists."""
         assert self._streams is not None, "reset before state_dict"
         return {
             "state": self.state.tolist(),

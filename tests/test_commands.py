@@ -117,6 +117,7 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("reader")
 
 
+@pytest.mark.numeric
 @pytest.mark.xdist_group("readme")
 @pytest.mark.parametrize("words", README, ids=[" ".join(words) for words in README])
 def test_the_readme_works_line_by_line(words: list[str], reader: Path) -> None:

@@ -194,5 +194,4 @@ def test_every_number_that_is_not_part_of_a_longer_rule_has_a_range() -> None:
     }
     assert without == {
         "controller.swarm.attraction",  # by its inertia
-        *(f"safety.{name}" for name in ("od_min", "death", "jump_fraction", "noise_od", "noise_fraction")),
     }

@@ -1,4 +1,4 @@
-"""One training run: agents, evaluation, records and checkpoints, which together continue to the bit after a stop."""
+"""One training run: agents, evaluation, records, and checkpoints to continue from, to the bit on one processor."""
 
 from __future__ import annotations
 

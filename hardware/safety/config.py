@@ -141,22 +141,24 @@ class SafetyConfig:
     overflow_ml: float = setting(
         5.0, "so much above the waste tube is an overflow, and whatever a vial cannot hold", "mL", within=(0, 10)
     )
-    od_min: float = setting(-0.1, "readings below are impossible", "OD")
+    od_min: float = setting(-0.1, "readings below are impossible", "OD", within=(-1, 0.05))
     od_max: float = setting(4.0, "readings above are impossible", "OD", within=(MAX_SETPOINT, 10))
     mu_max: float = setting(0.04, "no culture grows faster (LB at 37 degC: 0.031)", "1/min", within=(0.001, 0.1))
-    death: float = setting(0.005, "fastest decline without a dose", "1/min")
+    death: float = setting(0.005, "fastest decline without a dose", "1/min", within=(0, 0.1))
     jump: float = setting(
         0.04, "a step beyond growth and dose of more than this is no culture", "OD", above=0.0, below=math.inf
     )
-    jump_fraction: float = setting(0.08, "or of more than this fraction of OD; 0.6 % of readings are such outliers")
+    jump_fraction: float = setting(
+        0.08, "or of more than this fraction of OD; 0.6 % of readings are such outliers", within=(0, 1)
+    )
     drift: float = setting(
         0.05,
         "unexplained change of ln OD, on top of six sd of the sensor, that in three samples in a row trips "
         "no_dilution or falls",
         within=(0.01, 1),
     )
-    noise_od: float = setting(0.005, "sd of the sensor", "OD")
-    noise_fraction: float = setting(0.005, "its part that is proportional to OD")
+    noise_od: float = setting(0.005, "sd of the sensor", "OD", within=(0, 0.5))
+    noise_fraction: float = setting(0.005, "its part that is proportional to OD", within=(0, 0.5))
     cooldown: float = setting(5.0, "without a dose after no_dilution or falls", "min", above=0.0, below=math.inf)
     stale_s: float | None = setting(
         None, "age of a newest sample that is stale; null: 40 s more than a control period", "s", at_most=7200.0

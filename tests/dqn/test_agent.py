@@ -1,6 +1,5 @@
 """The agent as a whole: an easy problem, populations, resuming, and one update recomputed with torch's own parts."""
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,8 @@ from dqn.config import DQNConfig
 from dqn.replay import Transition
 from dqn.trainer import Trainer
 from tests.dqn.problems import IdentityEnv, streams
+
+pytestmark = pytest.mark.numeric
 
 SMALL = DQNConfig(
     hidden=(16, 16),
@@ -49,61 +50,24 @@ def _trainer(config: DQNConfig, seeds: range) -> Trainer:
     return Trainer(IdentityEnv(seeds), agent, interval=50)
 
 
-def _train(trainer: Trainer, records: int | None = None) -> Trainer:
-    for k, _ in enumerate(trainer.run()):
-        if records is not None and k + 1 == records:
-            break
+def _train(trainer: Trainer) -> Trainer:
+    for _ in trainer.run():
+        pass
     return trainer
 
 
 @pytest.mark.parametrize("changes", [{}, {"action_gap": 0.5, "huber": 0.5}], ids=["plain", "all"])
 def test_solves_the_identity_problem(changes: dict[str, Any]) -> None:
-    """Every one of 8 agents picks the paying action for every symbol, and Q is 1 / (1 - gamma) there."""
-    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 1500, "epsilon_end": 0.3, **changes})
-    trainer = _train(_trainer(config, range(8)))
-    q = trainer.agent.online(torch.eye(3).expand(8, 3, 3))
-    assert torch.equal(q.argmax(-1), torch.arange(3).expand(8, 3))
-    torch.testing.assert_close(q.amax(-1), torch.full((8, 3), 2.0), rtol=0.1, atol=0.1)
-
-
-@pytest.mark.parametrize("changes", [{}, EVERYTHING], ids=["plain", "everything"])
-def test_agent_of_a_population_is_the_agent_alone(changes: dict[str, Any]) -> None:
-    """Same episodes, actions and minibatches; weights equal up to rounding over the first updates."""
-    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 60, "epsilon_start": 0.5, **changes})
-    population = _train(_trainer(config, range(4, 12))).agent
-    for i in (0, 3, 7):
-        alone = _train(_trainer(config, range(4 + i, 5 + i))).agent
-        assert torch.equal(population.replay.state_dict()["rows"][i], alone.replay.state_dict()["rows"][0])
-        for one, other in ((population.online, alone.online), (population.target, alone.target)):
-            torch.testing.assert_close(one.flat[i], other.flat[0], rtol=1e-4, atol=1e-6)
-    assert not torch.allclose(population.online.flat[0], population.online.flat[1])
-
-
-@pytest.mark.parametrize("changes", [{}, EVERYTHING], ids=["plain", "everything"])
-@pytest.mark.parametrize("stop", [1, 5, -1])
-def test_a_resumed_run_is_the_uninterrupted_one(changes: dict[str, Any], stop: int) -> None:
-    """Also where no episode ends in what is left of it, 7 steps."""
-    total = SMALL.total_steps + 7 * (stop < 0)
-    config = DQNConfig(**{**SMALL.__dict__, **changes, "total_steps": total})
-    whole = _trainer(config, range(3))
-    returns = [record.episode_return for record in whole.run()]
-    stop %= len(returns)
-    stopped = _train(_trainer(config, range(3)), records=stop)
-    state = copy.deepcopy(stopped.state_dict())
-    resumed = _trainer(config, range(3))
-    resumed.load_state_dict(state)
-    rest = [record.episode_return for record in resumed.run()]
-    for one, other in zip(
-        (whole.agent.online, whole.agent.target),
-        (resumed.agent.online, resumed.agent.target),
-        strict=True,
-    ):
-        assert torch.equal(one.flat, other.flat)
-    np.testing.assert_array_equal(np.array(returns[stop:]), np.array(rest))
+    """Every one of 4 agents picks the paying action for every symbol, and Q is 1 / (1 - gamma) there."""
+    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 1200, "epsilon_end": 0.3, **changes})
+    trainer = _train(_trainer(config, range(4)))
+    q = trainer.agent.online(torch.eye(3).expand(4, 3, 3))
+    assert torch.equal(q.argmax(-1), torch.arange(3).expand(4, 3))
+    torch.testing.assert_close(q.amax(-1), torch.full((4, 3), 2.0), rtol=0.1, atol=0.1)
 
 
 def test_one_update_agrees_with_torch() -> None:
-    """Minibatch, target, squared error and Adam, recomputed with autograd from the same draws."""
+    """Minibatch, target, squared error and Adam's step, recomputed with autograd from the same draws."""
     config = DQNConfig(**{**SMALL.__dict__, "learn_start": 40, "total_steps": 41, "gamma": 0.9})
     trainer = _trainer(config, range(2))
     before = trainer.agent.online.flat.clone()
@@ -130,10 +94,11 @@ def test_one_update_agrees_with_torch() -> None:
         with torch.no_grad():
             # before the first copy the target network holds the initial weights of the online one
             target = reward + 0.9 * q(s_t).amax(1)
-        adam = torch.optim.Adam([parameters], lr=config.learning_rate)
         (0.5 * (q(s_tm1).gather(1, action[:, None])[:, 0] - target) ** 2).mean().backward()
-        adam.step()
-        torch.testing.assert_close(agent.online.flat[i].double(), parameters.detach(), rtol=1e-4, atol=1e-6)
+        slope = parameters.grad
+        assert slope is not None
+        expected = before[i] - config.learning_rate * slope / (slope.abs() + 1e-8)  # Adam's first step
+        torch.testing.assert_close(agent.online.flat[i].double(), expected, rtol=1e-4, atol=1e-6)
 
 
 def _filled(config: DQNConfig, seeds: range) -> DQNAgent:
@@ -211,37 +176,23 @@ def test_rewards_of_replaced_goals_are_scaled_like_those_of_the_environment() ->
     torch.testing.assert_close(q[:, 1], torch.full((2, 2), -20.0), rtol=0.02, atol=0.0)
 
 
-def test_truncation_bootstraps_and_termination_does_not() -> None:
-    """All rewards 1 and one observation: Q grows towards 1 / (1 - gamma) only where episodes are truncated."""
-    config = DQNConfig(**{**SMALL.__dict__, "total_steps": 10_000, "gamma": 0.9, "target_period": 10})
-    values = []
-    for continues in (1.0, 0.0):
-        agent = DQNAgent(config, 1, 2, streams(range(1)))
-        one = np.ones((1, 1), dtype=np.float32)
-        for k in range(500):
-            agent.observe(one, np.array([k % 2]), np.ones(1), one, np.array([continues]))
-        values.append(agent.online(torch.ones(1, 1, 1))[0, 0])
-    torch.testing.assert_close(values[0], torch.full((2,), 10.0), rtol=0.05, atol=0.0)
-    torch.testing.assert_close(values[1], torch.full((2,), 1.0), rtol=0.05, atol=0.0)
-
-
-def test_exploration_follows_epsilon() -> None:
-    """At epsilon 0.5 with 4 actions the greedy one comes up in 0.5 + 0.5 / 4 of the steps."""
-    config = DQNConfig(**{**SMALL.__dict__, "epsilon_start": 0.5, "epsilon_end": 0.5})
-    agent = DQNAgent(config, 3, 4, streams(range(64)))
+def test_exploration_follows_epsilon_and_tries_every_action_equally_often() -> None:
+    """At epsilon 0.6 with 5 actions the greedy one comes up in 0.4 + 0.6 / 5 of the steps, each other one in 0.12."""
+    config = DQNConfig(**{**SMALL.__dict__, "epsilon_start": 0.6, "epsilon_end": 0.6})
+    agent = DQNAgent(config, 3, 5, streams(range(64)))
     observation = torch.eye(3)[torch.arange(64) % 3]
-    greedy = agent.online(observation.unsqueeze(1))[:, 0].argmax(-1)
-    share = np.mean([agent.act(observation.numpy()) == greedy.numpy() for _ in range(400)])
-    assert float(share) == pytest.approx(0.625, abs=0.01)
+    greedy = agent.online(observation.unsqueeze(1))[:, 0].argmax(-1).numpy()
+    beyond = (np.array([agent.act(observation.numpy()) for _ in range(400)]) - greedy) % 5
+    np.testing.assert_allclose(np.bincount(beyond.ravel(), minlength=5) / beyond.size, [0.52, *[0.12] * 4], atol=0.01)
 
 
-@pytest.mark.parametrize(("step", "expected"), [(0, 1.0), (250, 0.525), (500, 0.05), (501, 0.05), (10**6, 0.05)])
-def test_epsilon_falls_linearly(step: int, expected: float) -> None:
-    assert DQNConfig(epsilon_start=1.0, epsilon_end=0.05, epsilon_steps=500).epsilon(step) == pytest.approx(expected)
-
-
-def test_epsilon_without_steps_is_its_end() -> None:
-    assert DQNConfig(epsilon_end=0.05, epsilon_steps=0).epsilon(0) == 0.05
+@pytest.mark.parametrize(
+    ("steps", "step", "expected"),
+    [(500, 0, 1.0), (500, 250, 0.525), (500, 500, 0.05), (500, 501, 0.05), (500, 10**6, 0.05), (0, 0, 0.05)],
+)
+def test_epsilon_falls_linearly(steps: int, step: int, expected: float) -> None:
+    config = DQNConfig(epsilon_start=1.0, epsilon_end=0.05, epsilon_steps=steps)
+    assert config.epsilon(step) == pytest.approx(expected)
 
 
 def test_as_large_a_share_of_a_minibatch_gets_another_goal_as_is_asked_for() -> None:
@@ -283,40 +234,7 @@ def test_costs_are_learned_in_the_scale_of_their_root_and_gaps_are_widened_there
     assert float(y) == pytest.approx(0.4 - np.sqrt(0.4**2 - value) - 0.25 * (-0.1 + 0.6))
 
 
-def test_what_explores_tries_every_action_equally_often() -> None:
-    agent = DQNAgent(DQNConfig(**{**SMALL.__dict__, "epsilon_start": 1.0}), 1, 5, streams(range(400)))
-    tried = np.concatenate([agent.act(np.zeros((400, 1), dtype=np.float32)) for _ in range(10)])
-    np.testing.assert_allclose(np.bincount(tried, minlength=5) / tried.size, 0.2, atol=0.03)
-
-
-def test_a_resumed_agent_tells_of_the_loss_and_the_range_of_q_that_it_had() -> None:
-    """Until it looks at them again, which may be an hundred updates off; each agent has its own."""
-    first, second = (DQNAgent(SMALL, 3, 3, streams(range(2))) for _ in range(2))
-    first.loss, first.q_range = torch.tensor([0.25, 4.0]), torch.tensor([[-3.0, 0.5], [-7.0, 2.0]])
-    second.load_state_dict(copy.deepcopy(first.state_dict()))
-    assert second.loss.tolist() == [0.25, 4.0]
-    assert second.q_range.tolist() == [[-3.0, 0.5], [-7.0, 2.0]]
-
-
 def test_relabelling_without_a_goal_is_refused() -> None:
     config = DQNConfig(**{**SMALL.__dict__, "hindsight_share": 0.5})
     with pytest.raises(ValueError, match=r"agent\.hindsight_share = 0\.5"):
         DQNAgent(config, 3, 3, streams(range(1)))
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("hidden", ()),
-        ("gamma", 1.0),
-        ("learning_rate", 0.0),
-        ("epsilon_end", 1.5),
-        ("batch_size", 0),
-        ("action_gap", 1.0),
-        ("hindsight_share", -0.1),
-        ("input_offset", (1.0,)),
-    ],
-)
-def test_values_out_of_range_are_named(key: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=rf"agent\.{key} "):
-        DQNConfig(**{key: value})

@@ -8,34 +8,6 @@ import pytest
 import torch
 
 from dqn import checkpoint
-from dqn.agent import DQNAgent
-from dqn.config import DQNConfig
-from dqn.trainer import Trainer
-from tests.dqn.problems import IdentityEnv, streams
-
-CONFIG = DQNConfig(hidden=(8, 8), total_steps=200, learn_start=20, batch_size=8, target_period=10)
-
-
-def _trainer() -> Trainer:
-    return Trainer(IdentityEnv(range(2)), DQNAgent(CONFIG, 3, 3, streams(range(2))), interval=30)
-
-
-def test_resume_through_a_file_is_exact(tmp_path: Path) -> None:
-    path = tmp_path / "checkpoint.pt"
-    whole = _trainer()
-    for record in whole.run():
-        if record.step == 90:
-            checkpoint.save(path, whole.state_dict())
-    resumed = _trainer()
-    resumed.load_state_dict(checkpoint.load(path))
-    assert resumed.agent.steps == 90
-    for _ in resumed.run():
-        pass
-    one, other = whole.agent.state_dict(), resumed.agent.state_dict()
-    for name in ("online", "target"):
-        assert torch.equal(one[name], other[name])
-    assert torch.equal(one["replay"]["rows"], other["replay"]["rows"])
-    assert one["explore"] == other["explore"]
 
 
 def test_a_failed_write_leaves_the_previous_checkpoint(tmp_path: Path) -> None:
@@ -92,14 +64,11 @@ def test_code_in_a_checkpoint_is_refused_and_not_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"nonsense", b"PK\x03\x04 torn"], ids=["empty", "text", "torn"])
 def test_unreadable_files_are_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "checkpoint.pt"
+    with pytest.raises(checkpoint.CheckpointError, match="no such checkpoint"):
+        checkpoint.load(path)
     path.write_bytes(content)
     with pytest.raises(checkpoint.CheckpointError, match=r"checkpoint\.pt: not a readable checkpoint"):
         checkpoint.load(path)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(checkpoint.CheckpointError, match="no such checkpoint"):
-        checkpoint.load(tmp_path / "checkpoint.pt")
 
 
 @pytest.mark.parametrize("content", [{"format": 99, "state": {}}, [1, 2]])

@@ -6,6 +6,8 @@ import torch
 
 from dqn.network import QNetwork, action_basis, initial_weights
 
+pytestmark = pytest.mark.numeric
+
 SIZES = (3, 7, 5, 4)
 AGENTS, BATCH = 3, 6
 
@@ -34,7 +36,8 @@ def test_forward_and_backward_agree_with_autograd(decay: float | None) -> None:
     observation = torch.randn(AGENTS, BATCH, SIZES[0], generator=generator)
     slope = torch.randn(AGENTS, BATCH, SIZES[-1], generator=generator)
     q, inputs = network.forward(observation)
-    network.backward(inputs, slope)
+    for _ in range(2):  # the second overwrites what the first has left
+        network.backward(inputs, slope)
     for i in range(AGENTS):
         twin = _twin(network, i)
         expected = twin(observation[i].double())
@@ -45,17 +48,6 @@ def test_forward_and_backward_agree_with_autograd(decay: float | None) -> None:
         for linear, (weight, bias) in zip(linears, QNetwork(network.grad, SIZES).layers, strict=True):
             torch.testing.assert_close(weight[i].double(), linear.weight.grad.T, rtol=1e-4, atol=1e-5)
             torch.testing.assert_close(bias[i, 0].double(), linear.bias.grad, rtol=1e-4, atol=1e-5)
-
-
-def test_backward_overwrites_an_earlier_gradient() -> None:
-    network = QNetwork(_flat(), SIZES)
-    observation = torch.ones(AGENTS, BATCH, SIZES[0])
-    _, inputs = network.forward(observation)
-    slope = torch.ones(AGENTS, BATCH, SIZES[-1])
-    network.backward(inputs, slope)
-    first = network.grad.clone()
-    network.backward(inputs, slope)
-    torch.testing.assert_close(network.grad, first, rtol=0.0, atol=0.0)
 
 
 def test_agents_do_not_see_one_another() -> None:
@@ -69,16 +61,19 @@ def test_agents_do_not_see_one_another() -> None:
     assert not torch.equal(before[1], after[1])
 
 
-def test_input_map_is_applied_and_reported() -> None:
+def test_maps_of_inputs_and_outputs_stay_with_other_weights_and_are_reported_as_copies() -> None:
     matrix, offset = torch.tensor([[3.0, -3.0], [0.0, 2.0], [1.0, 0.5]]), torch.tensor([0.0, -1.2, 0.25])
-    sizes = (3, 4, 2)
-    network = QNetwork(_flat(sizes), sizes, matrix, offset)
-    observation = torch.rand(AGENTS, BATCH, 2)
+    sizes, basis, observation = (3, 4, 2), action_basis(2, 1.0), torch.rand(AGENTS, BATCH, 2)
     plain = QNetwork(_flat(sizes), sizes)
-    torch.testing.assert_close(network(observation), plain(observation @ matrix.T + offset))
-    stored = network.input_map()
-    np.testing.assert_array_equal(stored[0], matrix.numpy())
-    np.testing.assert_array_equal(stored[1], offset.numpy())
+    first = QNetwork(0.5 * _flat(sizes), sizes, matrix.clone(), offset.clone(), basis.clone())
+    for network in (first, first.with_weights(plain.flat)):
+        for array, expected in zip((*network.input_map(), network.output_map()), (matrix, offset, basis), strict=True):
+            np.testing.assert_array_equal(array, expected.numpy())
+            array += 1.0
+    expected = plain(observation @ matrix.T + offset) @ basis
+    torch.testing.assert_close(network(observation), expected)
+    for array, unit in zip((*plain.input_map(), plain.output_map()), (np.eye(3), np.zeros(3), np.eye(2)), strict=True):
+        np.testing.assert_array_equal(array, unit)
 
 
 def test_initial_weights_follow_torch_linear() -> None:
@@ -96,9 +91,13 @@ def test_initial_weights_follow_torch_linear() -> None:
 
 
 def test_action_basis_spans_everything_and_prefers_smooth_differences() -> None:
-    plain = action_basis(17, 0.0).double()
-    gram = plain @ plain.T
-    torch.testing.assert_close(gram, torch.diag(torch.diag(gram)), rtol=0.0, atol=1e-5)  # orthogonal rows
+    for decay in (0.0, 0.5, 2.0):
+        rows = action_basis(17, decay).double()
+        lengths = 17.0 * (1.0 + torch.arange(17, dtype=torch.float64)) ** (-2.0 * decay)
+        torch.testing.assert_close(rows @ rows.T, torch.diag(lengths), rtol=1e-4, atol=1e-5)  # orthogonal rows
+        assert bool((rows[:, -1] > 0.0).all())
+    linear = action_basis(17, 0.0)[1].double().diff()
+    torch.testing.assert_close(linear, linear[:1].expand(16), rtol=1e-4, atol=0.0)
     basis = action_basis(17, 2.0).double()
     assert int(torch.linalg.matrix_rank(basis)) == 17
     torch.testing.assert_close(basis[0], torch.ones(17, dtype=torch.float64))

@@ -1,6 +1,5 @@
 """Agents in groups: the same whatever the number of threads, and whole again after a stop."""
 
-import copy
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,6 +12,8 @@ from dqn.population import Population
 from dqn.trainer import Trainer, TrainRecord
 from tests.dqn.problems import IdentityEnv, streams
 from tests.dqn.test_agent import SMALL
+
+pytestmark = pytest.mark.numeric
 
 GROUPS = (range(4), range(4, 7), range(7, 8))
 
@@ -43,20 +44,6 @@ def test_agents_come_in_the_order_of_their_groups() -> None:
     alone = Trainer(IdentityEnv(range(5, 6)), DQNAgent(SMALL, 3, 3, streams(range(5, 6))), interval=50)
     first = next(alone.run())
     np.testing.assert_allclose(next(_population(2).run()).episode_return[5], first.episode_return[0])
-
-
-def test_a_resumed_population_is_the_uninterrupted_one() -> None:
-    whole = _population(2)
-    returns = [record.episode_return for record in whole.run()]
-    stopped = _population(2)
-    running = stopped.run()
-    for _ in range(5):
-        next(running)
-    resumed = _population(1)
-    resumed.load_state_dict(copy.deepcopy(stopped.state_dict()))
-    rest = [record.episode_return for record in resumed.run()]
-    np.testing.assert_array_equal(np.array(returns[5:]), np.array(rest))
-    assert torch.equal(whole.weights(), resumed.weights())
 
 
 def test_an_error_in_one_group_ends_the_run() -> None:

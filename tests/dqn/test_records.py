@@ -1,4 +1,4 @@
-"""What training tells of itself, by hand: records, diagnostics, counts; and the network's constant maps."""
+"""What training tells of itself, by hand: records, diagnostics, counts, targets."""
 
 from typing import Any
 
@@ -8,7 +8,6 @@ import torch
 
 from dqn.agent import DIAGNOSED, DQNAgent
 from dqn.config import DQNConfig
-from dqn.network import QNetwork, action_basis, initial_weights
 from dqn.trainer import Trainer, TrainRecord
 from tests.dqn.problems import IdentityEnv, streams
 
@@ -98,38 +97,9 @@ def test_parts_of_the_input_map_that_do_not_fit_are_refused(changes: dict[str, A
     DQNConfig(hidden=(5,), input_matrix=(1.0, 0.0, 0.0, 1.0), input_offset=(0.0, 0.0))
 
 
-def test_rows_of_the_action_basis_have_their_lengths_and_rise_at_the_end() -> None:
-    for decay in (0.0, 0.5, 2.0):
-        basis = action_basis(9, decay).double()
-        lengths = np.sqrt(9.0) * (1.0 + np.arange(9.0)) ** -decay
-        np.testing.assert_allclose(basis.norm(dim=1), lengths, rtol=1e-5)
-        assert bool((basis[:, -1] > 0.0).all())
-    linear = action_basis(9, 0.0)[1].double().numpy()
-    np.testing.assert_allclose(np.diff(linear), np.diff(linear)[0], rtol=1e-5)
-
-
-def test_other_weights_keep_maps_and_what_is_exported_is_a_copy() -> None:
-    matrix, offset, basis = torch.tensor([[3.0, -3.0], [0.0, 2.0], [1.0, 0.5]]), torch.ones(3), action_basis(4, 1.0)
-    flat = torch.from_numpy(np.stack([initial_weights((3, 5, 4), np.random.SeedSequence(k)) for k in range(2)]))
-    network = QNetwork(flat[:1], (3, 5, 4), matrix, offset, basis)
-    other = network.with_weights(flat)
-    observation = torch.rand(1, 6, 2)
-    torch.testing.assert_close(other(observation.expand(2, -1, -1))[:1], network(observation))
-    np.testing.assert_array_equal(network.output_map(), basis.numpy())
-    np.testing.assert_array_equal(QNetwork(flat, (3, 5, 4)).output_map(), np.eye(4))
-    for array in (*network.input_map(), network.output_map()):
-        array += 1.0
-    np.testing.assert_array_equal(network.input_map()[0], matrix.numpy())
-    np.testing.assert_array_equal(network.input_map()[1], np.ones(3))
-    np.testing.assert_array_equal(network.output_map(), basis.numpy())
-    plain = QNetwork(flat, (3, 5, 4))
-    np.testing.assert_array_equal(plain.input_map()[0], np.eye(3))
-    np.testing.assert_array_equal(plain.input_map()[1], np.zeros(3))
-
-
 @pytest.mark.parametrize("gap", [0.0, 0.5])
 def test_the_target_of_an_update_with_and_without_an_action_gap(gap: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One transition in the memory, two features of it: y = r + gamma max Q(s') - gap (max Q(s) - Q(s, a))."""
+    """y = r + gamma max Q(s') - gap (max Q(s) - Q(s, a)) of one transition; that of the second agent has terminated."""
     maps = {"input_matrix": (1.0, -1.0, 0.0, 2.0), "input_offset": (0.5, 0.0)}
     config = DQNConfig(hidden=(8,), batch_size=4, gamma=0.9, action_gap=gap, reward_scale=2.0, **maps)
     agent = DQNAgent(config, 2, 3, streams(range(2)))
@@ -137,11 +107,11 @@ def test_the_target_of_an_update_with_and_without_an_action_gap(gap: float, monk
     np.testing.assert_array_equal(agent.online.input_map()[1], [0.5, 0.0])
     assert agent.sizes == (2, 8, 3)
     before, after, action = np.full((2, 2), 0.3), np.full((2, 2), 0.7), np.array([1, 2])
-    agent.observe(before, action, np.array([0.25, -0.5]), after, np.ones(2))
+    agent.observe(before, action, np.array([0.25, -0.5]), after, np.array([1.0, 0.0]))
     seen: list[torch.Tensor] = []
     monkeypatch.setattr(agent, "fit", lambda observation, chosen, target: seen.append(target))
     agent.learn()
     q, q_after = (agent.target(torch.full((2, 1, 2), x))[:, 0] for x in (0.3, 0.7))
     chosen = q[torch.arange(2), torch.tensor(action)]
-    y = torch.tensor([0.5, -1.0]) + 0.9 * q_after.max(1).values - gap * (q.max(1).values - chosen)
+    y = torch.tensor([0.5, -1.0]) + torch.tensor([0.9, 0.0]) * q_after.max(1).values - gap * (q.max(1).values - chosen)
     torch.testing.assert_close(seen[0], y[:, None].expand(2, 4))

@@ -54,12 +54,6 @@ def test_what_follows_from_a_block_is_computed_once() -> None:
     assert shapes == [(2, CALLS_PER_BLOCK, 3)] * 2
 
 
-def test_seeds_differ() -> None:
-    stream = UniformStream(_seeds(range(2)), 4)
-    numbers = stream.take(1)
-    assert not np.array_equal(numbers[0], numbers[1])
-
-
 @pytest.mark.parametrize("calls", [0, 1, CALLS_PER_BLOCK - 1, CALLS_PER_BLOCK, CALLS_PER_BLOCK + 1])
 def test_continues_from_its_state(calls: int) -> None:
     one = UniformStream(_seeds(range(3)), 2)

@@ -5,6 +5,8 @@ import torch
 
 from dqn.targets import advantage_target, compressed, expanded, huber_loss, loss_gradient, q_target
 
+pytestmark = pytest.mark.numeric
+
 GAMMA = 0.9
 # Chain: in state 0 action 0 stays (reward 0), action 1 moves to state 1 (reward 1); state 1 is left by either action,
 # back to state 0, with reward 2 for action 0 and 0 for action 1.

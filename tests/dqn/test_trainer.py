@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from numpy.typing import NDArray
 
@@ -10,6 +11,8 @@ from dqn.agent import DQNAgent
 from dqn.config import DQNConfig
 from dqn.trainer import Trainer
 from tests.dqn.problems import streams
+
+pytestmark = pytest.mark.numeric
 
 Array = NDArray[Any]
 
@@ -130,17 +133,6 @@ def test_copies_whose_episodes_end_at_other_steps_and_in_other_ways_are_told_apa
     assert after == [[1, 2] * 4, [11, 12, 13, 11, 12, 13, 11, 12]]  # the last of an episode, not the next one's first
     assert goes_on == [[1, 0] * 4, [1] * 8]  # nothing follows an end, and a cut is none
     assert [record.episode_return.tolist() for record in records] == [[2.0, 6.0], [2.0, 6.0]]
-
-
-def test_an_episode_that_a_stop_cuts_in_two_counts_as_one_when_it_is_resumed() -> None:
-    """Copy 1 is in the second step of its second episode by then, which pays 2 a step."""
-    first, second = uneven(), uneven()
-    next(first.run())
-    state = first.state_dict()
-    assert state["return"] == [0.0, 2.0]
-    second.load_state_dict(state)
-    (rest,) = second.run()
-    assert (rest.step, rest.episode_return.tolist()) == (8, [2.0, 6.0])
 
 
 def test_records_come_at_multiples_of_their_interval_wherever_a_run_goes_on() -> None:

@@ -17,6 +17,8 @@ from envs.plant.pump import PumpConfig
 from envs.plant.sensor import SensorConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig
 
+pytestmark = pytest.mark.numeric
+
 Array = NDArray[np.float64]
 
 MODEL = (0.03, 1.0 / 3.0)

@@ -13,6 +13,8 @@ from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Evaluation
 from tests.two_species import EQUAL_RATES_C, p_putida_rate
 
+pytestmark = pytest.mark.numeric
+
 PREVIEW = CocultureConfig(control_min=30.0, episode_steps=24, preview_min=360.0)
 
 

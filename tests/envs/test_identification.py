@@ -17,6 +17,8 @@ from envs.integrators import rk4
 from hardware.storage.recording_reader import read_recording
 from tests.real_recording import DITHER, needs_dither
 
+pytestmark = pytest.mark.numeric
+
 
 def series(time: np.ndarray, od: np.ndarray, pump_rate: np.ndarray) -> Series:
     return Series(time, od, pump_rate, np.arange(len(time)))

@@ -11,6 +11,8 @@ from experiments.training.density import Density
 from experiments.training.evaluation import Evaluation
 from experiments.training.session import merit
 
+pytestmark = pytest.mark.numeric
+
 
 @pytest.fixture(scope="module")
 def evaluation():
@@ -116,14 +118,6 @@ def test_starts_too_far_for_a_slow_pump_do_not_count_as_offsets():
     assert exact.steady_abs_error[0] < 0.001
     offset = evaluation(of(aiming(step_factors(config), lambda setpoint: np.where(setpoint < 0.25, 0.212, setpoint))))
     assert offset.steady_abs_error[0] == pytest.approx(0.012, abs=0.001)
-
-
-def test_random_and_constant_policies_lose_clearly(evaluation):
-    rng = np.random.default_rng(0)
-    random = evaluation(of(lambda od, setpoint: rng.integers(0, 17, od.shape)))
-    constant = evaluation(of(lambda od, setpoint: np.full(od.shape, 8)))
-    assert random.regret_pct[0] > 100.0
-    assert constant.regret_pct[0] > 100.0
 
 
 def test_value_iteration_agrees_on_a_coarse_grid():

@@ -12,6 +12,8 @@ from envs.coculture.task import CocultureConfig, CocultureVectorEnv, advance, li
 from envs.plant.plant import Plant, PlantConfig, of_pair
 from tests.envs.test_plant import preset
 
+pytestmark = pytest.mark.numeric
+
 WARM = PairConfig(  # the second gains where it is warm
     SpeciesConfig("cold", (-0.05, 2.0)), SpeciesConfig("warm", (0.06, -1.0), (), 45.0), temperatures=(20.0, 32.0)
 )

@@ -23,6 +23,8 @@ from envs.identification.screening import Series
 from experiments.calibration.config import CalibrateConfig
 from experiments.calibration.study import simulated
 
+pytestmark = pytest.mark.numeric
+
 MU, TAU = 0.03, 1.0 / 3.0
 
 

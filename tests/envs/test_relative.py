@@ -13,6 +13,8 @@ from envs.task import EnvConfig, step_factors
 from experiments.training.evaluation import Evaluation
 from experiments.training.relative import Relative
 
+pytestmark = pytest.mark.numeric
+
 CONFIG = RelativeConfig()
 
 
@@ -76,7 +78,7 @@ def test_the_nearest_level_by_hand() -> None:
     assert nearest_level(error, np.full(7, 0.5), 5).tolist() == [0, 2, 2, 2, 3, 4, 4]
 
 
-@pytest.mark.parametrize("levels", [9, 33])
+@pytest.mark.parametrize("levels", [5, 9])
 def test_the_one_line_law_is_the_optimum_of_any_number_of_levels(levels: int) -> None:
     task = Relative(replace(CONFIG, n_actions=levels))
     law = Evaluation(task, task.report_grid()[::7])(task.myopic)
@@ -85,7 +87,7 @@ def test_the_one_line_law_is_the_optimum_of_any_number_of_levels(levels: int) ->
 
 def test_nothing_beats_the_optimum_and_the_one_line_law_is_it() -> None:
     task = Relative(CONFIG)
-    evaluation = Evaluation(task, task.report_grid())
+    evaluation = Evaluation(task, task.report_grid()[::5])
     law = evaluation(task.myopic)
     assert abs(law.regret_pct[0]) < 1e-5  # the optimum's values are interpolated
     rng = np.random.default_rng(0)
@@ -103,10 +105,3 @@ def test_a_finer_grid_finds_the_same_optimum() -> None:
         coarse, fine = (solve_relative(CONFIG, share, 40, spacing) for spacing in (1 / 256, 1 / 1024))
         costs = [np.square(o.rollout(starts)[0]).sum() for o in (coarse, fine)]
         assert costs[0] == pytest.approx(costs[1], rel=2e-4)
-
-
-def test_ranges() -> None:
-    with pytest.raises(ValueError, match=r"env.growth_shares = \[0.5, 0.2\]"):
-        RelativeConfig(growth_shares=(0.5, 0.2))
-    with pytest.raises(ValueError, match=r"env.largest_error = 1.0 periods of full pump: allowed 1.1 to 100"):
-        RelativeConfig(largest_error=1.0)

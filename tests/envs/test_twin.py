@@ -23,6 +23,8 @@ from experiments.calibration.twin_file import plant_of, twin_yaml
 from experiments.laws.density.baselines import Threshold, ThresholdConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig
 
+pytestmark = pytest.mark.numeric
+
 Array = NDArray[np.float64]
 
 MINUTES = 840  # 14 h, in which mu rises by 40 % and tau from 0.29 to 0.42

@@ -19,6 +19,8 @@ from envs.identification.verdict import judged
 from experiments.calibration.study import against_truth
 from tests.studies.second_simulator import Conditions, simulate
 
+pytestmark = pytest.mark.numeric
+
 Array = NDArray[np.float64]
 
 

@@ -31,6 +31,8 @@ from experiments.laws import registry
 from experiments.training import run as training
 from tests.experiments.test_deploy import inverse_policy
 
+pytestmark = pytest.mark.numeric
+
 ROOT = Path(__file__).parents[2]
 EVERY = ("dqn", "pi", "pi_tuned", "mpc", "adaptive_inverse", "threshold", "hold", "oracle")
 FEEDBACK = ("dqn", "pi_tuned", "mpc", "adaptive_inverse")

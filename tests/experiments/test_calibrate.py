@@ -34,6 +34,8 @@ from hardware.storage.recording_reader import Recording, read_recording
 from tests.patience import PATIENCE_S
 from tests.real_recording import DITHER, needs_dither
 
+pytestmark = pytest.mark.numeric
+
 ROOT = Path(__file__).parents[2]
 Cli = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -21,6 +21,8 @@ from experiments.reporting import charts, pair_charts
 from hardware.storage.marks import Mark, add_mark
 from tests.envs.test_plant import preset
 
+pytestmark = pytest.mark.numeric
+
 TRUE = PairConfig(
     SpeciesConfig("alpha", (0.06, -1.1)), SpeciesConfig("beta", (-0.01, 0.6, -8.1), (), 60.0),
     PigmentConfig((-100.0, 4000.0), 31.0), (27.0, 35.0),

@@ -41,6 +41,8 @@ from tests.experiments import laws
 from tests.experiments.test_exits import ENVIRONMENT
 from tests.patience import PATIENCE_S
 
+pytestmark = pytest.mark.numeric
+
 ASKED = CertifyConfig(env=EnvConfig(), setpoints=(0.4, 0.8), trajectories=0)
 SCENARIO = Scenario((0.45, 0.65), (30.0, 30.0), (37.0, 37.0))
 

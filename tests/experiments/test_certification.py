@@ -22,6 +22,8 @@ from experiments.certification.question import CertificationError, question
 from experiments.certification.verdict import Proof, attacked, dose_below, physical, prove
 from tests.experiments import laws
 
+pytestmark = pytest.mark.numeric
+
 BOX = ((-0.02, 1.52), (0.4, 0.8))
 FAST = CertifyConfig(trajectories=0)
 LARGEST = 0.06  # what the full pump takes off ln x in a minute: 0.02 / (1/3)

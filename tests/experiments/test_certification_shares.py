@@ -23,6 +23,8 @@ from experiments.certification.share_loop import ShareCase, ShareLoop
 from experiments.certification.verdict import Proof, prove
 from tests.experiments import laws
 
+pytestmark = pytest.mark.numeric
+
 FAST = CertifyConfig(trajectories=0)
 B = 0.06
 

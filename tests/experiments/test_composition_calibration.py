@@ -13,6 +13,8 @@ from experiments.laws import registry
 from experiments.laws.share.calibration import calibrate_sensor
 from tests.two_species import p_putida_rate, steady_production
 
+pytestmark = pytest.mark.numeric
+
 
 def protocol(share, n=40, hours=5, factor=0.8, offset=300.0):
     """Thirty readings of medium, and thirty of a culture at 33.2 degC after some hours at OD 0.5, (N, 30) each."""

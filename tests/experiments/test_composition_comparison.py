@@ -21,6 +21,8 @@ from experiments.control.policies import SHIPPED_COMPOSITION
 from experiments.laws.share.estimator import FACTOR, OFFSET, CompositionEstimator, CompositionEstimatorConfig
 from tests.experiments.test_deploy import inverse_policy
 
+pytestmark = pytest.mark.numeric
+
 SHORT = (
     "replicates=3", "workers=1", "studies.composition.scenarios=[ratio_steps]",
     "scenarios.ratio_steps.minutes=[30,60,60,60]",

@@ -30,6 +30,8 @@ from experiments.laws.share.program import Program
 from hardware import memory
 from tests.two_species import e_coli_rate, p_putida_rate, steady_production
 
+pytestmark = pytest.mark.numeric
+
 NAN = float("nan")
 QUIET = CompositionEstimatorConfig(
     growth_sd=0.0,

@@ -17,6 +17,8 @@ from experiments.laws.share.program import Program
 from hardware import memory
 from tests.two_species import EQUAL_RATES_C, e_coli_rate, p_putida_rate
 
+pytestmark = pytest.mark.numeric
+
 NAN = float("nan")
 STEPS = Program((NAN, 0.3, 0.7, 0.3), (60.0, 360.0, 600.0, 600.0))
 BLIND = ("pi", "proportional", "inverse_dynamics", "bang_bang", "myopic", "receding")

@@ -27,6 +27,8 @@ from hardware.simulated import SimulatedConfig, SimulatedReactors
 from hardware.storage.marks import Mark
 from tests.experiments.composition_keeper import Reckoning
 
+pytestmark = pytest.mark.numeric
+
 HOLD = Scenario((0.5,), (10_000.0,), (33.2,), ratios=(0.7,))
 PLANT = plant_preset("coculture")
 

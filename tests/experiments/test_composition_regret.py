@@ -9,6 +9,8 @@ from experiments.training.coculture import Coculture
 from experiments.training.evaluation import Evaluation
 from tests.studies.learners import one_line, receding
 
+pytestmark = pytest.mark.numeric
+
 PREVIEW = CocultureConfig(control_min=30.0, episode_steps=24, preview_min=360.0)
 
 

@@ -20,6 +20,8 @@ from experiments.laws.density.mpc import Mpc, MpcConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 from experiments.laws.density.pso import SwarmConfig
 
+pytestmark = pytest.mark.numeric
+
 MODEL = EnvConfig()
 QUICK = SwarmConfig(particles=6, iterations=8)
 MAKERS: dict[str, Callable[[], Controller]] = {

@@ -11,6 +11,8 @@ from envs.task import EnvConfig
 from experiments.laws.density.estimator import EstimatorConfig
 from experiments.laws.density.inverse import Inverse, InverseConfig
 
+pytestmark = pytest.mark.numeric
+
 ONE = np.ones(1, dtype=bool)
 PLAIN = {"noise_memory": 0.0, "warmth": 0.0, "warmth_sd": 0.0, "first_dose": 1.0, "first_dose_sd": 0.0, "hurry": 0.0}
 

@@ -12,6 +12,8 @@ from envs.task import EnvConfig, step_factors
 from experiments.laws.density.mpc import Mpc, MpcConfig, Problem
 from experiments.laws.density.pso import SwarmConfig, minimise
 
+pytestmark = pytest.mark.numeric
+
 Array = NDArray[np.float64]
 MODEL = EnvConfig()
 

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 from envs.task import EnvConfig
 from experiments.laws.density.pi import ChiBioPI, ChiBioPIConfig, TunedPI, TunedPIConfig
 
+pytestmark = pytest.mark.numeric
+
 Array = NDArray[np.float64]
 
 

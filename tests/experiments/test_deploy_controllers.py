@@ -38,6 +38,8 @@ from hardware.pioreactor.family import PioreactorFamily
 from hardware.storage.journal import Journal, read_journal
 from tests.experiments.test_deploy import inverse_policy
 
+pytestmark = pytest.mark.numeric
+
 ROOT = Path(__file__).parents[2]
 NAMES = ("M0", "M1")
 WHY = {  # what each controller says of a decision: name -> number of values per reactor

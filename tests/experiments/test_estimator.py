@@ -11,6 +11,8 @@ from envs.task import EnvConfig
 from experiments.laws.density.estimator import GAIN, LOG_OD, MU, Estimator, EstimatorConfig
 from hardware import memory
 
+pytestmark = pytest.mark.numeric
+
 MODEL = EnvConfig(mu=0.025, tau=1 / 3)
 DEFAULT = EstimatorConfig()
 BARE = EstimatorConfig(

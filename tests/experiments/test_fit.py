@@ -30,6 +30,8 @@ from hardware.safety.config import SafetyConfig
 from hardware.simulated import SimulatedConfig
 from tests.hardware.driver_lab import DriverLab
 
+pytestmark = pytest.mark.numeric
+
 CALM = Scenario((0.5, 0.6), (10.0, 10.0), (37.0, 37.0))
 WARMER = replace(CALM, temperatures=(30.0, 37.0))
 

@@ -30,6 +30,8 @@ from hardware.storage.journal import read_journal
 from tests.campaigns.rehearsal import Killed, Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
+pytestmark = pytest.mark.numeric
+
 NAMES = ("M0", "M1", "M2")
 KINDS = ("pi", "pi_tuned", "mpc", "inverse", "dqn", "threshold")
 SCHEDULE = Scenario((0.5, 0.35), (20.0, 40.0), (37.0, 30.0), recovery_od=0.5)

@@ -22,6 +22,8 @@ from experiments.laws.density.learned import settings
 from experiments.train import main
 from experiments.training.run import fingerprint
 
+pytestmark = pytest.mark.numeric
+
 FILES = sorted(Path(os.environ["POLICIES"]).glob("*.npz")) if "POLICIES" in os.environ else [SHIPPED]
 MODELS = [  # mu 1/min, tau, control period min, largest pump rate mL/s
     (0.01, 0.2, 1.0, 0.02), (0.03, 1 / 3, 1.0, 0.02), (0.05, 0.3, 1.0, 0.02), (0.03, 0.6, 1.0, 0.02),

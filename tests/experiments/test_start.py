@@ -68,10 +68,10 @@ def test_a_mere_folder_of_that_name_beside_an_editable_install(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("name", "more", "also"),
     [
-        ("deploy", [], ""), ("deploy", ["resume=runs/deploy/x"], "; pumps not verified off: resume the run"),
+        ("deploy", ["resume=runs/deploy/x"], "; pumps not verified off: resume the run"),
         ("train", ["resume=runs/train/x"], ""),
     ],
-)  # fmt: skip
+)
 def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, name: str, more: list[str], also: str) -> None:
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", f"experiments.{name}", *more]
@@ -104,6 +104,7 @@ for name, *words in commands:
 """
 
 
+@pytest.mark.slow
 def test_help_and_a_refusal_load_nothing_that_is_slow(tmp_path: Path) -> None:
     """What computes, draws and trains is loaded where it is used: a slip of the pen costs no second."""
     commands = [[name, word] for name in COMMANDS for word in ("--help", "bogus=1", REFUSED.get(name)) if word]

@@ -56,7 +56,7 @@ RUNS = {
     "pi_tuned": [*TEN, "controller=pi_tuned"],
     "shares": [*TEN, "plant=coculture", "composition=dqn_preview", "scenario.ratios=[0.4]"],
 }
-pytestmark = pytest.mark.xdist_group("curves")  # its tests share these runs
+pytestmark = [pytest.mark.xdist_group("curves"), pytest.mark.numeric]  # its tests share these runs
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +98,7 @@ def folded(tag: str) -> str:
     return base if base in CURVES and end in POPULATION else tag
 
 
+@pytest.mark.slow
 def test_the_page_explains_the_curves_that_runs_write_and_no_other(runs: Path) -> None:
     written = {folded(tag) for events in parts(runs) for tag in scalars(events)}
     explained = dict(ROW.findall(PAGE.read_text(encoding="utf-8")))
@@ -131,12 +132,14 @@ def test_a_population_is_told_by_the_mean_of_its_middle_half_and_by_its_ends(tmp
         assert curve(own, "eval/regret_pct")[0].tolist() == [10.0, value]
 
 
+@pytest.mark.slow
 def test_every_curve_and_figure_says_what_it_is(runs: Path) -> None:
     for events in parts(runs):
         for tag in (*scalars(events), *scalars(events, "images")):
             assert events.SummaryMetadata(tag).summary_description == described(tag) != "", tag
 
 
+@pytest.mark.slow
 def test_the_curves_of_a_deployment_are_its_recording_over_minutes(runs: Path) -> None:
     """Several reactors: a run each, with the same tags, so that they can be laid over each other.
 
@@ -161,6 +164,7 @@ def test_the_curves_of_a_deployment_are_its_recording_over_minutes(runs: Path) -
     assert len(curve(events, "culture/od")) == len(read_recording(runs / "dqn" / "recordings" / "M0.csv").od)
 
 
+@pytest.mark.slow
 def test_points_are_dated_by_the_minute_of_the_culture(runs: Path) -> None:
     """12 min of culture that took a second: TensorBoard's relative axis shows them as 12 min."""
     for where, minutes in ((runs / "dqn", 1.0), (runs / "pi" / "reactors" / "M1", 2.0)):
@@ -169,6 +173,7 @@ def test_points_are_dated_by_the_minute_of_the_culture(runs: Path) -> None:
         np.testing.assert_allclose(np.diff(wall), 60.0 * minutes, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_charts_of_the_custom_page_show_curves_that_exist(runs: Path) -> None:
     """Learning with its limits; OD with the setpoint's band; share with its band."""
     for name, titles in (
@@ -200,6 +205,7 @@ def test_charts_of_the_custom_page_show_curves_that_exist(runs: Path) -> None:
             assert ("culture/od",) * 3 in bands
 
 
+@pytest.mark.slow
 def test_hparams_has_a_row_for_each_policy_with_seed_model_and_results(runs: Path) -> None:
     rows = {}
     for events in parts(runs):
@@ -261,6 +267,7 @@ def test_what_a_sweep_varied_is_seen_beside_runs_of_other_words(tmp_path: Path) 
     assert {m.name.tag: m.display_name for m in experiment.metric_infos} == METRICS
 
 
+@pytest.mark.slow
 def test_configuration_and_results_stand_as_text(runs: Path) -> None:
     for name in RUNS:
         texts = {tag: e for e in parts(runs / name) for tag in e.Tags()["tensors"] if tag.startswith("run/")}
@@ -304,6 +311,7 @@ def test_a_resumed_training_keeps_what_is_older_than_its_checkpoint_and_that_of_
         assert curve(events, name).tolist() == [[k, each[n]] for k, each in curves.items()]
 
 
+@pytest.mark.slow
 def test_a_resumed_run_keeps_the_curves_of_all_reactors_where_one_stopped_early(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -322,6 +330,7 @@ def test_a_resumed_run_keeps_the_curves_of_all_reactors_where_one_stopped_early(
     assert curve(events, "culture/od")[:, 0].tolist() == recorded.time_min.tolist()
 
 
+@pytest.mark.slow
 def test_a_picture_has_its_size(runs: Path) -> None:
     (events,) = parts(runs / "dqn")
     (image,) = events.Tensors("figures/closed_loop")

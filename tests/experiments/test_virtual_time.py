@@ -1,4 +1,4 @@
-"""The Chi.Bio's driver against an emulated device in virtual time: a whole run in the time that its arithmetic takes."""
+"""The Chi.Bio driver against an emulated device in virtual time: a run takes as long as its arithmetic."""
 
 import json
 from pathlib import Path

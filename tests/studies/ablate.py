@@ -3,7 +3,7 @@
 `python -m tests.studies.ablate` trains every entry of `ablations` in ablate.yaml beside this file: the agent of the
 command line with some of its values replaced. The run folder gets ablation.csv (a row per variant and seed),
 summary.json, table.md, a figure, and one sub-folder per variant with its TensorBoard curves. A stopped run goes on with
-`resume=RUN`, to the bit.
+`resume=RUN`, to the bit on one processor.
 """
 
 import csv

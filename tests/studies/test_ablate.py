@@ -18,6 +18,8 @@ from tests.patience import PATIENCE_S
 from tests.studies.ablate import AblateConfig, Row, summarise
 from tests.studies.variants import variant
 
+pytestmark = pytest.mark.numeric
+
 ROOT = Path(__file__).parents[2]
 SHORT = ["agent.total_steps=300", "agent.learn_start=100", "agent.epsilon_steps=100", "eval_every=300", "n_agents=2"]
 

@@ -11,6 +11,8 @@ import pytest
 
 from tests.patience import PATIENCE_S
 
+pytestmark = pytest.mark.numeric
+
 ROOT = Path(__file__).parents[2]
 SHORT = [
     "agent.total_steps=120", "agent.learn_start=60", "agent.epsilon_steps=60", "agent.batch_size=16", "n_agents=2",

@@ -7,6 +7,8 @@ import pytest
 
 from tests.studies.intervals import IntervalsConfig, intervals, one, row
 
+pytestmark = pytest.mark.numeric
+
 
 def test_a_table_for_each_simulator_with_a_row_for_each_kind(tmp_path: Path) -> None:
     config = IntervalsConfig(3, 2, ("threshold", "proportional"), (2.0, 3.0), (0.05,), workers=2)

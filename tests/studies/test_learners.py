@@ -5,6 +5,8 @@ import pytest
 from tests.studies import learners
 from tests.studies.learners import Job, LearnersConfig
 
+pytestmark = pytest.mark.numeric
+
 
 @pytest.fixture
 def two_tasks(monkeypatch: pytest.MonkeyPatch) -> LearnersConfig:

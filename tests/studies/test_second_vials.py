@@ -25,6 +25,8 @@ from tests.studies.second_vials import (
     tracking_error,
 )
 
+pytestmark = pytest.mark.numeric
+
 COLD = np.full(1, -100.0)  # a target that never heats
 NOTHING = np.zeros((13, 1))
 

@@ -9,6 +9,8 @@ from experiments.cli import frame
 from tests.studies.measurement import Measurement, measure
 from tests.studies.speed import GROUPS, SpeedConfig, table
 
+pytestmark = pytest.mark.numeric
+
 
 def test_the_ratio_is_the_rivals_time_over_ours():
     m = Measurement(

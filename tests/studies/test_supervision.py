@@ -3,7 +3,11 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from tests.studies.supervision import SupervisionConfig, supervision
+
+pytestmark = pytest.mark.numeric
 
 
 def test_a_blinded_filter_rests_elsewhere_unless_it_is_watched(tmp_path: Path) -> None:

@@ -26,6 +26,8 @@ from tests.studies.two_species import (
     two_species,
 )
 
+pytestmark = pytest.mark.numeric
+
 
 def test_each_row_and_cell_is_of_its_own_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs of a known error: .01 for the first law, .02 for the second ..., twice that where E. coli grows faster.
