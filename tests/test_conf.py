@@ -585,6 +585,11 @@ def test_of_two_folders_to_resume_the_last_is_taken(tmp_path):
         ("turbidostat deploy safety.responses.bud", ["safety.responses.budget="]), ("turbidostat nonsense ", []),
         ("turbidostat deploy safety.resp", ["safety.responses."]), ("turbidostat demo ", ["--help"]),
         ("turbidostat calibrate --", ["--help", "--help=all", "--cfg", "--multirun"]),
+        ("turbidostat certify backend", []), ("turbidostat deploy back", ["backend="]),
+        ("turbidostat train agent=p", ["agent=paper "]), ("turbidostat train +env=rel", ["+env=relative "]),
+        ("turbidostat deploy plant.growth.temperature_l", ["plant.growth.temperature_law="]),
+        ("turbidostat deploy plant.growth.temperature_law=ar", ["plant.growth.temperature_law=arrhenius "]),
+        ("turbidostat deploy backend.stir", []), ("turbidostat deploy backend=chibio backend.stir", ["backend.stir="]),
     ],
 )  # fmt: skip
 def test_a_shell_is_offered_what_fits_where_the_line_stands(line, words):
@@ -623,7 +628,7 @@ def test_a_preset_file_is_called_by_its_name_and_other_files_are_left_alone(tmp_
         (["completion", "ksh"], "error: completion: allowed bash, zsh, fish\n", 2),
         (["completion"], "error: completion: allowed bash, zsh, fish\n", 2),
         (["complete", "turbidostat", "blan"], "blank \n", None), (["-h"], "usage: turbidostat COMMAND", None),
-        (["calibrat"], "error: calibrat: no such command; did you mean calibrate?\n", 2),
+        (["calibrat"], "did you mean calibrate?\n", 2), (["xyzzy"], "error: xyzzy: ", 2),
     ],
 )  # fmt: skip
 def test_the_console_script_answers_by_itself(words, said, status, monkeypatch, capsys):
