@@ -11,7 +11,7 @@ from hydra.core.plugins import Plugins
 import experiments.control.run
 import experiments.control.timetable
 import experiments.reporting.page
-import experiments.training.run
+import experiments.training.run  # noqa: F401
 import hardware.chibio.family
 import hardware.pioreactor.family
 import hardware.simulated  # noqa: F401

@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 
 from tests.patience import PATIENCE_S
 
-__all__ = ["ROOT", "Program", "run", "spent_s"]
+__all__ = ["OURS", "ROOT", "Program", "run", "spent_s"]
 
 ROOT = Path(__file__).parents[1]
 OURS = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}

@@ -19,7 +19,7 @@ from experiments.cli import frame, sweep
 from experiments.cli.frame import UserError
 from experiments.control import run as control
 from experiments.control.config import DeployConfig
-from experiments.train import main, train
+from experiments.train import main
 from experiments.training.config import TrainConfig
 from experiments.training.session import Session
 from tests.patience import PATIENCE_S
@@ -51,10 +51,8 @@ def alone(tmp_path_factory) -> list[dict[str, Any]]:
     """Summaries of seeds 0 and 1 as single runs."""
     folders = [tmp_path_factory.mktemp(f"alone{seed}") for seed in range(2)]
     for seed, folder in enumerate(folders):
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(charts, "save", lambda figure, folder, name: folder / name)
-            patched.setattr(Curves, "end", lambda *given, **more: None)
-            train(main.config([*SMOKE, f"seed={seed}"]), folder)
+        done = run("experiments.train", *SMOKE, f"seed={seed}", "hydra.run.dir=.", cwd=folder, **BLANK)
+        assert done.returncode == 0, done.stderr
     return [summary(folder) for folder in folders]
 
 
