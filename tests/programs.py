@@ -72,7 +72,7 @@ def _begin(
 
         save = charts.save
         charts.save = lambda figure, folder, name: save(Figure((1.0, 1.0)), folder, name)
-    sys.argv = list(words)
+    sys.argv = [words[0], *words[1 + (words[0] == "-c") :]]
     if words[0] == "-c":
         exec(words[1], {"__name__": "__main__"})
     else:

@@ -17,7 +17,9 @@ SHORT = ["agent=paper", "agent.total_steps=200", "agent.learn_start=100", "check
 
 
 def run(*words: str, cwd: Path, limit: int | None = None) -> subprocess.CompletedProcess[str]:
-    return programs.run(*words, cwd=cwd, limit=limit)
+    """A command that draws only where its figures are what is refused."""
+    drawn = "experiments.calibrate" in words
+    return programs.run(*words, cwd=cwd, limit=limit, WITHOUT_FIGURES="" if drawn else "1")
 
 
 def refused(done: subprocess.CompletedProcess[str], words: str) -> None:

@@ -147,6 +147,7 @@ def _saves(folder: Path) -> None:
         (folder / "saved").touch()
 
 
+@pytest.mark.slow
 def test_a_worker_told_by_the_terminal_and_by_its_command_saves_what_it_did(tmp_path: Path) -> None:
     with contextlib.suppress(KeyboardInterrupt), stop.Workers(1) as workers:
         workers.submit(_saves, tmp_path)
