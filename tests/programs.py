@@ -12,7 +12,8 @@ import runpy
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing import forkserver, process
 from multiprocessing.connection import Connection
@@ -119,6 +120,14 @@ class Program:
         status = self._process.exitcode
         assert status is not None, f"still at work after {seconds:g} s: {self.said()}"
         return status
+
+    def until(self, there: Callable[[], bool]) -> None:
+        """Wait for what the program brings about. Raises: AssertionError where it has ended without."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not there():
+            assert time.monotonic() < deadline, self.said()
+            assert self.poll() is None, self.said()
+            time.sleep(0.01)
 
     def end(self) -> tuple[int, str]:
         """Status and what was said, after it has ended by itself."""

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -231,9 +230,7 @@ def test_a_user_who_resumes_reads_one_line(tmp_path: Path) -> None:
         backend = "backend=chibio", f"backend.url={device.url}", "backend.speed=60", "backend.reactors=[M0]"
         words = *backend, "controller=pi", "hydra.run.dir=run"
         with Program("experiments.deploy", *words, cwd=tmp_path, out=tmp_path / "out") as first:
-            while not (folder / "state.json").exists():
-                assert first.poll() is None, first.said()
-                time.sleep(0.02)
+            first.until((folder / "state.json").exists)
         for name, content in (
             ("state.json", b'{"began": [null]}'),
             ("recordings/M0.csv", b"time_min,od\n1,2\n"),

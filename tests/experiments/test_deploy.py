@@ -123,6 +123,7 @@ def test_recording_can_be_calibrated_on(deployed):
     assert recording.pump_rate.max() <= 0.02
 
 
+@pytest.mark.slow
 def test_same_seed_same_recording_and_another_seed_another(policy_file, tmp_path):
     texts, short = [], ["scenario=hold", "scenario.minutes=[20]"]
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
@@ -455,6 +456,7 @@ def test_a_training_that_ends_while_the_latest_policy_is_taken_swaps_nothing(tmp
         np.testing.assert_array_equal(own.biases[0], older.biases[0])
 
 
+@pytest.mark.slow
 def test_a_run_ends_although_an_absent_reactor_cannot_be_verified_off_and_says_so():
     lab = DriverLab(("M0", "M1"), od=0.5)
     lab.reactors.begin()

@@ -6,7 +6,7 @@ import resource
 import signal
 import time
 import urllib.request
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ import pytest
 
 from hardware.emulator.process import EmulatorProcess
 from hardware.storage.journal import read_journal
-from tests.patience import PATIENCE_S
 from tests.programs import Program
 
 SPEED = 30.0
@@ -57,21 +56,13 @@ class Bench:
         truth = self.truth()
         return [f"{m}/{pump}" for m in ("M0", "M1") for pump, on in truth[m]["motors"].items() if on]
 
-    def until(self, there: Callable[[], bool]) -> None:
-        """Wait for what the client brings about."""
-        deadline = time.monotonic() + PATIENCE_S
-        while not there():
-            assert time.monotonic() < deadline
-            assert self.client.poll() is None, self.client.said()
-            time.sleep(0.01)
-
     def until_a_dose(self) -> None:
         """Wait until a pump runs."""
-        self.until(lambda: bool(self.motors()))
+        self.client.until(lambda: bool(self.motors()))
 
     def until_under_way(self) -> None:
         """Wait until a pump runs and each reactor has two rows on record."""
-        self.until(lambda: all(len(volumes(self.folder, name)) > 1 for name in ("M0", "M1")))
+        self.client.until(lambda: all(len(volumes(self.folder, name)) > 1 for name in ("M0", "M1")))
         self.until_a_dose()
 
     def slow(self, seconds: float) -> None:
@@ -122,7 +113,9 @@ def test_a_signal_while_the_pumps_are_being_switched_on_costs_no_row(bench: Benc
     bench.until_under_way()
     bench.slow(6.0)  # 0.2 s for each request: the signal falls inside the switching on
     began = journal.stat().st_size
-    bench.until(lambda: b'"kind":"intent"' in journal.read_bytes()[began:])  # not every sample is new enough for a dose
+    bench.client.until(
+        lambda: b'"kind":"intent"' in journal.read_bytes()[began:]
+    )  # not every sample is new enough for a dose
     bench.client.send_signal(signal.SIGTERM)
     status, said = bench.end()
     assert status == 0, said
@@ -194,7 +187,7 @@ def test_an_overflow_pump_runs_over_doses_and_a_kill_and_is_off_after_every_othe
     def until_fed(bench: Bench) -> None:
         """Until a dose is given beside a running overflow pump."""
         both = [{f"{name}/Pump1", f"{name}/Pump3"} for name in ("M0", "M1")]
-        bench.until(lambda: state.exists() and any(pumps <= set(bench.motors()) for pumps in both))
+        bench.client.until(lambda: state.exists() and any(pumps <= set(bench.motors()) for pumps in both))
 
     with EmulatorProcess(
         ["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5", "--overflow-pump", "Pump3"]

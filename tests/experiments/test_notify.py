@@ -116,6 +116,7 @@ def rehearsal(folder: Path, tell: Notifier | None = None) -> Rehearsal:
     return run
 
 
+@pytest.mark.slow
 def test_a_hook_that_hangs_changes_no_sample_and_no_dose(tmp_path: Path) -> None:
     plain = rehearsal(tmp_path / "plain")
     server = Server(hangs=True)

@@ -69,9 +69,7 @@ def test_a_service_manager_that_ends_a_blank_leaves_its_pumps_off(tmp_path: Path
             f"backend.calibration={tmp_path}/c",
         )
         client = Program("experiments.blank", *words, cwd=tmp_path, out=tmp_path / "out")
-        while "waiting for" not in client.said():
-            assert client.poll() is None, client.said()
-            time.sleep(0.02)
+        client.until(lambda: "waiting for" in client.said())
         with (
             urllib.request.urlopen(
                 urllib.request.Request(f"{device.url}/SetOutputTarget/Pump1/M0/0.05", method="POST"), timeout=10.0

@@ -40,19 +40,12 @@ def test_the_line_is_unplugged_for_three_minutes(
     numbers = [f"backend.speed={SPEED}", "backend.reactors=[M0,M1]", f"hydra.run.dir={folder}"]
     client = Program("experiments.deploy", *scenario, *link, *numbers, cwd=tmp_path, out=tmp_path / "out")
 
-    def wait(condition: object, seconds: float) -> None:
-        deadline = time.monotonic() + seconds
-        while not condition():  # type: ignore[operator]
-            assert client.poll() is None, client.said()
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-
-    wait(lambda: len(rows(folder, "M1")) >= 3, 40.0)
+    client.until(lambda: len(rows(folder, "M1")) >= 3)
     line.unplug()
     before = len(rows(folder, "M1"))
     time.sleep(180.0 / SPEED)
     line.plug()
-    wait(lambda: len(rows(folder, "M1")) >= before + 4, 40.0)
+    client.until(lambda: len(rows(folder, "M1")) >= before + 4)
     client.send_signal(signal.SIGINT)
     status, said = client.end()
     assert status == 0, said

@@ -48,25 +48,12 @@ class Run(Program):
 
     def until_said(self, words: str) -> None:
         """Wait for standard output to hold `words`."""
-        self._until(lambda: words in (self.folder / "out").read_text())
+        self.until(lambda: words in (self.folder / "out").read_text())
 
-    def until_there(self, pattern: str) -> None:
-        """Wait for a file with something in it."""
-        self._until(lambda: any(path.stat().st_size for path in self.folder.glob(pattern)))
-
-    def until_rows(self, pattern: str) -> None:
-        """Wait for a table with a row below its head: what writes it is under way."""
-        self._until(lambda: any(path.read_text().count("\n") > 1 for path in self.folder.glob(pattern)))
-
-    def until_processes(self, count: int) -> None:
-        self._until(lambda: len(self.processes()) >= count)
-
-    def _until(self, there: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while not there():
-            assert time.monotonic() < deadline
-            assert self.poll() is None, self.said()
-            time.sleep(0.02)
+    def until_there(self, pattern: str, lines: int = 0) -> None:
+        """Wait for a file with something in it, or with more than so many lines."""
+        paths = self.folder.glob
+        self.until(lambda: any(p.stat().st_size and p.read_bytes().count(b"\n") >= lines for p in paths(pattern)))
 
     def ctrl_c(self, number: int = signal.SIGINT) -> None:
         """As a terminal does: to every process of the foreground group."""
@@ -100,7 +87,7 @@ def go_on(run: Run, line: str) -> None:
 @pytest.mark.slow
 def test_a_stopped_training_goes_on_to_the_bit_with_the_command_it_names(tmp_path: Path) -> None:
     run = Run(tmp_path, "experiments.train", *SHORT, "hydra.run.dir=a folder")  # one that needs quotes
-    run.until_rows("a folder/progress.csv")
+    run.until_there("a folder/progress.csv", lines=2)
     run.terminate()
     line = run.stopped()
     assert "keeps checkpoint.pt, progress.csv; go on" in line
@@ -132,7 +119,7 @@ def test_an_impatient_user_gets_out_at_once_and_keeps_what_was_saved(tmp_path: P
 def test_a_stopped_benchmark_ends_its_workers(tmp_path: Path) -> None:
     words = ["+experiment=comparison", "workers=2", "replicates=200", "train_seeds=1", "hydra.run.dir=run"]
     run = Run(tmp_path, "experiments.benchmark", *words)
-    run.until_rows("run/training/dqn/progress.csv")
+    run.until_there("run/training/dqn/progress.csv", lines=2)
     run.ctrl_c(signal.SIGTERM)  # its workers get it too
     assert run.stopped() == "stopped; run keeps training/; to try again, start anew"
     assert (tmp_path / "run/training/dqn/checkpoint.pt").is_file()
@@ -264,7 +251,7 @@ def test_a_stop_waits_until_the_writer_of_events_holds_no_lock(
 @pytest.mark.slow
 def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
     run = Run(tmp_path, "tests.campaigns.faults", "workers=2")
-    run.until_processes(4)  # the command, two workers, and what tracks their semaphores
+    run.until(lambda: len(run.processes()) >= 4)  # the command, two workers, and what tracks their semaphores
     run.kill()
     run.gone()
 
@@ -272,7 +259,7 @@ def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_stopped_ablation_goes_on_in_the_middle_of_a_variant(tmp_path: Path) -> None:
     run = Run(tmp_path, "tests.studies.ablate", *SHORT, "only=[tuned]", "n_agents=2", "hydra.run.dir=study")
-    run.until_rows("study/tuned/progress.csv")
+    run.until_there("study/tuned/progress.csv", lines=2)
     run.ctrl_c()
     line = run.stopped()
     before = (tmp_path / "study/tuned/progress.csv").read_text().splitlines()

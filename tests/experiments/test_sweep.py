@@ -1,11 +1,12 @@
 """A sweep on one machine: one folder, the results of single runs, and going on after whatever ended it."""
 
 import json
+import os
 import re
 import shlex
 import signal
-import time
-from collections.abc import Callable
+import subprocess
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -23,13 +24,20 @@ from experiments.train import main
 from experiments.training.config import TrainConfig
 from experiments.training.session import Session
 from tests.patience import PATIENCE_S
-from tests.programs import Program, run
+from tests.programs import OURS, Program, run
 
+TRAIN = "experiments.train"
 PARALLEL = "joblib", "submitit_local"
 BLANK = {"WITHOUT_FIGURES": "1"}
 SMOKE = ["+experiment=smoke", "agent.total_steps=300"]
 LONG = ["n_agents=1", "agent.total_steps=1000", "agent.learn_start=100", "eval_every=200", "checkpoint_every=100"]
 pytestmark = pytest.mark.xdist_group("sweep")  # its tests share what a single run gives
+
+
+def started(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """By an interpreter of its own, whose workers are not forked from a worker."""
+    command, environment = [sys.executable, "-m", TRAIN, *words], {**os.environ, **OURS}
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
 
 
 def summary(folder: Path) -> dict[str, Any]:
@@ -38,20 +46,12 @@ def summary(folder: Path) -> dict[str, Any]:
     return {key: value for key, value in found.items() if key not in ("train_seconds", "policy")}
 
 
-def until(there: Callable[[], bool], process: Program) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not there():
-        assert time.monotonic() < deadline
-        assert process.poll() is None, process.said()
-        time.sleep(0.01)
-
-
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory) -> list[dict[str, Any]]:
     """Summaries of seeds 0 and 1 as single runs."""
     folders = [tmp_path_factory.mktemp(f"alone{seed}") for seed in range(2)]
     for seed, folder in enumerate(folders):
-        done = run("experiments.train", *SMOKE, f"seed={seed}", "hydra.run.dir=.", cwd=folder, **BLANK)
+        done = run(TRAIN, *SMOKE, f"seed={seed}", "hydra.run.dir=.", cwd=folder, **BLANK)
         assert done.returncode == 0, done.stderr
     return [summary(folder) for folder in folders]
 
@@ -59,7 +59,7 @@ def alone(tmp_path_factory) -> list[dict[str, Any]]:
 @pytest.mark.parametrize("launcher", ["basic", *(pytest.param(n, marks=pytest.mark.slow) for n in PARALLEL)])
 def test_every_launcher_gives_the_summaries_of_single_runs_in_one_folder(launcher, alone, tmp_path):
     words = "-m", "seed=range(0,2)", *SMOKE, f"hydra/launcher={launcher}"
-    done = run("experiments.train", *words, cwd=tmp_path, **BLANK)
+    done = started(*words, cwd=tmp_path) if launcher in PARALLEL else run(TRAIN, *words, cwd=tmp_path, **BLANK)
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "runs" / "train").iterdir()
     assert sorted(p.name for p in folder.iterdir() if p.is_dir() and p.name.isdigit()) == ["0", "1"]
@@ -73,7 +73,7 @@ def test_a_stopped_sweep_does_only_what_is_missing(tmp_path):
     words = "experiments.train", "-m", "seed=range(0,3)", *LONG, "hydra.sweep.dir=a sweep"
     process = Program(*words, cwd=tmp_path, out=tmp_path / "out", err=tmp_path / "err", **BLANK)
     folder = tmp_path / "a sweep"
-    until((folder / "1/checkpoint.pt").is_file, process)
+    process.until((folder / "1/checkpoint.pt").is_file)
     process.send_signal(signal.SIGINT)
     assert process.wait() == 130
     (line,) = (tmp_path / "err").read_text().splitlines()
@@ -83,7 +83,7 @@ def test_a_stopped_sweep_does_only_what_is_missing(tmp_path):
     assert told, line
     before = (folder / "0/summary.json").stat().st_mtime_ns
     assert 1 <= len(_returns(folder / "1")) < 10
-    again = run("experiments.train", *shlex.split(told[1]), cwd=tmp_path, **BLANK)
+    again = run(TRAIN, *shlex.split(told[1]), cwd=tmp_path, **BLANK)
     assert again.returncode == 0, again.stderr
     assert "3 of 3 jobs finished" in again.stdout
     assert not list(folder.glob("*/stopped_*"))  # job 1 went on from its checkpoint
@@ -95,7 +95,7 @@ def test_a_stopped_sweep_does_only_what_is_missing(tmp_path):
     assert ours["best"]["weights"].equal(whole.best.weights)
     assert ours["returns"] == whole.returns
     times = [(folder / f"{k}/summary.json").stat().st_mtime_ns for k in range(3)]
-    assert "3 of 3 jobs finished" in run("experiments.train", "resume=a sweep", cwd=tmp_path).stdout
+    assert "3 of 3 jobs finished" in run(TRAIN, "resume=a sweep", cwd=tmp_path).stdout
     assert [(folder / f"{k}/summary.json").stat().st_mtime_ns for k in range(3)] == times
 
 
@@ -148,7 +148,7 @@ def test_a_folder_goes_on_with_the_same_config_only_and_one_process_at_a_time(tm
     busy = "import time; from pathlib import Path; from experiments.cli import sweep\n"
     busy += f"with sweep.working(Path({str(tmp_path)!r})): print('in', flush=True); time.sleep(600)"
     with Program("-c", busy, cwd=tmp_path, out=tmp_path / "out") as other:
-        until(lambda: other.said() == "in\n", other)
+        other.until(lambda: other.said() == "in\n")
         with pytest.raises(sweep.Busy), sweep.working(tmp_path):
             pass
     with sweep.working(tmp_path):
@@ -328,7 +328,7 @@ def test_a_single_run_is_not_resumed_as_a_sweep(tmp_path):
 
 
 def test_a_word_that_no_job_can_take_leaves_no_folder(tmp_path):
-    done = run("experiments.train", "-m", "seed=0,1", "agent.learning_rat=1", "hydra.sweep.dir=all", cwd=tmp_path)
+    done = run(TRAIN, "-m", "seed=0,1", "agent.learning_rat=1", "hydra.sweep.dir=all", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert "agent.learning_rat" in done.stderr
     assert not (tmp_path / "all").exists()

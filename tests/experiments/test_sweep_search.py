@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import json
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +10,6 @@ import pytest
 from hydra.core.utils import JobReturn, JobStatus
 
 from experiments.cli import frame, search, sweep
-from tests.patience import PATIENCE_S
 from tests.programs import Program
 
 WORDS = ["+hparams_search=tuned", "+experiment=smoke", "n_agents=1", "agent.total_steps=300", "checkpoint_every=100"]
@@ -38,11 +36,7 @@ def worker(folder: Path, name: str) -> Program:
 def test_two_processes_share_a_search_and_take_up_the_trial_of_a_killed_one(tmp_path: Path) -> None:
     first = worker(tmp_path, "first")
     folder = tmp_path / "search"
-    deadline = time.monotonic() + PATIENCE_S
-    while not (folder / "0/config.yaml").is_file():  # the first trial is at work
-        assert time.monotonic() < deadline
-        assert first.poll() is None, first.said()
-        time.sleep(0.01)
+    first.until((folder / "0/config.yaml").is_file)  # the first trial is at work
     first.kill()
     first.wait()
     assert sweep.Job.at(folder / "0").state == "running"
