@@ -4,7 +4,9 @@ import json
 import os
 import signal
 import subprocess
-from collections.abc import Iterator
+import sys
+import time
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,8 +17,9 @@ from experiments.cli import sweep
 from experiments.train import main
 from experiments.training.session import Session
 from tests.experiments import slurm_lab
-from tests.programs import ROOT, Program
+from tests.patience import PATIENCE_S
 
+ROOT = Path(__file__).parents[2]
 WORDS = ["agent.total_steps=1000", "agent.learn_start=100", "eval_every=500", "checkpoint_every=100"]
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(slurm_lab.missing()), reason=slurm_lab.missing())]
 
@@ -25,6 +28,14 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(slurm_lab.missing()), re
 def cluster(tmp_path: Path) -> Iterator[dict[str, str]]:
     with slurm_lab.cluster(tmp_path / "slurm") as environment:
         yield {**environment, "PYTHONPATH": str(ROOT)}
+
+
+def until(there: Callable[[], bool], process: subprocess.Popen[str], seconds: float = PATIENCE_S) -> None:
+    deadline = time.monotonic() + seconds
+    while not there():
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.01)
 
 
 def kill(job: str) -> None:
@@ -50,18 +61,26 @@ def test_jobs_killed_or_told_to_end_are_queued_again_and_end_with_the_weights_of
     """Job 0 is killed by the cluster, job 1 gets the signal of a time limit, in the middle of their training."""
     folder = tmp_path / "sweep"
     words = ["-m", "seed=range(0,4)", *WORDS, "hydra/launcher=slurm", "hydra.launcher.mem_gb=1"]
-    words = "experiments.train", *words, "hydra.sweep.dir=sweep"
-    with Program(*words, cwd=tmp_path, out=tmp_path / "out", SLURM_CONF=cluster["SLURM_CONF"]) as process:
-        process.until((folder / "0/checkpoint.pt").is_file)
+    with open(tmp_path / "out", "w") as out:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "experiments.train", *words, "hydra.sweep.dir=sweep"],
+            cwd=tmp_path, env=cluster, stdout=out, stderr=out, text=True,
+        )  # fmt: skip
+    try:
+        until((folder / "0/checkpoint.pt").is_file, process)
         array = next(path.name for path in (folder / ".submitit").iterdir()).partition("_")[0]
         subprocess.run(["scontrol", "requeue", f"{array}_0"], env=cluster, check=True)
         kill(f"{array}_0")
-        process.until((folder / "1/checkpoint.pt").is_file)
+        until((folder / "1/checkpoint.pt").is_file, process)
         ask = subprocess.Popen(["scancel", "--signal=USR2", f"{array}_1"], env=cluster, stderr=subprocess.DEVNULL)
-        process.until(lambda: "Requeued job" in log(folder, array, 1))
+        until(lambda: "Requeued job" in log(folder, array, 1), process)
         ask.kill()  # it would ask again and again, also the job's next life
         ask.wait()
-        assert process.wait() == 0, process.said()
+        status = process.wait(PATIENCE_S)
+    finally:
+        process.kill()
+        process.wait()
+    assert status == 0, (tmp_path / "out").read_text()
     lives = [log(folder, array, k).count("Starting with") for k in range(4)]
     assert lives == [2, 2, 1, 1]
     assert not list(folder.glob("*/stopped_*"))  # the second life went on, it did not begin anew
