@@ -1,19 +1,19 @@
 """Every command of README and docs does what the page says, or needs hardware.
 
-In each run of the suite all of them are checked against what the commands take, and those of the README run one after
-the other in one folder, with less work for the long ones. `-m slow` runs all the others.
+All of them are checked against what the commands take. Those of the README run, each behind the ones whose files it
+reads, with less work for the long ones; `-m campaign` runs all the others.
 """
 
 import importlib
-import os
 import re
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
 
+from tests import programs
 from tests.documented import PAGES, ROOT, commands, needs_hardware
 from tests.patience import PATIENCE_S
 
@@ -22,11 +22,13 @@ OTHERS = (
     "turbidostat",
 )  # fmt: skip
 SHOWN = {
-    f"{page.name}: {' '.join(words)}": words
+    " ".join(words): words
     for page in PAGES
+    if page.name != "extending.md"  # whose commands a test of its own runs
     for words in commands(page)
-    if words[0] not in OTHERS and page.name != "extending.md"  # whose commands a test of its own runs
+    if words[0] not in OTHERS
 }
+RECORDINGS = "RECORDING.csv", "FILE.csv", "chibio_ecoli_dither.csv"
 SHIPPED = "+experiment=shipped"  # a minute; to its end it gives the policy that ships, which is put in its place
 LESS = {
     "tests.campaigns.rig_study": ['overrides=[scenario.recovery_od=0.7,"scenario.minutes=[3,3,3]"]'],
@@ -49,7 +51,7 @@ def ready(folder: Path) -> None:
         (folder / name / "config.yaml").write_text("seed: 0\n", encoding="utf-8")
     run = folder / "RUN"
     shutil.copy(ROOT / "dqn" / "shipped" / "policy.npz", run)
-    for name in ("RECORDING.csv", "FILE.csv", "chibio_ecoli_dither.csv"):
+    for name in RECORDINGS:
         shutil.copy(ROOT / "experiments" / "data" / "open_loop.csv", folder / name)
     calibrated = folder / "runs" / "calibrate" / "1"
     calibrated.mkdir(parents=True)
@@ -82,12 +84,8 @@ def test_the_pages_have_commands_at_all() -> None:
     assert sum(needs_hardware(words) for words in SHOWN.values()) >= 6
 
 
-def run(words: list[str], folder: Path, seconds: float = PATIENCE_S) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "HOME": str(folder), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-m", *words],
-        cwd=folder, env=environment, capture_output=True, text=True, timeout=seconds, check=False,
-    )  # fmt: skip
+def run(words: list[str], folder: Path, seconds: float = PATIENCE_S, **environment: str) -> None:
+    done = programs.run(*words, cwd=folder, seconds=seconds, HOME=str(folder), **environment)
     assert done.returncode == 0, f"{' '.join(words)}: {done.stderr[-2000:]}"
 
 
@@ -96,6 +94,8 @@ def shorter(words: list[str]) -> list[str]:
     less = LESS.get(words[0], [])
     if any(word.startswith("resume=") for word in words):
         return words
+    if words == ["experiments.deploy", "scenario=ratio_steps"]:
+        less = ["scenario.minutes=[20,20,20,20]"]
     if "backend=emulator" in words:
         less = ["scenario.minutes=[2,2,2]", "scenario.recovery_od=0.3", "backend.reactors=[M0]"]
         if any("ratio" in word or "plant=coculture" in word for word in words):
@@ -104,41 +104,68 @@ def shorter(words: list[str]) -> list[str]:
     return [*words, *less]
 
 
-README = [
-    words
+README = {
+    " ".join(words): words
     for words in commands(ROOT / "README.md")
     if words[0] not in ("turbidostat", "experiments.demo") and not needs_hardware(words)
-]
+}
+QUICK = "experiments", "experiments.calibrate", "experiments.train env_file=latest", "experiments.deploy policy=latest"
+"""Lines of every run of the suite; their figures are blank."""
+
+
+def before(shown: str) -> str | None:
+    """The line of the README whose files this one reads."""
+    lines = [*README][: [*README].index(shown)]
+    if "_file=latest" in shown or "report" in shown:
+        writer = "-m " if "runs=" in shown else "calibrate"
+    elif "policy=latest" in shown:
+        writer = SHIPPED if "certify" in shown else "train env_file=latest"
+    else:
+        writer = "stop_within" if "resume=latest" in shown else None
+    return None if writer is None else next(line for line in lines if writer in line)
 
 
 @pytest.fixture(scope="module")
-def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of somebody who types the lines of the README one after the other."""
-    return tmp_path_factory.mktemp("reader")
+def lived(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The folder of somebody who typed a line of the README, and before it those that it needs."""
+
+    @cache
+    def typed(shown: str) -> Path:
+        folder = tmp_path_factory.mktemp("reader")
+        if earlier := before(shown):
+            shutil.copytree(typed(earlier), folder, dirs_exist_ok=True)
+        plain = {"WITHOUT_FIGURES": "1"} if shown in QUICK else {}
+        run(shorter(README[shown]), folder, **plain)
+        if SHIPPED in shown:
+            newest = max(folder.glob("runs/train/*/policy.npz"), key=lambda path: path.stat().st_mtime)
+            shutil.copy(ROOT / "dqn" / "shipped" / "policy.npz", newest)
+        return folder
+
+    return typed
 
 
 @pytest.mark.numeric
 @pytest.mark.xdist_group("readme")
-@pytest.mark.parametrize("words", README, ids=[" ".join(words) for words in README])
-def test_the_readme_works_line_by_line(words: list[str], reader: Path) -> None:
-    run(shorter(words), reader)
-    if SHIPPED in words:
-        newest = max(reader.glob("runs/train/*/policy.npz"), key=lambda path: path.stat().st_mtime)
-        shutil.copy(ROOT / "dqn" / "shipped" / "policy.npz", newest)
+@pytest.mark.parametrize(
+    "shown", [pytest.param(line, marks=[] if line in QUICK else pytest.mark.slow) for line in README]
+)
+def test_a_line_of_the_readme_works(shown: str, lived: Callable[[str], Path]) -> None:
+    lived(shown)
 
 
 def test_the_readme_has_lines_that_need_no_hardware() -> None:
     assert len(README) > 12
+    assert set(QUICK) <= set(README)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("shown", [name for name in SHOWN if "README" not in name and not needs_hardware(SHOWN[name])])
+@pytest.mark.parametrize("shown", [name for name in SHOWN if name not in README and not needs_hardware(SHOWN[name])])
 def test_a_command_of_the_pages_runs(shown: str, tmp_path: Path) -> None:
     run(["experiments.calibrate", "hydra.run.dir=RUN"], tmp_path)
     if "resume=RUN" in shown or "run=RUN" in shown:
         run(["experiments.deploy", "hydra.run.dir=RUN"], tmp_path)
     shutil.copy(ROOT / "dqn" / "shipped" / "policy.npz", tmp_path / "RUN")
-    for name in ("RECORDING.csv", "FILE.csv", "chibio_ecoli_dither.csv"):
+    for name in RECORDINGS:
         shutil.copy(ROOT / "experiments" / "data" / "open_loop.csv", tmp_path / name)
     run(shorter(SHOWN[shown]), tmp_path, 3000.0)

@@ -17,9 +17,11 @@ from envs.plant.plant import PlantConfig
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments import __main__ as program
+from experiments import demo
 from experiments.cli import completion, frame, reference
 from experiments.cli.calibrated import read_env_file
 from experiments.control.config import deploy_schema
+from experiments.deploy import main as deploy
 from experiments.train import main
 from experiments.training.config import ENVS, TrainConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
@@ -49,31 +51,6 @@ def test_both_forms_of_choosing_an_environment(form):
     assert load_train(*form) == load_train()
 
 
-@pytest.mark.parametrize("option", options("env"))
-def test_every_environment_composes(option):
-    env = load_train(f"env={option}").env
-    assert type(env).__name__ == {"sim": "EnvConfig", "relative": "RelativeConfig"}.get(option, "CocultureConfig")
-
-
-@pytest.mark.parametrize("option", options("agent"))
-def test_every_agent_composes(option):
-    agent = load_train(f"agent={option}").agent
-    own = {
-        "relative": ((64, 64), 0.0, 5e-4, 15_000),
-        "coculture": ((128, 128), 0.9, 1e-3, 8_000),
-        "coculture_preview": ((128, 128), 0.97, 1e-3, 20_000),
-    }
-    papers = ((64, 64), 0.99, 1e-3, 10_000)
-    assert (tuple(agent.hidden), agent.gamma, agent.learning_rate, agent.total_steps) == own.get(option, papers)
-
-
-def test_the_papers_agent_adds_nothing_to_a_plain_dqn():
-    agent = load_train("agent=paper").agent
-    assert agent.hindsight_share == agent.action_gap == agent.huber == 0.0
-    assert agent.reward_scale == 1.0
-    assert len(agent.input_matrix) == 0
-
-
 def said(group: str, option: str) -> dict[str, Any]:
     """What the file of a preset and those it stands on say, read by nothing but YAML."""
     own = yaml.safe_load((CONF / group / f"{option}.yaml").read_text()) or {}
@@ -93,6 +70,11 @@ def merge(into: dict[str, Any], values: dict[str, Any]) -> None:
             into[key] = value
 
 
+def plain(value: Any) -> Any:
+    """Tuples as YAML has them."""
+    return [plain(one) for one in value] if isinstance(value, tuple | list) else value
+
+
 def held(config: Any, values: dict[str, Any], prefix: str = "") -> dict[str, tuple[Any, Any]]:
     """Every value of a preset that a config has otherwise: the two of them by name."""
     wrong = {}
@@ -100,38 +82,34 @@ def held(config: Any, values: dict[str, Any], prefix: str = "") -> dict[str, tup
         found = getattr(config, key)
         if isinstance(value, dict) and not isinstance(found, dict):
             wrong |= held(found, value, f"{prefix}{key}.")
-        elif (list(found) if isinstance(found, tuple) else found) != value:
+        elif plain(found) != value:
             wrong[f"{prefix}{key}"] = found, value
     return wrong
 
 
-@pytest.mark.parametrize("option", options("scenario"))
-def test_every_scenario_composes(option):
-    """To what its file says; its minutes are those of its steps together."""
-    scenario, values = load_deploy(f"scenario={option}").scenario, said("scenario", option)
-    assert held(scenario, values) == {}
-    minutes = values.get("minutes", [60] if option == "hold" else list(scenario.minutes))
-    assert scenario.total_min == sum(minutes)
-    assert len(scenario.setpoints) == len(scenario.temperatures) == len(minutes)
+COMPOSED = {"env": load_train, "agent": load_train, "scenario": load_deploy, "plant": load_deploy}
 
 
-@pytest.mark.parametrize("option", options("plant"))
-def test_every_plant_composes(option):
-    assert held(load_deploy(f"plant={option}").plant, said("plant", option)) == {}
+@pytest.mark.parametrize(("group", "option"), [(group, option) for group in COMPOSED for option in options(group)])
+def test_every_preset_composes_to_what_its_file_says(group, option):
+    """The minutes of a scenario are those of its steps together; a task is of its own kind."""
+    config, values = COMPOSED[group](f"{group}={option}"), said(group, option)
+    found = getattr(config, group)
+    assert held(found, values) == {}
+    if group == "scenario":
+        minutes = values.get("minutes", [60] if option == "hold" else list(found.minutes))
+        assert found.total_min == sum(minutes)
+        assert len(found.setpoints) == len(found.temperatures) == len(minutes)
+    if group == "env":
+        assert type(found) is ENVS[values.get("kind", "density")]
 
 
-def test_the_overflow_pump_of_the_device_is_off_and_its_values_are_checked():
-    assert load_deploy("backend=chibio").backend.overflow_pump.pump == ""
-    assert load_deploy("backend=emulator", "backend.overflow_pump.pump=Pump4").backend.overflow_pump.pump == "Pump4"
-    for override in ("pump=Pump2", "duty=1.0", "duty=much", "tube=22"):
-        with pytest.raises(frame.UserError, match=rf"overflow_pump\.{override.split('=')[0]}"):
-            load_deploy("backend=chibio", f"backend.overflow_pump.{override}")
-
-
-def test_the_papers_schedule():
-    scenario = load_deploy("scenario=setpoint_steps").scenario
-    assert list(scenario.setpoints) == [0.8, 0.65, 0.5]
-    assert list(scenario.minutes) == [30, 30, 30]
+def test_what_the_paper_says():
+    agent, scenario = load_train("agent=paper").agent, load_deploy("scenario=setpoint_steps").scenario
+    assert (tuple(agent.hidden), agent.gamma, agent.learning_rate, agent.total_steps) == ((64, 64), 0.99, 1e-3, 10_000)
+    assert agent.hindsight_share == agent.action_gap == agent.huber == len(agent.input_matrix) == 0
+    assert agent.reward_scale == 1.0
+    assert (list(scenario.setpoints), list(scenario.minutes)) == ([0.8, 0.65, 0.5], [30, 30, 30])
 
 
 STATED = {
@@ -155,7 +133,7 @@ def repeated(values: dict[str, Any], default: Any, prefix: str = "") -> list[str
         own = getattr(default, key)
         if isinstance(value, dict):
             found += repeated(value, own, f"{prefix}{key}.")
-        elif key != "kind" and value == (list(own) if isinstance(own, tuple) else own):
+        elif key != "kind" and value == plain(own):
             found.append(f"{prefix}{key}")
     return found
 
@@ -187,6 +165,8 @@ def test_a_backend_holds_only_what_differs_from_the_dataclass(name, config):
 
 
 COMMANDS = sorted(p.stem for p in CONF.glob("*.yaml") if p.stem != "base")
+LONG = "benchmark", "deploy"
+EACH = [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in COMMANDS]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -207,7 +187,7 @@ def test_every_field_of_every_command_says_what_it_is(name):
     assert repeated({k: v for k, v in root.items() if not isinstance(v, dict)}, command.schema) == []
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", EACH)
 def test_help_shows_usage_and_every_value(name, capsys, monkeypatch):
     command = importlib.import_module(f"experiments.{name}").main
     pages = {}
@@ -231,20 +211,19 @@ def test_help_shows_usage_and_every_value(name, capsys, monkeypatch):
 
 
 def test_help_of_a_part_that_there_is_not_names_those_that_there_are():
-    command = importlib.import_module("experiments.deploy").main
     with pytest.raises(frame.UserError, match=r"^--help = plnat: allowed all, backend, plant, .*share_warnings"):
-        command._answer(["--help=plnat"])
+        deploy._answer(["--help=plnat"])
 
 
 def test_help_shows_the_values_that_the_rest_of_the_line_gives(capsys, monkeypatch):
-    command = importlib.import_module("experiments.deploy").main
     monkeypatch.setattr(sys, "argv", ["deploy", "backend=chibio", "--help=backend", "backend.stir=0.7"])
-    command()
+    deploy()
     page = capsys.readouterr().out
     assert re.search(r"^  backend\.stir = 0\.7 +stirrer \(allowed: 0 to 1; default: 0\.5\)$", page, re.MULTILINE)
     assert "backend.control_min" not in page
 
 
+@pytest.mark.slow
 def test_the_configuration_page_is_that_of_the_code():
     """Written anew by `python -m experiments.cli.reference > docs/configuration.md`."""
     assert (CONF.parent / "docs" / "configuration.md").read_text(encoding="utf-8") == reference.page()
@@ -336,29 +315,19 @@ def test_every_argument_has_the_form_that_hydra_takes(given, understood):
     ("override", "parts"),
     [
         ("env.mu=abc", ["env.mu", "abc", "a number, 0 < mu"]),
-        ("env.mu=-1", ["env.mu", "-1", "allowed 0 < mu"]),
         ("env.mu=nan", ["env.mu", "nan", "allowed"]),
         ("env.nois=1", ["env.nois", "no such key", "mu, tau"]),
-        ("+env.nois=1", ["env.nois", "no such key", "mu, tau"]),
         ("foo=1", ["foo", "no such key", "n_agents"]),
-        ("lr=1", ["lr: no such key; did you mean agent.learning_rate?; allowed here: env, agent"]),
-        ("total_steps=9", ["did you mean agent.total_steps?"]),
-        ("+foo=1", ["foo", "no such key", "n_agents"]),
+        ("lr=1", ["lr", "agent.learning_rate", "env, agent"]),
         ("env=simm", ["env=simm", "no such option", "sim"]),
         ("+experiment=nope", ["experiment=nope", "no such option", "smoke"]),
         ("seed=1.5", ["seed", "1.5", "a whole number"]),
-        ("seed=-1", ["seed", "-1", "at least 0"]),
         ("agent.init_zero_output=perhaps", ["agent.init_zero_output", "perhaps", "true or false"]),
-        ("agent.gamma=1", ["agent.gamma", "1.0", "0 <= gamma < 1"]),
         ("agent.hidden=[64,x]", ["agent.hidden[1]", "x", "a whole number"]),
-        ("device=tpu", ["device", "tpu", "cpu, cuda"]),
         ("env=null", ["group"]),
         ("agent.hidden=[", ["["]),
-        (
-            "seed=range(0,4)",
-            ["seed=range(0,4): several values are a sweep, which begins with -m (-m 'seed=range(0,4)')"],
-        ),
-        ("seed=1,2", ["seed=1,2: several values are a sweep, which begins with -m (-m 'seed=1,2')"]),
+        ("seed=range(0,4)", ["seed=range(0,4)", "-m 'seed=range(0,4)'"]),
+        ("seed=1,2", ["seed=1,2", "-m 'seed=1,2'"]),
     ],
 )
 def test_a_wrong_override_is_one_line_with_key_value_and_what_is_allowed(override, parts):
@@ -370,19 +339,13 @@ def test_a_wrong_override_is_one_line_with_key_value_and_what_is_allowed(overrid
         assert part in message
 
 
-@pytest.mark.parametrize(
-    ("word", "line"),
-    [
-        ("--foo", "--foo: no such option; values are given as foo=VALUE"),
-        ("--seed=3", "values are given as seed=3; see"),
-    ],
-)
-def test_a_wrong_option_is_one_line(word, line, capsys, monkeypatch):
+@pytest.mark.parametrize(("word", "remedy"), [("--foo", "foo=VALUE"), ("--seed=3", "seed=3")])
+def test_a_wrong_option_is_one_line(word, remedy, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train", "-m", "seed=1,2", word])
     with pytest.raises(SystemExit) as ended:
-        importlib.import_module("experiments.train").main()
+        main()
     told = capsys.readouterr().err
-    assert (ended.value.code, told.count("\n"), line in told) == (1, 1, True)
+    assert (ended.value.code, told.count("\n"), remedy in told) == (1, 1, True)
 
 
 @pytest.mark.parametrize("word", ["foo", "--foo", "env.mu=0.02"])
@@ -390,30 +353,24 @@ def test_the_demo_takes_no_words(word, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["demo", word])
     with pytest.raises(SystemExit, match="^1$"):
-        importlib.import_module("experiments.demo").main()
-    assert capsys.readouterr().err.startswith(f"error: {word}: the demo takes nothing but --help; values go to")
+        demo.main()
+    assert capsys.readouterr().err.startswith(f"error: {word}: ")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
-    ("words", "line"),
+    ("backend", "key", "value"),
     [
-        (["backend=chibio", "backend.url=notaurl"], "backend.url = 'notaurl': allowed http://host:port, for instance"),
-        (["backend=chibio", "backend.url=http://x/y"], "backend.url = 'http://x/y': allowed"),
-        (["backend=pioreactor", "backend.broker=mqtt://x"], "backend.broker = 'mqtt://x': allowed the name of a host;"),
-        (["backend=pioreactor", "backend.leader=x.local"], "backend.leader = x.local: allowed http://host:port"),
-        (
-            ["backend=pioreactor", "backend.units.pio01.address=10.4.4.4"],
-            "address = 10.4.4.4: allowed http://host:port",
-        ),
+        ("chibio", "url", "notaurl"), ("chibio", "url", "http://x/y"), ("pioreactor", "broker", "mqtt://x"),
+        ("pioreactor", "leader", "x.local"), ("pioreactor", "units.pio01.address", "10.4.4.4"),
     ],
-)
-def test_an_address_that_cannot_be_one_is_refused_with_the_config(words, line):
-    with pytest.raises(frame.UserError, match=re.escape(line)):
-        importlib.import_module("experiments.deploy").main.config(words)
+)  # fmt: skip
+def test_an_address_that_cannot_be_one_is_refused_with_the_config(backend, key, value):
+    with pytest.raises(frame.UserError, match=rf"{key.rpartition('.')[2]} = '?{re.escape(value)}'?: allowed "):
+        load_deploy(f"backend={backend}", f"backend.{key}={value}")
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", EACH)
 def test_help_lists_what_the_command_takes_and_every_option_of_it_composes(name, capsys, monkeypatch):
     command = importlib.import_module(f"experiments.{name}").main
     monkeypatch.setattr(sys, "argv", [name, "--help=all"])
@@ -435,34 +392,14 @@ def test_help_lists_what_the_command_takes_and_every_option_of_it_composes(name,
 @pytest.mark.parametrize(
     ("name", "override", "line"),
     [
-        (
-            "train",
-            "+experiment=paper",
-            "experiment=paper: a recipe of benchmark; python -m experiments.benchmark +experi",
-        ),
-        (
-            "benchmark",
-            "experiment=smoke",
-            "experiment=smoke: a recipe of train; python -m experiments.train +experiment",
-        ),
-        (
-            "deploy",
-            "+experiment=smoke",
-            "experiment=smoke: a recipe of train; python -m experiments.train +experiment=s",
-        ),
+        ("train", "+experiment=paper", "experiment=paper: a recipe of benchmark"),
+        ("benchmark", "experiment=smoke", "experiment=smoke: a recipe of train"),
+        ("deploy", "+experiment=smoke", "experiment=smoke: a recipe of train"),
         ("train", "+experiment=nope", "experiment=nope: no such option; allowed: shipped, smoke"),
-        (
-            "train",
-            "plant=bench",
-            "plant=bench: train takes env, agent, experiment, hparams_search; plant= is for deploy",
-        ),
+        ("train", "plant=bench", "plant=bench: train takes env, agent, experiment, hparams_search; plant= is for de"),
         ("benchmark", "plant=bench", "plant=bench: benchmark takes env, experiment; plant= is for deploy"),
         ("report", "agent=tuned", "agent=tuned: report takes no group; agent= is for train"),
-        (
-            "mark",
-            "+safety=default",
-            "safety=default: mark takes no group; safety= is for deploy",
-        ),
+        ("mark", "+safety=default", "safety=default: mark takes no group; safety= is for deploy"),
     ],
 )
 def test_a_group_or_recipe_of_another_command_names_the_right_one(name, override, line):
@@ -585,6 +522,11 @@ def test_of_two_folders_to_resume_the_last_is_taken(tmp_path):
         ("turbidostat deploy safety.responses.bud", ["safety.responses.budget="]), ("turbidostat nonsense ", []),
         ("turbidostat deploy safety.resp", ["safety.responses."]), ("turbidostat demo ", ["--help"]),
         ("turbidostat calibrate --", ["--help", "--help=all", "--cfg", "--multirun"]),
+        ("turbidostat certify backend", []), ("turbidostat deploy backend=em", ["backend=emulator "]),
+        ("turbidostat train agent=p", ["agent=paper "]), ("turbidostat train +env=rel", ["+env=relative "]),
+        ("turbidostat deploy plant.growth.temperature_l", ["plant.growth.temperature_law="]),
+        ("turbidostat deploy plant.growth.temperature_law=ar", ["plant.growth.temperature_law=arrhenius "]),
+        ("turbidostat deploy backend.stir", []), ("turbidostat deploy backend=chibio backend.stir", ["backend.stir="]),
     ],
 )  # fmt: skip
 def test_a_shell_is_offered_what_fits_where_the_line_stands(line, words):
@@ -623,7 +565,7 @@ def test_a_preset_file_is_called_by_its_name_and_other_files_are_left_alone(tmp_
         (["completion", "ksh"], "error: completion: allowed bash, zsh, fish\n", 2),
         (["completion"], "error: completion: allowed bash, zsh, fish\n", 2),
         (["complete", "turbidostat", "blan"], "blank \n", None), (["-h"], "usage: turbidostat COMMAND", None),
-        (["calibrat"], "error: calibrat: no such command; did you mean calibrate?\n", 2),
+        (["calibrat"], "did you mean calibrate?\n", 2), (["xyzzy"], "error: xyzzy: ", 2),
     ],
 )  # fmt: skip
 def test_the_console_script_answers_by_itself(words, said, status, monkeypatch, capsys):

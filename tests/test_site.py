@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 # one worker makes what its tests look at, which takes minutes where the machine is busy
-pytestmark = [pytest.mark.xdist_group("site"), pytest.mark.timeout(1200)]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("site"), pytest.mark.timeout(1200)]
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
     path.relative_to(ROOT / "docs").with_suffix("").as_posix()
@@ -61,7 +61,6 @@ def test_the_site_is_whole_without_a_network(site: Path) -> None:
     assert (site / "method.html").read_text(encoding="utf-8").count("<math") > 50
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("page", "text"),
     [

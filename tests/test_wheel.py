@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.xdist_group("wheel")  # one worker makes what its tests look at
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wheel")]  # one worker makes what its tests look at
 ROOT = Path(__file__).parents[1]
 READ = {
     "conf/deploy.yaml", "conf/scenario/hold.yaml", "conf/hydra/launcher/slurm.yaml", "dqn/shipped/policy.npz",

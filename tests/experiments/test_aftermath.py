@@ -54,6 +54,7 @@ def sections(folder: Path) -> str:
     return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", re.sub(r'src="[^"]*"', "", page)))
 
 
+@pytest.mark.slow
 def test_a_drifting_run_says_since_when_the_model_does_not_hold(copy):
     text = sections(copy)
     assert "Predicted and measured" in text
@@ -80,6 +81,7 @@ def test_a_drifting_run_says_since_when_the_model_does_not_hold(copy):
     assert sections(copy) == text  # a second report finds the same run
 
 
+@pytest.mark.slow
 def test_the_controllers_own_estimates_are_read_from_the_journal(drifting):
     why = decisions(drifting, "M0")
     assert set(why) == {"minute", "mu", "gain"}
@@ -92,6 +94,7 @@ def test_the_controllers_own_estimates_are_read_from_the_journal(drifting):
     assert why["mu"][-1] > 1.1 * why["mu"][0]
 
 
+@pytest.mark.slow
 def test_rows_on_which_a_supervisor_acted_are_counted(copy):
     """As its explanation says, 0 or 1 beside the others; a row without it counts as none."""
     lines = (copy / "journal.jsonl").read_text().splitlines()
@@ -106,6 +109,7 @@ def test_rows_on_which_a_supervisor_acted_are_counted(copy):
     assert text.count("A supervisor acted on 40 rows, minute 100 to 139.") == 1
 
 
+@pytest.mark.slow
 def test_only_who_decides_with_a_fitted_model_is_told_to_calibrate_again(copy, tmp_path):
     fitted = tmp_path / "calibrated.yaml"
     fitted.write_text("mu: 0.03\ntau: 0.3333\n")
@@ -121,6 +125,7 @@ def test_only_who_decides_with_a_fitted_model_is_told_to_calibrate_again(copy, t
     assert sections(copy).count("Recalibrate: ") == 2
 
 
+@pytest.mark.slow
 def test_what_the_interlock_did_stands_beside_it(copy):
     summary = json.loads((copy / "summary.json").read_text())
     summary["reactors"]["M0"] |= {
@@ -131,11 +136,13 @@ def test_what_the_interlock_did_stands_beside_it(copy):
     assert f"The interlock spoke in 7 of {rows} rows: stale in 7 rows, minute 31 to 40." in sections(copy)
 
 
+@pytest.mark.slow
 def test_a_short_run_is_not_judged(tmp_path):
     run_folder = deployed(tmp_path / "run", "controller=pi", "scenario.minutes=[8,8,8]")
     assert "Too short to tell: " in sections(run_folder)
 
 
+@pytest.mark.slow
 def test_a_recording_that_cannot_be_compared_says_why(copy):
     path = copy / "recordings" / "M1.csv"
     path.write_text("\n".join(path.read_text().splitlines()[:5]) + "\n")
@@ -144,6 +151,7 @@ def test_a_recording_that_cannot_be_compared_says_why(copy):
     assert text.count("its culture is not the model: ") == 1
 
 
+@pytest.mark.slow
 def test_the_model_is_the_runs(copy, tmp_path):
     config = (copy / "config.yaml").read_text()
     assert believed(copy).source == "nominal"
@@ -170,6 +178,7 @@ def test_other_runs_have_no_such_section(tmp_path):
     assert "Predicted and measured" not in sections(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_folder_of_runs_names_the_deployment(drifting, tmp_path):
     (tmp_path / "1_calibrate").mkdir()
     (tmp_path / "1_calibrate" / "summary.json").write_text('{"mu": 0.03}')
@@ -180,6 +189,7 @@ def test_a_folder_of_runs_names_the_deployment(drifting, tmp_path):
     assert (tmp_path / "tables" / "3_deploy_after_M0.csv").is_file()
 
 
+@pytest.mark.slow
 def test_each_reactor_is_compared_with_the_model_of_its_own_volume(tmp_path):
     """Vials of 14 and 9 mL that grow and are fed as planned; tau = V / 60."""
     vials = "backend.reactors=[M0,M1]", "bench.volume_ml=14", "bench.volumes_ml.M1=9", "scenario.minutes=[80,80,80]"

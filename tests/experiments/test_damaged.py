@@ -1,10 +1,7 @@
 """A run folder that was damaged: every file a resume reads ends in one line with file, reason and remedy."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,9 +18,10 @@ from experiments.deploy import _schema
 from experiments.record.record import Record
 from hardware.emulator.process import EmulatorProcess
 from hardware.errors import RecordingError
+from tests import programs
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
-from tests.experiments.test_deploy import ENVIRONMENT, inverse_policy
-from tests.patience import PATIENCE_S
+from tests.experiments.test_deploy import inverse_policy
+from tests.programs import Program
 
 Change = Callable[[Any], object]
 HOLD = Scenario((0.4,), (600.0,), (37.0,))
@@ -223,26 +221,16 @@ def test_a_policy_whose_metadata_were_damaged(tmp_path: Path, metadata: dict[str
         load_policy(str(tmp_path / "policy.npz"), 1.0, 0.02)
 
 
+@pytest.mark.slow
 def test_a_user_who_resumes_reads_one_line(tmp_path: Path) -> None:
     """The same through the entry point: what goes wrong before and after the reactors are opened."""
 
-    def deploy(*arguments: str) -> list[str]:
-        command = [sys.executable, "-m", "experiments.deploy", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, timeout=PATIENCE_S, check=False)
-        assert done.returncode == 1
-        assert "Traceback" not in done.stderr
-        return [line for line in done.stderr.strip().splitlines() if not line[:2].isdigit()]
-
     folder = tmp_path / "run"
     with EmulatorProcess(["--reactors", "M0", "--speed", "60", "--od", "0.5"]) as device:
-        backend = ["backend=chibio", f"backend.url={device.url}", "backend.speed=60", "backend.reactors=[M0]"]
-        command = [sys.executable, "-m", "experiments.deploy", *backend, "controller=pi", f"hydra.run.dir={folder}"]
-        first = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while not (folder / "state.json").exists():
-            assert first.poll() is None
-            os.sched_yield()
-        first.kill()
-        first.wait()
+        backend = "backend=chibio", f"backend.url={device.url}", "backend.speed=60", "backend.reactors=[M0]"
+        words = *backend, "controller=pi", "hydra.run.dir=run"
+        with Program("experiments.deploy", *words, cwd=tmp_path, out=tmp_path / "out") as first:
+            first.until((folder / "state.json").exists)
         for name, content in (
             ("state.json", b'{"began": [null]}'),
             ("recordings/M0.csv", b"time_min,od\n1,2\n"),
@@ -251,7 +239,8 @@ def test_a_user_who_resumes_reads_one_line(tmp_path: Path) -> None:
         ):
             whole = (folder / name).read_bytes()
             (folder / name).write_bytes(content)
-            said = deploy(f"resume={folder}")
-            assert len(said) == 1, said
+            done = programs.run("experiments.deploy", "resume=run", cwd=tmp_path)
+            said = [line for line in done.stderr.strip().splitlines() if not line[:2].isdigit()]
+            assert (done.returncode, len(said)) == (1, 1), done.stderr
             assert Path(name).name in said[0]
             (folder / name).write_bytes(whole)

@@ -1,9 +1,6 @@
 """`dry_run=true`: the timetable by hand, no device asked, nothing left behind."""
 
 import math
-import os
-import subprocess
-import sys
 from datetime import datetime
 from pathlib import Path
 
@@ -14,8 +11,7 @@ from experiments.cli import frame
 from experiments.control.config import DeployConfig
 from experiments.control.timetable import expected, timetable
 from experiments.deploy import deploy, main
-from tests.experiments.test_deploy import ROOT
-from tests.patience import PATIENCE_S
+from tests.programs import run
 
 NOON = datetime(2026, 3, 2, 12, 0)
 GROWTH, DILUTION, VOLUME_ML = 0.03, 0.06, 20.0
@@ -186,11 +182,8 @@ def test_what_has_no_timetable_is_refused_and_does_not_run(
 
 def test_no_device_is_asked_and_no_folder_left(tmp_path: Path) -> None:
     """The address answers nobody, so a run would fail."""
-    command = [sys.executable, "-m", "experiments.deploy", "backend=chibio", "backend.url=http://127.0.0.1:9"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [*command, "dry_run=true"], capture_output=True, text=True, env=environment, timeout=PATIENCE_S, cwd=tmp_path
-    )
+    words = "experiments.deploy", "backend=chibio", "backend.url=http://127.0.0.1:9", "dry_run=true"
+    done = run(*words, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "pumps not weighed, taken as 1 mL/s: M0" in done.stdout
     assert list(tmp_path.iterdir()) == []

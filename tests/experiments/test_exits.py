@@ -2,14 +2,12 @@
 
 import csv
 import json
-import os
 import resource
 import signal
-import subprocess
-import sys
 import time
 import urllib.request
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +15,10 @@ import pytest
 
 from hardware.emulator.process import EmulatorProcess
 from hardware.storage.journal import read_journal
-from tests.patience import PATIENCE_S
+from tests.programs import Program
 
-ROOT = Path(__file__).parents[2]
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 SPEED = 30.0
+OTHERS = signal.SIGINT, signal.SIGHUP
 BROKEN = """
 import experiments.deploy
 from experiments.laws.density.inverse import Inverse
@@ -44,14 +41,12 @@ class Bench:
         self, device: EmulatorProcess, folder: Path, code: str = "", more: Sequence[str] = (), resume: bool = False
     ) -> None:
         self.device, self.folder = device, folder
-        program = ["-c", code] if code else ["-m", "experiments.deploy"]
+        program = ["-c", code] if code else ["experiments.deploy"]
         scenario = ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[1000]"]
         backend = ["backend=chibio", f"backend.url={device.url}", f"backend.speed={SPEED}", "backend.reactors=[M0,M1]"]
         new = ["controller=adaptive_inverse", *scenario, *backend, *more, f"hydra.run.dir={folder}"]
-        command = [sys.executable, *program, *([f"resume={folder}"] if resume else new)]
-        self.client = subprocess.Popen(
-            command, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-        )
+        words = [*program, *([f"resume={folder}"] if resume else new)]
+        self.client = Program(*words, cwd=folder.parent, out=folder.with_suffix(".out"), WITHOUT_FIGURES="1")
 
     def truth(self) -> dict[str, Any]:
         with urllib.request.urlopen(f"{self.device.control}/_emulator/truth", timeout=10.0) as answer:
@@ -63,58 +58,64 @@ class Bench:
 
     def until_a_dose(self) -> None:
         """Wait until a pump runs."""
-        deadline = time.monotonic() + PATIENCE_S
-        while not self.motors():
-            assert time.monotonic() < deadline
-            assert self.client.poll() is None
-            time.sleep(0.005)
+        self.client.until(lambda: bool(self.motors()))
+
+    def until_under_way(self) -> None:
+        """Wait until a pump runs and each reactor has two rows on record."""
+        self.client.until(lambda: all(len(volumes(self.folder, name)) > 1 for name in ("M0", "M1")))
+        self.until_a_dose()
+
+    def slow(self, seconds: float) -> None:
+        """From now on each request takes so much device time."""
+        url = f"{self.device.control}/_emulator/fault/slow_s/all/{seconds:g}"
+        urllib.request.urlopen(urllib.request.Request(url, method="POST"), timeout=10.0).close()
 
     def end(self) -> tuple[int, str]:
         """Status and what was said, after the client has ended by itself."""
-        said = self.client.communicate(timeout=PATIENCE_S)[0]
-        return self.client.returncode, said
+        return self.client.end()
 
     def check(self, outcome: str) -> None:
         """Everything off, seen by the emulator and on record, and every reactor with a row."""
         assert self.motors() == []
         rows, torn = read_journal(self.folder / "journal.jsonl")
         assert torn == 0
-        stops = [row for row in rows if row["kind"] == "stop"]
-        if stops:
-            assert stops[-1]["not_verified"] == []
+        assert [row["not_verified"] for row in rows if row["kind"] == "stop"][-1:] == [[]]
         summary = json.loads((self.folder / "summary.json").read_text())
         assert outcome in summary["outcome"]
         assert all(reactor["rows"] > 0 for reactor in summary["reactors"].values())
 
 
+@contextmanager
+def at_work(folder: Path, code: str = "") -> Iterator[Bench]:
+    with EmulatorProcess(["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5"]) as device:
+        one = Bench(device, folder, code)
+        with one.client:
+            yield one
+
+
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
-    with EmulatorProcess(["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5"]) as device:
-        one = Bench(device, tmp_path / "run")
+    with at_work(tmp_path / "run") as one:
         yield one
-        if one.client.poll() is None:
-            one.client.kill()
-            one.client.communicate()
 
 
 def volumes(folder: Path, name: str) -> list[float]:
-    with open(folder / "recordings" / f"{name}.csv", newline="") as file:
-        return [float(row["volume_ml"]) for row in csv.DictReader(file)]
+    """Of every whole row."""
+    path = folder / "recordings" / f"{name}.csv"
+    with open(path if path.exists() else "/dev/null", newline="") as file:
+        return [float(row["volume_ml"]) for row in csv.DictReader(file) if None not in row.values()]
 
 
+@pytest.mark.slow
 def test_a_signal_while_the_pumps_are_being_switched_on_costs_no_row(bench: Bench) -> None:
     """The journal's newest row tells when the waste pump runs and the feed pump not yet: a second of device time."""
     journal = bench.folder / "journal.jsonl"
-    bench.until_a_dose()
-    time.sleep(2.0 * 60.0 / SPEED)
-    urllib.request.urlopen(
-        urllib.request.Request(f"{bench.device.control}/_emulator/fault/slow_s/all/6", method="POST"), timeout=10.0
-    ).close()  # 0.2 s for each request: the signal falls inside the switching on
+    bench.until_under_way()
+    bench.slow(6.0)  # 0.2 s for each request: the signal falls inside the switching on
     began = journal.stat().st_size
-    deadline = time.monotonic() + PATIENCE_S  # over so slow a link not every sample is new enough for a dose
-    while b'"kind":"intent"' not in journal.read_bytes()[began:]:
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
+    bench.client.until(
+        lambda: b'"kind":"intent"' in journal.read_bytes()[began:]
+    )  # not every sample is new enough for a dose
     bench.client.send_signal(signal.SIGTERM)
     status, said = bench.end()
     assert status == 0, said
@@ -131,77 +132,53 @@ def test_a_signal_while_the_pumps_are_being_switched_on_costs_no_row(bench: Benc
     bench.check("stopped by the operator")
 
 
-def test_three_signals_at_once_end_with_a_summary(bench: Bench) -> None:
-    bench.until_a_dose()
-    time.sleep(2.0 * 60.0 / SPEED)
-    bench.until_a_dose()
-    for _ in range(3):
-        bench.client.send_signal(signal.SIGINT)
-        time.sleep(0.15)
-    for _ in range(40):  # and all the way through the summary
-        time.sleep(0.05)
-        if bench.client.poll() is not None:
-            break
-        bench.client.send_signal(signal.SIGINT)
-    status, said = bench.end()
-    assert "pumps verified off" in said
-    assert "Traceback" not in said
-    bench.check("stopped by the operator")
-    assert status in (0, 130, -signal.SIGINT)  # the last one may fall into the end of the interpreter
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, *(pytest.param(n, marks=pytest.mark.slow) for n in OTHERS)])
 def test_a_signal_in_the_middle_of_a_dose(bench: Bench, number: int) -> None:
-    bench.until_a_dose()
-    time.sleep(2.0 * 60.0 / SPEED)
-    bench.until_a_dose()
+    bench.until_under_way()
     bench.client.send_signal(number)
     status, said = bench.end()
-    assert "pumps verified off" in said
     assert "Traceback" not in said
     bench.check("stopped by the operator")
     assert status == 0
 
 
-def test_an_impatient_operator_does_not_get_out_before_the_pumps_are_off(bench: Bench) -> None:
-    bench.until_a_dose()
-    time.sleep(2.0 * 60.0 / SPEED)
-    urllib.request.urlopen(
-        urllib.request.Request(f"{bench.device.control}/_emulator/fault/slow_s/all/3", method="POST"), timeout=10.0
-    ).close()
-    bench.client.send_signal(signal.SIGINT)
+@pytest.mark.slow
+@pytest.mark.parametrize("slow_s", [0.0, 3.0])
+def test_signal_after_signal_does_not_end_it_before_the_pumps_are_off(bench: Bench, slow_s: float) -> None:
+    """Through the switching off and through the summary."""
+    bench.until_under_way()
+    bench.slow(slow_s)
     while bench.client.poll() is None:
-        time.sleep(0.1)
         bench.client.send_signal(signal.SIGINT)
+        time.sleep(0.05)
     status, said = bench.end()
-    assert "pumps verified off" in said
+    assert "Traceback" not in said
     assert bench.motors() == []
-    assert status in (0, 130, -signal.SIGINT)
+    bench.check("stopped by the operator")
+    assert status in (0, 130, -signal.SIGINT)  # the last one may fall into the end of the interpreter
 
 
+@pytest.mark.slow
 def test_a_full_disk(bench: Bench) -> None:
-    bench.until_a_dose()
-    time.sleep(3.0 * 60.0 / SPEED)
+    bench.until_under_way()
     size = (bench.folder / "journal.jsonl").stat().st_size
     bench.until_a_dose()
     resource.prlimit(bench.client.pid, resource.RLIMIT_FSIZE, (size + 40, resource.RLIM_INFINITY))
     status, said = bench.end()
     assert status == 1
-    assert "pumps verified off" in said
     assert "free disk space, then resume the run" in said.splitlines()[-1]
     assert bench.motors() == []
     assert read_journal(bench.folder / "journal.jsonl")[1] == 0
 
 
+@pytest.mark.slow
 def test_an_exception_in_the_controller(tmp_path: Path) -> None:
-    with EmulatorProcess(["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5"]) as device:
-        bench = Bench(device, tmp_path / "run", BROKEN)
-        status, said = bench.end()
-        assert status == 1
-        assert "pumps verified off" in said
+    with at_work(tmp_path / "run", BROKEN) as bench:
+        assert bench.end()[0] == 1
         bench.check("failed: RuntimeError: the controller failed")
 
 
+@pytest.mark.slow
 def test_an_overflow_pump_runs_over_doses_and_a_kill_and_is_off_after_every_other_end(tmp_path: Path) -> None:
     pump = ["backend.overflow_pump.pump=Pump3", "backend.overflow_pump.duty=0.95"]
     folder = tmp_path / "run"
@@ -209,11 +186,8 @@ def test_an_overflow_pump_runs_over_doses_and_a_kill_and_is_off_after_every_othe
 
     def until_fed(bench: Bench) -> None:
         """Until a dose is given beside a running overflow pump."""
-        deadline = time.monotonic() + PATIENCE_S
-        while not (state.exists() and any({f"{m}/Pump1", f"{m}/Pump3"} <= set(bench.motors()) for m in ("M0", "M1"))):
-            assert time.monotonic() < deadline
-            assert bench.client.poll() is None
-            time.sleep(0.005)
+        both = [{f"{name}/Pump1", f"{name}/Pump3"} for name in ("M0", "M1")]
+        bench.client.until(lambda: state.exists() and any(pumps <= set(bench.motors()) for pumps in both))
 
     with EmulatorProcess(
         ["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5", "--overflow-pump", "Pump3"]
@@ -232,7 +206,6 @@ def test_an_overflow_pump_runs_over_doses_and_a_kill_and_is_off_after_every_othe
         state.write_text(whole)
         bench = Bench(device, folder, resume=True)
         until_fed(bench)
-        time.sleep(2.0 * 60.0 / SPEED)
         bench.client.send_signal(signal.SIGTERM)
         status, said = bench.end()
         assert status == 0, said

@@ -12,6 +12,7 @@ from tests.campaigns.rehearsal import Rehearsal, rehearsed
 from tests.hardware.emulator_lab import quiet
 
 
+@pytest.mark.slow
 def test_half_the_flow_is_told_at_its_beginning_at_its_end_and_in_every_row_between(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

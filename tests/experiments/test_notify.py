@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import subprocess
 import sys
 import threading
@@ -22,8 +21,8 @@ from experiments.control.config import DeployConfig
 from experiments.control.notify import Hook, Notifier, hidden
 from experiments.record.summary import ChangeLog
 from hardware.emulator.faults import inject
+from tests import programs
 from tests.campaigns.rehearsal import Rehearsal, rehearsed
-from tests.experiments.test_deploy import ROOT
 from tests.hardware.emulator_lab import quiet
 from tests.patience import PATIENCE_S
 
@@ -73,12 +72,8 @@ def server() -> Iterator[Server]:
 
 
 def deployed(folder: Path, *overrides: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **variables}
-    command = [sys.executable, "-m", "experiments.deploy", f"hydra.run.dir={folder}", "controller=pi"]
-    short = ["scenario=hold", "scenario.minutes=[5]"]
-    return subprocess.run(
-        [*command, *short, *overrides], capture_output=True, text=True, env=environment, timeout=PATIENCE_S, check=False
-    )
+    words = f"hydra.run.dir={folder}", "controller=pi", "scenario=hold", "scenario.minutes=[5]", *overrides
+    return programs.run("experiments.deploy", *words, cwd=folder.parent, WITHOUT_FIGURES="1", **variables)
 
 
 def test_an_address_is_told_of_start_and_end_and_stands_in_no_file(tmp_path: Path, server: Server) -> None:
@@ -121,6 +116,7 @@ def rehearsal(folder: Path, tell: Notifier | None = None) -> Rehearsal:
     return run
 
 
+@pytest.mark.slow
 def test_a_hook_that_hangs_changes_no_sample_and_no_dose(tmp_path: Path) -> None:
     plain = rehearsal(tmp_path / "plain")
     server = Server(hangs=True)

@@ -89,6 +89,18 @@ class Cut(Rehearsal):
         return float(self.loop.interlock.budget.fed_ml[0]) - float(self.truth("M0")["feed_ml"])
 
 
+def in_a_dose(folder: Path, *names: str) -> Rehearsal:
+    """A run after some minutes at full feed, the feed pump of M0 on."""
+    run = Rehearsal(folder, rehearsed(names, Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
+    run.begin()
+    run.loop.density.law = Full()
+    for _ in run.run(300.0):
+        pass
+    while not run.device.apps["M0"].data["Pump1"]["ON"]:
+        run.loop.step()
+    return run
+
+
 def reasons(steps: list[Step]) -> str:
     return " ".join(step.reasons[0] or "" for step in steps)
 
@@ -118,6 +130,7 @@ def test_repeats_of_a_dead_program_are_booked_when_they_happened_and_alarm_nobod
     assert hour.max() < 2.5  # a minute holds two repetitions at most
 
 
+@pytest.mark.slow
 def test_they_are_booked_once_however_often_the_program_dies(tmp_path: Path) -> None:
     run = Cut(tmp_path, FEED_ON)
     run.wait(500.0)
@@ -133,6 +146,7 @@ def test_they_are_booked_once_however_often_the_program_dies(tmp_path: Path) -> 
     assert run.record.series("volume_ml")[0].sum() == pytest.approx(float(run.loop.interlock.budget.fed_ml[0]))
 
 
+@pytest.mark.slow
 def test_a_repeat_that_stands_in_a_row_already_is_in_no_second_one(tmp_path: Path) -> None:
     """The second life decides with the repeats booked, and dies before it can save that it has."""
     run = Cut(tmp_path, FEED_ON)
@@ -249,13 +263,7 @@ def test_repeats_before_a_board_agent_ended_them_are_booked(
 
 
 def test_repeats_under_a_lost_link_are_booked_before_the_next_sample_is_judged(tmp_path: Path) -> None:
-    run = Rehearsal(tmp_path, rehearsed(("M0", "M1"), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
-    run.begin()
-    run.loop.density.law = Full()
-    for _ in run.run(300.0):
-        pass
-    while not run.device.apps["M0"].data["Pump1"]["ON"]:
-        run.loop.step()
+    run = in_a_dose(tmp_path, "M0", "M1")
     inject(run.device, "lost_request", "all", -1)
     end = run.clock.now() + 600.0
     for _ in run.run(end):
@@ -272,13 +280,7 @@ def test_repeats_under_a_lost_link_are_booked_before_the_next_sample_is_judged(t
 
 
 def test_a_device_that_was_restarted_in_a_dose_repeated_nothing(tmp_path: Path) -> None:
-    run = Rehearsal(tmp_path, rehearsed(("M0",), Scenario((0.5,), (600.0,), (37.0,))), quiet(mu=0.03), od=0.8)
-    run.begin()
-    run.loop.density.law = Full()
-    for _ in run.run(300.0):
-        pass
-    while not run.device.apps["M0"].data["Pump1"]["ON"]:
-        run.loop.step()
+    run = in_a_dose(tmp_path, "M0")
     inject(run.device, "power_cut")
     for _ in run.run(run.clock.now() + 900.0):
         pass

@@ -169,6 +169,7 @@ def never_together(run: Rehearsal) -> None:
     assert all(any(a <= start and end <= b for a, b, _ in waste) for start, end, _ in feeds)
 
 
+@pytest.mark.slow
 def test_on_the_device_both_pumps_give_what_the_step_says_and_it_counts(tmp_path: Path) -> None:
     run = whole(tmp_path)
     vial = run.device.vials["M0"]
@@ -243,7 +244,7 @@ def journal(run: Rehearsal, kind: str) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("request_", REQUESTS)
-@pytest.mark.parametrize("away_s", [5.0, 200.0])
+@pytest.mark.parametrize("away_s", [5.0, pytest.param(200.0, marks=pytest.mark.slow)])
 def test_a_kill_in_a_dose_never_gives_it_twice_and_what_flowed_is_booked(
     request_: str, away_s: float, tmp_path: Path
 ) -> None:

@@ -149,6 +149,7 @@ def _windows(run: Rehearsal) -> list[dict[str, object]]:
     return list(summary["windows"])
 
 
+@pytest.mark.slow
 def test_a_run_killed_between_the_decision_that_ends_a_step_and_its_record_goes_on_in_the_next(tmp_path: Path) -> None:
     whole = _run(tmp_path / "whole")
     for _ in whole.run():

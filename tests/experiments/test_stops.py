@@ -6,8 +6,6 @@ import os
 import re
 import shlex
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -23,92 +21,75 @@ from experiments.cli import frame, stop
 from experiments.reporting.tensorboard import Events
 from experiments.training.config import TrainConfig
 from experiments.training.session import Session
+from tests import programs
 from tests.patience import PATIENCE_S
+from tests.programs import Program
 from tests.studies.ablate import AblateConfig, _read
 
-ROOT = Path(__file__).parents[2]
+BLANK = {"WITHOUT_FIGURES": "1"}
 SHORT = ["agent=paper", "agent.total_steps=1000", "agent.learn_start=100", "eval_every=200"]
 
 
-class Run:
+class Run(Program):
     """A command in a folder of its own, known by a mark that all its processes inherit."""
 
     def __init__(self, folder: Path, *words: str) -> None:
-        self.folder, self._mark = folder, f"RUN_OF_TEST={uuid4().hex}"
-        name, _, value = self._mark.partition("=")
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), name: value}
-        command = [sys.executable, "-m", *words]
-        with open(folder / "out", "w") as out, open(folder / "err", "w") as err:
-            self.process = subprocess.Popen(
-                command, cwd=folder, env=environment, stdout=out, stderr=err, start_new_session=True
-            )
+        self.folder, mark = folder, uuid4().hex
+        self._mark = f"RUN_OF_TEST={mark}".encode()
+        super().__init__(*words, cwd=folder, out=folder / "out", err=folder / "err", **BLANK, RUN_OF_TEST=mark)
 
     def processes(self) -> list[int]:
         """Every living process of the command, also those in sessions of their own."""
-        found = []
+        found = [self.pid] if self.poll() is None else []
         for path in Path("/proc").glob("[0-9]*/environ"):
-            try:
-                if self._mark.encode() in path.read_bytes():
-                    found.append(int(path.parent.name))
-            except OSError:  # gone meanwhile, or somebody else's
-                continue
+            with contextlib.suppress(OSError):  # gone meanwhile, or somebody else's
+                found += [int(path.parent.name)] if self._mark in path.read_bytes() else []
         return found
 
     def until_said(self, words: str) -> None:
         """Wait for standard output to hold `words`."""
-        self._until(lambda: words in (self.folder / "out").read_text())
+        self.until(lambda: words in (self.folder / "out").read_text())
 
-    def until_there(self, pattern: str) -> None:
-        """Wait for a file with something in it."""
-        self._until(lambda: any(path.stat().st_size for path in self.folder.glob(pattern)))
+    def until_there(self, pattern: str, lines: int = 0) -> None:
+        """Wait for a file with something in it, or with more than so many lines."""
+        paths = self.folder.glob
+        self.until(lambda: any(p.stat().st_size and p.read_bytes().count(b"\n") >= lines for p in paths(pattern)))
 
-    def until_rows(self, pattern: str) -> None:
-        """Wait for a table with a row below its head: what writes it is under way."""
-        self._until(lambda: any(path.read_text().count("\n") > 1 for path in self.folder.glob(pattern)))
-
-    def until_processes(self, count: int) -> None:
-        self._until(lambda: len(self.processes()) >= count)
-
-    def _until(self, there) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while not there():
-            assert time.monotonic() < deadline
-            assert self.process.poll() is None, (self.folder / "err").read_text()
-            time.sleep(0.02)
-
-    def ctrl_c(self) -> None:
+    def ctrl_c(self, number: int = signal.SIGINT) -> None:
         """As a terminal does: to every process of the foreground group."""
-        os.killpg(self.process.pid, signal.SIGINT)
+        os.killpg(self.pid, number)
 
-    def end(self) -> str:
+    def stopped(self) -> str:
         """The one line on standard error, after the command has ended as a stopped one and left no process."""
-        status = self.process.wait(PATIENCE_S)
-        said = (self.folder / "err").read_text()
-        assert status == 130, said
-        assert len(said.splitlines()) == 1, said
+        status, told = self.wait(), (self.folder / "err").read_text()
+        assert status == 130, told
+        assert len(told.splitlines()) == 1, told
         assert "Traceback" not in (self.folder / "out").read_text()
-        deadline = time.monotonic() + PATIENCE_S  # a process that was ended may take a moment
+        self.gone()
+        return told.strip()
+
+    def gone(self) -> None:
+        """Wait until no process is left; one that was ended may take a moment."""
+        deadline = time.monotonic() + PATIENCE_S
         while self.processes():
             assert time.monotonic() < deadline, self.processes()
             time.sleep(0.02)
-        return said.strip()
 
 
 def go_on(run: Run, line: str) -> None:
     """Run the command that the line names, as it stands there."""
     told = re.search(r"go on with: python (-m [\w.]+ resume=.+)$", line)
     assert told, line
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, *shlex.split(told[1])]
-    done = subprocess.run(command, cwd=run.folder, env=environment, capture_output=True, text=True)
+    done = programs.run(*shlex.split(told[1])[1:], cwd=run.folder, **BLANK)
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_stopped_training_goes_on_to_the_bit_with_the_command_it_names(tmp_path: Path) -> None:
     run = Run(tmp_path, "experiments.train", *SHORT, "hydra.run.dir=a folder")  # one that needs quotes
-    run.until_rows("a folder/progress.csv")
-    run.process.terminate()
-    line = run.end()
+    run.until_there("a folder/progress.csv", lines=2)
+    run.terminate()
+    line = run.stopped()
     assert "keeps checkpoint.pt, progress.csv; go on" in line
     assert "stopping at the end of this episode" in (tmp_path / "out").read_text()
     go_on(run, line)
@@ -123,22 +104,24 @@ def test_a_stopped_training_goes_on_to_the_bit_with_the_command_it_names(tmp_pat
     assert resumed.best.history == whole.best.history
 
 
+@pytest.mark.slow
 def test_an_impatient_user_gets_out_at_once_and_keeps_what_was_saved(tmp_path: Path) -> None:
     run = Run(tmp_path, "experiments.train", *SHORT, "n_agents=128", "checkpoint_every=100", "hydra.run.dir=run")
     run.until_there("run/checkpoint.pt")
-    run.process.send_signal(signal.SIGHUP)
+    run.send_signal(signal.SIGHUP)
     run.until_said("stopping")
     run.ctrl_c()
-    assert run.end() == "stopped at once; what was saved before is whole"
+    assert run.stopped()
     assert checkpoint.load(tmp_path / "run/checkpoint.pt")["returns"]
 
 
+@pytest.mark.slow
 def test_a_stopped_benchmark_ends_its_workers(tmp_path: Path) -> None:
     words = ["+experiment=comparison", "workers=2", "replicates=200", "train_seeds=1", "hydra.run.dir=run"]
     run = Run(tmp_path, "experiments.benchmark", *words)
-    run.until_rows("run/training/dqn/progress.csv")
-    os.killpg(run.process.pid, signal.SIGTERM)  # its workers get it too
-    assert run.end() == "stopped; run keeps training/; to try again, start anew"
+    run.until_there("run/training/dqn/progress.csv", lines=2)
+    run.ctrl_c(signal.SIGTERM)  # its workers get it too
+    assert run.stopped() == "stopped; run keeps training/; to try again, start anew"
     assert (tmp_path / "run/training/dqn/checkpoint.pt").is_file()
 
 
@@ -151,6 +134,7 @@ def _saves(folder: Path) -> None:
         (folder / "saved").touch()
 
 
+@pytest.mark.slow
 def test_a_worker_told_by_the_terminal_and_by_its_command_saves_what_it_did(tmp_path: Path) -> None:
     with contextlib.suppress(KeyboardInterrupt), stop.Workers(1) as workers:
         workers.submit(_saves, tmp_path)
@@ -264,22 +248,20 @@ def test_a_stop_waits_until_the_writer_of_events_holds_no_lock(
     events.close()
 
 
+@pytest.mark.slow
 def test_workers_do_not_outlive_a_killed_command(tmp_path: Path) -> None:
     run = Run(tmp_path, "tests.campaigns.faults", "workers=2")
-    run.until_processes(4)  # the command, two workers, and what tracks their semaphores
-    run.process.kill()
-    run.process.wait()
-    deadline = time.monotonic() + PATIENCE_S
-    while run.processes():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    run.until(lambda: len(run.processes()) >= 3)  # the command and two workers
+    run.kill()
+    run.gone()
 
 
+@pytest.mark.slow
 def test_a_stopped_ablation_goes_on_in_the_middle_of_a_variant(tmp_path: Path) -> None:
     run = Run(tmp_path, "tests.studies.ablate", *SHORT, "only=[tuned]", "n_agents=2", "hydra.run.dir=study")
-    run.until_rows("study/tuned/progress.csv")
+    run.until_there("study/tuned/progress.csv", lines=2)
     run.ctrl_c()
-    line = run.end()
+    line = run.stopped()
     before = (tmp_path / "study/tuned/progress.csv").read_text().splitlines()
     assert all(int(row.split(",")[0]) < 1000 for row in before[1:])
     go_on(run, line)
@@ -292,6 +274,7 @@ def test_a_stopped_ablation_goes_on_in_the_middle_of_a_variant(tmp_path: Path) -
     assert [row.regret_pct for row in _read(tmp_path / "study/ablation.csv")] == whole.report()[1].regret_pct.tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "there", "kept"),
     [
@@ -310,30 +293,30 @@ def test_a_stopped_command_says_what_it_keeps(words: list[str], there: str, kept
     run = Run(tmp_path, *words, "hydra.run.dir=run")
     run.until_there(f"run/{there}")
     run.ctrl_c()
-    assert run.end() == f"stopped; run keeps {kept}; to try again, start anew"
+    assert run.stopped() == f"stopped; run keeps {kept}; to try again, start anew"
 
 
+@pytest.mark.slow
 def test_a_stopped_kill_campaign_leaves_neither_clients_nor_emulators(tmp_path: Path) -> None:
     run = Run(tmp_path, "tests.campaigns.kills", "kills=4", "runs=2", "longest_s=60", "hydra.run.dir=run")
     run.until_there("run/run0/journal.jsonl")
     run.ctrl_c()
-    assert "run keeps calibration/, ended_runs.json, run0.log, run0/" in run.end()
+    assert "run keeps calibration/, ended_runs.json, run0.log, run0/" in run.stopped()
     assert json.loads((tmp_path / "run/ended_runs.json").read_text()) == {"runs": []}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_demo_is_silent_but_for_its_step(number: int, tmp_path: Path) -> None:
     run = Run(tmp_path, "experiments.demo")
     run.until_said("fitting")
-    run.process.send_signal(number)
-    assert "1_calibrate keeps no result" in run.end()
+    run.send_signal(number)
+    assert "1_calibrate keeps no result" in run.stopped()
     assert "experiments.train" not in (tmp_path / "out").read_text()
 
 
 def test_the_demo_explains_itself_and_does_nothing_else(tmp_path: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "experiments.demo", "--help"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    done = programs.run("experiments.demo", "--help", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "calibrate, train" in done.stdout
     assert not list(tmp_path.iterdir())

@@ -7,8 +7,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -22,24 +20,24 @@ from experiments.cli import frame, sweep
 from experiments.cli.frame import UserError
 from experiments.control import run as control
 from experiments.control.config import DeployConfig
-from experiments.train import main, train
+from experiments.train import main
 from experiments.training.config import TrainConfig
 from experiments.training.session import Session
 from tests.patience import PATIENCE_S
+from tests.programs import OURS, Program, run
 
-ROOT = Path(__file__).parents[2]
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+TRAIN = "experiments.train"
+PARALLEL = "joblib", "submitit_local"
+BLANK = {"WITHOUT_FIGURES": "1"}
 SMOKE = ["+experiment=smoke", "agent.total_steps=300"]
-LONG = ["agent.total_steps=1000", "agent.learn_start=100", "eval_every=200", "checkpoint_every=100"]
+LONG = ["n_agents=1", "agent.total_steps=1000", "agent.learn_start=100", "eval_every=200", "checkpoint_every=100"]
 pytestmark = pytest.mark.xdist_group("sweep")  # its tests share what a single run gives
 
 
-def command(*words: str) -> list[str]:
-    return [sys.executable, "-m", "experiments.train", *words]
-
-
-def run(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*words), cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=200)
+def started(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """By an interpreter of its own, whose workers are not forked from a worker."""
+    command, environment = [sys.executable, "-m", TRAIN, *words], {**os.environ, **OURS}
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
 
 
 def summary(folder: Path) -> dict[str, Any]:
@@ -48,26 +46,20 @@ def summary(folder: Path) -> dict[str, Any]:
     return {key: value for key, value in found.items() if key not in ("train_seconds", "policy")}
 
 
-def until(there: Callable[[], bool], process: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not there():
-        assert time.monotonic() < deadline
-        assert process.poll() is None
-        time.sleep(0.01)
-
-
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory) -> list[dict[str, Any]]:
     """Summaries of seeds 0 and 1 as single runs."""
     folders = [tmp_path_factory.mktemp(f"alone{seed}") for seed in range(2)]
     for seed, folder in enumerate(folders):
-        train(main.config([*SMOKE, f"seed={seed}"]), folder)
+        done = run(TRAIN, *SMOKE, f"seed={seed}", "hydra.run.dir=.", cwd=folder, **BLANK)
+        assert done.returncode == 0, done.stderr
     return [summary(folder) for folder in folders]
 
 
-@pytest.mark.parametrize("launcher", ["basic", "joblib", "submitit_local"])
+@pytest.mark.parametrize("launcher", ["basic", *(pytest.param(n, marks=pytest.mark.slow) for n in PARALLEL)])
 def test_every_launcher_gives_the_summaries_of_single_runs_in_one_folder(launcher, alone, tmp_path):
-    done = run("-m", "seed=range(0,2)", *SMOKE, f"hydra/launcher={launcher}", cwd=tmp_path)
+    words = "-m", "seed=range(0,2)", *SMOKE, f"hydra/launcher={launcher}"
+    done = started(*words, cwd=tmp_path) if launcher in PARALLEL else run(TRAIN, *words, cwd=tmp_path, **BLANK)
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "runs" / "train").iterdir()
     assert sorted(p.name for p in folder.iterdir() if p.is_dir() and p.name.isdigit()) == ["0", "1"]
@@ -75,17 +67,15 @@ def test_every_launcher_gives_the_summaries_of_single_runs_in_one_folder(launche
     assert f"2 of 2 jobs finished in runs/train/{folder.name}" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_stopped_sweep_does_only_what_is_missing(tmp_path):
     """Ctrl-C in the second of three jobs; then the command that is named, and once more where nothing is missing."""
-    with open(tmp_path / "err", "w") as err:
-        process = subprocess.Popen(
-            command("-m", "seed=range(0,3)", *LONG, "hydra.sweep.dir=a sweep"),
-            cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=err, text=True,
-        )  # fmt: skip
+    words = "experiments.train", "-m", "seed=range(0,3)", *LONG, "hydra.sweep.dir=a sweep"
+    process = Program(*words, cwd=tmp_path, out=tmp_path / "out", err=tmp_path / "err", **BLANK)
     folder = tmp_path / "a sweep"
-    until((folder / "1/checkpoint.pt").is_file, process)
+    process.until((folder / "1/checkpoint.pt").is_file)
     process.send_signal(signal.SIGINT)
-    assert process.wait(PATIENCE_S) == 130
+    assert process.wait() == 130
     (line,) = (tmp_path / "err").read_text().splitlines()
     told = re.fullmatch(
         r"stopped; 1 of 3 jobs finished in a sweep; what is missing: python -m experiments.train (.+)", line
@@ -93,7 +83,7 @@ def test_a_stopped_sweep_does_only_what_is_missing(tmp_path):
     assert told, line
     before = (folder / "0/summary.json").stat().st_mtime_ns
     assert 1 <= len(_returns(folder / "1")) < 10
-    again = run(*shlex.split(told[1]), cwd=tmp_path)
+    again = run(TRAIN, *shlex.split(told[1]), cwd=tmp_path, **BLANK)
     assert again.returncode == 0, again.stderr
     assert "3 of 3 jobs finished" in again.stdout
     assert not list(folder.glob("*/stopped_*"))  # job 1 went on from its checkpoint
@@ -105,7 +95,7 @@ def test_a_stopped_sweep_does_only_what_is_missing(tmp_path):
     assert ours["best"]["weights"].equal(whole.best.weights)
     assert ours["returns"] == whole.returns
     times = [(folder / f"{k}/summary.json").stat().st_mtime_ns for k in range(3)]
-    assert "3 of 3 jobs finished" in run("resume=a sweep", cwd=tmp_path).stdout
+    assert "3 of 3 jobs finished" in run(TRAIN, "resume=a sweep", cwd=tmp_path).stdout
     assert [(folder / f"{k}/summary.json").stat().st_mtime_ns for k in range(3)] == times
 
 
@@ -155,16 +145,12 @@ def test_a_folder_goes_on_with_the_same_config_only_and_one_process_at_a_time(tm
     (tmp_path / "progress.csv").touch()
     job.put_aside()
     assert (tmp_path / "stopped_1/progress.csv").is_file()
-    busy = "import sys; from pathlib import Path; from experiments.cli import sweep\n"
-    busy += f"with sweep.working(Path({str(tmp_path)!r})): print('in', flush=True); sys.stdin.read()"
-    with subprocess.Popen(
-        [sys.executable, "-c", busy], env=ENVIRONMENT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == "in\n"
+    busy = "import time; from pathlib import Path; from experiments.cli import sweep\n"
+    busy += f"with sweep.working(Path({str(tmp_path)!r})): print('in', flush=True); time.sleep(600)"
+    with Program("-c", busy, cwd=tmp_path, out=tmp_path / "out") as other:
+        other.until(lambda: other.said() == "in\n")
         with pytest.raises(sweep.Busy), sweep.working(tmp_path):
             pass
-        other.kill()
     with sweep.working(tmp_path):
         pass
 
@@ -342,7 +328,7 @@ def test_a_single_run_is_not_resumed_as_a_sweep(tmp_path):
 
 
 def test_a_word_that_no_job_can_take_leaves_no_folder(tmp_path):
-    done = run("-m", "seed=0,1", "agent.learning_rat=1", "hydra.sweep.dir=all", cwd=tmp_path)
+    done = run(TRAIN, "-m", "seed=0,1", "agent.learning_rat=1", "hydra.sweep.dir=all", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert "agent.learning_rat" in done.stderr
     assert not (tmp_path / "all").exists()

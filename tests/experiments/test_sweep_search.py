@@ -2,10 +2,6 @@
 
 import importlib.metadata
 import json
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,8 +10,7 @@ import pytest
 from hydra.core.utils import JobReturn, JobStatus
 
 from experiments.cli import frame, search, sweep
-from tests.experiments.test_sweep import ENVIRONMENT
-from tests.patience import PATIENCE_S
+from tests.programs import Program
 
 WORDS = ["+hparams_search=tuned", "+experiment=smoke", "n_agents=1", "agent.total_steps=300", "checkpoint_every=100"]
 TRIALS = 4
@@ -28,30 +23,25 @@ def _optuna() -> int:
         return 0
 
 
-def worker(folder: Path, name: str) -> subprocess.Popen[str]:
+pytestmark = pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
+
+
+def worker(folder: Path, name: str) -> Program:
     """A process that takes part in the search."""
     words = [*WORDS, f"hydra.sweeper.trials={TRIALS}", "hydra.sweep.dir=search"]
-    with open(folder / name, "w") as out:
-        return subprocess.Popen(
-            [sys.executable, "-m", "experiments.train", *words],
-            cwd=folder, env=ENVIRONMENT, stdout=out, stderr=out, text=True,
-        )  # fmt: skip
+    return Program("experiments.train", *words, cwd=folder, out=folder / name, WITHOUT_FIGURES="1")
 
 
-@pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
+@pytest.mark.slow
 def test_two_processes_share_a_search_and_take_up_the_trial_of_a_killed_one(tmp_path: Path) -> None:
     first = worker(tmp_path, "first")
     folder = tmp_path / "search"
-    deadline = time.monotonic() + PATIENCE_S
-    while not (folder / "0/config.yaml").is_file():  # the first trial is at work
-        assert time.monotonic() < deadline
-        assert first.poll() is None, (tmp_path / "first").read_text()
-        time.sleep(0.01)
-    first.send_signal(signal.SIGKILL)
+    first.until((folder / "0/config.yaml").is_file)  # the first trial is at work
+    first.kill()
     first.wait()
     assert sweep.Job.at(folder / "0").state == "running"
     for each in [worker(tmp_path, "second"), worker(tmp_path, "third")]:
-        assert each.wait(PATIENCE_S) == 0, [(tmp_path / name).read_text() for name in ("second", "third")]
+        assert each.wait() == 0, each.said()
     said = "".join((tmp_path / name).read_text() for name in ("second", "third"))
     assert said.count("trial 0 goes on: its process is gone") == 1
     jobs = sweep.survey(folder)
@@ -67,7 +57,6 @@ def test_two_processes_share_a_search_and_take_up_the_trial_of_a_killed_one(tmp_
     assert [(t.number, t.state.name, t.value) for t in trials] == [(k, "COMPLETE", ours[str(k)]) for k in range(TRIALS)]
 
 
-@pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
 def test_an_objective_of_nothing_is_the_best_of_those_above_it(tmp_path: Path) -> None:
     """Twelve trials: one of them reaches 0, one fails, the others return their number."""
 
@@ -87,7 +76,6 @@ def test_an_objective_of_nothing_is_the_best_of_those_above_it(tmp_path: Path) -
     assert [t.value for t in study._open().get_trials()] == [1.0, 2.0, 3.0, None, *map(float, range(5, 11)), 0.0, 12.0]
 
 
-@pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
 def test_trials_that_are_given_out_together_keep_their_numbers_folders_and_results(tmp_path: Path) -> None:
     """Five, two at a time: the words of the command line come first, and each result is its own trial's."""
     given: list[tuple[int, list[list[str]]]] = []
@@ -114,7 +102,6 @@ def test_trials_that_are_given_out_together_keep_their_numbers_folders_and_resul
     assert [t.value for t in study._open().get_trials()] == [10.0, 9.0, 8.0, 7.0, 6.0]
 
 
-@pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
 def test_a_range_is_of_whole_numbers_where_both_its_ends_are(tmp_path: Path) -> None:
     said = {
         "whole": {"low": 1, "high": 4}, "part": {"low": 0, "high": 0.5}, "down": {"low": -0.5, "high": 1},
@@ -144,7 +131,6 @@ def test_a_range_is_of_whole_numbers_where_both_its_ends_are(tmp_path: Path) -> 
     assert 5 <= sum(params["tens"] < 0.03 for params in tried) <= 35  # half of three tens
 
 
-@pytest.mark.skipif(_optuna() < 4, reason="no optuna 4 or newer: pip install -e '.[sweep]'")
 def test_a_space_that_is_none_is_one_line() -> None:
     with pytest.raises(frame.UserError, match=r"^hydra\.sweeper\.space\.env\.mu: .*; write \{low: 1, high: 9\}"):
         search.Search(1, 1, frame.OmegaConf.create({"env.mu": {"low": 2.0, "high": 1.0}}))

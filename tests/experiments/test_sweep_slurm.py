@@ -21,7 +21,7 @@ from tests.patience import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 WORDS = ["agent.total_steps=1000", "agent.learn_start=100", "eval_every=500", "checkpoint_every=100"]
-pytestmark = pytest.mark.skipif(bool(slurm_lab.missing()), reason=slurm_lab.missing())
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(slurm_lab.missing()), reason=slurm_lab.missing())]
 
 
 @pytest.fixture

@@ -22,24 +22,20 @@ from matplotlib.image import imread
 from experiments.reporting.curves import TRAINING
 from experiments.reporting.tensorboard import Events
 from tests.patience import PATIENCE_S
+from tests.programs import OURS, ROOT, run
 
-ROOT = Path(__file__).parents[2]
 BROWSER = next((b for b in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if b), None)
 DRAWN = os.environ.get("BOARD_FIGURES")
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright (python -m pip install playwright)")
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.xdist_group("tensorboard"),  # its tests share the runs and the browser
     pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)"),
 ]
 LEARNING, DEPLOYMENT = "Learning, several agents" if DRAWN else "Learning", ("Density", "Pump, heat, interlock")
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+ENVIRONMENT = {**os.environ, **OURS}
 SHORT = ["agent.total_steps=300", "agent.learn_start=100"]
 LONG = ["agent.total_steps=3000", "n_agents=3"]  # of the figures
-
-
-def start(*words: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", *words]
-    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 @pytest.fixture(scope="module")
@@ -53,15 +49,9 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     if DRAWN:
         commands.append(("train", *LONG, "agent=paper", f"hydra.run.dir={folder / 'learning_paper'}"))
-    processes = [start(f"experiments.{name}", *words) for name, *words in commands]
-    try:
-        for process in processes:
-            said, _ = process.communicate(timeout=PATIENCE_S)
-            assert process.returncode == 0, said
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
+    for name, *words in commands:
+        done = run(f"experiments.{name}", *words, cwd=folder)
+        assert done.returncode == 0, done.stderr
     return folder
 
 

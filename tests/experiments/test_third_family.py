@@ -3,9 +3,6 @@
 import csv
 import importlib.util
 import json
-import os
-import signal
-import subprocess
 import sys
 from collections.abc import Iterator
 from datetime import datetime
@@ -23,9 +20,8 @@ from experiments.deploy import main
 from hardware import family
 from hardware.storage.journal import read_journal
 from tests.evolver_stub import VIALS, EvolverStub
-from tests.patience import PATIENCE_S
+from tests.programs import ROOT, Program, run
 
-ROOT = Path(__file__).parents[2]
 DRIVER = ROOT / "tests" / "evolver.py"
 AWAY = "http://127.0.0.1:9"
 
@@ -110,10 +106,6 @@ def test_its_dry_run_says_where_it_is(known: None) -> None:
     assert text.count("bench.bottle_ml=2000 lasts") == VIALS
 
 
-def client(folder: Path, *given: str) -> list[str]:
-    return [sys.executable, "-m", "experiments.deploy", *given]
-
-
 def fed(run: Path) -> np.ndarray[Any, Any]:
     """What the recordings say that each vial got, mL."""
     found = []
@@ -125,24 +117,12 @@ def fed(run: Path) -> np.ndarray[Any, Any]:
 
 def test_a_run_is_killed_in_a_dose_and_goes_on(device: EvolverStub, tmp_path: Path) -> None:
     """A dose that was given and not answered is counted once, none is given twice, and all sixteen are held."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     device.hold_at = "15"
-    given = [f"extend={DRIVER}", *words(device.url), "hydra.run.dir=here"]
-    first = subprocess.Popen(
-        client(tmp_path, *given), cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-    )
-    assert device.held.wait(120.0), first.communicate(timeout=5.0)[0].decode()
-    first.send_signal(signal.SIGKILL)
-    first.communicate(timeout=PATIENCE_S)
+    given = "experiments.deploy", f"extend={DRIVER}", *words(device.url), "hydra.run.dir=here"
+    with Program(*given, cwd=tmp_path, out=tmp_path / "out", WITHOUT_FIGURES="1") as first:
+        assert device.held.wait(120.0), first.said()
     device.go.set()
-    done = subprocess.run(
-        client(tmp_path, "resume=here"),
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-    )
+    done = run("experiments.deploy", "resume=here", cwd=tmp_path, WITHOUT_FIGURES="1")
     assert done.returncode == 0, done.stderr + done.stdout
     summary = json.loads((tmp_path / "here/summary.json").read_text())
     assert summary["outcome"] == "completed"
