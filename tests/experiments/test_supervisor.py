@@ -252,6 +252,7 @@ def watched(config: EstimatorConfig, bounds: EstimateBounds | None) -> tuple[np.
     return np.array(alarms), np.array(off)
 
 
+@pytest.mark.slow
 def test_a_filter_that_is_blind_is_found_out_and_costs_nothing() -> None:
     """It alarms as soon as its ten watched readings are there; its policy has no certificate and so no bounds."""
     assert certificate.bounds(POLICY, settings(POLICY, asdict(BLIND)), SHIPPED, EnvConfig()) is None
@@ -274,6 +275,7 @@ def begun(folder: Path) -> tuple[Rehearsal, RelativeController, ChangeLog]:
     return run, law, ChangeLog(run.loop)
 
 
+@pytest.mark.slow
 def test_the_console_says_once_when_the_supervisor_begins_and_ends_and_the_journal_every_time(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -328,6 +330,7 @@ def test_surprises_stand_in_the_row_and_the_screen_says_who_decides_alone(
     assert sum("the supervisor's law acts" in line for line in said) == 1
 
 
+@pytest.mark.slow
 def test_three_strains_on_three_pumps_are_held_without_a_calibration(tmp_path: Path) -> None:
     """True OD, from the emulator, against the setpoint in the last ten minutes of each phase."""
     schedule = Scenario((0.5, 0.4), (25.0, 25.0), (37.0, 37.0), recovery_od=0.45)
