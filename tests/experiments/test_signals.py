@@ -51,7 +51,7 @@ def test_a_command_takes_it_from_a_file_outside(tmp_path: Path) -> None:
 
 def test_it_is_recorded_warned_of_summed_up_and_saved(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("WARNING"):
-    run.deploy(main.config([*WORDS, *LIGHT, "scenario.minutes=[200]"]), tmp_path)
+        run.deploy(main.config([*WORDS, *LIGHT, "scenario.minutes=[200]"]), tmp_path)
     found = rows(tmp_path)
     minute, mean = (np.array([float(row[key]) for row in found]) for key in ("elapsed_min", "light"))
     assert {row["light_setpoint"] for row in found} == {"1400.0"}
