@@ -1,6 +1,7 @@
 """The command `calibrate`: its files, its numbers, and its refusals."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from importlib import resources
@@ -373,24 +374,17 @@ def test_the_screen_and_the_file_say_of_each_number_what_it_is(fitted: Calibrati
     first = {"first": 0.019, "last": 0.022, "change_pct": 15.8, "significant": True, "segments": 4}
     assert content["drift"]["mu"] == {**first, "per_hour": {"value": 0.002, "ci95": [0.001, 0.003]}}
     assert (content["drift"]["tau"]["first"], content["drift"]["tau"]["segments"]) == (0.41, 3)
-    text = report(fitted, r, content)
-    for line in (
-        "  mu          0.02000 1/min   95 % 0.01800 to 0.02300   (doubling time 34.7 min)",
-        "  tau         0.4000          95 % 0.3500 to 0.4400   (dilution 0.0500 1/min at 0.02 mL/s)",
-        "  held out    PMSE 3.5 % over the window's last 30 % with the pair of the first 70 %, 0.75 % over its own",
-        "              PMSE 4.25 % on 17 readings outside the window, started afresh",
-        "  drift       mu 0.019 to 0.022 along the recording (+16 %)",
-        "  drift       tau 0.41 to 0.37 along the recording (-10 %)",
-        "  note        a note\n  against     it drifts\n  against     it is noisy",
-    ):
-        assert line in text
-    assert "  PMSE        1.25 %   (" in text
-    assert "as in the paper; 2.5 % with the returned pair)" in text
-    assert f"  window      rows 0:{content['rows_used'][1]}, {content['window']}" in text
+    lines = report(fitted, r, content).splitlines()
+    for key, *numbers in (
+        ("mu", "0.02000", "0.01800", "0.02300", "34.7"), ("tau", "0.4000", "0.3500", "0.4400", "0.0500"),
+        ("held out", "3.5 %", "30 %", "70 %", "0.75 %"), ("PMSE", "4.25 %", "17"), ("PMSE", "1.25 %", "2.5 %"),
+        ("drift", "mu 0.019 to 0.022", "+16 %"), ("drift", "tau 0.41 to 0.37", "-10 %"), ("note", "a note"),
+        ("against", "it drifts"), ("against", "it is noisy"), ("window", f"0:{content['rows_used'][1]}"),
+    ):  # fmt: skip
+        assert any(line.strip().startswith(key) and all(n in line for n in numbers) for line in lines), key
     head = environment_yaml(fitted, "mine.csv")
-    assert "# 95 % intervals: mu 0.018 to 0.023 1/min, tau 0.35 to 0.44.\n" in head
-    assert ", PMSE 1.25 %.\n" in head
-    assert "\n# Against it: it drifts.\n# Against it: it is noisy.\n" in head
+    for part in ("mu 0.018 to 0.023 1/min, tau 0.35 to 0.44", "1.25 %", "it drifts", "it is noisy"):
+        assert any(line.startswith("#") and part in line for line in head.splitlines())
     model = OmegaConf.create(head)
     assert (model.mu, model.tau, model.control_min) == (0.02, 0.4, 1.0)
 
@@ -402,11 +396,10 @@ def test_beside_the_pair_stands_that_of_the_other_method(method: str, fitted: Ca
     estimate = replace(fitted.estimate, mu=Parameter(0.031, 0.03, 0.032), tau=Parameter(0.33, 0.25, 0.37))
     found = replace(fitted, method=method, sound=True, free_run=free, estimate=estimate)
     (line,) = (line for line in report(found, shipped, {"doubling_min": 1.0}).splitlines() if "beside" in line)
-    assert line == (
-        "  beside      prediction_error: mu 0.03100 (0.03000 to 0.03200), tau 0.3300 (0.2500 to 0.3700)"
-        if method == "free_run"
-        else "  beside      free_run: mu 0.02100 (0.02000 to 0.02200), tau 0.3000 (0.2000 to 0.5000)"
-    )
+    other = ("prediction_error", "0.03100", "0.03000", "0.03200", "0.3300", "0.2500", "0.3700")
+    if method == "prediction_error":
+        other = ("free_run", "0.02100", "0.02000", "0.02200", "0.3000", "0.2000", "0.5000")
+    assert tuple(re.findall(r"0\.\d+|free_run|prediction_error", line)) == other
 
 
 @pytest.mark.parametrize("rest_min", [10.0, 0.0])
@@ -477,8 +470,8 @@ def test_files_have_the_name_that_was_given_and_curves_the_numbers_of_each_segme
             self.close = lambda: written.append(("closed",))
 
     for figure in ("fit_figure", "drift_figure", "twin_figure"):
-        monkeypatch.setattr(calibration_charts, figure, lambda *given, name=figure: (name, given[-1]))
-    monkeypatch.setattr(charts, "save", lambda figure, folder, key: (figure, folder, key))
+        monkeypatch.setattr(calibration_charts, figure, lambda *given, name=figure: name)
+    monkeypatch.setattr(charts, "save", lambda figure, folder, key: (figure, folder))
     monkeypatch.setattr(tensorboard, "Events", Curves)
     monkeypatch.setattr(command, "calibrate", lambda raw, config, doubts: found)
     monkeypatch.setattr(command, "twin", lambda raw, result, segment_min: segment_min)
@@ -492,19 +485,14 @@ def test_files_have_the_name_that_was_given_and_curves_the_numbers_of_each_segme
     assert (tmp_path / "twin.yaml").read_text() == "# open_loop.csv, 75\n"
     assert not (tmp_path / "calibrated.yaml").exists()
     out = capsys.readouterr().out
-    assert "reading the shipped recording\n" in out
-    assert f"  files       {tmp_path}/mine.yaml\n              {tmp_path}/twin.yaml\n" in out
+    assert all(f"{tmp_path}/{name}.yaml" in out for name in ("mine", "twin"))
     results = {"mu_per_min": 0.02, "tau": 0.4, "pmse_pct": 1.25}
-    assert written[:3] == [
+    assert written == [
         ({f"calibration/{key}": value for key, value in results.items()}, 0),
         ({"drift/mu_per_min": 0.03, "drift/tau": 0.3}, 0), ({"drift/mu_per_min": 0.05}, 1),
+        *((f"calibration/{key}", (f"{key}_figure", tmp_path / "figures"), 0) for key in ("fit", "drift", "twin")),
+        ("closed",),
     ]  # fmt: skip
-    said = {"fit": "measured and model", "drift": "segments of about 75 min, fitted alone", "twin": "its twin"}
-    assert written[3:-1] == [
-        (f"calibration/{key}", ((f"{key}_figure", f"open_loop.csv: {title}"), tmp_path / "figures", key), 0)
-        for key, title in said.items()
-    ]
-    assert written[-1] == ("closed",)
 
 
 def test_a_study_returns_the_worse_share_of_both_and_says_each(
@@ -526,13 +514,10 @@ def test_a_study_returns_the_worse_share_of_both_and_says_each(
     assert asked == [4]
     content = json.loads((tmp_path / "summary.json").read_text())
     assert content["coverage_pct"] == pytest.approx({"mu": 100.0 / 3, "tau": 200.0 / 3})
-    title = "4 simulated recordings of 5 h under pi, 2 % noise"
-    ((values, truth, figure_title),) = drawn
-    assert figure_title == f"{title} (seed 4)"
+    ((values, truth, _),) = drawn
     assert (values.tolist(), truth[0].tolist(), truth[1].tolist()) == ([0.02] * 3, [0.02, 0.0175, 0.024], [0.4] * 3)
-    out = capsys.readouterr().out
-    assert out.startswith(f"{title}\n")
+    lines = capsys.readouterr().out.splitlines()
     # half widths: 0.0025 of 0.02, and 0.045 of 0.4 twice beside 0.05 of 0.5; biases of mu 0, +14.3 and -16.7 %
-    assert "mu: 95 % intervals hold the truth in 33.3 %, median bias +0.00 %, half width 12.5 %\n" in out
-    assert "tau: 95 % intervals hold the truth in 66.7 %, median bias +0.00 %, half width 11.3 %\n" in out
-    assert "refused: 1 of 4; the first: flat\n" in out
+    for key, *numbers in (("mu", "33.3 %", "+0.00 %", "12.5 %"), ("tau", "66.7 %", "+0.00 %", "11.3 %"),
+                          ("refused", "1 of 4", "flat")):  # fmt: skip
+        assert any(line.startswith(key) and all(n in line for n in numbers) for line in lines), key

@@ -162,14 +162,12 @@ def test_a_cell_that_the_policy_loses_to_two_is_lost_once() -> None:
     out.section("")
     page._beside_paper(out, summary)
     (said,) = [content for _, blocks in out.sections for kind, content in blocks if kind == "verdict"]
-    assert said["claim"].startswith(
-        "Of 6 cells here, the learned policy (dqn) loses 3, 2 of them for certain (the 95 %"
-    )
+    assert [word for word in said["claim"].replace(",", "").split() if word.isdigit()][:3] == ["6", "3", "2"]
     assert len(said["items"]) == 4
-    assert said["items"][0].startswith("OD 0.8, ISE: dqn 0.05 loses to mpc 0.03; mpc minus dqn: -0.015, 95 % -0.02 to")
+    assert all(part in said["items"][0] for part in ("OD 0.8", "ISE", "dqn 0.05", "mpc 0.03"))
     each = [item.split(" minus dqn: ")[1].split(",")[0] for item in said["items"]]
     assert each == ["-0.015", "-0.015", "-0.012", "-0.018"]
-    assert [item.endswith("which holds 0.") for item in said["items"]] == [False, False, False, True]
+    assert ["holds 0" in item for item in said["items"]] == [False, False, False, True]
 
 
 def section() -> Page:

@@ -14,7 +14,6 @@ from tests.studies.second_vials import (
     Conditions,
     Program,
     Trace,
-    Turbidostat,
     Vials,
     coverage,
     draw,
@@ -231,13 +230,6 @@ def test_the_density_is_held(density: Any) -> None:
         assert 0.42 < np.quantile(late, 0.01) < 0.46
         assert 0.53 < np.quantile(late, 0.99) < 0.56
     assert trace.told_ml.max() <= 1.2
-
-
-def test_unknown_density_and_step_are_refused() -> None:
-    with pytest.raises(ValueError, match="dither or hold, not warm"):
-        Turbidostat(2, "warm")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="divide a minute"):
-        Vials(nominal(1), step_s=7)
 
 
 def test_finer_steps_change_nothing() -> None:
