@@ -78,6 +78,7 @@ def test_model_based_controllers_reach_the_oracle_where_their_model_is_true(cont
         assert bound * (1.0 - 5e-5) <= total(trial(controller, "nominal", scenario, 1), "ise") <= bound * 1.02
 
 
+@pytest.mark.slow
 def test_oracle_knows_each_vial_and_gains_by_it():
     """Noise-free ITAE on `bench`, where every vial is another; `adaptive_inverse` learns them and comes nearest."""
     best = total_clean("oracle")
@@ -106,6 +107,7 @@ def test_oracle_is_the_dynamic_programme_of_the_training_model():
     assert ise == pytest.approx(float(np.sum((t.od[0, 1:] - 0.5) ** 2)), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_no_feedback_loses_to_feedback():
     for metric in ("ise", "itae"):
         lost = total(trial("hold", "nominal_noise", "setpoint_steps", 4), metric)
@@ -114,6 +116,7 @@ def test_no_feedback_loses_to_feedback():
         )
 
 
+@pytest.mark.slow
 def test_threshold_loses_to_graded_feedback():
     """It pumps fully or not at all. On ITAE it may still beat the device's own PI, whose gain is too low by four."""
     lost = total(trial("threshold", "nominal_noise", "setpoint_steps", 4), "itae")
@@ -145,9 +148,9 @@ def test_every_controller_meets_the_same_vials_and_noise():
 
 
 def test_a_batch_is_its_replicates_and_seeds_decide():
-    many, few = (trial("mpc", "bench", "temperature_switch", n) for n in (6, 2))
+    many, few = (trial("adaptive_inverse", "bench", "temperature_switch", n) for n in (6, 2))
     np.testing.assert_allclose(many.od[:2], few.od, rtol=1e-12)
-    assert not np.allclose(few.od, trial("mpc", "bench", "temperature_switch", 2, seed=1).od)
+    assert not np.allclose(few.od, trial("adaptive_inverse", "bench", "temperature_switch", 2, seed=1).od)
 
 
 def test_samples_without_a_dose_are_counted_for_each_vial():

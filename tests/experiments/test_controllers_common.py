@@ -118,6 +118,21 @@ def test_readings_of_any_value_give_a_rate_in_range(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MAKERS)
+def test_a_reading_that_is_no_number_is_as_good_as_no_sample(name: str) -> None:
+    """In the third and the fourth minute, of one vial in two; what is decided from then on is the same."""
+    od = 0.5 + 0.03 * np.random.default_rng(5).standard_normal((12, N))
+    lost, yes = (np.arange(12) // 2 == 1)[:, None] & (np.arange(N) % 2 == 0), np.ones(N, dtype=bool)
+
+    def rates(readings: Array, rows: Array) -> Array:
+        law = MAKERS[name]()
+        given = zip(range(12), readings, rows, strict=True)
+        return np.array([law.act(x, np.full(N, 0.48), np.full(N, float(k)), fresh) for k, x, fresh in given])
+
+    found, expected = rates(np.where(lost, np.nan, od), lost | yes), rates(od, ~lost)
+    np.testing.assert_array_equal(found[4:], expected[4:])
+
+
+@pytest.mark.parametrize("name", MAKERS)
 def test_reset_forgets(name: str) -> None:
     od = 0.5 + 0.05 * np.random.default_rng(2).standard_normal((10, N))
     controller, yes = MAKERS[name](), np.ones(N, dtype=bool)

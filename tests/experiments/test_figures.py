@@ -49,6 +49,7 @@ from experiments.training.relative import Relative
 from hardware.storage.marks import Mark
 from tests.experiments import laws
 
+pytestmark = pytest.mark.xdist_group("figures")  # its tests share trained figures
 MINUTES = np.arange(0.0, 331.0, 30.0)  # twelve samples, 5.5 h
 HOURS = MINUTES / 60.0
 LATER = MINUTES + 5.0
@@ -484,6 +485,7 @@ def drawn_as(figure: Figure, panel: int) -> list[str]:
     return [line.get_drawstyle() for line in figure.axes[panel].lines if len(line.get_xdata()) > 1]
 
 
+@pytest.mark.slow
 def test_what_holds_until_the_next_row_is_drawn_over_the_time_after_its_own() -> None:
     """Pump rates and targets hold from their row on; an episode of a share has them at the end of their decision."""
     after = "steps-post"
@@ -593,6 +595,7 @@ def test_example_loops_in_relative_coordinates_follow_their_model() -> None:
     np.testing.assert_allclose(shown[:, inside], law, atol=1 / 32 + 1e-6)  # the nearest of 17 levels
 
 
+@pytest.mark.slow
 def test_example_episodes_of_a_share_are_as_long_as_they_say() -> None:
     """Twelve decisions of 10 min, each of one of 17 temperatures from 29 to 36 degC."""
     task, shipped = Coculture(CocultureConfig(episode_steps=12)), load(SHIPPED_COMPOSITION["dqn"])
