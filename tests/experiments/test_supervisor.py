@@ -1,6 +1,7 @@
 """The policy that ships under its supervisor: which law acts, what the journal and the console say of it."""
 
 import logging
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -297,10 +298,9 @@ def test_the_console_says_once_when_the_supervisor_begins_and_ends_and_the_journ
     rows = [row for row in read_journal(tmp_path / "journal.jsonl")[0] if row["kind"] == "decision"]
     acted = [r["row"]["time_min"] for r in rows if r["reactor"] == "M0" and r["why"]["supervised"] == 1.0]
     after = [r["row"]["time_min"] for r in rows if r["reactor"] == "M0" and r["row"]["time_min"] > acted[-1]]
-    assert said == [
-        f"M0: the supervisor's law acts, the estimate is in doubt, from minute {acted[0]:.0f}",
-        f"M0: the policy acts again from minute {after[0]:.0f}",
-    ]
+    assert [re.findall(r"M\d|law acts|policy acts|minute \d+", line) for line in said] == [
+        ["M0", "law acts", f"minute {acted[0]:.0f}"], ["M0", "policy acts", f"minute {after[0]:.0f}"],
+    ]  # fmt: skip
     assert 4 <= len(acted) <= 6
     assert not any(r["why"]["supervised"] for r in rows if r["reactor"] == "M1")
 
