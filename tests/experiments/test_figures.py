@@ -761,10 +761,13 @@ def test_every_law_keeps_its_mark_and_one_that_does_nothing_is_off_the_scale() -
     assert [name for name in marks if name != "sensor-noise floor"] == ["pi", "mpc"]
     assert dots(costs.axes[0]) == {(0.05, -0.18): marks["pi"], (0.2, 0.18): marks["mpc"]}
     assert dots(costs.axes[1]) == {(6.0, -0.18): marks["pi"], (9.0, 0.18): marks["mpc"]}
-    entries = [difference("ise", 30.0), {**difference("ise", -10.0), "controller": "mpc"}]
+    unsure = {"controller": "mpc", "verdict": "no difference shown"}
+    entries = [difference("ise", 30.0), difference("ise", -10.0) | unsure]
     entries.append({**difference("ise", 9000.0), "controller": "hold"})
     drawn = figures.differences(entries, "dqn_adaptive")
     assert dots(drawn.axes[0]) == {(30.0, -0.18): marks["pi"], (-10.0, 0.18): marks["mpc"]}
+    alone = (line for line in drawn.axes[0].lines if len(line.get_xdata()) == 1)
+    assert [line.get_xdata()[0] for line in alone if to_hex(line.get_markerfacecolor()) == "#ffffff"] == [-10.0]
     assert [label(ax, "x") for ax in drawn.axes] == [f"{m} minus that of dqn_adaptive, %" for m in ("ISE", "ITAE")]
     assert drawn.axes[0].get_xlim()[1] < 9000.0
     paper = figures.published_and_ours([row(0.05, 6.0), {**row(0.06, 7.0), "controller": "mpc", "window": "0.5"}])
