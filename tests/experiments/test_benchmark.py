@@ -139,7 +139,7 @@ def test_the_devices_pi_lands_where_the_published_one_does():
 def test_every_controller_meets_the_same_vials_and_noise():
     """Recovery is undiluted, so all start alike; afterwards the sensor's error differs only by what scales with OD."""
     first = trial("hold", "bench", "setpoint_steps", 6)
-    for controller in ("oracle", "mpc", "threshold"):
+    for controller in ("oracle", "pi_tuned", "threshold"):
         other = trial(controller, "bench", "setpoint_steps", 6)
         np.testing.assert_array_equal(first.od[:, 0], other.od[:, 0])
         errors = [(t.od - t.clean).ravel() for t in (first, other)]
