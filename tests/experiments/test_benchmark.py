@@ -136,6 +136,7 @@ def test_the_devices_pi_lands_where_the_published_one_does():
         assert 5.7 <= score.itae.mean() <= 9.8
 
 
+@pytest.mark.slow
 def test_every_controller_meets_the_same_vials_and_noise():
     """Recovery is undiluted, so all start alike; afterwards the sensor's error differs only by what scales with OD."""
     first = trial("hold", "bench", "setpoint_steps", 6)
