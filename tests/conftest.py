@@ -7,6 +7,8 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import settings
 
+from tests.programs import spent_s
+
 settings.register_profile("busy", deadline=None)  # a machine may be busy with other things; the mutants have their own
 settings.load_profile("busy")
 
@@ -26,9 +28,9 @@ _began = pytest.StashKey[float]()
 
 
 def _cpu_s() -> float:
-    """Return the processor time of this process and of those that it has waited for, s."""
+    """Return the processor time of this process, of those that it has waited for, and of forked programs, s."""
     times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    return times.user + times.system + times.children_user + times.children_system + spent_s()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -1,13 +1,12 @@
-"""`python -m experiments.calibrate` as a user runs it: its files, its numbers, and its refusals."""
+"""The command `calibrate`: its files, its numbers, and its refusals."""
 
 import json
-import os
-import subprocess
-import sys
+import re
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,37 +30,39 @@ from experiments.reporting import calibration_charts, charts, tensorboard
 from experiments.reporting.verdict import verdict
 from hardware.errors import RecordingError
 from hardware.storage.recording_reader import Recording, read_recording
-from tests.patience import PATIENCE_S
 from tests.real_recording import DITHER, needs_dither
 
 pytestmark = pytest.mark.numeric
 
-ROOT = Path(__file__).parents[2]
-Cli = Callable[..., subprocess.CompletedProcess[str]]
+SHIPPED = Path(str(resources.files("experiments") / "data" / "open_loop.csv"))
+Cli, Summary = Callable[..., str], Callable[[], dict[str, Any]]
 
 
 @pytest.fixture
-def cli(tmp_path: Path) -> Cli:
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [
-                sys.executable,
-                "-W",
-                "ignore",
-                "-m",
-                "experiments.calibrate",
-                *arguments,
-                f"hydra.run.dir={tmp_path}/run",
-            ],
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
-        )
+def cli(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
+    """The command with these words, in this process; what it printed. Raises: UserError where it ends with a line."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: str) -> str:
+        (tmp_path / "run").mkdir(exist_ok=True)
+        command.body(command.main.config(words), tmp_path / "run")
+        return capsys.readouterr().out
 
     return run
+
+
+@pytest.fixture
+def plain(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> Cli:
+    """The command without twin and figures, which take longer than the fit."""
+    monkeypatch.setattr(command, "twin", lambda *given: None)
+    monkeypatch.setattr(command, "twin_yaml", lambda *given: "")
+    monkeypatch.setattr(command, "_draw", lambda *given: None)
+    return cli
+
+
+@pytest.fixture
+def summary_of(tmp_path: Path) -> Summary:
+    return lambda: json.loads((tmp_path / "run" / "summary.json").read_text())  # type: ignore[no-any-return]
 
 
 def tidy(path: Path, od: np.ndarray, time: np.ndarray, pump_rate: np.ndarray) -> str:
@@ -78,7 +79,7 @@ def recording() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def shipped() -> Recording:
-    return read_recording(str(resources.files("experiments") / "data" / "open_loop.csv"))
+    return read_recording(str(SHIPPED))
 
 
 @pytest.fixture(scope="module")
@@ -86,19 +87,16 @@ def real(shipped: Recording) -> Calibration:
     return calibrate(Series(shipped.time_min, shipped.od, shipped.pump_rate, shipped.row))
 
 
-def test_shipped_recording_from_the_command_line(cli: Cli, tmp_path: Path) -> None:
-    done = cli()
-    assert done.returncode == 0, done.stderr
-    run = tmp_path / "run"
-    content = json.loads((run / "summary.json").read_text())
+@pytest.mark.slow
+def test_the_shipped_recording(cli: Cli, summary_of: Summary, tmp_path: Path) -> None:
+    cli()
+    run, content = tmp_path / "run", summary_of()
     assert content["mu"]["ci95"][0] <= 0.028 <= content["mu"]["ci95"][1]
     assert content["tau"]["ci95"][0] <= 0.31 <= content["tau"]["ci95"][1]
     assert content["rows_used"] == [0, 361]
     assert (content["n_used"], content["n_rejected"], content["warnings"]) == (361, 0, [])
     assert content["pmse_pct"] < 0.05
     assert content["verdict"]["word"] == "use"
-    for word in ("use: ", "mu ", "tau ", "PMSE", "window", "held out", "doubling", "calibrated.yaml"):
-        assert word in done.stdout
     for figure in ("figures/fit.png", "figures/drift.png", "figures/twin.png"):
         assert (run / figure).read_bytes().startswith(b"\x89PNG")
     assert list(run.glob("events.out.tfevents.*"))
@@ -114,21 +112,19 @@ def test_shipped_recording_from_the_command_line(cli: Cli, tmp_path: Path) -> No
     assert plant.sensor.outlier_rate == 0.0
 
 
-def test_shipped_recording_is_what_the_generator_makes(cli: Cli, tmp_path: Path) -> None:
-    assert cli("generate=true", "out=again.csv").returncode == 0
-    shipped = resources.files("experiments") / "data" / "open_loop.csv"
-    assert (tmp_path / "again.csv").read_text() == shipped.read_text()
-    again = cli("generate=true", "out=again.csv")
-    assert again.returncode == 1
-    assert again.stderr == "error: out=again.csv: exists; remove it or choose another file\n"
+def test_the_shipped_recording_is_what_the_generator_makes(cli: Cli, tmp_path: Path) -> None:
+    cli("generate=true", "out=again.csv")
+    assert (tmp_path / "again.csv").read_text() == SHIPPED.read_text()
+    with pytest.raises(frame.UserError, match=r"out=again\.csv"):
+        cli("generate=true", "out=again.csv")
 
 
 @needs_dither
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", ["0:700", None])
-def test_real_recording_from_the_command_line(cli: Cli, tmp_path: Path, rows: str | None) -> None:
-    done = cli(f"data={DITHER}", *([f"rows={rows}"] if rows else []))
-    assert done.returncode == 0, done.stderr
-    content = json.loads((tmp_path / "run" / "summary.json").read_text())
+def test_a_real_recording(cli: Cli, summary_of: Summary, tmp_path: Path, rows: str | None) -> None:
+    cli(f"data={DITHER}", *([f"rows={rows}"] if rows else []))
+    content = summary_of()
     assert 0.0098 <= content["mu"]["value"] <= 0.0108
     assert 0.28 <= content["tau"]["value"] <= 0.33
     assert content["pmse_pct"] <= 0.6
@@ -141,9 +137,8 @@ def test_real_recording_from_the_command_line(cli: Cli, tmp_path: Path, rows: st
             r["first"] == 1157 and r["last"] == 1208 and "sensor broken" in r["reason"] for r in content["rejected"]
         )
         assert content["n_rejected"] >= 52
-        assert any("tau drifts" in w for w in content["warnings"])
-        assert any("mu drifts" in w for w in content["warnings"])
-        assert "sensor broken" in done.stdout
+        assert content["drift"]["mu"]["significant"]
+        assert content["drift"]["tau"]["significant"]
         plant = read_plant_file(str(tmp_path / "run" / "twin.yaml"))
         mu, tau = np.array(plant.growth.knots_mu), 1.0 / (3.0 * np.array(plant.pump.knots_ml_s))
         assert plant.growth.knots_min[-1] == pytest.approx(1157, abs=2)
@@ -157,185 +152,140 @@ def test_real_recording_from_the_command_line(cli: Cli, tmp_path: Path, rows: st
         assert [np.hypot(floor, od * share) for od in (0.4, 0.1)] == pytest.approx([0.0127, 0.0057], rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [
-        ("empty", "is empty"),
-        ("binary", "not a text file"),
-        ("counts", "raw detector counts"),
-        ("backward", "time does not advance"),
-        ("negative", "more negative than noise"),
-        ("never runs", "the pump never runs"),
-        ("never stops", "the pump never stops"),
-        ("absent", "No such file"),
-    ],
-)
-def test_refusals_are_one_line(
-    cli: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray], kind: str, message: str
+def test_a_recording_that_cannot_be_used_is_one_line_with_its_name(
+    plain: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> None:
+    """One that is not there, one that the reader refuses, one that the fit refuses."""
     time, od, pump_rate = recording
-    path = tmp_path / "bad.csv"
-    growing = 0.1 * np.exp(0.005 * time) * (od / od)
-    if kind == "empty":
-        path.write_bytes(b"")
-    elif kind == "binary":
-        path.write_bytes(np.random.default_rng(1).bytes(5000))
-    elif kind != "absent":
-        tidy(
-            path,
-            od={"counts": 13000 * 10**-od, "negative": -od}.get(kind, growing if "never" in kind else od),
-            time=time[::-1] if kind == "backward" else time,
-            pump_rate={"never runs": 0 * time, "never stops": 0 * time + 0.01}.get(kind, pump_rate),
-        )
-    done = cli(f"data={path}")
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: ")
-    assert done.stderr.count("\n") == 1
-    assert message in done.stderr
-    assert str(path) in done.stderr
+    tidy(tmp_path / "counts.csv", 13000 * 10**-od, time, pump_rate)
+    tidy(tmp_path / "always.csv", 0.1 * np.exp(0.005 * time), time, 0 * time + 0.01)
+    for name in ("absent.csv", "counts.csv", "always.csv"):
+        with pytest.raises(frame.UserError, match=name.removesuffix(".csv")) as caught:
+            plain(f"data={tmp_path / name}")
+        assert str(tmp_path / name) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def of_two_pumps(path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray], first: float) -> str:
+    """A file in which pump 1 gave this share of the medium, and pump 3 the rest."""
+    rows = "".join(
+        f"{60 * t},{y},{first * u},{(1.0 - first) * u}\n"
+        for t, y, u in zip(*map(np.ndarray.tolist, recording), strict=True)
+    )
+    path.write_text("exp_time,od_measured,pump_1_rate,pump_3_rate\n" + rows)
+    return f"data={path}"
 
 
 def test_a_refusal_of_the_fit_carries_what_the_reader_noted(
-    cli: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
+    plain: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> None:
-    path = tmp_path / "third.csv"
-    rows = "".join(f"{60 * t},{y},0,{u}\n" for t, y, u in zip(*map(np.ndarray.tolist, recording), strict=True))
-    path.write_text("exp_time,od_measured,pump_1_rate,pump_3_rate\n" + rows)
-    done = cli(f"data={path}")
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
-    for part in ("the pump never runs", "pump 3 ran and is not counted", "say pumps=[3]"):
-        assert part in done.stderr
-    assert cli(f"data={path}", "pumps=[3]", "pump_ml_s=1").returncode == 0
+    data = of_two_pumps(tmp_path / "third.csv", recording, 0.0)
+    with pytest.raises(frame.UserError, match=r"pump 3 .*pumps=\[3\]") as caught:
+        plain(data)
+    assert "\n" not in str(caught.value)
+    plain(data, "pumps=[3]", "pump_ml_s=1")
 
 
 def test_a_second_feed_is_told_in_the_first_line_and_on_the_page(
-    cli: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
+    plain: Cli, summary_of: Summary, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> None:
     """Pumps 1 and 3 share the feed, 7 to 3: with one of them alone tau is wrong by 30 %."""
-    path, columns = tmp_path / "shared.csv", zip(*map(np.ndarray.tolist, recording), strict=True)
-    rows = "".join(f"{60 * t},{y},{0.7 * u},{0.3 * u}\n" for t, y, u in columns)
-    path.write_text("exp_time,od_measured,pump_1_rate,pump_3_rate\n" + rows)
-    done = cli(f"data={path}")
-    assert done.returncode == 0, done.stderr
-    first = next(line for line in done.stdout.splitlines() if line.startswith("use"))
-    assert first.startswith("use with care: ")
-    assert first.endswith("; pump 3 ran and is not counted; say pumps=[1,3]")
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert next(iter(summary)) == "verdict"
-    assert summary["verdict"]["word"] == "use with care"
-    assert summary["tau"]["value"] == pytest.approx(0.7 * 0.31, rel=0.05)
-    said = verdict(summary, {"data": str(path)})
+    data = of_two_pumps(tmp_path / "shared.csv", recording, 0.7)
+    first = next(line for line in plain(data).splitlines() if line.startswith("use"))
+    content = summary_of()
+    assert next(iter(content)) == "verdict"
+    assert content["verdict"]["word"] == "use with care"
+    assert "pumps=[1,3]" in first
+    assert content["tau"]["value"] == pytest.approx(0.7 * 0.31, rel=0.05)
+    said = verdict(content, {"data": data.removeprefix("data=")})
     assert said is not None
-    assert said.claim.startswith("Calibration of shared.csv: use with care: ")
-    assert cli(f"data={path}", "pumps=[1,3]").returncode == 0
-    again = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert "shared.csv" in said.claim
+    assert "use with care" in said.claim
+    plain(data, "pumps=[1,3]")
+    again = summary_of()
     assert again["verdict"]["word"] == "use"
     assert again["tau"]["value"] == pytest.approx(0.31, rel=0.05)
 
 
-def test_a_recording_without_tau_leaves_mu_and_what_to_do(cli: Cli, tmp_path: Path) -> None:
+def test_a_recording_without_tau_leaves_mu_and_what_to_do(plain: Cli, summary_of: Summary, tmp_path: Path) -> None:
     time = np.arange(0.0, 240.0)
     od = 0.1 * np.exp(0.009 * time) * (1.0 + 0.01 * np.random.default_rng(3).standard_normal(240))
-    done = cli(tidy(tmp_path / "batch.csv", od, time, 0.0 * time))
-    assert done.returncode == 1
-    assert "batch.csv: record again: rows 0-239: the pump never runs" in done.stderr
-    assert "record with a pump that runs and rests; mu alone is 0.00" in done.stderr
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary["verdict"]["word"] == "record again"
-    assert summary["verdict"]["then"] == "record with a pump that runs and rests"
-    assert (summary["mu"], summary["tau"]) == (None, None)
-    assert summary["mu_alone"]["ci95"][0] <= 0.009 <= summary["mu_alone"]["ci95"][1]
-    assert summary["mu_alone"]["rows"] == [0, 240]
-    said = verdict(summary, {"data": "batch.csv"})
-    assert said is not None
-    assert "record again: rows 0-239: the pump never runs" in said.claim
-    assert said.items[0].startswith("mu alone 0.00")
-    assert said.items[0].endswith(", rows 0 to 239")
+    with pytest.raises(frame.UserError) as caught:
+        plain(tidy(tmp_path / "batch.csv", od, time, 0.0 * time))
+    content = summary_of()
+    for part in ("word", "why", "then"):
+        assert content["verdict"][part] in str(caught.value)
+    assert "mu alone is 0.00" in str(caught.value)
+    assert content["verdict"]["word"] == "record again"
+    assert (content["mu"], content["tau"]) == (None, None)
+    assert content["mu_alone"]["ci95"][0] <= 0.009 <= content["mu_alone"]["ci95"][1]
+    assert content["mu_alone"]["rows"] == [0, 240]
 
 
-def test_merged_rows_are_told_beside_what_the_reader_noted(cli: Cli, tmp_path: Path) -> None:
-    """Sixty hours of rows of 20 s, one of them without a reading."""
-    time, od, rate = open_loop(OpenLoop(hours=60.0), np.random.default_rng(3))
-    fine = np.arange(0.0, 3600.0, 1.0 / 3.0)
-    held = rate[0][np.floor(fine).astype(int)]
+def test_merged_rows_are_told_beside_what_the_reader_noted(plain: Cli, summary_of: Summary, tmp_path: Path) -> None:
+    """Six hours of rows of 2 s, one of them without a reading."""
+    time, od, rate = open_loop(OpenLoop(hours=6.0), np.random.default_rng(3))
+    fine = np.arange(0.0, 360.0, 1.0 / 30.0)
     smooth = np.exp(np.interp(fine, time, np.log(od[0])))
     smooth[500] = np.nan
-    done = cli(tidy(tmp_path / "fine.csv", smooth, fine, held))
-    assert done.returncode == 0, done.stderr
-    content = json.loads((tmp_path / "run" / "summary.json").read_text())
+    plain(tidy(tmp_path / "fine.csv", smooth, fine, rate[0][np.floor(fine).astype(int)]))
+    content = summary_of()
     assert [n.split(":")[0] for n in content["notes"][:1]] == ["row 500"]
-    assert content["notes"][-1] == "10800 rows merged into 3600 of a minute or more"
+    assert content["notes"][-1].startswith("10800 rows merged into 360 ")
     assert content["tau"]["value"] == pytest.approx(0.31, rel=0.05)
 
 
-def test_rows_too_far_apart_for_the_segments_are_told_as_that(cli: Cli, tmp_path: Path) -> None:
+def test_rows_too_far_apart_for_the_segments_are_told_as_that(plain: Cli, summary_of: Summary, tmp_path: Path) -> None:
     time = 15.0 * np.arange(60)
     pump_rate = np.where(time % 120 < 60, 0.018, 0.0)
     volume = np.concatenate([[0.0], np.cumsum(15.0 * pump_rate[:-1])])
     noise = np.random.default_rng(2).normal(0.0, 0.005, len(time))
     data = tidy(tmp_path / "slow.csv", 0.3 * np.exp(0.028 * time - volume / 0.31 + noise), time, pump_rate)
-    done = cli(data)
-    assert done.returncode == 1
-    told = "rows are 15 min apart, and a segment of 120 min holds 8; allowed at least 10; check the unit of time, or"
-    assert f"slow.csv: record again: {told} say identify.segment_min=300; " in done.stderr
-    assert done.stderr.count("\n") == 1
-    done = cli(data, "identify.segment_min=300")
-    assert done.returncode == 0, done.stderr
-    assert "use with care" in done.stdout
-    assert "rows are 15 min apart; record every minute, or every change of the pump's rate" in done.stdout
-    assert json.loads((tmp_path / "run" / "summary.json").read_text())["tau"]["value"] == pytest.approx(0.31, rel=0.05)
+    with pytest.raises(frame.UserError, match=r"slow\.csv: .*15 min.*120 min.*identify\.segment_min=300") as caught:
+        plain(data)
+    assert "\n" not in str(caught.value)
+    plain(data, "identify.segment_min=300")
+    content = summary_of()
+    assert content["verdict"]["word"] == "use with care"
+    assert "15 min" in content["verdict"]["why"]
+    assert content["tau"]["value"] == pytest.approx(0.31, rel=0.05)
 
 
 def test_flaws_are_excluded_and_reported(
-    cli: Cli, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
+    plain: Cli, summary_of: Summary, tmp_path: Path, recording: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> None:
     time, od, pump_rate = (a.copy() for a in recording)
     od[[30, 31]], od[60], od[90] = np.nan, -0.5, 3.0 * od[90]
     time[120], time[150] = time[119], time[140] + 0.5
-    done = cli(tidy(tmp_path / "flawed.csv", od, time, pump_rate))
-    assert done.returncode == 0, done.stderr
-    content = json.loads((tmp_path / "run" / "summary.json").read_text())
+    out, content = plain(tidy(tmp_path / "flawed.csv", od, time, pump_rate)), summary_of()
     assert content["n_rejected"] == 4
     assert [(r["rows"], r["n"]) for r in content["rejected"]] == [("90", 1)]
-    notes = " | ".join(content["notes"])
-    for part in ("30-31: OD is not a finite", "row 60: OD below", "120, 150: time does not advance"):
-        assert part in notes
-        assert part in done.stdout
+    for rows in ("30-31", "60", "120, 150"):
+        assert any(rows in note and note in out for note in content["notes"])
     assert content["tau"]["value"] == pytest.approx(0.31, rel=0.02)
 
 
-def test_coverage_study_writes_its_figure(cli: Cli, tmp_path: Path) -> None:
-    done = cli("coverage=40")
-    assert done.returncode == 0, done.stderr
-    content = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert content["recordings"] == 40
-    assert all(80 <= share <= 100 for share in content["coverage_pct"].values())
+def test_a_study_of_intervals_counts_its_recordings_and_draws_them(
+    cli: Cli, summary_of: Summary, tmp_path: Path
+) -> None:
+    cli("coverage=3", "protocol.hours=2.5")
+    content = summary_of()
+    assert (content["recordings"], content["refused"]) == (3, 0)
+    assert 0.0 < content["relative_half_width_pct"]["mu"] < content["relative_half_width_pct"]["tau"] < 10.0
     assert (tmp_path / "run" / "figures" / "coverage.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_help_documents_the_generator(cli: Cli) -> None:
-    done = cli("--help=all")
-    assert done.returncode == 0
-    for word in ("generate=true", "protocol.noise", "coverage=200", "rows=0:700", "pmse_limit"):
-        assert word in done.stdout
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
         ("rows=abc", "rows = abc: allowed FIRST:END"),
-        ("coverage=-1", "coverage = -1: allowed"),
         ("name=../x", "name = ../x: allowed"),
-        ("pump_ml_s=0", "pump_ml_s = 0.0 mL/s: allowed"),
         ("identify.window=big", "identify.window = big: allowed auto, all"),
-        ("protocol.tau=3", "protocol.tau = 3.0: allowed"),
-        ("+identify.windows=all", "identify.windows: no such key"),
     ],
 )
-def test_wrong_values_name_key_value_and_range(override: str, message: str) -> None:
-    with pytest.raises(frame.UserError, match=message.replace("+", r"\+").replace(".", r"\.")):
-        frame.load(frame.compose("calibrate", [override]), CalibrateConfig())
+def test_wrong_words_are_told_with_key_value_and_what_is_allowed(override: str, message: str) -> None:
+    with pytest.raises(frame.UserError, match=message.replace(".", r"\.")):
+        command.main.config([override])
 
 
 def test_yaml_and_dataclass_hold_the_same_defaults() -> None:
@@ -350,7 +300,7 @@ def test_environment_file_tells_its_origin(real: Calibration) -> None:
 
 def test_rows_are_those_of_the_file_also_where_its_beginning_is_left_out() -> None:
     """From minute 40 of a recording by the minute, with two rows rejected among them."""
-    r = read_recording(str(resources.files("experiments") / "data" / "open_loop.csv"))
+    r = read_recording(str(SHIPPED))
     od = r.od.copy()
     od[[90, 200]] *= 4.0
     raw = Series(r.time_min[40:], od[40:], r.pump_rate[40:], r.row[40:])
@@ -426,24 +376,17 @@ def test_the_screen_and_the_file_say_of_each_number_what_it_is(fitted: Calibrati
     first = {"first": 0.019, "last": 0.022, "change_pct": 15.8, "significant": True, "segments": 4}
     assert content["drift"]["mu"] == {**first, "per_hour": {"value": 0.002, "ci95": [0.001, 0.003]}}
     assert (content["drift"]["tau"]["first"], content["drift"]["tau"]["segments"]) == (0.41, 3)
-    text = report(fitted, r, content)
-    for line in (
-        "  mu          0.02000 1/min   95 % 0.01800 to 0.02300   (doubling time 34.7 min)",
-        "  tau         0.4000          95 % 0.3500 to 0.4400   (dilution 0.0500 1/min at 0.02 mL/s)",
-        "  held out    PMSE 3.5 % over the window's last 30 % with the pair of the first 70 %, 0.75 % over its own",
-        "              PMSE 4.25 % on 17 readings outside the window, started afresh",
-        "  drift       mu 0.019 to 0.022 along the recording (+16 %)",
-        "  drift       tau 0.41 to 0.37 along the recording (-10 %)",
-        "  note        a note\n  against     it drifts\n  against     it is noisy",
-    ):
-        assert line in text
-    assert "  PMSE        1.25 %   (" in text
-    assert "as in the paper; 2.5 % with the returned pair)" in text
-    assert f"  window      rows 0:{content['rows_used'][1]}, {content['window']}" in text
+    lines = report(fitted, r, content).splitlines()
+    for key, *numbers in (
+        ("mu", "0.02000", "0.01800", "0.02300", "34.7"), ("tau", "0.4000", "0.3500", "0.4400", "0.0500"),
+        ("held out", "3.5 %", "30 %", "70 %", "0.75 %"), ("PMSE", "4.25 %", "17"), ("PMSE", "1.25 %", "2.5 %"),
+        ("drift", "mu 0.019 to 0.022", "+16 %"), ("drift", "tau 0.41 to 0.37", "-10 %"), ("note", "a note"),
+        ("against", "it drifts"), ("against", "it is noisy"), ("window", f"0:{content['rows_used'][1]}"),
+    ):  # fmt: skip
+        assert any(line.strip().startswith(key) and all(n in line for n in numbers) for line in lines), key
     head = environment_yaml(fitted, "mine.csv")
-    assert "# 95 % intervals: mu 0.018 to 0.023 1/min, tau 0.35 to 0.44.\n" in head
-    assert ", PMSE 1.25 %.\n" in head
-    assert "\n# Against it: it drifts.\n# Against it: it is noisy.\n" in head
+    for part in ("mu 0.018 to 0.023 1/min, tau 0.35 to 0.44", "1.25 %", "it drifts", "it is noisy"):
+        assert any(line.startswith("#") and part in line for line in head.splitlines())
     model = OmegaConf.create(head)
     assert (model.mu, model.tau, model.control_min) == (0.02, 0.4, 1.0)
 
@@ -455,11 +398,10 @@ def test_beside_the_pair_stands_that_of_the_other_method(method: str, fitted: Ca
     estimate = replace(fitted.estimate, mu=Parameter(0.031, 0.03, 0.032), tau=Parameter(0.33, 0.25, 0.37))
     found = replace(fitted, method=method, sound=True, free_run=free, estimate=estimate)
     (line,) = (line for line in report(found, shipped, {"doubling_min": 1.0}).splitlines() if "beside" in line)
-    assert line == (
-        "  beside      prediction_error: mu 0.03100 (0.03000 to 0.03200), tau 0.3300 (0.2500 to 0.3700)"
-        if method == "free_run"
-        else "  beside      free_run: mu 0.02100 (0.02000 to 0.02200), tau 0.3000 (0.2000 to 0.5000)"
-    )
+    other = ("prediction_error", "0.03100", "0.03000", "0.03200", "0.3300", "0.2500", "0.3700")
+    if method == "prediction_error":
+        other = ("free_run", "0.02100", "0.02000", "0.02200", "0.3000", "0.2000", "0.5000")
+    assert tuple(re.findall(r"0\.\d+|free_run|prediction_error", line)) == other
 
 
 @pytest.mark.parametrize("rest_min", [10.0, 0.0])
@@ -530,8 +472,8 @@ def test_files_have_the_name_that_was_given_and_curves_the_numbers_of_each_segme
             self.close = lambda: written.append(("closed",))
 
     for figure in ("fit_figure", "drift_figure", "twin_figure"):
-        monkeypatch.setattr(calibration_charts, figure, lambda *given, name=figure: (name, given[-1]))
-    monkeypatch.setattr(charts, "save", lambda figure, folder, key: (figure, folder, key))
+        monkeypatch.setattr(calibration_charts, figure, lambda *given, name=figure: name)
+    monkeypatch.setattr(charts, "save", lambda figure, folder, key: (figure, folder))
     monkeypatch.setattr(tensorboard, "Events", Curves)
     monkeypatch.setattr(command, "calibrate", lambda raw, config, doubts: found)
     monkeypatch.setattr(command, "twin", lambda raw, result, segment_min: segment_min)
@@ -545,19 +487,14 @@ def test_files_have_the_name_that_was_given_and_curves_the_numbers_of_each_segme
     assert (tmp_path / "twin.yaml").read_text() == "# open_loop.csv, 75\n"
     assert not (tmp_path / "calibrated.yaml").exists()
     out = capsys.readouterr().out
-    assert "reading the shipped recording\n" in out
-    assert f"  files       {tmp_path}/mine.yaml\n              {tmp_path}/twin.yaml\n" in out
+    assert all(f"{tmp_path}/{name}.yaml" in out for name in ("mine", "twin"))
     results = {"mu_per_min": 0.02, "tau": 0.4, "pmse_pct": 1.25}
-    assert written[:3] == [
+    assert written == [
         ({f"calibration/{key}": value for key, value in results.items()}, 0),
         ({"drift/mu_per_min": 0.03, "drift/tau": 0.3}, 0), ({"drift/mu_per_min": 0.05}, 1),
+        *((f"calibration/{key}", (f"{key}_figure", tmp_path / "figures"), 0) for key in ("fit", "drift", "twin")),
+        ("closed",),
     ]  # fmt: skip
-    said = {"fit": "measured and model", "drift": "segments of about 75 min, fitted alone", "twin": "its twin"}
-    assert written[3:-1] == [
-        (f"calibration/{key}", ((f"{key}_figure", f"open_loop.csv: {title}"), tmp_path / "figures", key), 0)
-        for key, title in said.items()
-    ]
-    assert written[-1] == ("closed",)
 
 
 def test_a_study_returns_the_worse_share_of_both_and_says_each(
@@ -579,13 +516,10 @@ def test_a_study_returns_the_worse_share_of_both_and_says_each(
     assert asked == [4]
     content = json.loads((tmp_path / "summary.json").read_text())
     assert content["coverage_pct"] == pytest.approx({"mu": 100.0 / 3, "tau": 200.0 / 3})
-    title = "4 simulated recordings of 5 h under pi, 2 % noise"
-    ((values, truth, figure_title),) = drawn
-    assert figure_title == f"{title} (seed 4)"
+    ((values, truth, _),) = drawn
     assert (values.tolist(), truth[0].tolist(), truth[1].tolist()) == ([0.02] * 3, [0.02, 0.0175, 0.024], [0.4] * 3)
-    out = capsys.readouterr().out
-    assert out.startswith(f"{title}\n")
+    lines = capsys.readouterr().out.splitlines()
     # half widths: 0.0025 of 0.02, and 0.045 of 0.4 twice beside 0.05 of 0.5; biases of mu 0, +14.3 and -16.7 %
-    assert "mu: 95 % intervals hold the truth in 33.3 %, median bias +0.00 %, half width 12.5 %\n" in out
-    assert "tau: 95 % intervals hold the truth in 66.7 %, median bias +0.00 %, half width 11.3 %\n" in out
-    assert "refused: 1 of 4; the first: flat\n" in out
+    for key, *numbers in (("mu", "33.3 %", "+0.00 %", "12.5 %"), ("tau", "66.7 %", "+0.00 %", "11.3 %"),
+                          ("refused", "1 of 4", "flat")):  # fmt: skip
+        assert any(line.startswith(key) and all(n in line for n in numbers) for line in lines), key

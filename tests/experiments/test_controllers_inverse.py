@@ -144,8 +144,3 @@ def test_with_levels_it_gives_the_nearest_of_them_from_none_to_all(levels: int, 
     exact = np.clip((0.03 + np.log(od / 0.5)) / 3.0, 0.0, 0.02)
     np.testing.assert_allclose(given, np.asarray(rates)[np.abs(exact[:, None] - rates).argmin(axis=1)], atol=1e-9)
     np.testing.assert_allclose(np.unique(given.round(9)), rates)
-
-
-def test_ranges() -> None:
-    with pytest.raises(ValueError, match=r"controller.estimator.noise_floor = 0.0 OD: allowed 0.0001 to 0.1"):
-        EstimatorConfig(noise_floor=0.0)

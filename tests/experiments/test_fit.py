@@ -34,14 +34,7 @@ pytestmark = pytest.mark.numeric
 
 CALM = Scenario((0.5, 0.6), (10.0, 10.0), (37.0, 37.0))
 WARMER = replace(CALM, temperatures=(30.0, 37.0))
-
-
-def refused(tmp_path: Path, words: str, **values: Any) -> None:
-    config = DeployConfig(**{"backend": PioreactorConfig(), "scenario": CALM, "force_policy": True, **values})
-    with pytest.raises(frame.UserError, match=words) as told:
-        assemble.unpack(config, tmp_path)
-    assert "\n" not in str(told.value)
-    assert not list(tmp_path.iterdir())
+OF_TWO = Scenario((0.5,), (60.0,), (33.0,), ratios=(0.5,))
 
 
 def test_what_fits_is_taken(tmp_path: Path) -> None:
@@ -49,36 +42,24 @@ def test_what_fits_is_taken(tmp_path: Path) -> None:
         assemble.unpack(DeployConfig(backend=backend, scenario=scenario, force_policy=True), tmp_path)
 
 
-def test_a_share_needs_fluorescence(tmp_path: Path) -> None:
-    shares = Scenario((0.5,), (60.0,), (33.0,), ratios=(0.5,))
-    refused(tmp_path, "scenario.ratios: backend=pioreactor measures no fluorescence", scenario=shares)
-    refused(tmp_path, "backend=pioreactor_rig measures", scenario=shares, backend=RigBackendConfig())
-
-
-def test_a_spare_pump_needs_pumps(tmp_path: Path) -> None:
-    supplied = replace(CALM, outputs=("pump3 2 mL/h", None))
-    refused(tmp_path, "scenario.outputs: backend=pioreactor has no spare pumps; drop them", scenario=supplied)
-
-
-def test_temperatures_need_a_thermostat(tmp_path: Path) -> None:
-    off = PioreactorConfig(thermostat=False)
-    refused(tmp_path, "30 to 37 degC: .* backend.thermostat=true", scenario=WARMER, backend=off)
-
-
-def test_a_controller_that_knows_the_plant_needs_a_simulated_one(tmp_path: Path) -> None:
-    refused(tmp_path, "oracle: .* not backend=pioreactor$", controller=registry.config("oracle"))
-
-
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"max_dose_ml": 0.9}, "interlock allows 1.2 mL in a period of 60 s; give bench.max_rate=0.015 or a larger"),
+        ({"scenario": OF_TWO}, "scenario.ratios: backend=pioreactor "),
+        ({"scenario": OF_TWO, "backend": RigBackendConfig()}, "backend=pioreactor_rig "),
+        ({"scenario": replace(CALM, outputs=("pump3 2 mL/h", None))}, "scenario.outputs: backend=pioreactor "),
+        ({"scenario": WARMER, "backend": PioreactorConfig(thermostat=False)}, "30 to 37 degC: .* backend.thermostat"),
+        ({"controller": registry.config("oracle")}, "oracle: .* not backend=pioreactor$"),
+        ({"backend": PioreactorConfig(max_dose_ml=0.9)}, "1.2 mL in a period of 60 s; give bench.max_rate=0.015 "),
     ],
 )
-def test_the_interlock_counts_with_the_units_own_period_volume_and_dose(
-    tmp_path: Path, values: dict[str, float], words: str
-) -> None:
-    refused(tmp_path, words, backend=PioreactorConfig(**values))
+def test_what_a_backend_cannot_do_is_one_line(tmp_path: Path, values: dict[str, Any], words: str) -> None:
+    """Light, spare pumps, temperatures, a plant that is known, and doses of the bench's own period and volume."""
+    config = DeployConfig(**{"backend": PioreactorConfig(), "scenario": CALM, "force_policy": True, **values})
+    with pytest.raises(frame.UserError, match=words) as told:
+        assemble.unpack(config, tmp_path)
+    assert "\n" not in str(told.value)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("key", ["safety.volume_ml", "backend.volume_ml", "controller.volume_ml", "backend.period_s"])

@@ -56,11 +56,11 @@ def test_missing_samples_are_bridged():
 
 def test_a_batch_is_its_single_rows_and_empty_rows_are_nan():
     rng = np.random.default_rng(0)
-    t = np.tile(np.arange(0.0, 91.0), (64, 1))
+    t = np.tile(np.arange(0.0, 91.0), (8, 1))
     od = rng.uniform(0.3, 0.9, t.shape)
     od[5] = np.nan
     batch = window_metrics(t, od, 0.65, 30.0, 60.0)
-    for i in range(64):
+    for i in range(8):
         one = window_metrics(t[i : i + 1], od[i : i + 1], 0.65, 30.0, 60.0)
         for key in ("ise", "itae", "ise_mean", "itae_mean", "settling_min", "steady_abs_error"):
             np.testing.assert_array_equal(getattr(one, key)[0], getattr(batch, key)[i])

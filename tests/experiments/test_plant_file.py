@@ -95,15 +95,18 @@ def test_a_bad_file_is_one_line_with_the_remedy(tmp_path: Path, text: str | None
 def test_no_vial_of_a_benchmark_begins_beyond_the_recording_s_end(tmp_path: Path) -> None:
     """The last knot is that of the pump here, at minute 660; the twin itself begins at 150, or after them all."""
     words = ["+experiment=comparison", "studies.comparison.plants=[twin]", f"plant_file={tmp_path / 'later.yaml'}"]
+    (tmp_path / "later.yaml").touch()
+    config = benchmark.main.config(words)
     for start, spread in ((150.0, 510.0), (700.0, 0.0)):
         later = TWIN.replace("pulse_cv: 0.2", "pulse_cv: 0.2, knots_min: [0.0, 660.0], knots_ml_s: [1.0, 0.9]")
         (tmp_path / "later.yaml").write_text(f"{later}start_min: {start}\n")
-        twin = with_twin(benchmark.main.config(words)).plants["twin"]
+        twin = with_twin(config).plants["twin"]
         assert (twin.start_min, twin.start_spread_min) == (start, spread)
         ages = Plant(twin, 200, np.random.default_rng(0)).age_min
         assert start <= ages.min() <= ages.max() <= max(start, 660.0)
 
 
+@pytest.mark.slow
 def test_a_benchmark_meets_all_hours_of_the_twin(file: str, tmp_path: Path) -> None:
     overrides = ["+experiment=comparison", "studies.comparison.plants=[nominal_noise,twin]", "replicates=40",
                  "studies.comparison.controllers=[pi]", f"plant_file={file}", "workers=1"]  # fmt: skip

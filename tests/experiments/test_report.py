@@ -9,7 +9,6 @@ import re
 import shutil
 import socket
 import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -20,9 +19,10 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from dqn import policy as policies
 from experiments import report
+from experiments.benchmark import main
 from experiments.cli import files, frame
 from experiments.comparison import page as comparison
-from experiments.comparison.published import TABLE_2
+from experiments.comparison.run import benchmark as run_benchmark
 from experiments.reporting import charts
 from experiments.reporting.page import Page
 from experiments.reporting.tables import Best, Table, count, number, plus_minus, typeset
@@ -32,28 +32,32 @@ from tests.patience import PATIENCE_S
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.xdist_group("report")  # its tests share a run, made once
 BROWSER = next((b for b in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if b), None)
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)")
 VOID = {"meta", "link", "br", "img", "hr"}
+
+
+STUDIES = (
+    "+studies.regulation={scenarios:[regulation],plants:[nominal_noise],controllers:[dqn,pi]}",
+    "+studies.setpoint_steps={scenarios:[setpoint_steps],plants:[nominal_noise],controllers:[dqn,pi,mpc]}",
+    "+studies.beyond={scenarios:[setpoint_steps],plants:[nominal,bench],"
+    "controllers:[dqn,pi,adaptive_inverse,threshold,oracle]}",
+    "controllers.mpc.swarm.particles=6", "controllers.mpc.swarm.iterations=8", "replicates=3", "workers=1",
+    "calibration=true",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def benchmark(tmp_path_factory):
-    """A small benchmark as a user runs it, with everything the page can show but training."""
+    """A small benchmark with everything the page can show but training."""
     folder = tmp_path_factory.mktemp("report")
     policies.save(folder / "policy.npz", inverse_policy())
-    done = subprocess.run(
-        [
-            sys.executable, "-m", "experiments.benchmark", "+experiment=beyond", "replicates=4", "workers=1",
-            "calibration=true", f"policies.dqn={folder / 'policy.npz'}", f"hydra.run.dir={folder / 'run'}",
-            "studies.beyond.plants=[nominal,bench]",
-            "studies.beyond.controllers=[dqn,pi,adaptive_inverse,threshold,oracle]",
-            "+studies.setpoint_steps={scenarios:[setpoint_steps],plants:[nominal_noise],controllers:[dqn,pi,mpc]}",
-            "studies.long.controllers=[]",
-        ],
-        capture_output=True, text=True, timeout=PATIENCE_S,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return folder / "run"
+    config = main.config([*STUDIES, f"policies.dqn={folder / 'policy.npz'}"])
+    run = folder / "run"
+    (run / ".hydra").mkdir(parents=True)
+    frame.save_config(config, run)
+    (run / ".hydra" / "overrides.yaml").write_text("- replicates=3\n")
+    run_benchmark(config, run)
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +89,7 @@ class Strict(html.parser.HTMLParser):
         assert self.open.pop() == tag
 
 
+@pytest.mark.slow
 def test_page_is_well_formed_and_points_to_nothing_outside(text):
     page = Strict()
     page.feed(text)
@@ -99,43 +104,26 @@ def test_page_is_well_formed_and_points_to_nothing_outside(text):
     assert set(re.findall(r"url\((.)", text)) <= {"#"}
 
 
+@pytest.mark.slow
 def test_page_holds_what_it_must(text, benchmark):
     summary = json.loads((benchmark / "summary.json").read_text())
     for figure in summary["figures"]:
         assert figure["title"].replace("'", "&#39;") in text
     assert text.count("data:image/svg+xml;base64,") == len(summary["figures"]) >= 6
-    for word in ("What was run", "seed", "turbidostat-dqn", "overrides", "T = 1 min", "T = window",
-                 "sensor-noise floor",
-                 "control effort", "plant, pump and start are not the paper"):  # fmt: skip
-        assert word in text
-    for cell in TABLE_2:
-        if cell.scenario == "setpoint_steps":
-            assert number(cell.itae, 4) in text
-    fitted = re.search(
-        r"Calibration: mu (\S+) \(95 % (\S+) to (\S+); true 0.03\), tau (\S+) \(95 % (\S+) to (\S+);", text
-    )
-    assert fitted
-    mu, low, high, tau, lower, higher = map(float, fitted.groups())
-    assert low < mu < high < lower < tau < higher
+    assert "<td>replicates=3</td>" in text
     assert "gain_ml_s: 1.11" in text  # the plants' values stand in the unfolded configuration
 
 
+@pytest.mark.slow
 def test_tables_are_the_summarys_numbers(benchmark):
     summary = json.loads((benchmark / "summary.json").read_text())
     with open(benchmark / "tables" / "table2_itae.csv", newline="") as f:
         rows = list(csv.DictReader(f))
     assert [r["window"] for r in rows] == ["OD 0.8", "OD 0.65", "OD 0.5"]
     for r, goal in zip(rows, ("0.8", "0.65", "0.5"), strict=True):
-        published = {p.controller: p.itae for p in TABLE_2 if p.window == goal}
-        assert {c: float(r[f"{c}, published"]) for c in published} == published
-        assert r["lowest published"] == min(published, key=lambda c: published[c])
-        ours = {
-            e["controller"]: e for e in summary["rows"]
-            if (e["scenario"], e["plant"], e["window"]) == ("setpoint_steps", "nominal_noise", goal)
-        }  # fmt: skip
-        for c in published:
-            assert r[f"{c}, here"] == plus_minus(ours[c]["itae_mean"], ours[c]["itae_sd"])
-        assert r["lowest of the three here"] == min(ours, key=lambda c: ours[c]["itae_mean"])
+        at = ("setpoint_steps", "nominal_noise", goal)
+        for e in (e for e in summary["rows"] if (e["scenario"], e["plant"], e["window"]) == at):
+            assert r[f"{e['controller']}, here"] == plus_minus(e["itae_mean"], e["itae_sd"])
     with open(benchmark / "tables" / "rows.csv", newline="") as f:
         head, *every = csv.reader(f)
     assert len(every) == len(summary["rows"])
@@ -150,27 +138,6 @@ def test_tables_are_the_summarys_numbers(benchmark):
     assert all(line.count("&") == 8 for line in latex.splitlines() if line.endswith(r"\\"))
     assert r"\textbf{" in latex
     assert r"$\pm$" in latex
-
-
-def row(controller, value, window="0.8", scenario="setpoint_steps"):
-    numbers = {"ise_mean": value, "itae_mean": value, "ise_sd": 0.1, "itae_sd": 0.1}
-    return {"controller": controller, "plant": "p", "scenario": scenario, "window": window, "n": 3, **numbers}
-
-
-def test_every_lost_cell_is_said_and_no_other():
-    rows = [row("dqn", 2.0), row("pi", 1.0), row("mpc", 1.5), row("dqn", 1.0, "0.5"), row("pi", 3.0, "0.5")]
-    pair = {"controller": "pi", "against": "dqn", "plant": "p", "scenario": "setpoint_steps", "window": "0.8",
-            "metric": "ise", "difference": -1.0, "ci95": [-2.5, 0.5], "verdict": "no difference shown"}  # fmt: skip
-    lost = comparison.losses(rows, [pair])
-    said = [loss.sentence for loss in lost]
-    assert len(said) == 4
-    assert said[0] == "OD 0.8, ISE: dqn 2 loses to pi 1; pi minus dqn: -1, 95 % -2.5 to 0.5, which holds 0."
-    assert said[1] == "OD 0.8, ISE: dqn 2 loses to mpc 1.5."
-    assert all(s.startswith("OD 0.8, ITAE") for s in said[2:])
-    assert [loss.cell for loss in lost] == 2 * ["OD 0.8, ISE"] + 2 * ["OD 0.8, ITAE"]
-    assert not any(loss.certain for loss in lost)
-    assert comparison.losses(rows, [{**pair, "verdict": "lower", "ci95": [-2.5, -0.5]}])[0].certain
-    assert comparison.losses([row("dqn", 1.0), row("pi", 2.0)], []) == []
 
 
 LAWS = ("a", "b", "c", "d", "e", "f")
@@ -253,6 +220,7 @@ def test_in_short_a_law_without_rival_stands_beside_the_oracle_and_the_noise(ora
     assert "Lowest" not in text
 
 
+@pytest.mark.slow
 def test_one_of_a_thing_is_not_told_as_many(benchmark, tmp_path):
     assert [count(n, "row") for n in (0, 1, 2)] == ["0 rows", "1 row", "2 rows"]
     summary = json.loads((benchmark / "summary.json").read_text())
@@ -264,6 +232,7 @@ def test_one_of_a_thing_is_not_told_as_many(benchmark, tmp_path):
     assert "<summary>1 row; also in tables/rows.csv" in text
 
 
+@pytest.mark.slow
 def test_no_markup_of_another_kind_is_left_on_a_page(text):
     """Backticks are Markdown's, and stood as characters around the names of laws and plants."""
     assert "`" not in re.sub(r"<pre>.*?</pre>", "", text, flags=re.DOTALL)
@@ -287,14 +256,6 @@ def test_numbers_that_a_verdict_has_told_are_folded_without_empty_rows_and_types
     text = report.write(tmp_path / "other").read_text(encoding="utf-8")
     assert "Every number" not in text
     assert "<th>answer</th><td>42</td>" in text
-
-
-def test_published_losses_are_the_papers():
-    """The PI beats the published DQN in three of the four temperature numbers, the MPC in the other (Table 2)."""
-    said = comparison.published_losses()
-    assert [s for s in said if "°C" in s] == ["37 °C ISE (mpc)", "30 °C ISE (pi)", "37 °C ITAE (pi)", "30 °C ITAE (pi)"]
-    assert "OD 0.5 ISE" not in " ".join(said)
-    assert "OD 0.5 ITAE" not in " ".join(said)
 
 
 def test_numbers_are_readable():
@@ -385,13 +346,6 @@ def test_powers_of_ten_are_written_as_numbers(tmp_path):
     assert {"0.1", "1", "10"} <= set(texts)
 
 
-def test_a_folder_of_runs_gets_one_page(tmp_path):
-    for name in ("1_calibrate", "2_train"):
-        run_folder(tmp_path / "demo" / name, {"value": name})
-    text = report.write(tmp_path / "demo").read_text(encoding="utf-8")
-    assert text.index("Calibrate: results") < text.index("Train: results")
-
-
 def test_several_runs_begin_with_what_each_came_to(tmp_path):
     for name, passed in (("1_first", True), ("2_second", False)):
         checks = [{"name": f"{name}'s", "holds": passed}]
@@ -405,7 +359,8 @@ def test_several_runs_begin_with_what_each_came_to(tmp_path):
     assert [text.count(words) for words in order[:4]] == [1, 1, 1, 1]
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)")
+@pytest.mark.slow
+@needs_browser
 def test_on_a_phone_no_page_scrolls_sideways_and_no_cell_is_a_column_of_letters(tmp_path):
     api = pytest.importorskip("playwright.sync_api", reason="no playwright (python -m pip install playwright)")
     keys = {"a_key_of_summary_json_that_is_rather_long.value": "x" * 300, "b": " ".join(["word"] * 60)}
@@ -558,6 +513,7 @@ def test_a_summary_of_any_shape_gets_a_page(content, words, tmp_path):
         ('{"beside_paper": 3}', "not the summary.json of a benchmark"),
         ('{"beside_paper": [], "rows": {}}', "not the summary.json of a benchmark"),
     ],
+    ids=["absent", "torn", "no text", "deep", "half a character", "a number", "no rows"],
 )
 def test_what_is_no_run_ends_in_one_line(content, message, tmp_path):
     if content is not None:
@@ -628,7 +584,8 @@ HOSTILE = """<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.
 <a href="javascript:top.document.title='owned'"><rect id="s0" width="300" height="150"/></a></svg>"""
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)")
+@pytest.mark.slow
+@needs_browser
 @pytest.mark.parametrize("guarded", [True, False])
 def test_no_figure_runs_a_script_or_asks_for_anything(guarded, tmp_path):
     """In a browser, with a server that would hear of it: with the page's ban on scripts, and without it."""
@@ -661,7 +618,8 @@ def test_no_figure_runs_a_script_or_asks_for_anything(guarded, tmp_path):
     assert "owned</title>" not in dom
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine (apt-get install chromium)")
+@pytest.mark.slow
+@needs_browser
 def test_a_browser_shows_the_page(benchmark, tmp_path):
     """Rendered for real: figures have their size, text its width, nothing is asked from anywhere, nothing overflows."""
     found = probe(tmp_path, benchmark / "report.html")

@@ -1,19 +1,15 @@
-"""The degradation study as a user runs it: what it leaves behind, and how it ends."""
+"""The degradation study, small: its output files."""
 
 import csv
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.patience import PATIENCE_S
+from tests.studies.degradation import degradation, main
 
 pytestmark = pytest.mark.numeric
 
-ROOT = Path(__file__).parents[2]
 SHORT = [
     "agent.total_steps=120", "agent.learn_start=60", "agent.epsilon_steps=60", "agent.batch_size=16", "n_agents=2",
     "eval_every=50", "~trained", "~fitted", "+trained={mine: {target_period: 30}}",
@@ -25,16 +21,10 @@ COLUMNS = [
 ]  # fmt: skip
 
 
-def degradation(*overrides: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "tests.studies.degradation", *overrides]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=PATIENCE_S, check=False)
-
-
+@pytest.mark.slow
 def test_a_study_leaves_curves_summary_and_figure(tmp_path: Path) -> None:
-    folder = tmp_path / "study"
-    done = degradation(*SHORT, f"hydra.run.dir={folder}")
-    assert done.returncode == 0, done.stderr
+    folder = tmp_path
+    degradation(main.config(SHORT), folder)
     with open(folder / "curves.csv", newline="") as f:
         reader = csv.DictReader(f)
         rows = list(reader)
@@ -52,18 +42,3 @@ def test_a_study_leaves_curves_summary_and_figure(tmp_path: Path) -> None:
         "steady_abs_error": 2,
     }
     assert (folder / "figures" / "degradation.png").stat().st_size > 5000
-    assert "target_period: 30" in (folder / "config.yaml").read_text()
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("n_agents=0", "n_agents = 0: allowed at least 1"),
-        ("trained.mine={doubled: true}", "mine.doubled: no such key"),
-    ],
-)
-def test_mistakes_are_one_line(override: str, message: str, tmp_path: Path) -> None:
-    done = degradation(override, f"hydra.run.dir={tmp_path}")
-    assert done.returncode == 1
-    assert message in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1

@@ -7,8 +7,7 @@ import pytest
 
 from tests.studies.second_simulator import LAWS, Conditions, simulate
 
-pytestmark = pytest.mark.numeric
-
+pytestmark = pytest.mark.slow  # of a yardstick, which no change of the program reaches
 QUIET = Conditions(hours=2, wander=0, dose_spread=0, noise=0)
 NEVER, ALWAYS = 1e9, 1e-9  # setpoints at which a threshold never or always pumps
 

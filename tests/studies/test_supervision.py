@@ -10,6 +10,7 @@ from tests.studies.supervision import SupervisionConfig, supervision
 pytestmark = pytest.mark.numeric
 
 
+@pytest.mark.slow
 def test_a_blinded_filter_rests_elsewhere_unless_it_is_watched(tmp_path: Path) -> None:
     supervision(SupervisionConfig(vials=4, hours=1.5, plants=("nominal_noise",)), tmp_path)
     found = json.loads((tmp_path / "summary.json").read_text())

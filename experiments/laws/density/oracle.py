@@ -29,10 +29,12 @@ class OracleConfig(ControllerConfig):
 
 
 @cache
-def _value(mu: float, tau: float, control_min: float, max_rate: float, levels: int, gamma: float) -> OptimalPolicy:
+def _value(
+    mu: float, tau: float, control_min: float, max_rate: float, levels: int, gamma: float, grid: int
+) -> OptimalPolicy:
     """The optimum of setpoint 1 for one vial; the model is linear in x, so V_s(x) = s^2 V_1(x/s) for any setpoint s."""
     model = EnvConfig(mu, tau, control_min=control_min, n_actions=levels, max_pump_rate=max_rate, start_od=SPAN)
-    return solve(model, gamma, np.array([1.0]), GRID)
+    return solve(model, gamma, np.array([1.0]), grid)
 
 
 class Oracle:
@@ -55,7 +57,7 @@ class Oracle:
         self._on_s = (self.rates * SECONDS * model.control_min / flow_ml_s)[:, None]
         mu, volume, gain = (plant.draws[key] for key in DRAWN)
         tau = volume / (SECONDS * gain)
-        fixed = (model.control_min, model.max_pump_rate, config.levels, config.gamma)
+        fixed = (model.control_min, model.max_pump_rate, config.levels, config.gamma, GRID)
         solved = [_value(float(m), float(t), *fixed) for m, t in zip(mu, tau, strict=True)]
         self._log_ratio = solved[0].log_od
         self._values = np.stack([s.value[0] for s in solved])
