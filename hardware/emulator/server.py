@@ -267,8 +267,8 @@ def _numbers(what: str, given: str) -> float | list[float]:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-def build(arguments: argparse.Namespace, clock: Clock) -> ChiBioDevice:
-    """Build the device that the arguments describe, on this clock. Raises: ValueError."""
+def build(arguments: argparse.Namespace, clock: Clock | None = None) -> ChiBioDevice:
+    """Build the device that the arguments describe; it runs on `clock`, else in scaled real time. Raises: ValueError."""
     ods, volumes_ml = _numbers("od", arguments.od), _numbers("volume", arguments.volume)
     low, high = arguments.pump_start
     vial = VialConfig(
@@ -279,7 +279,7 @@ def build(arguments: argparse.Namespace, clock: Clock) -> ChiBioDevice:
     plant = replace(plant, pump=replace(plant.pump, overflow_ml_s=arguments.overflow_flow))
     return ChiBioDevice(
         tuple(arguments.reactors.split(",")),
-        clock,
+        clock or DeviceClock(arguments.speed),
         np.random.default_rng(arguments.seed),
         DeviceOptions(unit=arguments.unit, vial=vial, plant=plant),
         od=ods,
@@ -299,7 +299,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for key, port in (("port", arguments.port), ("control-port", control)):
             if not 0 <= port <= 65535:
                 raise ValueError(f"{key} = {port}: allowed 0 to 65535; choose another")
-        server = EmulatorServer(build(arguments, DeviceClock(arguments.speed)), arguments.host, arguments.port, control)
+        server = EmulatorServer(build(arguments), arguments.host, arguments.port, control)
     except OSError as problem:
         where = f"{arguments.host}:{arguments.port}"
         print(f"emulator: {where}: {problem.strerror or problem}; choose another or end what uses it")
