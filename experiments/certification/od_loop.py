@@ -80,6 +80,11 @@ class OdLoop:
         """Largest |x - r| of a band in d, OD, (S,)."""
         return self.high * np.maximum(np.expm1(high), -np.expm1(low))
 
+    def within(self, half_width: Array) -> tuple[Array, Array]:
+        """Return the lowest and the highest d of |x - r| <= half_width (S,), at every setpoint of each strip."""
+        ratio = half_width / self.high
+        return _log(1.0 - ratio), np.log1p(ratio)
+
     def key(self, case: OdCase) -> object:
         """Every case is a loop of its own."""
         return case
