@@ -54,10 +54,16 @@ class Limits:
     reached: float = setting(0.95, "least share of a band that the attack reaches, errors", within=(0, 1))
     reached_nominal: float = setting(0.9, "the same, exact estimates", within=(0, 1))
     safe_excess: float = setting(
-        0.02, "limit of safety: half-width over that of the law, no noise and the nominal model", "OD", within=(0, 1)
+        0.05, "limit of safety: half-width over that of the law, no noise and the nominal model", "OD", within=(0, 1)
+    )
+    safe_excess_median: float = setting(
+        0.01,
+        "limit of safety: its median over the setpoints; more is found where the pump is another",
+        "OD",
+        within=(0, 1),
     )
     safe_excess_uncertain: float = setting(
-        0.15, "limit of safety: the same under noise and uncertainty", "OD", within=(0, 1)
+        0.2, "limit of safety: the same under noise and uncertainty", "OD", within=(0, 1)
     )
     safe_excess_share: float = setting(
         0.025,
@@ -66,7 +72,7 @@ class Limits:
         within=(0, 10),
     )
     safe_low_dose: float = setting(
-        3.0,
+        4.0,
         "limit of safety: how far below the setpoint half of the largest dose may still be given",
         "periods of growth",
         within=(0, 100),

@@ -47,7 +47,8 @@ class Check:
         return self.name.split(": ", 1)[-1]
 
     def __str__(self) -> str:
-        return f"{self.name}: {self.value:.4g}, allowed {self.limit:g}" + (f" ({self.where})" if self.where else "")
+        value = f"{self.value:.4g}" if np.isfinite(self.value) else "no finite value"
+        return f"{self.name}: {value}, allowed {self.limit:g}" + (f" ({self.where})" if self.where else "")
 
 
 def worst(checks: Iterable[Check]) -> list[Check]:
@@ -186,12 +187,16 @@ def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Lim
     """
     every = np.ones(dose.size, dtype=bool)
     yield _count("nominal: strips that the pump cannot hold", asked, ~proofs[0].holdable)
+    if asked.median is not None:
+        middle = float(np.median(np.nan_to_num(proofs[0].excess, nan=np.inf)))
+        title = f"nominal: median half-width over that of the law, safety, {asked.unit}"
+        yield Check(title, middle, asked.median, f"all {asked.what}s")
     for proof in proofs:
         name, held = proof.case.name, proof.holdable
         if not held.any():
             continue
         yield _count(f"{name}: strips without a band", asked, held & ~proof.band.invariant)
-        yield _count(f"{name}: strips whose band is not entered", asked, held & ~np.isfinite(proof.band.periods))
+        yield _count(f"{name}: strips whose band is not entered", asked, held & ~proof.band.entered)
         yield _count(f"{name}: strips in which a low culture may be washed out", asked, held & ~proof.grows)
         if name in asked.late:
             title, value, limit = "entry after the law's, periods", proof.later, asked.late[name]
@@ -240,7 +245,7 @@ def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -
         met = {c.name: points_in_strips(wider, *asked.loop.seen(c)) for c in asked.cases}
         points, action = met["nominal"], wider.action
     else:
-        asked = replace(asked, loop=asked.loop.at(np.asarray(setpoints, dtype=np.float64)))
+        asked = replace(asked, loop=asked.loop.at(np.asarray(setpoints, dtype=np.float64)), median=None)
         points, action = on_lines(network, asked.box[0], asked.loop.low)
         met = dict.fromkeys((case.name for case in asked.cases), points)
     proofs = [prove(asked.loop, met[c.name], action, c, asked.margins[c.name]) for c in asked.cases]

@@ -38,6 +38,7 @@ class Question:
     judged, for a policy of the OD may rest at several places of a strip, and the hull of them is its band.
     unit: of half-widths. what: a strip is one of. setpoints: lowest and highest, OD.
     drawn: cases that a figure shows. bounds: of an estimator, where the policy needs one.
+    median: limit of safety of the median excess over all strips of the nominal case; None: not judged.
     """
 
     loop: Any
@@ -52,6 +53,7 @@ class Question:
     setpoints: tuple[float, float]
     drawn: tuple[str, ...]
     bounds: EstimateBounds | None = None
+    median: float | None = None
 
 
 def actions(policy: Policy) -> Array:
@@ -115,12 +117,14 @@ def _of_od(policy: Policy, config: CertifyConfig) -> Question:
         OdCase("uncertain", config.uncertainty, 0.0),
         OdCase("noise and uncertain", config.uncertainty, config.noise),
     )
-    exact, off = limits.excess, limits.excess_uncertain
-    margins = {case.name: margin for case, margin in zip(cases, (exact, exact, off, off), strict=True)}
+    margins = {case.name: limits.excess_uncertain for case in cases} | {"nominal": limits.excess}
     judged = {"nominal": limits.safe_excess, "noise and uncertain": limits.safe_excess_uncertain}
     highest = config.start_od[1] * float((strips[1] / strips[0]).max())  # of any setpoint that starts at a strip's d
     box = ((-config.noise - BEYOND, highest + config.noise + BEYOND), (low, high))
-    return Question(loop, cases, margins, judged, {}, box, None, "OD", "setpoint", (low, high), tuple(margins))
+    return Question(
+        loop, cases, margins, judged, {}, box, None, "OD", "setpoint", (low, high), tuple(margins),
+        median=limits.safe_excess_median,
+    )  # fmt: skip
 
 
 def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None) -> Question:

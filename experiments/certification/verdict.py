@@ -96,7 +96,7 @@ def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 
     own = np.take_along_axis(shift[..., 0], pieces.action, axis=1)
     below = pieces.low <= start[:, :1]
     law_half_width = loop.half_width(law.low, law.high)
-    allowed = np.stack(loop.within(law_half_width + margin), axis=1)
+    allowed = np.stack(loop.within(np.nan_to_num(law_half_width) + margin), axis=1)  # without a band: the margin alone
     return Proof(
         case,
         (shift[:, 0, 0] > STILL) & (shift[:, -1, 1] < -STILL),

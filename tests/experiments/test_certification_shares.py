@@ -282,7 +282,8 @@ def test_what_is_asked_of_a_policy_of_error_and_growth_share() -> None:
     watched = ["watched errors at setpoint 0.6"]
     asked = question(laws.share_law(), FAST)
     assert [case.name for case in asked.cases] == own + gains + watched
-    limits = {case.name: (asked.judged[case.name], asked.late[case.name]) for case in asked.cases}
+    assert asked.judged == {case.name: 0.025 for case in asked.cases}
+    limits = {case.name: (asked.margins[case.name], asked.late[case.name]) for case in asked.cases}
     assert limits.pop("nominal") == (0.005, 1)
     assert limits == {name: (1 / 64, 4 if name.startswith("slow") else 1) for name in [*own[1:], *gains, *watched]}
     other = question(laws.share_law(), replace(FAST, bench=Bench(volume_ml=12.0)))
