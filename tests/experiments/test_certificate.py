@@ -144,7 +144,7 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(
 ) -> None:
     """In 12 mL a culture at rest needs mu tau / u_max = 0.3 of the pump; this policy gives 0.5 at the setpoint.
 
-    In 28 mL and growing by 0.045 1/min it needs more than the pump has.
+    In 28 mL and growing by 0.0432 1/min it needs more than the pump has.
     """
     source = written(tmp_path / "policy.npz", laws.law())
     wanted = Wanted(str(source), Bench(), EnvConfig(), {}, SCENARIO.setpoints, 10.0, at_stake=True, forced=False)
@@ -162,7 +162,7 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(
     check = policy_check(replace(wanted, bench=bench))
     assert check.ok
     assert all(str(one) in check.detail for one in worst(found))
-    weak, grown = Bench(volume_ml=28.0), replace(ASKED, env=EnvConfig(mu=0.045))
+    weak, grown = Bench(volume_ml=28.0), replace(ASKED, env=EnvConfig(mu=0.0432))
     written(source, laws.law(), config=grown)
     said = refused(source, tmp_path / "run", bench=weak)
     assert "proven anew" in said
