@@ -12,7 +12,7 @@ import numpy as np
 from dqn import policy as policies
 from experiments.certification import certificate
 from experiments.certification.config import CertifyConfig
-from experiments.certification.judge import Certificate, certify
+from experiments.certification.judge import KINDS, SAFETY, Certificate, certify, worst
 from experiments.certification.question import CertificationError, model_of
 from experiments.certification.verdict import Proof
 from experiments.cli import files, frame
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 def body(config: CertifyConfig, folder: Path) -> None:
-    """Certify one policy. Raises: frame.UserError where it cannot be read or asked, or where it fails."""
+    """Certify one policy. Raises: frame.UserError where it cannot be read or asked, or where it is not safe."""
     source = find_policy(config.policy)
     if config.env_file is not None:
         config = replace(config, env=read_env_file(config.env_file), env_file=None)
@@ -47,10 +47,17 @@ def body(config: CertifyConfig, folder: Path) -> None:
     for line in found.cannot_hold():
         log.info("said, not judged: %s", line)
     unwritten = _write(folder, source, certificate.content(policy, beside, config, found), to, found)
-    if failed := [check for check in found.checks if not check.holds]:
-        of = f"{len(failed)} of {len(found.checks)} requirements fail"
+    unsafe, short = (found.failed(kind) for kind in KINDS)
+    if unsafe or short:
         log.info("what helps: %s", REMEDY)
-        raise frame.UserError(f"policy {source}: not certified, {of}, the first: {failed[0]}")
+    if unsafe:
+        of = f"{len(unsafe)} of {sum(check.kind == SAFETY for check in found.checks)} requirements of safety fail"
+        raise frame.UserError(f"policy {source}: not safe, {of}, the first: {unsafe[0]}")
+    if short:
+        told = "; ".join(map(str, worst(short)))
+        log.warning("policy %s: safe, a device runs it; its performance falls short: %s", source, told)
+    else:
+        log.info("policy %s: safe, and every requirement of performance is met", source)
     if unwritten and config.to:  # it was asked for there
         raise frame.UserError(unwritten)
 
@@ -97,7 +104,7 @@ def _place(config: CertifyConfig, source: Path) -> Path | None:
 
 def _summary(source: Path, content: dict[str, Any], found: Certificate) -> dict[str, Any]:
     """What a page shows: the verdict, every requirement, and a row per case."""
-    kept = ("passed", "of", "observation", "setpoints", "bounds", "checks", "cannot_hold")
+    kept = ("safe", "passed", "of", "observation", "setpoints", "bounds", "checks", "cannot_hold")
     cases = [_row(found.question.loop, proof) for proof in found.proofs if proof.holdable.any()]
     heads = (*content["observation"][:2], "from action", "to action")
     drops = [dict(zip(heads, drop.values(), strict=True)) for drop in content["not_monotone"]]

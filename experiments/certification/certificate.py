@@ -1,8 +1,8 @@
-"""The file of a certificate: what it holds, where it lies, and whether it is that of a policy at hand."""
+"""The file of a certificate: what it holds, where it lies, and what a device concludes from it."""
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,19 @@ from envs.bench import Bench
 from envs.task import EnvConfig
 from experiments.certification.bounds import EstimateBounds
 from experiments.certification.config import CertifyConfig
-from experiments.certification.judge import Certificate, recheck
+from experiments.certification.judge import KINDS, PERFORMANCE, SAFETY, Certificate, Check, recheck, worst
 from experiments.certification.network import Array
 from experiments.certification.question import CertificationError, full_pump, model_of
 from experiments.certification.verdict import Proof
 
-__all__ = ["FORMAT", "Stored", "beside", "bounds", "content", "doubts", "load"]
+__all__ = ["FORMAT", "FormatError", "Opinion", "Stored", "beside", "bounds", "content", "judged", "load"]
 
-FORMAT = 2
+FORMAT = 3
+BETTER = "train with another seed or n_agents=8, or use policy=shipped"
+
+
+class FormatError(ValueError):
+    """A certificate of another version of this program."""
 
 
 def beside(policy: Path) -> Path:
@@ -34,12 +39,14 @@ class Stored:
     """A certificate as it was read: what it is of, what was asked, and what failed.
 
     of: what decides, by name: fingerprints of the parts of a policy, and the settings that act beside it.
+    safe: every requirement of safety is met. passed: every requirement is met. failed: the requirements that are not.
     setpoints: lowest and highest that it speaks of, OD. bounds: of an estimator's errors, and its growth shares.
     """
 
     of: Mapping[str, Any]
+    safe: bool
     passed: bool
-    failed: tuple[str, ...]
+    failed: tuple[Check, ...]
     config: CertifyConfig
     setpoints: tuple[float, float]
     bounds: EstimateBounds | None
@@ -84,6 +91,7 @@ def content(policy: Policy, settings: Mapping[str, Any], config: CertifyConfig, 
     asked = found.question
     return {
         "format": FORMAT,
+        "safe": found.safe,
         "passed": found.passed,
         "of": {**fingerprints(policy), **settings},
         "observation": list(policy.observation),
@@ -100,16 +108,18 @@ def content(policy: Policy, settings: Mapping[str, Any], config: CertifyConfig, 
 
 
 def load(path: Path) -> Stored:
-    """Read a certificate. Raises: OSError; ValueError for a damaged one."""
+    """Read a certificate. Raises: OSError; FormatError for one of another version; ValueError for a damaged one."""
     try:
         given = json.loads(path.read_text(encoding="utf-8"))
         if given["format"] != FORMAT:
-            raise ValueError(f"of format {given['format']}, this version reads {FORMAT}")
+            raise FormatError(f"has format {given['format']}, this version reads format {FORMAT}")
         low, high = given["setpoints"]
+        failed = tuple(_check(check) for check in given["checks"] if check["holds"] is not True)
         return Stored(
             dict(given["of"]),
-            given["passed"] is True and all(check["holds"] is True for check in given["checks"]),
-            tuple(str(check["name"]) for check in given["checks"] if not check["holds"]),
+            given["safe"] is True and not any(check.kind == SAFETY for check in failed),
+            given["passed"] is True and given["safe"] is True and not failed,
+            failed,
             build(CertifyConfig(), given["config"]),
             (float(low), float(high)),
             EstimateBounds.of(given["bounds"]) if given["bounds"] else None,
@@ -118,8 +128,16 @@ def load(path: Path) -> Stored:
         raise ValueError(f"{type(error).__name__}: {error}") from None
 
 
+def _check(given: Mapping[str, Any]) -> Check:
+    """Read a requirement, whose value is null where it was no finite number. Raises: ValueError, KeyError."""
+    name, where, kind = (str(given[key]) for key in ("name", "where", "kind"))
+    if kind not in KINDS:
+        raise ValueError(f"kind {kind} of a requirement: allowed {', '.join(KINDS)}")
+    return Check(name, np.nan if given["value"] is None else float(given["value"]), float(given["limit"]), where, kind)
+
+
 def bounds(policy: Policy, settings: Mapping[str, Any], file: Path, model: EnvConfig) -> EstimateBounds | None:
-    """Within which errors of its estimator a policy may act; None without a certificate that is of these.
+    """Within which errors of its estimator a policy may act; None without a certificate of it that says it is safe.
 
     Args: settings: that decide beside the policy. file: of the policy, beside which its certificate lies. model: tau,
     control period and largest pump rate of the run.
@@ -128,12 +146,24 @@ def bounds(policy: Policy, settings: Mapping[str, Any], file: Path, model: EnvCo
         stored = load(beside(file))
     except (OSError, ValueError):
         return None
-    if stored.bounds is None or not stored.passed or stored.config.quick or stored.differs(policy, settings):
+    if stored.bounds is None or not stored.safe or stored.config.quick or stored.differs(policy, settings):
         return None
     return replace(stored.bounds, full_pump=full_pump(model))
 
 
-def doubts(
+@dataclass(frozen=True)
+class Opinion:
+    """What a device concludes from a certificate.
+
+    refused: reasons not to let the policy pump, each with its remedy. short: performance that falls short, each with
+    number, limit and remedy; no reason to refuse.
+    """
+
+    refused: list[str] = field(default_factory=list)
+    short: list[str] = field(default_factory=list)
+
+
+def judged(
     policy: Policy,
     settings: Mapping[str, Any],
     file: Path,
@@ -141,8 +171,8 @@ def doubts(
     bench: Bench,
     model: EnvConfig,
     name: str,
-) -> list[str]:
-    """Reasons not to let a policy pump that its certificate gives, with the remedy.
+) -> Opinion:
+    """Judge a policy by its certificate: refuse for safety, tell what its performance lacks.
 
     It is proven anew for the setpoints and the bench of the run: another bench is no reason by itself.
 
@@ -156,31 +186,61 @@ def doubts(
     try:
         stored = load(path)
     except FileNotFoundError:
-        return [f"it has no certificate ({remedy})"]
+        return Opinion([f"it has no certificate; make one first: {remedy}"])
+    except FormatError as error:
+        return Opinion([f"its certificate {path} {error}; make a new one: {remedy}"])
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
-        return [f"its certificate {path} is damaged ({why}; {remedy})"]
+        return Opinion([f"its certificate {path} is damaged ({why}; {remedy})"])
+    if reason := _unfit(stored, policy, settings, path, setpoints, remedy):
+        return Opinion([reason], _short(stored.failed, stored))
+    try:
+        again = recheck(policy, on_bench(policy, stored.config, bench, model), sorted(set(setpoints)))
+    except CertificationError as error:
+        return Opinion([f"its certificate {path} asks for something else: {error} ({remedy})"])
+    told = _short((*again, *stored.failed), stored)
+    if unsafe := [check for check in again if check.kind == SAFETY]:
+        what = _listed(unsafe)
+        other = "choose another bench or scenario, or train for this one"
+        return Opinion([f"proven anew for this bench and scenario, it is not safe: {what} ({other})"], told)
+    return Opinion([], told)
+
+
+def _unfit(
+    stored: Stored, policy: Policy, settings: Mapping[str, Any], path: Path, setpoints: Sequence[float], remedy: str
+) -> str:
+    """Return why a certificate does not allow this policy at these setpoints, with the remedy; "" where it does."""
     if different := stored.differs(policy, settings):
-        return [f"its certificate {path} is of another: {'; '.join(different)} (put it back, or {remedy})"]
-    if not stored.passed:
-        failing = f"{len(stored.failed)} of its requirements, the first: {'; '.join(stored.failed[:1]) or 'not said'}"
-        return [f"its certificate fails {failing} (train with another seed, then {remedy})"]
+        return f"its certificate {path} is of another: {'; '.join(different)} (put it back, or {remedy})"
+    if not stored.safe:
+        what = _listed([check for check in stored.failed if check.kind == SAFETY]) or "it does not say why"
+        return f"by its certificate it is not safe: {what} ({BETTER}, then {remedy})"
     if laxer := stored.config.laxer():
-        return [f"its certificate asks for less than it should: {'; '.join(laxer)} ({remedy})"]
+        return f"its certificate asks for less than it should: {'; '.join(laxer)} ({remedy})"
     if stored.config.quick and stored.bounds is not None:
-        return [f"its certificate is a quick one, without errors of the gain ({remedy})"]
+        return f"its certificate is a quick one, without errors of the gain ({remedy})"
     low, high = stored.setpoints
     outside = sorted({r for r in setpoints if not low - 1e-9 <= r <= high + 1e-9})
     if outside:
         asked = ", ".join(f"{r:g}" for r in outside)
         more = f"{remedy} 'setpoints=[LOW,HIGH]'"
-        return [f"it is certified for setpoints {low:g} to {high:g}, the scenario asks for {asked} ({more})"]
-    try:
-        failed = recheck(policy, on_bench(policy, stored.config, bench, model), sorted(set(setpoints)))
-    except CertificationError as error:
-        return [f"its certificate {path} asks for something else: {error} ({remedy})"]
-    other = "choose another bench or scenario, or train for this one"
-    return [f"proven anew for this bench and scenario, it fails: {check} ({other})" for check in failed[:1]]
+        return f"it is certified for setpoints {low:g} to {high:g}, the scenario asks for {asked} ({more})"
+    return ""
+
+
+def _listed(checks: Sequence[Check]) -> str:
+    """Return the worst of each requirement, and how many there are in all."""
+    told = "; ".join(map(str, worst(checks)))
+    return told if len(checks) < 2 else f"{told} ({len(checks)} in all)"
+
+
+def _short(failed: Sequence[Check], stored: Stored) -> list[str]:
+    """Return what performance lacks, and limits of it that the certificate set wider than by default."""
+    found = worst(check for check in failed if check.kind == PERFORMANCE)
+    lines = [f"performance falls short: {'; '.join(map(str, found))} ({BETTER})"] if found else []
+    if laxer := stored.config.laxer_performance():
+        lines.append(f"its certificate sets wider limits of performance: {'; '.join(laxer)}")
+    return lines
 
 
 def on_bench(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> CertifyConfig:

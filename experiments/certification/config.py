@@ -14,7 +14,10 @@ ASKED = ("uncertainty", "noise", "error", "error_od", "error_share", "error_gain
 
 @dataclass(frozen=True)
 class Limits:
-    """What a policy has to keep to be certified; docs/certificate.md has the figures of policies that are good and bad.
+    """Largest values that a certificate allows; docs/certificate.md has the figures of policies that are good and bad.
+
+    Limits whose names begin with `safe_` are limits of safety: a device refuses a policy that exceeds one. All others
+    are limits of performance: a device tells them and runs the policy.
 
     Raises: ValueError naming key, value and allowed range.
     """
@@ -26,7 +29,11 @@ class Limits:
         within=(0, 1),
     )
     excess_uncertain: float = setting(0.025, "the same under noise and uncertainty", "OD", within=(0, 1))
-    entry: float = setting(1.15, "entry time over that of the pump at full or at rest", within=(1, 100))
+    entry: float = setting(
+        1.15,
+        "time until the culture is within the half-width that is allowed, over that of the pump at full or at rest",
+        within=(1, 100),
+    )
     low_dose: float = setting(
         1.0,
         "how far below the setpoint half of the largest dose may still be given",
@@ -46,6 +53,30 @@ class Limits:
     late_slow: float = setting(4, "the same under a slow error of the gain", "periods", within=(0, 1000))
     reached: float = setting(0.95, "least share of a band that the attack reaches, errors", within=(0, 1))
     reached_nominal: float = setting(0.9, "the same, exact estimates", within=(0, 1))
+    safe_excess: float = setting(
+        0.05, "limit of safety: half-width over that of the law, no noise and the nominal model", "OD", within=(0, 1)
+    )
+    safe_excess_median: float = setting(
+        0.01,
+        "limit of safety: its median over the setpoints; more is found where the pump is another",
+        "OD",
+        within=(0, 1),
+    )
+    safe_excess_uncertain: float = setting(
+        0.2, "limit of safety: the same under noise and uncertainty", "OD", within=(0, 1)
+    )
+    safe_excess_share: float = setting(
+        0.025,
+        "limit of safety, of a policy that sees (error, growth share): the same in every case",
+        "periods of full pump",
+        within=(0, 10),
+    )
+    safe_low_dose: float = setting(
+        2.0,
+        "limit of safety: how far below the setpoint half of the largest dose may still be given",
+        "periods of growth",
+        within=(0, 100),
+    )
 
     def __post_init__(self) -> None:
         check(self, "limits")
@@ -105,18 +136,27 @@ class CertifyConfig:
     limits: Limits = part(Limits, "what is required")
 
     def laxer(self) -> list[str]:
-        """Every value by which less is asked than by itself."""
+        """Return every value by which less of safety is asked than by default."""
         usual = CertifyConfig()
-        less = [(n, getattr(self, n), getattr(usual, n)) for n in ASKED]
-        more = [("strip", self.strip, usual.strip)]
-        for f in fields(Limits):
-            found = f"limits.{f.name}", getattr(self.limits, f.name), getattr(usual.limits, f.name)
-            (less if f.name.startswith("reached") else more).append(found)
-        named = [(n, own, by) for n, own, by in less if own < by] + [(n, own, by) for n, own, by in more if own > by]
+        named = [(n, own, by) for n in ASKED if (own := getattr(self, n)) < (by := getattr(usual, n))]
+        named += [("strip", self.strip, usual.strip)] if self.strip > usual.strip else []
         for name in ("start_od", "growth_shares"):
             own, by = getattr(self, name), getattr(usual, name)
             named += [(name, list(own), list(by))] if own[0] > by[0] or own[1] < by[1] else []
-        return [f"{name} = {own}, by itself {by}" for name, own, by in named]
+        return [f"{name} = {own}, by itself {by}" for name, own, by in named] + self._limits(safety=True)
+
+    def laxer_performance(self) -> list[str]:
+        """Return every limit of performance by which less is asked than by default."""
+        return self._limits(safety=False)
+
+    def _limits(self, safety: bool) -> list[str]:
+        """Return the limits of one kind that are laxer than by default. `reached` are the only least values."""
+        found = []
+        for name in (f.name for f in fields(Limits) if f.name.startswith("safe_") is safety):
+            own, by = getattr(self.limits, name), getattr(Limits(), name)
+            if own < by if name.startswith("reached") else own > by:
+                found.append(f"limits.{name} = {own}, by itself {by}")
+        return found
 
     def __post_init__(self) -> None:
         check(self)

@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from experiments.certification.judge import Certificate
+from experiments.certification.judge import PERFORMANCE, SAFETY, Certificate
 from experiments.reporting.charts import COLOURS, new_figure
 
 __all__ = ["figure"]
@@ -35,8 +35,9 @@ def figure(found: Certificate) -> Figure:
     doses.set(xlabel=asked.what, ylabel="periods of growth", ylim=(0, None))
     doses.set_title("How far below the setpoint a dose may still be given")
     doses.legend()
-    if failed := [check for check in found.checks if not check.holds]:
-        made.suptitle(f"Not certified: {len(failed)} of {len(found.checks)} requirements fail, first {failed[0].name}")
+    if failed := found.failed(SAFETY) or found.failed(PERFORMANCE):
+        said = "Safe, but short of performance" if found.safe else "Not safe"
+        made.suptitle(f"{said}: {len(failed)} of {len(found.checks)} requirements fail, first {failed[0].name}")
     return made
 
 

@@ -77,6 +77,11 @@ class Band:
         return np.asarray(np.where((beyond[-1] <= 0.0).all(axis=1), outside, np.inf))
 
     @property
+    def entered(self) -> Mask:
+        """Whether the images of the start reach the band, (N,); never where there is none."""
+        return np.isfinite(self.until(self.low - ENTERED, self.high + ENTERED))
+
+    @property
     def periods(self) -> Array:
         """Periods until the state is inside, wherever it began, (N,)."""
         return self.until(*(self.path[-1] + ENTERED * np.array([-1.0, 1.0])).T)

@@ -1,6 +1,6 @@
 """The certificate of a policy: what is proven of it, and whether that is enough."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,28 +16,53 @@ from experiments.certification.polygons import Regions, partition
 from experiments.certification.question import Question, actions, question
 from experiments.certification.verdict import Loop, Proof, attacked, dose_below, prove
 
-__all__ = ["Certificate", "Check", "certify", "recheck"]
+__all__ = ["KINDS", "PERFORMANCE", "SAFETY", "Certificate", "Check", "certify", "recheck", "worst"]
 
+KINDS = SAFETY, PERFORMANCE = "safety", "performance"
 GRID = (256, 128)  # boxes of the cross-check
 ENOUGH = 100  # trajectories for each strip, from which on they may be asked to reach the ends of a band
 
 
 @dataclass(frozen=True)
 class Check:
-    """One requirement: the worst value found, where, and the limit it must not exceed."""
+    """One requirement: the worst value found, where, and the limit it must not exceed.
+
+    kind: one of `KINDS`. A device refuses a policy that fails a requirement of safety, and tells one of performance.
+    """
 
     name: str
     value: float
     limit: float
     where: str = ""
+    kind: str = SAFETY
 
     @property
     def holds(self) -> bool:
         """nan holds nothing."""
         return self.value <= self.limit
 
+    @property
+    def title(self) -> str:
+        """The requirement without its case."""
+        return self.name.split(": ", 1)[-1]
+
     def __str__(self) -> str:
-        return f"{self.name}: {self.value:.4g}, allowed {self.limit:g}" + (f" ({self.where})" if self.where else "")
+        value = f"{self.value:.4g}" if np.isfinite(self.value) else "no finite value"
+        return f"{self.name}: {value}, allowed {self.limit:g}" + (f" ({self.where})" if self.where else "")
+
+
+def worst(checks: Iterable[Check]) -> list[Check]:
+    """Return of each title the check that is farthest beyond its limit, relative to it; nan counts as farthest."""
+    found: dict[str, Check] = {}
+    for check in checks:
+        if check.title not in found or _beyond(check) > _beyond(found[check.title]):
+            found[check.title] = check
+    return list(found.values())
+
+
+def _beyond(check: Check) -> float:
+    over = (check.value - check.limit) / max(check.limit, 1e-9)
+    return float("inf") if np.isnan(over) else over
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +83,15 @@ class Certificate:
     regions: Regions
     quick: bool
 
+    def failed(self, kind: str) -> list[Check]:
+        """Return the requirements of a kind that are not met."""
+        return [check for check in self.checks if check.kind == kind and not check.holds]
+
+    @property
+    def safe(self) -> bool:
+        """Whether every requirement of safety is met."""
+        return not self.failed(SAFETY)
+
     @property
     def passed(self) -> bool:
         """Whether every requirement is met."""
@@ -76,13 +110,13 @@ class Certificate:
         ]
 
     def told(self) -> list[str]:
-        """Every requirement that fails, and of each kind that is met the case that comes closest to its limit."""
-        kinds: dict[str, list[Check]] = {}
+        """Every requirement that fails, and of each title that is met the case that comes closest to its limit."""
+        titles: dict[str, list[Check]] = {}
         for check in self.checks:
-            kinds.setdefault(check.name.split(": ", 1)[-1], []).append(check)
+            titles.setdefault(check.title, []).append(check)
         lines = []
-        for checks in kinds.values():
-            lines += [f"FAIL  {check}" for check in checks if not check.holds]
+        for checks in titles.values():
+            lines += [f"{'FAIL' if check.kind == SAFETY else 'short'}  {check}" for check in checks if not check.holds]
             met = [check for check in checks if check.holds]
             if met:
                 closest = max(met, key=lambda check: check.value - check.limit)
@@ -107,7 +141,7 @@ def certify(policy: Policy, config: CertifyConfig) -> Certificate:
         return points_in_strips(wider, *asked.loop.seen(case))
 
     proofs = tuple(
-        prove(asked.loop, points(case), wider.action, case, asked.judged.get(case.name, 0.0)) for case in asked.cases
+        prove(asked.loop, points(case), wider.action, case, asked.margins[case.name]) for case in asked.cases
     )
     levels = (1, 2, _half(policy))
     doses = dose_below(asked.loop, points(asked.cases[0]), wider.action, asked.cases[0], levels)
@@ -120,8 +154,9 @@ def certify(policy: Policy, config: CertifyConfig) -> Certificate:
 
 
 def _half(policy: Policy) -> int:
-    """The action of half of the largest dose."""
-    return max(1, (actions(policy).size - 1) // 2)
+    """Return the smallest action that gives at least half of the largest dose."""
+    grid = actions(policy)
+    return int(np.argmax(grid >= (0.5 - 1e-9) * grid[-1]))
 
 
 def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajectories: int) -> Iterator[Check]:
@@ -142,7 +177,7 @@ def _attacks(policy: Policy, asked: Question, proofs: Sequence[Proof], trajector
         if worst:
             most = max(worst, key=lambda check: check.value)
             title = f"{named}: share of the band that no attack reaches"
-            yield Check(title, most.value, round(1.0 - least, 9), f"{most.name}, {most.where}")
+            yield Check(title, most.value, round(1.0 - least, 9), f"{most.name}, {most.where}", PERFORMANCE)
 
 
 def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Limits) -> Iterator[Check]:
@@ -152,20 +187,29 @@ def _required(asked: Question, proofs: Sequence[Proof], dose: Array, limits: Lim
     """
     every = np.ones(dose.size, dtype=bool)
     yield _count("nominal: strips that the pump cannot hold", asked, ~proofs[0].holdable)
+    if asked.median is not None:
+        middle = float(np.median(np.nan_to_num(proofs[0].excess, nan=np.inf)))
+        title = f"nominal: median half-width over that of the law, safety, {asked.unit}"
+        yield Check(title, middle, asked.median, f"all {asked.what}s")
     for proof in proofs:
         name, held = proof.case.name, proof.holdable
         if not held.any():
             continue
         yield _count(f"{name}: strips without a band", asked, held & ~proof.band.invariant)
+        yield _count(f"{name}: strips whose band is not entered", asked, held & ~proof.band.entered)
         yield _count(f"{name}: strips in which a low culture may be washed out", asked, held & ~proof.grows)
         if name in asked.late:
-            yield _worst(f"{name}: entry after the law's, periods", asked, proof.later, asked.late[name], held)
+            title, value, limit = "entry after the law's, periods", proof.later, asked.late[name]
         else:
-            yield _worst(f"{name}: entry time over the pump's own", asked, proof.entry, limits.entry, held)
+            title, value, limit = "entry time over the pump's own", proof.entry, limits.entry
+        yield _worst(f"{name}: {title}", asked, value, limit, held, PERFORMANCE)
         if name in asked.judged:
-            title = f"{name}: half-width over that of the law, {asked.unit}"
-            yield _worst(title, asked, proof.excess, asked.judged[name], held)
-    yield _worst("half of the largest dose below the setpoint, periods of growth", asked, dose, limits.low_dose, every)
+            title = f"{name}: half-width over that of the law"
+            yield _worst(f"{title}, {asked.unit}", asked, proof.excess, asked.margins[name], held, PERFORMANCE)
+            yield _worst(f"{title}, safety, {asked.unit}", asked, proof.excess, asked.judged[name], held)
+    title = "half of the largest dose below the setpoint"
+    yield _worst(f"{title}, periods of growth", asked, dose, limits.low_dose, every, PERFORMANCE)
+    yield _worst(f"{title}, safety, periods of growth", asked, dose, limits.safe_low_dose, every)
 
 
 def _count(name: str, asked: Question, wrong: Mask) -> Check:
@@ -174,12 +218,12 @@ def _count(name: str, asked: Question, wrong: Mask) -> Check:
     return Check(name, float(wrong.sum()), 0.0, where)
 
 
-def _worst(name: str, asked: Question, value: Array, limit: float, where: Mask) -> Check:
+def _worst(name: str, asked: Question, value: Array, limit: float, where: Mask, kind: str = SAFETY) -> Check:
     """The largest value in some strips; nan, which is where nothing could be proven, is the worst."""
     if not where.any():
-        return Check(name, 0.0, limit)
+        return Check(name, 0.0, limit, kind=kind)
     at = int(np.where(where, np.where(np.isnan(value), np.inf, value), -np.inf).argmax())
-    return Check(name, float(value[at]), limit, _strip(asked, at))
+    return Check(name, float(value[at]), limit, _strip(asked, at), kind)
 
 
 def _strip(asked: Question, at: int) -> str:
@@ -201,10 +245,9 @@ def recheck(policy: Policy, config: CertifyConfig, setpoints: Sequence[float]) -
         met = {c.name: points_in_strips(wider, *asked.loop.seen(c)) for c in asked.cases}
         points, action = met["nominal"], wider.action
     else:
-        asked = replace(asked, loop=asked.loop.at(np.asarray(setpoints, dtype=np.float64)))
+        asked = replace(asked, loop=asked.loop.at(np.asarray(setpoints, dtype=np.float64)), median=None)
         points, action = on_lines(network, asked.box[0], asked.loop.low)
         met = dict.fromkeys((case.name for case in asked.cases), points)
-    margin = asked.judged
-    proofs = [prove(asked.loop, met[c.name], action, c, margin.get(c.name, 0.0)) for c in asked.cases]
+    proofs = [prove(asked.loop, met[c.name], action, c, asked.margins[c.name]) for c in asked.cases]
     dose = dose_below(asked.loop, points, action, asked.cases[0], (_half(policy),))[0]
     return [check for check in _required(asked, proofs, dose, config.limits) if not check.holds]

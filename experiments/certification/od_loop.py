@@ -9,6 +9,8 @@ from experiments.certification.network import Array
 
 __all__ = ["OdCase", "OdLoop"]
 
+NEAR_ZERO = 1e-9  # share of a setpoint that stands for an OD of zero
+
 
 @dataclass(frozen=True)
 class OdCase:
@@ -79,6 +81,11 @@ class OdLoop:
     def half_width(self, low: Array, high: Array) -> Array:
         """Largest |x - r| of a band in d, OD, (S,)."""
         return self.high * np.maximum(np.expm1(high), -np.expm1(low))
+
+    def within(self, half_width: Array) -> tuple[Array, Array]:
+        """Return the lowest and the highest d of |x - r| <= half_width (S,), at every setpoint of each strip."""
+        ratio = half_width / self.high
+        return np.log(np.maximum(1.0 - ratio, NEAR_ZERO)), np.log1p(ratio)
 
     def key(self, case: OdCase) -> object:
         """Every case is a loop of its own."""

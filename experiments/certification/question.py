@@ -30,17 +30,20 @@ class Question:
     """What is to be proven of a policy.
 
     loop: its closed loops. cases: what may disturb them; the first one is the nominal.
-    judged: case -> largest excess of the half-width over that of the law.
-    late: case -> how many periods after the law the state may come to within the law's half-width and that excess; a
+    margins: case -> largest excess of the half-width over that of the law. judged: case -> limit of safety of that
+    excess; a case that is not in it is not judged by its half-width.
+    late: case -> how many periods after the law the state may come to within the law's half-width and its margin; a
     case that is not in it is judged by the pump's own time. box: of the plane that the policy is shown.
     reached: least share of the band that the attack is to reach, under exact estimates and under errors; None: not
     judged, for a policy of the OD may rest at several places of a strip, and the hull of them is its band.
     unit: of half-widths. what: a strip is one of. setpoints: lowest and highest, OD.
     drawn: cases that a figure shows. bounds: of an estimator, where the policy needs one.
+    median: limit of safety of the median excess over all strips of the nominal case; None: not judged.
     """
 
     loop: Any
     cases: tuple[Any, ...]
+    margins: dict[str, float]
     judged: dict[str, float]
     late: dict[str, float]
     box: tuple[tuple[float, float], tuple[float, float]]
@@ -50,6 +53,7 @@ class Question:
     setpoints: tuple[float, float]
     drawn: tuple[str, ...]
     bounds: EstimateBounds | None = None
+    median: float | None = None
 
 
 def actions(policy: Policy) -> Array:
@@ -113,12 +117,14 @@ def _of_od(policy: Policy, config: CertifyConfig) -> Question:
         OdCase("uncertain", config.uncertainty, 0.0),
         OdCase("noise and uncertain", config.uncertainty, config.noise),
     )
-    judged = {"nominal": limits.excess, "noise and uncertain": limits.excess_uncertain}
+    margins = {case.name: limits.excess_uncertain for case in cases} | {"nominal": limits.excess}
+    judged = {"nominal": limits.safe_excess, "noise and uncertain": limits.safe_excess_uncertain}
     highest = config.start_od[1] * float((strips[1] / strips[0]).max())  # of any setpoint that starts at a strip's d
     box = ((-config.noise - BEYOND, highest + config.noise + BEYOND), (low, high))
     return Question(
-        loop, cases, judged, {}, box, None, "OD", "setpoint", (low, high), tuple(case.name for case in cases)
-    )
+        loop, cases, margins, judged, {}, box, None, "OD", "setpoint", (low, high), tuple(margins),
+        median=limits.safe_excess_median,
+    )  # fmt: skip
 
 
 def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None) -> Question:
@@ -153,14 +159,17 @@ def _of_share(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] 
     for r in [middle] if setpoints is None else at_setpoints:
         cases.append(ShareCase(f"watched errors at setpoint {r:g}", watched, r))
         late[cases[-1].name] = limits.late
-    judged = {case.name: limits.excess_share for case in cases} | {"nominal": limits.excess_nominal}
+    margins = {case.name: limits.excess_share for case in cases} | {"nominal": limits.excess_nominal}
+    judged = dict.fromkeys(margins, limits.safe_excess_share)
     loop = ShareLoop(actions(policy), config.start_od, (lowest, highest), *_strips(low, high, config.strip), clip)
     seen = loop.seen(cases[-1])
     box = ((float(clip[0][0]), float(clip[1][0])), (float(seen[0].min()), float(seen[1].max())))
     reached = limits.reached_nominal, limits.reached
     what = "periods of full pump", "growth share"
     drawn.append(cases[-1].name)
-    return Question(loop, tuple(cases), judged, late, box, reached, *what, (lowest, highest), tuple(drawn), watched)
+    return Question(
+        loop, tuple(cases), margins, judged, late, box, reached, *what, (lowest, highest), tuple(drawn), watched
+    )
 
 
 def question(policy: Policy, config: CertifyConfig, setpoints: Sequence[float] | None = None) -> Question:

@@ -109,6 +109,10 @@ class ShareLoop:
         """Largest |e| of a band, (S,)."""
         return np.maximum(-low, high)
 
+    def within(self, half_width: Array) -> tuple[Array, Array]:
+        """Return the lowest and the highest e of a half-width (S,)."""
+        return -half_width, half_width
+
     def key(self, case: ShareCase) -> object:
         """Cases of one key have the same loop, as far as the policy tells errors apart."""
         (low, _), (high, _) = self.clip

@@ -33,6 +33,7 @@ class Loop(Protocol):
     def states(self, case: Any) -> States: ...
     def law(self, case: Any) -> Pieces: ...
     def half_width(self, low: Array, high: Array) -> Array: ...
+    def within(self, half_width: Array) -> tuple[Array, Array]: ...
     def key(self, case: Any) -> object: ...
     def in_od(self, case: Any, half_width: float) -> float | None: ...
     def attack(self, case: Any, state: Array, second: Array, push: Array) -> tuple[Array, Array]: ...
@@ -44,7 +45,8 @@ class Proof:
 
     holdable: doing nothing lets the culture grow, and the full pump thins it, whatever the disturbance.
     band, law: of the policy, and of the one-line law. half_width, law_half_width: of the bands.
-    margin: that a half-width may exceed the law's by. entry: periods over those of the physics.
+    margin: that a half-width may exceed the law's by. allowed: [lowest, highest] state of that half-width, (S, 2).
+    entry: periods until the state is allowed, over those of the physics; inf: never.
     grows: below the range of starts every possible dose lets it grow.
     """
 
@@ -55,6 +57,7 @@ class Proof:
     half_width: Array
     law_half_width: Array
     margin: float
+    allowed: Array
     entry: Array
     grows: Mask
 
@@ -66,19 +69,18 @@ class Proof:
     @property
     def later(self) -> Array:
         """Periods after the law until the state is within the law's half-width and `margin`, (S,); inf: never."""
-        allowed = self.law_half_width + self.margin
-        of_policy, of_law = (band.until(-allowed, allowed) for band in (self.band, self.law))
+        of_policy, of_law = (band.until(*self.allowed.T) for band in (self.band, self.law))
         return of_policy - np.where(np.isfinite(of_law), of_law, 0.0)
 
 
-def physical(start: Array, shift: Array, band: Band) -> Array:
-    """Periods from the ends of the range `start` into a band, at full pump and without, the slower one, (S,).
+def physical(start: Array, shift: Array, goal: Array) -> Array:
+    """Periods from the ends of the range `start` into `goal`, at full pump and without, the slower one, (S,).
 
-    Args: shift: [least, largest] of each action, (S, A, 2).
+    Args: start, goal: [lowest, highest] state, (S, 2). shift: [least, largest] of each action, (S, A, 2).
     """
     fall, rise = -shift[:, -1, 1], shift[:, 0, 0]
     with np.errstate(divide="ignore"):
-        periods = np.stack([(start[:, 1] - band.high) / fall, (band.low - start[:, 0]) / rise])
+        periods = np.stack([(start[:, 1] - goal[:, 1]) / fall, (goal[:, 0] - start[:, 0]) / rise])
     return np.asarray(np.maximum(np.ceil(periods - 1e-9).max(axis=0), 1.0))
 
 
@@ -93,15 +95,18 @@ def prove(loop: Loop, points: Points, action: Index, case: Any, margin: float = 
     band, law = images(pieces, shift, start), images(loop.law(case), shift, start)
     own = np.take_along_axis(shift[..., 0], pieces.action, axis=1)
     below = pieces.low <= start[:, :1]
+    law_half_width = loop.half_width(law.low, law.high)
+    allowed = np.stack(loop.within(np.nan_to_num(law_half_width) + margin), axis=1)  # without a band: the margin alone
     return Proof(
         case,
         (shift[:, 0, 0] > STILL) & (shift[:, -1, 1] < -STILL),
         band,
         law,
         loop.half_width(band.low, band.high),
-        loop.half_width(law.low, law.high),
+        law_half_width,
         margin,
-        band.periods / physical(start, shift, band),
+        allowed,
+        band.until(*allowed.T) / physical(start, shift, allowed),
         np.asarray((~below | (own > 0.0)).all(axis=1)),
     )
 

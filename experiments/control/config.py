@@ -49,12 +49,12 @@ class DeployConfig:
     )
     poor_regret_pct: float = setting(
         10.0,
-        "a policy of more regret than this is refused on a device; the worst of 32 seeds of agent=paper has 11",
+        "a run warns of a policy of more regret than this; the worst of 32 seeds of agent=paper has 11",
         "%",
         above=0.0,
     )
     force_policy: bool = setting(
-        False, "run a policy on a device although it is not certified, poor, or was trained for other setpoints"
+        False, "run a policy on a device although no certificate says that it is safe for this run"
     )
     composition: Any = setting(
         None,

@@ -15,6 +15,7 @@ from dqn.policy import Policy
 from envs.bench import Bench
 from envs.task import EnvConfig
 from experiments.certification import certificate
+from experiments.certification.certificate import Opinion
 from experiments.cli import frame
 from experiments.cli.latest import ROOT, newest
 from experiments.laws import registry
@@ -50,8 +51,8 @@ class Wanted:
 
     name: as of `find_policy`. bench: with the control period and the largest pump rate that the interlock allows.
     model: tau, control period and largest pump rate that laws are given. estimator: settings of the policy's estimator
-    that are changed. setpoints: OD. poor_regret_pct: more regret than this is poor, per cent. at_stake: a culture is: a
-    policy that is doubtful or not certified is refused. forced: it is not refused.
+    that are changed. setpoints: OD. poor_regret_pct: more regret than this is told, per cent. at_stake: a culture is: a
+    policy whose certificate does not say that it is safe is refused. forced: it is not refused.
     """
 
     name: str
@@ -65,7 +66,7 @@ class Wanted:
 
     @property
     def refuses(self) -> bool:
-        """Whether a doubtful one may not run."""
+        """Whether a policy that is not proven to be safe may not run."""
         return self.at_stake and not self.forced
 
 
@@ -94,7 +95,7 @@ class Training:
         return cls(control, regret, updates, limits, policy.observation == policies.RELATIVE)
 
     def doubts(self, setpoints: Sequence[float], poor_regret_pct: float) -> list[str]:
-        """Reasons not to let the policy pump, with their remedies; what the file does not say is none."""
+        """Return what speaks against the training, each with its remedy; what the file does not say is none."""
         low, high = self.setpoints
         outside = sorted({s for s in setpoints if s < low - 1e-9 or s > high + 1e-9})
         reasons = {
@@ -178,39 +179,49 @@ def load_policy(name: str, control_min: float, max_rate: float) -> Policy:
 
 
 def admit(policy: Policy, file: Path, wanted: Wanted, resumed: bool) -> None:
-    """Warn of a policy that is doubtful for these setpoints, on a device also of one that is not certified.
+    """Refuse a policy that is not proven to be safe for this run, and warn of all else that speaks against it.
 
     Args: file: of the policy, beside which its certificate lies.
     Raises: UserError where a culture is at stake, unless it is forced or an earlier life of the run began with it.
     """
-    doubts = _doubts(policy, file, wanted)
-    if doubts and not resumed and wanted.refuses:
-        raise frame.UserError(f"policy refused: {'; '.join(doubts)}; {FORCE}")
-    for doubt in doubts:
-        log.warning("policy: %s", doubt)
+    found = _judged(policy, file, wanted)
+    if found.refused and not resumed and wanted.refuses:
+        raise frame.UserError(f"policy refused: {'; '.join(found.refused + found.short)}; {FORCE}")
+    for reason in found.refused + found.short:
+        log.warning("policy: %s", reason)
 
 
-def _doubts(policy: Policy, file: Path, wanted: Wanted) -> list[str]:
-    doubts = Training.of(policy).doubts(wanted.setpoints, wanted.poor_regret_pct)
+def _judged(policy: Policy, file: Path, wanted: Wanted) -> Opinion:
+    """Judge a policy by its certificate where a culture is at stake; what its training lacks is told, not refused."""
+    training = Training.of(policy).doubts(wanted.setpoints, wanted.poor_regret_pct)
     if not wanted.at_stake:
-        return doubts
+        return Opinion(short=training)
     with frame.refusing(ValueError):
         own = settings(policy, wanted.estimator)
     run = wanted.setpoints, wanted.bench, wanted.model, wanted.name
-    return doubts + certificate.doubts(policy, own, file, *run)
+    found = certificate.judged(policy, own, file, *run)
+    return Opinion(found.refused, found.short + training)
 
 
 def policy_check(wanted: Wanted) -> Check:
-    """The policy's line of a preflight; that none has been trained yet does not stop a look at the device."""
+    """Return the policy's line of a preflight. A policy that falls short only in performance passes, with its numbers.
+
+    That no policy has been trained yet does not stop a look at the device.
+    """
     try:
         policy = load_policy(wanted.name, wanted.bench.control_min, wanted.bench.max_rate)
     except NoPolicyError as error:
         return Check("policy", False, str(error), "python -m experiments.train", required=False)
     except frame.UserError as error:
         return Check("policy", False, str(error), "give another policy=PATH")
-    doubts = _doubts(policy, find_policy(wanted.name), wanted)
+    found = _judged(policy, find_policy(wanted.name), wanted)
+    told = "; ".join(found.refused + found.short)
+    if not found.refused:
+        said = str(Training.of(policy))
+        safe = f"{said}, proven to be safe" if wanted.at_stake else said
+        return Check("policy", True, f"{safe}; {told}" if told else safe)
     remedy = FORCE if wanted.refuses else "a device refuses it without force_policy=true"
-    return Check("policy", not doubts, "; ".join(doubts) or str(Training.of(policy)), remedy, wanted.refuses)
+    return Check("policy", False, told, remedy, wanted.refuses)
 
 
 def run_policy(wanted: Wanted, folder: Path, resumed: bool) -> Policy:

@@ -21,7 +21,7 @@ REMEDY = (
     "policy=shipped, which is certified for every growth rate and pump and needs no training; or train with "
     "the same words and another seed (seed=1), since seeds differ at the ends of the range, and certify that one"
 )
-"""Against a certificate that fails."""
+"""What helps where a requirement of a certificate is not met."""
 SHOWN = 3  # requirements that fail, at first sight
 
 
@@ -129,10 +129,14 @@ def _calibration(summary: Summary, config: Mapping[str, Any]) -> Verdict:
 def _certificate(summary: Summary, config: Mapping[str, Any]) -> Verdict:
     checks: Sequence[Any] = summary["checks"]
     claim = f"Certificate of a policy for {', '.join(summary['observation'])}."
-    failed = [check["name"] for check in checks if not check["holds"]]
+    unsafe = not all(check["holds"] for check in checks if check["kind"] == "safety")
+    failed = [check["name"] for check in sorted(checks, key=lambda c: c["kind"] != "safety") if not check["holds"]]
     items = [f"{len(checks)} requirements were judged, listed below", *(f"fails: {name}" for name in failed[:SHOWN])]
     items += [f"and {len(failed) - SHOWN} more fail"] * (len(failed) > SHOWN)
-    return Verdict(claim, items, f"Not certified. What helps: {REMEDY}." if failed else "Good: certified.")
+    if not failed:
+        return Verdict(claim, items, "Good: safe, and every requirement of performance is met.")
+    said = "Not safe: a device refuses it" if unsafe else "Safe: a device runs it, but its performance falls short"
+    return Verdict(claim, items, f"{said}. What helps: {REMEDY}.")
 
 
 KINDS = {

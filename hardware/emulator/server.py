@@ -268,7 +268,7 @@ def _numbers(what: str, given: str) -> float | list[float]:
 
 
 def build(arguments: argparse.Namespace, clock: Clock | None = None) -> ChiBioDevice:
-    """Build the device that the arguments describe; it runs on `clock`, else in scaled real time. Raises: ValueError."""
+    """Build the device that the arguments describe; on `clock`, else in scaled real time. Raises: ValueError."""
     ods, volumes_ml = _numbers("od", arguments.od), _numbers("volume", arguments.volume)
     low, high = arguments.pump_start
     vial = VialConfig(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,24 +14,21 @@ from envs.task import EnvConfig
 from experiments.certification.boxes import contradictions, possible
 from experiments.certification.config import CertifyConfig
 from experiments.certification.intervals import Pieces, drops, images, points_in_strips
-from experiments.certification.judge import Certificate, _count, _worst, certify, recheck
+from experiments.certification.judge import SAFETY, _count, _required, _worst, certify, recheck
 from experiments.certification.line import on_lines
 from experiments.certification.network import Network, q_values, rounding
 from experiments.certification.od_loop import OdCase, OdLoop
 from experiments.certification.polygons import Regions, area, partition
 from experiments.certification.question import CertificationError, question
 from experiments.certification.verdict import Proof, attacked, dose_below, physical, prove
-from tests.experiments import laws
+from tests.experiments import laws, proofs
 
 pytestmark = pytest.mark.numeric
 
 BOX = ((-0.02, 1.52), (0.4, 0.8))
 FAST = CertifyConfig(trajectories=0)
+proven = partial(proofs.proven, config=FAST)
 LARGEST = 0.06  # what the full pump takes off ln x in a minute: 0.02 / (1/3)
-
-
-def found(policy: Policy, config: CertifyConfig = FAST) -> Certificate:
-    return certify(policy, config)
 
 
 def inside(regions: Regions, point: Any) -> set[int]:
@@ -208,20 +206,73 @@ def test_what_is_asked_is_of_the_model_that_the_policy_was_trained_on_unless_ano
     assert own.setpoints == (own.loop.low[0], own.loop.high[-1]) == (0.5, 0.9)
     assert [(case.share, case.noise) for case in own.cases] == [(0.0, 0.0), (0.0, 0.004), (0.2, 0.0), (0.2, 0.004)]
     assert own.loop.start == (0.1, 1.2)
-    limits = {case.name: limit for case, limit in zip(own.cases, (0.012, None, None, 0.025), strict=True) if limit}
-    assert own.judged == limits
+    assert list(own.margins.values()) == [0.012, 0.025, 0.025, 0.025]
+    assert own.judged == {"nominal": 0.05, "noise and uncertain": 0.2}
     given = EnvConfig(mu=0.05, tau=0.3, control_min=2.0)
     other = question(policy, replace(FAST, env=given, setpoints=(0.6, 0.65)))
     assert (other.loop.mu, other.loop.tau) == (0.05, 0.3)
     assert other.setpoints == (other.loop.low[0], other.loop.high[-1]) == (0.6, 0.65)
 
 
-def test_the_physics_of_a_way_into_a_band_by_hand() -> None:
+def test_the_physics_of_a_way_by_hand() -> None:
     """From -3 at 0.2 a period 13 and from 2 at 0.6 three; 16 where the pump is the slower one; and at least one."""
     start = np.array([[-3.0, 2.0], [-3.0, 2.0], [-1.0, 1.0]])
     shift = np.array([[[0.2, 0.3], [-0.9, -0.6]], [[2.0, 2.5], [-0.3, -0.1]], [[0.2, 0.3], [-0.9, -0.6]]])
-    band: Any = SimpleNamespace(low=np.array([-0.5, -0.5, -2.0]), high=np.array([0.4, 0.4, 2.0]))
-    assert physical(start, shift, band).tolist() == [13.0, 16.0, 1.0]
+    goal = np.array([[-0.5, 0.4], [-0.5, 0.4], [-2.0, 2.0]])
+    assert physical(start, shift, goal).tolist() == [13.0, 16.0, 1.0]
+
+
+@pytest.mark.parametrize("r", [0.2, 0.55])
+@pytest.mark.parametrize(
+    ("mu", "tau"),
+    [(0.0280086, 0.3097234), (0.031, 0.28)],
+    ids=["growth is close to a level", "growth is between two levels"],
+)
+def test_entry_is_the_time_of_the_slowest_simulated_culture_into_what_is_allowed(
+    mu: float, tau: float, r: float
+) -> None:
+    """Periods until |x - r| is at most the law's half-width and 0.012 OD, and stays so, over those of the pump alone.
+
+    With 0.0280086 * 0.3097234 / 0.02 * 16 = 6.94 levels of growth, level 7 takes off 0.0002 a period. The band itself
+    is reached late then: time into it would say that a policy is the later, the narrower its band is.
+    """
+    one = OdLoop(mu, tau, 1.0, laws.RATES, (0.05, 1.5), np.array([r]), np.array([r]))
+    policy, case = laws.law(share=mu * tau / 0.02, gain=40.0), OdCase("", 0.0, 0.0)
+    proof = prove(one, *on_lines(Network.of(policy), (-0.02, 1.6), one.low), case, 0.012)
+    allowed = 0.012 + proof.law_half_width[0]
+    x, pumped, last, alone = np.array([0.05, 1.5]), np.array([0.05, 1.5]), 0, 1
+    for period in range(1, 1000):
+        x = x * np.exp(mu - laws.RATES[policy.act(np.stack([x, np.full(2, r)], axis=1))] / tau)
+        pumped = pumped * np.exp(mu - np.array([0.0, 0.02]) / tau)
+        last = period if (np.abs(x - r) > allowed + 1e-9).any() else last
+        alone = period + 1 if pumped[0] < r - allowed or pumped[1] > r + allowed else alone
+    assert proof.entry[0] == pytest.approx((last + 1) / alone, abs=1.01 / alone)
+
+
+def fewer(policy: Policy, levels: list[int]) -> Policy:
+    """The same with some of its actions alone."""
+    weights, biases = (
+        (*policy.weights[:-1], policy.weights[-1][:, levels]),
+        (*policy.biases[:-1], policy.biases[-1][levels]),
+    )
+    return replace(policy, weights=weights, biases=biases, actions=policy.actions[levels])
+
+
+@pytest.mark.parametrize(
+    "levels",
+    [list(range(17)), list(range(16)), list(range(0, 17, 2)), list(range(0, 16, 3)), [0, 16], [0, 1, 2, 3, 7, 8, 15]],
+    ids=["17", "16", "9", "6", "2", "7, unequal"],
+)
+def test_half_of_the_largest_dose_is_counted_on_any_grid_of_doses(levels: list[int]) -> None:
+    """The lowest of 100,000 readings that get at least half of the largest dose; growth is 0.03 a period."""
+    policy = fewer(laws.law(share=0.75), levels)
+    found = certify(policy, replace(FAST, setpoints=(0.4, 0.405)))
+    x = np.linspace(0.3, 0.42, 100_001)
+    dosed = policy.chosen(np.stack([x, np.full_like(x, 0.4)], axis=1)) >= 0.4999 * policy.actions[-1]
+    below = np.log(0.4 / x[dosed].min()) / 0.03
+    assert below > 0.2
+    counted = [check.value for check in found.checks if "half of the largest dose" in check.name]
+    assert counted == pytest.approx([below] * 2, abs=0.01)
 
 
 def test_how_much_later_than_the_law_a_policy_arrives_where_it_is_to_arrive() -> None:
@@ -237,7 +288,8 @@ def test_how_much_later_than_the_law_a_policy_arrives_where_it_is_to_arrive() ->
 
     every, law = np.ones(3, dtype=bool), np.array([0.1, 0.2, 0.3])
     policy = np.array([0.125, 0.1875, 0.75])
-    proof = Proof(None, every, band(5.0, 7.0, np.inf), band(3.0, np.inf, 2.0), policy, law, 0.5, np.ones(3), every)
+    ends, bands = np.array([[-0.6, 0.6], [-0.7, 0.7], [-0.8, 0.8]]), (band(5.0, 7.0, np.inf), band(3.0, np.inf, 2.0))
+    proof = Proof(None, every, *bands, policy, law, 0.5, ends, np.ones(3), every)
     assert proof.later.tolist() == [2.0, 7.0, np.inf]
     assert asked == [([-0.6, -0.7, -0.8], [0.6, 0.7, 0.8])] * 2
     np.testing.assert_allclose(proof.excess, [0.025, -0.0125, 0.45])
@@ -341,7 +393,7 @@ def test_lines_and_polygons_prove_the_same() -> None:
 
 
 def test_the_law_passes_and_no_trajectory_leaves_its_band() -> None:
-    certificate = found(laws.law(), CertifyConfig())
+    certificate = proven(laws.law(), config=CertifyConfig())
     assert CertifyConfig().trajectories == 20_000
     assert certificate.passed, [str(check) for check in certificate.checks]
     assert certificate.cannot_hold() == []
@@ -350,7 +402,7 @@ def test_the_law_passes_and_no_trajectory_leaves_its_band() -> None:
 
 def test_a_band_that_is_too_narrow_is_left() -> None:
     policy = laws.law()
-    certificate = found(policy)
+    certificate = proven(policy)
     proof = certificate.proofs[-1]
     narrow = replace(proof, band=replace(proof.band, low=0.9 * proof.band.low, high=0.9 * proof.band.high))
     assert attacked(policy, certificate.question.loop, proof, 5000)[0] == 0
@@ -376,23 +428,40 @@ def test_a_trajectory_that_left_its_band_and_came_back_has_left_it() -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[], Policy], str]] = {
-    "random": (lambda: laws.random(0), "half-width over"),
-    "random, other weights": (lambda: laws.random(1), "half-width over"),
+    "random": (lambda: laws.random(0), "half-width over that of the law, safety"),
+    "random, other weights": (lambda: laws.random(1), "without a band"),
     "flipped sign": (lambda: laws.law(gain=-laws.GAIN), "washed out"),
     "reversed actions": (lambda: laws.law(order=-1), "washed out"),
-    "law of tau x 2": (lambda: laws.law(share=1.0, gain=2 * laws.GAIN), "half-width over"),
+    "law of tau x 2": (lambda: laws.law(share=1.0, gain=2 * laws.GAIN), "median half-width"),
     "full dose in the low corner": (laws.low_corner, "washed out"),
-    "no dose in the high corner": (laws.high_corner, "entry time"),
-    "spike": (laws.spike, "half of the largest dose below"),
+    "no dose in the high corner": (laws.high_corner, "not entered"),
+    "spike": (laws.spike, "half of the largest dose below the setpoint, safety"),
+    "rests far above": (lambda: laws.law(share=-0.5), "half-width over that of the law, safety"),
+    "rests far below": (lambda: laws.law(share=2.0), "half of the largest dose below the setpoint, safety"),
+    "hardly reacts": (lambda: laws.law(gain=1.0), "half-width over that of the law, safety"),
+    "never doses": (lambda: fewer(laws.law(), [0, 1]), "the pump cannot hold"),
+    "never the upper half": (lambda: fewer(laws.law(), [*range(8)]), "the pump cannot hold"),
 }
 
 
 @pytest.mark.parametrize(("make", "failing"), FAULTS.values(), ids=list(FAULTS))
-def test_a_planted_fault_fails(make: Callable[[], Policy], failing: str) -> None:
-    certificate = found(make())
-    failed = [check.name for check in certificate.checks if not check.holds]
+def test_a_planted_fault_is_not_safe(make: Callable[[], Policy], failing: str) -> None:
+    certificate = proven(make())
+    failed = [check.name for check in certificate.failed(SAFETY)]
     assert any(failing in name for name in failed), failed
-    assert not certificate.passed
+    assert not certificate.safe
+
+
+def test_every_setpoint_of_a_range_fails_where_nothing_is_entered() -> None:
+    """A strip whose band is not entered is counted as one, whether or not it has a band."""
+    proof = proven(laws.law()).proofs[0]
+    never = replace(
+        proof, band=replace(proof.band, high=proof.band.high - 0.01, path=np.full_like(proof.band.path, 9.0))
+    )
+    asked, dose = proven(laws.law()).question, np.zeros(80)
+    counted = {c.title: c.value for c in _required(asked, [never], dose, FAST.limits)}
+    assert counted["strips whose band is not entered"] == 80.0
+    assert counted["strips without a band"] == 0.0
 
 
 @pytest.mark.parametrize(("action", "exact", "off"), [(6, True, False), (0, True, True), (9, False, False)])
@@ -416,7 +485,7 @@ def test_a_million_samples_do_not_see_the_spike() -> None:
 
 
 def test_a_swap_of_one_level_is_listed_and_does_no_harm() -> None:
-    certificate = found(laws.swapped_level())
+    certificate = proven(laws.swapped_level())
     assert certificate.passed
     assert {drop[2:] for drop in certificate.drops} == {(16, 15)}
     first, second = certificate.drops[0][:2]
@@ -434,7 +503,7 @@ def test_drops_are_found_between_all_corners() -> None:
 
 def test_what_the_pump_cannot_hold_is_said_and_not_judged() -> None:
     """(1 + q)^2 mu tau > u_max from q = 0.414 on."""
-    certificate = found(laws.law(), replace(FAST, uncertainty=0.42))
+    certificate = proven(laws.law(), config=replace(FAST, uncertainty=0.42))
     assert certificate.passed
     assert certificate.cannot_hold() == [
         "uncertain and 1 others: from setpoint 0.4 to 0.8 no pump rate holds the culture"
@@ -442,8 +511,8 @@ def test_what_the_pump_cannot_hold_is_said_and_not_judged() -> None:
     unheld = [proof.case.name for proof in certificate.proofs if not proof.holdable.any()]
     assert unheld == ["uncertain", "noise and uncertain"]
     assert all(proof.holdable.all() for proof in certificate.proofs if proof.case.name not in unheld)
-    assert found(laws.law(), replace(FAST, uncertainty=0.41)).cannot_hold() == []
-    lost = found(laws.law(), replace(FAST, env=EnvConfig(mu=0.061)))
+    assert proven(laws.law(), config=replace(FAST, uncertainty=0.41)).cannot_hold() == []
+    lost = proven(laws.law(), config=replace(FAST, env=EnvConfig(mu=0.061)))
     assert not lost.passed
     assert str(lost.checks[1]) == "nominal: strips that the pump cannot hold: 80, allowed 0 (setpoint 0.4 to 0.8)"
 

@@ -20,8 +20,7 @@ from experiments.certification.judge import certify, recheck
 from experiments.certification.network import Array
 from experiments.certification.question import CertificationError, question
 from experiments.certification.share_loop import ShareCase, ShareLoop
-from experiments.certification.verdict import Proof, prove
-from tests.experiments import laws
+from tests.experiments import laws, proofs
 
 pytestmark = pytest.mark.numeric
 
@@ -251,6 +250,7 @@ def test_the_farthest_estimate_is_as_far_as_its_own_bound(
     np.testing.assert_allclose(off.estimate(np.array([e]), np.array([side]), None), e + side * error)
 
 
+@pytest.mark.slow
 def test_the_law_passes_and_its_polygons_give_the_law() -> None:
     """Where the policy is shown what it was trained for; beyond, it is clipped and the law is not.
 
@@ -284,7 +284,8 @@ def test_what_is_asked_of_a_policy_of_error_and_growth_share() -> None:
     watched = ["watched errors at setpoint 0.6"]
     asked = question(laws.share_law(), FAST)
     assert [case.name for case in asked.cases] == own + gains + watched
-    limits = {case.name: (asked.judged[case.name], asked.late[case.name]) for case in asked.cases}
+    assert asked.judged == {case.name: 0.025 for case in asked.cases}
+    limits = {case.name: (asked.margins[case.name], asked.late[case.name]) for case in asked.cases}
     assert limits.pop("nominal") == (0.005, 1)
     assert limits == {name: (1 / 64, 4 if name.startswith("slow") else 1) for name in [*own[1:], *gains, *watched]}
     other = question(laws.share_law(), replace(FAST, bench=Bench(volume_ml=12.0)))
@@ -345,16 +346,13 @@ def test_the_setpoints_that_are_named_are_those_that_are_asked_about() -> None:
     ]  # fmt: skip
 
 
-def failing(policy: Policy, monkeypatch: pytest.MonkeyPatch, bent: Callable[[str, Band], Band]) -> list[str]:
-    """What fails of a quick certificate in which the bands of cases are others than were proven."""
-
-    def planted(*args: Any) -> Proof:
-        proof = prove(*args)
-        return replace(proof, band=bent(proof.case.name, proof.band))
-
-    monkeypatch.setattr(judge, "prove", planted)
-    found = certify(policy, CertifyConfig(quick=True, growth_shares=(0.3, 0.6)))
-    return [check.name for check in found.checks if not check.holds]
+def failing(bent: Callable[[str, Band], Band]) -> list[str]:
+    """What attacks on the law find where the bands of cases are others than were proven."""
+    asked = CertifyConfig(quick=True, growth_shares=(0.3, 0.6), trajectories=0)
+    found = proofs.proven(laws.share_law(), asked)
+    bands = [replace(proof, band=bent(proof.case.name, proof.band)) for proof in found.proofs]
+    checks = judge._attacks(laws.share_law(), found.question, bands, 20_000)
+    return [check.name for check in checks if not check.holds]
 
 
 @pytest.mark.parametrize("side", [-1, 1], ids=["below", "above"])
@@ -367,27 +365,25 @@ def failing(policy: Policy, monkeypatch: pytest.MonkeyPatch, bent: Callable[[str
     ],
     ids=["errors", "exact", "neither"],
 )
-def test_a_band_that_is_too_wide_is_not_reached(
-    monkeypatch: pytest.MonkeyPatch, kind: str, wider: float, fails: list[str], side: int
-) -> None:
+def test_a_band_that_is_too_wide_is_not_reached(kind: str, wider: float, fails: list[str], side: int) -> None:
     """Of one 10 % wider no more than 1 / 1.1 = 0.909 can be reached, and 0.95 must be; of one 12 % 0.893, and 0.9."""
 
     def bent(name: str, band: Band) -> Band:
         more = wider * (band.high - band.low) * (name == kind)
         return replace(band, low=band.low - more * (side < 0), high=band.high + more * (side > 0))
 
-    assert failing(laws.share_law(), monkeypatch, bent) == fails
+    assert failing(bent) == fails
 
 
 @pytest.mark.parametrize("kind", ["nominal", "errors", "watched errors at setpoint 0.6"])
-def test_a_band_that_is_a_little_too_narrow_is_left(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_a_band_that_is_a_little_too_narrow_is_left(kind: str) -> None:
     """By 2 %, a half of it on each side."""
 
     def bent(name: str, band: Band) -> Band:
         less = 0.01 * (band.high - band.low) * (name == kind)
         return replace(band, low=band.low + less, high=band.high - less)
 
-    assert failing(laws.share_law(), monkeypatch, bent) == ["adversarial trajectories that left the band"]
+    assert failing(bent) == ["adversarial trajectories that left the band"]
 
 
 FAULTS: dict[str, Policy] = {
@@ -406,7 +402,7 @@ def test_the_hole_is_the_law_beside_it_and_a_policy_without_depth_passes() -> No
     away = np.abs(points - laws.HOLE).sum(axis=1)
     assert set(lower[away < 0.0499]) == {3}
     assert set(lower[away > 0.0601]) == {0}
-    assert certify(laws.share_law_with_a_hole(0), FAST).passed
+    assert certify(laws.share_law_with_a_hole(0), replace(FAST, full_pumps=())).passed
 
 
 def e_above(where: float, k: float = 1e3) -> laws.Ramp:
@@ -452,12 +448,12 @@ NINETEEN: dict[str, Policy] = {
 
 
 def test_the_law_that_is_not_bent_passes() -> None:
-    assert certify(laws.bent_share_law(), FAST).passed
+    assert certify(laws.bent_share_law(), replace(FAST, full_pumps=())).passed
 
 
-@pytest.mark.parametrize("policy", NINETEEN.values(), ids=list(NINETEEN))
-def test_a_fault_by_another_hand_fails(policy: Policy) -> None:
-    assert not certify(policy, replace(FAST, full_pumps=())).passed
+@pytest.mark.parametrize("policy", [*FAULTS.values(), *NINETEEN.values()], ids=[*FAULTS, *NINETEEN])
+def test_a_planted_fault_or_one_by_another_hand_is_not_safe(policy: Policy) -> None:
+    assert not certify(policy, replace(FAST, full_pumps=())).safe
 
 
 WORSE: dict[str, tuple[Policy, float, tuple[float, float]]] = {
@@ -468,18 +464,17 @@ WORSE: dict[str, tuple[Policy, float, tuple[float, float]]] = {
 }
 
 
-@pytest.mark.parametrize("quick", [True, False], ids=["quick", "whole"])
 @pytest.mark.parametrize(("policy", "excess", "where"), WORSE.values(), ids=list(WORSE))
 def test_a_policy_that_is_a_little_worse_than_the_law_fails_by_how_much_it_is(
-    policy: Policy, excess: float, where: tuple[float, float], quick: bool
+    policy: Policy, excess: float, where: tuple[float, float]
 ) -> None:
     """Exact estimates: e' = s - v of the law is within 1/32.
 
     An offset of 0.04 is where e rests. Of even levels the nearest is within 1/16. With a gain of 1.5, e' = -e / 2
     within 1/32 rests within (1/32) / (1 - 1/2). Three levels less leave 3/16, which is in the middle of the hole.
     """
-    found = certify(policy, replace(FAST, quick=quick))
-    assert not found.passed
+    found = certify(policy, replace(FAST, quick=True))
+    assert not found.safe
     failed = {check.name: check for check in found.checks if not check.holds}
     nominal = failed["nominal: half-width over that of the law, periods of full pump"]
     assert nominal.value == pytest.approx(excess, abs=2e-3)
@@ -515,7 +510,7 @@ def test_no_dose_in_the_high_corner_fails() -> None:
     given = laws.share_law(add=(2, 0, 100.0))
     weights, biases = ([a.copy() for a in arrays] for arrays in (given.weights, given.biases))
     weights[0][:, 2], biases[0][2] = 50.0, -75.0
-    assert not certify(replace(given, weights=tuple(weights), biases=tuple(biases)), FAST).passed
+    assert not certify(replace(given, weights=tuple(weights), biases=tuple(biases)), replace(FAST, full_pumps=())).safe
 
 
 def test_samples_do_not_see_the_spike_and_the_proof_of_a_device_does() -> None:
@@ -531,13 +526,13 @@ def test_samples_do_not_see_the_spike_and_the_proof_of_a_device_does() -> None:
 
 def test_beyond_what_the_policy_sees_it_acts_as_at_the_edge() -> None:
     """No dose below -1.15: a culture of OD 0.05 at a setpoint of 1, e = -50, grows; its policy sees -1.15."""
-    found = certify(laws.share_law(), FAST)
+    found = proofs.proven(laws.share_law(), FAST)
     start = found.question.loop.range(found.question.cases[0])
     np.testing.assert_allclose(start[:, 0], np.log(0.05) / B)
     assert {case.name: case for case in found.question.cases}["nominal"].setpoint is None
     assert all(proof.grows.all() for proof in found.proofs)
     blind = replace(laws.share_law(), low=np.array([0.5, 0.05], np.float32))  # always sees too much
-    assert not certify(blind, FAST).passed
+    assert not certify(blind, replace(FAST, full_pumps=())).safe
 
 
 def test_growth_shares_that_were_not_trained_are_not_asked() -> None:

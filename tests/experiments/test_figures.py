@@ -643,7 +643,7 @@ def test_every_case_of_a_certificate_has_lines_of_its_own_with_a_gap_where_nothi
         assert line.get_label() == f"action {level} and higher"
         np.testing.assert_allclose(line.get_ydata(), depth)
     assert shown.get_suptitle() == (
-        f"Not certified: 1 of {len(found.checks)} requirements fail, first {found.checks[0].name}"
+        f"Not safe: 1 of {len(found.checks)} requirements fail, first {found.checks[0].name}"
     )
 
 

@@ -14,21 +14,19 @@ from envs.bench import Bench
 from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments import demo
-from experiments.certification import certificate
-from experiments.certification.config import CertifyConfig
-from experiments.certification.judge import certify
-from experiments.cli import files, frame
+from experiments.certification.judge import KINDS, PERFORMANCE, SAFETY, worst
+from experiments.cli import frame
 from experiments.cli.frame import UserError
 from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
 from experiments.control.policies import COMPOSITION_POLICY, composition_policy, find_policy, load_policy
 from experiments.laws import registry
-from experiments.laws.density.learned import settings
 from experiments.training.config import TrainConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.emulator.process import EmulatorProcess
 from hardware.simulated import SimulatedConfig
 from tests.experiments import laws
+from tests.experiments.proofs import proven, written
 
 TRAINED = {"updates": 36_000, "regret_pct": 0.1, "model": {"setpoints": [0.2, 0.6, 1.0]}}
 DOUBTFUL = {
@@ -42,61 +40,63 @@ DOUBTFUL = {
 doubtful = pytest.mark.parametrize(("metadata", "message"), DOUBTFUL.values(), ids=list(DOUBTFUL))
 
 
-def certified(path: Path, given: policy.Policy) -> None:
-    """Save a policy with its certificate."""
-    policy.save(path, given)
-    asked = CertifyConfig(env=EnvConfig(), setpoints=(0.4, 0.8), trajectories=0)
-    content = certificate.content(given, settings(given), asked, certify(given, asked))
-    files.write_json(certificate.beside(path), content)
-
-
 def deployed(tmp_path: Path, metadata: dict[str, Any], **changes: Any) -> DeployConfig:
     """The config of a run at 0.8, 0.65 and 0.5 with a certified policy of this training."""
     given = laws.law()
-    certified(tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, **metadata}))
+    written(tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, **metadata}))
     scenario = Scenario((0.8, 0.65, 0.5), (30.0,) * 3, (37.0,) * 3)
     return DeployConfig(**{"scenario": scenario, "policy": str(tmp_path / "given.npz"), **changes})
 
 
 @doubtful
-def test_a_doubtful_policy_is_kept_from_a_culture(
-    tmp_path: Path, metadata: dict[str, Any], message: str, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("backend", [SimulatedConfig(), EmulatorConfig(), ChiBioConfig()], ids=lambda b: b.kind)
+def test_what_a_training_lacks_is_warned_of_where_the_policy_is_proven_to_be_safe(
+    tmp_path: Path, metadata: dict[str, Any], message: str, backend: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """In one line, which is the error."""
-    config = deployed(tmp_path, metadata, backend=ChiBioConfig())
-    with pytest.raises(UserError, match=rf"policy refused: .*{message}.*; force_policy=true runs it all the same"):
-        assemble.unpack(config, tmp_path)
-    assert not [record for record in caplog.records if record.levelname == "WARNING"]
-
-
-@doubtful
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"backend": SimulatedConfig()},
-        {"backend": EmulatorConfig()},
-        {"backend": ChiBioConfig(), "force_policy": True},
-        {"backend": ChiBioConfig(), "resume": "RUN"},  # its culture is in the vial already
-    ],
-    ids=["sim", "emulator", "forced", "resumed"],
-)
-def test_elsewhere_it_is_warned_of(
-    tmp_path: Path, metadata: dict[str, Any], message: str, changes: dict[str, Any], caplog: pytest.LogCaptureFixture
-) -> None:
+    changes = {"backend": backend}
     assert assemble.unpack(deployed(tmp_path, metadata, **changes), tmp_path).policy is not None
     warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(warned) == 1
     assert re.search(message, warned[0])
 
 
+@pytest.mark.parametrize(
+    ("changes", "refused"),
+    [({}, True), ({"force_policy": True}, False), ({"resume": "RUN"}, False)],  # its culture is in the vial already
+    ids=["new", "forced", "resumed"],
+)
+def test_a_policy_that_is_not_safe_is_kept_from_a_culture_with_all_that_it_lacks_in_one_line(
+    tmp_path: Path, changes: dict[str, Any], refused: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What its certificate says, what its performance and its training lack, and the one word that runs it."""
+    config = deployed(tmp_path, {"regret_pct": 127.0, "updates": 0}, backend=ChiBioConfig(), **changes)
+    written(tmp_path / "given.npz", replace(laws.high_corner(), metadata=policy.load(tmp_path / "given.npz").metadata))
+    if refused:
+        with pytest.raises(UserError, match=r"^policy refused: .*; force_policy=true runs it all the same$") as caught:
+            assemble.unpack(config, tmp_path)
+        assert not caplog.messages
+        said = str(caught.value)
+    else:
+        assert assemble.unpack(config, tmp_path).policy is not None
+        said = " ".join(caplog.messages)
+    failed = [check for check in proven(laws.high_corner()).checks if not check.holds]
+    assert {check.kind for check in failed} == {SAFETY, PERFORMANCE}
+    for kind in KINDS:
+        assert all(str(check) in said for check in worst(check for check in failed if check.kind == kind))
+    assert "its regret is 127 %" in said
+    assert "before the first update" in said
+    assert "\n" not in said
+
+
 @pytest.mark.parametrize("reactor", ["M0", "M1"])
 def test_setpoints_of_a_single_reactor_are_judged_as_those_of_all(reactor: str, tmp_path: Path) -> None:
     """Trained up to 1.0, certified up to 0.8; asked for by one reactor alone."""
     devices = ChiBioConfig(reactors=("M0", "M1"))
-    for setpoint, said in ((1.1, "trained for setpoints 0.2 to 1, the scenario asks for 1.1"), (0.9, "certif.* 0.9")):
-        asked = {reactor: {"setpoints": [0.8, setpoint, 0.5]}}
-        with pytest.raises(UserError, match=rf"policy refused: .*{said}"):
-            assemble.unpack(deployed(tmp_path, {}, backend=devices, each=asked), tmp_path)
+    asked = {reactor: {"setpoints": [0.8, 0.9, 0.5]}}
+    with pytest.raises(
+        UserError, match=r"policy refused: it is certified for setpoints 0\.4 to 0\.8, .* asks for 0\.9 "
+    ):
+        assemble.unpack(deployed(tmp_path, {}, backend=devices, each=asked), tmp_path)
     within = {reactor: {"setpoints": [0.7, 0.6, 0.4]}}
     assert assemble.unpack(deployed(tmp_path, {}, backend=devices, each=within), tmp_path).policy is not None
 
@@ -159,7 +159,7 @@ def test_a_file_of_an_earlier_version_runs_and_says_what_is_not_known(
     given = laws.law()
     model = {key: value for key, value in given.metadata["model"].items() if key != "setpoints"}
     said = {**given.metadata, "model": model, "regret_pct": 0.1}  # its regret and its control period
-    certified(tmp_path / "given.npz", replace(given, metadata=said))
+    written(tmp_path / "given.npz", replace(given, metadata=said))
     config = DeployConfig(backend=ChiBioConfig(), policy=str(tmp_path / "given.npz"))
     with caplog.at_level("INFO"):
         assemble.unpack(config, tmp_path)
@@ -220,11 +220,9 @@ def test_latest_is_what_train_or_demo_wrote_last(tmp_path: Path, monkeypatch: py
     [
         ("latest", {}, "policy=latest: no training run under runs/", "python -m experiments.train", False),
         ("nowhere.npz", {}, "policy nowhere.npz: no such file", "give another policy=PATH", True),
-        ("given.npz", {"at_stake": True}, "its regret is 127 %, more than poor_regret_pct = 10 %",
-         "force_policy=true runs it all the same", True),
+        ("given.npz", {"at_stake": True}, "it has no certificate", "force_policy=true runs it all the same", True),
         ("given.npz", {"at_stake": True, "forced": True}, "its regret is 127 %",
          "a device refuses it without force_policy=true", False),
-        ("given.npz", {}, "its regret is 127 %", "a device refuses it without force_policy=true", False),
     ],
 )  # fmt: skip
 def test_a_look_at_a_policy_says_what_is_wrong_with_it_and_whether_a_run_would_begin(
@@ -239,6 +237,19 @@ def test_a_look_at_a_policy_says_what_is_wrong_with_it_and_whether_a_run_would_b
     assert (found.name, found.remedy, found.required) == ("policy", remedy, required)
     assert said in found.detail
     assert not found.ok
+
+
+@pytest.mark.parametrize("at_stake", [False, True])
+def test_a_look_at_a_policy_that_only_lacks_performance_passes_and_says_so(at_stake: bool, tmp_path: Path) -> None:
+    given = laws.law()
+    source = written(
+        tmp_path / "given.npz", replace(given, metadata={**given.metadata, **TRAINED, "regret_pct": 127.0})
+    )
+    asked = policies.Wanted(str(source), Bench(), EnvConfig(), {}, (0.5,), 10.0, at_stake=at_stake, forced=False)
+    found = policies.policy_check(asked)
+    assert found.ok
+    assert "its regret is 127 %, more than poor_regret_pct = 10 %" in found.detail
+    assert ("proven to be safe" in found.detail) is at_stake
 
 
 @pytest.fixture(scope="module")
@@ -268,13 +279,13 @@ def test_the_device_is_looked_at_before_anything_was_trained(
     assert lines(replace(config, controller=registry.config("pi")), tmp_path, caplog) == []
 
 
-def test_a_preflight_says_that_a_policy_would_be_refused(
+def test_a_preflight_says_whether_a_policy_would_be_refused(
     device: ChiBioConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    config = deployed(tmp_path, {"regret_pct": 127_981.0}, backend=device, preflight_only=True)
-    with pytest.raises(UserError, match=r"preflight: 1 of \d+ checks failed, the first: FAIL  policy: its regret is"):
-        lines(config, tmp_path, caplog)
-    caplog.clear()
-    assert lines(deployed(tmp_path, {}, backend=device, preflight_only=True), tmp_path, caplog) == [
-        "pass  policy: regret 0.1 % against the optimum of its model, setpoints 0.2 to 1"
+    config = deployed(tmp_path, {}, backend=device, preflight_only=True)
+    assert lines(config, tmp_path, caplog) == [
+        "pass  policy: regret 0.1 % against the optimum of its model, setpoints 0.2 to 1, proven to be safe"
     ]
+    written(tmp_path / "given.npz", laws.high_corner())
+    with pytest.raises(UserError, match=r"preflight: 1 of \d+ checks failed, the first: FAIL  policy: .* not safe: "):
+        lines(config, tmp_path, caplog)

@@ -85,7 +85,7 @@ def test_it_is_what_its_command_trains() -> None:
 def test_it_has_the_certificate_that_a_device_asks_for() -> None:
     shipped = policies.load(SHIPPED)
     run = [0.2, 0.5, 1.0], Bench(), EnvConfig(), "shipped"
-    assert certificate.doubts(shipped, settings(shipped), SHIPPED, *run) == []
+    assert certificate.judged(shipped, settings(shipped), SHIPPED, *run) == certificate.Opinion([], [])
     bounds = certificate.bounds(shipped, settings(shipped), SHIPPED, EnvConfig())
     assert bounds is not None
     assert bounds.full_pump == pytest.approx(0.02 * 1.0 / (1 / 3))

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from conf import presets
+from dqn import policy as policies
 from experiments.cli import frame
 from experiments.control import assemble
 from experiments.control.timetable import timetable
@@ -20,6 +21,7 @@ from experiments.deploy import main
 from hardware import family
 from hardware.storage.journal import read_journal
 from tests.evolver_stub import VIALS, EvolverStub
+from tests.experiments import laws
 from tests.programs import ROOT, Program, run
 
 DRIVER = ROOT / "tests" / "evolver.py"
@@ -94,7 +96,8 @@ def test_what_it_cannot_do_is_refused(known: None, tmp_path: Path, given: list[s
 
 
 def test_a_culture_is_at_stake(known: None, tmp_path: Path) -> None:
-    poor = ["controller=dqn", "poor_regret_pct=1e-6"]
+    policies.save(tmp_path / "policy.npz", laws.law())
+    poor = ["controller=dqn", f"policy={tmp_path / 'policy.npz'}"]
     with pytest.raises(frame.UserError, match="policy refused: .*force_policy=true runs it all the same"):
         assemble.unpack(main.config(words(AWAY, *poor)), tmp_path)
     assert assemble.unpack(main.config(words(AWAY, *poor, "force_policy=true")), tmp_path).policy is not None
