@@ -19,9 +19,10 @@ from experiments.cli import stop
 
 __all__ = ["main"]
 
-LOADED = (
-    "matplotlib.pyplot", "scipy.optimize", "torch.utils.tensorboard", "hardware.emulator.family",
-    *(f"experiments.{name}" for name in ("calibrate", "train", "certify", "deploy", "report")),
+FIRST = ("matplotlib.pyplot", "scipy.optimize", "experiments.calibrate")  # what the first command needs
+OTHERS = (
+    "torch.utils.tensorboard", "hardware.emulator.family",
+    *(f"experiments.{name}" for name in ("train", "certify", "deploy", "report")),
 )  # fmt: skip
 PLAN = """\
 The demo runs five commands, in about 15 s:
@@ -75,12 +76,15 @@ def _run(arguments: list[str]) -> None:
 def step(arguments: list[str], signals: list[int]) -> int:
     """Run one command to its end; return its exit status, or that of a stopped command.
 
-    It has a session of its own, so that a signal reaches it once, from here, however it was sent.
+    It has a session of its own, so that a signal reaches it once, from here, however it was sent. Meanwhile this process
+    loads what later commands need.
     Args: signals: come in here; each is passed on.
     """
     process, stopped = multiprocessing.get_context("fork").Process(target=_run, args=(arguments,)), False
     with _held(stop.SIGNALS):
         process.start()
+    for module in OTHERS:
+        import_module(module)
     while process.is_alive():
         while signals:
             assert process.pid is not None
@@ -102,7 +106,7 @@ def main() -> None:
     print(PLAN.format(folder=folder), flush=True)
     signals: list[int] = []
     with stop.handled(lambda number, _: signals.append(number), *stop.SIGNALS):
-        for module in LOADED:
+        for module in FIRST:
             import_module(module)
         for name, *overrides in commands(folder):
             print("\n$ python -m", f"experiments.{name}", *overrides, flush=True)

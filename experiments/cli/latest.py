@@ -10,7 +10,7 @@ WRITTEN = {
     "env_file": (("calibrate/**/calibrated.yaml", "demo/*/1_calibrate/calibrated.yaml"), "calibrate"),
     "plant_file": (("calibrate/**/twin.yaml", "demo/*/1_calibrate/twin.yaml"), "calibrate"),
     "runs": (("*/*/sweep.json",), "train -m 'seed=range(0,4)'"),
-    "run": (("deploy/*/recordings", "demo/*/3_deploy/recordings"), "deploy"),
+    "run": (("deploy/*/recordings", "demo/*/4_deploy/recordings"), "deploy"),
 }
 """Key -> where its files are below runs/, and the command that writes them."""
 FOLDERS = ("resume", "runs", "run")  # keys that are given the folder of the file that is found

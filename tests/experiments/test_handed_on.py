@@ -104,7 +104,7 @@ def test_latest_is_the_file_that_was_written_last_or_its_folder(
         "runs/calibrate/b/calibrated.yaml", "runs/calibrate/b/twin.yaml", "runs/demo/z/1_calibrate/calibrated.yaml",
         "runs/demo/a/1_calibrate/calibrated.yaml", "runs/calibrate/a/twin.yaml", "runs/train/c/checkpoint.pt",
         "runs/train/b/sweep.json", "runs/train/a/checkpoint.pt", "runs/deploy/y/state.json", "runs/deploy/x/state.json",
-        "runs/deploy/y/recordings", "runs/demo/a/3_deploy/recordings",
+        "runs/deploy/y/recordings", "runs/demo/a/4_deploy/recordings",
     ]  # fmt: skip
     for age, name in enumerate(written):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -118,7 +118,7 @@ def test_latest_is_the_file_that_was_written_last_or_its_folder(
         ("resume=latest", "deploy"): "resume=runs/deploy/x",
         ("runs=latest", "report"): "runs=runs/train/b",
         ("run=latest", "report"): "run=latest",
-        ("run=latest", "mark"): "run=runs/demo/a/3_deploy",
+        ("run=latest", "mark"): "run=runs/demo/a/4_deploy",
         ("policy=latest", "deploy"): "policy=latest",
         ("env_file=x.yaml", "train"): "env_file=x.yaml",
     }

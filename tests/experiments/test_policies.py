@@ -15,13 +15,11 @@ from envs.scenario import Scenario
 from envs.task import EnvConfig
 from experiments import demo
 from experiments.certification.judge import KINDS, PERFORMANCE, SAFETY, worst
-from experiments.cli import frame
 from experiments.cli.frame import UserError
 from experiments.control import assemble, policies
 from experiments.control.config import DeployConfig
 from experiments.control.policies import COMPOSITION_POLICY, composition_policy, find_policy, load_policy
 from experiments.laws import registry
-from experiments.training.config import TrainConfig
 from hardware.chibio.config import ChiBioConfig, EmulatorConfig
 from hardware.emulator.process import EmulatorProcess
 from hardware.simulated import SimulatedConfig
@@ -166,32 +164,25 @@ def test_a_file_of_an_earlier_version_runs_and_says_what_is_not_known(
     assert "it does not say updates, trained setpoints: an earlier version wrote it" in caplog.text
 
 
-def test_the_demo_trains_until_the_policy_is_within_the_limits() -> None:
-    _, train, *_ = demo.commands(Path("runs/demo/now"))
-    assert train[:2] == ["-m", "experiments.train"]
-    given = [word for word in train[2:] if not word.startswith(("hydra.", "env_file="))]
-    config = frame.load(frame.compose("train", given), TrainConfig())
-    assert config.stop_within == 1.0
-
-
 def test_each_step_of_the_demo_takes_what_the_step_before_it_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Calibrated, trained on that, flown with both, reported as one; a step that fails is the last one."""
+    """Calibrated, trained on that, certified, run by the device, reported as one; a step that fails is the last one."""
     place = Path("runs/demo/now")
-    steps = {words[1]: dict(word.split("=", 1) for word in words[2:]) for words in demo.commands(place)}
-    folders = {f"experiments.{name}": f"{place}/{k}_{name}" for k, name in
-               enumerate(("calibrate", "train", "deploy", "report"), 1)}  # fmt: skip
+    steps = {name: dict(word.split("=", 1) for word in words) for name, *words in demo.commands(place)}
+    folders = {
+        name: f"{place}/{k}_{name}" for k, name in enumerate(("calibrate", "train", "certify", "deploy", "report"), 1)
+    }
     assert {name: given["hydra.run.dir"] for name, given in steps.items()} == folders
-    calibrated = f"{place}/1_calibrate/calibrated.yaml"
-    assert [steps[f"experiments.{name}"]["env_file"] for name in ("train", "deploy")] == [calibrated] * 2
-    assert steps["experiments.deploy"]["policy"] == f"{place}/2_train/policy.npz"
-    assert steps["experiments.report"]["run"] == str(place)
+    assert steps["train"]["env_file"] == f"{place}/1_calibrate/calibrated.yaml"
+    assert [steps[name]["policy"] for name in ("certify", "deploy")] == [f"{place}/2_train/policy.npz"] * 2
+    assert steps["deploy"]["backend"] == "emulator"
+    assert steps["report"]["run"] == str(place)
     ran: list[str] = []
-    status = {"experiments.deploy": 3}
-    monkeypatch.setattr(demo, "step", lambda words, signals: (ran.append(words[1]), status.get(words[1], 0))[1])
+    status = {"deploy": 3}
+    monkeypatch.setattr(demo, "step", lambda words, signals: (ran.append(words[0]), status.get(words[0], 0))[1])
     monkeypatch.setattr("sys.argv", ["demo"])
     with pytest.raises(SystemExit) as ended:
         demo.main()
-    assert (ended.value.code, ran) == (3, list(folders)[:3])
+    assert (ended.value.code, ran) == (3, list(folders)[:4])
     status.clear()
     ran.clear()
     demo.main()
@@ -201,7 +192,7 @@ def test_each_step_of_the_demo_takes_what_the_step_before_it_left(monkeypatch: p
 def test_latest_is_what_train_or_demo_wrote_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Copies of policies that runs of a controller keep are none."""
     monkeypatch.chdir(tmp_path)
-    _, learned, flown, _ = (
+    _, learned, _, flown, _ = (
         Path(step[-1].removeprefix("hydra.run.dir=")) / "policy.npz" for step in demo.commands(Path("runs/demo/now"))
     )
     swept = Path("runs/train/then_sweep/3/policy.npz")
