@@ -76,8 +76,8 @@ def _run(arguments: list[str]) -> None:
 def step(arguments: list[str], signals: list[int]) -> int:
     """Run one command to its end; return its exit status, or that of a stopped command.
 
-    It has a session of its own, so that a signal reaches it once, from here, however it was sent. Meanwhile this process
-    loads what later commands need.
+    It has a session of its own, so that a signal reaches it once, from here, however it was sent. Meanwhile this
+    process loads what later commands need.
     Args: signals: come in here; each is passed on.
     """
     process, stopped = multiprocessing.get_context("fork").Process(target=_run, args=(arguments,)), False

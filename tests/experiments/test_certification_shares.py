@@ -355,6 +355,7 @@ def failing(bent: Callable[[str, Band], Band]) -> list[str]:
     return [check.name for check in checks if not check.holds]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [-1, 1], ids=["below", "above"])
 @pytest.mark.parametrize(
     ("kind", "wider", "fails"),
@@ -375,6 +376,7 @@ def test_a_band_that_is_too_wide_is_not_reached(kind: str, wider: float, fails: 
     assert failing(bent) == fails
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["nominal", "errors", "watched errors at setpoint 0.6"])
 def test_a_band_that_is_a_little_too_narrow_is_left(kind: str) -> None:
     """By 2 %, a half of it on each side."""

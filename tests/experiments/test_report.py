@@ -348,12 +348,12 @@ def test_powers_of_ten_are_written_as_numbers(tmp_path):
 
 def test_several_runs_begin_with_what_each_came_to(tmp_path):
     for name, passed in (("1_first", True), ("2_second", False)):
-        checks = [{"name": f"{name}'s", "holds": passed}]
+        checks = [{"name": f"{name}'s", "holds": passed, "kind": "safety"}]
         found = {"cannot_hold": [], "observation": [name], "passed": passed, "checks": checks}
         run_folder(tmp_path / "both" / name, found)
     text = re.sub(r"<[^>]*>", " ", report.write(tmp_path / "both").read_text(encoding="utf-8"))
-    order = ["Certificate of a policy for 1_first", "Good: certified", "Certificate of a policy for 2_second",
-             "Not certified. What helps", "First: results", "First: what was run", "Second: results"]  # fmt: skip
+    order = ["Certificate of a policy for 1_first", "Good: safe", "Certificate of a policy for 2_second",
+             "Not safe: a device refuses it", "First: results", "First: what was run", "Second: results"]  # fmt: skip
     places = [text.rindex(words) for words in order[:4]] + [text.rindex(words) for words in order[4:]]
     assert places == sorted(places)
     assert [text.count(words) for words in order[:4]] == [1, 1, 1, 1]
