@@ -79,7 +79,8 @@ class SimulatedReactors:
         """Dose once within the coming control period. Raises: nothing."""
         volume = np.where(command.rows, command.pump_rate, 0.0) * 60.0 * self.control_min
         self._feed_s = volume / self.config.pump_ml_s
-        self._target = np.where(command.rows, command.temperature, np.nan)
+        asked = command.rows & ~np.isnan(command.temperature)
+        self._target = np.where(asked, command.temperature, self._target)
         return Receipt(volume_ml=volume)
 
     def repeated(self) -> list[tuple[float, Receipt]]:

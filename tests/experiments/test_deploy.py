@@ -340,6 +340,10 @@ def test_what_is_switched_off_is_off_in_its_own_vial_alone():
     assert reactors.heat_off(second) == []
     reactors.measure()
     assert plant.thermal.target.tolist() == [38.0, 0.0]
+    assert reactors.heat_off(np.array([True, False])) == []
+    reactors.actuate(Command(np.array([True, True]), np.zeros(2), np.array([np.nan, 35.0])))  # as the loop goes on
+    reactors.measure()
+    assert plant.thermal.target.tolist() == [0.0, 35.0]
     [said] = reactors.regulate(second, np.full(2, 0.5))
     assert said.startswith("B: ")
 
