@@ -5,6 +5,7 @@ reads, with less work for the long ones; `-m campaign` runs all the others.
 """
 
 import importlib
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -29,7 +30,6 @@ SHOWN = {
     if words[0] not in OTHERS
 }
 RECORDINGS = "RECORDING.csv", "FILE.csv", "chibio_ecoli_dither.csv"
-SHIPPED = "+experiment=shipped"  # a minute; to its end it gives the policy that ships, which is put in its place
 LESS = {
     "tests.campaigns.rig_study": ['overrides=[scenario.recovery_od=0.7,"scenario.minutes=[3,3,3]"]'],
     "experiments.train": ["agent.total_steps=300", "agent.learn_start=100", "n_agents=2"],
@@ -107,7 +107,8 @@ def shorter(words: list[str]) -> list[str]:
 README = {
     " ".join(words): words
     for words in commands(ROOT / "README.md")
-    if words[0] not in ("turbidostat", "experiments.demo") and not needs_hardware(words)
+    if words[0] not in ("turbidostat", "experiments.demo", "experiments.certify", "hardware.emulator")
+    and not needs_hardware(words)
 }
 QUICK = "experiments", "experiments.calibrate", "experiments.train env_file=latest", "experiments.deploy policy=latest"
 """Lines of every run of the suite; their figures are blank."""
@@ -119,7 +120,7 @@ def before(shown: str) -> str | None:
     if "_file=latest" in shown or "report" in shown:
         writer = "-m " if "runs=" in shown else "calibrate"
     elif "policy=latest" in shown:
-        writer = SHIPPED if "certify" in shown else "train env_file=latest"
+        writer = "train env_file=latest"
     else:
         writer = "stop_within" if "resume=latest" in shown else None
     return None if writer is None else next(line for line in lines if writer in line)
@@ -136,9 +137,6 @@ def lived(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
             shutil.copytree(typed(earlier), folder, dirs_exist_ok=True)
         plain = {"WITHOUT_FIGURES": "1"} if shown in QUICK else {}
         run(shorter(README[shown]), folder, **plain)
-        if SHIPPED in shown:
-            newest = max(folder.glob("runs/train/*/policy.npz"), key=lambda path: path.stat().st_mtime)
-            shutil.copy(ROOT / "dqn" / "shipped" / "policy.npz", newest)
         return folder
 
     return typed
@@ -151,6 +149,29 @@ def lived(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
 )
 def test_a_line_of_the_readme_works(shown: str, lived: Callable[[str], Path]) -> None:
     lived(shown)
+
+
+@pytest.mark.numeric
+@pytest.mark.slow
+def test_the_way_of_the_readme_from_a_recording_to_the_device_is_completed(tmp_path: Path) -> None:
+    """Calibrate, train, certify, preflight, run: by the Chi.Bio driver over sockets, and nothing is forced."""
+    lines = list(commands(ROOT / "README.md"))
+    [server] = [words for words in lines if words[0] == "hardware.emulator"]
+    [check, deploy] = [words for words in lines if any(word.startswith("backend.url=") for word in words)]
+    run(["experiments.calibrate"], tmp_path)
+    run(["experiments.train", "env_file=latest", "stop_within=2"], tmp_path)
+    refused = programs.run(*deploy, cwd=tmp_path)
+    assert (refused.returncode, "force_policy" in refused.stderr) == (1, True)
+    run(["experiments.certify", "policy=latest"], tmp_path)
+    with programs.Program(*server, "--port", "0", cwd=tmp_path, out=tmp_path / "said") as device:
+        device.until(lambda: "emulator ready" in device.said())
+        [url] = re.findall(r"ready: (http://\S+)", device.said())
+        here = [f"backend.url={url}" if word.startswith("backend.url=") else word for word in deploy]
+        run([*here, "preflight_only=true"], tmp_path)
+        run([*here, "scenario.minutes=[3,2,2]", "scenario.recovery_od=0.3"], tmp_path)
+    assert set(check) - set(deploy) == {"preflight_only=true"}
+    [summary] = tmp_path.glob("runs/deploy/*/summary.json")
+    assert json.loads(summary.read_text())["outcome"] == "completed"
 
 
 def test_the_readme_has_lines_that_need_no_hardware() -> None:

@@ -194,6 +194,8 @@ def judged(
         return Opinion([f"its certificate {path} is damaged ({why}; {remedy})"])
     if reason := _unfit(stored, policy, settings, path, setpoints, remedy):
         return Opinion([reason], _short(stored.failed, stored))
+    if reason := _other_pump(policy, stored.config, bench, model):
+        return Opinion([reason], _short(stored.failed, stored))
     try:
         again = recheck(policy, on_bench(policy, stored.config, bench, model), sorted(set(setpoints)))
     except CertificationError as error:
@@ -226,6 +228,21 @@ def _unfit(
         more = f"{remedy} 'setpoints=[LOW,HIGH]'"
         return f"it is certified for setpoints {low:g} to {high:g}, the scenario asks for {asked} ({more})"
     return ""
+
+
+def _other_pump(policy: Policy, config: CertifyConfig, bench: Bench, model: EnvConfig) -> str:
+    """Return why a policy of the OD does not suit the pump of a run, with the remedy; "" where it does.
+
+    It is proven for a tau within `uncertainty` of the one that it was trained for; one of relative coordinates for any.
+    """
+    if policy.observation == RELATIVE:
+        return ""
+    tau = model_of(policy, config).tau * bench.tau / config.bench.tau
+    if abs(model.tau / tau - 1.0) <= config.uncertainty:
+        return ""
+    share = 100.0 * config.uncertainty
+    remedy = "give env_file=CALIBRATED.yaml of the calibration that it was trained on, or train for this pump"
+    return f"it is proven for tau = {tau:.3g} +- {share:.0f} %, this run has tau = {model.tau:.3g} ({remedy})"
 
 
 def _listed(checks: Sequence[Check]) -> str:

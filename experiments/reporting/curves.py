@@ -81,7 +81,6 @@ CURVES = {
     "controller/bias_p": Curve("", "relative error of the second species' growth curve, as estimated"),
     "controller/bias_e_sd": Curve("", "how unsure the first of these errors is, sd"),
     "controller/bias_p_sd": Curve("", "how unsure the second of these errors is, sd"),
-    "controller/policy": Curve("", "number of the policy of the share in force, 0 for the one that the run began with"),
     "controller/thermometer_error": Curve("degC", "true less measured temperature, as estimated"),
     "controller/dose_spread": Curve("", "sd of a dose over its size, as estimated, at least as configured"),
     "controller/dose_gain": Curve("", "dose over the dose that was asked for, as estimated"),

@@ -103,6 +103,17 @@ def concluded(given: policy.Policy, path: Path) -> certificate.Opinion:
     return certificate.judged(given, settings(given), path, SCENARIO.setpoints, Bench(), EnvConfig(), "mine")
 
 
+@pytest.mark.parametrize("factor", [0.4, 0.69, 0.72, 1.28, 1.32, 4.0])
+def test_a_device_refuses_a_policy_that_is_proven_for_another_pump(factor: float, tmp_path: Path) -> None:
+    """At a vial of 14 mL, whose tau is .7 of that of 20 mL with the same pump; +-30 % is what is proven."""
+    given, bench = laws.law(), Bench(volume_ml=14.0)
+    path = written(tmp_path / "policy.npz", given)
+    run = EnvConfig(tau=0.7 * EnvConfig().tau * factor)
+    found = certificate.judged(given, settings(given), path, SCENARIO.setpoints, bench, run, "mine")
+    other = [reason for reason in found.refused if f"this run has tau = {run.tau:.3g}" in reason]
+    assert bool(other) == (not 0.7 <= factor <= 1.3)
+
+
 @pytest.mark.parametrize("share", [False, True], ids=["OD", "relative"])
 def test_a_device_refuses_for_each_requirement_of_safety_and_tells_each_of_performance(
     share: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -161,7 +172,7 @@ def test_what_only_lacks_performance_runs_on_a_device_with_its_numbers_told(
     assert found
     assert all(check.kind == PERFORMANCE for check in found)
     assert all(str(check) in warned for check in worst(found))
-    check = policy_check(replace(wanted, bench=bench))
+    check = policy_check(replace(wanted, bench=bench, model=EnvConfig(tau=bench.tau)))
     assert check.ok
     assert all(str(one) in check.detail for one in worst(found))
     weak, grown = Bench(volume_ml=28.0), replace(ASKED, env=EnvConfig(mu=0.0432))
