@@ -16,7 +16,7 @@ ROOMS := conf dqn envs experiments hardware $(sort $(patsubst %/,%,$(dir $(wildc
 .DELETE_ON_ERROR:
 
 $(STAMP): pyproject.toml constraints.txt
-	@echo "Setting up $(VENV), once: Python packages of about 1 GB, one to three minutes."
+	@echo "Setting up $(VENV), once: Python packages of 1.7 GB, one to three minutes."
 	@$(PYTHON) -c 'import sys; sys.exit("error: Python %d.%d is too old: allowed 3.11 and newer; make PYTHON=python3.11" % sys.version_info[:2] if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
