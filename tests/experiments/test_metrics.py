@@ -93,7 +93,10 @@ def test_a_later_window_counts_from_its_own_start_on_either_side_of_its_setpoint
     assert m.settling_min.tolist() == [12.0, 20.0]
     whole = [(11 * 0.1 + 0.06 + 18 * 0.02) / 30.0, (19 * 0.1 + 0.06 + 10 * 0.02) / 30.0]  # trapezia of |e|
     np.testing.assert_allclose(m.abs_error, whole)
-    np.testing.assert_allclose(m.ise, [11 * 0.01 + 0.0052 + 18 * 0.0004, 19 * 0.01 + 0.0052 + 10 * 0.0004])
+    ise = np.array([11 * 0.01 + 0.0052 + 18 * 0.0004, 19 * 0.01 + 0.0052 + 10 * 0.0004])
+    np.testing.assert_allclose(m.ise, ise)
+    np.testing.assert_allclose(m.ise_mean, ise / 30.0)
+    np.testing.assert_allclose(m.itae_mean, m.itae / 30.0)
 
 
 def test_the_steady_error_is_that_of_the_last_ten_minutes_with_both_their_ends() -> None:
