@@ -504,8 +504,9 @@ def test_bounds_of_an_estimator_depend_on_the_od_and_return_from_a_file() -> Non
     assert EstimateBounds.of(json.loads(json.dumps(asdict(bounds)))) == bounds
 
 
-def test_the_shipped_policy_has_its_certificate() -> None:
-    """Proven again, and attacked by few in every case."""
+@pytest.mark.parametrize("full_pumps", [(0.03,), pytest.param(None, marks=pytest.mark.slow)], ids=["one", "all"])
+def test_the_shipped_policy_has_its_certificate(full_pumps: tuple[float, ...] | None) -> None:
+    """Proven again, for one further B or for all, and attacked by few in every case."""
     shipped = find_policy("shipped")
     given = policy.load(shipped)
     stored = certificate.load(certificate.beside(shipped))
@@ -513,7 +514,7 @@ def test_the_shipped_policy_has_its_certificate() -> None:
     assert stored.safe
     assert stored.passed
     assert not stored.config.quick
-    found = certify(given, replace(stored.config, trajectories=0))
+    found = certify(given, replace(stored.config, trajectories=0, full_pumps=full_pumps or stored.config.full_pumps))
     assert found.passed
     assert [attacked(given, found.question.loop, proof, 184)[0] for proof in found.proofs] == [0] * len(found.proofs)
     assert stored.config.trajectories == CertifyConfig().trajectories == 20_000
