@@ -185,9 +185,10 @@ def test_an_overflow_pump_runs_over_doses_and_a_kill_and_is_off_after_every_othe
     state = folder / "state.json"
 
     def until_fed(bench: Bench) -> None:
-        """Until a dose is given beside a running overflow pump."""
+        """Until each reactor has a row and a dose is given beside a running overflow pump."""
         both = [{f"{name}/Pump1", f"{name}/Pump3"} for name in ("M0", "M1")]
-        bench.client.until(lambda: state.exists() and any(pumps <= set(bench.motors()) for pumps in both))
+        bench.client.until(lambda: state.exists() and all(volumes(folder, name) for name in ("M0", "M1")))
+        bench.client.until(lambda: any(pumps <= set(bench.motors()) for pumps in both))
 
     with EmulatorProcess(
         ["--reactors", "M0,M1", "--speed", str(SPEED), "--od", "0.5", "--overflow-pump", "Pump3"]
