@@ -1,4 +1,4 @@
-"""Fit growth curves and pigment of two species: `python -m experiments.calibrate_pair first=[A.csv] second=[B.csv]`.
+"""Fit growth curves and pigment: `python -m experiments.calibrate_pair 'first=[A.csv]' 'second=[B.csv]'`.
 
 Each species is recorded alone, at three temperatures or more. A mixed run with counted shares corrects both curves.
 """

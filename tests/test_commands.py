@@ -6,8 +6,11 @@ reads, with less work for the long ones; `-m campaign` runs all the others.
 
 import importlib
 import json
+import os
 import re
+import shlex
 import shutil
+import subprocess
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -15,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from tests import programs
-from tests.documented import PAGES, ROOT, commands, needs_hardware
+from tests.documented import OPEN, PAGES, ROOT, commands, needs_hardware
 from tests.patience import PATIENCE_S
 
 OTHERS = (
@@ -77,6 +80,24 @@ def test_a_command_of_the_pages_is_one_that_the_program_takes(
         given = [re.sub(r",.*$", "", w.replace("=range(", "=")) for w in given]
     assert (ROOT / f"{program.replace('.', '/')}.py").is_file()
     importlib.import_module(program).main.config(given)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_a_shell_passes_the_words_of_every_line_on_as_they_stand(shell: str, tmp_path: Path) -> None:
+    """Pages and the comments of the presets, which `--help` prints; zsh refuses a bracket that is not quoted."""
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    presets = [path for room in ("conf", "tests") for path in (ROOT / room).rglob("*.yaml")]
+    text = re.sub(r"\\\n\s*", "", "\n".join(path.read_text(encoding="utf-8") for path in (*PAGES, *presets)))
+    shown = re.findall(r"(?:^ {4}|^# {3}|`)(python -m .*?)(?= {2}|`|$| \| | > | #)", text, re.MULTILINE)
+    lines = [line for line in shown if not OPEN.search(line)]
+    script = "\n".join(["python() { printf '%s\\n' \"$*\"; }", *lines])
+    plain = {"PATH": os.environ["PATH"], "HOME": "$HOME"}
+    done = subprocess.run(
+        [shell, "-c", script], cwd=tmp_path, env=plain, capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert done.stderr == ""
+    assert done.stdout.splitlines() == [" ".join(shlex.split(line)[1:]) for line in lines]
 
 
 def test_the_pages_have_commands_at_all() -> None:
