@@ -151,20 +151,21 @@ def test_a_file_of_one_s_own_that_does_not_load_is_one_line(
 
 
 def test_cleanrl_s_way_to_an_environment() -> None:
-    """What its dqn.py builds: SyncVectorEnv of wrapped copies by their id."""
+    """What its dqn.py builds and reads, with the three changes of the page."""
     import gymnasium
 
     def copy() -> gymnasium.Env[object, object]:
         return gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.make("envs:Bioreactor-v0"))
 
-    env = gymnasium.vector.SyncVectorEnv([copy, copy])
+    env = gymnasium.vector.SyncVectorEnv([copy, copy], autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP)
     env.reset(seed=1)
-    for _ in range(101):
-        _, reward, _, _, infos = env.step(env.action_space.sample())
-        if "episode" in infos:
-            np.testing.assert_array_equal(infos["episode"]["l"], [100, 100])
-            return
-    raise AssertionError(reward)
+    for step in range(100):
+        after, _, _, truncations, infos = env.step(env.action_space.sample())
+        assert list(truncations) == [step == 99] * 2
+    for k, first in enumerate(after):
+        assert infos["final_info"]["episode"]["l"][k] == 100
+        assert infos["final_obs"][k].shape == first.shape
+        assert infos["final_obs"][k][0] != first[0]
 
 
 def test_two_preset_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
